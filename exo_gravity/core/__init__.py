@@ -1,0 +1,15 @@
+"""The mathematics: standard library and NumPy only. No ROS, no input or output, no clock (time is an argument)."""
+
+from exo_gravity.core.arm import STANDARD_GRAVITY, ArmModel
+from exo_gravity.core.gravity import LAWS, gravity_torque, paper_mobile_torque, paper_static_torque
+from exo_gravity.core.tilt import Tilt
+
+__all__ = [
+    "LAWS",
+    "STANDARD_GRAVITY",
+    "ArmModel",
+    "Tilt",
+    "gravity_torque",
+    "paper_mobile_torque",
+    "paper_static_torque",
+]

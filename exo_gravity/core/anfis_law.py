@@ -1,0 +1,138 @@
+"""The ANFIS as a law of the control loop: learned torques of joints 2 to 4, inside the box they were learned in.
+
+It was trained with an upright trunk, for one arm: joint 1 then needs no torque, and gets none. Outside the box, on a
+tilted trunk or for another arm it would extrapolate, and nobody knows what: `outside` says so in a sentence, and the
+caller falls back to the exact law. Gains c_n and gravity scale the torque as they do in every law.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from exo_gravity.core.anfis import Anfis
+from exo_gravity.core.arm import ArmModel
+from exo_gravity.core.errors import DataError
+from exo_gravity.core.gravity import Torque
+from exo_gravity.core.tilt import Tilt
+
+INPUTS = ("theta_2", "theta_3", "theta_4")
+JOINTS = ("2", "3", "4")
+# rad between joint 1's axis and gravity that still counts as upright: a trunk 0.5 degrees off changes the torques of
+# the paper's arm by 0.04 Nm at most, a few steps of the motors' 12-bit torque.
+UPRIGHT = math.radians(0.5)
+FORMAT = "exo_gravity ANFIS law 1"
+
+
+@dataclass(frozen=True, eq=False)
+class AnfisLaw:
+    """Torques of an upright arm, learned over a box of joint angles.
+
+    model: one output per joint 2, 3, 4 in Nm at `gravity` m/s^2 and gain 1; its inputs are theta_2..theta_4, scaled to
+    -1..1 over the box. low, high: (3,) rad, the box. first_moment: M2..M4 in kg m of the arm it was trained for.
+    source: a sentence on the data. error: {'training': (3,) Nm, 'held_out': (3,) Nm}, RMSE of joints 2 to 4.
+    """
+
+    model: Anfis
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    first_moment: tuple[float, ...]
+    gravity: float
+    source: str
+    error: Mapping[str, Sequence[float]]
+
+    @classmethod
+    def load(cls, content: str | Mapping[str, Any]) -> AnfisLaw:
+        """Return the law that JSON text, or the mapping it holds, describes. Raises DataError that names the flaw."""
+        try:
+            content = json.loads(content) if isinstance(content, str) else content
+            if content["format"] != FORMAT:
+                raise DataError(f"ANFIS file: format = {content['format']!r}: must be {FORMAT!r}")
+            joints = [content["joints"][joint] for joint in JOINTS]
+            box = [tuple(float(bound) for bound in content["box"][name]) for name in INPUTS]
+            low, high = zip(*box, strict=True)
+            law = cls(
+                Anfis(*([joint[part] for joint in joints] for part in ("centre", "sigma", "consequent"))),
+                low,
+                high,
+                tuple(float(moment) for moment in content["arm"]["first_moment"]),
+                float(content["arm"]["gravity"]),
+                str(content["source"]),
+                {kind: [float(joint[f"{kind}_rmse"]) for joint in joints] for kind in ("training", "held_out")},
+            )
+        except KeyError as error:
+            raise DataError(f"ANFIS file: {error.args[0]} is missing") from None
+        except (TypeError, ValueError) as error:
+            raise DataError(f"ANFIS file: {error}: must be what train_anfis writes") from None
+        law._check()
+        return law
+
+    def _check(self) -> None:
+        if self.model.centre.shape[1] != len(INPUTS):
+            raise DataError(f"ANFIS file: {self.model.centre.shape[1]} inputs: must be {', '.join(INPUTS)}")
+        for name, low, high in zip(INPUTS, self.low, self.high, strict=True):
+            if not -2 * math.pi <= low < high <= 2 * math.pi:
+                raise DataError(f"ANFIS file: box of {name} = {[low, high]}: must be [low, high] in rad")
+        if len(self.first_moment) != len(JOINTS) or not all(0 <= moment < math.inf for moment in self.first_moment):
+            raise DataError(f"ANFIS file: first_moment = {list(self.first_moment)}: must be M2, M3, M4 in kg m")
+        if not 0 < self.gravity < math.inf:
+            raise DataError(f"ANFIS file: gravity = {self.gravity}: must be greater than 0 m/s^2")
+
+    def dump(self) -> str:
+        """Return the JSON text that `load` reads, one line per rule."""
+        parts = (self.model.centre, self.model.sigma, self.model.consequent)
+        joints = {}
+        for i, joint in enumerate(JOINTS):
+            joints[joint] = {f"{kind}_rmse": float(values[i]) for kind, values in self.error.items()}
+            joints[joint] |= dict(zip(("centre", "sigma", "consequent"), (p[i].tolist() for p in parts), strict=True))
+        content = {
+            "format": FORMAT,
+            "about": "Takagi-Sugeno models (Jang 1993) of the holding torque in Nm of joints 2 to 4, trunk upright. "
+            "Inputs: joint angles, scaled to -1..1 over the box (rad). Consequents: p_0..p_3 of each rule.",
+            "source": self.source,
+            "arm": {"first_moment": self.first_moment, "gravity": self.gravity},
+            "box": dict(zip(INPUTS, zip(self.low, self.high, strict=True), strict=True)),
+            "joints": joints,
+        }
+        return re.sub(r"\[[^\[\]]*\]", lambda found: " ".join(found[0].split()), json.dumps(content, indent=1)) + "\n"
+
+    def outside(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> str:
+        """Return a sentence that says why the law was not trained for this arm, pose or tilt, or '' if it was.
+
+        The sentence holds no measured value: it stays the same for as long as the reason does.
+        """
+        if not tilt.axis_angle <= UPRIGHT:
+            return f"the trunk is tilted by more than {math.degrees(UPRIGHT):g} degrees: the ANFIS was trained upright"
+        for joint, angle, low, high in zip(JOINTS, theta[1:], self.low, self.high, strict=True):
+            if not low <= angle <= high:
+                return f"theta_{joint} is outside the ANFIS's training box, {low:.3f} to {high:.3f} rad"
+        for joint, moment, trained in zip(JOINTS, arm.first_moment[1:], self.first_moment, strict=True):
+            if not math.isclose(moment, trained, rel_tol=1e-6, abs_tol=1e-12):
+                return f"the ANFIS was trained for another arm: its M{joint} is {trained:.4f} kg m"
+        return ""
+
+    def inside(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> bool:
+        """Return whether the law was trained for this arm, pose (4,) rad and tilt."""
+        return not self.outside(arm, theta, tilt)
+
+    def torque(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
+        """Return the torque in Nm at pose `theta` (4,) rad, as the other laws do; meaningless unless `inside`."""
+        tau = self.torques(np.array((theta[1:],)))[0].tolist()
+        scale = arm.scale
+        return (0.0, *(scale[joint] * value / self.gravity for joint, value in enumerate(tau, start=1)))
+
+    def torques(self, theta: np.ndarray) -> np.ndarray:
+        """Return the torques (n, 3) in Nm of joints 2 to 4 at their angles (n, 3) rad, at gain 1."""
+        return self.model.output(scaled(theta, self.low, self.high))
+
+
+def scaled(theta: np.ndarray, low: Sequence[float], high: Sequence[float]) -> np.ndarray:
+    """Return angles (n, d) rad scaled to -1..1 over the box from `low` to `high` (d,)."""
+    low, high = np.asarray(low), np.asarray(high)
+    return (2.0 * theta - low - high) / (high - low)

@@ -1,0 +1,251 @@
+"""AK60-6 and AK80-9: what each motor can do, and the bytes of its MIT mode on V1 and V2 boards.
+
+Command, 8 bytes, a big-endian bit stream, arbitration ID = motor ID (CubeMars driver manual V1.0.15, "MIT mode"):
+
+    position 16 | velocity 12 | kp 12 | kd 12 | torque 12        tau = kp (p - p_motor) + kd (v - v_motor) + torque
+
+Reply, 6 bytes, or 8 on newer firmware, arbitration ID = the motor's own or the master's (0):
+
+    motor ID 8 | position 16 | velocity 12 | torque 12 | temperature + 40 8 | error 8
+
+All on the output side of the gear. A field of b bits spans its range with 2^b - 1 steps, rounded to the nearest: the
+manual's own 2^b overflows at the maximum, and truncation turns 0 Nm into a push. No code is exactly 0 Nm.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+from exo_gravity.core.errors import FrameError, ParameterError
+
+ENTER = b"\xff" * 7 + b"\xfc"
+EXIT = b"\xff" * 7 + b"\xfd"
+SET_ZERO = b"\xff" * 7 + b"\xfe"
+SPECIAL_FRAMES = (ENTER, EXIT, SET_ZERO)
+
+MOTOR_ERRORS = {
+    0: "none",
+    1: "motor over-temperature",
+    2: "over-current",
+    3: "over-voltage",
+    4: "under-voltage",
+    5: "encoder",
+    6: "MOSFET over-temperature",
+    7: "stall",
+}
+
+
+@dataclass(frozen=True)
+class MotorSpec:
+    """A motor type: wire ranges of its firmware (each symmetric about 0), and its physical limits.
+
+    position_range rad, velocity_range rad/s, torque_range Nm, kp_max Nm/rad, kd_max Nm s/rad: what the wire codes span.
+    rated_torque, peak_torque: Nm at the output. gear_ratio. A wire range is not a physical limit.
+    """
+
+    name: str
+    velocity_range: float
+    torque_range: float
+    rated_torque: float
+    peak_torque: float
+    gear_ratio: int
+    position_range: float = 12.5
+    kp_max: float = 500.0
+    kd_max: float = 5.0
+
+    def with_ranges(self, velocity_range: float, torque_range: float) -> MotorSpec:
+        """Return this motor with another firmware's velocity and torque range: no bus query tells them."""
+        for name, value in (("velocity_range", velocity_range), ("torque_range", torque_range)):
+            if not 1.0 <= value <= 100.0:
+                raise ParameterError(name, value, "from 1 to 100, as the firmware's manual says")
+        return replace(self, velocity_range=velocity_range, torque_range=torque_range)
+
+
+MOTORS = {
+    spec.name: spec
+    for spec in (
+        MotorSpec("AK60-6", velocity_range=45.0, torque_range=15.0, rated_torque=3.0, peak_torque=9.0, gear_ratio=6),
+        MotorSpec("AK80-9", velocity_range=50.0, torque_range=18.0, rated_torque=9.0, peak_torque=18.0, gear_ratio=9),
+    )
+}
+
+
+class MotorCommand(NamedTuple):
+    """What a command frame asks: rad, rad/s, Nm/rad, Nm s/rad, Nm."""
+
+    position: float
+    velocity: float
+    kp: float
+    kd: float
+    torque: float
+
+
+class MotorReply(NamedTuple):
+    """What a motor answers: rad, rad/s, Nm; temperature in degC and error code are None from 6-byte firmware."""
+
+    motor_id: int
+    position: float
+    velocity: float
+    torque: float
+    temperature: int | None
+    error: int | None
+
+
+def pack_command(spec: MotorSpec, position: float, velocity: float, kp: float, kd: float, torque: float) -> bytes:
+    """Return the 8 bytes of a command; never those of a special frame.
+
+    position rad, velocity rad/s, kp 0..500 Nm/rad, kd 0..5 Nm s/rad, torque Nm. Raises ParameterError on NaN, infinity
+    or a value outside the spec's range.
+    """
+    word = (
+        _code("position", position, -spec.position_range, spec.position_range, 0xFFFF) << 48
+        | _code("velocity", velocity, -spec.velocity_range, spec.velocity_range, 0xFFF) << 36
+        | _code("kp", kp, 0.0, spec.kp_max, 0xFFF) << 24
+        | _code("kd", kd, 0.0, spec.kd_max, 0xFFF) << 12
+        | _code("torque", torque, -spec.torque_range, spec.torque_range, 0xFFF)
+    )
+    data = word.to_bytes(8, "big")
+    # All other fields at their maximum, the top torque codes spell enter, exit and set zero: ask for a little less.
+    return data if data not in SPECIAL_FRAMES else data[:7] + b"\xfb"
+
+
+def unpack_command(spec: MotorSpec, data: bytes) -> MotorCommand:
+    """Return what a command frame asks. Raises FrameError unless it is 8 bytes and no special frame."""
+    if len(data) != 8 or bytes(data) in SPECIAL_FRAMES:
+        raise FrameError(data, "a command of 8 bytes that is no special frame")
+    word = int.from_bytes(data, "big")
+    return MotorCommand(
+        _value(word >> 48, -spec.position_range, spec.position_range, 0xFFFF),
+        _value(word >> 36 & 0xFFF, -spec.velocity_range, spec.velocity_range, 0xFFF),
+        _value(word >> 24 & 0xFFF, 0.0, spec.kp_max, 0xFFF),
+        _value(word >> 12 & 0xFFF, 0.0, spec.kd_max, 0xFFF),
+        _value(word & 0xFFF, -spec.torque_range, spec.torque_range, 0xFFF),
+    )
+
+
+def pack_reply(
+    spec: MotorSpec,
+    motor_id: int,
+    position: float,
+    velocity: float,
+    torque: float,
+    temperature: int | None = None,
+    error: int | None = None,
+) -> bytes:
+    """Return the bytes of a reply: 8 of them, or 6 without `temperature` (degC, -40..215) and `error` (0..255).
+
+    Raises ParameterError on NaN, infinity or a value outside the spec's range.
+    """
+    word = (
+        _whole("motor_id", motor_id, 0, 255) << 40
+        | _code("position", position, -spec.position_range, spec.position_range, 0xFFFF) << 24
+        | _code("velocity", velocity, -spec.velocity_range, spec.velocity_range, 0xFFF) << 12
+        | _code("torque", torque, -spec.torque_range, spec.torque_range, 0xFFF)
+    )
+    data = word.to_bytes(6, "big")
+    if temperature is None:
+        return data
+    return data + bytes((_whole("temperature", temperature, -40, 215) + 40, _whole("error", error, 0, 255)))
+
+
+def unpack_reply(spec: MotorSpec, data: bytes) -> MotorReply:
+    """Return what a motor answers. Raises FrameError unless it is 6 or 8 bytes."""
+    if len(data) not in (6, 8):
+        raise FrameError(data, "a reply of 6 or 8 bytes")
+    word = int.from_bytes(data[:6], "big")
+    return MotorReply(
+        word >> 40,
+        _value(word >> 24 & 0xFFFF, -spec.position_range, spec.position_range, 0xFFFF),
+        _value(word >> 12 & 0xFFF, -spec.velocity_range, spec.velocity_range, 0xFFF),
+        _value(word & 0xFFF, -spec.torque_range, spec.torque_range, 0xFFF),
+        data[6] - 40 if len(data) == 8 else None,
+        data[7] if len(data) == 8 else None,
+    )
+
+
+def _code(name: str, value: float, low: float, high: float, codes: int) -> int:
+    if not low <= value <= high:  # NaN fails this too
+        raise ParameterError(name, value, f"from {low:g} to {high:g}")
+    return round((value - low) * (codes / (high - low)))
+
+
+def _value(code: int, low: float, high: float, codes: int) -> float:
+    return low + code * ((high - low) / codes)
+
+
+def _standstill(spec: MotorSpec) -> float:
+    """Return the velocity in rad/s that a motor reads where 0 was asked."""
+    span = spec.velocity_range
+    return _value(_code("velocity", 0.0, -span, span, 0xFFF), -span, span, 0xFFF)
+
+
+def _whole(name: str, value: int, low: int, high: int) -> int:
+    if not isinstance(value, int) or not low <= value <= high:
+        raise ParameterError(name, value, f"a whole number from {low} to {high}")
+    return value
+
+
+@dataclass(frozen=True)
+class JointMotor:
+    """One motor as it sits on one joint.
+
+    can_id: 1..126, so that the first byte of a reply (this ID) never is the first byte of our commands, whose position
+    is always 0 (0x7f or 0x80): a bus that echoes can't make a command look like a reply.
+    direction: +1 or -1; joint angle = direction * (motor angle - zero). zero: motor angle in rad where the joint is 0.
+    torque_scale: real output torque per commanded Nm (0.75 is reported of one AK80-9); 0.2..2.
+    """
+
+    spec: MotorSpec
+    can_id: int
+    direction: int = 1
+    zero: float = 0.0
+    torque_scale: float = 1.0
+
+    def __post_init__(self):
+        if not isinstance(self.can_id, int) or not 1 <= self.can_id <= 126:
+            raise ParameterError("can_id", self.can_id, "a whole number from 1 to 126")
+        if self.direction not in (1, -1):
+            raise ParameterError("direction", self.direction, "1 or -1")
+        if not abs(self.zero) <= self.spec.position_range - math.pi:
+            limit = self.spec.position_range - math.pi
+            raise ParameterError("zero", self.zero, f"from {-limit:.2f} to {limit:.2f} rad, or the angle wraps")
+        if not 0.2 <= self.torque_scale <= 2.0:
+            raise ParameterError("torque_scale", self.torque_scale, "from 0.2 to 2")
+
+    def command(self, effort: float, damping: float) -> bytes:
+        """Return the frame for a joint `effort` in Nm and a `damping` in Nm s/rad, clamped to the wire.
+
+        Raises ParameterError on NaN or infinity.
+        """
+        torque = self.direction * effort / self.torque_scale
+        if damping:  # no code is exactly 0 rad/s: what standstill leaves as would push with damping times that
+            torque -= damping * _standstill(self.spec)
+        if math.isfinite(torque) and abs(torque) > self.spec.torque_range:
+            torque = math.copysign(self.spec.torque_range, torque)
+        return pack_command(self.spec, 0.0, 0.0, 0.0, damping, torque)
+
+    def joint_reply(self, data: bytes) -> MotorReply:
+        """Return what a reply's bytes say of the joint: rad, rad/s and Nm are the joint's. Raises FrameError."""
+        reply = unpack_reply(self.spec, data)
+        return MotorReply(
+            reply.motor_id,
+            self.joint_position(reply.position),
+            self.direction * reply.velocity,
+            self.joint_effort(reply.torque),
+            reply.temperature,
+            reply.error,
+        )
+
+    def joint_position(self, motor_position: float) -> float:
+        """Return the joint angle in rad for a motor angle in rad."""
+        return self.direction * (motor_position - self.zero)
+
+    def motor_position(self, joint_position: float) -> float:
+        """Return the motor angle in rad for a joint angle in rad."""
+        return self.direction * joint_position + self.zero
+
+    def joint_effort(self, motor_torque: float) -> float:
+        """Return the joint torque in Nm for a torque in the motor's own Nm."""
+        return self.direction * motor_torque * self.torque_scale

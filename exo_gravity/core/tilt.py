@@ -1,0 +1,95 @@
+"""Trunk tilt: orientation of the trunk -> pitch, roll -> the direction of gravity in each arm's base frame.
+
+Axes of the trunk (REP-103): x forward, y left, z up. Roll r about x, then pitch p about y, both fixed axes:
+p > 0 bows forward, r > 0 leans to the right. Heading does not matter to gravity. Base frame of the left arm in trunk
+axes: x0 left, y0 forward, z0 down; the right arm is its mirror image, so it sees the same with r replaced by -r.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from exo_gravity.core.arm import one_float
+from exo_gravity.core.errors import ParameterError
+
+SIDES = ("left", "right")
+
+
+class Tilt(NamedTuple):
+    """The tilt of a trunk as one arm feels it; make it with `Tilt.of`.
+
+    pitch, roll: the trunk's, in rad (REP-103). direction: (3,) unit vector of gravity in the arm's base frame.
+    axis_angle: rad in 0..pi between joint 1's axis and gravity, the paper's theta_1. beta, phi: the paper's letters,
+    added to theta_3 and theta_2.
+    """
+
+    pitch: float
+    roll: float
+    direction: tuple[float, float, float]
+    axis_angle: float
+    beta: float
+    phi: float
+
+    @classmethod
+    def of(cls, side: str, pitch: float = 0.0, roll: float = 0.0) -> Tilt:
+        """Return the tilt of the `side` ('left' or 'right') arm for a trunk at `pitch` and `roll` in rad."""
+        if side not in SIDES:
+            raise ParameterError("side", side, f"one of {', '.join(SIDES)}")
+        pitch = one_float("pitch", pitch, -math.pi, math.pi, "rad")
+        roll = one_float("roll", roll, -math.pi, math.pi, "rad")
+        outward = roll if side == "left" else -roll
+        forward, right, down = _gravity(pitch, outward)
+        direction = (-right, forward, down)
+        return cls(pitch, roll, direction, math.acos(max(-1.0, min(1.0, down))), -pitch, outward)
+
+
+def _gravity(pitch: float, roll: float) -> tuple[float, float, float]:
+    """Gravity's unit vector along forward, right and down."""
+    return math.sin(pitch), math.sin(roll) * math.cos(pitch), math.cos(roll) * math.cos(pitch)
+
+
+def gravity_in_trunk(pitch: float, roll: float) -> np.ndarray:
+    """Return the unit vector of gravity, (3,), in the trunk's axes (x forward, y left, z up)."""
+    forward, right, down = _gravity(pitch, roll)
+    return np.array((forward, -right, -down))
+
+
+def pitch_roll(gravity_in_trunk: Sequence[float]) -> tuple[float, float]:
+    """Return pitch in -pi/2..pi/2 and roll in -pi..pi, rad, of a trunk that sees gravity in that direction (3,)."""
+    x, y, z = (float(component) for component in gravity_in_trunk)
+    norm = math.sqrt(x * x + y * y + z * z)
+    if not 0.0 < norm < math.inf:
+        raise ParameterError("gravity_in_trunk", gravity_in_trunk, "a finite vector other than zero")
+    return math.asin(max(-1.0, min(1.0, x / norm))), math.atan2(-y, -z)
+
+
+def rotation_matrix(quaternion: Sequence[float], name: str = "quaternion") -> np.ndarray:
+    """Return the rotation matrix (3, 3) of a unit quaternion (x, y, z, w), ROS order.
+
+    Raises ParameterError under `name` unless it is finite and its norm is within 1 % of 1 (what drivers round to).
+    """
+    q = np.asarray(quaternion, dtype=float)
+    norm = float(np.linalg.norm(q)) if q.shape == (4,) else math.nan
+    if not abs(norm - 1.0) < 0.01:
+        raise ParameterError(name, quaternion, "a unit quaternion (x, y, z, w)")
+    x, y, z, w = q / norm
+    return np.array(
+        (
+            (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+            (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+            (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+        )
+    )
+
+
+def gravity_from_orientation(quaternion: Sequence[float], rotation_trunk_from_imu: np.ndarray) -> np.ndarray:
+    """Return gravity's unit vector (3,) in the trunk's axes from an IMU's orientation.
+
+    quaternion: (x, y, z, w), world from IMU, world z up (REP-145). rotation_trunk_from_imu: (3, 3).
+    """
+    down_in_imu = -rotation_matrix(quaternion, "orientation")[2]  # world z up, seen from the IMU, is the last row
+    return rotation_trunk_from_imu @ down_in_imu

@@ -1,0 +1,46 @@
+from glob import glob
+
+from setuptools import find_packages, setup
+
+package_name = "exo_gravity"
+nodes = ("can_bridge", "imu", "compensator", "simulator", "recorder")
+tools = ("launcher", "trial", "report", "budget", "validate", "train_anfis")
+
+extras = {
+    # Jazzy as wheels, for a machine without ROS. Where ROS 2 is installed it must not be named.
+    "ros": ["ros-jazzy-rclpy[fastrtps]==7.1.6", "ros-jazzy-common-interfaces==5.3.6"],
+    "imu": ["imufusion>=1.3"],
+    "sim": ["mujoco>=3.2"],
+    "report": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11", "scipy>=1.11"],
+    "validate": ["pin>=3.0", "roboticstoolbox-python>=1.1.1", "threadpoolctl>=3.0"],
+    "test": ["hypothesis>=6.100", "mcap-ros2-support>=0.5", "pytest>=8.0", "pytest-timeout>=2.3"],
+}
+
+setup(
+    name=package_name,
+    version="0.1.0",
+    packages=find_packages(include=[package_name, package_name + ".*"]),
+    package_data={f"{package_name}.nodes": ["fastdds.xml"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
+        (f"share/{package_name}", ["package.xml"]),
+        (f"share/{package_name}/config", glob("config/*.yaml")),
+        (f"share/{package_name}/config/trials", glob("config/trials/*.yaml")),
+        (f"share/{package_name}/config/sros2", glob("config/sros2/*.xml")),
+        (f"share/{package_name}/launch", glob("launch/*.py")),
+    ],
+    python_requires=">=3.10",
+    install_requires=["msgpack>=1.0", "numpy>=1.26", "python-can>=4.3", "PyYAML>=6.0"],
+    extras_require=extras,
+    zip_safe=False,
+    maintainer="exo_gravity maintainers",
+    maintainer_email="maintainers@exo-gravity.example",
+    description="Feed-forward gravity compensation for a worn upper-body exoskeleton with AK60-6 and AK80-9 motors",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            *(f"{name} = exo_gravity.nodes.{name}:main" for name in nodes),
+            *(f"{name} = exo_gravity.tools.{name}:main" for name in tools),
+        ]
+    },
+)

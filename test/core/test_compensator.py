@@ -1,0 +1,251 @@
+"""The compensator: no torque without fresh and finite input, and no step whatever is changed."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core.anfis import Anfis
+from exo_gravity.core.anfis_law import AnfisLaw
+from exo_gravity.core.compensator import LONGEST_STEP, Compensator, Settings
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.tilt import Tilt
+
+ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
+THETA = (0.2, 0.7, 0.6, 0.5)
+PERIOD = 0.002
+
+
+def make(**changes) -> Settings:
+    defaults = {
+        "side": "left",
+        "robot": ROBOT,
+        "wearer_mass": (0.0, 0.0, 2.0, 1.6),
+        "wearer_cog": (0.0, 0.0, 0.16, 0.17),
+        "max_effort": (9.0, 18.0, 9.0, 9.0),
+        "tilt_timeout": 0.0,
+    }
+    return Settings(**{**defaults, **changes})
+
+
+class Run:
+    def __init__(self, **changes):
+        self.compensator = Compensator(make(**changes))
+        self.now = 50.0
+        self.efforts = []
+
+    def cycle(self, seconds=PERIOD, theta=THETA, period=PERIOD):
+        for _ in range(max(1, round(seconds / period))):
+            self.now += period
+            answer = self.compensator.step(self.now, theta)
+            self.efforts.append(answer.effort)
+        return answer
+
+    @property
+    def largest_step(self):
+        return float(np.abs(np.diff(np.array(self.efforts), axis=0)).max())
+
+
+def test_after_the_ramp_the_torque_is_the_laws():
+    run = Run()
+    assert run.cycle().effort == (0.0, 0.0, 0.0, 0.0)
+    run.cycle(0.5)
+    half = run.efforts[-1]
+    run.cycle(0.6)
+    np.testing.assert_allclose(run.efforts[-1], gravity_torque(ROBOT, THETA), rtol=1e-12)
+    np.testing.assert_allclose(half, 0.5 * gravity_torque(ROBOT, THETA), rtol=0.01)
+
+
+def test_a_tilted_trunk_changes_the_torque():
+    run = Run(tilt_timeout=0.08)
+    for _ in range(600):
+        run.compensator.tilt(run.now, pitch=0.3, roll=-0.2)
+        run.cycle()
+    expected = gravity_torque(ROBOT, THETA, Tilt.of("left", 0.3, -0.2).direction)
+    np.testing.assert_allclose(run.efforts[-1], expected, rtol=1e-12)
+
+
+def test_without_a_fresh_tilt_there_is_no_torque_and_a_reason():
+    run = Run(tilt_timeout=0.08)
+    assert run.cycle()[:2] == (None, "no trunk tilt yet")
+    run.compensator.tilt(run.now, 0.0, 0.0)
+    assert run.cycle().effort is not None
+    assert "older than 80 ms" in run.cycle(0.1).reason
+
+
+@pytest.mark.parametrize(
+    "theta",
+    [(0.0, 0.0, 0.0), (0.0, 0.0, math.nan, 0.0), (math.inf, 0.0, 0.0, 0.0), (0.0, 0.0, 1e308, 1e308), (0, -27, 0, 0)],
+)
+def test_impossible_angles_get_no_torque(theta):
+    run = Run()
+    run.cycle(2.0)
+    answer = run.cycle(theta=theta)
+    assert answer.effort is None
+    assert "not 4 numbers within 26 rad" in answer.reason
+
+
+@pytest.mark.parametrize("angle", [math.nan, math.inf, 4.0])
+def test_an_impossible_tilt_is_refused_and_the_last_one_stays(angle):
+    run = Run(tilt_timeout=0.08)
+    run.compensator.tilt(run.now, 0.1, 0.0)
+    with pytest.raises(ParameterError):
+        run.compensator.tilt(run.now, angle, 0.0)
+    assert run.cycle().effort is not None
+
+
+def test_after_a_break_the_torque_ramps_in_anew():
+    run = Run()
+    run.cycle(2.0)
+    run.now += 0.2
+    assert run.cycle().effort == (0.0, 0.0, 0.0, 0.0)
+
+
+def test_zero_g_carries_the_wearers_arm_in_proportion_to_the_support():
+    run = Run(mode="zero_g", support=0.5)
+    run.cycle(1.2)
+    arm = ROBOT.with_wearer((0.0, 0.0, 2.0, 1.6), (0.0, 0.0, 0.16, 0.17), 0.5)
+    np.testing.assert_allclose(run.efforts[-1], gravity_torque(arm, THETA), rtol=1e-12)
+
+
+def test_a_change_of_mode_reaches_the_arm_without_a_step():
+    run = Run()
+    run.cycle(1.5)
+    run.efforts.clear()
+    run.compensator.apply(make(mode="zero_g"))
+    run.cycle(0.5)
+    one, two = (gravity_torque(make(mode=mode).arm, THETA) for mode in ("one_g", "zero_g"))
+    np.testing.assert_allclose(run.efforts[-1], (one + two) / 2, rtol=0.01)
+    run.cycle(1.0)
+    np.testing.assert_allclose(run.efforts[-1], two, rtol=1e-12)
+    assert run.largest_step <= np.abs(two - one).max() * PERIOD * 1.001
+
+
+def test_the_transition_takes_the_time_that_the_new_settings_say():
+    run = Run(transition_time=0.3)
+    run.cycle(1.5)
+    run.compensator.apply(make(mode="zero_g", transition_time=4.0))
+    run.cycle(1.0)
+    one, two = (gravity_torque(make(mode=mode).arm, THETA) for mode in ("one_g", "zero_g"))
+    np.testing.assert_allclose(run.efforts[-1], one + (two - one) / 4, rtol=0.01)
+    run.cycle(3.1)
+    np.testing.assert_allclose(run.efforts[-1], two, rtol=1e-12)
+
+
+def test_settings_swept_again_and_again_are_followed_without_a_step():
+    run = Run(mode="zero_g", support=0.0)
+    run.cycle(1.5)
+    run.efforts.clear()
+    for support in np.linspace(0.0, 1.0, 101):
+        run.compensator.apply(make(mode="zero_g", support=support))
+        run.cycle(0.02)
+    run.cycle(1.0)
+    one, two = (gravity_torque(make(mode=mode).arm, THETA) for mode in ("one_g", "zero_g"))
+    np.testing.assert_allclose(run.efforts[-1], two, rtol=1e-12)
+    assert run.largest_step <= np.abs(two - one).max() / 1.0 * PERIOD * 1.1
+
+
+def test_too_much_torque_is_clamped_and_named():
+    run = Run(max_effort=(3.0, 1.0, 3.0, 3.0))
+    answer = run.cycle(2.0)
+    assert answer.effort[1] == 1.0
+    assert answer.clamped == (1,)
+
+
+CHANGES = st.fixed_dictionaries(
+    {},
+    optional={
+        "mode": st.sampled_from(["one_g", "zero_g"]),
+        "law": st.sampled_from(["exact", "paper_static", "paper_mobile"]),
+        "support": st.floats(0, 1),
+        "wearer_mass": st.tuples(*[st.floats(0, 2)] * 4),
+        "max_effort": st.tuples(*[st.floats(0, 20)] * 4),
+        "max_effort_rate": st.floats(1, 200),
+        "transition_time": st.floats(0.2, 5.0),
+    },
+)
+PERIODS = st.sampled_from([0.001, 0.002, 0.004, 0.009, 0.011, 0.03, 0.045])  # late ones too
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.tuples(CHANGES, st.lists(PERIODS, max_size=60), st.tuples(*[st.floats(-1.5, 1.5)] * 4)), max_size=9))
+def test_no_sequence_of_changes_poses_and_late_cycles_steps_the_torque_beyond_its_rate(sequence):
+    run = Run()
+    run.cycle(1.2)
+    for change, periods, theta in sequence:
+        run.compensator.apply(make(**change))
+        for period in periods:
+            run.cycle(period, theta, period)
+            allowed = change.get("max_effort_rate", 50.0) * min(period, LONGEST_STEP)
+            assert np.abs(np.subtract(*run.efforts[-2:])).max() <= allowed * (1 + 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("side", "both"),
+        ("law", "newton"),
+        ("mode", "half_g"),
+        ("support", 1.1),
+        ("wearer_mass", (0.0, 0.0, 900.0, 0.0)),
+        ("wearer_cog", (0.0, 0.0, 0.31, 0.0)),
+        ("max_effort", (1.0, 2.0, 3.0)),
+        ("max_effort_rate", math.nan),
+        ("transition_time", 0.1),
+        ("max_total_mass", math.inf),
+    ],
+)
+def test_impossible_settings_are_refused_by_name(field, value):
+    with pytest.raises(ParameterError) as caught:
+        make(**{field: value})
+    assert caught.value.name.replace(".", "_") == field
+
+
+def test_more_than_the_largest_total_mass_is_refused_whatever_the_mode():
+    make(max_total_mass=5.5)  # 1.854 kg of robot, 3.6 kg of wearer
+    for mode in ("one_g", "zero_g"):
+        with pytest.raises(ParameterError, match=r"total mass in kg = 5.45: must be at most max_total_mass = 5 "):
+            make(mode=mode, max_total_mass=5.0)
+
+
+def test_of_the_wearer_the_share_that_is_supported_counts_for_the_total_mass():
+    assert make(mode="zero_g", support=0.5, max_total_mass=5.0).arm.total_mass == pytest.approx(3.654)
+
+
+def learned(moments=ROBOT.first_moment[1:]):
+    """An ANFIS of constant 0.5, 1.0 and 0.25 Nm on joints 2 to 4, in a box of 0 to 1 rad."""
+    rules = np.zeros((3, 8, 4))
+    rules[:, :, 0] = [[0.5], [1.0], [0.25]]
+    model = Anfis(np.tile([-1.0, 1.0], (3, 3, 1)), np.ones((3, 3, 2)), rules)
+    return AnfisLaw(model, (0.0,) * 3, (1.0,) * 3, moments, ROBOT.gravity, "made up", {})
+
+
+def test_inside_its_box_the_anfis_answers():
+    run = Run(law="anfis", anfis=learned())
+    answer = run.cycle(1.2)
+    assert answer.fallback == ""
+    np.testing.assert_allclose(answer.effort, (0.0, 0.5, 1.0, 0.25), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("theta", "pitch", "moments", "why"),
+    [
+        ((0.2, 1.2, 0.6, 0.5), 0.0, ROBOT.first_moment[1:], "theta_2 is outside"),
+        (THETA, 0.1, ROBOT.first_moment[1:], "tilted"),
+        (THETA, 0.0, (0.3, 0.2, 0.1), "another arm"),
+    ],
+)
+def test_where_the_anfis_was_not_trained_the_exact_law_answers_and_says_why(theta, pitch, moments, why):
+    run = Run(law="anfis", anfis=learned(moments))
+    run.compensator.tilt(run.now, pitch, 0.0)
+    answer = run.cycle(1.2, theta)
+    assert why in answer.fallback
+    np.testing.assert_allclose(answer.effort, gravity_torque(ROBOT, theta, Tilt.of("left", pitch).direction))
+
+
+def test_the_anfis_without_a_file_is_refused():
+    with pytest.raises(ParameterError, match="anfis_file"):
+        make(law="anfis")

@@ -1,0 +1,73 @@
+"""The compensator's parameters as settings: every value, possible or not, is taken or refused with a sentence."""
+
+import math
+import random
+
+import numpy as np
+import pytest
+
+from exo_gravity.core.compensator import LONGEST_STEP, Compensator
+from exo_gravity.core.control_params import COMPENSATOR, settings_of
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.params import values_of
+
+LIVE = [param for param in COMPENSATOR if not param.fixed]
+WRONG = (-0.1, math.nan, math.inf, 900.0, "", "heavy", True, None, [], [0.1] * 3, [0.1] * 5, [0.1, math.nan, 0.1, 0.1])
+WRONG += ([0.0, 0.0, 0.31, 0.0], [0.1, -1e-9, 0.1, 0.1], [1e308] * 4, ["0.1"] * 4, b"0.1", {}, 1e308)
+
+
+def possible(param, rng):
+    """Draw a value that the parameter by itself can have."""
+    if param.choices:
+        return rng.choice(param.choices)
+    if not param.bounds:
+        return param.default
+    low, high = param.bounds
+    high = high * rng.choice([1.0, 0.1]) if low == 0.0 else high
+    if isinstance(param.default, list):
+        return [rng.uniform(low, high) for _ in param.default]
+    return rng.choice([low, rng.uniform(low, high)])
+
+
+def test_a_thousand_changes_possible_and_not_are_taken_or_refused_and_never_step_the_torque():
+    rng = random.Random(7)
+    values = values_of(COMPENSATOR, {"use_imu": False})
+    compensator = Compensator(settings_of(values))
+    now, last, refused, moved = 100.0, np.zeros(4), 0, 0.0
+    for _ in range(1000):
+        changed = {p.name: possible(p, rng) for p in rng.sample(LIVE, rng.choice([1, 1, 2, 5]))}
+        if rng.random() < 0.4:
+            changed[rng.choice([*LIVE]).name if rng.random() < 0.9 else "suport"] = rng.choice(WRONG)
+        try:
+            checked = values_of(COMPENSATOR, {**values, **changed})
+            compensator.apply(settings_of(checked))
+            values = checked
+        except ParameterError as error:
+            assert len(str(error).split()) > 4
+            refused += 1
+        theta = [rng.uniform(-1.5, 1.5) for _ in range(4)]
+        for _ in range(rng.randrange(8)):
+            period = rng.choice([0.002, 0.004, 0.02])
+            now += period
+            effort = np.array(compensator.step(now, theta).effort)
+            step = np.abs(effort - last).max()
+            assert step <= values["max_effort_rate"] * min(period, LONGEST_STEP) * (1 + 1e-9)
+            last, moved = effort, moved + step
+    assert 300 < refused < 700
+    assert moved > 100.0  # Nm: it did follow
+
+
+@pytest.mark.parametrize(
+    "name", ["use_sim_time", "start_type_description_service", "qos_overrides./tf.publisher.depth"]
+)
+def test_what_ros_itself_declares_on_every_node_is_left_alone(name):
+    assert name not in values_of(COMPENSATOR, {name: True})
+
+
+def test_the_total_mass_is_bounded_by_its_parameter():
+    wearer = {"wearer.body_mass": 75.0, "mode": "zero_g"}
+    assert settings_of(values_of(COMPENSATOR, wearer)).arm.total_mass == pytest.approx(5.559, abs=1e-3)
+    values = values_of(COMPENSATOR, {**wearer, "max_total_mass": 5.0})
+    with pytest.raises(ParameterError, match=r"total mass in kg = 5.56: must be at most max_total_mass = 5 \("):
+        settings_of(values)
+    assert settings_of({**values, "support": 0.5}).arm.total_mass == pytest.approx(3.707, abs=1e-3)

@@ -1,0 +1,176 @@
+"""Whatever bytes and numbers come, the motors' codec gives a value within the wire's range or a clear error."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from exo_gravity.core.errors import FrameError, ParameterError
+from exo_gravity.core.motors import (
+    MOTORS,
+    SPECIAL_FRAMES,
+    JointMotor,
+    pack_command,
+    pack_reply,
+    unpack_command,
+    unpack_reply,
+)
+
+COMMAND, REPLY = ("position", "velocity", "kp", "kd", "torque"), ("position", "velocity", "torque")
+SPECIAL_NUDGE = 3  # codes less that a command asks for where it would spell a special frame
+LONGEST = 80  # bytes; CAN FD has up to 64
+
+seeded = settings(max_examples=200, derandomize=True, database=None, deadline=None)
+BYTES = st.binary(max_size=LONGEST) | st.binary(min_size=6, max_size=6) | st.binary(min_size=8, max_size=8)
+NUMBERS = st.floats() | st.floats(-20.0, 20.0) | st.floats(0.0, 600.0) | st.integers(-(10**30), 10**30)
+EXTREME_CODES = st.lists(st.sampled_from((0x00, 0xFF)), min_size=8, max_size=8).map(bytes)
+SHARES = st.floats(-1.0, 1.0) | st.sampled_from((-1.0, 0.0, 1.0))
+
+
+@st.composite
+def specs(draw):
+    """A motor with its default ranges or those of any other firmware."""
+    spec = draw(st.sampled_from(list(MOTORS.values())))
+    return draw(st.just(spec) | st.builds(spec.with_ranges, st.floats(1.0, 100.0), st.floats(1.0, 100.0)))
+
+
+def bounds(spec, field):
+    """Least and greatest value of a field, and how far apart two codes are."""
+    low, high, bits = {
+        "position": (-spec.position_range, spec.position_range, 16),
+        "velocity": (-spec.velocity_range, spec.velocity_range, 12),
+        "kp": (0.0, spec.kp_max, 12),
+        "kd": (0.0, spec.kd_max, 12),
+        "torque": (-spec.torque_range, spec.torque_range, 12),
+    }[field]
+    return low, high, (high - low) / (2**bits - 1)
+
+
+def assert_within(spec, fields, values):
+    for field, value in zip(fields, values, strict=True):
+        low, high, code = bounds(spec, field)
+        assert low - 1e-9 * code <= value <= high + 1e-9 * code
+
+
+def scaled(spec, field, share):
+    low, high, _ = bounds(spec, field)
+    return min(high, max(low, (low + high) / 2.0 + share * (high - low) / 2.0))
+
+
+@seeded
+@given(specs(), st.tuples(*[NUMBERS] * 5))
+def test_any_numbers_make_a_command_of_8_bytes_within_one_code_or_an_error_that_names_the_field(spec, values):
+    inside = [bounds(spec, f)[0] <= v <= bounds(spec, f)[1] for f, v in zip(COMMAND, values, strict=True)]
+    if all(inside):
+        assert len(pack_command(spec, *values)) == 8
+        return
+    with pytest.raises(ParameterError) as caught:
+        pack_command(spec, *values)
+    assert caught.value.name == COMMAND[inside.index(False)]
+
+
+@seeded
+@given(specs(), st.tuples(*[SHARES] * 5))
+def test_what_a_command_asks_comes_back_within_half_a_code(spec, shares):
+    asked = [scaled(spec, field, share) for field, share in zip(COMMAND, shares, strict=True)]
+    data = pack_command(spec, *asked)
+    assert data not in SPECIAL_FRAMES
+    got = unpack_command(spec, data)
+    top = all(g >= bounds(spec, f)[1] - 1e-9 for f, g in zip(COMMAND[:4], got[:4], strict=True))
+    for field, wanted, value in zip(COMMAND, asked, got, strict=True):
+        codes = 0.5 + (SPECIAL_NUDGE if top and field == "torque" else 0)
+        assert abs(value - wanted) <= (codes + 1e-6) * bounds(spec, field)[2]
+
+
+@seeded
+@given(specs(), st.tuples(*[SHARES] * 3), st.integers(0, 255), st.integers(-40, 215) | st.none(), st.integers(0, 255))
+def test_what_a_motor_replies_comes_back_within_half_a_code(spec, shares, motor_id, temperature, error):
+    told = [scaled(spec, field, share) for field, share in zip(REPLY, shares, strict=True)]
+    got = unpack_reply(spec, pack_reply(spec, motor_id, *told, temperature, error))
+    assert (got.motor_id, got.temperature) == (motor_id, temperature)
+    assert got.error == (None if temperature is None else error)
+    for field, wanted, value in zip(REPLY, told, got[1:4], strict=True):
+        assert abs(value - wanted) <= (0.5 + 1e-6) * bounds(spec, field)[2]
+
+
+@seeded
+@given(specs(), BYTES)
+def test_any_bytes_are_a_reply_within_range_or_an_error_that_shows_them(spec, data):
+    try:
+        reply = unpack_reply(spec, data)
+    except FrameError as error:
+        assert len(data) not in (6, 8) and error.data == data
+        return
+    assert len(data) in (6, 8) and 0 <= reply.motor_id <= 255
+    assert_within(spec, REPLY, reply[1:4])
+    assert (reply.temperature is None) == (reply.error is None) == (len(data) == 6)
+
+
+@seeded
+@given(specs(), BYTES | st.sampled_from(SPECIAL_FRAMES))
+def test_any_bytes_are_a_command_within_range_or_an_error_that_shows_them(spec, data):
+    try:
+        command = unpack_command(spec, data)
+    except FrameError as error:
+        assert (len(data) != 8 or data in SPECIAL_FRAMES) and error.data == data
+        return
+    assert len(data) == 8
+    assert_within(spec, COMMAND, command)
+
+
+@seeded
+@given(specs(), st.binary(min_size=8, max_size=8) | EXTREME_CODES)
+def test_bytes_that_were_understood_are_packed_to_the_same_bytes(spec, data):
+    assume(data not in SPECIAL_FRAMES)
+    command, reply = unpack_command(spec, data), unpack_reply(spec, data)
+    assume(data[:7] != b"\xff" * 7)  # beside a special frame a command may have been nudged
+    assert pack_command(spec, *command) == data
+    assert pack_reply(spec, *reply) == data
+
+
+@st.composite
+def joints(draw):
+    return JointMotor(
+        draw(specs()),
+        draw(st.integers(1, 126)),
+        draw(st.sampled_from((1, -1))),
+        draw(st.floats(-9.0, 9.0)),
+        draw(st.floats(0.2, 2.0)),
+    )
+
+
+@seeded
+@given(joints(), NUMBERS, NUMBERS)
+def test_a_joint_makes_a_command_of_any_effort_without_stiffness_or_refuses_it(motor, effort, damping):
+    try:
+        command = unpack_command(motor.spec, motor.command(effort, damping))
+    except ParameterError:
+        assert not (math.isfinite(effort) and abs(effort) < 1e100 and 0.0 <= damping <= motor.spec.kd_max)
+        return
+    assert_within(motor.spec, COMMAND, command)
+    assert command.kp == 0.0 and abs(command.kd - damping) <= bounds(motor.spec, "kd")[2]
+    torque = motor.direction * effort / motor.torque_scale
+    slack = (1.5 + damping) * max(bounds(motor.spec, field)[2] for field in ("torque", "velocity"))
+    assert abs(command.torque - max(-motor.spec.torque_range, min(motor.spec.torque_range, torque))) <= slack
+
+
+@seeded
+@given(joints(), BYTES)
+def test_a_joint_reads_any_bytes_as_finite_numbers_or_refuses_them(motor, data):
+    try:
+        reply = motor.joint_reply(data)
+    except FrameError:
+        assert len(data) not in (6, 8)
+        return
+    assert all(map(math.isfinite, reply[1:4]))
+    assert abs(reply.position) <= motor.spec.position_range + abs(motor.zero) + 1e-9
+
+
+@seeded
+@given(joints(), st.floats(-3.0, 3.0))
+def test_a_joint_angle_comes_back_within_one_code(motor, angle):
+    data = pack_reply(motor.spec, motor.can_id, motor.motor_position(angle), 0.0, 0.0)
+    assert motor.joint_reply(data).position == pytest.approx(angle, abs=bounds(motor.spec, "position")[2])

@@ -1,0 +1,115 @@
+"""The bits on the wire: against frames known from elsewhere, a bit-by-bit decoder, and the figures of real drives."""
+
+import numpy as np
+import pytest
+
+from exo_gravity.core import wire
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors import MOTORS, pack_command, pack_reply
+from exo_gravity.core.wire import (
+    BITRATE,
+    TYPICAL_COMMAND,
+    TYPICAL_REPLY,
+    Rate,
+    check_rate,
+    frame_bits,
+    load,
+    stuffed_bits,
+    worst_frame_bits,
+)
+
+SPEC = MOTORS["AK60-6"]
+
+
+def frames(kind, count=2000, seed=5):
+    """(can_id, data) of an arm that is carried, anywhere in its workspace and at any torque it may have."""
+    rng = np.random.default_rng(seed)
+    for index in range(count):
+        can_id = index % 4 + 1
+        torque, position, velocity = rng.uniform((-3, -1.65, -1), (3, 3.14, 1))
+        if kind == "command":
+            yield can_id, pack_command(SPEC, 0.0, 0.0, 0.0, 0.0, torque)
+        else:
+            extra = (int(rng.integers(20, 60)), 0) if kind == 8 else ()
+            yield can_id, pack_reply(SPEC, can_id, position, velocity, torque, *extra)
+
+
+def test_a_frame_of_8_bytes_has_111_bits_and_at_most_135():
+    assert (frame_bits(8), worst_frame_bits(8)) == (111, 135)
+
+
+def test_a_frame_of_6_bytes_has_95_bits_and_at_most_115():
+    assert (frame_bits(6), worst_frame_bits(6)) == (95, 115)
+
+
+def test_an_empty_frame_with_id_0_is_stuffed_as_worked_out_by_hand():
+    # 34 zeros (start, ID, control, length 0, a CRC of 0): a stuff bit after the first 5, then after every 5 more.
+    assert stuffed_bits(0, b"") == frame_bits(0) + 34 // 5
+
+
+def test_the_crc_is_that_of_can():
+    # Check value of CRC-15/CAN over the ASCII digits 1 to 9 (catalogue of parametrised CRC algorithms).
+    bits = [byte >> place & 1 for byte in b"123456789" for place in range(7, -1, -1)]
+    assert wire._crc(bits) == 0x059E
+
+
+def test_no_frame_is_shorter_than_without_stuffing_or_longer_than_the_worst():
+    rng = np.random.default_rng(1)
+    for _ in range(500):
+        size = int(rng.integers(0, 9))
+        data = bytes(rng.choice([0x00, 0xFF, 0x0F, 0x07, 0xF8], size).tolist())
+        assert frame_bits(size) <= stuffed_bits(int(rng.integers(0, 2048)), data) <= worst_frame_bits(size)
+
+
+@pytest.mark.parametrize(
+    ("kind", "typical"), [("command", TYPICAL_COMMAND), (6, TYPICAL_REPLY[6]), (8, TYPICAL_REPLY[8])]
+)
+def test_the_typical_bits_are_the_mean_of_what_a_carried_arm_sends(kind, typical):
+    assert np.mean([stuffed_bits(*frame) for frame in frames(kind)]) == pytest.approx(typical, abs=1.0)
+
+
+def test_four_motors_at_500_hz_load_the_bus_by_half():
+    assert load(500.0, 4).share == pytest.approx(0.48, abs=0.01)
+    assert load(500.0, 4, worst=True).share == pytest.approx(0.54)
+
+
+def test_the_largest_rate_of_four_motors_is_926_hz_at_the_worst_and_more_than_1000_typically():
+    assert load(1.0, 4, worst=True).largest_rate == pytest.approx(926.0, abs=0.5)
+    assert 1000.0 < load(1.0, 4).largest_rate < 1061.0
+
+
+def test_at_the_largest_rate_the_bus_is_full():
+    for worst in (False, True):
+        full = load(load(1.0, 4, worst=worst).largest_rate, 4, worst=worst)
+        assert full.share == pytest.approx(1.0) and full.bits_per_second == pytest.approx(BITRATE)
+
+
+def test_shorter_replies_and_fewer_motors_load_the_bus_less():
+    assert load(500.0, 4, 6).share < load(500.0, 4).share
+    assert load(500.0, 8).share == pytest.approx(2 * load(500.0, 4).share)
+
+
+def test_a_rate_that_does_not_fit_is_refused_with_the_one_that_does():
+    assert check_rate(1000.0, 4).share < 1.0
+    with pytest.raises(ParameterError, match=r"rate = 600\.0: must be at most 516 Hz"):
+        check_rate(600.0, 8)
+
+
+@pytest.mark.parametrize(
+    ("rate", "motors", "reply_bytes"), [(0.0, 4, 8), (float("nan"), 4, 8), (500.0, 0, 8), (500.0, 4, 7)]
+)
+def test_what_is_no_rate_no_motors_or_no_reply_is_refused(rate, motors, reply_bytes):
+    with pytest.raises(ParameterError):
+        load(rate, motors, reply_bytes)
+
+
+def test_a_rate_is_counted_over_a_second_or_more_and_begins_anew_with_its_counter():
+    rate = Rate()
+    assert [rate.update(now, count) for now, count in ((10.0, 0), (10.5, 250), (11.0, 500), (11.1, 540))] == [
+        0.0,
+        0.0,
+        500.0,
+        500.0,
+    ]
+    assert rate.update(12.0, 3) == 0.0
+    assert rate.update(14.0, 203) == 100.0
