@@ -1,0 +1,1 @@
+"""Devices: the CAN bus of the motors, the IMU. Drivers raise, nodes decide."""

@@ -1,0 +1,88 @@
+"""The watchdog: what a dead process left pushing is let down; what it left in peace is left in peace."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from dataclasses import replace
+from itertools import count, pairwise
+
+import can
+import pytest
+
+from exo_gravity.core.limits import Limits
+from exo_gravity.core.motors import ENTER, EXIT, MOTORS, JointMotor, unpack_command
+from exo_gravity.hardware.watchdog import Charge, let_down
+from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
+
+MOTORS_OF_ARM = tuple(JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1))
+LIMITS = Limits(("a", "b", "c", "d"), (-1.6,) * 4, (3.1,) * 4, (6.0,) * 4, (3.0, 9.0, 3.0, 3.0))
+QUICKLY = replace(LIMITS, fade_time=0.5, damping=1.5)
+CHANNELS = (f"test_watchdog_{n}" for n in count())
+EFFORT = (0.0, 3.0, 1.0, 0.5)
+PERIOD = 0.004
+# A process that carries an arm on a bus of its own, as far as its watchdog can know.
+CARRIER = """
+import sys, time
+from exo_gravity.core.safety import OFF, Drive
+from exo_gravity.hardware.watchdog import Watchdog
+watchdog = Watchdog()
+print("carrying", flush=True)
+while True:
+    watchdog.note(Drive((0.0,) * 4, 0.0, {powered}))
+    time.sleep(0.01)
+"""
+
+
+@pytest.fixture
+def wire():
+    channel = next(CHANNELS)
+    device = SimulatedDevice(SimulatedArm(), [SimulatedMotor(joint) for joint in MOTORS_OF_ARM])
+    device.arm.reset((0.0, 0.9, 0.3, 0.3))
+    for joint, effort in zip(MOTORS_OF_ARM, EFFORT, strict=True):
+        device.exchange(joint.can_id, ENTER)
+        device.exchange(joint.can_id, joint.command(effort, 0.0))
+    bus, stop = can.Bus(interface="virtual", channel=channel), threading.Event()
+    thread = threading.Thread(target=device.run, args=(bus, stop.is_set))
+    thread.start()
+    with can.Bus(interface="virtual", channel=channel) as listener:
+        yield channel, device, listener
+        stop.set()
+        thread.join()
+    bus.shutdown()
+
+
+def test_it_goes_on_from_the_last_torques_and_ends_with_the_motors_off(wire):
+    channel, device, listener = wire
+    let_down(Charge(("virtual", channel, {}), MOTORS_OF_ARM, QUICKLY, PERIOD), EFFORT, pytest.fail)
+    frames = [(m.arbitration_id, bytes(m.data)) for m in iter(lambda: listener.recv(0.0), None)]
+    torques = [unpack_command(MOTORS["AK80-9"], data).torque for to, data in frames if to == 2 and data[0] == 0x80]
+    assert torques[0] == pytest.approx(EFFORT[1], abs=0.25)
+    steps = [abs(after - before) for before, after in pairwise(torques)]
+    assert max(steps) <= LIMITS.max_effort_rate * PERIOD + 2 * 36.0 / 4095
+    assert ENTER not in [data for _, data in frames]
+    assert not any(motor.entered for motor in device.motors)
+    assert [data for to, data in frames if to == 2 and data[0] == 0xFF][-1] == EXIT
+
+
+def test_a_bus_that_can_not_be_opened_is_told():
+    told = []
+    let_down(Charge(("no_such_interface", "x", {}), MOTORS_OF_ARM, QUICKLY, PERIOD), EFFORT, told.append)
+    assert len(told) == 1
+    assert "CAN bus no_such_interface x" in told[0]
+
+
+@pytest.mark.parametrize(("powered", "number"), [(True, signal.SIGSTOP), (False, signal.SIGKILL)])
+def test_a_frozen_carrier_is_killed_and_one_with_its_motors_off_is_let_die(powered, number):
+    process = subprocess.Popen(
+        [sys.executable, "-c", CARRIER.format(powered=powered)], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout.readline() == "carrying\n"
+        os.kill(process.pid, number)
+        assert process.wait(30) == -signal.SIGKILL
+        assert process.stdout.read() == ""  # no charge to let down; ends when the watchdog, too, has ended
+    finally:
+        process.kill()
+        process.stdout.close()
