@@ -1,0 +1,166 @@
+"""The simulated arm's mechanics, against the exact law, energy, and common sense."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from exo_gravity.core import ArmModel, Tilt, gravity_torque
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.sim import STEP, ArmConfig, SimulatedArm
+
+UPRIGHT = (0.0, 0.0, 1.0)
+OUT = (0.3, 0.8, 0.7, 0.6)  # a pose where every link is lifted
+FREE = {"coulomb_friction": (0.0,) * 4, "viscous_friction": (0.0,) * 4}
+
+
+def play(arm, torque, duration):
+    for _ in range(round(duration / STEP)):
+        arm.step(torque)
+
+
+def moved(arm, start):
+    """Largest angle in degrees by which a joint has left `start`."""
+    return np.degrees(np.abs(np.subtract(arm.positions, start)).max())
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_static_torque_is_that_of_the_exact_law_in_any_pose_and_tilt(side):
+    random = np.random.default_rng(1)
+    for _ in range(100):
+        length = random.uniform(0.02, 0.4, 4)
+        links = ArmModel(length, random.uniform(0, 1, 4) * length, random.uniform(0.1, 2, 4))
+        arm = SimulatedArm(ArmConfig(links))
+        direction = Tilt.of(side, *random.uniform(-np.pi, np.pi, 2)).direction
+        theta = random.uniform(-np.pi, np.pi, 4)
+        arm.set_gravity(direction)
+        arm.reset(theta)
+        np.testing.assert_allclose(arm.data.qfrc_bias, gravity_torque(links, theta, direction), atol=1e-12)
+
+
+def test_static_torque_with_a_worn_arm_is_that_of_both_together():
+    mass, cog = (0.0, 0.0, 2.0, 1.7), (0.0, 0.0, 0.16, 0.2)
+    arm = SimulatedArm(ArmConfig(wearer_mass=mass, wearer_cog=cog))
+    arm.reset(OUT)
+    expected = gravity_torque(arm.config.links.with_wearer(mass, cog), OUT)
+    np.testing.assert_allclose(arm.data.qfrc_bias, expected, atol=1e-12)
+
+
+def test_it_falls_without_torque():
+    arm = SimulatedArm()
+    arm.reset(OUT)
+    play(arm, (0.0,) * 4, 1.0)
+    assert moved(arm, OUT) > 30
+
+
+def test_the_exact_torque_holds_it():
+    arm = SimulatedArm()
+    arm.reset(OUT)
+    play(arm, gravity_torque(arm.config.links, OUT), 10.0)
+    assert moved(arm, OUT) < 1e-6
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_friction_holds_it_against_a_small_imbalance_without_creep(sign):
+    arm = SimulatedArm()
+    arm.reset(OUT)
+    play(arm, gravity_torque(arm.config.links, OUT) + sign * 0.05, 10.0)
+    assert moved(arm, OUT) < 0.01
+
+
+def test_an_imbalance_beyond_friction_moves_it():
+    arm = SimulatedArm()
+    arm.reset(OUT)
+    play(arm, gravity_torque(arm.config.links, OUT) - 0.5, 1.0)
+    assert moved(arm, OUT) > 5
+
+
+def test_without_friction_the_same_small_imbalance_moves_it():
+    arm = SimulatedArm(ArmConfig(**FREE))
+    arm.reset(OUT)
+    play(arm, gravity_torque(arm.config.links, OUT) + 0.05, 1.0)
+    assert moved(arm, OUT) > 5
+
+
+def test_without_friction_it_falls_as_the_energy_balance_says():
+    arm = SimulatedArm(ArmConfig(**FREE))
+    arm.model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+    arm.reset((0.0, 0.3, 0.8, 0.6))
+    start = arm.data.energy.sum()
+    play(arm, (0.0,) * 4, 0.25)
+    potential, kinetic = arm.data.energy
+    assert kinetic > 0.5
+    assert potential + kinetic == pytest.approx(start, abs=0.01 * kinetic)
+
+
+@pytest.mark.parametrize("rotor", [0.0, 0.01])
+def test_the_elbow_has_the_inertia_of_a_tube_about_its_joint_and_of_the_rotor(rotor):
+    arm = SimulatedArm(ArmConfig(rotor_inertia=(0.0, 0.0, 0.0, rotor)))
+    column = np.zeros(4)
+    mujoco.mj_mulM(arm.model, arm.data, column, np.array((0.0, 0.0, 0.0, 1.0)))
+    links, radius = arm.config.links, 0.03
+    length, mass, cog = links.length[3], links.mass[3], links.cog[3]
+    assert column[3] == pytest.approx(mass * (length**2 / 12 + radius**2 / 2 + cog**2) + rotor)
+
+
+@pytest.mark.parametrize("joint", range(4))
+@pytest.mark.parametrize("side", ["position_min", "position_max"])
+def test_joint_stops_hold_against_the_motors_peak_torque(joint, side):
+    arm = SimulatedArm()
+    stop = getattr(arm.config, side)[joint]
+    theta = np.clip(np.zeros(4), arm.config.position_min, arm.config.position_max)
+    theta[joint] = stop
+    arm.set_gravity((0.0, 0.0, 0.0))
+    arm.reset(theta)
+    torque = np.zeros(4)
+    torque[joint] = (9.0, 18.0, 9.0, 9.0)[joint] * (-1 if side == "position_min" else 1)
+    play(arm, torque, 1.0)
+    assert abs(np.degrees(arm.positions[joint] - stop)) < 1.0
+
+
+def test_each_joint_turns_190_degrees_in_all():
+    config = ArmConfig()
+    np.testing.assert_allclose(np.degrees(config.position_max - config.position_min), 190.0)
+
+
+def test_the_wearers_arm_sinks_where_the_bare_arm_is_held():
+    arm = SimulatedArm(ArmConfig(wearer_mass=(0, 0, 2.0, 1.7), wearer_cog=(0, 0, 0.16, 0.2)))
+    arm.reset(OUT)
+    play(arm, gravity_torque(arm.config.links, OUT), 1.0)
+    assert moved(arm, OUT) > 20
+
+
+def test_tilting_the_trunk_turns_gravity_live():
+    arm = SimulatedArm()
+    arm.reset((0.0,) * 4)
+    play(arm, (0.0,) * 4, 0.5)
+    assert moved(arm, (0.0,) * 4) < 1e-6
+    arm.set_gravity(Tilt.of("right", pitch=0.6).direction)
+    play(arm, (0.0,) * 4, 2.0)
+    assert moved(arm, (0.0,) * 4) > 10
+
+
+def test_reset_brings_it_to_rest():
+    arm = SimulatedArm()
+    arm.reset(OUT)
+    play(arm, (0.0,) * 4, 0.3)
+    arm.reset(OUT)
+    assert arm.positions == list(OUT)
+    assert arm.velocities == [0.0] * 4
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"coulomb_friction": (0.2, 0.2, 0.2)}, "coulomb_friction"),
+        ({"viscous_friction": (-0.1, 0, 0, 0)}, "viscous_friction"),
+        ({"rotor_inertia": (float("nan"), 0, 0, 0)}, "rotor_inertia"),
+        ({"wearer_mass": (0, 0, 2000, 0)}, "wearer_mass"),
+        ({"wearer_cog": (0, 0, 0.31, 0)}, "wearer_cog"),
+        ({"position_min": (2.0, 0, 0, 0)}, "position_min"),
+        ({"links": ArmModel((0.05, 0.13, 0.3, 0.3), (0,) * 4, (0.5, 0.5, 0.0, 0.2))}, "links.mass"),
+    ],
+)
+def test_an_impossible_configuration_is_refused_by_name(change, name):
+    with pytest.raises(ParameterError) as caught:
+        ArmConfig(**change)
+    assert caught.value.name == name

@@ -1,0 +1,96 @@
+"""The simulated IMU: frames, signs, and errors of the size it was given."""
+
+import math
+
+import numpy as np
+import pytest
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.tilt import pitch_roll, rotation_matrix
+from exo_gravity.sim import ImuConfig, SimulatedImu
+
+G = 9.80665
+EXACT = {"gyroscope_noise": 0.0, "accelerometer_noise": 0.0, "gyroscope_bias": 0.0, "accelerometer_bias": 0.0}
+# Turned by 120 degrees about (1, 1, 1): the IMU's x, y, z point along the trunk's y, z, x.
+MOUNTED = (0.5, 0.5, 0.5, 0.5)
+
+
+def test_at_rest_the_accelerometer_reads_g_upward():
+    gyroscope, accelerometer = SimulatedImu(ImuConfig(**EXACT)).sample(0.0, 0.0)
+    np.testing.assert_allclose(accelerometer, (0, 0, G))
+    np.testing.assert_allclose(gyroscope, 0)
+
+
+def test_bowing_forward_shows_on_x_and_leaning_right_on_y():
+    imu = SimulatedImu(ImuConfig(**EXACT))
+    np.testing.assert_allclose(imu.sample(0.3, 0.0)[1], (-G * math.sin(0.3), 0, G * math.cos(0.3)))
+    np.testing.assert_allclose(imu.sample(0.0, 0.3)[1], (0, G * math.sin(0.3), G * math.cos(0.3)))
+
+
+def test_gravity_is_opposite_to_what_the_accelerometer_reads():
+    for pitch, roll in np.random.default_rng(0).uniform(-1.5, 1.5, (50, 2)):
+        _, accelerometer = SimulatedImu(ImuConfig(**EXACT)).sample(pitch, roll)
+        assert pitch_roll(-accelerometer) == pytest.approx((pitch, roll))
+
+
+def test_readings_are_in_the_imus_own_axes():
+    gyroscope, accelerometer = SimulatedImu(ImuConfig(rotation_trunk_from_imu=MOUNTED, **EXACT)).sample(0, 0, 0.2, 0.1)
+    np.testing.assert_allclose(accelerometer, (0, G, 0), atol=1e-12)
+    np.testing.assert_allclose(gyroscope, (0.2, 0, 0.1), atol=1e-12)
+
+
+def test_rotating_readings_back_to_the_trunk_undoes_the_mounting():
+    mounting = np.array((0.1, -0.4, 0.3, 0.8)) / np.linalg.norm((0.1, -0.4, 0.3, 0.8))
+    there = SimulatedImu(ImuConfig(rotation_trunk_from_imu=mounting, **EXACT)).sample(0.3, -0.2, 0.5, 0.7)
+    here = SimulatedImu(ImuConfig(**EXACT)).sample(0.3, -0.2, 0.5, 0.7)
+    for a, b in zip(there, here, strict=True):
+        np.testing.assert_allclose(rotation_matrix(mounting) @ a, b)
+
+
+def test_the_gyroscope_is_the_rate_at_which_the_accelerometers_vector_turns():
+    # A fixed vector seen from a turning frame changes by -omega x vector.
+    imu, step = SimulatedImu(ImuConfig(**EXACT)), 1e-6
+    pitch, roll, pitch_rate, roll_rate = 0.4, -0.7, 0.9, -1.3
+    gyroscope, before = imu.sample(pitch, roll, pitch_rate, roll_rate)
+    after = imu.sample(pitch + pitch_rate * step, roll + roll_rate * step)[1]
+    np.testing.assert_allclose((after - before) / step, -np.cross(gyroscope, before), atol=1e-4)
+
+
+def test_noise_has_the_density_it_was_given():
+    rate = 200.0
+    imu = SimulatedImu(ImuConfig(rate=rate))
+    samples = np.array([imu.sample(0.0, 0.0) for _ in range(4000)])
+    spread = samples.std(axis=0) / math.sqrt(rate / 2)
+    np.testing.assert_allclose(spread[0], math.radians(0.007), rtol=0.05)
+    np.testing.assert_allclose(spread[1], 180e-6 * G, rtol=0.05)
+
+
+def test_biases_stay_and_have_the_size_they_were_given():
+    quiet = {"gyroscope_noise": 0.0, "accelerometer_noise": 0.0}
+    biases = []
+    for seed in range(400):
+        imu = SimulatedImu(ImuConfig(seed=seed, **quiet))
+        first, second = (np.array(imu.sample(0.0, 0.0)) for _ in range(2))
+        np.testing.assert_array_equal(first, second)
+        biases.append(first - ((0, 0, 0), (0, 0, G)))
+    np.testing.assert_allclose(np.std(biases, axis=(0, 2)), (math.radians(0.1), 5e-3 * G), rtol=0.1)
+
+
+def test_the_same_seed_gives_the_same_samples():
+    one, other, third = (SimulatedImu(ImuConfig(seed=seed)).sample(0.1, 0.2) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(one, other)
+    assert not np.array_equal(one, third)
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"rotation_trunk_from_imu": (0, 0, 0, 2)}, "rotation_trunk_from_imu"),
+        ({"rate": 0.0}, "rate"),
+        ({"gyroscope_bias": -1.0}, "gyroscope_bias"),
+    ],
+)
+def test_an_impossible_configuration_is_refused_by_name(change, name):
+    with pytest.raises(ParameterError) as caught:
+        ImuConfig(**change)
+    assert caught.value.name == name
