@@ -1,0 +1,40 @@
+"""ROS messages <-> plain values, in one place. Joints are looked up by name, never by index."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from builtin_interfaces.msg import Time
+from sensor_msgs.msg import JointState
+
+from exo_gravity.core.errors import ParameterError
+
+
+def to_time(nanoseconds: int) -> Time:
+    """Return a message stamp for nanoseconds."""
+    return Time(sec=nanoseconds // 1_000_000_000, nanosec=nanoseconds % 1_000_000_000)
+
+
+def to_nanoseconds(stamp: Time) -> int:
+    """Return the nanoseconds of a message stamp."""
+    return stamp.sec * 1_000_000_000 + stamp.nanosec
+
+
+def by_name(message: JointState, field: str, names: Sequence[str]) -> tuple[float, ...]:
+    """Return `message`'s position, velocity or effort (n,) in the order of `names`.
+
+    Raises ParameterError where the names are not exactly these, each once, where the field has another length, or
+    where a value is NaN or infinite: an absent joint is an error, never 0.
+    """
+    values, given = getattr(message, field), message.name
+    if len(values) != len(given):
+        raise ParameterError(field, list(values), f"as long as its {len(given)} names")
+    if given != list(names):
+        if sorted(given) != sorted(names):
+            raise ParameterError("name", list(given), f"exactly {', '.join(names)}, each once")
+        values = [values[given.index(name)] for name in names]
+    result = tuple(values)
+    if not all(map(math.isfinite, result)):
+        raise ParameterError(field, list(result), "finite")
+    return result

@@ -1,0 +1,82 @@
+"""A subscription that its user looks after alone: on a thread with a wait set of its own, or by looking when it suits.
+
+rclpy's executor rebuilds its wait set, services and all, for every message: most of what a message costs (measured, out
+and back at 500 Hz: 35 + 21 % of a core, against 14 + 11 %). Here the wait set holds one subscription. `WaitSet` and
+`take_message` are rclpy's inner interface, which its own `wait_for_message` uses; where they have changed, the executor
+calls back as for any other subscription, and only the speed is lost.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.callback_groups import CallbackGroup
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+PATIENCE = 100_000_000  # ns between two looks at whether to stop
+
+
+class Unexecuted(CallbackGroup):
+    """Keeps its subscriptions out of the executor's wait set."""
+
+    def can_execute(self, entity) -> bool:
+        return False
+
+    def beginning_execution(self, entity) -> bool:
+        return False
+
+    def ending_execution(self, entity) -> None:
+        pass
+
+
+class HotPath:
+    """Calls `callback(message, info)` for each message of `topic`: on a thread after `start`, or in each `poll`."""
+
+    def __init__(self, node: Node, msgtype: type, topic: str, callback: Callable[[Any, dict], None], qos: QoSProfile):
+        self.failure: Exception | None = None  # of the callback; ends the thread
+        self._callback = callback
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name=topic, daemon=True)
+        subscription = node.create_subscription(msgtype, topic, callback, qos, callback_group=Unexecuted())
+        try:
+            self._wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
+            self._take = subscription.handle.take_message
+        except (AttributeError, TypeError) as error:
+            node.get_logger().warning(f"{topic} is left to the executor: another rclpy ({error})")
+            node.destroy_subscription(subscription)
+            node.create_subscription(msgtype, topic, callback, qos)
+            self._wait_set, self._take = None, lambda *_: None
+        self._subscription = subscription
+
+    def start(self) -> None:
+        """Start the thread."""
+        if self._wait_set is not None:
+            self._thread.start()
+
+    def poll(self) -> None:
+        """Call back for every message that waits, on the caller's thread."""
+        subscription = self._subscription
+        while (item := self._take(subscription.msg_type, False)) is not None:
+            self._callback(*item)
+
+    def stop(self) -> None:
+        """End the thread, before the node is destroyed."""
+        self._stopping = True
+        if self._thread.ident is not None:
+            self._thread.join()
+
+    def _run(self) -> None:
+        wait_set, handle = self._wait_set, self._subscription.handle
+        try:
+            with handle:
+                while not self._stopping:
+                    wait_set.clear_entities()
+                    wait_set.add_subscription(handle)
+                    wait_set.wait(PATIENCE)
+                    self.poll()
+        except Exception as error:
+            self.failure = error

@@ -1,0 +1,149 @@
+"""imu: another driver's `sensor_msgs/Imu` in, the trunk's pitch and roll out, one for each sample.
+
+While samples are missing, impossible or not yet settled it publishes nothing: whoever needs the tilt sees it grow old,
+and `can_bridge` latches the fault. The reason stands in the log once, and on /diagnostics for as long as it lasts.
+"""
+
+from __future__ import annotations
+
+import time
+
+from geometry_msgs.msg import Vector3Stamped
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Imu
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.params import Param
+from exo_gravity.hardware.imu import ImuSample, TrunkEstimator, TrunkOrientation
+from exo_gravity.nodes.conversions import to_nanoseconds
+from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics
+from exo_gravity.nodes.hot_path import HotPath
+from exo_gravity.nodes.params import declare
+from exo_gravity.nodes.run import run
+
+PITCH_YAW, DATA = "/imu/pitch_yaw", "/imu/data"
+# The fusion integrates every sample: a queue of the newest alone would lose some whenever the node is kept waiting.
+DEPTH = 50
+WATCH_PERIOD = 0.1  # s
+
+# fmt: off
+PARAMETERS = (
+    Param("input_topic", "/imu/data_raw", "topic of the driver's sensor_msgs/Imu", fixed=True),
+    # No default turns an IMU the right way: four zeros are no rotation, and refused.
+    Param("rotation_trunk_from_imu", [0.0, 0.0, 0.0, 0.0], "unit quaternion x, y, z, w, from calibration; required",
+          (-1.0, 1.0), fixed=True),
+    Param("rate", 100.0, "roughly, samples per s of the IMU", (20.0, 2000.0), fixed=True),
+    Param("timeout", 0.1, "silence in s that is an error", (0.02, 1.0), fixed=True),
+)
+# fmt: on
+
+
+class ImuNode(Node):
+    """The ROS shell around `hardware.imu.TrunkEstimator`."""
+
+    def __init__(self):
+        super().__init__("imu", automatically_declare_parameters_from_overrides=True)
+        values = declare(self, PARAMETERS)
+        self._topic = self.resolve_topic_name(values["input_topic"])
+        if self._topic in (PITCH_YAW, DATA):
+            raise ParameterError("input_topic", values["input_topic"], "a topic that this node does not publish itself")
+        self._estimator = TrunkEstimator(values["rotation_trunk_from_imu"], values["rate"])
+        self._timeout = values["timeout"]
+        self._arrived = self._counted = time.monotonic()
+        self._received = self._received_before = self._published = self._refused = 0
+        self._rate = 0.0
+        self._refusal: ParameterError | None = None  # since the last look
+        self._last_refusal = "none"
+        self._diagnostics = Diagnostics(self)
+        self._pitch_yaw = self.create_publisher(Vector3Stamped, PITCH_YAW, DEPTH)
+        self._data = self.create_publisher(Imu, DATA, DEPTH)
+        self._samples = HotPath(
+            self, Imu, self._topic, self._on_imu, QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        )
+        self.create_timer(WATCH_PERIOD, self._report)
+        self._samples.start()
+
+    @property
+    def failure(self) -> Exception | None:
+        """What went wrong on the thread of the samples."""
+        return self._samples.failure
+
+    def close(self) -> None:
+        """Take no more samples."""
+        self._samples.stop()
+
+    def _on_imu(self, message: Imu, _info: dict) -> None:
+        self._arrived = time.monotonic()
+        self._received += 1
+        try:
+            answer = self._estimator.update(sample_of(message))
+        except ParameterError as error:
+            self._refused += 1
+            self._refusal, self._last_refusal = error, str(error)
+            return
+        if answer is not None:
+            self._published += 1
+            self._publish(message, answer)
+
+    def _publish(self, message: Imu, answer: TrunkOrientation) -> None:
+        tilt = Vector3Stamped()
+        tilt.header.stamp, tilt.header.frame_id = message.header.stamp, "trunk"
+        tilt.vector.x, tilt.vector.y = answer.roll, answer.pitch
+        self._pitch_yaw.publish(tilt)
+        data = Imu(header=tilt.header)
+        q, rate, acceleration = data.orientation, data.angular_velocity, data.linear_acceleration
+        q.x, q.y, q.z, q.w = answer.orientation.tolist()
+        # In the trunk's axes; a covariance of zeros means unknown, one of -1 not reported (REP-145).
+        rotation = self._estimator.rotation
+        rate.x, rate.y, rate.z = (rotation @ _vector(message.angular_velocity)).tolist()
+        acceleration.x, acceleration.y, acceleration.z = (rotation @ _vector(message.linear_acceleration)).tolist()
+        data.angular_velocity_covariance[0] = min(message.angular_velocity_covariance[0], 0.0)
+        data.linear_acceleration_covariance[0] = min(message.linear_acceleration_covariance[0], 0.0)
+        self._data.publish(data)
+
+    def _report(self) -> None:
+        now = time.monotonic()
+        age, refusal, self._refusal = now - self._arrived, self._refusal, None
+        if now - self._counted >= 1.0:
+            self._rate = (self._received - self._received_before) / (now - self._counted)
+            self._counted, self._received_before = now, self._received
+        values = {
+            "rate (Hz)": f"{self._rate:.0f}",
+            "age (s)": f"{age:.3f}",
+            "received": self._received,
+            "published": self._published,
+            "refused": self._refused,
+            "last refusal": self._last_refusal,
+            "gyroscope bias (rad/s)": self._estimator.gyroscope_bias.round(4).tolist(),
+        }
+        if not self._received:
+            self._diagnostics.report(WARN, f"waiting for {self._topic}", values)
+        elif age > self._timeout:
+            self._diagnostics.report(ERROR, f"no samples on {self._topic}", values)
+        elif refusal:
+            self._diagnostics.report(ERROR, f"refused: {refusal.name} must be {refusal.expected}", values)
+        elif self._estimator.settling:
+            self._diagnostics.report(WARN, f"settling: {self._estimator.settling}", values)
+        else:
+            self._diagnostics.report(OK, "publishing", values)
+
+
+def sample_of(message: Imu) -> ImuSample:
+    """Return the sample that a message holds; what its covariances say is not reported becomes None."""
+    q = message.orientation
+    return ImuSample(
+        to_nanoseconds(message.header.stamp) * 1e-9,
+        None if message.angular_velocity_covariance[0] == -1.0 else _vector(message.angular_velocity),
+        None if message.linear_acceleration_covariance[0] == -1.0 else _vector(message.linear_acceleration),
+        None if message.orientation_covariance[0] == -1.0 else (q.x, q.y, q.z, q.w),
+    )
+
+
+def _vector(message) -> tuple[float, float, float]:
+    return message.x, message.y, message.z
+
+
+def main() -> None:
+    """Entry point of the executable `imu`."""
+    raise SystemExit(run(ImuNode, priority=15))

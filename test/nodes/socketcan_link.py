@@ -1,0 +1,48 @@
+"""What can only be shown where SocketCAN exists, on vcan0: a link that goes down."""
+
+import subprocess
+import time
+
+import pytest
+
+from exo_gravity.core.errors import BusError
+from exo_gravity.core.motors import EXIT, MOTORS, JointMotor
+from exo_gravity.core.safety import OFF, Drive
+from exo_gravity.hardware.motor_bus import MotorBus, open_bus
+
+VCAN = ("socketcan", "vcan0")
+AK60 = MOTORS["AK60-6"]
+IDS = (1, 2, 3, 4)
+
+
+def set_link(state):
+    subprocess.run(["ip", "link", "set", "vcan0", state], check=True)
+
+
+def test_a_link_that_goes_down_is_a_bus_error_and_the_motors_are_switched_off_when_it_is_back():
+    ours, other = (open_bus(*VCAN, {}) for _ in range(2))
+    bus = MotorBus(ours, [JointMotor(AK60, can_id) for can_id in IDS])
+    bus.exchange(Drive((0.0,) * 4, 0.0, True), time.monotonic())
+    set_link("down")
+    try:
+        for _ in range(3):
+            with pytest.raises(BusError, match=r"vcan0.*Network is down"):
+                bus.exchange(OFF, time.monotonic())
+    finally:
+        set_link("up")
+    other.shutdown()
+    with open_bus(*VCAN, {}) as other:
+        bus.exchange(OFF, time.monotonic())
+        sent = [bytes(frame.data) for frame in iter(lambda: other.recv(0.0), None)]
+    assert sent.count(EXIT) == 4
+    bus.stop()
+
+
+def test_the_last_frames_on_a_link_that_is_down_raise_nothing():
+    bus = MotorBus(open_bus(*VCAN, {}), [JointMotor(AK60, can_id) for can_id in IDS])
+    set_link("down")
+    try:
+        bus.stop()
+    finally:
+        set_link("up")
+    assert bus.ignored["unsent"] == 16

@@ -1,0 +1,115 @@
+"""The nodes as processes on vcan0, where SocketCAN exists: `make socketcan`.
+
+The nodes are judged from outside, by the frames on the bus and by their log. An emulated machine is 10 to 20 times
+slower than a real one, so the nodes' clock is slowed down in proportion: the limits stay those of a worn arm.
+"""
+
+import time
+from pathlib import Path
+
+import can
+import pytest
+import yaml
+
+from exo_gravity.core.motors import ENTER, EXIT, MOTORS, unpack_command, unpack_reply
+from exo_gravity.hardware.motor_bus import open_bus
+from exo_gravity.tools import launcher
+from exo_gravity.tools.launcher import Launcher
+
+CONFIG = Path(__file__).parents[2] / "config" / "sim.yaml"
+VCAN = ("socketcan", "vcan0")
+AK60 = MOTORS["AK60-6"]
+IDS = (1, 2, 3, 4)
+SLOWER = 10
+# Found by every Python process that has its folder in PYTHONPATH, before anything else is imported.
+SITECUSTOMIZE = f"""
+import os, select, time
+def refuse(*_): raise PermissionError  # what the nodes gain, whoever shares two slow cores with them lacks
+os.setpriority = refuse
+monotonic, sleep, wait = time.monotonic, time.sleep, select.select
+time.monotonic = lambda: monotonic() / {SLOWER}
+time.sleep = lambda duration: sleep(duration * {SLOWER})
+select.select = lambda r, w, x, timeout=None: wait(r, w, x, timeout and timeout * {SLOWER})
+"""
+TRIAL = {"name": "short", "steps": [{"move": [0.1, 0.8, 0.7, 0.6], "over": 0.5}, {"hold": 0.6}]}
+CHANGES = {
+    "can_bridge": {"rate": 50.0, "command_timeout": 0.1, "reply_timeout": 0.1, "sign_check_torque": 0.0}
+    | {"ramp_time": 0.5, "fade_time": 0.5, "damping": 0.5},
+    "compensator": {"use_imu": False},
+    "simulator": {"imu": {"rate": 10.0}, "trunk": {"pitch": 0.0, "roll": 0.0}, "trial_delay": 0.6},
+}
+
+
+@pytest.fixture
+def frames():
+    """Every frame on vcan0 as it comes."""
+    frames = []
+    with open_bus(*VCAN, {}) as bus, can.Notifier(bus, [frames.append]):
+        yield frames
+
+
+@pytest.fixture
+def nodes(tmp_path, monkeypatch):
+    """Bridge, compensator and simulator as processes on vcan0 with a slow clock, and their log as it grows."""
+    (tmp_path / "sitecustomize.py").write_text(SITECUSTOMIZE)
+    (tmp_path / "trial.yaml").write_text(yaml.safe_dump(TRIAL))
+    content = yaml.safe_load(CONFIG.read_text())
+    del content["/imu"]
+    for node, changes in CHANGES.items():
+        content[f"/right/{node}"]["ros__parameters"].update(changes)
+    for node in ("can_bridge", "simulator"):
+        content[f"/right/{node}"]["ros__parameters"]["can"] = dict(zip(("interface", "channel"), VCAN, strict=True))
+    content["/right/simulator"]["ros__parameters"]["trial"] = str(tmp_path / "trial.yaml")
+    params = tmp_path / "params.yaml"
+    params.write_text(yaml.safe_dump(content))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(launcher, "DESCENT", launcher.DESCENT * SLOWER)
+    log = []
+    nodes = Launcher(params, lambda node, line: log.append(f"{node}: {line}"))
+    nodes.start()
+    yield nodes, log
+    nodes.stop()
+    print("\n".join(log))
+
+
+def wait_for(text, nodes, log):
+    """Wait until a node has said `text`."""
+    end = time.monotonic() + 120.0
+    while not any(text in line for line in log):
+        assert nodes.dead() is None
+        assert time.monotonic() < end, f"waited in vain for: {text}"
+        time.sleep(0.1)
+
+
+def angles(frames):
+    """Return the motors' angles in rad from the newest reply of each."""
+    newest = {frame.arbitration_id: frame.data for frame in frames[-100:] if frame.data[0] == frame.arbitration_id}
+    return [unpack_reply(AK60, newest[can_id]).position for can_id in IDS]
+
+
+def asked(frames, can_id):
+    """Return the torque in Nm that this motor was asked for last."""
+    return [unpack_command(AK60, frame.data).torque for frame in frames[-100:] if is_command(frame, can_id)][-1]
+
+
+def is_command(frame, can_id):
+    return frame.arbitration_id == can_id and frame.data[0] in (0x7F, 0x80)
+
+
+def test_the_nodes_carry_the_arm_and_switch_the_motors_off(nodes, frames):
+    nodes, log = nodes
+    wait_for("can_bridge: INFO active", nodes, log)
+    wait_for("wearer: hold", nodes, log)
+    let_go = angles(frames)
+    wait_for("wearer: done", nodes, log)
+    assert angles(frames) == pytest.approx(let_go, abs=0.01)
+    assert abs(asked(frames, 3)) > 1.0  # five times what friction could hold
+
+    bridge = nodes.process("/right/can_bridge")
+    bridge.terminate()
+    assert bridge.wait(120.0) == 0
+    for can_id in IDS:
+        special = [bytes(f.data) for f in frames if f.arbitration_id == can_id and bytes(f.data) in (ENTER, EXIT)]
+        assert ENTER in special
+        assert special[-1] == EXIT
+    assert not any("Traceback" in line for line in log)

@@ -1,0 +1,213 @@
+"""The node `recorder` in a process of its own, over real DDS: what was published is in the recording."""
+
+from __future__ import annotations
+
+import json
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import rclpy
+import yaml
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rosbags.highlevel import AnyReader
+from sensor_msgs.msg import Imu, JointState
+from std_msgs.msg import String
+
+from exo_gravity.nodes.conversions import to_time
+from exo_gravity.tools.bag import read_bag
+
+NODE = [sys.executable, "-c", "from exo_gravity.nodes.recorder import main; main()", "--ros-args"]
+NAMES = ["j1", "j2", "j3", "j4"]
+COUNT = 300
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def start(output, *arguments, **options):
+    given = ("-p", f"output:={output}") if output else ()
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen([*NODE, *given, *arguments], **pipes, **options)
+
+
+class Arm:
+    """A node in this process that publishes what a bridge and a compensator would."""
+
+    def __init__(self):
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self.node = rclpy.create_node("bridge", namespace="/right", context=self.context)
+        self.node.declare_parameter("robot.mass", [0.5, 0.6, 0.7, 0.8])
+        self.node.declare_parameter("support", 0.0)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        create = self.node.create_publisher
+        self.states = create(JointState, "joint_states", 1)
+        self.efforts = create(JointState, "effort_commands", 1)
+        self.imu = create(Imu, "/imu/data_raw", qos_profile_sensor_data)
+        self.faults = create(DiagnosticArray, "/diagnostics", 10)
+        self.steps = create(String, "wearer_step", LATCHED)
+        self.other = create(String, "chatter", 10)
+
+    def close(self):
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+    def until(self, condition, timeout=60.0):
+        """Spin until `condition()` holds."""
+        deadline = time.monotonic() + timeout
+        while not condition():
+            assert time.monotonic() < deadline, "did not happen in time"
+            self.executor.spin_once(timeout_sec=0.01)
+
+    def heard(self):
+        """Whether every topic that is to be recorded has a listener."""
+        publishers = (self.states, self.efforts, self.imu, self.faults, self.steps)
+        return all(publisher.get_subscription_count() for publisher in publishers)
+
+    def publish(self, k):
+        stamp = to_time(time.time_ns())
+        state = JointState(name=NAMES, position=[float(k)] * 4, velocity=[0.0] * 4, effort=[1.0] * 4)
+        effort = JointState(name=NAMES, effort=[float(k)] * 4)
+        image = Imu()
+        for message in (state, effort, image):
+            message.header.stamp = stamp
+        self.states.publish(state)
+        self.efforts.publish(effort)
+        self.imu.publish(image)
+        self.executor.spin_once(timeout_sec=0.002)
+
+
+@pytest.fixture
+def arm():
+    arm = Arm()
+    yield arm
+    arm.close()
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    """A recording from beginning to end: its folder, the lines of JSON, the exit code, and what DDS calls the type."""
+    path = tmp_path_factory.mktemp("recorder") / "bag"
+    arm = Arm()
+    arm.steps.publish(String(data=json.dumps({"step": 0, "action": "hold", "duration": 9.0})))
+    process = start(path, "-p", "live:=true")
+    try:
+        arm.until(arm.heard)
+        known = arm.node.get_publishers_info_by_topic("/right/joint_states")[0]
+        for k in range(COUNT):
+            arm.publish(k)
+        status = DiagnosticStatus(level=DiagnosticStatus.ERROR, name="right/bridge", message="motor 2 is silent")
+        arm.faults.publish(DiagnosticArray(status=[status]))
+        arm.node.set_parameters([Parameter("support", value=0.5)])
+        lines = []
+        while not lines or "motor 2 is silent" not in lines[-1]:
+            lines.append(process.stdout.readline())
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=30)
+        yield path, lines, process.returncode, known.topic_type_hash
+    finally:
+        process.kill()
+        process.wait()
+        arm.close()
+
+
+def recorded(path, topic):
+    with AnyReader([path]) as reader:
+        chosen = [connection for connection in reader.connections if connection.topic == topic]
+        return [(stamp, reader.deserialize(data, c.msgtype)) for c, stamp, data in reader.messages(chosen)]
+
+
+def test_on_ctrl_c_it_closes_the_recording_and_ends_with_0(session):
+    path, _, code, _ = session
+    assert code == 0 and (path / "metadata.yaml").exists()
+
+
+@pytest.mark.parametrize("topic", ["/right/joint_states", "/right/effort_commands"])
+def test_every_message_of_an_arm_is_in_the_recording(session, topic):
+    field = "position" if topic.endswith("states") else "effort"
+    assert [round(getattr(message, field)[0]) for _, message in recorded(session[0], topic)] == list(range(COUNT))
+
+
+def test_every_message_has_the_time_of_its_arrival(session):
+    for stamp, message in recorded(session[0], "/right/joint_states"):
+        sent = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        assert 0 < stamp - sent < 10**9
+
+
+def test_a_best_effort_publisher_is_recorded_as_such(session):
+    with AnyReader([session[0]]) as reader:
+        (imu,) = (c for c in reader.connections if c.topic == "/imu/data_raw")
+    assert imu.ext.offered_qos_profiles[0].reliability.name == "BEST_EFFORT" and imu.msgcount > 0
+
+
+def test_what_was_told_before_the_recorder_came_is_in_it(session):
+    ((_, message),) = recorded(session[0], "/right/wearer_step")
+    assert json.loads(message.data)["action"] == "hold"
+
+
+def test_foreign_topics_are_left_alone(session):
+    with AnyReader([session[0]]) as reader:
+        assert "/right/chatter" not in reader.topics
+
+
+def test_the_type_has_the_hash_that_its_publisher_announces(session):
+    metadata = yaml.safe_load((session[0] / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    topics = {
+        entry["topic_metadata"]["name"]: entry["topic_metadata"] for entry in metadata["topics_with_message_count"]
+    }
+    assert topics["/right/joint_states"]["type_description_hash"] == str(session[3])
+
+
+def test_parameters_at_the_start_are_in_it_in_the_form_that_starts_a_node(session):
+    parameters = yaml.safe_load(read_bag(session[0]).parameters["/right/bridge"])["/right/bridge"]["ros__parameters"]
+    assert parameters["robot.mass"] == [0.5, 0.6, 0.7, 0.8] and parameters["support"] == 0.0
+
+
+def test_a_parameter_that_was_changed_is_an_event(session):
+    assert "/right/bridge: support = 0.5" in [event.text for event in read_bag(session[0]).events]
+
+
+def test_the_live_line_tells_joints_step_and_faults(session):
+    line = json.loads(session[1][-1])
+    assert line["right"]["names"] == NAMES and line["right"]["position"] == [float(COUNT - 1)] * 4
+    assert line["right"]["command"] == [float(COUNT - 1)] * 4 and line["right"]["step"]["action"] == "hold"
+    assert line["faults"] == ["right/bridge: motor 2 is silent"]
+
+
+def test_without_an_output_it_says_what_is_missing_and_ends_with_2():
+    process = start(None)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 2 and "output" in errors
+
+
+def test_a_full_disk_ends_it_with_the_reason_and_disturbs_nobody(arm, tmp_path):
+    small = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))  # noqa: E731
+    process = start(tmp_path / "bag", preexec_fn=small)
+    arm.until(arm.heard)
+    k = 0
+    while process.poll() is None and k < 20_000:
+        arm.publish(k := k + 1)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 1 and "recording ended after" in errors and "File too large" in errors
+    assert len(read_bag(tmp_path / "bag").recordings[0].time) > 50
+
+
+def test_the_recording_of_a_killed_recorder_can_be_read(arm, tmp_path):
+    process = start(tmp_path / "bag")
+    arm.until(arm.heard)
+    first = time.monotonic()
+    k = 0
+    while time.monotonic() - first < 1.5:
+        arm.publish(k := k + 1)
+    process.kill()
+    process.communicate(timeout=30)
+    read = read_bag(tmp_path / "bag")
+    assert len(read.recordings[0].time) > k // 4 and Path(tmp_path / "bag" / "metadata.yaml").exists() is False
