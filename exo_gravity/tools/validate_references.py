@@ -1,0 +1,90 @@
+"""The two references: gravity torques by other people's code, from the same masses and Table 1 of the paper.
+
+The Robotics Toolbox's `gravload` runs a recursive Newton-Euler over the Denavit-Hartenberg parameters; Pinocchio's
+`computeGeneralizedGravity` runs one over spatial inertias. Neither shares a line with `core.gravity`, nor
+with the other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from exo_gravity.core.arm import JOINT_COUNT, ArmModel
+from exo_gravity.core.errors import DataError
+
+# Table 1 of the paper, standard Denavit-Hartenberg; a is the link's length, d is 0.
+ALPHA = (-math.pi / 2, math.pi / 2, 0.0, 0.0)
+OFFSET = (0.0, -math.pi / 2, 0.0, 0.0)
+
+Reference = Callable[[np.ndarray, np.ndarray], np.ndarray]  # theta (n, 4), direction (n, 3) -> Nm (n, 4)
+
+
+def gravload(arm: ArmModel) -> Reference:
+    """Return the torque by the Robotics Toolbox: theta (n, 4) rad and gravity's direction (n, 3) -> (n, 4) Nm."""
+    robot = toolbox_robot(arm)
+    # Releases differ in the sign of `gravity`. Their default tells: in all of them it means weight along -z.
+    g = arm.gravity * -math.copysign(1.0, robot.gravity[2])
+
+    def torque(theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        poses = zip(theta, g * direction, strict=True)
+        return arm.gain * np.array([robot.gravload(q, gravity) for q, gravity in poses])
+
+    return torque
+
+
+def toolbox_robot(arm: ArmModel):
+    """Return the arm as the Robotics Toolbox's DHRobot."""
+    try:
+        from roboticstoolbox import DHRobot, RevoluteDH
+    except ImportError as error:
+        raise _absent("roboticstoolbox", error) from None
+    return DHRobot(
+        [
+            # The toolbox counts a centre of gravity from the link's far end.
+            RevoluteDH(a=a, alpha=alpha, offset=offset, m=m, r=(d - a, 0, 0), I=np.zeros((3, 3)), Jm=0, B=0, G=1)
+            for a, alpha, offset, m, d in zip(arm.length, ALPHA, OFFSET, arm.mass, arm.cog, strict=True)
+        ]
+    )
+
+
+def pinocchio(arm: ArmModel) -> Reference:
+    """Return the torque by Pinocchio: theta (n, 4) rad and gravity's direction (n, 3) -> (n, 4) Nm."""
+    pin, model = pinocchio_model(arm)
+    data = model.createData()
+
+    def torque(theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        result = np.empty_like(theta)
+        for i, gravity in enumerate(arm.gravity * direction):
+            model.gravity.linear = gravity
+            result[i] = pin.computeGeneralizedGravity(model, data, theta[i])
+        return arm.gain * result
+
+    return torque
+
+
+def pinocchio_model(arm: ArmModel):
+    """Return the module `pinocchio` and the arm as its Model."""
+    try:
+        import pinocchio as pin
+    except ImportError as error:
+        raise _absent("pinocchio", error) from None
+    model = pin.Model()
+    parent, placement = 0, pin.SE3.Identity()
+    for joint in range(JOINT_COUNT):
+        parent = model.addJoint(parent, pin.JointModelRZ(), placement, f"joint_{joint + 1}")
+        turned = pin.SE3(pin.utils.rotate("z", OFFSET[joint]), np.zeros(3))
+        along = turned * pin.SE3(np.eye(3), np.array((arm.cog[joint], 0.0, 0.0)))
+        inertia = pin.Inertia(float(arm.mass[joint]), np.zeros(3), np.zeros((3, 3)))
+        model.appendBodyToJoint(parent, inertia, along)
+        placement = turned * pin.SE3(pin.utils.rotate("x", ALPHA[joint]), np.array((arm.length[joint], 0.0, 0.0)))
+    return pin, model
+
+
+REFERENCES = {"gravload": gravload, "Pinocchio": pinocchio}
+
+
+def _absent(module: str, error: ImportError) -> DataError:
+    return DataError(f"{module} can't be imported ({error}): pip install 'exo_gravity[report,validate]'")

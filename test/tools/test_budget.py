@@ -1,0 +1,112 @@
+"""budget: from a parameter file to a table, a verdict, pictures and an exit code."""
+
+from pathlib import Path
+
+import matplotlib.image
+import pytest
+import yaml
+from matplotlib.figure import Figure
+
+from exo_gravity.tools.budget import main
+
+BRIDGE, COMPENSATOR = "/right/can_bridge", "/right/compensator"
+SIM = Path(__file__).parents[2] / "config" / "sim.yaml"
+
+
+@pytest.fixture
+def run(tmp_path, capsys):
+    """Run budget on the packaged simulated arm with `changes` {node: {parameter: value}}; return its code and text."""
+
+    def run(*arguments, changes=None, without=()):
+        content = {node: entry for node, entry in yaml.safe_load(SIM.read_text()).items() if node not in without}
+        for node, values in (changes or {}).items():
+            content[node]["ros__parameters"].update(values)
+        params = tmp_path / "params.yaml"
+        params.write_text(yaml.safe_dump(content))
+        code = main(["--params", str(params), "--output", str(tmp_path / "out"), *map(str, arguments)])
+        output = capsys.readouterr()
+        return code, output.out + output.err
+
+    return run
+
+
+@pytest.fixture
+def plain(monkeypatch):
+    """Pictures take longest: leave them blank where they are not looked at."""
+    monkeypatch.setattr("exo_gravity.tools.budget.joint_figure", lambda *_: Figure(figsize=(1, 1)))
+
+
+@pytest.mark.usefixtures("plain")
+def test_full_zero_g_of_75_kg_is_said_to_be_beyond_the_papers_motors_and_by_how_much(run):
+    code, text = run("--body-mass", 75)
+    assert code == 1
+    assert "Full Zero-G of a wearer of 75 kg is beyond the motors of /right." in text
+    assert "19.6 Nm, 2.2 times the rated torque of its AK80-9 (9 Nm), beyond its peak (18 Nm)" in text
+    assert "AK80-64 would do (48 Nm rated)" in text
+    assert "The largest support within rated torque everywhere is 0.068." in text
+
+
+@pytest.mark.usefixtures("plain")
+def test_the_support_that_it_recommends_is_within_rated_torque_everywhere(run):
+    code, text = run("--body-mass", 75, "--support", 0.068)
+    assert code == 0 and "within rated torque everywhere on /right" in text
+
+
+def test_every_joint_gets_a_picture(run, tmp_path):
+    run("--body-mass", 40, "--support", 0.5)
+    pictures = sorted((tmp_path / "out").iterdir())
+    assert [path.name for path in pictures] == [f"right_joint_{number}.png" for number in (1, 2, 3, 4)]
+    assert all(matplotlib.image.imread(path).std() > 0.05 for path in pictures)
+
+
+@pytest.mark.usefixtures("plain")
+def test_both_arms_of_a_file_are_reported(tmp_path, capsys):
+    both = ["--params", str(SIM.with_name("sim_both.yaml")), "--output", str(tmp_path), "--body-mass", "60"]
+    assert main(both) == 1
+    text = capsys.readouterr().out
+    assert "/left at support 1" in text and "/right at support 1" in text
+
+
+@pytest.mark.usefixtures("plain")
+def test_a_motor_that_gives_three_quarters_counts_with_three_quarters(run):
+    _, text = run("--body-mass", 75, changes={BRIDGE: {"torque_scale": [1.0, 0.75, 1.0, 1.0]}})
+    assert "its AK80-9 (6.75 Nm), beyond its peak (13.5 Nm)" in text
+
+
+@pytest.mark.usefixtures("plain")
+def test_a_robot_that_is_too_heavy_by_itself_is_told(run):
+    _, text = run("--body-mass", 75, changes={COMPENSATOR: {"robot": {"mass": [1.0, 1.0, 3.0, 1.0]}}})
+    assert "The robot alone asks for more than rated torque somewhere" in text
+
+
+WRONG = {
+    "three masses": (COMPENSATOR, {"robot": {"mass": [0.5] * 3}}, "/right robot.mass = [0.5, 0.5, 0.5]: must be 4"),
+    "an unknown motor": (BRIDGE, {"motor": ["AK99"] * 4}, "must be 4, each one of AK60-6, AK80-9"),
+    "three motors": (BRIDGE, {"motor": ["AK80-9"] * 3}, "/right motor = ['AK80-9', 'AK80-9', 'AK80-9']: must be 4"),
+    "limits the wrong way": (BRIDGE, {"position_min": [1.7, 0.0, 0.0, 0.0]}, "/right position_max"),
+    "a forearm too long": (COMPENSATOR, {"link_length": [0.05, 0.13, 0.3, 0.15]}, "forearm and hand"),
+}
+
+
+@pytest.mark.parametrize(("node", "values", "sentence"), WRONG.values(), ids=WRONG)
+def test_a_wrong_file_ends_with_one_sentence(run, node, values, sentence):
+    code, text = run("--body-mass", 75, changes={node: values})
+    assert code == 2 and sentence in text
+
+
+def test_an_arm_without_a_bridge_is_refused(run):
+    code, text = run("--body-mass", 75, without=(BRIDGE,))
+    assert code == 2 and BRIDGE in text
+
+
+@pytest.mark.parametrize(
+    "arguments", [("--body-mass", 75_000), ("--body-mass", 75, "--support", 2), ("--body-mass", "nan")]
+)
+def test_an_impossible_wearer_ends_with_exit_code_2(run, arguments):
+    code, text = run(*arguments)
+    assert code == 2 and "must be a number from" in text
+
+
+def test_a_missing_file_ends_with_exit_code_2(capsys):
+    assert main(["--params", "nowhere.yaml", "--body-mass", "75"]) == 2
+    assert "nowhere.yaml" in capsys.readouterr().err

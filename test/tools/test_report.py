@@ -1,0 +1,269 @@
+"""From a bag to the report on the terminal, in files and as an exit code."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import dataclasses
+import io
+import math
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import made_bags as made
+import matplotlib.image
+import numpy as np
+import pytest
+from rich.console import Console
+
+from exo_gravity.core.errors import DataError
+from exo_gravity.core.verdict import Limits
+from exo_gravity.tools.bag import Bag, Event, read_bag
+from exo_gravity.tools.report import analyse, main, print_report, write
+
+POSES = [[0.1, 0.4, 0.5, 0.6], [-0.2, 0.8, 0.3, 0.9]]
+PUSH = [0.05, 0.25, -0.15, 0.1]
+
+
+def bag_of(*recordings, **more):
+    """A bag as if it had been read."""
+    empty = {"events": (), "parameters": {}, "notes": (), "problems": ()}
+    return Bag(Path("demo"), made.START, recordings, **{**empty, **more})
+
+
+@pytest.fixture(scope="module")
+def held():
+    return analyse(bag_of(made.trial(POSES, hold=4.0, push=PUSH)))
+
+
+@pytest.fixture(scope="module")
+def fell():
+    return analyse(bag_of(made.trial(POSES, hold=6.0, fall_after=5.0)))
+
+
+@pytest.fixture(scope="module")
+def folder(held, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    write(held, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def short_bag(tmp_path_factory):
+    """A bag of two holds with some drift in the elbow, 6 degrees per minute."""
+    drift = np.array([0.0, 0.0, 0.0, math.radians(6.0) / 60.0])
+    recording = made.trial(POSES, hold=4.0, rate=100.0, drift=drift)
+    return made.write_bag(tmp_path_factory.mktemp("bags") / "short", made.messages(recording))
+
+
+def rows(path):
+    with path.open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def printed(report):
+    console = Console(file=io.StringIO(), width=140)
+    print_report(report, console)
+    return console.file.getvalue()
+
+
+def test_an_arm_that_held_is_0_and_one_that_fell_is_1(held, fell):
+    assert (held.exit_code, fell.exit_code) == (0, 1)
+
+
+def test_what_could_not_be_read_is_2_even_if_the_rest_held(held):
+    problem = bag_of(*held.bag.recordings, problems=("left: damaged",))
+    assert analyse(problem).exit_code == 2
+
+
+def test_limits_make_the_same_recording_fail(held):
+    assert analyse(held.bag, Limits(max_stray=1e-6)).exit_code == 1
+
+
+def test_holds_csv_has_a_row_for_each_hold_and_joint_with_the_numbers_of_the_analysis(held, folder):
+    ((recording, trial),) = held.arms
+    found = rows(folder / "holds.csv")
+    assert len(found) == 4 * len(trial.holds) == 12
+    for row in found:
+        hold, joint = trial.holds[int(row["hold"]) - 1], recording.joint_names.index(row["joint"])
+        assert float(row["pose_deg"]) == pytest.approx(math.degrees(hold.pose[joint]), rel=1e-4)
+        rate = 60 * math.degrees(hold.drift_rate[joint])
+        assert float(row["drift_deg_per_min"]) == pytest.approx(rate, rel=1e-4)
+        assert float(row["torque_error_nm"]) == pytest.approx(hold.torque_error[joint], rel=1e-4)
+
+
+def test_motions_csv_has_the_push_with_its_peak_in_degrees(folder):
+    push = [row for row in rows(folder / "motions.csv") if row["kind"] == "push"]
+    np.testing.assert_allclose([float(row["peak_deg"]) for row in push], np.degrees(PUSH), atol=0.1)
+
+
+def test_an_unknown_torque_error_is_an_empty_cell_and_a_dash(held, tmp_path):
+    (whole,) = held.bag.recordings
+    arrays = (whole.time, whole.position, whole.velocity, whole.effort, np.full_like(whole.command, math.nan))
+    report = analyse(bag_of(type(whole)(whole.name, whole.joint_names, *arrays, whole.steps)))
+    write(report, tmp_path)
+    assert {row["torque_error_nm"] for row in rows(tmp_path / "holds.csv")} == {""}
+    assert "–" in printed(report)
+
+
+class Page(HTMLParser):
+    """Collects what a page refers to, and checks that its tags are closed in order."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.references, self.text = [], [], ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.references += [value for name, value in attrs if name in ("src", "href", "srcset", "data")]
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def test_the_page_is_well_formed_and_refers_to_nothing_outside_itself(folder):
+    page = Page((folder / "report.html").read_text(encoding="utf-8"))
+    assert page.open == []
+    assert len(page.references) == 2 and all(ref.startswith("data:image/png;base64,") for ref in page.references)
+    assert "url(" not in (folder / "report.html").read_text(encoding="utf-8")
+
+
+def test_the_pictures_in_the_page_are_those_beside_it(folder):
+    page = Page((folder / "report.html").read_text(encoding="utf-8"))
+    embedded = [base64.b64decode(ref.partition(",")[2]) for ref in page.references]
+    assert embedded == [(folder / f"right_{kind}.png").read_bytes() for kind in ("overview", "drift")]
+
+
+def test_a_figure_is_large_enough_to_print_and_not_blank(folder):
+    picture = matplotlib.image.imread(folder / "right_overview.png")
+    assert picture.shape[1] >= 1600 and picture[..., :3].std() > 0.05
+
+
+def test_the_page_tells_the_verdict_and_each_reason(fell, tmp_path):
+    write(fell, tmp_path)
+    text = Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
+    assert "It did not hold." in text and all(sentence in text for sentence in fell.failures)
+
+
+def test_what_a_recording_says_cannot_become_markup(held, tmp_path):
+    said = {"events": (Event(1.0, "<script>alert(1)</script>"),), "parameters": {"/a": "/a: <b>\n"}}
+    write(analyse(bag_of(*held.bag.recordings, **said, notes=("<i>",))), tmp_path)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<script>" not in text and "<b>\n" not in text and "&lt;script&gt;" in text
+
+
+@pytest.fixture(scope="module")
+def unscripted():
+    """A recording as of a real arm, whose wearer nobody recorded, carried all the while."""
+    whole = made.trial(POSES, hold=4.0)
+    return analyse(bag_of(dataclasses.replace(whole, steps=(), carried=((0.0, whole.time[-1]),))))
+
+
+def test_without_a_script_what_was_still_is_a_hold_and_the_report_says_so(unscripted):
+    ((_, trial),) = unscripted.arms
+    assert len(trial.holds) == 2 and unscripted.exit_code == 0
+    assert "right: nobody recorded what the wearer was told" in " ".join(printed(unscripted).split())
+
+
+def test_the_page_has_the_note_too(unscripted, tmp_path):
+    write(unscripted, tmp_path)
+    assert "nobody recorded what the wearer was told" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_where_nothing_tells_when_the_arm_was_carried_the_report_says_so(held, unscripted):
+    assert "its way down may be taken for a slip" in " ".join(printed(held).split())
+    assert "its way down" not in printed(unscripted)
+
+
+def test_a_trial_that_was_not_done_is_judged_up_to_there_and_the_report_says_so(held):
+    (whole,) = held.bag.recordings
+    report = analyse(bag_of(dataclasses.replace(whole, carried=((0.0, 15.0),))))
+    assert report.exit_code == 0
+    assert "let down at 15.0 s, before the trial was done" in " ".join(printed(report).split())
+
+
+def test_a_trial_that_was_done_has_no_such_note(held):
+    (whole,) = held.bag.recordings
+    assert not analyse(bag_of(dataclasses.replace(whole, carried=((0.0, whole.time[-1]),)))).notes
+
+
+def test_what_could_be_read_of_a_damaged_recording_held_as_far_as_it_goes(held):
+    assert "It held, as far as it could be read." in printed(analyse(bag_of(*held.bag.recordings, problems=("x",))))
+
+
+@pytest.mark.parametrize("option", ["--max-drift", "--max-drift-after-push", "--max-rate", "--min-hold"])
+@pytest.mark.parametrize("value", ["nan", "-1", "half"])
+def test_a_limit_that_is_no_number_from_0_up_is_refused(short_bag, capsys, option, value):
+    with pytest.raises(SystemExit) as caught:
+        main([str(short_bag), f"{option}={value}"])
+    assert caught.value.code == 2 and option in capsys.readouterr().err
+
+
+def test_the_table_shows_every_hold_and_the_push(held):
+    text = printed(held)
+    assert re.findall(r"^ +(\d) +[\d.]+ +[\d.]+ ", text, re.MULTILINE) == ["1", "2", "3"]
+    assert re.search(r"push +\S+ +\S+ +2\.\d 14\.\d -8\.\d +5\.\d", text)
+    assert "It held." in text
+
+
+def test_brackets_in_a_message_are_printed_as_they_are(held):
+    text = printed(analyse(bag_of(*held.bag.recordings, notes=("frame [01 02]",))))
+    assert "frame [01 02]" in text
+
+
+def test_no_hold_is_reported_with_figures_and_1(tmp_path, capsys):
+    moving = made.trial(POSES, hold=0.5, rate=100.0)
+    bag = made.write_bag(tmp_path / "moving", made.messages(moving, script=False))
+    assert main([str(bag), "--output", str(tmp_path / "out")]) == 1
+    assert "never still" in capsys.readouterr().out
+    assert (tmp_path / "out" / "report.html").exists() and (tmp_path / "out" / "right_overview.png").exists()
+
+
+def test_a_report_lies_beside_its_recording_by_default(short_bag, capsys):
+    assert main([str(short_bag)]) == 0
+    assert sorted(path.name for path in short_bag.with_name("short_report").iterdir()) == [
+        "holds.csv", "motions.csv", "report.html", "right_drift.png", "right_overview.png",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("option", ["--max-drift=0.3", "--max-rate=5"])
+def test_a_limit_on_the_command_line_is_in_degrees(short_bag, tmp_path, option, capsys):
+    assert main([str(short_bag), "--output", str(tmp_path), option]) == 1
+    assert "right_joint_4 " in capsys.readouterr().out
+
+
+def test_a_limit_that_is_wide_enough_holds(short_bag, tmp_path):
+    assert main([str(short_bag), "--output", str(tmp_path), "--max-drift=0.5", "--max-rate=7"]) == 0
+
+
+def test_a_wrong_file_is_2_and_one_sentence(tmp_path, capsys):
+    assert main([str(tmp_path / "nothing")]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.count("\n") == 1 and "nothing: no such file" in captured.err
+
+
+def test_a_folder_that_cannot_be_written_is_named(held, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="file"):
+        write(held, tmp_path / "file" / "report")
+
+
+def test_a_recording_cut_short_is_reported_and_says_so(short_bag, tmp_path, capsys):
+    whole = (short_bag / "short.mcap").read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole[: len(whole) * 2 // 3])
+    assert main([str(cut), "--output", str(tmp_path / "out")]) in (0, 1)
+    assert "cut short" in " ".join(capsys.readouterr().out.split())
+    assert len(rows(tmp_path / "out" / "holds.csv")) >= 4
+
+
+def test_the_holds_of_a_bag_are_those_of_its_arrays(short_bag):
+    ((_, trial),) = analyse(read_bag(short_bag)).arms
+    assert len(trial.holds) == 2
+    np.testing.assert_allclose([hold.pose[:3] for hold in trial.holds], np.array(POSES)[:, :3], atol=1e-3)

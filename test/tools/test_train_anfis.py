@@ -1,0 +1,208 @@
+"""Training an ANFIS: it converges, beats the paper, learns from a recording, and refuses too little of one."""
+
+import json
+import math
+
+import made_bags as made
+import numpy as np
+import pytest
+import yaml
+
+from exo_gravity.core import gravity_torque
+from exo_gravity.core.anfis_law import AnfisLaw, scaled
+from exo_gravity.core.errors import DataError
+from exo_gravity.tools.anfis_bag import TILT_TOPIC, TILT_TYPE, from_bag
+from exo_gravity.tools.anfis_data import from_gravload
+from exo_gravity.tools.anfis_training import RIDGE, _Projection, train, train_law
+from exo_gravity.tools.train_anfis import main
+from exo_gravity.tools.validate_arm import workspace
+from exo_gravity.tools.validate_tables import PAPER_ANFIS
+
+RNG = np.random.default_rng(1)
+SPREAD = RNG.uniform((-1.0, 0.0, -0.5, 0.0), (1.0, 1.5, 1.5, 1.5), (45, 4))
+
+
+def params_file(folder):
+    """A parameter file of the arm that `made_bags` records."""
+    values = {"side": "right", "joint_names": list(made.NAMES), "link_length": made.ARM.length.tolist()}
+    values["robot"] = {"mass": made.ARM.mass.tolist(), "cog": made.ARM.cog.tolist()}
+    path = folder / "arm.yaml"
+    path.write_text(yaml.safe_dump({"/right/compensator": {"ros__parameters": values}}), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def learned():
+    """The packaged arm's samples and the law trained on them."""
+    space = workspace()
+    samples = from_gravload(space)
+    return space, samples, train_law(samples, space.arm)[0]
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    recording = made.trial(SPREAD, hold=2.6, rate=40.0)
+    return made.write_bag(tmp_path_factory.mktemp("bags") / "spread", made.messages(recording, script=False))
+
+
+@pytest.fixture
+def recorded(tmp_path):
+    return workspace(params_file(tmp_path))
+
+
+def test_it_trains_on_the_papers_1053_positions_and_is_checked_on_the_768_between_them(learned):
+    _, samples, _ = learned
+    assert (len(samples.angle), len(samples.held_out_angle)) == (1053, 12 * 8 * 8)
+
+
+def test_the_training_error_is_below_a_tenth_of_the_papers_on_each_joint(learned):
+    assert np.all(np.array(learned[2].error["training"]) < np.array(PAPER_ANFIS) / 10)
+
+
+def test_the_held_out_error_is_below_the_papers_training_error_on_each_joint(learned):
+    assert np.all(np.array(learned[2].error["held_out"]) < PAPER_ANFIS)
+
+
+def test_the_law_holds_the_arm_as_the_exact_one_does_anywhere_in_its_box(learned):
+    space, _, law = learned
+    theta = np.random.default_rng(2).uniform(space.low, space.high, (2000, 4))
+    assert law.torques(theta[:, 1:]) == pytest.approx(gravity_torque(space.arm, theta)[:, 1:], abs=2e-3)
+
+
+def test_the_reported_errors_are_those_of_the_saved_law(learned):
+    _, samples, law = learned
+    again = AnfisLaw.load(law.dump())
+    held_out = np.sqrt(np.mean((again.torques(samples.held_out_angle) - samples.held_out_torque) ** 2, axis=0))
+    assert again.error["held_out"] == pytest.approx(held_out)
+
+
+def test_the_projected_gradient_is_that_of_finite_differences():
+    inputs = RNG.uniform(-1, 1, (60, 2))
+    problem = _Projection(inputs, np.sin(3 * inputs[:, 0]) * inputs[:, 1], 3, RIDGE, lambda step, rmse: None)
+    premises = np.concatenate((RNG.uniform(-1, 1, 6), RNG.uniform(-0.3, 0.3, 6)))
+
+    def cost(at):
+        return 0.5 * np.sum(problem.residual(at) ** 2)
+
+    numeric = [(cost(premises + step) - cost(premises - step)) / 2e-6 for step in 1e-6 * np.eye(12)]
+    gradient = problem.jacobian(premises).T @ problem.residual(premises)
+    assert gradient == pytest.approx(np.array(numeric), rel=1e-4, abs=1e-8)
+
+
+def test_a_function_that_the_model_can_express_is_learned_to_rounding():
+    inputs = RNG.uniform(-1, 1, (100, 2))
+    assert train(inputs, 1.0 + 2.0 * inputs[:, 0] - inputs[:, 1], 2).rmse < 1e-9
+
+
+def test_moving_the_premises_lowers_the_error_that_least_squares_alone_leaves():
+    inputs = RNG.uniform(-1, 1, (300, 2))
+    output = np.sin(4 * inputs[:, 0]) * np.cos(3 * inputs[:, 1])
+    assert train(inputs, output, 3).rmse < train(inputs, output, 3, max_evaluations=1).rmse / 2
+
+
+def test_each_evaluation_is_reported():
+    seen = []
+    inputs = RNG.uniform(-1, 1, (50, 2))
+    result = train(inputs, inputs[:, 0] ** 3, 2, on_evaluation=lambda step, rmse: seen.append(step))
+    assert seen == list(range(1, result.evaluations + 1))
+
+
+def test_fewer_samples_than_consequents_are_refused():
+    with pytest.raises(DataError, match="at least 256"):
+        train(np.zeros((200, 3)), np.zeros(200), 4)
+
+
+def test_gains_of_the_arm_do_not_change_what_is_learned(tmp_path):
+    content = yaml.safe_load(params_file(tmp_path).read_text(encoding="utf-8"))
+    content["/right/compensator"]["ros__parameters"]["gain"] = [0.0, 0.5, 1.0, 2.0]
+    (tmp_path / "gain.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+    with_gain, without = (from_gravload(workspace(tmp_path / name)) for name in ("gain.yaml", "arm.yaml"))
+    assert np.array_equal(with_gain.torque, without.torque)
+
+
+def test_from_a_recording_it_learns_the_torques_that_were_measured(bag, recorded):
+    law, _ = train_law(from_bag(bag, recorded, 2), recorded.arm, 2, ridge=0.03)
+    inside = np.random.default_rng(3).uniform(law.low, law.high, (500, 3))
+    exact = gravity_torque(made.ARM, np.pad(inside, ((0, 0), (1, 0))))[:, 1:]
+    assert np.all(np.sqrt(np.mean((law.torques(inside) - exact) ** 2, axis=0)) < 0.15)
+
+
+def test_the_box_of_a_recording_is_that_of_the_poses_held(bag, recorded):
+    samples = from_bag(bag, recorded, 2)
+    assert samples.low == pytest.approx(SPREAD[:, 1:].min(axis=0), abs=0.01)
+    assert samples.high == pytest.approx(SPREAD[:, 1:].max(axis=0), abs=0.01)
+
+
+def test_every_fifth_hold_is_kept_for_the_check(bag, recorded):
+    samples = from_bag(bag, recorded, 2)
+    assert (len(samples.angle), len(samples.held_out_angle)) == (36, 9)
+    assert scaled(samples.held_out_angle, samples.low, samples.high).shape == (9, 3)
+
+
+def test_a_part_of_the_box_without_a_pose_is_named(bag, recorded):
+    with pytest.raises(DataError, match=r"theta_2 \d/6.*record holds there"):
+        from_bag(bag, recorded, 6)
+
+
+def few_poses(folder, **more):
+    return made.write_bag(
+        folder / "few", made.messages(made.trial(SPREAD[:8], hold=2.6, rate=40.0), script=False), **more
+    )
+
+
+def test_too_few_poses_are_refused_in_one_sentence(tmp_path, recorded):
+    with pytest.raises(DataError, match=r"record holds there|samples"):
+        from_bag(few_poses(tmp_path), recorded, 2)
+
+
+def test_holds_on_a_tilted_trunk_are_left_out(tmp_path, recorded):
+    types = made.STORE.types
+    vector = types["geometry_msgs/msg/Vector3"](x=0.0, y=math.radians(5.0), z=0.0)
+    stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
+    message = types[TILT_TYPE](header=types["std_msgs/msg/Header"](stamp=stamp, frame_id=""), vector=vector)
+    data = bytes(made.STORE.serialize_cdr(message, TILT_TYPE))
+    tilted = [(TILT_TOPIC, TILT_TYPE, made.START + k * 100_000_000, data) for k in range(400)]
+    states = list(made.messages(made.trial(SPREAD[:8], hold=2.6, rate=40.0), script=False))
+    folder = made.write_bag(tmp_path / "tilted", sorted(states + tilted, key=lambda entry: entry[2]))
+    with pytest.raises(DataError, match="0 holds with an upright trunk"):
+        from_bag(folder, recorded, 2)
+
+
+def test_another_arms_joints_are_refused_by_name(bag):
+    with pytest.raises(DataError, match="right_shoulder_rotation"):
+        from_bag(bag, workspace(), 2)
+
+
+def test_the_command_saves_a_law_that_loads_and_prints_both_errors(bag, tmp_path, capsys):
+    saved = tmp_path / "law.json"
+    main(["--params", str(params_file(tmp_path)), "--bag", str(bag), "--output", str(saved)])
+    law = AnfisLaw.load(saved.read_text(encoding="utf-8"))
+    printed = capsys.readouterr().out
+    assert law.first_moment == made.ARM.first_moment[1:]
+    assert "45 holds" in printed and "training RMSE" in printed and "held-out RMSE" in printed
+    assert f"{law.error['held_out'][0]:.2e}" in printed
+
+
+def test_the_file_says_what_it_was_trained_on(bag, tmp_path):
+    saved = tmp_path / "law.json"
+    main(["--params", str(params_file(tmp_path)), "--bag", str(bag), "--output", str(saved)])
+    assert "spread" in json.loads(saved.read_text(encoding="utf-8"))["source"]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["--params", "nowhere.yaml"], ["--bag", "nowhere"], ["--side", "middle"], ["--functions", "1"]],
+    ids=lambda arguments: " ".join(arguments),
+)
+def test_wrong_use_ends_with_2_and_one_sentence(arguments, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main([*arguments, "--output", str(tmp_path / "law.json")])
+    assert ended.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_an_output_that_cant_be_written_ends_with_2(bag, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["--params", str(params_file(tmp_path)), "--bag", str(bag), "--output", str(tmp_path / "no" / "law.json")])
+    assert ended.value.code == 2
+    assert "law.json" in capsys.readouterr().err

@@ -1,0 +1,217 @@
+"""The paper's comparison: references, cases, figures of merit, and the command from parameter file to exit code."""
+
+import csv
+import math
+import sys
+from dataclasses import replace
+
+import matplotlib.image
+import numpy as np
+import pytest
+import yaml
+
+from exo_gravity.core import ArmModel
+from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.tools import anfis_training, validate, validate_figures, validate_laws
+from exo_gravity.tools.anfis_growth import growth, sizes
+from exo_gravity.tools.validate_arm import with_cog_at_link_ends, workspace
+from exo_gravity.tools.validate_references import REFERENCES, gravload
+
+DOWN = np.array(((0.0, 0.0, 1.0),))
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory):
+    """Exit code, printed text, folder and parts of a run with few poses and short training."""
+    folder = tmp_path_factory.mktemp("validation")
+    lines, parts, evaluate = [], [], validate.evaluate
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(validate, "QUICK_COUNT", 60)
+        patch.setattr(validate_figures, "GRID", (8, 8, 3))
+        patch.setattr(anfis_training, "MAX_EVALUATIONS", 12)
+        patch.setattr(validate, "evaluate", lambda *given: parts.append(evaluate(*given)) or parts[-1])
+        patch.setattr("builtins.print", lambda *parts, **_: lines.append(" ".join(map(str, parts))))
+        with pytest.raises(SystemExit) as ended:
+            validate.main(["--quick", "--output", str(folder)])
+    return ended.value.code, "\n".join(lines), folder, parts
+
+
+def write_params(folder, arm, bridge=None):
+    content = {"/right/compensator": {"ros__parameters": arm}}
+    if bridge:
+        content["/right/can_bridge"] = {"ros__parameters": bridge}
+    path = folder / "arm.yaml"
+    path.write_text(yaml.safe_dump(content), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("name", list(REFERENCES))
+def test_a_reference_gives_the_torque_of_a_straight_horizontal_arm_by_hand(name):
+    arm = ArmModel((0.05, 0.13, 0.3, 0.3), (0.05, 0.1, 0.2, 0.15), (0.5, 0.4, 0.6, 0.2), gravity=10.0)
+    sideways = np.array(((0.4, math.pi / 2, 0.0, 0.0),))
+    elbow = 10.0 * 0.2 * 0.15
+    shoulder = 10.0 * (0.4 * 0.1 + 0.6 * (0.13 + 0.2) + 0.2 * (0.13 + 0.3 + 0.15))
+    assert REFERENCES[name](arm)(sideways, DOWN)[0] == pytest.approx((0.0, shoulder, 0.0, 0.0), abs=1e-12)
+    forward = np.array(((0.4, 0.0, math.pi / 2, 0.0),))
+    assert REFERENCES[name](arm)(forward, DOWN)[0, 3] == pytest.approx(elbow, abs=1e-12)
+
+
+@pytest.mark.parametrize("name", list(REFERENCES))
+def test_a_reference_scales_with_the_gains(name):
+    space = workspace()
+    arm = replace(space.arm, gain=(0.5, 1.0, 1.5, 2.0))
+    pose = np.array(((0.3, 0.5, 0.7, 0.9),))
+    assert REFERENCES[name](arm)(pose, DOWN) == pytest.approx(REFERENCES[name](space.arm)(pose, DOWN) * arm.gain)
+
+
+@pytest.mark.parametrize(("name", "module"), [("gravload", "roboticstoolbox"), ("Pinocchio", "pinocchio")])
+def test_a_reference_that_is_not_installed_is_named_with_what_installs_it(name, module, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(DataError, match=rf"{module}.*pip install 'exo_gravity\[report,validate\]'"):
+        REFERENCES[name](workspace().arm)
+
+
+def test_the_first_case_is_the_1053_positions_with_an_upright_trunk():
+    case = next(validate_laws.cases("", workspace(), 10))
+    assert case.theta.shape == (13 * 9 * 9, 4)
+    assert len(np.unique(case.theta, axis=0)) == 1053
+    assert np.all(case.axis_angle == 0) and np.all(case.theta[:, 0] == 0)
+
+
+def test_the_random_cases_turn_joint_1_and_tilt_the_trunk_within_their_limits():
+    space = workspace()
+    cases = list(validate_laws.cases("", space, 500))[1:]
+    assert [case.limit for case in cases] == [0, 5, 10, 20, 30]
+    for case in cases:
+        assert np.all((case.theta >= space.low) & (case.theta <= space.high)) and np.ptp(case.theta[:, 0]) > 3
+        for angle in (case.beta, case.phi):
+            assert np.abs(angle).max() == pytest.approx(math.radians(case.limit), rel=0.05)
+
+
+def test_rmse_largest_error_and_share_are_those_of_a_known_error():
+    case = next(validate_laws.cases("", workspace(), 10))
+    expected = np.full((1053, 4), 2.0)
+    given = expected + 0.1
+    given[0, 2] += 1.0
+    rows = validate_laws.compare(case, {"law": given}, "reference", expected)
+    assert (rows[0].rmse, rows[0].largest, rows[0].share) == pytest.approx((0.1, 0.1, 0.05))
+    assert rows[2].largest == pytest.approx(1.1)
+
+
+def test_a_joint_that_needs_no_torque_has_no_share():
+    case = next(validate_laws.cases("", workspace(), 10))
+    assert math.isnan(validate_laws.compare(case, {"law": np.ones((1053, 4))}, "", np.zeros((1053, 4)))[0].share)
+
+
+def test_the_papers_premise_is_link_ends_gain_1_and_its_own_gravity():
+    arm = with_cog_at_link_ends(ArmModel((0.1,) * 4, (0.05,) * 4, (1.0,) * 4, (0.5,) * 4))
+    assert np.array_equal(arm.cog, arm.length) and arm.gravity == 9.8 and np.all(arm.gain == 1)
+
+
+def test_the_arm_is_read_from_dotted_and_nested_names_alike(tmp_path):
+    mass, cog = [0.1, 0.2, 0.3, 0.4], [0.01, 0.02, 0.03, 0.04]
+    nested = workspace(write_params(tmp_path, {"robot": {"mass": mass, "cog": cog}, "gravity": 9.8}))
+    dotted = workspace(write_params(tmp_path, {"robot.mass": mass, "robot.cog": cog, "gravity": 9.8}))
+    assert nested.arm == dotted.arm == ArmModel((0.05, 0.13, 0.3, 0.3), cog, mass, gravity=9.8)
+
+
+def test_the_joint_limits_are_those_of_the_bridge_beside_the_compensator(tmp_path):
+    path = write_params(tmp_path, {}, {"position_min": [-1.0, 0.0, 0.0, 0.0], "position_max": [1.0, 1.5, 1.5, 2.0]})
+    assert workspace(path).high.tolist() == [1.0, 1.5, 1.5, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("arm", "bridge", "named"),
+    [
+        ({"robot.mass": [1.0, 2.0, 3.0]}, None, "robot.mass"),
+        ({"robot.cog": [1.0, 1.0, 1.0, 1.0]}, None, "robot.cog"),
+        ({}, {"position_min": ["a", "b", "c", "d"]}, "position_min"),
+        ({}, {"position_min": [2.0, 2.0, 2.0, 2.0], "position_max": [1.0, 1.0, 1.0, 1.0]}, "position_min"),
+        ({"side": "left"}, None, "right"),
+    ],
+)
+def test_an_impossible_arm_is_refused_by_the_name_of_the_parameter(arm, bridge, named, tmp_path):
+    with pytest.raises(ParameterError, match=named):
+        workspace(write_params(tmp_path, arm, bridge))
+
+
+def test_all_checks_hold_on_the_packaged_arm(quick):
+    code, printed, *_ = quick
+    assert code == 0
+    assert "FAILED" not in printed and printed.count("\nheld") == 4
+
+
+def test_the_papers_figures_stand_beside_ours(quick):
+    for figure in ("6.06e-16", "4.06e-16", "8.03e-17", "1.71e-03", "1.32e-03", "3.15e-04", "380 s"):
+        assert figure in quick[1]
+
+
+def test_the_csv_has_a_row_per_case_law_reference_and_joint(quick):
+    with (quick[2] / "laws.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * 6 * 4 * 2 * 4
+    exact = [float(row["largest"]) for row in rows if row["law"] == "exact"]
+    assert max(exact) < 1e-12
+
+
+def test_the_paper_laws_are_off_at_the_configured_centres_of_gravity(quick):
+    with (quick[2] / "laws.csv").open(encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["cog"] == "as configured" and row["law"] == "EQ2-EQ5"]
+    assert float(next(row for row in rows if row["joint"] == "2")["rmse"]) > 0.1
+
+
+@pytest.mark.parametrize("name", ["workspace.png", "tilt.png"])
+def test_the_figures_are_pictures_with_something_in_them(quick, name):
+    assert matplotlib.image.imread(quick[2] / name)[..., :3].std() > 0.05
+
+
+def test_an_exact_law_that_is_off_by_a_billionth_somewhere_fails_its_check(quick):
+    paper, configured = quick[3]
+    rows = [replace(row, largest=1e-9) if (row.law, row.joint) == ("exact", 3) else row for row in configured.rows]
+    failed = [sentence for held, sentence in validate.checks(paper, replace(configured, rows=rows)) if not held]
+    assert len(failed) == 1 and failed[0].startswith("exact law")
+
+
+@pytest.mark.parametrize("kind", ["training", "held_out"])
+def test_an_anfis_worse_than_the_papers_on_one_joint_fails_its_check(quick, kind):
+    paper, configured = quick[3]
+    law = replace(paper.law, error={**paper.law.error, kind: [1e-6, 1.33e-3, 1e-6]})
+    failed = [sentence for held, sentence in validate.checks(replace(paper, law=law), configured) if not held]
+    assert len(failed) == 1 and failed[0].startswith("ANFIS")
+
+
+def test_a_failed_check_ends_with_1(monkeypatch):
+    monkeypatch.setattr(validate, "_run", lambda options: False)
+    with pytest.raises(SystemExit) as ended:
+        validate.main([])
+    assert ended.value.code == 1
+
+
+@pytest.mark.parametrize("arguments", [["--params", "nowhere.yaml"], ["--side", "up"], ["--more"]], ids=" ".join)
+def test_wrong_use_ends_with_2(arguments, tmp_path):
+    with pytest.raises(SystemExit) as ended:
+        validate.main([*arguments, "--output", str(tmp_path)])
+    assert ended.value.code == 2
+
+
+def test_an_output_folder_that_cant_be_made_ends_with_2(tmp_path, capsys):
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    with pytest.raises(SystemExit) as ended:
+        validate.main(["--output", str(tmp_path / "file" / "folder")])
+    assert ended.value.code == 2
+    assert "file" in capsys.readouterr().err
+
+
+def test_growth_is_measured_from_2_to_6_inputs():
+    assert {inputs for _, inputs in sizes()} == {2, 3, 4, 5, 6}
+
+
+def test_the_growth_of_one_model_counts_its_rules_parameters_and_positions():
+    row = growth(workspace(), 2, 3)
+    assert (row.rules, row.parameters, row.positions) == (8, 8 * 4 + 2 * 3 * 2, 5**3)
+    assert row.training_time > 0 and row.inference_time > 0 and 0 < row.held_out_rmse < 1
+
+
+def test_gravload_is_told_gravity_in_its_own_sign():
+    abducted = np.array(((0.0, 0.1, 0.0, 0.0),))
+    assert gravload(workspace().arm)(abducted, DOWN)[0, 1] > 0
