@@ -1,0 +1,64 @@
+"""The law, against compiled Pinocchio and the Robotics Toolbox, all called from Python for the same arm and poses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from bench.table import Row, race
+from exo_gravity.core import gravity_torque
+from exo_gravity.core.control_params import COMPENSATOR, settings_of
+from exo_gravity.core.gravity import LAWS
+from exo_gravity.core.params import values_of
+from exo_gravity.core.tilt import Tilt
+from exo_gravity.tools.validate_references import pinocchio_model, toolbox_robot
+
+POSES = 100_000
+LOOP = 2_000  # of them, for the peers, which take one after the other
+
+
+def laws(quick: bool) -> Iterator[Row]:
+    """Yield the rows of the law."""
+    arm = settings_of(values_of(COMPENSATOR, {})).arm
+    poses = np.random.default_rng(1).uniform(-1.5, 1.5, (POSES, 4))
+    pin, model = pinocchio_model(arm)
+    model.gravity.linear = np.array((0.0, 0.0, arm.gravity))
+    data, robot = model.createData(), toolbox_robot(arm)
+    law, tilt = LAWS["exact"].torque, Tilt.of("right")
+    pose = poses[0]
+    theta = tuple(pose.tolist())
+    np.testing.assert_allclose(law(arm, theta, tilt), pin.computeGeneralizedGravity(model, data, pose), atol=1e-12)
+
+    blocks = 11 if quick else 51
+    ours, pinocchio, toolbox = race(
+        (
+            (lambda: law(arm, theta, tilt), 2000),
+            (lambda: pin.computeGeneralizedGravity(model, data, pose), 2000),
+            (lambda: robot.gravload(pose), 20),
+        ),
+        blocks,
+    )
+    yield Row("law, one pose: Pinocchio", ours.median * 1e6, pinocchio.median * 1e6, "us", ours.text(1e6))
+    yield Row("law, one pose: Robotics Toolbox", ours.median * 1e6, toolbox.median * 1e6, "us", ours.text(1e6))
+
+    def pinocchio_loop() -> None:
+        for pose in poses[:LOOP]:
+            pin.computeGeneralizedGravity(model, data, pose)
+
+    def toolbox_loop() -> None:
+        for pose in poses[: LOOP // 100]:
+            robot.gravload(pose)
+
+    ours, pinocchio, toolbox = race(
+        ((lambda: gravity_torque(arm, poses), 1), (pinocchio_loop, 1), (toolbox_loop, 1)), blocks
+    )
+    mine, spread = ours.median / POSES * 1e6, ours.text(1e6 / POSES)
+    yield Row("law, 100,000 poses, per pose: Pinocchio in a loop", mine, pinocchio.median / LOOP * 1e6, "us", spread)
+    yield Row(
+        "law, 100,000 poses, per pose: Robotics Toolbox in a loop",
+        mine,
+        toolbox.median / (LOOP // 100) * 1e6,
+        "us",
+        spread,
+    )

@@ -1,0 +1,80 @@
+"""A row of the benchmark: a figure of ours against a peer's, or a limit's, of the same run; the table, and the file."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+
+@dataclass(frozen=True)
+class Row:
+    """name: of what, and against what. ours, peer: in `unit`. spread: of ours, in words. more_is_better: of ours."""
+
+    name: str
+    ours: float
+    peer: float
+    unit: str
+    spread: str = ""
+    more_is_better: bool = False
+
+    @property
+    def ratio(self) -> float:
+        """Ours as a multiple of the peer's."""
+        return self.ours / self.peer if self.peer else float("inf") if self.ours else 1.0
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds a call of each block; `text` has the range that holds the middle half of them."""
+
+    blocks: tuple[float, ...]
+
+    @property
+    def median(self) -> float:
+        """Seconds a call."""
+        return statistics.median(self.blocks)
+
+    def text(self, scale: float) -> str:
+        """Return the middle half, in units of 1/`scale` s."""
+        low, _, high = statistics.quantiles(self.blocks, n=4)
+        return f"{low * scale:.3g} to {high * scale:.3g}"
+
+
+def race(calls: Sequence[tuple[Callable[[], object], int]], blocks: int) -> list[Timing]:
+    """Time functions in turns, so that whatever else the machine does meets them all alike.
+
+    calls: of each the function, and how often a block calls it.
+    """
+    times: list[list[float]] = [[] for _ in calls]
+    for _ in range(blocks):
+        for (call, count), taken in zip(calls, times, strict=True):
+            begin = time.perf_counter()
+            for _ in range(count):
+                call()
+            taken.append((time.perf_counter() - begin) / count)
+    return [Timing(tuple(taken)) for taken in times]
+
+
+def show(rows: Sequence[Row], console: Console) -> None:
+    """Print the table."""
+    table = Table("", "ours", "spread", "peer or limit", "unit", "ratio", "", box=None, pad_edge=False)
+    for column in table.columns[1:4] + table.columns[5:6]:
+        column.justify = "right"
+    for row in rows:
+        mark = "x, more is better" if row.more_is_better else "x"
+        table.add_row(row.name, f"{row.ours:.4g}", row.spread, f"{row.peer:.4g}", row.unit, f"{row.ratio:.3g}", mark)
+    console.print(table)
+
+
+def save(rows: Sequence[Row], path: Path) -> None:
+    """Write the rows as JSON."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content = [{name: getattr(row, name) for name in ("name", "ours", "peer", "unit", "ratio")} for row in rows]
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

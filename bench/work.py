@@ -1,0 +1,110 @@
+"""The work besides the loop: the ANFIS's training, an offline trial against real time, the report against rosbags."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import yaml
+from rich.console import Console
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from bench.table import Row
+from exo_gravity.core.protocol import Protocol
+from exo_gravity.tools import report
+from exo_gravity.tools.anfis_data import from_gravload
+from exo_gravity.tools.anfis_training import train_law
+from exo_gravity.tools.bag import read_bag
+from exo_gravity.tools.params import packaged_config
+from exo_gravity.tools.trial_offline import run_offline, simulated_trials
+from exo_gravity.tools.validate_arm import workspace
+
+TRAINING_LIMIT = 10.0  # s that somebody waits before a terminal without wondering
+JOINT_STATE = "sensor_msgs/msg/JointState"
+RATE = 500  # Hz, of the recording
+
+
+def work(quick: bool) -> Iterator[Row]:
+    """Yield the rows of the work besides the loop."""
+    repeats = 3 if quick else 5
+    space = workspace(None, "right")
+    samples = from_gravload(space)
+    seconds = _timed(lambda: train_law(samples, space.arm, 4), repeats)
+    yield Row("ANFIS, training: limit", float(np.median(seconds)), TRAINING_LIMIT, "s", _range(seconds))
+
+    speeds = [length / taken for length, taken in (_offline(60.0 if quick else 300.0) for _ in range(repeats))]
+    yield Row("trial offline: real time", float(np.median(speeds)), 1.0, "x", _range(speeds), more_is_better=True)
+
+    with tempfile.TemporaryDirectory() as folder:
+        bag = _recording(Path(folder, "bag"), 30 if quick else 300)
+        size = sum(file.stat().st_size for file in bag.iterdir()) / 1e6
+        ours = [size / taken for taken in _timed(lambda: _report(bag, Path(folder, "report")), repeats)]
+        peer = [size / taken for taken in _timed(lambda: _read_all(bag), 1)]
+    yield Row(
+        "report, whole: rosbags reading the messages alone",
+        float(np.median(ours)),
+        peer[0],
+        "MB/s",
+        _range(ours),
+        more_is_better=True,
+    )
+
+
+def _timed(call: Callable[[], object], repeats: int) -> list[float]:
+    taken = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        call()
+        taken.append(time.perf_counter() - begin)
+    return taken
+
+
+def _range(values: list[float]) -> str:
+    return f"{min(values):.3g} to {max(values):.3g}"
+
+
+def _offline(hold: float) -> tuple[float, float]:
+    """Return the length in s of a trial on the simulated right arm, and how long it took."""
+    steps = [{"move": [0.1, 0.8, 0.7, 0.6], "over": 3.0}, {"hold": hold}]
+    protocol = Protocol.parse({"name": "bench", "steps": steps})
+    params = packaged_config("sim.yaml")
+    trials = simulated_trials(params, protocol)
+    begin = time.perf_counter()
+    bag, _ = run_offline(trials, params, Console(quiet=True), lambda: False)
+    return float(bag.recordings[0].time[-1]), time.perf_counter() - begin
+
+
+def _recording(path: Path, seconds: int) -> Path:
+    """Write joint states and efforts of an arm that is led from pose to pose, as rosbag2 in MCAP."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    header, stamp = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
+    names = yaml.safe_load(packaged_config("sim.yaml").read_text())["/right/compensator"]["ros__parameters"]
+    rng = np.random.default_rng(1)
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        states, commands = (
+            writer.add_connection(f"/right/{topic}", JOINT_STATE, typestore=store)
+            for topic in ("joint_states", "effort_commands")
+        )
+        for index in range(seconds * RATE):
+            at = 1_700_000_000_000_000_000 + index * 1_000_000_000 // RATE
+            when = header(stamp(at // 10**9, at % 10**9), "")
+            moving = 0.3 * np.sin(min(index / RATE % 15.0, 3.0) * np.ones(4)) + 1e-4 * rng.standard_normal(4)
+            for connection, arrays in ((states, (moving, np.zeros(4), moving)), (commands, ([], [], moving))):
+                message = store.types[JOINT_STATE](when, names["joint_names"], *map(np.asarray, arrays))
+                writer.write(connection, at, bytes(store.serialize_cdr(message, JOINT_STATE)))
+    return path
+
+
+def _report(bag: Path, folder: Path) -> None:
+    report.write(report.analyse(read_bag(bag)), folder)
+
+
+def _read_all(bag: Path) -> None:
+    with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        for connection, _, data in reader.messages():
+            reader.deserialize(data, connection.msgtype)
