@@ -100,7 +100,6 @@ def _watch(watched: int, memory: mmap.mmap, receiver: Connection, tell: Callable
     if charge and powered:
         tell(f"the process that carried the arm {why}: letting the arm down")
         let_down(charge, effort, tell)
-        tell("the arm is down, its motors are off")
 
 
 def _load(interface: str) -> None:
@@ -124,7 +123,8 @@ def let_down(charge: Charge, effort: Sequence[float], tell: Callable[[str], None
     machine.take_over(effort, time.monotonic())
     loop = ControlLoop(MotorBus(bus, charge.motors, powered=True), machine, charge.period, lambda now, joints: None)
     loop.start()
-    return loop.stop()
+    loop.stop()
+    return tell("the arm is down, its motors are off")
 
 
 def main() -> None:

@@ -55,7 +55,9 @@ def wire():
 
 def test_it_goes_on_from_the_last_torques_and_ends_with_the_motors_off(wire):
     channel, device, listener = wire
-    let_down(Charge(("virtual", channel, {}), MOTORS_OF_ARM, QUICKLY, PERIOD), EFFORT, pytest.fail)
+    told = []
+    let_down(Charge(("virtual", channel, {}), MOTORS_OF_ARM, QUICKLY, PERIOD), EFFORT, told.append)
+    assert told == ["the arm is down, its motors are off"]
     frames = [(m.arbitration_id, bytes(m.data)) for m in iter(lambda: listener.recv(0.0), None)]
     torques = [unpack_command(MOTORS["AK80-9"], data).torque for to, data in frames if to == 2 and data[0] == 0x80]
     assert torques[0] == pytest.approx(EFFORT[1], abs=0.25)
