@@ -105,6 +105,10 @@ class Limits:
             expected = f"at least {4 * WALL_WIDTH} rad above position_min = {list(self.position_min)}"
             raise ParameterError("position_max", list(self.position_max), expected)
 
+    def silent(self, now: float, joint: JointSample) -> bool:
+        """Return whether the reading `joint` is so old at `now` s that its motor counts as silent."""
+        return not now - joint.time <= self.reply_timeout
+
     def find_fault(
         self, now: float, joints: Sequence[JointSample], before: Sequence[JointSample], overshoot: float = OVERSHOOT
     ) -> Fault | None:
@@ -113,7 +117,7 @@ class Limits:
         overshoot: rad past the joint limits that are no fault yet.
         """
         for i, (name, joint, last) in enumerate(zip(self.joint_names, joints, before, strict=True)):
-            if not now - joint.time <= self.reply_timeout:
+            if self.silent(now, joint):
                 return Fault("motor_silent", f"{name}: no reply for more than {self.reply_timeout * 1000:.0f} ms")
             if joint.error:
                 text = MOTOR_ERRORS.get(joint.error, "unknown")

@@ -92,7 +92,7 @@ class SafetyMachine:
         self._before: Sequence[JointSample] = (UNKNOWN,) * 4
         self._unreached = False  # whether a motor was silent when the way down ended
         self._known = False  # whether zeros and signs have been checked since the motors answer
-        self._sign_check = self._new_sign_check()
+        self._sign_check: SignCheck | None = None  # while PROVING
 
     def enable(self, now: float) -> bool:
         """Begin the checks, after which torque ramps in. Refused (False) unless DISABLED."""
@@ -251,7 +251,7 @@ class SafetyMachine:
 
     def _note(self, now: float, joints: Sequence[JointSample]) -> bool:
         """Note whether the arm is at rest, as far as its motors answer; return whether one of them is silent."""
-        silent = [now - joint.time > self.limits.reply_timeout for joint in joints]
+        silent = [self.limits.silent(now, joint) for joint in joints]
         if any(silent):
             self._known = False  # it may have lost its power, and with it the turns of its encoder
         if any(

@@ -148,7 +148,7 @@ class CanBridge(LifecycleNode):
 
     def _publish(self, now: float, joints: Sequence[JointSample]) -> None:
         """Publish a joint state if every motor has answered lately: an unknown angle is never sent as a number."""
-        if any(now - joint.time > self._limits.reply_timeout for joint in joints):
+        if any(self._limits.silent(now, joint) for joint in joints):
             return
         message = self._joint_states
         message.position, message.velocity, message.effort, *_ = zip(*joints, strict=True)
@@ -224,7 +224,7 @@ class CanBridge(LifecycleNode):
         if safety.state is not State.DISABLED:
             return f"refused: the arm is {safety.state.value}, must be disabled"
         now = time.monotonic()
-        if any(now - joint.time > self._limits.reply_timeout for joint in self._loop.samples):
+        if any(self._limits.silent(now, joint) for joint in self._loop.samples):
             return "refused: a motor does not answer"
         if not safety.settled(now):
             return "refused: the arm is not at rest"
