@@ -16,6 +16,7 @@ from exo_gravity.core.anfis_law import AnfisLaw
 from exo_gravity.core.arm import JOINT_COUNT, MAX_TOTAL_MASS, ArmModel, four_floats, one_float
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.gravity import LAWS, Torque
+from exo_gravity.core.limits import MOST_EFFORT
 from exo_gravity.core.tilt import SIDES, Tilt
 
 MODES = ("one_g", "zero_g")
@@ -71,7 +72,7 @@ class Settings:
         one_float("max_total_mass", self.max_total_mass, 0.5, MAX_TOTAL_MASS, "kg")
         one_float("max_effort_rate", self.max_effort_rate, 1.0, 1000.0, "Nm/s")
         one_float("transition_time", self.transition_time, 0.2, 30.0, "s")
-        limit = tuple(four_floats("max_effort", self.max_effort, 0.0, 40.0, "Nm").tolist())
+        limit = tuple(four_floats("max_effort", self.max_effort, 0.0, MOST_EFFORT, "Nm").tolist())
         object.__setattr__(self, "max_effort", limit)
         # Combined whatever the mode, so that an impossible wearer is refused before somebody switches to zero_g.
         whole = self.robot.with_wearer(self.wearer_mass, self.wearer_cog, self.support)

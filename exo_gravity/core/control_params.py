@@ -9,7 +9,7 @@ from exo_gravity.core.anfis_law import AnfisLaw
 from exo_gravity.core.arm import MAX_GAIN, MAX_GRAVITY, MAX_LENGTH, MAX_MASS, MAX_TOTAL_MASS, STANDARD_GRAVITY, ArmModel
 from exo_gravity.core.compensator import LAW_NAMES, MODES, Settings
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.limits import Limits
+from exo_gravity.core.limits import MOST_EFFORT, Limits
 from exo_gravity.core.motors import MOTORS, JointMotor
 from exo_gravity.core.params import Param
 from exo_gravity.core.tilt import SIDES
@@ -78,7 +78,7 @@ COMPENSATOR = (
     Param("wearer.table", "de_leva", "table of segment masses and centres of gravity", choices=tuple(TABLES)),
     Param("wearer.segment_length", list(TYPICAL_LENGTH), "upper arm, forearm, hand in m", (0.0, 0.6)),
     Param("max_total_mass", 10.0, "most that may be carried in all, in kg", (0.5, MAX_TOTAL_MASS), fixed=True),
-    Param("max_effort", [3.0, 9.0, 3.0, 3.0], "largest torque per joint in Nm", (0.0, 40.0)),
+    Param("max_effort", [3.0, 9.0, 3.0, 3.0], "largest torque per joint in Nm", (0.0, MOST_EFFORT)),
     Param("max_effort_rate", 50.0, "fastest change of torque in Nm/s", (1.0, 1000.0)),
     Param("transition_time", 1.0, "time in s over which a change of mass, mode or law reaches the arm", (0.2, 30.0)),
     Param("use_imu", True, "false: the trunk counts as upright (the paper's seated wearer)", fixed=True),
