@@ -15,6 +15,7 @@ from sensor_msgs.msg import Imu
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import Param
+from exo_gravity.core.rate import Rate
 from exo_gravity.hardware.imu import ImuSample, TrunkEstimator, TrunkOrientation
 from exo_gravity.nodes.conversions import to_nanoseconds
 from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics
@@ -50,9 +51,9 @@ class ImuNode(Node):
             raise ParameterError("input_topic", values["input_topic"], "a topic that this node does not publish itself")
         self._estimator = TrunkEstimator(values["rotation_trunk_from_imu"], values["rate"])
         self._timeout = values["timeout"]
-        self._arrived = self._counted = time.monotonic()
-        self._received = self._received_before = self._published = self._refused = 0
-        self._rate = 0.0
+        self._arrived = time.monotonic()
+        self._received = self._published = self._refused = 0
+        self._rate = Rate()
         self._refusal: ParameterError | None = None  # since the last look
         self._last_refusal = "none"
         self._diagnostics = Diagnostics(self)
@@ -105,11 +106,8 @@ class ImuNode(Node):
     def _report(self) -> None:
         now = time.monotonic()
         age, refusal, self._refusal = now - self._arrived, self._refusal, None
-        if now - self._counted >= 1.0:
-            self._rate = (self._received - self._received_before) / (now - self._counted)
-            self._counted, self._received_before = now, self._received
         values = {
-            "rate (Hz)": f"{self._rate:.0f}",
+            "rate (Hz)": f"{self._rate.update(now, self._received):.0f}",
             "age (s)": f"{age:.3f}",
             "received": self._received,
             "published": self._published,

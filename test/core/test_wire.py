@@ -10,7 +10,6 @@ from exo_gravity.core.wire import (
     BITRATE,
     TYPICAL_COMMAND,
     TYPICAL_REPLY,
-    Rate,
     check_rate,
     frame_bits,
     load,
@@ -101,15 +100,3 @@ def test_a_rate_that_does_not_fit_is_refused_with_the_one_that_does():
 def test_what_is_no_rate_no_motors_or_no_reply_is_refused(rate, motors, reply_bytes):
     with pytest.raises(ParameterError):
         load(rate, motors, reply_bytes)
-
-
-def test_a_rate_is_counted_over_a_second_or_more_and_begins_anew_with_its_counter():
-    rate = Rate()
-    assert [rate.update(now, count) for now, count in ((10.0, 0), (10.5, 250), (11.0, 500), (11.1, 540))] == [
-        0.0,
-        0.0,
-        500.0,
-        500.0,
-    ]
-    assert rate.update(12.0, 3) == 0.0
-    assert rate.update(14.0, 203) == 100.0
