@@ -13,7 +13,13 @@ extras = {
     "sim": ["mujoco>=3.2"],
     "report": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11", "scipy>=1.11"],
     "validate": ["pin>=3.0", "roboticstoolbox-python>=1.1.1", "threadpoolctl>=3.0"],
-    "test": ["hypothesis>=6.100", "mcap-ros2-support>=0.5", "pytest>=8.0", "pytest-timeout>=2.3"],
+    "test": [
+        "hypothesis>=6.100",
+        "mcap-ros2-support>=0.5",
+        "pytest>=8.0",
+        "pytest-rerunfailures>=14.0",
+        "pytest-timeout>=2.3",
+    ],
 }
 
 setup(

@@ -26,8 +26,8 @@ CALM = 2.0  # s for which one that was let down must stay down, its inputs being
 DOWN = 40.0  # s until it must be down
 
 
-def play(row, stage, punctual):
-    """Do `row` to the carried arm on `stage`, and return its line of the table. punctual: judge lateness too."""
+def play(row, stage):
+    """Do `row` to the carried arm on `stage`; return its line of the table. On a punctual stage it may be too late."""
     stage.carry()
     said, told = stage.watcher.said, len(stage.log)
     since = time.time()
@@ -44,7 +44,7 @@ def play(row, stage, punctual):
         stage.watcher.until(stage.listener.switched_off, DOWN)
     end = time.monotonic() + CALM
     stage.watcher.until(lambda: time.monotonic() > end)
-    return _line(row, stage, since, result, stage.log[told:], punctual)
+    return _line(row, stage, since, result, stage.log[told:])
 
 
 def _result(row, stage):
@@ -54,7 +54,7 @@ def _result(row, stage):
     return status.split(": ")[1] if status.startswith("fault") else status
 
 
-def _line(row, stage, since, result, log, punctual):
+def _line(row, stage, since, result, log):
     frames = list(stage.listener.frames)
     whole = seen(frames, since, 1.0 / stage.rate)
     carried = result.startswith("active")
@@ -63,7 +63,7 @@ def _line(row, stage, since, result, log, punctual):
         for bad, text in (
             (not carried and whole.reaction is None, "not let down"),
             (carried and row.within is not None, "stayed carried"),
-            (punctual and row.within is not None and (whole.reaction or 0.0) > row.within, "too late"),
+            (stage.punctual and row.within is not None and (whole.reaction or 0.0) > row.within, "too late"),
             (whole.speed > SPEED, "too fast"),
             (whole.excess > 0.0, "torque step"),
             (whole.armed, "armed again"),
@@ -97,8 +97,12 @@ class Theatre:
             self._count += 1
             folder = self._folder / str(self._count)
             folder.mkdir()
-            self._stage = row.on(folder)
-        line = play(row, self._stage, self._punctual)
+            self._stage = row.on(folder, self._punctual)
+        try:
+            line = play(row, self._stage)
+        except BaseException:
+            self.close()  # wherever it stands
+            raise
         if row.spent or line["unsafe"]:  # a frozen compensator, or who knows what
             stage = self._stage
             self.close()

@@ -30,6 +30,11 @@ SEATED = {"compensator": {"use_imu": False}}  # starts at once: no IMU to wait f
 
 QUICK = {"sign_check_torque": 0.0, "fade_time": 0.5, "damping": 1.5}
 GENTLE = {"sign_check_torque": 0.0, "fade_time": 2.0, "damping": 5.0}
+# The longest ages that there may be: tests share a machine that is busy with others.
+PATIENT = {
+    "can_bridge": {"command_timeout": 0.1, "reply_timeout": 0.1},
+    "compensator": {"tilt_timeout": 0.5},
+}
 
 
 class Watcher:
@@ -48,14 +53,21 @@ class Watcher:
         self.node.create_subscription(JointState, f"{arm}/effort_commands", self.efforts.append, 1000)
         self.node.create_subscription(String, f"{arm}/wearer_step", self.wearer.append, 10)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
-        self._thread = threading.Thread(target=self.executor.spin, daemon=True)
+        self._closing = False
+        self._thread = threading.Thread(target=self._spin, daemon=True)
         self._thread.start()
 
     def close(self):
+        self._closing = True
+        self.executor.wake()
+        self._thread.join()
         self.executor.shutdown()
-        rclpy.try_shutdown(context=self.context)
-        self._thread.join(10)
         self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+    def _spin(self):
+        while not self._closing:
+            self.executor.spin_once()
 
     def _on_diagnostics(self, message):
         for status in message.status:
@@ -108,9 +120,23 @@ class Watcher:
     def wearer_does(self, action):
         return bool(self.wearer) and json.loads(self.wearer[-1].data)["action"] == action
 
+    def carry(self):
+        """Wait until the arm is carried. A machine that stutters lets it down, as it must: then arm it once more."""
+
+        def told(*states):
+            return any(self.said("can_bridge", state) for state in states)
+
+        self.until(lambda: told("active", "fault:", "disabled"))
+        while not told("active"):
+            if told("fault:"):
+                assert self.trigger("clear_fault").success
+                self.until(lambda: told("disabled"))
+            assert self.enable(True).success
+            self.until(lambda: told("active", "fault:"))
+
     def bring_to(self, trial):
         """Let the virtual wearer bring the carried arm where the protocol file `trial` says, and let go."""
-        self.until(lambda: self.said("can_bridge", "active"))
+        self.carry()
         self.wearer.clear()
         assert self.set("simulator", trial="").successful
         assert self.set("simulator", trial=str(trial)).successful
@@ -120,10 +146,11 @@ class Watcher:
 class Stack:
     """The nodes of a parameter file, changed as a test wants it, on a bus of its own.
 
-    Where a test does not ask for more, the start and the way down are made short: `QUICK`.
+    Where a test does not ask for more, the start and the way down are made short, `QUICK`, and, unless they are to be
+    `punctual`, the nodes patient.
     """
 
-    def __init__(self, folder, base="sim.yaml", without=(), port=None, **changes):
+    def __init__(self, folder, base="sim.yaml", without=(), port=None, punctual=False, **changes):
         content = yaml.safe_load((CONFIG / base).read_text())
         port = port or next(PORTS)
         for node in [node for node in content if node.split("/")[-1] in without]:
@@ -133,6 +160,8 @@ class Stack:
                 parameters["can"]["options"]["port"] = port
             if node.endswith("/can_bridge"):
                 parameters.update(QUICK)
+            if not punctual:
+                parameters.update(PATIENT.get(node.split("/")[-1], {}))
         for node, values in changes.items():
             content["/right/" + node if node != "imu" else "/imu"]["ros__parameters"].update(values)
         self.bus = {"interface": "udp_multicast", "channel": "239.74.163.2", "port": port, "hop_limit": 0}

@@ -1,7 +1,6 @@
 """The stages on which faults are played: which nodes run, in which processes, and who commands."""
 
 import math
-import shutil
 import subprocess
 import sys
 import time
@@ -12,7 +11,7 @@ from builtin_interfaces.msg import Time
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
-from stage import GENTLE, SEATED, Listener, Stack, Watcher
+from stage import CONFIG, GENTLE, SEATED, Listener, Stack, Watcher
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.tools.params import load
@@ -24,12 +23,15 @@ UPRIGHT = {"trunk": {"pitch": 0.0, "roll": 0.0}}
 
 
 class Stage:
-    """Nodes that carry the arm in a horizontal pose, seen from outside. Ended with `close`."""
+    """Nodes that carry the arm in a horizontal pose, seen from outside. Ended with `close`.
+
+    punctual: whether they have the time-outs that they are shipped with, or patience with a busy machine.
+    """
 
     rate = 250.0
 
-    def __init__(self, folder):
-        self.folder = Path(folder)
+    def __init__(self, folder, punctual=True):
+        self.folder, self.punctual = Path(folder), punctual
         self.pose = self.folder / "horizontal.yaml"
         self.pose.write_text(yaml.safe_dump(HORIZONTAL))
         self.watcher = Watcher()
@@ -39,31 +41,25 @@ class Stage:
             stack.start()
 
     def _stacks(self):
-        return [Stack(self.folder, can_bridge=GENTLE)]
+        return [self._stack(can_bridge=GENTLE)]
+
+    def _stack(self, **changes):
+        return Stack(self.folder, punctual=self.punctual, **changes)
 
     def carry(self):
         """Bring the arm to the pose, from whatever the last fault left. On a busy machine it may take a second try."""
-        self.watcher.until(lambda: self.watcher.joints and self.watcher.efforts)
+        watcher = self.watcher
+        watcher.until(lambda: watcher.joints and watcher.efforts)
         while not self._carried():
-            self.watcher.until(lambda: self._is("fault:") or self._is("disabled"))
+            watcher.until(lambda: watcher.said("can_bridge", "fault:"))
 
     def _carried(self):
         watcher = self.watcher
-        if self._is("fault:"):
-            assert watcher.trigger("clear_fault").success
-            watcher.until(lambda: self._is("disabled"))
-        if self._is("disabled"):
-            assert watcher.enable(True).success
-        watcher.until(lambda: self._is("active") or self._is("fault:"))
-        if self._is("active"):
-            watcher.bring_to(self.pose)
-            self.listener.frames.clear()
-            seen = len(watcher.joints)
-            watcher.until(lambda: len(watcher.joints) > seen + self.rate / 4)
-        return self._is("active")
-
-    def _is(self, state):
-        return self.watcher.said("can_bridge", state)
+        watcher.bring_to(self.pose)
+        self.listener.frames.clear()
+        seen = len(watcher.joints)
+        watcher.until(lambda: len(watcher.joints) > seen + self.rate / 4)
+        return watcher.said("can_bridge", "active")
 
     def process(self, node):
         """Return the process of a node by the last part of its name."""
@@ -90,8 +86,8 @@ class Split(Stage):
     """The compensator under a launcher of its own: its end does not end the rest."""
 
     def _stacks(self):
-        rest = Stack(self.folder, without=("compensator", "imu"), can_bridge=GENTLE, simulator=UPRIGHT)
-        return [rest, Stack(self.folder, without=("can_bridge", "simulator", "imu"), port=rest.bus["port"], **SEATED)]
+        rest = self._stack(without=("compensator", "imu"), can_bridge=GENTLE, simulator=UPRIGHT)
+        return [rest, self._stack(without=("can_bridge", "simulator", "imu"), port=rest.bus["port"], **SEATED)]
 
 
 class Commanded(Stage):
@@ -99,24 +95,19 @@ class Commanded(Stage):
 
     rate = 100.0
 
-    def __init__(self, folder):
-        super().__init__(folder)
+    def __init__(self, *given):
+        super().__init__(*given)
         self.spoil = lambda message: None
         node = self.watcher.node
-        parameters = load(self.stacks[0].path.parent / "params.yaml")["/right/compensator"]
+        parameters = load(CONFIG / "sim.yaml")["/right/compensator"]
         self._arm = ArmModel(*(parameters[name] for name in ("link_length", "robot.cog", "robot.mass")))
         self._publisher = node.create_publisher(JointState, "/right/effort_commands", 1)
         node.create_subscription(JointState, "/right/joint_states", self._answer, NEWEST)
         self.watcher.executor.wake()
 
     def _stacks(self):
-        whole = Stack(self.folder)
-        shutil.copy(whole.path, self.folder / "params.yaml")
-        return [
-            Stack(
-                self.folder, without=("compensator", "imu"), can_bridge=GENTLE | {"rate": self.rate}, simulator=UPRIGHT
-            )
-        ]
+        bridge = GENTLE | {"rate": self.rate}
+        return [self._stack(without=("compensator", "imu"), can_bridge=bridge, simulator=UPRIGHT)]
 
     def _answer(self, state):
         message = JointState(header=state.header, name=state.name)
@@ -132,8 +123,8 @@ class Commanded(Stage):
 class OtherClock(Stage):
     """The bridge's and the compensator's clock is ours: /clock, which goes wherever we set it."""
 
-    def __init__(self, folder):
-        super().__init__(folder)
+    def __init__(self, *given):
+        super().__init__(*given)
         self.shift = 0.0
         self._publisher = self.watcher.node.create_publisher(Clock, "/clock", 10)
         self.watcher.node.create_timer(0.002, self._tick)
@@ -142,7 +133,7 @@ class OtherClock(Stage):
     def _stacks(self):
         clock = {"use_sim_time": True}
         changes = {"compensator": clock | {"use_imu": False}, "can_bridge": clock | GENTLE, "simulator": UPRIGHT}
-        return [Stack(self.folder, without=("imu",), **changes)]
+        return [self._stack(without=("imu",), **changes)]
 
     def _tick(self):
         fraction, seconds = math.modf(time.time() + self.shift)
@@ -153,7 +144,7 @@ class Launched(Stage):
     """The launcher is a process of its own."""
 
     def _stacks(self):
-        return [_Process(Stack(self.folder, can_bridge=GENTLE))]
+        return [_Process(self._stack(can_bridge=GENTLE))]
 
 
 class _Process:

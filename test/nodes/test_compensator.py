@@ -20,6 +20,8 @@ from exo_gravity.core.wearer import Wearer
 from exo_gravity.nodes.conversions import to_nanoseconds, to_time
 from exo_gravity.tools.trial_offline import simulated_trials
 
+pytestmark = pytest.mark.real_time
+
 PARTS = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
 PROTOCOL = Protocol.parse({"name": "hold", "steps": [{"hold": 1.0}]})
 SEATED = {"use_imu": False}

@@ -4,6 +4,8 @@ import pytest
 from rows import ROWS
 from run import Theatre
 
+pytestmark = pytest.mark.real_time
+
 SHORT = [row for row in ROWS if row.short]
 
 

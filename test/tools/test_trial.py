@@ -329,6 +329,7 @@ PATIENT = {
 }
 
 
+@pytest.mark.real_time
 def test_a_recorder_that_is_killed_ends_the_trial_at_once_with_what_it_wrote(run, capsys, monkeypatch):
     class Killer(launcher.Launcher):
         """Kills the recorder two seconds into the hold."""
@@ -347,6 +348,7 @@ def test_a_recorder_that_is_killed_ends_the_trial_at_once_with_what_it_wrote(run
     assert "the recorder ended with exit code -9 before the trial was done" in capsys.readouterr().out
 
 
+@pytest.mark.real_time
 def test_over_ros_the_arm_holds_in_the_pose_that_it_has_offline(run):
     code, folder = run(changes=PATIENT)
     assert code == 0, (folder / "log.txt").read_text()
