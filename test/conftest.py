@@ -10,8 +10,8 @@ import os
 import time
 
 import pytest
+from clock import beat
 
-BEAT = 0.005  # s
 STALL = 0.03  # s between two beats
 
 os.environ["ROS_DOMAIN_ID"] = str(os.getpid() % 100 + 1)
@@ -22,24 +22,15 @@ class Stalled(AssertionError):
     """A test failed on a machine that stood still meanwhile."""
 
 
-def _beat(longest):
-    before = time.monotonic()
-    while True:
-        time.sleep(BEAT)
-        now = time.monotonic()
-        longest.value = max(longest.value, now - before)
-        before = now
-
-
 @pytest.fixture(scope="session")
 def longest_beat():
     """The longest time between two beats of the clock since it was set to 0, in s."""
     spawn = multiprocessing.get_context("spawn")
     longest = spawn.Value("d", 0.0)
-    clock = spawn.Process(target=_beat, args=(longest,), daemon=True)
+    clock = spawn.Process(target=beat, args=(longest,), daemon=True)
     clock.start()
     while not longest.value:
-        time.sleep(BEAT)
+        time.sleep(0.005)
     yield longest
     clock.terminate()
     clock.join()

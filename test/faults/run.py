@@ -103,7 +103,7 @@ class Theatre:
         except BaseException:
             self.close()  # wherever it stands
             raise
-        if row.spent or line["unsafe"]:  # a frozen compensator, or who knows what
+        if row.spent or line["unsafe"]:  # a dead compensator, or who knows what
             stage = self._stage
             self.close()
             line["log"] = stage.log[-20:] if line["unsafe"] else []

@@ -28,8 +28,8 @@ CONFIG = Path(__file__).parents[2] / "config"
 PORTS = itertools.count(20_000 + os.getpid() % 10_000)
 SEATED = {"compensator": {"use_imu": False}}  # starts at once: no IMU to wait for
 
-QUICK = {"sign_check_torque": 0.0, "fade_time": 0.5, "damping": 1.5}
-GENTLE = {"sign_check_torque": 0.0, "fade_time": 2.0, "damping": 5.0}
+QUICK = {"sign_check_torque": 0.0, "ramp_time": 0.5, "fade_time": 0.5, "damping": 1.5}
+GENTLE = QUICK | {"ramp_time": 1.0, "fade_time": 2.0, "damping": 5.0}
 # The longest ages that there may be: tests share a machine that is busy with others.
 PATIENT = {
     "can_bridge": {"command_timeout": 0.1, "reply_timeout": 0.1},
@@ -59,7 +59,6 @@ class Watcher:
 
     def close(self):
         self._closing = True
-        self.executor.wake()
         self._thread.join()
         self.executor.shutdown()
         self.node.destroy_node()
@@ -67,7 +66,7 @@ class Watcher:
 
     def _spin(self):
         while not self._closing:
-            self.executor.spin_once()
+            self.executor.spin_once(timeout_sec=0.1)
 
     def _on_diagnostics(self, message):
         for status in message.status:

@@ -76,15 +76,6 @@ def test_the_arm_stays_where_it_is_let_go_and_follows_live_changes_of_parameters
     assert np.abs(steps).max() <= 50.0 * 0.004 * 1.5
 
 
-def test_no_node_waits_for_another_ones_shared_memory(start, watcher):
-    stack = start(**SEATED)
-    watcher.carry()
-    for node in ("can_bridge", "compensator", "simulator"):
-        maps = Path(f"/proc/{stack.launcher.process(f'/right/{node}').pid}/maps").read_text()
-        assert "librmw_fastrtps" in maps
-        assert "fastrtps_port" not in maps
-
-
 def test_without_the_compensator_the_same_arm_falls(start, watcher, to_pose):
     start(without=("compensator", "imu"))
     watcher.until(lambda: watcher.said("can_bridge", "waiting for effort commands"))
@@ -107,12 +98,16 @@ def test_stopped_in_a_pose_the_arm_comes_down_gently_before_the_motors_are_switc
     assert listener.switched_off()
 
 
-@pytest.mark.parametrize("way_out", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_to_the_bridge_switches_the_motors_off_and_stops_everything(start, watcher, listen, way_out):
+def test_ctrl_c_to_the_bridge_switches_the_motors_off_and_stops_everything(start, watcher, listen):
     stack = start(**SEATED)
     listener = listen(stack)
     watcher.carry()
-    stack.launcher.process("/right/can_bridge").send_signal(way_out)
+    # Meanwhile: none of the nodes has mapped another one's shared memory, which it might wait for.
+    for node in ("can_bridge", "compensator", "simulator"):
+        maps = Path(f"/proc/{stack.launcher.process(f'/right/{node}').pid}/maps").read_text()
+        assert "librmw_fastrtps" in maps
+        assert "fastrtps_port" not in maps
+    stack.launcher.process("/right/can_bridge").send_signal(signal.SIGINT)
     watcher.until(lambda: stack.dead is not None)
     assert stack.dead == ("/right/can_bridge", 0)
     assert listener.switched_off()

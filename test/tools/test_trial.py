@@ -55,7 +55,7 @@ def changed(folder, changes):
     for node, entry in content.items():
         values = entry["ros__parameters"]
         if node == "/right/can_bridge":
-            values["sign_check_torque"] = 0.0  # it takes 3 s
+            values.update(sign_check_torque=0.0, ramp_time=0.5, fade_time=0.5, damping=1.5)  # seconds less
         elif node == "/right/simulator":
             values["trial_delay"] = 1.5
         values.update(changes.get(node, {}))
