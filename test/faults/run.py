@@ -22,7 +22,7 @@ from rich.table import Table
 from rows import ROWS
 
 WATCHED = 3.0  # s for which an arm that may stay carried is watched
-CALM = 2.0  # s for which one that was let down must stay down, its inputs being well again
+CALM = 1.0  # s for which one that was let down must stay down, its inputs being well again
 DOWN = 40.0  # s until it must be down
 
 

@@ -42,8 +42,9 @@ def listen():
         listener.close()
 
 
-def test_the_arm_stays_where_it_is_let_go_and_follows_live_changes_of_parameters(start, watcher, to_pose):
-    start()
+def test_the_arm_stays_where_it_is_let_go_follows_live_changes_and_comes_down_gently(start, watcher, to_pose, listen):
+    stack = start(can_bridge=GENTLE)
+    listener = listen(stack)
     watcher.bring_to(to_pose)
     left = watcher.position()
     seen = len(watcher.joints)
@@ -75,6 +76,13 @@ def test_the_arm_stays_where_it_is_let_go_and_follows_live_changes_of_parameters
     steps = np.diff([message.effort[2] for message in watcher.efforts])
     assert np.abs(steps).max() <= 50.0 * 0.004 * 1.5
 
+    # Stopped, it comes down gently before the motors are switched off.
+    watcher.joints.clear()
+    stack.stop()
+    assert max(max(map(abs, message.velocity)) for message in watcher.joints) < 1.0
+    assert abs(watcher.position()[2]) < 0.2  # what friction holds
+    assert listener.switched_off()
+
 
 def test_without_the_compensator_the_same_arm_falls(start, watcher, to_pose):
     start(without=("compensator", "imu"))
@@ -83,19 +91,6 @@ def test_without_the_compensator_the_same_arm_falls(start, watcher, to_pose):
     watcher.until(lambda: watcher.wearer_does("hold"))
     left = watcher.position()
     watcher.until(lambda: max(abs(a - b) for a, b in zip(watcher.position(), left, strict=True)) > math.radians(20))
-
-
-def test_stopped_in_a_pose_the_arm_comes_down_gently_before_the_motors_are_switched_off(
-    start, watcher, to_pose, listen
-):
-    stack = start(can_bridge=GENTLE, **SEATED)
-    listener = listen(stack)
-    watcher.bring_to(to_pose)
-    watcher.joints.clear()
-    stack.stop()
-    assert max(max(map(abs, message.velocity)) for message in watcher.joints) < 1.0
-    assert abs(watcher.position()[2]) < 0.2  # what friction holds
-    assert listener.switched_off()
 
 
 def test_ctrl_c_to_the_bridge_switches_the_motors_off_and_stops_everything(start, watcher, listen):
