@@ -32,7 +32,7 @@ from exo_gravity.core.safety import Drive, SafetyMachine
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.motor_bus import MotorBus, open_bus
 
-FROZEN = 0.08  # s without a note
+FROZEN = 0.08  # s without a note, while this process is running
 POLL = 0.01  # s
 OPENING = 1.0  # s for which a bus that can't be opened is tried again
 NOTE = struct.Struct("=7d")  # monotonic time, powered, damping, effort (4,)
@@ -86,13 +86,18 @@ def _watch(watched: int, memory: mmap.mmap, receiver: Connection, tell: Callable
         os.setpriority(os.PRIO_PROCESS, 0, -20)
     charge: Charge | None = None
     why = "died"
+    silence, looked, seen = 0.0, time.monotonic(), 0.0
     with contextlib.suppress(EOFError):
         while True:
             if receiver.poll(POLL):
                 charge = receiver.recv()
                 _load(charge.address[0])
             noted, powered, *_ = NOTE.unpack_from(memory)
-            if powered and time.monotonic() - noted > FROZEN:
+            now = time.monotonic()
+            # Where this process was not run either, the whole machine stood still, and the other one gets its chance.
+            silence = silence + min(now - looked, 2 * POLL) if powered and noted == seen else 0.0
+            looked, seen = now, noted
+            if silence > FROZEN:
                 why = f"did nothing for {FROZEN * 1000:.0f} ms, and was killed"
                 os.kill(watched, signal.SIGKILL)  # from here on it does nothing any more, even if it takes long to die
                 break

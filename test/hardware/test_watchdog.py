@@ -5,8 +5,10 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from dataclasses import replace
 from itertools import count, pairwise
+from pathlib import Path
 
 import can
 import pytest
@@ -28,8 +30,8 @@ import sys, time
 from exo_gravity.core.safety import OFF, Drive
 from exo_gravity.hardware.watchdog import Watchdog
 watchdog = Watchdog()
-print("carrying", flush=True)
 while True:
+    print("carrying", flush=True)
     watchdog.note(Drive((0.0,) * 4, 0.0, {powered}))
     time.sleep(0.01)
 """
@@ -75,16 +77,38 @@ def test_a_bus_that_can_not_be_opened_is_told():
     assert "CAN bus no_such_interface x" in told[0]
 
 
-@pytest.mark.parametrize(("powered", "number"), [(True, signal.SIGSTOP), (False, signal.SIGKILL)])
-def test_a_frozen_carrier_is_killed_and_one_with_its_motors_off_is_let_die(powered, number):
-    process = subprocess.Popen(
-        [sys.executable, "-c", CARRIER.format(powered=powered)], stdout=subprocess.PIPE, text=True
-    )
-    try:
-        assert process.stdout.readline() == "carrying\n"
-        os.kill(process.pid, number)
-        assert process.wait(30) == -signal.SIGKILL
-        assert process.stdout.read() == ""  # no charge to let down; ends when the watchdog, too, has ended
-    finally:
+@pytest.fixture
+def carry():
+    processes = []
+
+    def carry(powered):
+        command = [sys.executable, "-c", CARRIER.format(powered=powered)]
+        processes.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+        assert processes[-1].stdout.readline() == "carrying\n"
+        return processes[-1]
+
+    yield carry
+    for process in processes:
         process.kill()
+        process.wait()
         process.stdout.close()
+
+
+@pytest.mark.parametrize(("powered", "number"), [(True, signal.SIGSTOP), (False, signal.SIGKILL)])
+def test_a_frozen_carrier_is_killed_and_one_with_its_motors_off_is_let_die(carry, powered, number):
+    process = carry(powered)
+    os.kill(process.pid, number)
+    assert process.wait(30) == -signal.SIGKILL
+    for line in process.stdout:  # no charge to let down; it ends when the watchdog, too, has ended
+        assert line == "carrying\n"
+
+
+def test_where_the_whole_machine_stood_still_the_carrier_lives_on(carry):
+    process = carry(powered=True)
+    (children,) = Path(f"/proc/{process.pid}/task").glob(f"{process.pid}/children")
+    both = [process.pid, int(children.read_text().split()[0])]
+    for number in (signal.SIGSTOP, signal.SIGCONT):
+        for pid in both:
+            os.kill(pid, number)
+        time.sleep(0.3)  # three times as long as the watchdog is patient, stopped and going on
+    assert process.poll() is None
