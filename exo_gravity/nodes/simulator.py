@@ -27,7 +27,6 @@ from exo_gravity.sim import SimulatedImu, Wearer
 from exo_gravity.sim.params import SIMULATOR, device_of, imu_of, set_faults
 
 TRUNK_SPEED = 0.5  # rad/s at which the trunk goes to the tilt that was set
-STEP_PERIOD = 0.02  # s between two looks at what the wearer does
 
 
 def protocol_of(path: str) -> Protocol:
@@ -39,7 +38,11 @@ def protocol_of(path: str) -> Protocol:
 
 
 class Simulator(Node):
-    """The ROS shell around `sim.SimulatedDevice`, which runs in a thread of its own."""
+    """The ROS shell around `sim.SimulatedDevice`, which runs in a thread of its own.
+
+    What it publishes it publishes from that thread, while no motor has anything to answer: from another one it would
+    hold the interpreter's lock when a command comes, and motors that answer late are none.
+    """
 
     def __init__(self):
         super().__init__("simulator", automatically_declare_parameters_from_overrides=True)
@@ -53,7 +56,6 @@ class Simulator(Node):
         self._slip = 0.0
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._step_publisher = self.create_publisher(String, "wearer_step", latched)
-        self.create_timer(STEP_PERIOD, self._follow)
         self._start_trunk(values)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
@@ -72,7 +74,7 @@ class Simulator(Node):
 
     def _play(self) -> None:
         try:
-            self._device.run(self._bus, self._stopping.is_set)
+            self._device.run(self._bus, self._stopping.is_set, self._aside)
         except ExoGravityError as error:
             self.failure = error
 
@@ -82,7 +84,13 @@ class Simulator(Node):
         topic = values["imu.topic"]
         self._imu_publisher = self.create_publisher(Imu, topic, qos_profile_sensor_data) if topic else None
         self._trunk_period = 1.0 / rate
-        self.create_timer(self._trunk_period, self._move_trunk)
+        self._trunk_due = 0.0
+
+    def _aside(self, now: float) -> None:
+        if now >= self._trunk_due:
+            self._trunk_due = max(self._trunk_due, now - self._trunk_period) + self._trunk_period
+            self._follow()
+            self._move_trunk()
 
     def _move_trunk(self) -> None:
         device, most = self._device, TRUNK_SPEED * self._trunk_period

@@ -96,8 +96,13 @@ class SimulatedDevice:
         reply = motor.receive(data, arm.positions[joint], arm.velocities[joint], self.time)
         return None if reply is None else (motor.reply_id, reply)
 
-    def run(self, bus: can.BusABC, should_stop: Callable[[], bool]) -> None:
-        """Play the device on `bus` in real time until `should_stop()`. Raises BusError when the bus fails."""
+    def run(
+        self, bus: can.BusABC, should_stop: Callable[[], bool], aside: Callable[[float], None] = lambda now: None
+    ) -> None:
+        """Play the device on `bus` in real time until `should_stop()`. Raises BusError when the bus fails.
+
+        aside(now) is called, `now` in monotonic s, whenever every command has been answered, at least every 2 ms.
+        """
         outbox: list[tuple[float, Frame]] = []
         echoes = _Echoes()
         last = time.monotonic()
@@ -113,6 +118,8 @@ class SimulatedDevice:
                 reply = heapq.heappop(outbox)[1]
                 echoes.expect(reply)
                 _send(bus, reply)
+            if not outbox:
+                aside(last)
 
     def _catch_up(self, duration: float) -> None:
         self.slip += max(0.0, duration - MAX_CATCH_UP)
