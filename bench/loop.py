@@ -94,7 +94,8 @@ def run(kind: str, rate: float, both: bool, seconds: float, watch: Callable[[dic
         time.sleep(SETTLING)
         window = _window(processes, seconds, watch)
         if dead := launcher.dead():
-            raise RuntimeError(f"{dead[0]} ended in mid-run: {news.lines[-5:]}")
+            last = [line for _, line in news.lines if dead[0] in line][-5:]
+            raise RuntimeError(f"{dead[0]} ended in mid-run: {last}")
         stack.close()
         if any(listener.wait() for listener in listeners):
             raise RuntimeError("the listener lost frames: the machine is too busy to measure anything")

@@ -24,6 +24,10 @@ JOINT_NAMES = Param(
     fixed=True,
 )
 # fmt: off
+REAL_TIME_PARAMETERS = (
+    Param("thread_priority", 0, "SCHED_FIFO priority of the hot thread, if permitted; 0: none", (0, 99), fixed=True),
+    Param("lock_memory", False, "keep the process's memory from being paged out, where permitted", fixed=True),
+)
 # For `can_bridge` these are what it believes of the motors; for `simulator`, what is true.
 MOTOR_PARAMETERS = (
     Param("can.interface", "", "python-can interface, e.g. socketcan, udp_multicast", fixed=True, required=True),
@@ -58,6 +62,7 @@ CAN_BRIDGE = (
     Param("rate", 250.0, "control cycles per second, as many as fit on the wire", (20.0, 2000.0), fixed=True),
     *MOTOR_PARAMETERS,
     *LIMIT_PARAMETERS,
+    *REAL_TIME_PARAMETERS,
 )
 COMPENSATOR = (
     Param("side", "right", "which arm: its base is mirrored", choices=SIDES, fixed=True),
@@ -83,6 +88,7 @@ COMPENSATOR = (
     Param("transition_time", 1.0, "time in s over which a change of mass, mode or law reaches the arm", (0.2, 30.0)),
     Param("use_imu", True, "false: the trunk counts as upright (the paper's seated wearer)", fixed=True),
     Param("tilt_timeout", 0.08, "age of the trunk tilt in s after which the arm is let down", (0.01, 0.5)),
+    *REAL_TIME_PARAMETERS,
 )
 # fmt: on
 

@@ -59,6 +59,11 @@ class ControlLoop:
         """Ask for `effort` (4,) Nm, computed from joint states taken at `answers` (monotonic s). None withdraws."""
         self._asked = (effort, answers)
 
+    @property
+    def thread_id(self) -> int:
+        """The system's number of the thread, once it was started."""
+        return self._thread.native_id
+
     def order(self, function: Callable[[], Any]) -> Future:
         """Run `function` on the control thread between two cycles; the future has its result."""
         future: Future = Future()

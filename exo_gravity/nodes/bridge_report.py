@@ -1,4 +1,4 @@
-"""What `can_bridge` tells on /diagnostics: state, fault, limits that act, and how the loop and the wire are doing."""
+"""What `can_bridge` tells: in its log what it starts with, on /diagnostics state, fault, limits, loop and wire."""
 
 from __future__ import annotations
 
@@ -7,13 +7,33 @@ from collections.abc import Sequence
 
 from rclpy.node import Node
 
+from exo_gravity.core.limits import Limits
 from exo_gravity.core.rate import Rate
 from exo_gravity.core.safety import State
-from exo_gravity.core.wire import Load
+from exo_gravity.core.wire import Load, load
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics
+from exo_gravity.nodes.run import open_to_others
 
 RECENT = 2.0  # s for which a limit that acted is still named
+
+
+def introduce(node: Node, limits: Limits, wire: Load, rate: float) -> None:
+    """Log what the arm will be held to, what `rate` (Hz) asks of the wire, and who else could command the arm."""
+    log = node.get_logger()
+    efforts = ", ".join(f"{effort:g}" for effort in limits.max_effort)
+    log.info(
+        f"at most {efforts} Nm, {limits.max_effort_rate:g} Nm/s, {max(limits.max_velocity):g} rad/s, "
+        f"{limits.max_temperature:g} degC; efforts no older than {limits.command_timeout * 1000:.0f} ms"
+    )
+    worst = load(rate, len(limits.joint_names), worst=True)
+    log.info(
+        f"{rate:g} Hz load the bus with {wire.bits_per_second / 1000:.0f} kbit/s, {wire.share:.0%} of it, "
+        f"{worst.share:.0%} at worst; {int(wire.largest_rate)} Hz would fill it"
+    )
+    opening = open_to_others()
+    if opening:
+        log.warning(f"{opening}: other hosts can command this arm; set LOCALHOST, or enforce SROS2")
 
 
 class BridgeReport:

@@ -21,20 +21,22 @@ from exo_gravity.core.control_params import CAN_BRIDGE, OPTIONS, limits_of, moto
 from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.limits import JointSample
 from exo_gravity.core.safety import SafetyMachine, State
-from exo_gravity.core.wire import check_rate, load
+from exo_gravity.core.wire import check_rate
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.motor_bus import MotorBus, open_bus
 from exo_gravity.hardware.watchdog import Charge, Watchdog
-from exo_gravity.nodes.bridge_report import BridgeReport
+from exo_gravity.nodes.bridge_report import BridgeReport, introduce
 from exo_gravity.nodes.conversions import by_name, to_nanoseconds
 from exo_gravity.nodes.hot_path import HotPath
 from exo_gravity.nodes.params import bus_of, declare
-from exo_gravity.nodes.run import open_to_others, run
+from exo_gravity.nodes.real_time import ask_real_time
+from exo_gravity.nodes.run import run
 from exo_gravity.nodes.sole_publisher import SolePublisher
 
 # Taken by the control thread, each cycle: deep enough that a second commander is not overlooked.
 EFFORTS = QoSProfile(depth=8, reliability=ReliabilityPolicy.RELIABLE)
 REMEMBERED = 256  # joint states whose stamps are known: more than command_timeout holds at any rate
+PATIENCE = 0.2  # share of a cycle by which it may begin late, to wait for its efforts
 REPORT_PERIOD = 0.1  # s
 ZEROED = 0.02  # rad about 0 that a motor may report after set_zero
 ZERO_TIMEOUT = 3.0  # s: motors are deaf for up to 1.5 s while they write their memory
@@ -52,8 +54,10 @@ class CanBridge(LifecycleNode):
         self._motors = motors_of(values)
         self._limits = limits_of(values)
         self._period = 1.0 / values["rate"]
+        self._real_time = values["thread_priority"], values["lock_memory"]
         self._wire = check_rate(values["rate"], len(self._motors))
-        self._answers = -math.inf  # when the joint states of the newest efforts were taken
+        # When the joint states of the newest efforts were taken, and those that were published last, monotonic s.
+        self._answers = self._asked = -math.inf
         self._watchdog = Watchdog()
         self._watchdog.guard(Charge(self._address, self._motors, self._limits, self._period))
         self._bus: MotorBus | None = None
@@ -69,28 +73,11 @@ class CanBridge(LifecycleNode):
         self.create_service(Trigger, "~/clear_fault", self._on_clear_fault)
         self.create_service(Trigger, "~/set_zero", self._on_set_zero)
         self.create_timer(REPORT_PERIOD, self._report)
-        self._introduce()
+        introduce(self, self._limits, self._wire, values["rate"])
         if values["autostart"]:
             self._open()
             self.trigger_configure()
             self.trigger_activate()
-
-    def _introduce(self) -> None:
-        """Say what the arm will be held to, before it is armed, and who else could command it."""
-        limits, log = self._limits, self.get_logger()
-        efforts = ", ".join(f"{effort:g}" for effort in limits.max_effort)
-        log.info(
-            f"at most {efforts} Nm, {limits.max_effort_rate:g} Nm/s, {max(limits.max_velocity):g} rad/s, "
-            f"{limits.max_temperature:g} degC; efforts no older than {limits.command_timeout * 1000:.0f} ms"
-        )
-        rate, wire, worst = 1.0 / self._period, self._wire, load(1.0 / self._period, len(self._motors), worst=True)
-        log.info(
-            f"{rate:g} Hz load the bus with {wire.bits_per_second / 1000:.0f} kbit/s, {wire.share:.0%} of it, "
-            f"{worst.share:.0%} at worst; {int(wire.largest_rate)} Hz would fill it"
-        )
-        opening = open_to_others()
-        if opening:
-            log.warning(f"{opening}: other hosts can command this arm; set LOCALHOST, or enforce SROS2")
 
     # Lifecycle
 
@@ -106,10 +93,11 @@ class CanBridge(LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start the control loop and arm, once the start gate is passed."""
         safety = SafetyMachine(self._limits, self._period)
-        self._loop = ControlLoop(self._bus, safety, self._period, self._publish, before_cycle=self._efforts.poll)
+        self._loop = ControlLoop(self._bus, safety, self._period, self._publish, before_cycle=self._take_efforts)
         self._bus = None  # the loop's from now on
         self._loop.order(lambda: self._loop.safety.enable(time.monotonic()))
         self._loop.start()
+        ask_real_time(self, self._real_time, self._loop.thread_id)
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -146,6 +134,12 @@ class CanBridge(LifecycleNode):
 
     # Control thread
 
+    def _take_efforts(self) -> None:
+        """Take the answer to the last joint state; the cycle waits a little for one that is late."""
+        self._efforts.poll()
+        if self._answers < self._asked:
+            self._efforts.poll(PATIENCE * self._period)
+
     def _publish(self, now: float, joints: Sequence[JointSample]) -> None:
         """Publish a joint state if every motor has answered lately: an unknown angle is never sent as a number."""
         if any(self._limits.silent(now, joint) for joint in joints):
@@ -153,7 +147,8 @@ class CanBridge(LifecycleNode):
         message = self._joint_states
         message.position, message.velocity, message.effort, *_ = zip(*joints, strict=True)
         message.header.stamp = self.get_clock().now().to_msg()
-        self._published[to_nanoseconds(message.header.stamp)] = min(joint.time for joint in joints)
+        self._asked = min(joint.time for joint in joints)
+        self._published[to_nanoseconds(message.header.stamp)] = self._asked
         if len(self._published) > REMEMBERED:
             self._published.popitem(last=False)
         self._publisher.publish(message)
@@ -171,12 +166,10 @@ class CanBridge(LifecycleNode):
             loop.trip_if_carried("second_commander", "more than one publisher of effort_commands")
         elif answers is None:
             self._refusal = f"stamp {to_nanoseconds(message.header.stamp)} ns answers no joint state of this bridge"
-        elif not message.effort:
-            loop.ask(None, answers)
         else:
+            self._answers = answers
             try:
-                loop.ask(by_name(message, "effort", self._names), answers)
-                self._answers = answers
+                loop.ask(by_name(message, "effort", self._names) if message.effort else None, answers)
             except ParameterError as error:
                 self._refusal = str(error)
                 loop.trip("command_impossible", f"effort_commands: {error.name} must be {error.expected}")

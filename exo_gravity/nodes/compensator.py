@@ -29,6 +29,7 @@ from exo_gravity.nodes.conversions import by_name
 from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics
 from exo_gravity.nodes.hot_path import HotPath
 from exo_gravity.nodes.params import changed, declare, prepared
+from exo_gravity.nodes.real_time import ask_real_time
 from exo_gravity.nodes.run import run
 from exo_gravity.nodes.sole_publisher import SolePublisher
 
@@ -75,6 +76,7 @@ class CompensatorNode(Node):
         self.create_timer(0.5, self._report)
         self._log(self._compensator.settings)
         self._joint_states.start()
+        ask_real_time(self, (values["thread_priority"], values["lock_memory"]), self._joint_states.thread_id)
 
     @property
     def failure(self) -> Exception | None:

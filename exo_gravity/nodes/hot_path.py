@@ -17,7 +17,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-PATIENCE = 100_000_000  # ns between two looks at whether to stop
+PATIENCE = 0.1  # s between two looks at whether to stop
 
 
 class Unexecuted(CallbackGroup):
@@ -57,9 +57,16 @@ class HotPath:
         if self._wait_set is not None:
             self._thread.start()
 
-    def poll(self) -> None:
-        """Call back for every message that waits, on the caller's thread."""
+    @property
+    def thread_id(self) -> int | None:
+        """The system's number of the thread, None where there is none."""
+        return self._thread.native_id
+
+    def poll(self, timeout: float = 0.0) -> None:
+        """Call back for every message that waits, on the caller's thread; wait for one for up to `timeout` s."""
         subscription = self._subscription
+        if timeout > 0.0 and self._wait_set is not None:
+            self._wait(timeout)
         while (item := self._take(subscription.msg_type, False)) is not None:
             self._callback(*item)
 
@@ -70,13 +77,15 @@ class HotPath:
             self._thread.join()
 
     def _run(self) -> None:
-        wait_set, handle = self._wait_set, self._subscription.handle
         try:
-            with handle:
-                while not self._stopping:
-                    wait_set.clear_entities()
-                    wait_set.add_subscription(handle)
-                    wait_set.wait(PATIENCE)
-                    self.poll()
+            while not self._stopping:
+                self.poll(PATIENCE)
         except Exception as error:
             self.failure = error
+
+    def _wait(self, timeout: float) -> None:
+        wait_set, handle = self._wait_set, self._subscription.handle
+        with handle:
+            wait_set.clear_entities()
+            wait_set.add_subscription(handle)
+            wait_set.wait(int(timeout * 1e9))

@@ -1,8 +1,10 @@
 """The compensator as a process of its own, fed with joint states by the test: whatever is set live, and both arms."""
 
 import math
+import os
 import random
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -155,6 +157,17 @@ def test_what_is_impossible_is_refused_with_a_sentence_and_nothing_is_changed(st
         assert sentence in result.reason
     assert dumped(watcher, ["/right/compensator"]) == before
     assert watcher.set("compensator", support=0).successful  # a whole number is a number
+
+
+def test_a_real_time_thread_and_locked_memory_are_had_where_they_are_permitted_and_told_where_not(start, watcher):
+    stack = start(without=ALONE, compensator={**SEATED, "thread_priority": 10, "lock_memory": True})
+    watcher.until(lambda: watcher.said("compensator", "waiting for joint_states"))
+    process = Path(f"/proc/{stack.launcher.process('/right/compensator').pid}")
+    policies = [os.sched_getscheduler(int(thread.name)) for thread in (process / "task").iterdir()]
+    locked = "VmLck:\t       0 kB" not in (process / "status").read_text()
+    told = "\n".join(stack.log)
+    assert (policies.count(os.SCHED_FIFO) == 1) != ("thread_priority 10 is not permitted" in told)
+    assert locked != ("lock_memory is not permitted" in told)
 
 
 def largest_excess(commands, rate):
