@@ -54,7 +54,7 @@ def pytest_pyfunc_call(pyfuncitem):
         longest.value = 0.0
     try:
         return (yield)
-    except AssertionError as error:
+    except Exception as error:
         if longest is not None and longest.value > STALL:
             raise Stalled(f"the machine stood still for {longest.value:.3f} s: {error}") from error
         raise

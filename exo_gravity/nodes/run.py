@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from exo_gravity.core.errors import ExoGravityError
 
+LOOK = 0.1  # s between two looks at whether a node is still needed
 CLOSING = 5  # s that the middleware may take to close
 SWITCH_INTERVAL = 2e-4  # s that a thread back from the bus may have to wait for the interpreter; Python's own is 5 ms
 
@@ -56,14 +58,13 @@ def run(make_node: Callable[[], Node], priority: int = 0, args: list[str] | None
     priority: 1..20, how much nicer than others the system is asked to be to this node, where the user may ask that.
     Not SCHED_FIFO: four such nodes can fill a core, and Linux then stops them all for 50 ms a second.
 
-    A node may have `close()`, called on every way out, and `failure`, an exception found in a thread of its own.
+    A node may have `close()`, called on every way out, `failure`, an exception found in a thread of its own, and
+    `needed`: as long as it is true the node outlives a launcher that died.
     """
     keep_to_this_machine()
     ending: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda received, _: ending.append(received))
-    if os.environ.get("EXO_GRAVITY_SUPERVISED"):  # end with the launcher, which holds our standard input open
-        threading.Thread(target=lambda: ending.append(len(sys.stdin.read())), daemon=True).start()
     if priority:
         with contextlib.suppress(PermissionError):  # then the node runs like any other process
             os.setpriority(os.PRIO_PROCESS, 0, -priority)
@@ -74,6 +75,8 @@ def run(make_node: Callable[[], Node], priority: int = 0, args: list[str] | None
     except (ExoGravityError, RuntimeError) as error:  # RuntimeError: rcl could not read its own arguments
         get_logger(executable).fatal(str(error))
         os._exit(2)  # without closing Fast DDS: it can hang when it is closed while it discovers others
+    if os.environ.get("EXO_GRAVITY_SUPERVISED"):
+        threading.Thread(target=_end_with_launcher, args=(node, ending), daemon=True).start()
     gc.collect()
     gc.freeze()  # what was imported stays: later collections need not look at it
     sys.setswitchinterval(SWITCH_INTERVAL)
@@ -95,3 +98,11 @@ def run(make_node: Callable[[], Node], priority: int = 0, args: list[str] | None
         executor.shutdown()
         node.destroy_node()
         rclpy.try_shutdown()
+
+
+def _end_with_launcher(node: Node, ending: list[int]) -> None:
+    """Wait until the launcher, which holds our standard input open, is no more."""
+    sys.stdin.read()
+    while getattr(node, "needed", False):
+        time.sleep(LOOK)
+    ending.append(0)

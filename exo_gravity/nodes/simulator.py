@@ -66,6 +66,11 @@ class Simulator(Node):
         self._thread = threading.Thread(target=self._play, name="device", daemon=True)
         self._thread.start()
 
+    @property
+    def needed(self) -> bool:
+        """Whether a motor is on: a real device does not vanish from under a bridge that lets its arm down."""
+        return any(motor.entered for motor in self._device.motors)
+
     def close(self) -> None:
         """Stop the device and close its bus."""
         self._stopping.set()
