@@ -33,10 +33,13 @@ TICKS = os.sysconf("SC_CLK_TCK")
 
 @dataclass(frozen=True)
 class Result:
-    """One run. arms: what was seen of each. cpu: share of a core by process. start: s from launch to carried."""
+    """One run. arms: what was seen of each. cpu: share of a core by process; stolen: the same, of what the hypervisor
+    gave to others. start: s from launch to carried.
+    """
 
     arms: list[Loop]
     cpu: dict[str, float]
+    stolen: float
     start: float
 
 
@@ -96,6 +99,8 @@ def run(kind: str, rate: float, both: bool, seconds: float, watch: Callable[[dic
         if dead := launcher.dead():
             last = [line for _, line in news.lines if dead[0] in line][-5:]
             raise RuntimeError(f"{dead[0]} ended in mid-run: {last}")
+        if fault := news.find("letting down"):
+            raise RuntimeError(f"the arm was let down in mid-run: {fault}")
         stack.close()
         if any(listener.wait() for listener in listeners):
             raise RuntimeError("the listener lost frames: the machine is too busy to measure anything")
@@ -104,18 +109,19 @@ def run(kind: str, rate: float, both: bool, seconds: float, watch: Callable[[dic
             with np.load(file) as frames:
                 cycles = cycles_of(dict(frames), arm.motors, *window[:2])
             loops.append(analyse(cycles, arm.motors, arm.law, 1.0 / rate))
-        return Result(loops, window[2], start)
+        return Result(loops, *window[2:], start)
 
 
-def _window(processes: dict[str, int], seconds: float, watch) -> tuple[float, float, dict[str, float]]:
-    """Let `seconds` pass; return begin and end (s since 1970) and each process's share of a core."""
-    before, begin = {name: _cpu(pid) for name, pid in processes.items()}, time.time()
+def _window(processes: dict[str, int], seconds: float, watch) -> tuple[float, float, dict[str, float], float]:
+    """Let `seconds` pass; return begin and end (s since 1970), each process's share of a core, and what was stolen."""
+    before, stolen, begin = {name: _cpu(pid) for name, pid in processes.items()}, _stolen(), time.time()
     if watch:
         watch(processes)
     else:
         time.sleep(seconds)
     end = time.time()
-    return begin, end, {name: (_cpu(pid) - before[name]) / (end - begin) for name, pid in processes.items()}
+    shares = {name: (_cpu(pid) - before[name]) / (end - begin) for name, pid in processes.items()}
+    return begin, end, shares, (_stolen() - stolen) / (end - begin)
 
 
 def _parts(kind: str, params: str, space: str, rate: float) -> list[tuple[str, ...]]:
@@ -143,6 +149,11 @@ def _cpu(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / TICKS
 
 
+def _stolen() -> float:
+    """Return the processor time in s that a hypervisor has given to others, of all cores together."""
+    return int(Path("/proc/stat").read_text().split("\n", 1)[0].split()[8]) / TICKS
+
+
 class _News:
     """The nodes' log, and a way to wait for a line of it."""
 
@@ -158,6 +169,10 @@ class _News:
     def first(self, text: str) -> float:
         """Return when a line that ends with `text` came, infinity if none did."""
         return next((when for when, line in self.lines if line.replace("INFO ", "").endswith(text)), float("inf"))
+
+    def find(self, text: str) -> str:
+        """Return the first line that has `text`, or ''."""
+        return next((line for _, line in self.lines if text in line), "")
 
     def wait(self, launcher: Launcher, text: str, count: int) -> None:
         """Wait until `count` lines have `text`."""

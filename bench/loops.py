@@ -16,6 +16,8 @@ RATES = (("one arm", False, 200), ("one arm", False, 500), ("one arm", False, 10
 QUICK = (RATES[1], RATES[3])
 RAMP = 1.0  # s, can_bridge's ramp_time
 KINDS = ("nodes", "python", "rclpy")
+TRIES = 3
+QUIET = 0.01  # share of a core that a hypervisor may give to others in a run that counts as quiet
 PARTS = 5  # of the time, whose least and largest figure are the spread
 
 
@@ -26,16 +28,30 @@ def loops(quick: bool, progress: Callable[[str], None]) -> Iterator[Row]:
         results = {}
         for kind in KINDS:
             progress(f"loop, {arms}, {rate} Hz: {kind}")
-            try:
-                results[kind] = run(kind, rate, both, 5.0 if quick else 20.0)
-            except RuntimeError as error:  # it did not get as far as to carry the arm: what that says is the row
-                progress(f"loop, {arms}, {rate} Hz: {kind}: {error}")
+            if result := _quietest(kind, rate, both, 5.0 if quick else 20.0, progress):
+                results[kind] = result
         yield from _rows(f"loop, {arms}, {rate} Hz", rate, results)
         if "nodes" in results:
             starts.append(results["nodes"].start)
     if starts:
         median = float(np.median(starts))
         yield Row("start, launch to active: the checks and the ramp", median, CALM + RAMP, "s", _ends(starts))
+
+
+def _quietest(kind: str, rate: int, both: bool, seconds: float, progress: Callable[[str], None]) -> Result | None:
+    """Return the run in which the hypervisor took least, of no more than `TRIES`; None if none carried the arm."""
+    best = None
+    for _ in range(TRIES):
+        try:
+            result = run(kind, rate, both, seconds)
+        except RuntimeError as error:
+            progress(f"  {error}")
+            continue
+        best = result if best is None or result.stolen < best.stolen else best
+        if best.stolen <= QUIET:
+            break
+        progress(f"  the hypervisor took {100 * result.stolen:.1f}% of a core")
+    return best
 
 
 def _rows(name: str, rate: int, results: dict[str, Result]) -> Iterator[Row]:
@@ -57,6 +73,7 @@ def _rows(name: str, rate: int, results: dict[str, Result]) -> Iterator[Row]:
     for what in ("missed", "incomplete", "lost"):
         percents = [100.0 * getattr(arm, what) / arm.cycles for arm in ours.arms]
         yield Row(f"{name}, {what}: limit", float(np.mean(percents)), allowed, "%", _ends(percents))
+    yield Row(f"{name}, taken by the hypervisor: quiet", 100.0 * ours.stolen, 100.0 * QUIET, "%")
     yield from _cpu(name, results)
 
 
