@@ -36,7 +36,7 @@ from exo_gravity.nodes.sole_publisher import SolePublisher
 # Taken by the control thread, each cycle: deep enough that a second commander is not overlooked.
 EFFORTS = QoSProfile(depth=8, reliability=ReliabilityPolicy.RELIABLE)
 REMEMBERED = 256  # joint states whose stamps are known: more than command_timeout holds at any rate
-PATIENCE = 0.2  # share of a cycle by which it may begin late, to wait for its efforts
+PATIENCE = 0.3  # share of a cycle by which it may begin late, to wait for its efforts
 REPORT_PERIOD = 0.1  # s
 ZEROED = 0.02  # rad about 0 that a motor may report after set_zero
 ZERO_TIMEOUT = 3.0  # s: motors are deaf for up to 1.5 s while they write their memory

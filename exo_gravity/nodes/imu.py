@@ -144,4 +144,4 @@ def _vector(message) -> tuple[float, float, float]:
 
 def main() -> None:
     """Entry point of the executable `imu`."""
-    raise SystemExit(run(ImuNode, priority=15))
+    raise SystemExit(run(ImuNode, priority=5))
