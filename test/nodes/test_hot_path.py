@@ -87,6 +87,19 @@ def test_a_poll_takes_everything_that_waits_and_the_publishers_numbers_with_it(m
     assert {thread for _, _, thread in pair.came} == {threading.current_thread().name}
 
 
+def test_a_poll_waits_for_a_message_but_no_longer_than_it_is_told(make):
+    pair = make()
+    pair.hot.poll(0.01)
+    assert pair.came == []
+    sender = threading.Timer(0.05, pair.send, "a")
+    sender.start()
+    begin = time.monotonic()
+    pair.hot.poll(20.0)
+    assert pair.texts() == ["a"]
+    assert time.monotonic() - begin < 20.0
+    sender.join()
+
+
 def test_the_executor_leaves_the_messages_alone(make):
     pair = make()
     pair.send("a")

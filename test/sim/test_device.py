@@ -285,6 +285,31 @@ def test_a_bus_that_fails_ends_the_run_with_a_bus_error():
         make_device().run(bus, lambda: False)
 
 
+class BusyBus:
+    """A bus on which four commands come at once; keeps the order of what happens."""
+
+    def __init__(self):
+        self.happened = []
+        self._waiting = [frame(can_id, command(can_id - 1)) for can_id in (1, 2, 3, 4)]
+
+    def recv(self, timeout):
+        if self._waiting:
+            return self._waiting.pop(0)
+        time.sleep(timeout)
+
+    def send(self, message):
+        self.happened.append(message.data[0])
+
+    def aside(self, now):
+        self.happened.append("aside")
+
+
+def test_what_else_is_to_do_waits_until_every_command_has_been_answered():
+    bus = BusyBus()
+    make_device().run(bus, lambda: "aside" in bus.happened, bus.aside)
+    assert sorted(bus.happened[:-1]) == [1, 2, 3, 4]
+
+
 # The clock, with one that the test turns
 
 
