@@ -16,6 +16,7 @@ RATES = (("one arm", False, 200), ("one arm", False, 500), ("one arm", False, 10
 QUICK = (RATES[1], RATES[3])
 RAMP = 1.0  # s, can_bridge's ramp_time
 KINDS = ("nodes", "python", "rclpy")
+PEERS = ("python", "Python without ROS"), ("rclpy", "bare rclpy")
 TRIES = 3
 QUIET = 0.01  # share of a core that a hypervisor may give to others in a run that counts as quiet
 PARTS = 5  # of the time, whose least and largest figure are the spread
@@ -62,7 +63,7 @@ def _rows(name: str, rate: int, results: dict[str, Result]) -> Iterator[Row]:
     ours = results["nodes"]
     for share in (50, 99, 99.9):
         figure, spread = _latency(ours, share)
-        for kind, peer in (("python", "Python without ROS"), ("rclpy", "bare rclpy")):
+        for kind, peer in PEERS:
             if kind in results:
                 yield Row(f"{name}, p{share:g}: {peer}", figure, _latency(results[kind], share)[0], "ms", spread)
         if share == 99:
@@ -71,8 +72,12 @@ def _rows(name: str, rate: int, results: dict[str, Result]) -> Iterator[Row]:
     for share in (99, 99.9):
         yield Row(f"{name}, spacing p{share:g}: one period", percentile(spacing, share), period, "ms")
     for what in ("missed", "incomplete", "lost"):
-        percents = [100.0 * getattr(arm, what) / arm.cycles for arm in ours.arms]
+        percents = _percents(ours, what)
         yield Row(f"{name}, {what}: limit", float(np.mean(percents)), allowed, "%", _ends(percents))
+        for kind, peer in PEERS:
+            if kind in results:
+                theirs = float(np.mean(_percents(results[kind], what)))
+                yield Row(f"{name}, {what}: {peer}", float(np.mean(percents)), theirs, "%", _ends(percents))
     yield Row(f"{name}, taken by the hypervisor: quiet", 100.0 * ours.stolen, 100.0 * QUIET, "%")
     yield from _cpu(name, results)
 
@@ -90,6 +95,11 @@ def _cpu(name: str, results: dict[str, Result]) -> Iterator[Row]:
 
 def _share(result: Result, part: str) -> float:
     return sum(100.0 * used for full, used in result.cpu.items() if full.endswith(f"/{part}"))
+
+
+def _percents(result: Result, what: str) -> list[float]:
+    """Return the share of cycles, in percent of each arm's, that were `what`: missed, incomplete or lost."""
+    return [100.0 * getattr(arm, what) / arm.cycles for arm in result.arms]
 
 
 def _latency(result: Result, share: float) -> tuple[float, str]:
