@@ -36,7 +36,8 @@ from exo_gravity.nodes.sole_publisher import SolePublisher
 # Taken by the control thread, each cycle: deep enough that a second commander is not overlooked.
 EFFORTS = QoSProfile(depth=8, reliability=ReliabilityPolicy.RELIABLE)
 REMEMBERED = 256  # joint states whose stamps are known: more than command_timeout holds at any rate
-PATIENCE = 0.3  # share of a cycle by which it may begin late, to wait for its efforts
+PATIENCE = 0.5  # share of the time that a cycle's exchange leaves, for which its efforts are waited for
+SMOOTHING = 0.02  # of the time that an exchange takes, a cycle
 REPORT_PERIOD = 0.1  # s
 ZEROED = 0.02  # rad about 0 that a motor may report after set_zero
 ZERO_TIMEOUT = 3.0  # s: motors are deaf for up to 1.5 s while they write their memory
@@ -58,6 +59,7 @@ class CanBridge(LifecycleNode):
         self._wire = check_rate(values["rate"], len(self._motors))
         # When the joint states of the newest efforts were taken, and those that were published last, monotonic s.
         self._answers = self._asked = -math.inf
+        self._began, self._exchange = 0.0, self._period  # when the exchange began, and how long one takes, in s
         self._watchdog = Watchdog()
         self._watchdog.guard(Charge(self._address, self._motors, self._limits, self._period))
         self._bus: MotorBus | None = None
@@ -138,10 +140,12 @@ class CanBridge(LifecycleNode):
         """Take the answer to the last joint state; the cycle waits a little for one that is late."""
         self._efforts.poll()
         if self._answers < self._asked:
-            self._efforts.poll(PATIENCE * self._period)
+            self._efforts.poll(PATIENCE * (self._period - self._exchange))
+        self._began = time.monotonic()
 
     def _publish(self, now: float, joints: Sequence[JointSample]) -> None:
         """Publish a joint state if every motor has answered lately: an unknown angle is never sent as a number."""
+        self._exchange += SMOOTHING * (now - self._began - self._exchange)
         if any(self._limits.silent(now, joint) for joint in joints):
             return
         message = self._joint_states

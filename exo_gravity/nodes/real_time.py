@@ -24,6 +24,4 @@ def ask_real_time(node: Node, asked: tuple[int, bool], thread: int | None) -> No
         except PermissionError:
             node.get_logger().warning(f"thread_priority {priority} is not permitted here: it needs an rtprio limit")
     if lock_memory and ctypes.CDLL(None).mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT):
-        node.get_logger().warning(
-            "lock_memory is not permitted here: it needs a higher memlock limit"
-        )
+        node.get_logger().warning("lock_memory is not permitted here: it needs a higher memlock limit")
