@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import threading
+from collections import deque
 from pathlib import Path
 
 import yaml
@@ -18,7 +19,7 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import String
 
 from exo_gravity.core.control_params import OPTIONS
-from exo_gravity.core.errors import ExoGravityError, ParameterError
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.protocol import Protocol
 from exo_gravity.hardware.motor_bus import open_bus
 from exo_gravity.nodes.params import bus_of, changed, declare
@@ -52,6 +53,7 @@ class Simulator(Node):
         self._delay = values["trial_delay"]
         self._trunk = (values["trunk.pitch"], values["trunk.roll"])
         self._wearer: Wearer | None = None
+        self._ordered: deque[Protocol] = deque()  # by a parameter, for the device's thread to begin
         self._told = None
         self._slip = 0.0
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -59,7 +61,7 @@ class Simulator(Node):
         self._start_trunk(values)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
-        self.failure: ExoGravityError | None = None  # run() ends the node for it
+        self.failure: Exception | None = None  # run() ends the node for it
         self._stopping = threading.Event()
         self._bus = open_bus(*bus_of(self, values))
         self.get_logger().info(f"simulated {values['side']} arm on {self._bus.channel_info}")
@@ -80,7 +82,7 @@ class Simulator(Node):
     def _play(self) -> None:
         try:
             self._device.run(self._bus, self._stopping.is_set, self._aside)
-        except ExoGravityError as error:
+        except Exception as error:
             self.failure = error
 
     def _start_trunk(self, values: dict) -> None:
@@ -126,6 +128,8 @@ class Simulator(Node):
         if device.slip > self._slip:
             self.get_logger().warning(f"fell {(device.slip - self._slip) * 1000:.0f} ms behind real time")
             self._slip = device.slip
+        while self._ordered:
+            self._begin(self._ordered.popleft(), 0.0)
         if self._protocol and self._wearer is None and all(motor.entered for motor in device.motors):
             self._begin(self._protocol, self._delay)
         if self._wearer is None or self._wearer.step == self._told:
@@ -157,7 +161,7 @@ class Simulator(Node):
         self._trunk = (values["trunk.pitch"], values["trunk.roll"])
         set_faults(self._device, values)
         if any(change.name == "trial" for change in changes) and values["trial"]:
-            self._begin(protocol_of(values["trial"]), 0.0)
+            self._ordered.append(protocol_of(values["trial"]))
 
 
 def main() -> None:
