@@ -11,7 +11,7 @@ coordinate after the other until it gets no worse.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +25,7 @@ from exo_gravity.core.wearer import LinkLoad
 USUAL_TILT = 20.0  # deg of pitch and roll that a trunk is counted on to do, either way
 SAMPLES = 50_000  # shares to within 0.5 %
 STARTS = 5  # poses from which a worst one is sought: one blind alley does no harm
+PIECE = 2_000  # poses, about 1 ms of arithmetic
 EQUAL = 1e-3  # Nm, or support: finer than a motor can
 STEPS = np.array(sorted(np.linspace(-1.0, 1.0, 21), key=abs))  # 0 first: a tie stays where it is
 
@@ -140,16 +141,28 @@ def torque_at(arm: ArmModel, points: np.ndarray) -> np.ndarray:
 
 
 def budget(
-    robot: ArmModel, load: LinkLoad, support: float, workspace: Workspace, rated: Sequence[float], peak: Sequence[float]
+    robot: ArmModel,
+    load: LinkLoad,
+    support: float,
+    workspace: Workspace,
+    rated: Sequence[float],
+    peak: Sequence[float],
+    pause: Callable[[], None] = lambda: None,
 ) -> tuple[JointBudget, ...]:
     """Return the budget of each joint of `robot` that carries `support` (0..1) of a wearer's arm.
 
-    rated, peak: (4,) Nm at the joints. Raises ParameterError where the load does not fit the robot.
+    rated, peak: (4,) Nm at the joints. pause: called before each millisecond or so of arithmetic, of which there are
+    some 500. Raises ParameterError where the load does not fit the robot.
     """
     full = robot.with_wearer(*load)
 
     def torques(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return torque_at(robot, points), torque_at(full, points)
+        pieces = []
+        for piece in np.array_split(points, len(points) // PIECE + 1):
+            pause()
+            pieces.append((torque_at(robot, piece), torque_at(full, piece)))
+        own, with_all = map(np.concatenate, zip(*pieces, strict=True))
+        return own, with_all
 
     points = workspace.points()
     starts = np.vstack((points[: SAMPLES // 5] * (1, 1, 1, 1, 0, 0), points))  # upright ones first

@@ -1,14 +1,14 @@
 """Whether the motors can give what the compensator's settings ask for: looked at beside the control loop, never in it.
 
 The motors and the joint limits are those of `can_bridge`, which is asked for its parameters once. A budget takes about
-0.2 s of arithmetic, so it is made in a thread of its own; while one is made, newer settings wait, and only the newest
-of them is looked at next.
+0.2 s of arithmetic, so it is made in a thread of its own, with a pause after each millisecond: in one go, at whatever
+priority, it kept threads of the loop from their processor for up to 0.1 s (measured, Linux 6.18, two busy cores). While
+one is made, newer settings wait, and only the newest of them is looked at next.
 """
 
 from __future__ import annotations
 
-import os
-import threading
+import time
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
@@ -27,6 +27,7 @@ from exo_gravity.core.params import values_of
 from exo_gravity.core.wearer import LinkLoad
 
 WITHIN = "within rated torque everywhere"
+PAUSE = 0.005  # s, some 500 times a budget
 ASKED = ("motor", "torque_scale", "position_min", "position_max")
 
 
@@ -41,7 +42,7 @@ class BudgetWatch:
         self._client = node.create_client(GetParameters, "can_bridge/get_parameters")
         self._asked: rclpy.Future | None = None
         self._bridge: Sequence[ParameterValue] | None = None
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="budget", initializer=_give_way)
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="budget")
         self._job: Future | None = None
         self._looked_at: tuple | None = None
 
@@ -75,11 +76,7 @@ class BudgetWatch:
             bridge = values_of([param for param in CAN_BRIDGE if param.name in ASKED], told)
             workspace = Workspace(bridge["position_min"], bridge["position_max"], self._max_tilt)
             torques = motor_torques(bridge["motor"], bridge["torque_scale"])
-            return overload(self._names, budget(robot, LinkLoad(mass, cog), support, workspace, *torques)) or WITHIN
+            joints = budget(robot, LinkLoad(mass, cog), support, workspace, *torques, lambda: time.sleep(PAUSE))
+            return overload(self._names, joints) or WITHIN
         except ParameterError as error:
             return f"unknown: can_bridge tells {error}"
-
-
-def _give_way() -> None:
-    """Let this thread run when nothing else wants to; on Linux a thread has a nice value of its own."""
-    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)
