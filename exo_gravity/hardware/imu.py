@@ -215,7 +215,8 @@ def _vector(name: str, values: Sequence[float] | None) -> np.ndarray:
 
 
 def _angle(a: np.ndarray, b: np.ndarray) -> float:
-    return math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b))
+    a, b = a / math.hypot(*a), b / math.hypot(*b)
+    return 2.0 * math.atan2(math.hypot(*(a - b)), math.hypot(*(a + b)))  # accurate for small angles too
 
 
 def _product(p: Sequence[float], q: Sequence[float]) -> np.ndarray:
