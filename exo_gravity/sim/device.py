@@ -108,12 +108,12 @@ class SimulatedDevice:
         last = time.monotonic()
         while not should_stop():
             due = min(outbox[0][0], last + _IDLE) if outbox else last + _IDLE
-            frame = _receive(bus, max(0.0, due - time.monotonic()))
+            frame, age = _receive(bus, max(0.0, due - time.monotonic()))
             now = time.monotonic()
             self._catch_up(now - last)
             last = now
             if frame and not echoes.take(frame) and (reply := self.exchange(*frame)):
-                heapq.heappush(outbox, (now + self._random.uniform(*REPLY_DELAY), reply))
+                heapq.heappush(outbox, (now - age + self._random.uniform(*REPLY_DELAY), reply))
             while outbox and outbox[0][0] <= time.monotonic():
                 reply = heapq.heappop(outbox)[1]
                 echoes.expect(reply)
@@ -169,18 +169,22 @@ class _Echoes:
         return True
 
 
-def _receive(bus: can.BusABC, timeout: float) -> Frame | None:
-    """Return the next frame of classic CAN with an 11-bit ID, or None. A remote frame comes out as one without data."""
+def _receive(bus: can.BusABC, timeout: float) -> tuple[Frame | None, float]:
+    """Return the next frame of classic CAN with an 11-bit ID, or None, and how long ago it arrived, in s.
+
+    A remote frame comes out as one without data.
+    """
     try:
         message = bus.recv(timeout)
     except can.CanOperationError as error:
         # A datagram on udp_multicast that holds no CAN frame fails on unpacking: it is noise, and the bus is well.
         if error.__cause__ is None or isinstance(error.__cause__, OSError):
             raise BusError(f"receiving on {bus.channel_info} failed: {error}") from error
-        return None
+        return None, 0.0
     if message is None or message.is_extended_id or message.is_error_frame or message.is_fd:
-        return None
-    return message.arbitration_id, bytes(message.data)
+        return None, 0.0
+    age = time.time() - message.timestamp
+    return (message.arbitration_id, bytes(message.data)), max(0.0, min(age, REPLY_DELAY[0]))
 
 
 def _send(bus: can.BusABC, frame: Frame) -> None:
