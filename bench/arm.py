@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import gc
-import os
 import time
 from collections.abc import Callable, Sequence
 
@@ -55,9 +53,3 @@ def paced(period: float, cycle: Callable[[], None], stopping: Sequence) -> None:
             time.sleep(remaining)
         elif remaining < -period:
             deadline = time.monotonic()
-
-
-def favour(priority: int) -> None:
-    """Ask the system for the priority that the package's nodes ask for."""
-    with contextlib.suppress(PermissionError):
-        os.setpriority(os.PRIO_PROCESS, 0, -priority)

@@ -11,10 +11,11 @@ import signal
 import sys
 import time
 
-from bench.arm import Arm, favour, paced
+from bench.arm import Arm, paced
 from exo_gravity.core.limits import UNKNOWN
 from exo_gravity.core.safety import NOTHING, Drive
 from exo_gravity.hardware.control_loop import COLLECTING
+from exo_gravity.hardware.scheduling import favour
 
 
 def main() -> None:

@@ -19,10 +19,11 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
-from bench.arm import Arm, favour, paced
+from bench.arm import Arm, paced
 from exo_gravity.core.limits import UNKNOWN
 from exo_gravity.core.safety import NOTHING, Drive
 from exo_gravity.hardware.control_loop import COLLECTING
+from exo_gravity.hardware.scheduling import favour
 from exo_gravity.nodes.run import keep_to_this_machine
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)

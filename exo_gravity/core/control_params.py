@@ -25,7 +25,7 @@ JOINT_NAMES = Param(
 )
 # fmt: off
 REAL_TIME_PARAMETERS = (
-    Param("thread_priority", 0, "SCHED_FIFO priority of the hot thread, if permitted; 0: none", (0, 99), fixed=True),
+    Param("thread_priority", 0, "SCHED_FIFO priority of the hot threads, if permitted; 0: none", (0, 99), fixed=True),
     Param("lock_memory", False, "keep the process's memory from being paged out, where permitted", fixed=True),
 )
 # For `can_bridge` these are what it believes of the motors; for `simulator`, what is true.

@@ -19,6 +19,8 @@ from exo_gravity.core.limits import JointSample
 from exo_gravity.core.safety import CARRYING, NOTHING, Drive, SafetyMachine, State
 from exo_gravity.hardware.motor_bus import MotorBus
 
+PATIENCE = 0.5  # share of the time that its work leaves of a cycle, for which it may wait for efforts
+SMOOTHING = 0.02  # of the time that the work takes, a cycle
 COLLECTING = 0.8  # share of a cycle in which replies are awaited; the rest is for handing them on
 BLUNDERS = 3  # unforeseen errors in a row after which the machine itself is not trusted any more
 LAST_RESORT = 3.0  # s of plain damping then
@@ -27,7 +29,8 @@ LAST_RESORT = 3.0  # s of plain damping then
 class ControlLoop:
     """Owns `bus` and `safety` from `start` until its thread has ended.
 
-    before_cycle() is called before every exchange, to `ask` for the newest efforts; on_cycle(now, samples) after it.
+    before_cycle(latest) is called before every exchange, to `ask` for the newest efforts, for which it may wait until
+    `latest` (monotonic s); on_cycle(now, samples) after it.
     cycles, late, incomplete count all cycles, those that began more than a period late, and those in which not every
     motor replied in time.
     """
@@ -38,7 +41,7 @@ class ControlLoop:
         safety: SafetyMachine,
         period: float,
         on_cycle: Callable[[float, Sequence[JointSample]], None],
-        before_cycle: Callable[[], None] = lambda: None,
+        before_cycle: Callable[[float], None] = lambda latest: None,
     ):
         self.cycles = self.late = self.incomplete = 0
         self.safety = safety
@@ -46,6 +49,7 @@ class ControlLoop:
         self._period = period
         self._on_cycle = on_cycle
         self._before_cycle = before_cycle
+        self._work = period  # s that a cycle takes without its waiting for efforts
         self._asked: tuple[Sequence[float] | None, float] = (None, -math.inf)
         self._orders: SimpleQueue[tuple[Callable[[], Any], Future]] = SimpleQueue()
         self._stopping = False
@@ -58,11 +62,6 @@ class ControlLoop:
     def ask(self, effort: Sequence[float] | None, answers: float) -> None:
         """Ask for `effort` (4,) Nm, computed from joint states taken at `answers` (monotonic s). None withdraws."""
         self._asked = (effort, answers)
-
-    @property
-    def thread_id(self) -> int:
-        """The system's number of the thread, once it was started."""
-        return self._thread.native_id
 
     def order(self, function: Callable[[], Any]) -> Future:
         """Run `function` on the control thread between two cycles; the future has its result."""
@@ -105,7 +104,7 @@ class ControlLoop:
         try:
             while blunders < BLUNDERS and not self._finished():
                 try:
-                    self._cycle()
+                    self._cycle(deadline)
                     blunders = 0
                 except Exception as error:  # whatever it is, the arm must come down
                     blunders += 1
@@ -119,8 +118,8 @@ class ControlLoop:
     def _finished(self) -> bool:
         return self._stopping and self.safety.state in (State.DISABLED, State.FAULT)
 
-    def _cycle(self) -> None:
-        self._before_cycle()
+    def _cycle(self, due: float) -> None:
+        self._before_cycle(due + PATIENCE * (self._period - self._work))
         self._obey()
         now = time.monotonic()
         if self._stopping:
@@ -134,6 +133,7 @@ class ControlLoop:
         self.cycles += 1
         self.incomplete += not complete
         self._on_cycle(time.monotonic(), self._bus.samples)
+        self._work += SMOOTHING * (time.monotonic() - now - self._work)
 
     def _obey(self) -> None:
         while True:

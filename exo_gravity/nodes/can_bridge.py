@@ -24,20 +24,19 @@ from exo_gravity.core.safety import SafetyMachine, State
 from exo_gravity.core.wire import check_rate
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.motor_bus import MotorBus, open_bus
+from exo_gravity.hardware.scheduling import ask_real_time
 from exo_gravity.hardware.watchdog import Charge, Watchdog
 from exo_gravity.nodes.bridge_report import BridgeReport, introduce
 from exo_gravity.nodes.conversions import by_name, to_nanoseconds
 from exo_gravity.nodes.hot_path import HotPath
 from exo_gravity.nodes.params import bus_of, declare
-from exo_gravity.nodes.real_time import ask_real_time
 from exo_gravity.nodes.run import run
 from exo_gravity.nodes.sole_publisher import SolePublisher
 
-# Taken by the control thread, each cycle: deep enough that a second commander is not overlooked.
-EFFORTS = QoSProfile(depth=8, reliability=ReliabilityPolicy.RELIABLE)
+# Taken by the control thread, each cycle: deep enough that a second commander is not overlooked. Not reliable: an old
+# effort sent again is of no use, and acknowledging each one costs both nodes a thread's work (measured: 2 % of a core).
+EFFORTS = QoSProfile(depth=8, reliability=ReliabilityPolicy.BEST_EFFORT)
 REMEMBERED = 256  # joint states whose stamps are known: more than command_timeout holds at any rate
-PATIENCE = 0.5  # share of the time that a cycle's exchange leaves, for which its efforts are waited for
-SMOOTHING = 0.02  # of the time that an exchange takes, a cycle
 REPORT_PERIOD = 0.1  # s
 ZEROED = 0.02  # rad about 0 that a motor may report after set_zero
 ZERO_TIMEOUT = 3.0  # s: motors are deaf for up to 1.5 s while they write their memory
@@ -59,7 +58,6 @@ class CanBridge(LifecycleNode):
         self._wire = check_rate(values["rate"], len(self._motors))
         # When the joint states of the newest efforts were taken, and those that were published last, monotonic s.
         self._answers = self._asked = -math.inf
-        self._began, self._exchange = 0.0, self._period  # when the exchange began, and how long one takes, in s
         self._watchdog = Watchdog()
         self._watchdog.guard(Charge(self._address, self._motors, self._limits, self._period))
         self._bus: MotorBus | None = None
@@ -99,7 +97,8 @@ class CanBridge(LifecycleNode):
         self._bus = None  # the loop's from now on
         self._loop.order(lambda: self._loop.safety.enable(time.monotonic()))
         self._loop.start()
-        ask_real_time(self, self._real_time, self._loop.thread_id)
+        for refused in ask_real_time(*self._real_time):
+            self.get_logger().warning(refused)
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -136,16 +135,14 @@ class CanBridge(LifecycleNode):
 
     # Control thread
 
-    def _take_efforts(self) -> None:
-        """Take the answer to the last joint state; the cycle waits a little for one that is late."""
+    def _take_efforts(self, latest: float) -> None:
+        """Take the answer to the last joint state; wait until `latest` (monotonic s) for one that is late."""
         self._efforts.poll()
         if self._answers < self._asked:
-            self._efforts.poll(PATIENCE * (self._period - self._exchange))
-        self._began = time.monotonic()
+            self._efforts.poll(latest - time.monotonic())
 
     def _publish(self, now: float, joints: Sequence[JointSample]) -> None:
         """Publish a joint state if every motor has answered lately: an unknown angle is never sent as a number."""
-        self._exchange += SMOOTHING * (now - self._began - self._exchange)
         if any(self._limits.silent(now, joint) for joint in joints):
             return
         message = self._joint_states

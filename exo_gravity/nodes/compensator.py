@@ -24,12 +24,12 @@ from exo_gravity.core.budget import USUAL_TILT
 from exo_gravity.core.compensator import Answer, Compensator, Settings
 from exo_gravity.core.control_params import COMPENSATOR, settings_of
 from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.hardware.scheduling import ask_real_time
 from exo_gravity.nodes.budget_watch import BudgetWatch
 from exo_gravity.nodes.conversions import by_name
 from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics
 from exo_gravity.nodes.hot_path import HotPath
 from exo_gravity.nodes.params import changed, declare, prepared
-from exo_gravity.nodes.real_time import ask_real_time
 from exo_gravity.nodes.run import run
 from exo_gravity.nodes.sole_publisher import SolePublisher
 
@@ -76,7 +76,8 @@ class CompensatorNode(Node):
         self.create_timer(0.5, self._report)
         self._log(self._compensator.settings)
         self._joint_states.start()
-        ask_real_time(self, (values["thread_priority"], values["lock_memory"]), self._joint_states.thread_id)
+        for refused in ask_real_time(values["thread_priority"], values["lock_memory"]):
+            self.get_logger().warning(refused)
 
     @property
     def failure(self) -> Exception | None:

@@ -57,11 +57,6 @@ class HotPath:
         if self._wait_set is not None:
             self._thread.start()
 
-    @property
-    def thread_id(self) -> int | None:
-        """The system's number of the thread, None where there is none."""
-        return self._thread.native_id
-
     def poll(self, timeout: float = 0.0) -> None:
         """Call back for every message that waits, on the caller's thread; wait for one for up to `timeout` s."""
         subscription = self._subscription

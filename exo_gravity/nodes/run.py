@@ -6,7 +6,6 @@ node's `close` still has a living context, and the last CAN frames do leave.
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import os
 import signal
@@ -23,6 +22,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from exo_gravity.core.errors import ExoGravityError
+from exo_gravity.hardware.scheduling import favour
 
 LOOK = 0.1  # s between two looks at whether a node is still needed
 CLOSING = 5  # s that the middleware may take to close
@@ -66,8 +66,7 @@ def run(make_node: Callable[[], Node], priority: int = 0, args: list[str] | None
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda received, _: ending.append(received))
     if priority:
-        with contextlib.suppress(PermissionError):  # then the node runs like any other process
-            os.setpriority(os.PRIO_PROCESS, 0, -priority)
+        favour(priority)
     executable = os.path.basename(sys.argv[0])
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
