@@ -28,14 +28,16 @@ Law = Callable[[Sequence[float]], Sequence[float]]
 class Loop:
     """What was seen of one arm. latency, spacing: s, of each answer and motor, and from each cycle to the next.
 
-    cycles: how many there should have been. missed: how many periods passed without commands. incomplete: cycles in
-    which not every motor replied before the next one. lost: answers that never came.
+    cycles: how many there should have been. missed: how many of them never came. late: how many came half a period late
+    or more; by the next one the loop may have caught up. incomplete: cycles in which not every motor replied before the
+    next one. lost: answers that never came.
     """
 
     latency: np.ndarray
     spacing: np.ndarray
     cycles: int
     missed: int
+    late: int
     incomplete: int
     lost: int
 
@@ -71,7 +73,7 @@ def analyse(cycles: Sequence[_Cycle], motors: Sequence[JointMotor], law: Law, pe
     """Return what the cycles show, for a loop that should run every `period` s by `law`: (4,) rad -> (4,) Nm."""
     starts = np.array([cycle.commands[0][0] for cycle in cycles])
     spacing = np.diff(starts)
-    missed = int(np.maximum(0, np.round(spacing / period) - 1).sum())
+    cycles_due = round(float(starts[-1] - starts[0]) / period) + 1
     answers = [_answer(cycle, motors, law) for cycle in cycles]
     given = [
         tuple(data for _, data in (cycle.commands[joint] for joint in range(len(motors))))
@@ -91,8 +93,9 @@ def analyse(cycles: Sequence[_Cycle], motors: Sequence[JointMotor], law: Law, pe
     return Loop(
         np.array(latency),
         spacing,
-        len(cycles) + missed,
-        missed,
+        cycles_due,
+        max(0, cycles_due - len(cycles)),
+        int(np.count_nonzero(spacing >= 1.5 * period)),
         sum(answer is None for answer in answers),
         lost,
     )

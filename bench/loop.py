@@ -28,6 +28,7 @@ POSES = [0.5, 1.0, 0.9, 1.0], [-0.3, 0.4, 0.2, 0.3]  # rad; between them every c
 MOVE = 1.0  # s
 START = 60.0  # s until the wearer must move
 SETTLING = 0.5  # s of movement before anything counts
+PRIORITY = 50  # `thread_priority` of the kind 'fifo'
 TICKS = os.sysconf("SC_CLK_TCK")
 
 
@@ -43,7 +44,7 @@ class Result:
     start: float
 
 
-def parameters(folder: Path, rate: float, both: bool, seconds: float, nodes: bool = True) -> Path:
+def parameters(folder: Path, rate: float, both: bool, seconds: float, nodes: bool, priority: int) -> Path:
     """Write a parameter file: `nodes` False for the simulators alone (the other entries stay in params.yaml)."""
     protocol = folder / "to_and_fro.yaml"
     steps = [{"move": pose, "over": MOVE} for pose in POSES] * int((seconds + 5.0) / (2 * MOVE) + 1)
@@ -52,9 +53,11 @@ def parameters(folder: Path, rate: float, both: bool, seconds: float, nodes: boo
     for name, entry in content.items():
         values = entry["ros__parameters"]
         if name.endswith("/can_bridge"):
-            values.update(rate=float(rate), sign_check_torque=0.0)  # the check takes as long as it takes
+            # Without the sign check, which takes as long as it takes.
+            values.update(rate=float(rate), sign_check_torque=0.0, thread_priority=priority)
         elif name.endswith("/compensator"):
-            values["use_imu"] = False  # the IMU's noise would blur which answer belongs to which reply; `imu` runs on
+            # The IMU's noise would blur which answer belongs to which reply; `imu` runs on.
+            values.update(use_imu=False, thread_priority=priority)
         elif name.endswith("/simulator"):
             # A second after the ramp: the motors are switched on when it begins.
             values.update(trial=str(protocol), trial_delay=2.0, trunk={"pitch": 0.0, "roll": 0.0})
@@ -65,13 +68,17 @@ def parameters(folder: Path, rate: float, both: bool, seconds: float, nodes: boo
     return whole if nodes else simulators
 
 
-def run(kind: str, rate: float, both: bool, seconds: float, watch: Callable[[dict[str, int]], None] | None = None):
-    """Run the `kind` ('nodes', 'python', 'rclpy') of loop and return its Result. watch: called while it runs, with the
-    process IDs, for `seconds`; by default that time just passes.
+def run(
+    kind: str, rate: float, both: bool, seconds: float, watch: Callable[[dict[str, int]], None] | None = None
+) -> Result:
+    """Run the `kind` of loop: 'nodes', the same with 'fifo' threads, 'python' or 'rclpy'.
+
+    watch: called while it runs, with the process IDs, for `seconds`; by default that time just passes.
+    Raises RuntimeError where the arm is not carried to the end.
     """
     with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as stack:
         folder = Path(name)
-        path = parameters(folder, rate, both, seconds, kind == "nodes")
+        path = parameters(folder, rate, both, seconds, kind in ("nodes", "fifo"), PRIORITY if kind == "fifo" else 0)
         whole = str(folder / "params.yaml")
         spaces = ["/right", "/left"] if both else ["/right"]
         arms = [Arm(whole, space) for space in spaces]
@@ -94,6 +101,8 @@ def run(kind: str, rate: float, both: bool, seconds: float, watch: Callable[[dic
                 processes[f"{space[1:]}/{part}"] = process.pid
         news.wait(launcher, "wearer: move (0", len(spaces))
         start = news.first(": active") - begin
+        if refused := news.find("not permitted"):
+            raise RuntimeError(refused)
         time.sleep(SETTLING)
         window = _window(processes, seconds, watch)
         if dead := launcher.dead():
@@ -125,7 +134,7 @@ def _window(processes: dict[str, int], seconds: float, watch) -> tuple[float, fl
 
 
 def _parts(kind: str, params: str, space: str, rate: float) -> list[tuple[str, ...]]:
-    if kind == "nodes":
+    if kind in ("nodes", "fifo"):
         return []
     if kind == "python":
         return [("python", "bench.floor", params, space, str(rate))]

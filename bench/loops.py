@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from bench.latency import percentile
-from bench.loop import Result, run
+from bench.loop import PRIORITY, Result, run
 from bench.table import Row
 from exo_gravity.core.safety import CALM
 
@@ -15,7 +15,7 @@ RATES = (("one arm", False, 200), ("one arm", False, 500), ("one arm", False, 10
          ("both arms", True, 500))  # fmt: skip
 QUICK = (RATES[1], RATES[3])
 RAMP = 1.0  # s, can_bridge's ramp_time
-KINDS = ("nodes", "python", "rclpy")
+KINDS = ("nodes", "fifo", "python", "rclpy")
 PEERS = ("python", "Python without ROS"), ("rclpy", "bare rclpy")
 TRIES = 3
 QUIET = 0.01  # share of a core that a hypervisor may give to others in a run that counts as quiet
@@ -28,10 +28,15 @@ def loops(quick: bool, progress: Callable[[str], None]) -> Iterator[Row]:
     for arms, both, rate in QUICK if quick else RATES:
         results = {}
         for kind in KINDS:
+            if kind == "fifo" and (both or rate < 500):  # they would leave no processor to two devices
+                continue
             progress(f"loop, {arms}, {rate} Hz: {kind}")
             if result := _quietest(kind, rate, both, 5.0 if quick else 20.0, progress):
                 results[kind] = result
-        yield from _rows(f"loop, {arms}, {rate} Hz", rate, results)
+        name = f"loop, {arms}, {rate} Hz"
+        yield from _rows(name, rate, results, "nodes")
+        if "fifo" in results:
+            yield from _rows(f"{name}, thread_priority {PRIORITY}", rate, results, "fifo")
         if "nodes" in results:
             starts.append(results["nodes"].start)
     if starts:
@@ -55,41 +60,41 @@ def _quietest(kind: str, rate: int, both: bool, seconds: float, progress: Callab
     return best
 
 
-def _rows(name: str, rate: int, results: dict[str, Result]) -> Iterator[Row]:
+def _rows(name: str, rate: int, results: dict[str, Result], kind: str) -> Iterator[Row]:
     period, allowed = 1e3 / rate, 1.0 if rate == 1000 else 0.1
-    if "nodes" not in results:
+    if kind not in results:
         yield Row(f"{name}, missed (it did not run): limit", 100.0, allowed, "%")
         return
-    ours = results["nodes"]
+    ours = results[kind]
     for share in (50, 99, 99.9):
         figure, spread = _latency(ours, share)
-        for kind, peer in PEERS:
-            if kind in results:
-                yield Row(f"{name}, p{share:g}: {peer}", figure, _latency(results[kind], share)[0], "ms", spread)
+        for other, peer in PEERS:
+            if other in results:
+                yield Row(f"{name}, p{share:g}: {peer}", figure, _latency(results[other], share)[0], "ms", spread)
         if share == 99:
             yield Row(f"{name}, p99: one period", figure, period, "ms", spread)
     spacing = np.concatenate([arm.spacing for arm in ours.arms]) * 1e3
     for share in (99, 99.9):
         yield Row(f"{name}, spacing p{share:g}: one period", percentile(spacing, share), period, "ms")
-    for what in ("missed", "incomplete", "lost"):
+    for what in ("missed", "late", "incomplete", "lost"):
         percents = _percents(ours, what)
         yield Row(f"{name}, {what}: limit", float(np.mean(percents)), allowed, "%", _ends(percents))
-        for kind, peer in PEERS:
-            if kind in results:
-                theirs = float(np.mean(_percents(results[kind], what)))
+        for other, peer in PEERS:
+            if other in results:
+                theirs = float(np.mean(_percents(results[other], what)))
                 yield Row(f"{name}, {what}: {peer}", float(np.mean(percents)), theirs, "%", _ends(percents))
     yield Row(f"{name}, taken by the hypervisor: quiet", 100.0 * ours.stolen, 100.0 * QUIET, "%")
-    yield from _cpu(name, results)
+    yield from _cpu(name, results, kind)
 
 
-def _cpu(name: str, results: dict[str, Result]) -> Iterator[Row]:
+def _cpu(name: str, results: dict[str, Result], kind: str) -> Iterator[Row]:
     """Yield what each node takes of a core: against what does the same without the rest, or against the core."""
     peers = {"can_bridge": ("rclpy", "bridge", "bare rclpy"), "compensator": ("rclpy", "answer", "bare rclpy")}
-    for node in sorted({full.rpartition("/")[2] for full in results["nodes"].cpu}):
-        kind, part, peer = peers.get(node, ("", "", "a core"))
-        limit = _share(results[kind], part) if kind in results else 100.0
-        shares = [100.0 * used for full, used in results["nodes"].cpu.items() if full.endswith(node)]
-        peer = peer if kind in results else "a core"
+    for node in sorted({full.rpartition("/")[2] for full in results[kind].cpu}):
+        other, part, peer = peers.get(node, ("", "", "a core"))
+        limit = _share(results[other], part) if other in results else 100.0
+        shares = [100.0 * used for full, used in results[kind].cpu.items() if full.endswith(node)]
+        peer = peer if other in results else "a core"
         yield Row(f"{name}, CPU of {node}: {peer}", sum(shares), limit, "%", _ends(shares))
 
 
@@ -98,7 +103,7 @@ def _share(result: Result, part: str) -> float:
 
 
 def _percents(result: Result, what: str) -> list[float]:
-    """Return the share of cycles, in percent of each arm's, that were `what`: missed, incomplete or lost."""
+    """Return the share of cycles, in percent of each arm's, that were `what`: missed, late, incomplete or lost."""
     return [100.0 * getattr(arm, what) / arm.cycles for arm in result.arms]
 
 

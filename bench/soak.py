@@ -52,7 +52,9 @@ def main() -> None:
         table.add_row(str(minute + 1), *(f"{figure:.3f}" for figure in figures), *sizes)
     console.print(table)
     seen = result.arms[0]
-    console.print(f"{seen.cycles} cycles, {seen.missed} missed, {seen.incomplete} incomplete, {seen.lost} lost")
+    console.print(
+        f"{seen.cycles} cycles, {seen.missed} missed, {seen.late} late, {seen.incomplete} incomplete, {seen.lost} lost"
+    )
 
 
 if __name__ == "__main__":

@@ -26,12 +26,15 @@ def read(angle, motor):
     return motor.joint_reply(pack_reply(motor.spec, motor.can_id, angle, 0.0, 0.0, 30, 0)).position
 
 
-def frames(count, depth=1, without=(), silent=()):
-    """A loop whose commands answer the replies of `depth` cycles before; cycles `without` commands, or replies."""
+def frames(count, depth=1, without=(), silent=(), late=()):
+    """A loop whose commands answer the replies of `depth` cycles before.
+
+    Cycles `without` commands, `silent` ones without replies, `late` ones by 0.6 of a period.
+    """
     rows = []
     for k in (k for k in range(count) if k not in without):
         for joint, motor in enumerate(MOTORS_OF_ARM):
-            at = START + k * PERIOD + joint * 20e-6
+            at = START + (k + 0.6 * (k in late)) * PERIOD + joint * 20e-6
             seen = [read(angle, m) for angle, m in zip(angles(max(0, k - depth)), MOTORS_OF_ARM, strict=True)]
             rows.append((at, motor.can_id, motor.command(law(seen)[joint], 0.0)))
             if k not in silent:
@@ -55,13 +58,18 @@ def test_the_latency_is_from_each_motors_reply_to_the_first_command_computed_fro
     loop = seen(frames(200, depth))
     assert loop.latency == pytest.approx(depth * PERIOD - REPLY, abs=1e-6)
     assert len(loop.latency) > 400
-    assert (loop.missed, loop.incomplete, loop.lost) == (0, 0, 0)
+    assert (loop.missed, loop.late, loop.incomplete, loop.lost) == (0, 0, 0, 0)
 
 
 def test_a_period_without_commands_is_missed_and_shows_in_the_spacing():
     loop = seen(frames(200, without=(50, 51)))
-    assert (loop.cycles, loop.missed) == (199, 2)
+    assert (loop.cycles, loop.missed, loop.late) == (199, 2, 1)
     assert loop.spacing.max() == pytest.approx(3 * PERIOD, abs=1e-6)
+
+
+def test_a_cycle_that_came_late_is_not_missed_once_the_loop_has_caught_up():
+    loop = seen(frames(200, late=(50, 120)))
+    assert (loop.cycles, loop.missed, loop.late) == (199, 0, 2)
 
 
 def test_a_cycle_without_all_replies_is_incomplete():
