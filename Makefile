@@ -1,6 +1,6 @@
 # make demo    the main job on the simulated device, about 75 s once everything is installed
 # make test    all tests
-# make bench   the laws, the loop and the tools against peers, 10 minutes, longer on a busy machine; QUICK=1: some of it
+# make bench   the laws, the loop and the tools against peers, 12 minutes, longer on a busy machine; QUICK=1: some of it
 # make faults  the whole fault matrix on the simulated device, 11 minutes; a table and build/faults.json
 # make socketcan  motor bus and nodes on vcan0; RUN=COMMAND puts a command before it, one that enters a virtual machine
 # make clean   remove what these made

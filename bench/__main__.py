@@ -1,6 +1,6 @@
 """python -m bench [--quick] [--only law,loop,work] [--output build/bench.json]: one table, and the same as JSON.
 
-10 minutes on two quiet cores; noisy runs are repeated, twice at most.
+12 minutes on two quiet cores; noisy runs are repeated, twice at most.
 """
 
 from __future__ import annotations
