@@ -101,7 +101,7 @@ class SimulatedDevice:
     ) -> None:
         """Play the device on `bus` in real time until `should_stop()`. Raises BusError when the bus fails.
 
-        aside(now) is called, `now` in monotonic s, whenever every command has been answered, at least every 2 ms.
+        aside(now) is called, `now` in monotonic s, whenever all commands are answered: without any, every 2 ms.
         """
         outbox: list[tuple[float, Frame]] = []
         echoes = _Echoes()
