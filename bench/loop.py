@@ -28,7 +28,7 @@ POSES = [0.5, 1.0, 0.9, 1.0], [-0.3, 0.4, 0.2, 0.3]  # rad; between them every c
 MOVE = 1.0  # s
 START = 60.0  # s until the wearer must move
 SETTLING = 0.5  # s of movement before anything counts
-PRIORITY = 50  # `thread_priority` of the kind 'fifo'
+OURS = {"nodes": 0, "fifo": 50}  # the kinds that are the package's nodes, and their `thread_priority`
 TICKS = os.sysconf("SC_CLK_TCK")
 
 
@@ -78,7 +78,7 @@ def run(
     """
     with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as stack:
         folder = Path(name)
-        path = parameters(folder, rate, both, seconds, kind in ("nodes", "fifo"), PRIORITY if kind == "fifo" else 0)
+        path = parameters(folder, rate, both, seconds, kind in OURS, OURS.get(kind, 0))
         whole = str(folder / "params.yaml")
         spaces = ["/right", "/left"] if both else ["/right"]
         arms = [Arm(whole, space) for space in spaces]
@@ -134,7 +134,7 @@ def _window(processes: dict[str, int], seconds: float, watch) -> tuple[float, fl
 
 
 def _parts(kind: str, params: str, space: str, rate: float) -> list[tuple[str, ...]]:
-    if kind in ("nodes", "fifo"):
+    if kind in OURS:
         return []
     if kind == "python":
         return [("python", "bench.floor", params, space, str(rate))]

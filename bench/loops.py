@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from bench.latency import percentile
-from bench.loop import PRIORITY, Result, run
+from bench.loop import OURS, Result, run
 from bench.table import Row
 from exo_gravity.core.safety import CALM
 
@@ -36,7 +36,7 @@ def loops(quick: bool, progress: Callable[[str], None]) -> Iterator[Row]:
         name = f"loop, {arms}, {rate} Hz"
         yield from _rows(name, rate, results, "nodes")
         if "fifo" in results:
-            yield from _rows(f"{name}, thread_priority {PRIORITY}", rate, results, "fifo")
+            yield from _rows(f"{name}, thread_priority {OURS['fifo']}", rate, results, "fifo")
         if "nodes" in results:
             starts.append(results["nodes"].start)
     if starts:
