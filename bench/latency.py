@@ -16,7 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from exo_gravity.core.motors import SPECIAL_FRAMES, JointMotor
+from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.motors import SPECIAL_FRAMES
 
 SAME = 8  # cycles within which an answer must not have been given before
 LONGEST = 0.1  # s after which an answer that never came is given up

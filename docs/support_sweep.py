@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.compensator import Settings
+from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import Limits
-from exo_gravity.core.motors import MOTORS, JointMotor
+from exo_gravity.core.motors import MOTORS
 from exo_gravity.core.protocol import Protocol
 from exo_gravity.core.wearer import Wearer
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor

@@ -9,8 +9,9 @@ from exo_gravity.core.anfis_law import AnfisLaw
 from exo_gravity.core.arm import MAX_GAIN, MAX_GRAVITY, MAX_LENGTH, MAX_MASS, MAX_TOTAL_MASS, STANDARD_GRAVITY, ArmModel
 from exo_gravity.core.compensator import LAW_NAMES, MODES, Settings
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import MOST_EFFORT, Limits
-from exo_gravity.core.motors import MOTORS, JointMotor
+from exo_gravity.core.motors import MOTORS
 from exo_gravity.core.params import Param
 from exo_gravity.core.tilt import SIDES
 from exo_gravity.core.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer

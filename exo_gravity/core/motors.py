@@ -14,7 +14,6 @@ manual's own 2^b overflows at the maximum, and truncation turns 0 Nm into a push
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -165,6 +164,12 @@ def unpack_reply(spec: MotorSpec, data: bytes) -> MotorReply:
     )
 
 
+def standstill(spec: MotorSpec) -> float:
+    """Return the velocity in rad/s that a motor reads where 0 was asked."""
+    span = spec.velocity_range
+    return _value(_code("velocity", 0.0, -span, span, 0xFFF), -span, span, 0xFFF)
+
+
 def _code(name: str, value: float, low: float, high: float, codes: int) -> int:
     if not low <= value <= high:  # NaN fails this too
         raise ParameterError(name, value, f"from {low:g} to {high:g}")
@@ -175,77 +180,7 @@ def _value(code: int, low: float, high: float, codes: int) -> float:
     return low + code * ((high - low) / codes)
 
 
-def _standstill(spec: MotorSpec) -> float:
-    """Return the velocity in rad/s that a motor reads where 0 was asked."""
-    span = spec.velocity_range
-    return _value(_code("velocity", 0.0, -span, span, 0xFFF), -span, span, 0xFFF)
-
-
 def _whole(name: str, value: int, low: int, high: int) -> int:
     if not isinstance(value, int) or not low <= value <= high:
         raise ParameterError(name, value, f"a whole number from {low} to {high}")
     return value
-
-
-@dataclass(frozen=True)
-class JointMotor:
-    """One motor as it sits on one joint.
-
-    can_id: 1..126, so that the first byte of a reply (this ID) never is the first byte of our commands, whose position
-    is always 0 (0x7f or 0x80): a bus that echoes can't make a command look like a reply.
-    direction: +1 or -1; joint angle = direction * (motor angle - zero). zero: motor angle in rad where the joint is 0.
-    torque_scale: real output torque per commanded Nm (0.75 is reported of one AK80-9); 0.2..2.
-    """
-
-    spec: MotorSpec
-    can_id: int
-    direction: int = 1
-    zero: float = 0.0
-    torque_scale: float = 1.0
-
-    def __post_init__(self):
-        if not isinstance(self.can_id, int) or not 1 <= self.can_id <= 126:
-            raise ParameterError("can_id", self.can_id, "a whole number from 1 to 126")
-        if self.direction not in (1, -1):
-            raise ParameterError("direction", self.direction, "1 or -1")
-        if not abs(self.zero) <= self.spec.position_range - math.pi:
-            limit = self.spec.position_range - math.pi
-            raise ParameterError("zero", self.zero, f"from {-limit:.2f} to {limit:.2f} rad, or the angle wraps")
-        if not 0.2 <= self.torque_scale <= 2.0:
-            raise ParameterError("torque_scale", self.torque_scale, "from 0.2 to 2")
-
-    def command(self, effort: float, damping: float) -> bytes:
-        """Return the frame for a joint `effort` in Nm and a `damping` in Nm s/rad, clamped to the wire.
-
-        Raises ParameterError on NaN or infinity.
-        """
-        torque = self.direction * effort / self.torque_scale
-        if damping:  # no code is exactly 0 rad/s: what standstill leaves as would push with damping times that
-            torque -= damping * _standstill(self.spec)
-        if math.isfinite(torque) and abs(torque) > self.spec.torque_range:
-            torque = math.copysign(self.spec.torque_range, torque)
-        return pack_command(self.spec, 0.0, 0.0, 0.0, damping, torque)
-
-    def joint_reply(self, data: bytes) -> MotorReply:
-        """Return what a reply's bytes say of the joint: rad, rad/s and Nm are the joint's. Raises FrameError."""
-        reply = unpack_reply(self.spec, data)
-        return MotorReply(
-            reply.motor_id,
-            self.joint_position(reply.position),
-            self.direction * reply.velocity,
-            self.joint_effort(reply.torque),
-            reply.temperature,
-            reply.error,
-        )
-
-    def joint_position(self, motor_position: float) -> float:
-        """Return the joint angle in rad for a motor angle in rad."""
-        return self.direction * (motor_position - self.zero)
-
-    def motor_position(self, joint_position: float) -> float:
-        """Return the motor angle in rad for a joint angle in rad."""
-        return self.direction * joint_position + self.zero
-
-    def joint_effort(self, motor_torque: float) -> float:
-        """Return the joint torque in Nm for a torque in the motor's own Nm."""
-        return self.direction * motor_torque * self.torque_scale

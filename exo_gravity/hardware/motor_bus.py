@@ -20,8 +20,9 @@ import can
 
 from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.errors import BusError, ParameterError
+from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import UNKNOWN, JointSample
-from exo_gravity.core.motors import ENTER, EXIT, SET_ZERO, JointMotor
+from exo_gravity.core.motors import ENTER, EXIT, SET_ZERO
 from exo_gravity.core.safety import OFF, Drive
 
 MASTER_ID = 0  # the arbitration ID under which some firmwares answer

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 
 from exo_gravity.core.arm import one_float
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors import ENTER, EXIT, SET_ZERO, JointMotor, MotorCommand, pack_reply, unpack_command
+from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.motors import ENTER, EXIT, SET_ZERO, MotorCommand, pack_reply, unpack_command
 
 MASTER_ID = 0
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from bench.latency import analyse, cycles_of
-from exo_gravity.core.motors import ENTER, MOTORS, JointMotor, pack_reply
+from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.motors import ENTER, MOTORS, pack_reply
 
 MOTOR_SPECS = ("AK60-6", "AK80-9", "AK60-6", "AK60-6")
 MOTORS_OF_ARM = tuple(JointMotor(MOTORS[name], can_id) for can_id, name in enumerate(MOTOR_SPECS, 1))

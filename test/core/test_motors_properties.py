@@ -9,15 +9,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from exo_gravity.core.errors import FrameError, ParameterError
-from exo_gravity.core.motors import (
-    MOTORS,
-    SPECIAL_FRAMES,
-    JointMotor,
-    pack_command,
-    pack_reply,
-    unpack_command,
-    unpack_reply,
-)
+from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.motors import MOTORS, SPECIAL_FRAMES, pack_command, pack_reply, unpack_command, unpack_reply
 
 COMMAND, REPLY = ("position", "velocity", "kp", "kd", "torque"), ("position", "velocity", "torque")
 SPECIAL_NUDGE = 3  # codes less that a command asks for where it would spell a special frame

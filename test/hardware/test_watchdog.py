@@ -13,8 +13,9 @@ from pathlib import Path
 import can
 import pytest
 
+from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import Limits
-from exo_gravity.core.motors import ENTER, EXIT, MOTORS, JointMotor, unpack_command
+from exo_gravity.core.motors import ENTER, EXIT, MOTORS, unpack_command
 from exo_gravity.hardware.watchdog import Charge, let_down
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
 

@@ -13,7 +13,8 @@ import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.errors import BusError, ParameterError
-from exo_gravity.core.motors import ENTER, MOTORS, SET_ZERO, JointMotor, pack_command, unpack_reply
+from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.motors import ENTER, MOTORS, SET_ZERO, pack_command, unpack_reply
 from exo_gravity.core.protocol import Protocol
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor, Wearer
 from exo_gravity.sim import device as device_module

@@ -8,8 +8,9 @@ import pytest
 from exo_gravity.core import ArmModel
 from exo_gravity.core.compensator import Settings
 from exo_gravity.core.errors import DataError
+from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import Limits
-from exo_gravity.core.motors import ENTER, EXIT, MOTORS, JointMotor, unpack_command
+from exo_gravity.core.motors import ENTER, EXIT, MOTORS, unpack_command
 from exo_gravity.core.protocol import Protocol
 from exo_gravity.sim import ArmConfig, ImuConfig, SimulatedArm, SimulatedDevice, SimulatedImu, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS

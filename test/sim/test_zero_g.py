@@ -10,8 +10,9 @@ import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.compensator import Settings
+from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import Limits
-from exo_gravity.core.motors import MOTORS, JointMotor
+from exo_gravity.core.motors import MOTORS
 from exo_gravity.core.protocol import Protocol
 from exo_gravity.core.tilt import Tilt
 from exo_gravity.core.wearer import Wearer
