@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 
 from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR, OPTIONS, motors_of, settings_of
 from exo_gravity.core.gravity import LAWS, Torque
-from exo_gravity.core.params import values_of
+from exo_gravity.core.param_table import values_of
 from exo_gravity.core.tilt import Tilt
 from exo_gravity.hardware.motor_bus import MotorBus, open_bus
-from exo_gravity.tools.params import load
+from exo_gravity.tools.inputs.parameter_file import load
 
 
 class Arm:

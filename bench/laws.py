@@ -10,9 +10,9 @@ from bench.table import Row, race
 from exo_gravity.core import gravity_torque
 from exo_gravity.core.control_params import COMPENSATOR, settings_of
 from exo_gravity.core.gravity import LAWS
-from exo_gravity.core.params import values_of
+from exo_gravity.core.param_table import values_of
 from exo_gravity.core.tilt import Tilt
-from exo_gravity.tools.validate_references import pinocchio_model, toolbox_robot
+from exo_gravity.tools.inputs.references import pinocchio_model, toolbox_robot
 
 POSES = 100_000
 LOOP = 2_000  # of them, for the peers, which take one after the other

@@ -21,8 +21,8 @@ import yaml
 
 from bench.arm import Arm
 from bench.latency import Loop, analyse, cycles_of
+from exo_gravity.tools.inputs.parameter_file import packaged_config
 from exo_gravity.tools.launcher import Launcher
-from exo_gravity.tools.params import packaged_config
 
 POSES = [0.5, 1.0, 0.9, 1.0], [-0.3, 0.4, 0.2, 0.3]  # rad; between them every cycle asks for other torques
 MOVE = 1.0  # s

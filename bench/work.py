@@ -15,14 +15,14 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from bench.table import Row
-from exo_gravity.core.protocol import Protocol
+from exo_gravity.bag.reader import read_bag
+from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.tools import report
-from exo_gravity.tools.anfis_data import from_gravload
-from exo_gravity.tools.anfis_training import train_law
-from exo_gravity.tools.bag import read_bag
-from exo_gravity.tools.params import packaged_config
-from exo_gravity.tools.trial_offline import run_offline, simulated_trials
-from exo_gravity.tools.validate_arm import workspace
+from exo_gravity.tools.anfis.data import from_gravload
+from exo_gravity.tools.anfis.training import train_law
+from exo_gravity.tools.inputs.arms import configured_arm
+from exo_gravity.tools.inputs.parameter_file import packaged_config
+from exo_gravity.tools.trials.offline import run_offline, simulated_trials
 
 TRAINING_LIMIT = 10.0  # s that somebody waits before a terminal without wondering
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -32,7 +32,7 @@ RATE = 500  # Hz, of the recording
 def work(quick: bool) -> Iterator[Row]:
     """Yield the rows of the work besides the loop."""
     repeats = 3 if quick else 5
-    space = workspace(None, "right")
+    space = configured_arm(None, "right")
     samples = from_gravload(space)
     seconds = _timed(lambda: train_law(samples, space.arm, 4), repeats)
     yield Row("ANFIS, training: limit", float(np.median(seconds)), TRAINING_LIMIT, "s", _range(seconds))
@@ -71,9 +71,9 @@ def _range(values: list[float]) -> str:
 def _offline(hold: float) -> tuple[float, float]:
     """Return the length in s of a trial on the simulated right arm, and how long it took."""
     steps = [{"move": [0.1, 0.8, 0.7, 0.6], "over": 3.0}, {"hold": hold}]
-    protocol = Protocol.parse({"name": "bench", "steps": steps})
+    script = TrialScript.parse({"name": "bench", "steps": steps})
     params = packaged_config("sim.yaml")
-    trials = simulated_trials(params, protocol)
+    trials = simulated_trials(params, script)
     begin = time.perf_counter()
     bag, _ = run_offline(trials, params, Console(quiet=True), lambda: False)
     return float(bag.recordings[0].time[-1]), time.perf_counter() - begin

@@ -15,10 +15,10 @@ from exo_gravity.core.compensator import Settings
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import Limits
 from exo_gravity.core.motors import MOTORS
-from exo_gravity.core.protocol import Protocol
+from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.core.wearer import Wearer
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
-from exo_gravity.sim.offline import Arm, OfflineTrial
+from exo_gravity.sim.offline import ArmSetup, OfflineTrial
 
 POSE = [0.3, 0.45, 0.10, 0.4]  # rad, within rated torque with all of the wearer's arm
 BEGIN, LED, ALONE = 10.0, 30.0, 10.0  # s: support 0 until then; the hand holds the arm; nobody does
@@ -37,8 +37,8 @@ def sweep():
     true_arm = SimulatedArm(ArmConfig(wearer_mass=1.03 * mass, wearer_cog=cog))  # 3 % heavier than believed
     device = SimulatedDevice(true_arm, [SimulatedMotor(motor) for motor in motors])
     steps = [{"move": POSE, "over": 3.0}, {"move": POSE, "over": LED}, {"hold": ALONE}]
-    protocol = Protocol.parse({"name": "support sweep", "steps": steps})
-    trial = OfflineTrial(Arm("right", device, motors, limits, settings, 250.0, (0.0, 0.0)), protocol, 8.0)
+    script = TrialScript.parse({"name": "support sweep", "steps": steps})
+    trial = OfflineTrial(ArmSetup("right", device, motors, limits, settings, 250.0, (0.0, 0.0)), script, 8.0)
     supports = [(0.0, 0.0)]
 
     def every_second(now):

@@ -1,9 +1,10 @@
 """`ros2 launch exo_gravity exo.launch.py params:=FILE`: starts `launcher`, which starts everything else."""
 
-from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, Shutdown
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.substitutions import ExecutableInPackage, FindPackageShare
+
+from launch import LaunchDescription
 
 
 def generate_launch_description():

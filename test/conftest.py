@@ -10,7 +10,8 @@ import os
 import time
 
 import pytest
-from clock import beat
+
+from .support.clock import beat
 
 STALL = 0.03  # s between two beats
 

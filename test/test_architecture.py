@@ -13,11 +13,12 @@ MAY_IMPORT = {
     "core": {"core"},
     "hardware": {"core", "hardware"},
     "sim": {"core", "sim"},
-    "nodes": {"core", "hardware", "sim", "nodes"},
-    "tools": {"core", "tools"},
+    "nodes": {"core", "hardware", "sim", "bag", "nodes"},
+    "bag": {"core", "bag"},
+    "tools": {"core", "bag", "tools"},
 }
 # Without ROS there are no nodes to start by their names: `trial --offline` alone reaches for the simulated device.
-ALSO = {"exo_gravity/tools/trial_offline.py": {"sim"}}
+ALSO = {"exo_gravity/tools/trials/offline.py": {"sim"}}
 
 
 def imported(path: Path) -> set[str]:

@@ -12,7 +12,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import MOST_EFFORT, Limits
 from exo_gravity.core.motors import MOTORS
-from exo_gravity.core.params import Param
+from exo_gravity.core.param_table import Param
 from exo_gravity.core.tilt import SIDES
 from exo_gravity.core.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from exo_gravity.core.recording import Recording
-from exo_gravity.core.trial import Trial
+from exo_gravity.core.trial_analysis import Trial
 
 
 @dataclass(frozen=True)
-class Limits:
+class HoldCriteria:
     """How far a held arm may drift: rad within any 10 s, in a pose and after a push has settled; rad/s over a hold.
 
     max_offset: rad, from where it was let go to where it is at the end of a scripted hold. rated_from: s, the length
@@ -30,7 +30,7 @@ class Limits:
     rated_from: float = 0.0
 
 
-def failures(recording: Recording, trial: Trial, limits: Limits) -> list[str]:
+def failures(recording: Recording, trial: Trial, limits: HoldCriteria) -> list[str]:
     """Return one sentence for each way in which the arm did not hold; none if it held."""
     found = []
     if not trial.holds:

@@ -23,7 +23,7 @@ from exo_gravity.core.budget import Workspace, budget, motor_torques, overload
 from exo_gravity.core.compensator import Settings
 from exo_gravity.core.control_params import CAN_BRIDGE
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.params import values_of
+from exo_gravity.core.param_table import values_of
 from exo_gravity.core.wearer import LinkLoad
 
 WITHIN = "within rated torque everywhere"

@@ -28,8 +28,8 @@ from exo_gravity.hardware.scheduling import ask_real_time
 from exo_gravity.hardware.watchdog import Charge, Watchdog
 from exo_gravity.nodes.bridge_report import BridgeReport, introduce
 from exo_gravity.nodes.conversions import by_name, to_nanoseconds
+from exo_gravity.nodes.declare import bus_of, declare
 from exo_gravity.nodes.hot_path import HotPath
-from exo_gravity.nodes.params import bus_of, declare
 from exo_gravity.nodes.run import run
 from exo_gravity.nodes.sole_publisher import SolePublisher
 

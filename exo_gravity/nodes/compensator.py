@@ -27,9 +27,9 @@ from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.hardware.scheduling import ask_real_time
 from exo_gravity.nodes.budget_watch import BudgetWatch
 from exo_gravity.nodes.conversions import by_name
+from exo_gravity.nodes.declare import changed, declare, prepared
 from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics
 from exo_gravity.nodes.hot_path import HotPath
-from exo_gravity.nodes.params import changed, declare, prepared
 from exo_gravity.nodes.run import run
 from exo_gravity.nodes.sole_publisher import SolePublisher
 

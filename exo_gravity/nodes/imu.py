@@ -14,13 +14,13 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.params import Param
+from exo_gravity.core.param_table import Param
 from exo_gravity.core.rate import Rate
-from exo_gravity.hardware.imu import ImuSample, TrunkEstimator, TrunkOrientation
+from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator, TrunkOrientation
 from exo_gravity.nodes.conversions import to_nanoseconds
+from exo_gravity.nodes.declare import declare
 from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics
 from exo_gravity.nodes.hot_path import HotPath
-from exo_gravity.nodes.params import declare
 from exo_gravity.nodes.run import run
 
 PITCH_YAW, DATA = "/imu/pitch_yaw", "/imu/data"

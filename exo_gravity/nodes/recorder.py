@@ -23,10 +23,10 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
-from exo_gravity.core.params import Param
-from exo_gravity.nodes.bag_writer import BagWriter, offered_qos
+from exo_gravity.bag.writer import BagWriter, offered_qos
+from exo_gravity.core.param_table import Param
+from exo_gravity.nodes.declare import declare
 from exo_gravity.nodes.drain import Drain
-from exo_gravity.nodes.params import declare
 from exo_gravity.nodes.run import run
 
 PARAMETERS = (

@@ -20,22 +20,22 @@ from std_msgs.msg import String
 
 from exo_gravity.core.control_params import OPTIONS
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.protocol import Protocol
+from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.hardware.motor_bus import open_bus
-from exo_gravity.nodes.params import bus_of, changed, declare
+from exo_gravity.nodes.declare import bus_of, changed, declare
 from exo_gravity.nodes.run import run
-from exo_gravity.sim import SimulatedImu, Wearer
-from exo_gravity.sim.params import SIMULATOR, device_of, imu_of, set_faults
+from exo_gravity.sim import SimulatedImu, VirtualWearer
+from exo_gravity.sim.device_params import SIMULATOR, device_of, imu_of, set_faults
 
 TRUNK_SPEED = 0.5  # rad/s at which the trunk goes to the tilt that was set
 
 
-def protocol_of(path: str) -> Protocol:
-    """Return the protocol of a YAML file, or raise ParameterError."""
+def script_of(path: str) -> TrialScript:
+    """Return the script of a YAML file, or raise ParameterError."""
     try:
-        return Protocol.parse(yaml.safe_load(Path(path).read_text(encoding="utf-8")))
+        return TrialScript.parse(yaml.safe_load(Path(path).read_text(encoding="utf-8")))
     except (OSError, yaml.YAMLError) as error:
-        raise ParameterError("trial", path, f"a readable protocol file ({error})") from None
+        raise ParameterError("trial", path, f"a readable script file ({error})") from None
 
 
 class Simulator(Node):
@@ -49,11 +49,11 @@ class Simulator(Node):
         super().__init__("simulator", automatically_declare_parameters_from_overrides=True)
         values = declare(self, SIMULATOR, free_prefix=OPTIONS)
         self._device = device_of(values)
-        self._protocol = protocol_of(values["trial"]) if values["trial"] else None
+        self._script = script_of(values["trial"]) if values["trial"] else None
         self._delay = values["trial_delay"]
         self._trunk = (values["trunk.pitch"], values["trunk.roll"])
-        self._wearer: Wearer | None = None
-        self._ordered: deque[Protocol] = deque()  # by a parameter, for the device's thread to begin
+        self._wearer: VirtualWearer | None = None
+        self._ordered: deque[TrialScript] = deque()  # by a parameter, for the device's thread to begin
         self._told = None
         self._slip = 0.0
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -130,11 +130,11 @@ class Simulator(Node):
             self._slip = device.slip
         while self._ordered:
             self._begin(self._ordered.popleft(), 0.0)
-        if self._protocol and self._wearer is None and all(motor.entered for motor in device.motors):
-            self._begin(self._protocol, self._delay)
+        if self._script and self._wearer is None and all(motor.entered for motor in device.motors):
+            self._begin(self._script, self._delay)
         if self._wearer is None or self._wearer.step == self._told:
             return
-        step, steps = self._wearer.step, self._wearer.protocol.steps
+        step, steps = self._wearer.step, self._wearer.script.steps
         self._told = step
         content = {"step": step, "of": len(steps), "action": "done", "duration": 0.0}
         if step < len(steps):
@@ -142,16 +142,16 @@ class Simulator(Node):
         self._step_publisher.publish(String(data=json.dumps(content)))
         self.get_logger().info(f"wearer: {content['action']} ({step} of {len(steps)})")
 
-    def _begin(self, protocol: Protocol, delay: float) -> None:
-        self._protocol, self._told = protocol, None
-        self._wearer = Wearer(protocol)
+    def _begin(self, script: TrialScript, delay: float) -> None:
+        self._script, self._told = script, None
+        self._wearer = VirtualWearer(script)
         self._device.start(self._wearer, delay)
 
     def _check_parameters(self, changes) -> SetParametersResult:
         try:
             values = changed(self, SIMULATOR, changes)
             if values["trial"]:
-                protocol_of(values["trial"])
+                script_of(values["trial"])
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
@@ -161,7 +161,7 @@ class Simulator(Node):
         self._trunk = (values["trunk.pitch"], values["trunk.roll"])
         set_faults(self._device, values)
         if any(change.name == "trial" for change in changes) and values["trial"]:
-            self._ordered.append(protocol_of(values["trial"]))
+            self._ordered.append(script_of(values["trial"]))
 
 
 def main() -> None:

@@ -4,7 +4,7 @@ It knows nothing of the compensator: CAN frames and IMU samples are all that joi
 
     motors = [SimulatedMotor(JointMotor(MOTORS["AK60-6"], can_id=1)), ...]     four, shoulder to elbow
     device = SimulatedDevice(SimulatedArm(ArmConfig()), motors, side="right")
-    device.start(Wearer(protocol), delay=2.0)                                  device.elapsed, wearer.step: how far
+    device.start(VirtualWearer(script), delay=2.0)                           device.elapsed, wearer.step: how far
     device.run(bus, stop.is_set)                                               real time, on any python-can bus
 
 or without a bus, as fast as it goes:
@@ -21,7 +21,7 @@ from exo_gravity.sim.arm import STEP, ArmConfig, SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu
 from exo_gravity.sim.motor import Firmware, SimulatedMotor
-from exo_gravity.sim.wearer import Hand, Wearer
+from exo_gravity.sim.virtual_wearer import Hand, VirtualWearer
 
 __all__ = [
     "STEP",
@@ -33,5 +33,5 @@ __all__ = [
     "SimulatedDevice",
     "SimulatedImu",
     "SimulatedMotor",
-    "Wearer",
+    "VirtualWearer",
 ]

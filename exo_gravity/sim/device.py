@@ -21,7 +21,7 @@ from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.tilt import Tilt
 from exo_gravity.sim.arm import STEP, SimulatedArm
 from exo_gravity.sim.motor import SimulatedMotor
-from exo_gravity.sim.wearer import Wearer
+from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 REPLY_DELAY = (200e-6, 400e-6)  # s
 MAX_CATCH_UP = 0.05  # s of physics made up for at once
@@ -56,7 +56,7 @@ class SimulatedDevice:
         self._random = random.Random(seed)
         self._steps = 0
         self._clock = 0.0  # s of time passed, of which `time` is the part in whole steps
-        self._trial: tuple[Wearer, float] | None = None
+        self._trial: tuple[VirtualWearer, float] | None = None
         self._tilted: tuple[float, float] | None = None
 
     @property
@@ -70,7 +70,7 @@ class SimulatedDevice:
         trial = self._trial
         return None if trial is None else self.time - trial[1]
 
-    def start(self, wearer: Wearer, delay: float = 0.0) -> None:
+    def start(self, wearer: VirtualWearer, delay: float = 0.0) -> None:
         """Let `wearer` begin with the protocol `delay` s from now, in place of any other."""
         self._trial = (wearer, self.time + delay)
 

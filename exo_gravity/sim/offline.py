@@ -23,16 +23,16 @@ from exo_gravity.core.errors import DataError
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.motors import ENTER, EXIT
-from exo_gravity.core.protocol import Protocol
 from exo_gravity.core.recording import Recording, ScriptedStep
 from exo_gravity.core.safety import Drive, SafetyMachine, State
 from exo_gravity.core.tilt import pitch_roll, rotation_matrix
+from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.imu import SimulatedImu
-from exo_gravity.sim.wearer import Wearer
+from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 LONGEST_START = 60.0  # s until the arm must be carried
-GRACE = 0.5  # s from the protocol's end until the arm is let down
+GRACE = 0.5  # s from the script's end until the arm is let down
 TILT_PERIOD = 0.01  # s between two tilts that the compensator is given
 IMU_SAMPLES = 100
 REMEMBERED = 64  # frames
@@ -43,7 +43,7 @@ CARRIED = (State.RAMPING_IN, State.ACTIVE)
 
 
 @dataclass(frozen=True)
-class Arm:
+class ArmSetup:
     """One arm: `device` is what is true of it; motors, limits and settings are what its controller believes.
 
     rate: control cycles per s. tilt: pitch and roll of the trunk in rad as its IMU tells, None without an IMU.
@@ -59,20 +59,20 @@ class Arm:
 
 
 class OfflineTrial:
-    """One arm, its controller, and a wearer who carries out a protocol once, `delay` s after the motors went on.
+    """One arm, its controller, and a wearer who carries out a script once, `delay` s after the motors went on.
 
     step: index of the wearer's step under way, None before the first. events: (s, what went wrong). trouble: why the
-    trial ended before the protocol did, or ''.
+    trial ended before the script did, or ''.
     """
 
-    def __init__(self, arm: Arm, protocol: Protocol, delay: float):
+    def __init__(self, arm: ArmSetup, script: TrialScript, delay: float):
         self.arm = arm
-        self.protocol = protocol
+        self.script = script
         self.events: list[tuple[float, str]] = []
         self.trouble = ""
-        self._wearer = Wearer(protocol)
+        self._wearer = VirtualWearer(script)
         self._delay = delay
-        self._start = math.inf  # of the protocol, s
+        self._start = math.inf  # of the script, s
         self._carried: list[float] = []  # the first and the last time that the motors carried the arm, s
         self._safety = SafetyMachine(arm.limits, 1.0 / arm.rate)
         self._compensator = Compensator(arm.settings)
@@ -96,7 +96,7 @@ class OfflineTrial:
         self._compensator.apply(settings)
 
     def run(self, should_stop: Callable[[float], bool] = lambda now: False) -> Recording:
-        """Carry the arm through the protocol, let it down, and return what `recorder` would have recorded.
+        """Carry the arm through the script, let it down, and return what `recorder` would have recorded.
 
         should_stop: is asked once per simulated second, with the time in s. DataError: nothing was recorded.
         """
@@ -151,14 +151,14 @@ class OfflineTrial:
         self._powered = drive.powered
 
     def _watch(self, now: float) -> None:
-        """Let the wearer begin once the motors are on, and the arm down once the protocol or patience has ended."""
+        """Let the wearer begin once the motors are on, and the arm down once the script or patience has ended."""
         if self._start == math.inf:
             if self._powered:
                 self.arm.device.start(self._wearer, self._delay)
                 self._start = now + self._delay
             elif now > LONGEST_START:
                 self._end(now, f"the arm was never carried: waiting for {self._safety.waiting_for}")
-        elif now > self._start + self.protocol.duration + GRACE:
+        elif now > self._start + self.script.duration + GRACE:
             self._safety.disable(now)
 
     def _end(self, now: float, why: str) -> None:
@@ -182,7 +182,7 @@ class OfflineTrial:
             raise DataError(self.trouble or f"{self.arm.name}: nothing was recorded")
         table = np.array(self._rows).reshape(-1, COLUMNS)
         columns = np.split(table[:, 1:], 4, axis=1)
-        steps = self.protocol.steps
+        steps = self.script.steps
         starts = itertools.accumulate((step.duration for step in steps), initial=self._start)
         done = float(table[-1, 0])
         script = tuple(

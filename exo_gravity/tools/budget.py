@@ -36,8 +36,8 @@ from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR
 from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.core.motors import MOTORS
 from exo_gravity.core.wearer import SEX, TABLES, TYPICAL_LENGTH, LinkLoad, Wearer
-from exo_gravity.tools.budget_figures import joint_figure
-from exo_gravity.tools.params import load
+from exo_gravity.tools.inputs.parameter_file import load
+from exo_gravity.tools.reporting.budget_figures import joint_figure
 
 DPI = 150
 # What the nodes take where a parameter file says nothing.

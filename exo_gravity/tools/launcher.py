@@ -20,7 +20,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from exo_gravity.core.errors import ExoGravityError, ParameterError
-from exo_gravity.tools.params import load, packaged_config
+from exo_gravity.tools.inputs.parameter_file import load, packaged_config
 
 DESCENT = 30.0  # s that a bridge may take to let its arm down before it is killed
 FAREWELL = 5.0  # s that any other node may take to end

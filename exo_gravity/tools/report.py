@@ -18,13 +18,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
 
+from exo_gravity.bag.reader import Bag, read_bag
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.recording import Recording
-from exo_gravity.core.trial import MIN_HOLD, Trial
-from exo_gravity.core.trial import analyse as analyse_arm
-from exo_gravity.core.verdict import Limits, failures
-from exo_gravity.tools import report_figures, report_page, report_table
-from exo_gravity.tools.bag import Bag, read_bag
+from exo_gravity.core.trial_analysis import MIN_HOLD, Trial
+from exo_gravity.core.trial_analysis import analyse as analyse_arm
+from exo_gravity.core.verdict import HoldCriteria, failures
+from exo_gravity.tools.reporting import figures, page, table
 
 DPI = 150
 MAX_EVENTS = 200
@@ -41,7 +41,7 @@ class Report:
     """
 
     bag: Bag
-    limits: Limits
+    limits: HoldCriteria
     arms: tuple[tuple[Recording, Trial], ...]
     failures: tuple[str, ...]
     notes: tuple[str, ...]
@@ -52,9 +52,9 @@ class Report:
         return 2 if self.bag.problems else int(bool(self.failures))
 
 
-def analyse(bag: Bag, limits: Limits | None = None, min_hold: float = MIN_HOLD) -> Report:
+def analyse(bag: Bag, limits: HoldCriteria | None = None, min_hold: float = MIN_HOLD) -> Report:
     """Return the report of a recording: holds of at least `min_hold` s, judged by `limits`."""
-    limits = limits or Limits()
+    limits = limits or HoldCriteria()
     arms = tuple((recording, analyse_arm(recording, min_hold)) for recording in bag.recordings)
     found = tuple(sentence for recording, trial in arms for sentence in failures(recording, trial, limits))
     return Report(bag, limits, arms, found, (*bag.notes, *_how_judged(bag)))
@@ -83,8 +83,8 @@ def write(report: Report, folder: str | Path) -> list[Path]:
     pages = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for kind, rows in (("holds", report_table.hold_rows), ("motions", report_table.motion_rows)):
-            report_table.write_csv(folder / f"{kind}.csv", (row for arm in report.arms for row in rows(*arm)))
+        for kind, rows in (("holds", table.hold_rows), ("motions", table.motion_rows)):
+            table.write_csv(folder / f"{kind}.csv", (row for arm in report.arms for row in rows(*arm)))
         for recording, trial in report.arms:
             pages.append(_arm_section(report, recording, trial, folder))
         (folder / "report.html").write_text(_page(report, pages), encoding="utf-8")
@@ -97,7 +97,7 @@ def print_report(report: Report, console: Console | None = None) -> None:
     """Print the tables, what is missing and the verdict."""
     console = console or _console()
     for recording, trial in report.arms:
-        report_table.print_tables(console, recording, trial)
+        table.print_tables(console, recording, trial)
     for note in report.notes:
         console.print(f"[yellow]Note:[/] {escape(note)}.")
     for problem in report.bag.problems:
@@ -109,35 +109,35 @@ def print_report(report: Report, console: Console | None = None) -> None:
 
 
 def _arm_section(report: Report, recording: Recording, trial: Trial, folder: Path) -> str:
-    figures = {"overview": report_figures.overview(recording, trial)}
+    drawn = {"overview": figures.overview(recording, trial)}
     captions = {
         "overview": "Positions, velocities and torques over time; holds are shaded and numbered, dashes are commanded.",
         "drift": "How far each joint went from where a hold began, and the drift of every hold with its uncertainty.",
     }
     if trial.holds:
-        figures["drift"] = report_figures.drift(recording, trial, report.limits)
+        drawn["drift"] = figures.drift(recording, trial, report.limits)
     pictures = []
-    for kind, figure in figures.items():
+    for kind, figure in drawn.items():
         buffer = BytesIO()
         figure.savefig(buffer, format="png", dpi=DPI)
         (folder / f"{recording.name.replace('/', '_')}_{kind}.png").write_bytes(buffer.getvalue())
-        pictures.append(report_page.figure_html(buffer.getvalue(), captions[kind]))
-    return report_page.arm_html(recording, trial, pictures)
+        pictures.append(page.figure_html(buffer.getvalue(), captions[kind]))
+    return page.arm_html(recording, trial, pictures)
 
 
 def _page(report: Report, sections: Sequence[str]) -> str:
     bag = report.bag
     began = datetime.fromtimestamp(bag.start / 1e9, timezone.utc).astimezone()
     length = max((float(recording.time[-1]) for recording in bag.recordings), default=0.0)
-    events = [f"{report_table.shown(event.time, 1)} s  {event.text}" for event in bag.events]
+    events = [f"{table.shown(event.time, 1)} s  {event.text}" for event in bag.events]
     more = [f"and {len(events) - MAX_EVENTS} more"] if len(events) > MAX_EVENTS else []
     ending = (
-        report_page.list_html("Notes", [*bag.problems, *report.notes])
-        + report_page.list_html("Faults and changed parameters", events[:MAX_EVENTS] + more)
-        + report_page.parameters_html(bag.parameters)
+        page.list_html("Notes", [*bag.problems, *report.notes])
+        + page.list_html("Faults and changed parameters", events[:MAX_EVENTS] + more)
+        + page.parameters_html(bag.parameters)
     )
     when = f"{began:%Y-%m-%d %H:%M:%S}, {length:.0f} s, {bag.path}"
-    return report_page.page_html(bag.path.stem, when, report.failures, sections, ending)
+    return page.page_html(bag.path.stem, when, report.failures, sections, ending)
 
 
 def _console() -> Console:
@@ -181,7 +181,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
     options = _arguments(args)
-    limits = Limits(
+    limits = HoldCriteria(
         max_stray=math.radians(options.max_drift),
         max_stray_after_push=math.radians(options.max_drift_after_push),
         max_rate=math.radians(options.max_rate) / 60.0,

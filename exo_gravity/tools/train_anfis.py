@@ -13,11 +13,11 @@ from pathlib import Path
 from exo_gravity.core.anfis_law import JOINTS
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.tilt import SIDES
-from exo_gravity.tools.anfis_bag import from_bag
-from exo_gravity.tools.anfis_data import from_gravload
-from exo_gravity.tools.anfis_training import RIDGE, train_law
-from exo_gravity.tools.validate_arm import workspace
-from exo_gravity.tools.validate_tables import PAPER_ANFIS
+from exo_gravity.tools.anfis.data import from_gravload
+from exo_gravity.tools.anfis.recorded import from_bag
+from exo_gravity.tools.anfis.training import RIDGE, train_law
+from exo_gravity.tools.comparison.tables import PAPER_ANFIS
+from exo_gravity.tools.inputs.arms import configured_arm
 
 RECORDED_RIDGE = 0.03  # recorded torques carry noise and stiction, which a law must not follow
 
@@ -35,7 +35,7 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
 
 
 def _run(options: argparse.Namespace) -> None:
-    space = workspace(options.params, options.side)
+    space = configured_arm(options.params, options.side)
     functions = options.functions or (2 if options.bag else 4)
     samples = from_bag(options.bag, space, functions) if options.bag else from_gravload(space)
     law, results = train_law(samples, space.arm, functions, RECORDED_RIDGE if options.bag else RIDGE)

@@ -22,14 +22,14 @@ from exo_gravity.core.anfis_law import AnfisLaw
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.gravity import gravity_torque, paper_static_torque
 from exo_gravity.core.tilt import SIDES
-from exo_gravity.tools import anfis_growth
-from exo_gravity.tools.anfis_data import GRID, from_gravload
-from exo_gravity.tools.anfis_training import Trained, train_law
-from exo_gravity.tools.validate_arm import Workspace, with_cog_at_link_ends, workspace
-from exo_gravity.tools.validate_figures import tilt_figure, workspace_figure
-from exo_gravity.tools.validate_laws import TILTS, Row, cases, compare, laws
-from exo_gravity.tools.validate_references import REFERENCES
-from exo_gravity.tools.validate_tables import PAPER_ANFIS, growth_line, law_table, paper_table, write_csv
+from exo_gravity.tools.anfis.data import GRID, from_gravload
+from exo_gravity.tools.anfis.training import Trained, train_law
+from exo_gravity.tools.comparison import growth
+from exo_gravity.tools.comparison.figures import tilt_figure, workspace_figure
+from exo_gravity.tools.comparison.laws import TILTS, Row, cases, compare, laws
+from exo_gravity.tools.comparison.tables import PAPER_ANFIS, growth_line, law_table, paper_table, write_csv
+from exo_gravity.tools.inputs.arms import ConfiguredArm, configured_arm, with_cog_at_link_ends
+from exo_gravity.tools.inputs.references import REFERENCES
 
 COUNT, QUICK_COUNT = 100_000, 2_000  # random poses per limit of the tilt
 CHUNK = 2_000  # poses between two strokes of the progress bar
@@ -41,13 +41,13 @@ LINK_ENDS, CONFIGURED = "at the link ends", "as configured"
 class Part:
     """One arm's results: its rows, its ANFIS and how that was trained."""
 
-    space: Workspace
+    space: ConfiguredArm
     rows: list[Row]
     law: AnfisLaw
     trained: list[Trained]
 
 
-def evaluate(cog: str, space: Workspace, count: int) -> Part:
+def evaluate(cog: str, space: ConfiguredArm, count: int) -> Part:
     """Return all laws against all references over the workspace and `count` random poses per tilt."""
     law, trained = train_law(from_gravload(space), space.arm)
     references = {name: build(space.arm) for name, build in REFERENCES.items()}
@@ -87,12 +87,12 @@ def checks(paper: Part, configured: Part) -> Iterator[tuple[bool, str]]:
         )
 
 
-def _growth(space: Workspace) -> list[anfis_growth.Growth]:
-    print(f"\nGrowth of an ANFIS for joint 3, inputs {', '.join(anfis_growth.INPUTS)}; Nm; the last rows take a minute")
+def _growth(space: ConfiguredArm) -> list[growth.Growth]:
+    print(f"\nGrowth of an ANFIS for joint 3, inputs {', '.join(growth.INPUTS)}; Nm; the last rows take a minute")
     print(growth_line())
     rows = []
-    for functions, inputs in anfis_growth.sizes():
-        rows.append(anfis_growth.growth(space, functions, inputs))
+    for functions, inputs in growth.sizes():
+        rows.append(growth.growth(space, functions, inputs))
         print(growth_line(rows[-1]), flush=True)
     return rows
 
@@ -127,7 +127,7 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
 
 
 def _run(options: argparse.Namespace) -> bool:
-    space = workspace(options.params, options.side)
+    space = configured_arm(options.params, options.side)
     output = Path(options.output)
     output.mkdir(parents=True, exist_ok=True)
     count = QUICK_COUNT if options.quick else COUNT

@@ -13,7 +13,8 @@ from pathlib import Path
 import can
 from geometry_msgs.msg import Vector3Stamped
 from sensor_msgs.msg import JointState
-from stages import Commanded, Launched, OtherClock, Split, Stage
+
+from ..faults.stages import Commanded, Launched, OtherClock, Split, Stage
 
 NOTICED = 0.10  # s from a fault to the safe action,
 DEAD = 0.15  # or where a process must be noticed dead

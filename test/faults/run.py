@@ -16,10 +16,11 @@ from pathlib import Path
 
 os.environ.setdefault("ROS_DOMAIN_ID", str(os.getpid() % 100 + 1))
 
-from judge import SPEED, seen
 from rich.console import Console
 from rich.table import Table
-from rows import ROWS
+
+from ..faults.judge import SPEED, seen
+from ..faults.rows import ROWS
 
 WATCHED = 3.0  # s for which an arm that may stay carried is watched
 CALM = 1.0  # s for which one that was let down must stay down, its inputs being well again

@@ -134,7 +134,7 @@ class Watcher:
             self.until(lambda: told("active", "fault:"))
 
     def bring_to(self, trial):
-        """Let the virtual wearer bring the carried arm where the protocol file `trial` says, and let go."""
+        """Let the virtual wearer bring the carried arm where the script file `trial` says, and let go."""
         self.carry()
         self.wearer.clear()
         assert self.set("simulator", trial="").successful

@@ -11,10 +11,11 @@ from builtin_interfaces.msg import Time
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
-from stage import CONFIG, GENTLE, SEATED, Listener, Stack, Watcher
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.tools.params import load
+from exo_gravity.tools.inputs.parameter_file import load
+
+from ..faults.stage import CONFIG, GENTLE, SEATED, Listener, Stack, Watcher
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 HORIZONTAL = {"name": "horizontal", "steps": [{"move": [0.0, 1.5, 0.0, 0.3], "over": 2.0}, {"hold": 600.0}]}

@@ -1,7 +1,8 @@
 """Real nodes in processes of their own, and a real node beside them that watches, asks and sets parameters."""
 
 import pytest
-from stage import Stack, Watcher
+
+from ..faults.stage import Stack, Watcher
 
 
 @pytest.fixture

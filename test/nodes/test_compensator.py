@@ -17,15 +17,15 @@ from sensor_msgs.msg import JointState
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.compensator import LONGEST_STEP
 from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR
-from exo_gravity.core.protocol import Protocol
+from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.core.wearer import Wearer
 from exo_gravity.nodes.conversions import to_nanoseconds, to_time
-from exo_gravity.tools.trial_offline import simulated_trials
+from exo_gravity.tools.trials.offline import simulated_trials
 
 pytestmark = pytest.mark.real_time
 
 PARTS = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
-PROTOCOL = Protocol.parse({"name": "hold", "steps": [{"hold": 1.0}]})
+SCRIPT = TrialScript.parse({"name": "hold", "steps": [{"hold": 1.0}]})
 SEATED = {"use_imu": False}
 ALONE = ("can_bridge", "simulator", "imu")  # what the test stands in for
 POSE = (0.2, 0.9, 0.7, 0.6)
@@ -298,7 +298,7 @@ def test_the_launcher_starts_from_what_param_dump_writes_unchanged(tmp_path, mak
     second.start()
     try:
         assert dumped(watcher, nodes) == dump
-        assert simulated_trials(path, PROTOCOL)  # and so do the tools
+        assert simulated_trials(path, SCRIPT)  # and so do the tools
     finally:
         second.stop()
     assert second.dead is None

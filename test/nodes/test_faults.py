@@ -1,8 +1,9 @@
 """The fault matrix in short: one row of each kind, judged as `make faults` does, but for the time it takes."""
 
 import pytest
-from rows import ROWS
-from run import Theatre
+
+from ..faults.rows import ROWS
+from ..faults.run import Theatre
 
 pytestmark = pytest.mark.real_time
 

@@ -21,8 +21,8 @@ from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
+from exo_gravity.bag.reader import read_bag
 from exo_gravity.nodes.conversions import to_time
-from exo_gravity.tools.bag import read_bag
 
 NODE = [sys.executable, "-c", "from exo_gravity.nodes.recorder import main; main()", "--ros-args"]
 NAMES = ["j1", "j2", "j3", "j4"]

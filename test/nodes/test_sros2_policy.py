@@ -18,8 +18,8 @@ import yaml
 from rclpy.node import NodeNameNonExistentError
 from rosbags.typesys import Stores, get_typestore
 
+from exo_gravity.bag.storage import Storage
 from exo_gravity.core.errors import DataError
-from exo_gravity.tools.bag_storage import Storage
 from exo_gravity.tools.launcher import Launcher
 
 CONFIG = Path(__file__).parents[2] / "config"

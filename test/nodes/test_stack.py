@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from stage import GENTLE, SEATED, Listener
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.motors import ENTER
 from exo_gravity.tools import train_anfis
+
+from ..faults.stage import GENTLE, SEATED, Listener
 
 pytestmark = pytest.mark.real_time
 

@@ -15,8 +15,8 @@ from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.motors import ENTER, MOTORS, SET_ZERO, pack_command, unpack_reply
-from exo_gravity.core.protocol import Protocol
-from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor, Wearer
+from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
 from exo_gravity.sim import device as device_module
 
 NAMES = ("AK60-6", "AK80-9", "AK60-6", "AK60-6")
@@ -104,7 +104,9 @@ def test_the_wearer_begins_after_the_delay_and_is_told_apart_by_time():
     device = make_device()
     assert device.elapsed is None
     device.advance(1.0)
-    wearer = Wearer(Protocol.parse({"name": "test", "steps": [{"move": list(OUT), "over": 2.0}, {"hold": 1.0}]}))
+    wearer = VirtualWearer(
+        TrialScript.parse({"name": "test", "steps": [{"move": list(OUT), "over": 2.0}, {"hold": 1.0}]})
+    )
     device.start(wearer, delay=0.5)
     device.advance(0.4)
     assert device.elapsed == pytest.approx(-0.1)

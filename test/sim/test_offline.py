@@ -11,14 +11,14 @@ from exo_gravity.core.errors import DataError
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import Limits
 from exo_gravity.core.motors import ENTER, EXIT, MOTORS, unpack_command
-from exo_gravity.core.protocol import Protocol
+from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.sim import ArmConfig, ImuConfig, SimulatedArm, SimulatedDevice, SimulatedImu, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
-from exo_gravity.sim.offline import Arm, OfflineTrial, told_tilt
+from exo_gravity.sim.offline import ArmSetup, OfflineTrial, told_tilt
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")
 POSE = [0.1, 0.6, 0.7, 0.5]
-PROTOCOL = Protocol.parse({"name": "one", "steps": [{"move": POSE, "over": 2.0}, {"hold": 3.0}]})
+SCRIPT = TrialScript.parse({"name": "one", "steps": [{"move": POSE, "over": 2.0}, {"hold": 3.0}]})
 MOTORS_AS_MOUNTED = (
     JointMotor(MOTORS["AK60-6"], 1),
     JointMotor(MOTORS["AK80-9"], 2, -1, 0.4),
@@ -48,8 +48,8 @@ def make():
         device = SimulatedDevice(SimulatedArm(ArmConfig()), [SimulatedMotor(motor) for motor in MOTORS_AS_MOUNTED])
         device.pitch, device.roll = 0.1, -0.06
         believed = [replace(motor, can_id=can_id) for motor, can_id in zip(MOTORS_AS_MOUNTED, ids, strict=True)]
-        arm = Arm("right", device, believed, LIMITS, Settings("right", links), 250.0, tilt)
-        return OfflineTrial(arm, PROTOCOL, 6.0)
+        arm = ArmSetup("right", device, believed, LIMITS, Settings("right", links), 250.0, tilt)
+        return OfflineTrial(arm, SCRIPT, 6.0)
 
     return make
 

@@ -13,11 +13,11 @@ from exo_gravity.core.compensator import Settings
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import Limits
 from exo_gravity.core.motors import MOTORS
-from exo_gravity.core.protocol import Protocol
 from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.core.wearer import Wearer
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
-from exo_gravity.sim.offline import Arm, OfflineTrial
+from exo_gravity.sim.offline import ArmSetup, OfflineTrial
 
 RATED = (3.0, 9.0, 3.0, 3.0)
 NAMES = ("rotation", "abduction", "flexion", "elbow")
@@ -43,8 +43,8 @@ def carried(settings, pose, tilt=UPRIGHT, seconds=30.0, after=()):
     device = SimulatedDevice(arm, [SimulatedMotor(motor) for motor in MOTORS_OF_ARM])
     device.pitch, device.roll = tilt
     steps = [{"move": pose, "over": 3.0}, *after, {"hold": seconds}]
-    protocol = Protocol.parse({"name": "let go", "steps": steps})
-    return OfflineTrial(Arm("right", device, MOTORS_OF_ARM, LIMITS, settings, 250.0, tilt), protocol, 8.0)
+    script = TrialScript.parse({"name": "let go", "steps": steps})
+    return OfflineTrial(ArmSetup("right", device, MOTORS_OF_ARM, LIMITS, settings, 250.0, tilt), script, 8.0)
 
 
 def moved(trial):

@@ -11,16 +11,17 @@ import re
 from html.parser import HTMLParser
 from pathlib import Path
 
-import made_bags as made
 import matplotlib.image
 import numpy as np
 import pytest
 from rich.console import Console
 
+from exo_gravity.bag.reader import Bag, Event, read_bag
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.verdict import Limits
-from exo_gravity.tools.bag import Bag, Event, read_bag
+from exo_gravity.core.verdict import HoldCriteria
 from exo_gravity.tools.report import analyse, main, print_report, write
+
+from ..support import made_bags as made
 
 POSES = [[0.1, 0.4, 0.5, 0.6], [-0.2, 0.8, 0.3, 0.9]]
 PUSH = [0.05, 0.25, -0.15, 0.1]
@@ -78,7 +79,7 @@ def test_what_could_not_be_read_is_2_even_if_the_rest_held(held):
 
 
 def test_limits_make_the_same_recording_fail(held):
-    assert analyse(held.bag, Limits(max_stray=1e-6)).exit_code == 1
+    assert analyse(held.bag, HoldCriteria(max_stray=1e-6)).exit_code == 1
 
 
 def test_holds_csv_has_a_row_for_each_hold_and_joint_with_the_numbers_of_the_analysis(held, folder):

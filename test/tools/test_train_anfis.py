@@ -3,7 +3,6 @@
 import json
 import math
 
-import made_bags as made
 import numpy as np
 import pytest
 import yaml
@@ -11,12 +10,14 @@ import yaml
 from exo_gravity.core import gravity_torque
 from exo_gravity.core.anfis_law import AnfisLaw, scaled
 from exo_gravity.core.errors import DataError
-from exo_gravity.tools.anfis_bag import TILT_TOPIC, TILT_TYPE, from_bag
-from exo_gravity.tools.anfis_data import from_gravload
-from exo_gravity.tools.anfis_training import RIDGE, _Projection, train, train_law
+from exo_gravity.tools.anfis.data import from_gravload
+from exo_gravity.tools.anfis.recorded import TILT_TOPIC, TILT_TYPE, from_bag
+from exo_gravity.tools.anfis.training import RIDGE, _Projection, train, train_law
+from exo_gravity.tools.comparison.tables import PAPER_ANFIS
+from exo_gravity.tools.inputs.arms import configured_arm
 from exo_gravity.tools.train_anfis import main
-from exo_gravity.tools.validate_arm import workspace
-from exo_gravity.tools.validate_tables import PAPER_ANFIS
+
+from ..support import made_bags as made
 
 RNG = np.random.default_rng(1)
 SPREAD = RNG.uniform((-1.0, 0.0, -0.5, 0.0), (1.0, 1.5, 1.5, 1.5), (45, 4))
@@ -34,7 +35,7 @@ def params_file(folder):
 @pytest.fixture(scope="module")
 def learned():
     """The packaged arm's samples and the law trained on them."""
-    space = workspace()
+    space = configured_arm()
     samples = from_gravload(space)
     return space, samples, train_law(samples, space.arm)[0]
 
@@ -47,7 +48,7 @@ def bag(tmp_path_factory):
 
 @pytest.fixture
 def recorded(tmp_path):
-    return workspace(params_file(tmp_path))
+    return configured_arm(params_file(tmp_path))
 
 
 def test_it_trains_on_the_papers_1053_positions_and_is_checked_on_the_768_between_them(learned):
@@ -116,7 +117,7 @@ def test_gains_of_the_arm_do_not_change_what_is_learned(tmp_path):
     content = yaml.safe_load(params_file(tmp_path).read_text(encoding="utf-8"))
     content["/right/compensator"]["ros__parameters"]["gain"] = [0.0, 0.5, 1.0, 2.0]
     (tmp_path / "gain.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
-    with_gain, without = (from_gravload(workspace(tmp_path / name)) for name in ("gain.yaml", "arm.yaml"))
+    with_gain, without = (from_gravload(configured_arm(tmp_path / name)) for name in ("gain.yaml", "arm.yaml"))
     assert np.array_equal(with_gain.torque, without.torque)
 
 
@@ -170,7 +171,7 @@ def test_holds_on_a_tilted_trunk_are_left_out(tmp_path, recorded):
 
 def test_another_arms_joints_are_refused_by_name(bag):
     with pytest.raises(DataError, match="right_shoulder_rotation"):
-        from_bag(bag, workspace(), 2)
+        from_bag(bag, configured_arm(), 2)
 
 
 def test_the_command_saves_a_law_that_loads_and_prints_both_errors(bag, tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""trial: protocol files, the offline run from file to report, what a person at a real arm is told, a run over ROS."""
+"""trial: script files, the offline run from file to report, what a person at a real arm is told, a run over ROS."""
 
 import csv
 import dataclasses
@@ -11,18 +11,19 @@ import signal
 import threading
 from pathlib import Path
 
-import made_bags as made
 import numpy as np
 import pytest
 import yaml
 from rich.console import Console
 
+from exo_gravity.bag.reader import Bag
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
-from exo_gravity.core.protocol import Protocol
+from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.tools import launcher, report
-from exo_gravity.tools.bag import Bag
-from exo_gravity.tools.trial import follow, is_guided, limits_for, main, missed, read_protocol, shortest_hold
-from exo_gravity.tools.trial_live import LEAD, Progress
+from exo_gravity.tools.trial import follow, is_guided, limits_for, main, missed, read_script, shortest_hold
+from exo_gravity.tools.trials.live import LEAD, Progress
+
+from ..support import made_bags as made
 
 CONFIG = Path(__file__).parents[2] / "config"
 SHORT = {"name": "short", "steps": [{"move": [0.1, 0.6, 1.2, 0.5], "over": 2.0}, {"hold": 4.0}]}
@@ -35,11 +36,11 @@ def run(tmp_path):
     """Run `trial`; return its exit code and the folder that it wrote, None if it wrote none."""
     handlers = [(number, signal.getsignal(number)) for number in (signal.SIGINT, signal.SIGTERM)]
 
-    def run(*arguments, protocol=SHORT, changes=None):
-        (tmp_path / "protocol.yaml").write_text(yaml.safe_dump(protocol))
+    def run(*arguments, script=SHORT, changes=None):
+        (tmp_path / "script.yaml").write_text(yaml.safe_dump(script))
         output = tmp_path / f"out_{next(PORTS)}"
         params = changed(tmp_path, changes or {})
-        given = [str(tmp_path / "protocol.yaml"), "--params", str(params), "--output", str(output), *arguments]
+        given = [str(tmp_path / "script.yaml"), "--params", str(params), "--output", str(output), *arguments]
         code = main(given)
         return code, next(output.iterdir(), None) if output.exists() else None
 
@@ -104,7 +105,7 @@ def thirteen(hold):
 
 
 def test_the_packaged_arm_drifts_less_than_a_fifth_of_a_degree_per_minute_in_all_thirteen_poses(run):
-    code, folder = run("--offline", "--max-rate", "0.2", protocol=thirteen(2.5))
+    code, folder = run("--offline", "--max-rate", "0.2", script=thirteen(2.5))
     rates = [abs(float(row["drift_deg_per_min"])) for row in holds(folder)]
     assert code == 0 and len(rates) == 4 * 13 and max(rates) < 0.2
 
@@ -114,17 +115,17 @@ def test_with_masses_a_tenth_off_and_half_the_friction_the_report_names_the_pose
     heavy = {"robot": {"mass": masses, "cog": [0.046, 0.113, 0.237, 0.128]}}
     slippery = {"friction": {"coulomb": [0.1, 0.2, 0.1, 0.1]}}
     changes = {"/right/compensator": heavy, "/right/simulator": slippery}
-    code, _ = run("--offline", protocol=thirteen(2.5), changes=changes)
+    code, _ = run("--offline", script=thirteen(2.5), changes=changes)
     text = capsys.readouterr().out
     assert code == 1 and "from where it was let go" in text
 
 
 @pytest.mark.parametrize("name", ["demo", "two_poses", "thirteen_poses"])
 def test_a_packaged_trial_stays_within_rated_torque_and_clear_of_the_joint_limits(name):
-    _, protocol = read_protocol(name)
+    _, script = read_script(name)
     values = yaml.safe_load((CONFIG / "exo.yaml").read_text())
     bridge, robot = (values[f"/right/{node}"]["ros__parameters"] for node in ("can_bridge", "compensator"))
-    poses = np.array([step.value for step in protocol.steps if step.action == "move"])
+    poses = np.array([step.value for step in script.steps if step.action == "move"])
     assert np.all(poses > np.array(bridge["position_min"]) + 0.15)
     assert np.all(poses < np.array(bridge["position_max"]) - 0.15)
     arm = ArmModel(robot["link_length"], robot["robot"]["cog"], robot["robot"]["mass"])
@@ -134,22 +135,22 @@ def test_a_packaged_trial_stays_within_rated_torque_and_clear_of_the_joint_limit
 
 
 def test_the_second_trial_has_thirteen_different_poses_of_a_minute_each():
-    _, protocol = read_protocol("thirteen_poses")
-    poses = {step.value for step in protocol.steps if step.action == "move"}
+    _, script = read_script("thirteen_poses")
+    poses = {step.value for step in script.steps if step.action == "move"}
     assert len(poses) == 13
-    assert [step.duration for step in protocol.steps if step.action == "hold"] == [60.0] * 13
+    assert [step.duration for step in script.steps if step.action == "hold"] == [60.0] * 13
 
 
 def test_the_push_of_the_first_trial_lasts_from_17_to_20_s():
-    _, protocol = read_protocol("two_poses")
-    assert [protocol.steps[protocol.at(time)[0]].action for time in (16.9, 17.1, 19.9, 20.1)] == [
+    _, script = read_script("two_poses")
+    assert [script.steps[script.at(time)[0]].action for time in (16.9, 17.1, 19.9, 20.1)] == [
         "hold", "push", "push", "hold",
     ]  # fmt: skip
 
 
 def test_only_holds_of_a_minute_are_judged_by_their_rate_unless_asked_for():
-    _, demo = read_protocol("demo")
-    _, thirteen_poses = read_protocol("thirteen_poses")
+    _, demo = read_script("demo")
+    _, thirteen_poses = read_script("thirteen_poses")
     assert limits_for(demo, None).max_rate == math.inf
     assert limits_for(thirteen_poses, None).max_rate == pytest.approx(math.radians(0.2) / 60)
     assert limits_for(demo, 1.0).max_rate == pytest.approx(math.radians(1.0) / 60)
@@ -188,10 +189,10 @@ def test_a_wrong_file_ends_with_exit_code_2_and_one_sentence(tmp_path, capsys, a
 class Person:
     """Somebody at a real arm: a clock that is set by hand, and what they read on the screen."""
 
-    def __init__(self, protocol, guided=True):
+    def __init__(self, script, guided=True):
         self.now, self.out = 0.0, io.StringIO()
         self.console = Console(file=self.out, width=120)
-        self.progress = Progress(Protocol.parse(protocol), guided, self.console, lambda: self.now)
+        self.progress = Progress(TrialScript.parse(script), guided, self.console, lambda: self.now)
 
     def at(self, now, position=(0.0,) * 4, faults=(), **more):
         self.now = now
@@ -268,7 +269,7 @@ def running():
 def test_a_recorder_that_ends_is_noticed_at_once(running):
     person = Person(SHORT)
     person.at(0.0)
-    why = follow(person.progress, Protocol.parse(SHORT), threading.Event(), lambda: -9, running)
+    why = follow(person.progress, TrialScript.parse(SHORT), threading.Event(), lambda: -9, running)
     assert why == "the recorder ended with exit code -9 before the trial was done"
 
 
@@ -276,14 +277,14 @@ def test_a_recorder_that_says_nothing_is_noticed(running):
     person = Person(SHORT)
     person.at(0.0)
     person.now = 10.1
-    why = follow(person.progress, Protocol.parse(SHORT), threading.Event(), lambda: None, running)
+    why = follow(person.progress, TrialScript.parse(SHORT), threading.Event(), lambda: None, running)
     assert why == "the recorder has said nothing for 10 s"
 
 
 def test_a_latched_fault_ends_the_trial_with_its_reason(running):
     person, fault = Person(SHORT), "right/can_bridge: letting down: motor_silent: elbow"
     person.at(0.0, faults=[fault])
-    assert follow(person.progress, Protocol.parse(SHORT), threading.Event(), lambda: None, running) == fault
+    assert follow(person.progress, TrialScript.parse(SHORT), threading.Event(), lambda: None, running) == fault
 
 
 def found(holds):
@@ -294,15 +295,15 @@ def found(holds):
 
 
 def test_a_hold_that_a_real_arm_never_came_to_rest_in_is_missed():
-    two = Protocol.parse({"name": "two", "steps": SHORT["steps"] * 2})
+    two = TrialScript.parse({"name": "two", "steps": SHORT["steps"] * 2})
     assert missed(two, found(2)) == ""
     assert missed(two, found(1)) == "right: 1 of 2 holds were found"
 
 
 def test_a_person_who_keeps_the_arm_still_for_a_moment_makes_no_hold():
-    protocol = Protocol.parse({"name": "p", "steps": [{"hold": 60.0}, {"hold": 14.0}]})
-    assert shortest_hold(protocol, guided=True) == 7.0
-    assert shortest_hold(protocol, guided=False) == 2.0
+    script = TrialScript.parse({"name": "p", "steps": [{"hold": 60.0}, {"hold": 14.0}]})
+    assert shortest_hold(script, guided=True) == 7.0
+    assert shortest_hold(script, guided=False) == 2.0
 
 
 def test_only_a_simulator_carries_out_a_protocol_without_a_person():
@@ -316,7 +317,7 @@ def test_ctrl_c_lets_the_arm_down_and_reports_what_there_is(run, capsys, monkeyp
         return stopped
 
     monkeypatch.setattr("exo_gravity.tools.trial.stop_on_signals", stop_on_signals)
-    code, folder = run("--offline", protocol={"name": "long", "steps": [SHORT["steps"][0], {"hold": 3000.0}]})
+    code, folder = run("--offline", script={"name": "long", "steps": [SHORT["steps"][0], {"hold": 3000.0}]})
     assert code == 1 and (folder / "report.html").exists()
     told = capsys.readouterr().out
     assert "stopped by the operator" in told and "slipped" not in told
@@ -343,7 +344,7 @@ def test_a_recorder_that_is_killed_ends_the_trial_at_once_with_what_it_wrote(run
             super().__init__(params, listen)
 
     monkeypatch.setattr("exo_gravity.tools.trial.Launcher", Killer)
-    code, folder = run(changes=PATIENT, protocol={"name": "long", "steps": [SHORT["steps"][0], {"hold": 90.0}]})
+    code, folder = run(changes=PATIENT, script={"name": "long", "steps": [SHORT["steps"][0], {"hold": 90.0}]})
     assert code == 1 and (folder / "report.html").exists()
     assert "the recorder ended with exit code -9 before the trial was done" in capsys.readouterr().out
 

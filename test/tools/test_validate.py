@@ -12,10 +12,12 @@ import yaml
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.tools import anfis_training, validate, validate_figures, validate_laws
-from exo_gravity.tools.anfis_growth import growth, sizes
-from exo_gravity.tools.validate_arm import with_cog_at_link_ends, workspace
-from exo_gravity.tools.validate_references import REFERENCES, gravload
+from exo_gravity.tools import validate
+from exo_gravity.tools.anfis import training
+from exo_gravity.tools.comparison import figures, laws
+from exo_gravity.tools.comparison.growth import growth, sizes
+from exo_gravity.tools.inputs.arms import configured_arm, with_cog_at_link_ends
+from exo_gravity.tools.inputs.references import REFERENCES, gravload
 
 DOWN = np.array(((0.0, 0.0, 1.0),))
 
@@ -27,8 +29,8 @@ def quick(tmp_path_factory):
     lines, parts, evaluate = [], [], validate.evaluate
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(validate, "QUICK_COUNT", 60)
-        patch.setattr(validate_figures, "GRID", (8, 8, 3))
-        patch.setattr(anfis_training, "MAX_EVALUATIONS", 12)
+        patch.setattr(figures, "GRID", (8, 8, 3))
+        patch.setattr(training, "MAX_EVALUATIONS", 12)
         patch.setattr(validate, "evaluate", lambda *given: parts.append(evaluate(*given)) or parts[-1])
         patch.setattr("builtins.print", lambda *parts, **_: lines.append(" ".join(map(str, parts))))
         with pytest.raises(SystemExit) as ended:
@@ -58,7 +60,7 @@ def test_a_reference_gives_the_torque_of_a_straight_horizontal_arm_by_hand(name)
 
 @pytest.mark.parametrize("name", list(REFERENCES))
 def test_a_reference_scales_with_the_gains(name):
-    space = workspace()
+    space = configured_arm()
     arm = replace(space.arm, gain=(0.5, 1.0, 1.5, 2.0))
     pose = np.array(((0.3, 0.5, 0.7, 0.9),))
     assert REFERENCES[name](arm)(pose, DOWN) == pytest.approx(REFERENCES[name](space.arm)(pose, DOWN) * arm.gain)
@@ -68,19 +70,19 @@ def test_a_reference_scales_with_the_gains(name):
 def test_a_reference_that_is_not_installed_is_named_with_what_installs_it(name, module, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(DataError, match=rf"{module}.*pip install 'exo_gravity\[report,validate\]'"):
-        REFERENCES[name](workspace().arm)
+        REFERENCES[name](configured_arm().arm)
 
 
 def test_the_first_case_is_the_1053_positions_with_an_upright_trunk():
-    case = next(validate_laws.cases("", workspace(), 10))
+    case = next(laws.cases("", configured_arm(), 10))
     assert case.theta.shape == (13 * 9 * 9, 4)
     assert len(np.unique(case.theta, axis=0)) == 1053
     assert np.all(case.axis_angle == 0) and np.all(case.theta[:, 0] == 0)
 
 
 def test_the_random_cases_turn_joint_1_and_tilt_the_trunk_within_their_limits():
-    space = workspace()
-    cases = list(validate_laws.cases("", space, 500))[1:]
+    space = configured_arm()
+    cases = list(laws.cases("", space, 500))[1:]
     assert [case.limit for case in cases] == [0, 5, 10, 20, 30]
     for case in cases:
         assert np.all((case.theta >= space.low) & (case.theta <= space.high)) and np.ptp(case.theta[:, 0]) > 3
@@ -89,18 +91,18 @@ def test_the_random_cases_turn_joint_1_and_tilt_the_trunk_within_their_limits():
 
 
 def test_rmse_largest_error_and_share_are_those_of_a_known_error():
-    case = next(validate_laws.cases("", workspace(), 10))
+    case = next(laws.cases("", configured_arm(), 10))
     expected = np.full((1053, 4), 2.0)
     given = expected + 0.1
     given[0, 2] += 1.0
-    rows = validate_laws.compare(case, {"law": given}, "reference", expected)
+    rows = laws.compare(case, {"law": given}, "reference", expected)
     assert (rows[0].rmse, rows[0].largest, rows[0].share) == pytest.approx((0.1, 0.1, 0.05))
     assert rows[2].largest == pytest.approx(1.1)
 
 
 def test_a_joint_that_needs_no_torque_has_no_share():
-    case = next(validate_laws.cases("", workspace(), 10))
-    assert math.isnan(validate_laws.compare(case, {"law": np.ones((1053, 4))}, "", np.zeros((1053, 4)))[0].share)
+    case = next(laws.cases("", configured_arm(), 10))
+    assert math.isnan(laws.compare(case, {"law": np.ones((1053, 4))}, "", np.zeros((1053, 4)))[0].share)
 
 
 def test_the_papers_premise_is_link_ends_gain_1_and_its_own_gravity():
@@ -110,14 +112,14 @@ def test_the_papers_premise_is_link_ends_gain_1_and_its_own_gravity():
 
 def test_the_arm_is_read_from_dotted_and_nested_names_alike(tmp_path):
     mass, cog = [0.1, 0.2, 0.3, 0.4], [0.01, 0.02, 0.03, 0.04]
-    nested = workspace(write_params(tmp_path, {"robot": {"mass": mass, "cog": cog}, "gravity": 9.8}))
-    dotted = workspace(write_params(tmp_path, {"robot.mass": mass, "robot.cog": cog, "gravity": 9.8}))
+    nested = configured_arm(write_params(tmp_path, {"robot": {"mass": mass, "cog": cog}, "gravity": 9.8}))
+    dotted = configured_arm(write_params(tmp_path, {"robot.mass": mass, "robot.cog": cog, "gravity": 9.8}))
     assert nested.arm == dotted.arm == ArmModel((0.05, 0.13, 0.3, 0.3), cog, mass, gravity=9.8)
 
 
 def test_the_joint_limits_are_those_of_the_bridge_beside_the_compensator(tmp_path):
     path = write_params(tmp_path, {}, {"position_min": [-1.0, 0.0, 0.0, 0.0], "position_max": [1.0, 1.5, 1.5, 2.0]})
-    assert workspace(path).high.tolist() == [1.0, 1.5, 1.5, 2.0]
+    assert configured_arm(path).high.tolist() == [1.0, 1.5, 1.5, 2.0]
 
 
 @pytest.mark.parametrize(
@@ -132,7 +134,7 @@ def test_the_joint_limits_are_those_of_the_bridge_beside_the_compensator(tmp_pat
 )
 def test_an_impossible_arm_is_refused_by_the_name_of_the_parameter(arm, bridge, named, tmp_path):
     with pytest.raises(ParameterError, match=named):
-        workspace(write_params(tmp_path, arm, bridge))
+        configured_arm(write_params(tmp_path, arm, bridge))
 
 
 def test_all_checks_hold_on_the_packaged_arm(quick):
@@ -207,11 +209,11 @@ def test_growth_is_measured_from_2_to_6_inputs():
 
 
 def test_the_growth_of_one_model_counts_its_rules_parameters_and_positions():
-    row = growth(workspace(), 2, 3)
+    row = growth(configured_arm(), 2, 3)
     assert (row.rules, row.parameters, row.positions) == (8, 8 * 4 + 2 * 3 * 2, 5**3)
     assert row.training_time > 0 and row.inference_time > 0 and 0 < row.held_out_rmse < 1
 
 
 def test_gravload_is_told_gravity_in_its_own_sign():
     abducted = np.array(((0.0, 0.1, 0.0, 0.0),))
-    assert gravload(workspace().arm)(abducted, DOWN)[0, 1] > 0
+    assert gravload(configured_arm().arm)(abducted, DOWN)[0, 1] > 0

@@ -1,0 +1,84 @@
+"""What a trial asks of the wearer: a list of steps, each of which takes its time.
+
+    name: demo
+    steps:
+      - {move: [0.0, 0.5, 0.6, 0.5], over: 2.0}      bring the arm to this pose (rad), then let go
+      - {hold: 10.0}                                 leave it alone
+      - {push: [0.0, 2.0, 1.5, 1.0], over: 0.4}      push it with these joint torques (Nm)
+
+A person reads the steps from the screen; the virtual wearer of the simulator carries them out.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import accumulate
+from typing import Any
+
+from exo_gravity.core.arm import four_floats, one_float
+from exo_gravity.core.errors import ParameterError
+
+MAX_DURATION = 3600.0  # s
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step: `action` is 'move', 'hold' or 'push'; `value` (4,) is the pose in rad or the torque in Nm, if any."""
+
+    action: str
+    duration: float
+    value: tuple[float, ...] = ()
+
+    @classmethod
+    def parse(cls, entry: Any, where: str) -> Step:
+        """Return the step that a mapping from YAML describes; `where` names it in a ParameterError."""
+        if isinstance(entry, Mapping) and set(entry) == {"hold"}:
+            return cls("hold", one_float(f"{where}.hold", entry["hold"], 0.1, MAX_DURATION, "s"))
+        for action, bound, unit in (("move", 3.5, "rad"), ("push", 20.0, "Nm")):
+            if isinstance(entry, Mapping) and set(entry) == {action, "over"}:
+                value = four_floats(f"{where}.{action}", entry[action], -bound, bound, unit)
+                return cls(action, one_float(f"{where}.over", entry["over"], 0.1, 60.0, "s"), tuple(value.tolist()))
+        raise ParameterError(where, entry, "{move: [4 rad], over: s}, {hold: s} or {push: [4 Nm], over: s}")
+
+
+@dataclass(frozen=True)
+class TrialScript:
+    """A named list of steps."""
+
+    name: str
+    steps: tuple[Step, ...]
+
+    @classmethod
+    def parse(cls, content: Any) -> TrialScript:
+        """Return the script that YAML content describes, or raise ParameterError that names the wrong entry."""
+        if not isinstance(content, Mapping) or set(content) != {"name", "steps"}:
+            raise ParameterError("script", content, "a mapping with just name and steps")
+        steps = content["steps"]
+        if not isinstance(steps, list) or not steps:
+            raise ParameterError("steps", steps, "a list of at least one step")
+        return cls(str(content["name"]), tuple(Step.parse(entry, f"steps[{i}]") for i, entry in enumerate(steps)))
+
+    @property
+    def duration(self) -> float:
+        """Length of all steps together in s."""
+        return sum(step.duration for step in self.steps)
+
+    @property
+    def pose_count(self) -> int:
+        """How many poses the arm is brought to."""
+        return sum(step.action == "move" for step in self.steps)
+
+    def at(self, elapsed: float) -> tuple[int, float]:
+        """Return the index of the step under way `elapsed` s after the start, and the time since that step began.
+
+        After the end the index is len(steps).
+        """
+        index = bisect_right(self._ends, elapsed)
+        return index, elapsed - (self._ends[index - 1] if index else 0.0)
+
+    @cached_property
+    def _ends(self) -> tuple[float, ...]:
+        return tuple(accumulate(step.duration for step in self.steps))

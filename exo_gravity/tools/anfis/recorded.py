@@ -1,0 +1,98 @@
+"""What an ANFIS learns from, recorded: the mean torque that the motors gave in each hold of a rosbag2.
+
+What stiction carries is missing from a measured torque: approach each pose from both sides. Torques are in Nm at
+gain 1, not scaled; every fifth hold is kept for the check.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_typestore
+
+from exo_gravity.bag.reader import read_bag
+from exo_gravity.bag.storage import Storage
+from exo_gravity.core.anfis_law import INPUTS, UPRIGHT, scaled
+from exo_gravity.core.arm import JOINT_COUNT
+from exo_gravity.core.errors import DataError
+from exo_gravity.core.recording import Recording
+from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.trial_analysis import analyse
+from exo_gravity.tools.anfis.data import Samples
+from exo_gravity.tools.inputs.arms import ConfiguredArm
+
+HELD_OUT = 5
+TILT_TOPIC, TILT_TYPE = "/imu/pitch_yaw", "geometry_msgs/msg/Vector3Stamped"
+
+
+def from_bag(path: str | Path, space: ConfiguredArm, functions: int) -> Samples:
+    """Return the mean measured torque of each hold of a rosbag2 in which the trunk was upright.
+
+    The box is that of the poses held, within the joint limits. Raises DataError, one sentence, where they do not
+    suffice for `functions` membership functions per input.
+    """
+    bag = read_bag(path)
+    names = {recording.name: recording for recording in bag.recordings}
+    recording = names.get(space.side) or (next(iter(names.values())) if len(names) == 1 else None)
+    if recording is None:
+        raise DataError(f"{path}: arms {', '.join(names)}: must have one named {space.side}")
+    if sorted(recording.joint_names) != sorted(space.joint_names):
+        wanted = ", ".join(space.joint_names) or "listed as joint_names of the compensator in the parameter file"
+        raise DataError(f"{path}: joints are {', '.join(recording.joint_names)}: must be {wanted}")
+    order = [recording.joint_names.index(name) for name in space.joint_names]
+    angle, torque = (part[:, order] for part in held(recording, _tilted(path, space.side, bag.start)))
+    kept = np.all((angle >= space.low) & (angle <= space.high), axis=1)
+    angle, torque = angle[kept, 1:], torque[kept, 1:]
+    checked = np.arange(len(angle)) % HELD_OUT == HELD_OUT - 1
+    if len(angle) < HELD_OUT:
+        raise DataError(f"{path}: {len(angle)} holds with an upright trunk: must be many more to learn from")
+    low, high = angle.min(axis=0), angle.max(axis=0)
+    _check_coverage(scaled(angle[~checked], low, high), functions)
+    source = f"recording {Path(path).name}, {len(angle)} holds"
+    return Samples(angle[~checked], torque[~checked], angle[checked], torque[checked], low, high, source)
+
+
+def held(recording: Recording, tilted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean angle (m, 4) rad and measured torque (m, 4) Nm of each hold.
+
+    tilted: times in s at which the trunk was not upright; holds in which that happened are left out.
+    """
+    angle, torque = [], []
+    for hold in analyse(recording).holds:
+        within = (recording.time >= hold.start) & (recording.time <= hold.end)
+        if not np.any((tilted >= hold.start) & (tilted <= hold.end)):
+            angle.append(hold.pose)
+            torque.append(recording.effort[within].mean(axis=0))
+    angle, torque = (np.array(values, dtype=float).reshape(-1, JOINT_COUNT) for values in (angle, torque))
+    known = np.all(np.isfinite(torque), axis=1)
+    return angle[known], torque[known]
+
+
+def _tilted(path: str | Path, side: str, start: int) -> np.ndarray:
+    """Return the times in s at which the recorded trunk was not upright; without an IMU it counts as upright."""
+    types = get_typestore(Stores.ROS2_JAZZY)
+    times = []
+    for batch in Storage(path).batches(lambda topic, msgtype: (topic, msgtype) == (TILT_TOPIC, TILT_TYPE)):
+        for stamp, data in zip(batch.stamps, batch.data, strict=True):
+            try:
+                vector = types.deserialize_cdr(data, TILT_TYPE).vector
+            except (SerdeError, ValueError) as error:
+                raise DataError(f"{path}: {TILT_TOPIC} can't be read ({error})") from None
+            if not Tilt.of(side, pitch=vector.y, roll=vector.x).axis_angle <= UPRIGHT:
+                times.append((stamp - start) / 1e9)
+    return np.array(times)
+
+
+def _check_coverage(inputs: np.ndarray, functions: int) -> None:
+    """Raise DataError where a cell of the grid partition has no sample: a rule would be made up there."""
+    cell = np.minimum(((inputs + 1) / 2 * functions).astype(int), functions - 1)
+    empty = sorted(set(product(range(functions), repeat=len(INPUTS))) - set(map(tuple, cell.tolist())))
+    if empty:
+        where = ", ".join(f"{name} {part + 1}/{functions}" for name, part in zip(INPUTS, empty[0], strict=True))
+        raise DataError(
+            f"{len(empty)} of the {functions ** len(INPUTS)} parts of the box that the poses span hold none "
+            f"(the first: {where}): record holds there"
+        )

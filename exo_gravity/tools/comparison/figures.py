@@ -1,0 +1,79 @@
+"""The figures of `validate`: error over the workspace, and error over trunk tilt."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import product
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+
+matplotlib.use("Agg")  # no window: a machine without a screen draws too
+from matplotlib import pyplot as plt
+from matplotlib.colors import LogNorm
+
+from exo_gravity.tools.comparison.laws import Row, rms
+from exo_gravity.tools.inputs.arms import ConfiguredArm
+
+FLOOR, CEILING = 1e-7, 1.0  # Nm, ends of the colour scale; less is drawn as the floor
+GRID = (56, 56, 7)  # positions of joints 2, 3, 4 behind the workspace figure
+# Lines that lie on one another stay visible: the wider ones below are drawn first.
+STYLES = {
+    "EQ2-EQ5": {"color": "tab:orange", "marker": "s", "linewidth": 4, "markersize": 7},
+    "EQ1m-EQ4m": {"color": "tab:red", "marker": "D", "linewidth": 2},
+    "ANFIS": {"color": "tab:blue", "marker": "^", "linestyle": "--"},
+    "exact": {"color": "tab:green", "marker": "o"},
+}
+
+Error = Callable[[np.ndarray], np.ndarray]  # theta (n, 4) rad -> error (n, 4) Nm
+
+
+def workspace_figure(path: Path, space: ConfiguredArm, errors: dict[str, Error]) -> None:
+    """Draw the RMSE over the elbow of joints 2 to 4 (rows) and each law (columns) over abduction and flexion."""
+    axes = [np.linspace(low, high, n) for low, high, n in zip(space.low[1:], space.high[1:], GRID, strict=True)]
+    theta = np.array(list(product((0.0,), *axes)))
+    degrees = [np.degrees(axis) for axis in axes]
+    figure, grid = plt.subplots(3, len(errors), figsize=(3.2 * len(errors) + 1.6, 8.4), sharex=True, sharey=True)
+    figure.set_layout_engine("constrained")
+    for column, (name, error) in zip(grid.T, errors.items(), strict=True):
+        values = rms(np.moveaxis(error(theta).reshape(*GRID, 4), 2, 0))
+        for joint, axis in enumerate(column, start=2):
+            shown = np.clip(values[..., joint - 1].T, FLOOR, CEILING)
+            image = axis.pcolormesh(*degrees[:2], shown, norm=LogNorm(FLOOR, CEILING), cmap="viridis", rasterized=True)
+            axis.set_title(f"{name}: joint {joint}", fontsize=10)
+    for axis in grid[-1]:
+        axis.set_xlabel("joint 2, abduction (degrees)")
+    for axis in grid[:, 0]:
+        axis.set_ylabel("joint 3, flexion (degrees)")
+    figure.colorbar(image, ax=grid, label="RMSE over the elbow's range (Nm)", extend="min")
+    figure.suptitle("Error against gravload over the workspace, trunk upright, configured centres of gravity")
+    _save(figure, path)
+
+
+def tilt_figure(path: Path, rows: Sequence[Row]) -> None:
+    """Draw the RMSE of each law over the limit of the tilt: a column per joint, a row per set of centres of gravity."""
+    rows = [row for row in rows if row.positions == "random" and row.reference == "gravload"]
+    cogs = list(dict.fromkeys(row.cog for row in rows))
+    figure, grid = plt.subplots(len(cogs), 4, figsize=(13, 6.4), sharex=True, sharey="col", squeeze=False)
+    figure.set_layout_engine("constrained")
+    for (cog, line), joint in product(zip(cogs, grid, strict=True), range(1, 5)):
+        axis = line[joint - 1]
+        for law, style in STYLES.items():
+            chosen = [row for row in rows if (row.cog, row.joint, row.law) == (cog, joint, law)]
+            label = f"{law} (at most {max(row.rmse for row in rows if row.law == law):.2g} Nm)"
+            axis.plot([row.limit for row in chosen], [row.rmse for row in chosen], label=label, **style)
+        axis.set_title(f"joint {joint}, CoGs {cog}", fontsize=10)
+        axis.grid(alpha=0.3)
+    for axis in grid[-1]:
+        axis.set_xlabel("tilt up to (degrees)")
+    for axis in grid[:, 0]:
+        axis.set_ylabel("RMSE (Nm)")
+    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(STYLES))
+    figure.suptitle("Error against gravload over trunk tilt, random poses; the ANFIS was trained upright")
+    _save(figure, path)
+
+
+def _save(figure, path: Path) -> None:
+    figure.savefig(path, dpi=130)
+    plt.close(figure)

@@ -1,0 +1,95 @@
+"""The curse of dimensionality, measured: what an ANFIS of joint 3 costs as its inputs grow from 2 to 6.
+
+Inputs are added in the order of `INPUTS`: the elbow and the shoulder's flexion, then abduction, rotation, and the
+trunk's pitch and sideways tilt of up to 30 degrees. The functions per input stay the same, so the rules multiply. Each
+model sees three positions per consequent, and learns from the exact law.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from exo_gravity.core.anfis import Anfis
+from exo_gravity.core.gravity import gravity_torque
+from exo_gravity.core.tilt import Tilt
+from exo_gravity.tools.anfis.training import train
+from exo_gravity.tools.comparison.laws import rms
+from exo_gravity.tools.inputs.arms import ConfiguredArm
+
+INPUTS = ("theta_3", "theta_4", "theta_2", "theta_1", "pitch", "tilt")
+COLUMNS = (2, 3, 1, 0, 4, 5)  # of theta_1..theta_4, pitch, tilt
+TILT = math.radians(30.0)
+SAMPLES = 3  # positions per consequent
+HELD_OUT = 2000  # random positions
+STEPS = 20  # evaluations of the premises
+MANY = 2000  # consequents above which one least-squares solution takes a minute: the premises stay where they start
+
+
+@dataclass(frozen=True)
+class Growth:
+    """One model: its size, what it took, and what it came to. Seconds; RMSE in Nm."""
+
+    inputs: int
+    functions: int
+    rules: int
+    parameters: int
+    positions: int
+    steps: int
+    training_time: float
+    inference_time: float
+    training_rmse: float
+    held_out_rmse: float
+
+
+def growth(space: ConfiguredArm, functions: int, inputs: int) -> Growth:
+    """Return what a model of joint 3 with `functions` per input and the first `inputs` of `INPUTS` costs and gives."""
+    consequents = functions**inputs * (inputs + 1)
+    count = math.ceil((SAMPLES * consequents) ** (1 / inputs))
+    positions = np.array(list(product(np.linspace(-1, 1, count), repeat=inputs)))
+    trained = train(positions, _torque(space, positions), functions, max_evaluations=STEPS if consequents < MANY else 1)
+    between = np.random.default_rng(0).uniform(-1, 1, (HELD_OUT, inputs))
+    error = trained.model.output(between)[:, 0] - _torque(space, between)
+    model = trained.model
+    return Growth(
+        inputs,
+        functions,
+        model.rules,
+        model.parameters,
+        len(positions),
+        trained.evaluations,
+        trained.seconds,
+        _inference_time(model, between),
+        trained.rmse,
+        float(rms(error)),
+    )
+
+
+def sizes() -> Iterator[tuple[int, int]]:
+    """Yield (functions, inputs) of the table, the cheap ones first."""
+    yield from product((2, 3), range(2, len(INPUTS) + 1))
+
+
+def _torque(space: ConfiguredArm, scaled: np.ndarray) -> np.ndarray:
+    """Return joint 3's torque (n,) for inputs (n, d) in -1..1 over the workspace; the others are 0."""
+    low, high = np.append(space.low, (-TILT, -TILT)), np.append(space.high, (TILT, TILT))
+    state = np.zeros((len(scaled), len(INPUTS)))
+    chosen = list(COLUMNS[: scaled.shape[1]])
+    state[:, chosen] = low[chosen] + (scaled + 1) / 2 * (high - low)[chosen]
+    direction = np.array([Tilt.of(space.side, pitch, roll).direction for pitch, roll in state[:, 4:].tolist()])
+    return gravity_torque(space.arm, state[:, :4], direction)[:, 2]
+
+
+def _inference_time(model: Anfis, inputs: np.ndarray) -> float:
+    """Return the median time in s of one pose."""
+    times = []
+    for pose in inputs[:500]:
+        started = time.perf_counter()
+        model.output(pose[None])
+        times.append(time.perf_counter() - started)
+    return float(np.median(times))

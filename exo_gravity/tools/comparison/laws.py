@@ -1,0 +1,116 @@
+"""Which laws are compared, over which poses and tilts, and what they are off by.
+
+Two arms: centres of gravity at the links' far ends, d_n = l_n, as the paper's equations have it, and as configured.
+Each over the 1,053 positions with an upright trunk, and over random poses with pitch and sideways tilt drawn evenly
+within a limit. The paper's laws get the angle between joint 1's axis and gravity as theta_1, as in the compensator.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from exo_gravity.core.anfis_law import AnfisLaw
+from exo_gravity.core.arm import ArmModel
+from exo_gravity.core.gravity import gravity_torque, paper_mobile_torque, paper_static_torque
+from exo_gravity.core.tilt import Tilt
+from exo_gravity.tools.anfis.data import GRID
+from exo_gravity.tools.inputs.arms import ConfiguredArm
+
+TILTS = (0, 5, 10, 20, 30)  # degrees
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """Poses theta (n, 4) rad of an arm, and as many tilts. cog: 'link ends' or 'configured'; limit: degrees.
+
+    direction (n, 3), axis_angle, beta, phi (n,) rad: as in `core.tilt.Tilt`.
+    """
+
+    cog: str
+    positions: str
+    limit: int
+    arm: ArmModel
+    theta: np.ndarray
+    direction: np.ndarray
+    axis_angle: np.ndarray
+    beta: np.ndarray
+    phi: np.ndarray
+
+    @property
+    def axis_first(self) -> np.ndarray:
+        """The poses with theta_1 as the paper means it."""
+        return np.column_stack((self.axis_angle, self.theta[:, 1:]))
+
+
+@dataclass(frozen=True)
+class Row:
+    """How far `law` is from `reference` on one joint (1..4) over the `count` poses of a case: RMSE and largest, Nm."""
+
+    cog: str
+    positions: str
+    limit: int
+    count: int
+    law: str
+    reference: str
+    joint: int
+    rmse: float
+    largest: float
+    rms_torque: float
+
+    @property
+    def share(self) -> float:
+        """RMSE as a share of the RMS torque; NaN where gravity asks for none."""
+        return self.rmse / self.rms_torque if self.rms_torque > 1e-12 else math.nan
+
+
+Torques = Callable[[Case], np.ndarray]
+
+
+def laws(anfis: AnfisLaw) -> dict[str, Torques]:
+    """Return the laws by name, each a function of a case -> (n, 4) Nm; the ANFIS even where it was not trained."""
+    return {
+        "exact": lambda case: gravity_torque(case.arm, case.theta, case.direction),
+        "EQ2-EQ5": lambda case: paper_static_torque(case.arm, case.axis_first),
+        "EQ1m-EQ4m": lambda case: paper_mobile_torque(case.arm, case.axis_first, case.beta, case.phi),
+        "ANFIS": lambda case: case.arm.gain * np.pad(anfis.torques(case.theta[:, 1:]), ((0, 0), (1, 0))),
+    }
+
+
+def cases(cog: str, space: ConfiguredArm, count: int) -> Iterator[Case]:
+    """Yield the case of the 1,053 positions, then one of `count` random poses for each of `TILTS`."""
+    axes = [np.linspace(low, high, n) for low, high, n in zip(space.low[1:], space.high[1:], GRID, strict=True)]
+    yield _case(cog, "workspace", 0, space, np.array(list(product((0.0,), *axes))))
+    for limit in TILTS:
+        rng = np.random.default_rng(limit)
+        yield _case(cog, "random", limit, space, rng.uniform(space.low, space.high, (count, 4)), rng)
+
+
+def _case(cog: str, positions: str, limit: int, space: ConfiguredArm, theta: np.ndarray, rng=None) -> Case:
+    bound = math.radians(limit)
+    tilt = rng.uniform(-bound, bound, (len(theta), 2)) if limit else np.zeros((len(theta), 2))
+    tilts = [Tilt.of(space.side, pitch, roll) for pitch, roll in tilt.tolist()]
+    felt = (np.array([getattr(t, name) for t in tilts]) for name in ("direction", "axis_angle", "beta", "phi"))
+    return Case(cog, positions, limit, space.arm, theta, *felt)
+
+
+def compare(case: Case, torque: dict[str, np.ndarray], reference: str, expected: np.ndarray) -> list[Row]:
+    """Return a row per law and joint: the laws' torques (n, 4) against the reference's `expected` (n, 4)."""
+    rms_torque = rms(expected)
+    rows = []
+    for law, given in torque.items():
+        error = given - expected
+        figures = zip(rms(error), np.abs(error).max(axis=0), rms_torque, strict=True)
+        for joint, numbers in enumerate(figures, start=1):
+            head = case.cog, case.positions, case.limit, len(case.theta), law, reference, joint
+            rows.append(Row(*head, *(float(number) for number in numbers)))
+    return rows
+
+
+def rms(values: np.ndarray) -> np.ndarray:
+    """Return the root mean square of each column."""
+    return np.sqrt(np.mean(np.square(values), axis=0))

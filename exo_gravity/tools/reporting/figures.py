@@ -1,0 +1,144 @@
+"""The figures of a report: the paper's plot of positions, velocities and torques, and a closer look at the drift.
+
+The colours are those of Okabe and Ito (2008), told apart with any colour vision. A recording of an hour is drawn as the
+least and greatest value of each of two thousand stretches, so that no peak is lost.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from exo_gravity.core.recording import Recording
+from exo_gravity.core.trial_analysis import Hold, Trial
+from exo_gravity.core.verdict import HoldCriteria
+from exo_gravity.tools.reporting.table import degrees, joint_labels, per_minute
+
+JOINT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
+HOLD_COLOUR, PUSH_COLOUR, INK, FAINT = "#E8EEF4", "#F9E3B4", "#222222", "#9AA3AB"
+STRETCHES = 2_000
+WIDTH = 11.0  # inches
+
+
+def overview(recording: Recording, trial: Trial) -> Figure:
+    """Return positions, velocities and torques over time, holds and pushes shaded, each hold numbered."""
+    figure = Figure(figsize=(WIDTH, 8.2), layout="constrained")
+    axes = figure.subplots(3, 1, sharex=True, height_ratios=(1.25, 1.0, 1.25))
+    panels = ((degrees(1.0), recording.position), (degrees(1.0), recording.velocity), (1.0, recording.effort))
+    for axis, label, (scale, values) in zip(
+        axes, ("Position (deg)", "Velocity (deg/s)", "Torque (Nm)"), panels, strict=True
+    ):
+        _shade(axis, trial)
+        for joint, colour in enumerate(JOINT_COLOURS):
+            axis.plot(*_envelope(recording.time, scale * values[:, joint]), color=colour, lw=1.1)
+        axis.set_ylabel(label)
+        _plain(axis)
+    commanded = bool(np.isfinite(recording.command).any())
+    for command in recording.command.T if commanded else ():
+        axes[2].plot(*_envelope(recording.time, command), color=INK, lw=0.6, ls=(0, (4, 3)))
+    for number, hold in enumerate(trial.holds, 1):
+        middle = (hold.start + hold.end) / 2
+        axes[0].annotate(
+            str(number), (middle, 1.0), (0, 3), xycoords=("data", "axes fraction"), textcoords="offset points",
+            ha="center", color=INK, fontsize=9,
+        )  # fmt: skip
+    axes[2].set_xlabel("Time (s)")
+    axes[2].set_xlim(recording.time[0], recording.time[-1])
+    _legend(figure, recording, trial, commanded)
+    return figure
+
+
+def drift(recording: Recording, trial: Trial, limits: HoldCriteria) -> Figure:
+    """Return how far each joint went from where each hold began, and the rate of drift of each hold."""
+    figure = Figure(figsize=(WIDTH, 6.6), layout="constrained")
+    grid = figure.add_gridspec(2, 4, height_ratios=(1.0, 1.1))
+    first = figure.add_subplot(grid[0, 0])
+    axes = [first, *(figure.add_subplot(grid[0, joint], sharex=first, sharey=first) for joint in (1, 2, 3))]
+    for joint, (axis, name) in enumerate(zip(axes, joint_labels(recording), strict=True)):
+        for hold in trial.holds:
+            time, away = _from_start(recording, hold, joint)
+            axis.plot(time, degrees(away), color=JOINT_COLOURS[joint], lw=0.9, alpha=0.75)
+        axis.set_title(name, fontsize=10, color=JOINT_COLOURS[joint], loc="left", weight="bold")
+        axis.set_xlabel("Time in the hold (s)")
+        axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
+        _plain(axis)
+        axis.tick_params(labelleft=joint == 0)
+    first.set_ylabel("Away from its start (deg)")
+    reach = max([0.1, *(abs(value) for axis in axes for value in axis.dataLim.intervaly if math.isfinite(value))])
+    first.set_ylim(-1.15 * reach, 1.15 * reach)
+    _rates(figure.add_subplot(grid[1, :]), recording, trial, limits)
+    return figure
+
+
+def _rates(axis: Axes, recording: Recording, trial: Trial, limits: HoldCriteria) -> None:
+    for joint, (name, colour) in enumerate(zip(joint_labels(recording), JOINT_COLOURS, strict=True)):
+        numbers = np.arange(1, len(trial.holds) + 1) + 0.12 * (joint - 1.5)
+        rate = [per_minute(hold.drift_rate[joint]) for hold in trial.holds]
+        error = [per_minute(hold.drift_rate_uncertainty[joint]) for hold in trial.holds]
+        axis.errorbar(numbers, rate, error, fmt="o", ms=4.5, lw=1.2, capsize=2, color=colour, label=name)
+    axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
+    if math.isfinite(limits.max_rate):
+        bound = per_minute(limits.max_rate)
+        axis.axhspan(-bound, bound, color=HOLD_COLOUR, zorder=-1, label=f"allowed: ±{bound:g} deg/min")
+        axis.legend(loc="upper left", bbox_to_anchor=(0, 1.14), ncols=5, frameon=False, fontsize=9)
+    axis.set_xticks(range(1, len(trial.holds) + 1))
+    axis.set_xlim(0.4, len(trial.holds) + 0.6)
+    axis.set_xlabel("Hold")
+    axis.set_ylabel("Drift (deg/min)")
+    _plain(axis)
+
+
+def _from_start(recording: Recording, hold: Hold, joint: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the time in the hold and the means over tenths of a second, less the first half second's."""
+    first, last = np.searchsorted(recording.time, (hold.start, hold.end))
+    time = recording.time[first:last] - hold.start
+    edges = np.unique(np.searchsorted(time, np.arange(0.0, hold.duration, max(0.1, hold.duration / STRETCHES))))
+    edges = edges[edges < len(time)]
+    count = np.diff(np.append(edges, len(time)))
+    mean = np.add.reduceat(recording.position[first:last, joint], edges, dtype=float) / count
+    return time[edges], mean - mean[: max(1, round(0.5 / 0.1))].mean()
+
+
+def _envelope(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a line through the least and the greatest value of each stretch of time."""
+    if len(time) <= 2 * STRETCHES:
+        return time, values
+    edges = np.linspace(0, len(time), STRETCHES, endpoint=False).astype(int)
+    ends = np.stack([np.minimum.reduceat(values, edges), np.maximum.reduceat(values, edges)], axis=1)
+    return np.repeat(time[edges], 2), ends.ravel()
+
+
+def _shade(axis: Axes, trial: Trial) -> None:
+    for hold in trial.holds:
+        axis.axvspan(hold.start, hold.end, color=HOLD_COLOUR, lw=0, zorder=0)
+    for motion in trial.motions:
+        if motion.kind in ("push", "slip"):
+            axis.axvspan(motion.start, motion.end, color=PUSH_COLOUR, lw=0, zorder=0)
+
+
+def _legend(figure: Figure, recording: Recording, trial: Trial, commanded: bool) -> None:
+    entries = [
+        Line2D([], [], color=colour, lw=2.5, label=name)
+        for name, colour in zip(joint_labels(recording), JOINT_COLOURS, strict=True)
+    ]
+    if commanded:
+        entries.append(Line2D([], [], color=INK, lw=0.8, ls=(0, (4, 3)), label="commanded"))
+    entries.append(Patch(color=HOLD_COLOUR, label="hold"))
+    if any(motion.kind in ("push", "slip") for motion in trial.motions):
+        entries.append(Patch(color=PUSH_COLOUR, label="push"))
+    columns = len(entries) if sum(len(entry.get_label()) for entry in entries) < 90 else 4
+    figure.legend(handles=entries, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
+
+
+def _plain(axis: Axes) -> None:
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.spines[["left", "bottom"]].set_color(FAINT)
+    axis.tick_params(color=FAINT, labelcolor=INK, labelsize=9)
+    axis.grid(axis="y", color="#D5DADF", lw=0.5)
+    axis.set_axisbelow(True)
+    axis.margins(x=0)

@@ -1,0 +1,156 @@
+"""The numbers of a report: rows for CSV and the page, and the tables on the terminal. Degrees here, radians inside."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from exo_gravity.core.recording import Recording
+from exo_gravity.core.trial_analysis import Hold, Motion, Trial
+
+Row = dict[str, Any]
+SPARE_COLUMNS = ("v deg/s", "peak speed deg/s", "error Nm", "torque Nm", "at s", "deg in 10 s")  # the first goes first
+
+
+def degrees(values: np.ndarray | float) -> np.ndarray:
+    """Return radians in degrees, or rad/s in degrees per second."""
+    return np.degrees(values)
+
+
+def per_minute(values: np.ndarray | float) -> np.ndarray:
+    """Return rad/s in degrees per minute."""
+    return 60.0 * np.degrees(values)
+
+
+def joint_labels(recording: Recording) -> list[str]:
+    """Return the joints' names for a reader: without the arm's, and with spaces."""
+    return [name.removeprefix(f"{recording.name}_").replace("_", " ") for name in recording.joint_names]
+
+
+def hold_rows(recording: Recording, trial: Trial) -> Iterator[Row]:
+    """Yield one row for each hold and joint."""
+    for number, hold in enumerate(trial.holds, 1):
+        for joint, name in enumerate(recording.joint_names):
+            yield {
+                "arm": recording.name,
+                "hold": number,
+                "start_s": hold.start,
+                "duration_s": hold.duration,
+                "after": hold.after,
+                "joint": name,
+                "pose_deg": degrees(hold.pose[joint]),
+                "drift_deg_per_min": per_minute(hold.drift_rate[joint]),
+                "drift_uncertainty_deg_per_min": per_minute(hold.drift_rate_uncertainty[joint]),
+                "drift_deg": degrees(hold.drift[joint]),
+                "stray_in_10_s_deg": degrees(hold.stray[joint]),
+                "rms_velocity_deg_per_s": degrees(hold.velocity_rms[joint]),
+                "rms_torque_nm": hold.torque_rms[joint],
+                "torque_error_nm": hold.torque_error[joint],
+            }
+
+
+def motion_rows(recording: Recording, trial: Trial) -> Iterator[Row]:
+    """Yield one row for each motion between holds and joint."""
+    for number, motion in enumerate(trial.motions, 1):
+        for joint, name in enumerate(recording.joint_names):
+            yield {
+                "arm": recording.name,
+                "motion": number,
+                "kind": motion.kind,
+                "start_s": motion.start,
+                "until_still_s": motion.until_still,
+                "joint": name,
+                "peak_deg": degrees(motion.peak[joint]),
+                "residual_deg": degrees(motion.residual[joint]),
+                "peak_speed_deg_per_s": degrees(motion.speed[joint]),
+            }
+
+
+def write_csv(path: Path, rows: Iterable[Row]) -> None:
+    """Write rows with their names on top; an unknown number is left empty. No rows, no file."""
+    rows = [{key: _csv_value(value) for key, value in row.items()} for row in rows]
+    if rows:
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, rows[0])
+            writer.writeheader()
+            writer.writerows(rows)
+
+
+def _csv_value(value: Any) -> Any:
+    if isinstance(value, str | int):
+        return value
+    return f"{value:.6g}" if math.isfinite(value) else ""
+
+
+def shown(value: float, digits: int) -> str:
+    """Return a number for a reader: a dash if unknown, and no minus before what rounds to 0."""
+    return f"{round(float(value), digits) + 0.0:.{digits}f}" if math.isfinite(value) else "–"
+
+
+def print_tables(console: Console, recording: Recording, trial: Trial) -> None:
+    """Print the holds and the motions of one arm, each cell with the four joints in order."""
+    console.print(f"\n[bold]{recording.name}[/], joints in order: {', '.join(joint_labels(recording))}")
+    if trial.holds:
+        console.print(_table(_hold_columns(trial.holds), console.width))
+    if pushes := [motion for motion in trial.motions if motion.kind != "move"]:
+        console.print(_table(_push_columns(pushes), console.width))
+
+
+def _hold_columns(holds: Sequence[Hold]) -> dict[str, list[str]]:
+    return {
+        "hold": [str(number) for number, _ in enumerate(holds, 1)],
+        "at s": [shown(hold.start, 1) for hold in holds],
+        "for s": [shown(hold.duration, 1) for hold in holds],
+        "pose deg": _fours((degrees(hold.pose) for hold in holds), 0),
+        "drift deg/min": _fours((per_minute(hold.drift_rate) for hold in holds), 2),
+        "±": [shown(per_minute(hold.drift_rate_uncertainty.max()), 2) for hold in holds],
+        "deg in 10 s": [shown(degrees(hold.stray.max()), 2) for hold in holds],
+        "v deg/s": [shown(degrees(hold.velocity_rms.max()), 2) for hold in holds],
+        "torque Nm": _fours((hold.torque_rms for hold in holds), 2),
+        "error Nm": [shown(hold.torque_error.max(), 2) for hold in holds],
+    }
+
+
+def _push_columns(motions: Sequence[Motion]) -> dict[str, list[str]]:
+    return {
+        "motion": [motion.kind for motion in motions],
+        "at s": [shown(motion.start, 1) for motion in motions],
+        "still after s": [_until_still(motion) for motion in motions],
+        "peak deg": _fours((degrees(motion.peak) for motion in motions), 1),
+        "residual deg": _fours((degrees(motion.residual) for motion in motions), 1),
+        "peak speed deg/s": _fours((degrees(motion.speed) for motion in motions), 0),
+    }
+
+
+def _until_still(motion: Motion) -> str:
+    # Nobody asks that of an arm on its way down.
+    known = math.isfinite(motion.until_still) or motion.kind == "let down"
+    return shown(motion.until_still, 1) if known else "never"
+
+
+def _table(columns: dict[str, list[str]], width: int) -> Table:
+    """Return the columns as a table; on a narrow terminal without the ones that the files have room for."""
+    for spare in SPARE_COLUMNS:
+        if sum(2 + max(map(len, (head, *cells))) for head, cells in columns.items()) > width:
+            columns.pop(spare, None)
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    for head in columns:
+        table.add_column(head, justify="right", no_wrap=True)
+    for row in zip(*columns.values(), strict=True):
+        table.add_row(*row)
+    return table
+
+
+def _fours(rows: Iterable[np.ndarray], digits: int) -> list[str]:
+    """Return one cell a row with its four numbers, each below the one of the row above."""
+    texts = [[shown(value, digits) for value in row] for row in rows]
+    width = max((len(text) for row in texts for text in row), default=0)
+    return [" ".join(text.rjust(width) for text in row) for row in texts]

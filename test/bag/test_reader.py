@@ -1,0 +1,368 @@
+"""Recordings of every form -> the arrays that were written, against rosbags as the independent writer and decoder."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import shutil
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
+
+from exo_gravity.bag.joints import FIELDS, Layout
+from exo_gravity.bag.reader import read_bag
+from exo_gravity.core.errors import DataError
+
+from ..support import made_bags as made
+
+POSES = [[0.1, 0.4, 0.5, 0.6], [-0.2, 0.8, 0.3, 0.9]]
+FORMS = {
+    "mcap": {},
+    "sqlite3": {"plugin": StoragePlugin.SQLITE3},
+    "mcap with compressed chunks": {"compression": CompressionMode.STORAGE},
+    "compressed file": {"compression": CompressionMode.FILE},
+    "compressed messages": {"compression": CompressionMode.MESSAGE},
+}
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return made.trial(POSES, hold=2.0, rate=200.0)
+
+
+@pytest.fixture(scope="module")
+def content(recording):
+    return list(made.messages(recording))
+
+
+@pytest.fixture
+def bag(content, tmp_path):
+    return made.write_bag(tmp_path / "bag", content)
+
+
+def only(path):
+    (recording,) = read_bag(path).recordings
+    return recording
+
+
+def assert_same(read, written, count=None):
+    assert read.name == written.name and read.joint_names == written.joint_names
+    for field in ("position", "velocity", "effort"):
+        np.testing.assert_allclose(getattr(read, field), getattr(written, field)[:count], rtol=1e-6)
+
+
+@pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
+def test_every_form_of_rosbag2_gives_the_arrays_that_were_written(recording, content, tmp_path, form):
+    assert_same(only(made.write_bag(tmp_path / "bag", content, **form)), recording)
+
+
+@pytest.mark.parametrize("chunked", [True, False])
+def test_an_mcap_file_of_another_writer_is_read(recording, content, tmp_path, chunked):
+    with (tmp_path / "other.mcap").open("wb") as file:
+        writer = McapWriter(file, chunk_size=20_000, compression=CompressionType.LZ4, use_chunking=chunked)
+        writer.start("ros2")
+        schema = writer.register_schema(made.JOINT_STATE, "ros2msg", b"std_msgs/Header header")
+        channels = {}
+        for topic, kind, stamp, data in content:
+            if kind == made.JOINT_STATE:
+                channel = channels.get(topic) or channels.setdefault(
+                    topic, writer.register_channel(topic, "cdr", schema)
+                )
+                writer.add_message(channel, stamp, data, stamp)
+        writer.finish()
+    assert_same(only(tmp_path / "other.mcap"), recording)
+
+
+def test_time_is_that_of_the_stamps_from_the_first_arrival_on(recording, bag):
+    np.testing.assert_allclose(only(bag).time, recording.time - 200e-6, atol=1e-8)
+
+
+def test_without_stamps_time_is_that_of_arrival(recording, tmp_path):
+    states = [
+        ("/joint_states", made.JOINT_STATE, made.START + round(time * 1e9), made.joint_state(0, made.NAMES, pose))
+        for time, pose in zip(recording.time.tolist(), recording.position, strict=True)
+    ]
+    read = only(made.write_bag(tmp_path / "bag", states))
+    np.testing.assert_allclose(read.time, recording.time, atol=1e-8)
+    assert read.name == "arm"
+
+
+def test_a_command_stands_beside_the_state_after_the_one_that_it_answers(recording, bag):
+    read = only(bag)
+    np.testing.assert_allclose(read.command[1:], recording.command[:-1], rtol=1e-6)
+    assert np.all(np.isnan(read.command[0]))
+
+
+def test_commands_that_ceased_do_not_count_for_longer_than_they_are_in_force(recording, content, tmp_path):
+    last = made.START + 2 * 10**9
+    some = [item for item in content if item[0] != "/right/effort_commands" or item[2] < last]
+    read = only(made.write_bag(tmp_path / "bag", some))
+    assert np.all(np.isfinite(read.command[(read.time > 0.1) & (read.time < 2.0)]))
+    assert np.all(np.isnan(read.command[read.time > 2.3]))
+
+
+def test_joints_are_found_by_name_whatever_their_order(recording, tmp_path):
+    names = made.NAMES[::-1]
+    turned = made.trial(POSES[:1], hold=2.0, rate=200.0)
+    content = list(made.messages(turned))
+    for k, (topic, kind, stamp, _) in enumerate(content):
+        if topic == "/right/effort_commands":
+            answered = stamp - 500_000
+            row = round((answered - made.START) * 200 / 1e9)
+            data = made.joint_state(answered, names, effort=turned.command[row][::-1])
+            content[k] = topic, kind, stamp, data
+    read = only(made.write_bag(tmp_path / "bag", content))
+    np.testing.assert_allclose(read.command[1:], turned.command[:-1], rtol=1e-6)
+
+
+def test_messages_of_changing_length_and_order_in_one_topic_are_all_decoded(tmp_path):
+    rng = np.random.default_rng(5)
+    content, expected = [], []
+    for k in range(300):
+        order = rng.permutation(4)
+        values = rng.standard_normal((3, 4))
+        stamp = made.START + k * 5_000_000
+        data = made.joint_state(stamp, [made.NAMES[i] for i in order], *values[:, order], frame="x" * int(k % 5))
+        content.append(("/right/joint_states", made.JOINT_STATE, stamp, data))
+        expected.append(values)
+    read = only(made.write_bag(tmp_path / "bag", content))
+    columns = [made.NAMES.index(name) for name in read.joint_names]
+    got = np.stack([read.position, read.velocity, read.effort], axis=1)
+    np.testing.assert_allclose(got, np.array(expected)[:, :, columns], rtol=1e-6)
+
+
+@given(
+    st.lists(st.text("abcü_1", min_size=1, max_size=9), max_size=6, unique=True),
+    st.text("abcü/", max_size=9),
+    st.sets(st.sampled_from(FIELDS)),
+    st.booleans(),
+)
+def test_the_layout_of_any_joint_state_is_what_rosbags_decodes(names, frame, present, little_endian):
+    types = made.STORE.types
+    header = types["std_msgs/msg/Header"](stamp=types["builtin_interfaces/msg/Time"](sec=7, nanosec=8), frame_id=frame)
+    numbers = {f: np.arange(len(names)) + 10.0 * k if f in present else np.zeros(0) for k, f in enumerate(FIELDS)}
+    message = types[made.JOINT_STATE](header, names, **numbers)
+    data = bytes(made.STORE.serialize_cdr(message, made.JOINT_STATE, little_endian=little_endian))
+    layout = Layout.of(data)
+    rows = np.frombuffer(data, np.uint8)[None]
+    decoded = made.STORE.deserialize_cdr(data, made.JOINT_STATE)
+    assert list(layout.names) == list(decoded.name) and layout.stamps(rows)[0] == 7_000_000_008
+    for field in FIELDS:
+        expected = getattr(decoded, field) if len(getattr(decoded, field)) else np.full(len(names), np.nan)
+        np.testing.assert_array_equal(layout.values(rows, names, (field,))[0, 0], expected)
+
+
+def test_what_the_wearer_was_told_is_the_script(recording, bag):
+    steps = only(bag).steps
+    assert [step.action for step in steps] == ["move", "hold", "move", "hold"]
+    np.testing.assert_allclose([step.start for step in steps], [step.start for step in recording.steps], atol=0.006)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
+def test_a_recording_cut_short_gives_what_was_written_before(recording, bag, share):
+    (bag / "metadata.yaml").unlink()
+    file = bag / "bag.mcap"
+    file.write_bytes(file.read_bytes()[: round(share * file.stat().st_size)])
+    read = read_bag(bag)
+    (arm,) = read.recordings
+    assert 0.8 * share < len(arm.time) / len(recording.time) <= 1.0
+    assert_same(arm, recording, len(arm.time))
+    assert "cut short" in read.notes[0]
+
+
+def test_a_recording_that_lacks_its_index_alone_is_whole(recording, bag):
+    file = bag / "bag.mcap"
+    file.write_bytes(file.read_bytes()[:-40])
+    read = read_bag(bag)
+    assert_same(read.recordings[0], recording)
+    assert not read.notes
+
+
+@pytest.mark.parametrize("share", [0.5, 0.9])
+def test_a_recording_with_compressed_chunks_cut_short_gives_the_whole_chunks(recording, content, tmp_path, share):
+    bag = made.write_bag(tmp_path / "bag", content * 4, compression=CompressionMode.STORAGE)
+    file = bag / "bag.mcap"
+    file.write_bytes(file.read_bytes()[: round(share * file.stat().st_size)])
+    read = read_bag(bag)
+    assert "cut short" in read.notes[0] and len(read.recordings[0].time) > 100
+
+
+def test_a_database_cut_short_gives_the_rows_before(recording, content, tmp_path):
+    bag = made.write_bag(tmp_path / "bag", content, plugin=StoragePlugin.SQLITE3)
+    (bag / "metadata.yaml").unlink()
+    file = bag / "bag.db3"
+    file.write_bytes(file.read_bytes()[: round(0.6 * file.stat().st_size)])
+    read = read_bag(bag)
+    assert len(read.recordings[0].time) > 100
+    assert "cut short" in read.notes[0]
+
+
+def test_the_parts_of_a_recording_are_read_in_the_order_of_their_numbers(recording, content, tmp_path):
+    folder = tmp_path / "split"
+    folder.mkdir()
+    edges = np.linspace(0, len(content), 13).astype(int)
+    for number, (first, last) in enumerate(itertools.pairwise(edges)):
+        part = made.write_bag(tmp_path / f"part_{number}", content[first:last])
+        shutil.move(part / f"part_{number}.mcap", folder / f"split_{number}.mcap")
+    read = only(folder)
+    assert_same(read, recording)
+    np.testing.assert_allclose(read.time, recording.time - 200e-6, atol=1e-8)
+
+
+def test_an_empty_recording_says_so(tmp_path):
+    topics = [("/right/joint_states", made.JOINT_STATE)]
+    with pytest.raises(DataError, match="empty"):
+        read_bag(made.write_bag(tmp_path / "bag", [], topics=topics))
+
+
+def test_a_recording_without_joint_states_says_what_it_has(tmp_path):
+    content = [("/chatter", "std_msgs/msg/String", made.START, made.string("hello"))]
+    with pytest.raises(DataError, match=r"no topic joint_states .* it has /chatter"):
+        read_bag(made.write_bag(tmp_path / "bag", content))
+
+
+def test_joint_states_of_another_type_do_not_count(tmp_path):
+    content = [("/right/joint_states", "std_msgs/msg/String", made.START, made.string("hello"))]
+    with pytest.raises(DataError, match="joint_states"):
+        read_bag(made.write_bag(tmp_path / "bag", content))
+
+
+@pytest.mark.parametrize("name", ["missing", "folder", "text.mcap", "text.db3", "text.txt"])
+def test_what_is_no_recording_is_refused_by_its_name(tmp_path, name):
+    (tmp_path / "folder").mkdir()
+    for file in ("text.mcap", "text.db3", "text.txt"):
+        (tmp_path / file).write_text("no recording at all, though long enough to look at\n" * 20)
+    with pytest.raises(DataError, match=name):
+        read_bag(tmp_path / name)
+
+
+def test_commands_for_other_joints_leave_positions_reported_and_say_so(recording, tmp_path):
+    content = made.messages(recording, command_names=("a", "b", "c", "d"))
+    read = read_bag(made.write_bag(tmp_path / "bag", content))
+    assert_same(read.recordings[0], recording)
+    (problem,) = read.problems
+    assert "/right/effort_commands" in problem and "a, b, c, d" in problem and "right_joint_1" in problem
+
+
+def test_joint_states_whose_names_change_are_refused(recording, content, tmp_path):
+    stamp = content[-1][2] + 10**9
+    other = made.joint_state(stamp, ("a", "b", "c", "d"), *np.zeros((3, 4)))
+    with pytest.raises(DataError, match=r"/right/joint_states: joint names differ: a, b, c, d"):
+        read_bag(made.write_bag(tmp_path / "bag", [*content, ("/right/joint_states", made.JOINT_STATE, stamp, other)]))
+
+
+def test_an_arm_that_cannot_be_read_leaves_the_other_reported(recording, content, tmp_path):
+    bad = [
+        ("/left/joint_states", made.JOINT_STATE, made.START + k * 10**6, made.joint_state(0, ["a"], [0.0]))
+        for k in range(9)
+    ]
+    read = read_bag(made.write_bag(tmp_path / "bag", [*bad, *content]))
+    assert [arm.name for arm in read.recordings] == ["right"]
+    assert "left" in read.problems[0] and "must be 4" in read.problems[0]
+
+
+def test_a_damaged_message_is_named_by_its_topic(content, tmp_path):
+    broken = [(topic, kind, stamp, data[:40]) for topic, kind, stamp, data in content if kind == made.JOINT_STATE]
+    with pytest.raises(DataError, match=r"/right/joint_states: .* damaged"):
+        read_bag(made.write_bag(tmp_path / "bag", broken))
+
+
+def test_without_commands_the_rest_is_reported_with_a_note(recording, content, tmp_path):
+    states = [item for item in content if item[0] != "/right/effort_commands"]
+    read = read_bag(made.write_bag(tmp_path / "bag", states))
+    assert_same(read.recordings[0], recording)
+    assert np.all(np.isnan(read.recordings[0].command)) and "effort_commands" in read.notes[0]
+
+
+@pytest.mark.parametrize("text", ["no JSON", "[1]", "{}", '{"action": "hold", "duration": null}'])
+def test_what_is_no_step_is_a_problem_in_one_sentence_and_the_rest_is_read(content, recording, tmp_path, text):
+    wrong = ("/right/wearer_step", "std_msgs/msg/String", content[-1][2], made.string(text))
+    read = read_bag(made.write_bag(tmp_path / "bag", [*content, wrong]))
+    assert read.problems == ("/right/wearer_step: a message of it is no step that a wearer was told",)
+    assert_same(read.recordings[0], recording)
+
+
+def status(level, text, **values):
+    """What a bridge says of itself, but for the time."""
+    types = made.STORE.types
+    pairs = [types["diagnostic_msgs/msg/KeyValue"](key=key, value=value) for key, value in values.items()]
+    entry = types["diagnostic_msgs/msg/DiagnosticStatus"](level, "right/can_bridge", text, "", pairs)
+    kind = "diagnostic_msgs/msg/DiagnosticArray"
+    stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
+    message = types[kind](types["std_msgs/msg/Header"](stamp=stamp, frame_id=""), [entry])
+    return "/diagnostics", kind, bytes(made.STORE.serialize_cdr(message, kind))
+
+
+def test_the_arm_is_carried_from_the_bridges_first_word_of_that_to_its_last(content, tmp_path):
+    states = ["checking", "ramping in", "active", "active", "letting down", "fault", "checking", "active", "active"]
+    for tenth, state in enumerate(states):
+        topic, kind, data = status(0, state, state=state)
+        content = [*content, (topic, kind, made.START + tenth * 10**8, data)]
+    content.sort(key=lambda item: item[2])
+    arrival = 0.0002  # s, of the first joint state, at which time begins
+    expected = [(0.1 - arrival, 0.3 - arrival), (0.7 - arrival, 0.8 - arrival)]
+    np.testing.assert_allclose(only(made.write_bag(tmp_path / "bag", content)).carried, expected, atol=1e-9)
+
+
+def test_where_no_bridge_tells_its_state_nobody_knows_when_the_arm_was_carried(content, bag):
+    assert only(bag).carried is None
+
+
+def test_faults_changed_parameters_and_parameters_at_the_start_are_told(content, tmp_path):
+    types = made.STORE.types
+    stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
+
+    def change(name, value):
+        nothing = dict(bool_value=False, integer_value=0, string_value="", byte_array_value=np.zeros(0, np.uint8))
+        nothing.update(bool_array_value=np.zeros(0, bool), integer_array_value=np.zeros(0, np.int64))
+        nothing.update(double_array_value=np.zeros(0), string_array_value=[])
+        value = types["rcl_interfaces/msg/ParameterValue"](type=3, double_value=value, **nothing)
+        parameter = types["rcl_interfaces/msg/Parameter"](name=name, value=value)
+        kind = "rcl_interfaces/msg/ParameterEvent"
+        message = types[kind](stamp, "/right/compensator", [], [parameter], [])
+        return "/parameter_events", kind, bytes(made.STORE.serialize_cdr(message, kind))
+
+    snapshot = "/right/compensator:\n  ros__parameters: {law: exact}\n"
+    told = [
+        (1.0, ("/recorder/parameters", "std_msgs/msg/String", made.string(snapshot))),
+        (2.0, status(0, "fine")),
+        (3.0, status(2, "motor 2 is silent")),
+        (3.5, status(2, "motor 2 is silent")),
+        (4.0, status(0, "fine")),
+        (5.0, change("support", 0.5)),
+    ]
+    extra = [(topic, kind, made.START + 200_000 + round(s * 1e9), data) for s, (topic, kind, data) in told]
+    read = read_bag(made.write_bag(tmp_path / "bag", sorted([*content, *extra], key=lambda item: item[2])))
+    assert [(round(event.time, 6), event.text) for event in read.events] == [
+        (3.0, "right/can_bridge: motor 2 is silent"),
+        (4.0, "right/can_bridge: OK, fine"),
+        (5.0, "/right/compensator: support = 0.5"),
+    ]
+    assert read.parameters == {"/right/compensator": snapshot}
+
+
+def test_progress_reaches_the_size_of_the_recording(bag):
+    seen = []
+    read_bag(bag, lambda done, size: seen.append((done, size)))
+    assert seen[-1][1] == (bag / "bag.mcap").stat().st_size
+    assert 0 < seen[0][0] <= seen[-1][0] <= seen[-1][1]
+
+
+def test_a_step_that_is_no_json_is_a_problem_and_not_the_end(content, recording, tmp_path):
+    steps = [("/right/wearer_step", "std_msgs/msg/String", made.START, made.string("gibberish"))]
+    states = [item for item in content if not item[0].endswith("wearer_step")]
+    read = read_bag(made.write_bag(tmp_path / "bag", [*steps, *states]))
+    assert "/right/wearer_step" in read.problems[0]
+    assert_same(read.recordings[0], recording)
+
+
+def test_a_step_of_the_virtual_wearer_has_more_than_is_needed(content, tmp_path):
+    done = json.dumps({"step": 4, "of": 4, "action": "done", "duration": 0.0})
+    stamp = content[-1][2] + 1
+    last = ("/right/wearer_step", "std_msgs/msg/String", stamp, made.string(done))
+    assert only(made.write_bag(tmp_path / "bag", [*content, last])).steps[-1].action == "done"

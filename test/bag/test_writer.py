@@ -1,0 +1,170 @@
+"""What `BagWriter` leaves on disk, seen by independent readers; killed, and on a disk that is full."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import QosDurability, QosReliability
+from rosbags.typesys import Stores, get_typestore
+
+from exo_gravity.bag.reader import read_bag
+from exo_gravity.bag.writer import BagWriter, offered_qos
+from exo_gravity.core.errors import DataError
+from exo_gravity.bag import writer
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+JOINT_STATE, STRING = "sensor_msgs/msg/JointState", "std_msgs/msg/String"
+NAMES = ["shoulder", "abduction", "flexion", "elbow"]
+START = 1_700_000_000_000_000_000
+RELIABLE = offered_qos(True, False, 1)
+
+
+def joint_state(k):
+    types = STORE.types
+    stamp = types["builtin_interfaces/msg/Time"](sec=START // 10**9, nanosec=k)
+    header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="")
+    return bytes(
+        STORE.serialize_cdr(types[JOINT_STATE](header, NAMES, *[np.array([k, 0.1, 0.2, 0.3])] * 3), JOINT_STATE)
+    )
+
+
+@pytest.fixture
+def bag(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("/right/joint_states", JOINT_STATE, RELIABLE)
+        writer.add_topic("/right/wearer_step", STRING, offered_qos(True, True, 1))
+        writer.write([("/right/joint_states", START + k, joint_state(k)) for k in range(100)])
+    assert writer.error is None
+    return tmp_path / "bag"
+
+
+def test_mcap_decodes_the_joint_names_from_the_schema_in_the_file(bag):
+    with (bag / "bag.mcap").open("rb") as file:
+        decoded = list(make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
+    assert [message.position[0] for _, _, _, message in decoded] == list(range(100))
+    schema, channel, record, message = decoded[7]
+    assert (schema.name, channel.topic, record.log_time) == (JOINT_STATE, "/right/joint_states", START + 7)
+    assert list(message.name) == NAMES
+
+
+def test_rosbags_reads_topics_types_and_messages(bag):
+    with AnyReader([bag]) as reader:
+        messages = [(c.topic, stamp, reader.deserialize(data, c.msgtype)) for c, stamp, data in reader.messages()]
+        assert {topic: info.msgtype for topic, info in reader.topics.items()} == {
+            "/right/joint_states": JOINT_STATE,
+            "/right/wearer_step": STRING,
+        }
+    assert [(stamp, state.position[0]) for _, stamp, state in messages] == [(START + k, k) for k in range(100)]
+
+
+def test_the_quality_of_service_that_was_offered_is_kept(bag):
+    with AnyReader([bag]) as reader:
+        offered = {c.topic: c.ext.offered_qos_profiles[0] for c in reader.connections}
+    assert offered["/right/joint_states"].reliability == QosReliability.RELIABLE
+    assert offered["/right/joint_states"].durability == QosDurability.VOLATILE
+    assert offered["/right/wearer_step"].durability == QosDurability.TRANSIENT_LOCAL
+
+
+def test_metadata_is_that_of_rosbag2_with_the_hash_of_each_type(bag):
+    metadata = yaml.safe_load((bag / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert metadata["storage_identifier"] == "mcap" and metadata["message_count"] == 100
+    topic = metadata["topics_with_message_count"][0]["topic_metadata"]
+    # What Jazzy's own publishers of a JointState announce.
+    expected = "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"
+    assert topic["type_description_hash"] == expected
+
+
+def test_a_folder_that_exists_is_not_written_over(bag):
+    with pytest.raises(DataError, match="exists already"):
+        BagWriter(bag)
+
+
+def test_a_type_that_is_not_known_is_refused_by_its_name(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer, pytest.raises(DataError, match="my_msgs/msg/Mine"):
+        writer.add_topic("/mine", "my_msgs/msg/Mine", RELIABLE)
+
+
+def test_what_waits_is_written_before_the_end(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("/right/joint_states", JOINT_STATE, RELIABLE)
+        for k in range(1500):
+            writer.write([("/right/joint_states", START + k, joint_state(k))])
+    assert writer.count == len(read_bag(tmp_path / "bag").recordings[0].time) == 1500
+
+
+def test_a_disk_that_never_answers_ends_the_recording_and_holds_nobody_up(tmp_path, monkeypatch):
+    answer = threading.Event()
+    monkeypatch.setattr(writer, "MAX_WAITING", 10)
+    monkeypatch.setattr(BagWriter, "_take", lambda self, item: answer.wait())
+    writer = BagWriter(tmp_path / "bag")
+    for k in range(20):
+        writer.write([("/right/joint_states", START + k, b"")])
+    assert "too slow" in str(writer.error)
+    answer.set()
+    writer.close()
+
+
+WRITE_UNTIL_KILLED = """
+import sys, time
+sys.path.insert(0, {folder!r})
+from test_bag_writer import *
+writer = BagWriter({path!r})
+writer.add_topic("/right/joint_states", JOINT_STATE, RELIABLE)
+while True:
+    now = time.time_ns()
+    writer.write([("/right/joint_states", now, joint_state(0))])
+    print(now, flush=True)
+    time.sleep(0.2)  # so slow that no buffer fills by itself
+"""
+
+
+def test_killed_at_any_moment_it_loses_at_most_the_last_second(tmp_path):
+    path = tmp_path / "bag"
+    code = WRITE_UNTIL_KILLED.format(folder=str(Path(__file__).parent), path=str(path))
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    stamps = []
+    while len(stamps) < 2 or stamps[-1] - stamps[0] < 1.7e9:
+        stamps.append(int(process.stdout.readline()))
+    process.send_signal(signal.SIGKILL)
+    stamps += [int(line) for line in process.stdout.read().split()]
+    process.wait()
+    assert not (path / "metadata.yaml").exists()
+    read = read_bag(path)
+    written = len(read.recordings[0].time)
+    assert stamps[-1] - stamps[written - 1] < 1e9
+    assert "cut short" in read.notes[0]
+
+
+FILL_THE_DISK = """
+import resource, sys
+sys.path.insert(0, {folder!r})
+from test_bag_writer import *
+resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+writer = BagWriter({path!r})
+writer.add_topic("/right/joint_states", JOINT_STATE, RELIABLE)
+for k in range(2_000):
+    if writer.error:
+        break
+    writer.write([("/right/joint_states", START + k * 1_000_000, joint_state(k))])
+writer.close()
+print(writer.error)
+"""
+
+
+def test_a_file_that_may_not_grow_ends_the_recording_with_the_reason_and_keeps_what_fits(tmp_path):
+    path = tmp_path / "bag"
+    code = FILL_THE_DISK.format(folder=str(Path(__file__).parent), path=str(path))
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0 and done.stderr == ""
+    assert "recording ended after" in done.stdout and "File too large" in done.stdout
+    assert len(read_bag(path).recordings[0].time) > 500

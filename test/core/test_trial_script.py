@@ -1,0 +1,40 @@
+"""A trial's script is read whole or refused with the entry that is wrong."""
+
+import pytest
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.trial_script import TrialScript
+
+GOOD = {
+    "name": "short",
+    "steps": [{"move": [0, 0.5, 0.6, 0.5], "over": 2.0}, {"hold": 10}, {"push": [0, 1, 1, 0], "over": 0.5}],
+}
+
+
+def test_a_protocol_knows_which_step_is_under_way():
+    script = TrialScript.parse(GOOD)
+    assert script.duration == 12.5
+    assert script.pose_count == 1
+    assert script.at(1.9)[0] == 0
+    index, since = script.at(2.5)
+    assert (script.steps[index].action, since) == ("hold", 0.5)
+    assert script.at(13.0)[0] == len(script.steps)
+
+
+@pytest.mark.parametrize(
+    ("content", "name"),
+    [
+        (None, "script"),
+        ({"name": "x", "steps": [], "extra": 1}, "script"),
+        ({"name": "x", "steps": []}, "steps"),
+        ({"name": "x", "steps": [{"hold": 1, "over": 1}]}, "steps[0]"),
+        ({"name": "x", "steps": [{"hold": "long"}]}, "steps[0].hold"),
+        ({"name": "x", "steps": [{"hold": 1}, {"move": [0, 0, 0], "over": 1}]}, "steps[1].move"),
+        ({"name": "x", "steps": [{"move": [0, 0, 0, 90], "over": 1}]}, "steps[0].move"),
+        ({"name": "x", "steps": [{"push": [0, 0, 0, 1], "over": -1}]}, "steps[0].over"),
+    ],
+)
+def test_a_wrong_entry_is_named(content, name):
+    with pytest.raises(ParameterError) as caught:
+        TrialScript.parse(content)
+    assert caught.value.name == name

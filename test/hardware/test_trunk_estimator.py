@@ -1,0 +1,214 @@
+"""The trunk's orientation from an IMU: on a recording of a real one, and on trunks whose motion is known exactly."""
+
+import math
+from pathlib import Path
+
+import imufusion
+import numpy as np
+import pytest
+from scipy.ndimage import uniform_filter1d
+from scipy.spatial.transform import Rotation
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.tilt import gravity_in_trunk
+from exo_gravity.hardware.trunk_estimator import MAX_GAP, ImuSample, TrunkEstimator
+
+RECORDING = Path(__file__).parents[3] / "shared" / "data" / "imu_handheld.csv"
+ALIGNED = (0.0, 0.0, 0.0, 1.0)
+G = 9.80665
+
+
+def angle(a, b):
+    """Angle in degrees between vectors (..., 3)."""
+    cross = np.linalg.norm(np.cross(a, b), axis=-1)
+    return np.degrees(np.arctan2(cross, np.sum(np.multiply(a, b), axis=-1)))
+
+
+def gravity(estimate):
+    return gravity_in_trunk(estimate.pitch, estimate.roll)
+
+
+@pytest.fixture(scope="module")
+def recording():
+    """Time (n,) s, gyroscope (n, 3) deg/s and accelerometer (n, 3) g of an IMU moved by hand."""
+    if not RECORDING.exists():
+        pytest.skip(f"the recording is not here: {RECORDING}")
+    columns = np.loadtxt(RECORDING, delimiter=",", skiprows=1)
+    return columns[:, 0], columns[:, 1:4], columns[:, 4:7]
+
+
+@pytest.fixture(scope="module")
+def estimates(recording):
+    """Gravity in the IMU's axes (n, 3) for each sample of the recording; NaN where the estimator gave nothing."""
+    estimator = TrunkEstimator(ALIGNED)
+    time, rate, acceleration = recording
+    answers = map(estimator.update, map(ImuSample, time, np.radians(rate), G * acceleration))
+    return np.array([(math.nan,) * 3 if answer is None else gravity(answer) for answer in answers])
+
+
+def test_nothing_is_given_for_3_seconds_and_everything_after(recording, estimates):
+    missing = np.isnan(estimates[:, 0])
+    assert recording[0][missing].max() == pytest.approx(3.0, abs=0.05) and not np.any(missing[np.argmin(missing) :])
+
+
+def test_at_rest_the_tilt_agrees_with_the_accelerometer_within_1_degree(recording, estimates):
+    _, rate, acceleration = recording
+    speed, size = np.linalg.norm(rate, axis=1), np.linalg.norm(acceleration, axis=1)
+    restless = (speed > 3.0) | (np.abs(size - np.median(size)) > 0.05)
+    at_rest = uniform_filter1d(restless.astype(float), 101) < 1e-9  # nothing stirs for half a second before and after
+    up = uniform_filter1d(acceleration, 101, axis=0)[at_rest]
+    error = angle(estimates[at_rest], -up)
+    assert np.mean(at_rest) > 0.3
+    assert np.nanmax(error) < 1.0
+
+
+def test_in_motion_the_tilt_turns_no_faster_than_the_gyroscope_plus_the_feedback(recording, estimates):
+    time, rate, _ = recording
+    feedback = math.degrees(0.5)  # deg/s: the gain, at most, whatever the accelerometer says
+    steps = angle(estimates[1:], estimates[:-1])
+    allowed = (np.linalg.norm(rate[1:], axis=1) + feedback) * np.diff(time)
+    assert np.nanmax(steps - allowed) <= 0.0
+
+
+def test_the_recording_agrees_with_imufusion_run_by_itself(recording, estimates):
+    ahrs, expected = imufusion.Ahrs(), []
+    for dt, rate, acceleration in zip(np.diff(recording[0], prepend=-0.01), *recording[1:], strict=True):
+        ahrs.set_sample_period(dt)
+        ahrs.update_no_magnetometer(rate, acceleration)
+        expected.append(-ahrs.get_gravity().astype(float))
+    # 0.05 degrees is what the gyroscope's bias, which this reference does not learn, makes of it.
+    assert np.nanmax(angle(estimates, np.array(expected))) < 0.1
+
+
+def samples_of(orientation, duration=5.0, rate=100.0, start=0.0, report=False, bias=(0.0, 0.0, 0.0)):
+    """Samples of an ideal IMU: `orientation(t)` is world from IMU, a Rotation."""
+    for step in range(1, round(duration * rate) + 1):
+        t = step / rate
+        now = orientation(t)
+        speed = (orientation(t - 1 / rate).inv() * now).as_rotvec() * rate + bias
+        yield ImuSample(start + t, speed, now.inv().apply((0, 0, G)), now.as_quat() if report else None)
+
+
+def last(estimator, samples):
+    answer = None
+    for sample in samples:
+        answer = estimator.update(sample)
+    return answer
+
+
+@pytest.mark.parametrize("report", [False, True])
+def test_the_tilt_is_the_trunks_however_the_imu_is_mounted(report):
+    world_from_trunk = Rotation.from_euler("xyz", (0.2, -0.5, 1.0))
+    for mounting in Rotation.random(20, random_state=1):
+        estimator = TrunkEstimator(mounting.as_quat())
+        answer = last(estimator, samples_of(lambda t, m=mounting: world_from_trunk * m, report=report))
+        assert (answer.pitch, answer.roll) == pytest.approx((-0.5, 0.2), abs=1e-4)
+
+
+@pytest.mark.parametrize("report", [False, True])
+def test_the_orientation_given_has_the_tilt_given(report):
+    mounting = Rotation.from_euler("zyx", (2.0, 0.4, -1.0))
+    bow = samples_of(lambda t: Rotation.from_euler("xyz", (0.3, 0.2 * t, 0.1)) * mounting, report=report)
+    answer = last(TrunkEstimator(mounting.as_quat()), bow)
+    down = Rotation.from_quat(answer.orientation).inv().apply((0, 0, -1))
+    assert down == pytest.approx(gravity(answer), abs=1e-6)
+
+
+def test_an_imu_mounted_upside_down_settles_the_right_way_up():
+    upside_down = Rotation.from_quat((1, 0, 0, 0))
+    answer = last(TrunkEstimator((1, 0, 0, 0)), samples_of(lambda t: upside_down))
+    assert (answer.pitch, answer.roll) == pytest.approx((0, 0), abs=1e-3)
+
+
+def test_a_bow_through_90_degrees_is_followed_without_a_jump():
+    estimator = TrunkEstimator(ALIGNED)
+    last(estimator, samples_of(lambda t: Rotation.identity()))
+    bow = samples_of(lambda t: Rotation.from_euler("y", t), duration=2.0, start=5.0)
+    down = np.array([gravity(estimator.update(sample)) for sample in bow])
+    assert angle(down[1:], down[:-1]).max() < 0.6  # 1 rad/s is 0.573 degrees a sample
+    assert down[-1] == pytest.approx((math.sin(2), 0, -math.cos(2)), abs=0.01)  # within one sample
+
+
+def test_the_gyroscopes_bias_is_learnt_at_rest():
+    estimator = TrunkEstimator(ALIGNED)
+    answer = last(estimator, samples_of(lambda t: Rotation.identity(), duration=60.0, bias=(0.03, 0, 0)))
+    assert estimator.gyroscope_bias == pytest.approx((0.03, 0, 0), abs=1e-3)
+    assert abs(answer.roll) < math.radians(0.3)  # 0.03 rad/s over a gain of 0.5 would be 3.4 degrees
+
+
+def settled(report=False, mounting=ALIGNED):
+    estimator = TrunkEstimator(mounting)
+    assert last(estimator, samples_of(lambda t: Rotation.identity(), report=report)) is not None
+    return estimator
+
+
+GOOD = ImuSample(5.01, (0.0, 0.0, 0.0), (0.0, 0.0, G))
+IMPOSSIBLE = {
+    "a stamp that is not a number": GOOD._replace(time=math.nan),
+    "an endless stamp": GOOD._replace(time=math.inf),
+    "the last stamp again": GOOD._replace(time=5.0),
+    "a stamp before the last": GOOD._replace(time=4.95),
+    "a gyroscope that says NaN": GOOD._replace(angular_velocity=(0, math.nan, 0)),
+    "a gyroscope in deg/s": GOOD._replace(angular_velocity=(0, 40.0, 0)),
+    "no gyroscope": GOOD._replace(angular_velocity=None),
+    "an accelerometer that says infinity": GOOD._replace(acceleration=(0, 0, math.inf)),
+    "a dead accelerometer": GOOD._replace(acceleration=(0, 0, 0)),
+    "an accelerometer in g": GOOD._replace(acceleration=(0, 0, 1.0)),
+    "an accelerometer at 20 g": GOOD._replace(acceleration=(0, 0, 20 * G)),
+    "no accelerometer": GOOD._replace(acceleration=None),
+    "two axes": GOOD._replace(acceleration=(0, G)),
+    "an orientation of zeros": GOOD._replace(orientation=(0, 0, 0, 0)),
+    "an orientation that is not a number": GOOD._replace(orientation=(0, 0, math.nan, 1)),
+}
+
+
+@pytest.mark.parametrize("sample", IMPOSSIBLE.values(), ids=IMPOSSIBLE)
+def test_an_impossible_sample_is_refused_and_leaves_the_estimate_as_it_was(sample):
+    estimator, untouched = settled(), settled()
+    with pytest.raises(ParameterError):
+        estimator.update(sample)
+    assert gravity(estimator.update(GOOD)) == pytest.approx(gravity(untouched.update(GOOD)), abs=1e-12)
+
+
+@pytest.mark.parametrize("report", [False, True])
+@pytest.mark.parametrize("start", [5.0 + MAX_GAP, 1e9, -1e3])
+def test_after_a_gap_or_another_clock_nothing_is_given_until_it_has_settled_again(report, start):
+    estimator = settled(report)
+    tilted = Rotation.from_euler("y", 1.0)
+    answers = [estimator.update(s) for s in samples_of(lambda t: tilted, start=start, report=report)]
+    given = [answer for answer in answers if answer is not None]
+    assert answers[0] is None and 0 < len(given) < len(answers) - 90
+    assert {round(answer.pitch, 2) for answer in given} == {1.0}
+
+
+def test_a_reported_orientation_that_jumps_is_not_passed_on():
+    estimator = settled(report=True)
+    jumped = Rotation.from_euler("y", 0.3)
+    answers = [estimator.update(s) for s in samples_of(lambda t: jumped, duration=0.9, start=5.0, report=True)]
+    assert not any(answers) and "jumped" in estimator.settling
+
+
+def test_a_driver_that_reports_the_identity_without_meaning_it_is_found_out():
+    estimator = TrunkEstimator(ALIGNED)
+    lying = (sample._replace(orientation=ALIGNED) for sample in samples_of(lambda t: Rotation.from_euler("x", 0.6)))
+    with pytest.raises(ParameterError, match="20 degrees of the accelerometer"):
+        last(estimator, lying)
+
+
+def test_a_gyroscope_with_a_reversed_axis_is_found_out():
+    estimator = settled()
+    bow = samples_of(lambda t: Rotation.from_euler("y", 0.5 * t), duration=3.0, start=5.0)
+    with pytest.raises(ParameterError, match="20 degrees of the accelerometer"):
+        last(estimator, (s._replace(angular_velocity=-np.asarray(s.angular_velocity)) for s in bow))
+
+
+def test_without_imufusion_only_an_imu_that_reports_its_orientation_is_followed(monkeypatch):
+    monkeypatch.setattr("exo_gravity.hardware.trunk_estimator.imufusion", None)
+    estimator = settled(report=True)
+    with pytest.raises(ParameterError, match="imufusion"):
+        estimator.update(GOOD)
+
+
+def test_the_mounting_must_be_given_as_a_unit_quaternion():
+    with pytest.raises(ParameterError, match="rotation_trunk_from_imu"):
+        TrunkEstimator((0, 0, 0, 0))
