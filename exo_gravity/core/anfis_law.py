@@ -117,12 +117,8 @@ class AnfisLaw:
                 return f"the ANFIS was trained for another arm: its M{joint} is {trained:.4f} kg m"
         return ""
 
-    def inside(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> bool:
-        """Return whether the law was trained for this arm, pose (4,) rad and tilt."""
-        return not self.outside(arm, theta, tilt)
-
     def torque(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
-        """Return the torque in Nm at pose `theta` (4,) rad, as the other laws do; meaningless unless `inside`."""
+        """Return the torque in Nm at pose `theta` (4,) rad, as the other laws do; meaningless where `outside`."""
         tau = self.torques(np.array((theta[1:],)))[0].tolist()
         scale = arm.scale
         return (0.0, *(scale[joint] * value / self.gravity for joint, value in enumerate(tau, start=1)))

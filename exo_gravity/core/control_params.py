@@ -1,4 +1,4 @@
-"""The parameters of `can_bridge` and `compensator`, and what their values mean: limits, motors, settings."""
+"""The parameters of `can_bridge` and `compensator`, and the limits, motors and settings that their values describe."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from exo_gravity.core.anfis_law import AnfisLaw
-from exo_gravity.core.arm import MAX_GAIN, MAX_GRAVITY, MAX_LENGTH, MAX_MASS, MAX_TOTAL_MASS, STANDARD_GRAVITY, ArmModel
-from exo_gravity.core.compensator import LAW_NAMES, MODES, Settings
+from exo_gravity.core.arm import MAX_GAIN, MAX_GRAVITY, MAX_LENGTH, MAX_MASS, STANDARD_GRAVITY, ArmModel
+from exo_gravity.core.compensator import Settings
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.limits import MOST_EFFORT, Limits
-from exo_gravity.core.motors import MOTORS
-from exo_gravity.core.param_table import Param
+from exo_gravity.core.joint_motor import MAX_CAN_ID, TORQUE_SCALE_BOUNDS, JointMotor
+from exo_gravity.core.limits import Limits
+from exo_gravity.core.motors import MOTORS, WIRE_RANGE_BOUNDS
+from exo_gravity.core.param_table import Param, param_of, params_of
 from exo_gravity.core.tilt import SIDES
 from exo_gravity.core.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
 
-OPTIONS = "can.options"  # everything below it goes to python-can as it is
+OPTIONS = "can.options"  # everything below this prefix is passed to python-can unchanged
 
 JOINT_NAMES = Param(
     "joint_names",
@@ -26,69 +26,57 @@ JOINT_NAMES = Param(
 )
 # fmt: off
 REAL_TIME_PARAMETERS = (
-    Param("thread_priority", 0, "SCHED_FIFO priority of the hot threads, if permitted; 0: none", (0, 99), fixed=True),
-    Param("lock_memory", False, "keep the process's memory from being paged out, where permitted", fixed=True),
+    Param("thread_priority", 0, "SCHED_FIFO priority of the control loop's threads; 0: none", (0, 99), fixed=True),
+    Param("lock_memory", False, "lock the process's memory (mlockall), where permitted", fixed=True),
 )
-# For `can_bridge` these are what it believes of the motors; for `simulator`, what is true.
+# `can_bridge` believes these values of its motors; for `simulator` they are the truth.
 MOTOR_PARAMETERS = (
     Param("can.interface", "", "python-can interface, e.g. socketcan, udp_multicast", fixed=True, required=True),
     Param("can.channel", "", "python-can channel, e.g. can0", fixed=True, required=True),
     Param("motor", ["AK60-6", "AK80-9", "AK60-6", "AK60-6"], "motor types", choices=tuple(MOTORS), fixed=True),
-    Param("can_id", [1, 2, 3, 4], "CAN IDs", (1, 126), fixed=True),
+    Param("can_id", [1, 2, 3, 4], "CAN IDs", (1, MAX_CAN_ID), fixed=True),
     Param("direction", [1, 1, 1, 1], "1 or -1: joint angle = direction * (motor angle - zero)", (-1, 1), fixed=True),
-    Param("zero", [0.0, 0.0, 0.0, 0.0], "motor angle in rad where the joint's angle is 0", (-12.5, 12.5), fixed=True),
-    Param("torque_scale", [1.0, 1.0, 1.0, 1.0], "real torque per commanded Nm", (0.2, 2.0), fixed=True),
-    Param("velocity_range", [45.0, 50.0, 45.0, 45.0], "wire range of the firmware in rad/s", (1.0, 100.0), fixed=True),
-    Param("torque_range", [15.0, 18.0, 15.0, 15.0], "wire range of the firmware in Nm", (1.0, 100.0), fixed=True),
+    Param("zero", [0.0] * 4, "motor angle at which the joint angle is 0", (-12.5, 12.5), "rad", fixed=True),
+    Param("torque_scale", [1.0] * 4, "real torque per commanded Nm", TORQUE_SCALE_BOUNDS, fixed=True),
+    Param("velocity_range", [45.0, 50.0, 45.0, 45.0], "velocity range of the firmware's wire format",
+          WIRE_RANGE_BOUNDS, "rad/s", fixed=True),
+    Param("torque_range", [15.0, 18.0, 15.0, 15.0], "torque range of the firmware's wire format",
+          WIRE_RANGE_BOUNDS, "Nm", fixed=True),
 )
-LIMIT_PARAMETERS = (
-    Param("position_min", [-1.65, -0.17, -0.78, -0.17], "lower joint limits in rad", (-3.15, 3.15), fixed=True),
-    Param("position_max", [1.65, 3.14, 2.53, 3.14], "upper joint limits in rad", (-3.15, 3.15), fixed=True),
-    Param("max_velocity", [5.0, 5.0, 5.0, 6.0], "speed in rad/s that lets the arm down", (0.1, 20.0), fixed=True),
-    Param("max_effort", [3.0, 9.0, 3.0, 3.0], "largest torque in Nm; rated by default", (0.0, 18.0), fixed=True),
-    Param("max_effort_rate", 50.0, "fastest change of torque in Nm/s", (1.0, 1000.0), fixed=True),
-    Param("max_temperature", 80.0, "motor temperature in degC that lets the arm down", (30.0, 120.0), fixed=True),
-    Param("command_timeout", 0.05, "age of efforts in s that lets the arm down", (0.01, 0.1), fixed=True),
-    Param("reply_timeout", 0.05, "silence of a motor in s that lets the arm down", (0.01, 0.1), fixed=True),
-    Param("ramp_time", 1.0, "from no torque to all of it in s", (0.5, 30.0), fixed=True),
-    Param("fade_time", 2.0, "from all torque to none in s, when the arm is let down", (0.5, 30.0), fixed=True),
-    Param("damping", 5.0, "motor-side damping on the way down in Nm s/rad", (0.5, 5.0), fixed=True),
-    Param("home", [0.0, 0.0, 0.0, 0.0], "rad, where the arm hangs at the start", (-3.15, 3.15), fixed=True),
-    Param("home_tolerance", [0.5, 0.34, 0.5, 0.5], "rad off home, refused at the start", (0.01, 6.3), fixed=True),
-    Param("sign_check_torque", 1.5, "Nm that try a joint's sign at the start; 0: none", (0.0, 3.0), fixed=True),
-)
+LIMIT_PARAMETERS = params_of(Limits, fixed=True)
 CAN_BRIDGE = (
     JOINT_NAMES,
     Param("autostart", True, "configure and activate at start, without an operator", fixed=True),
-    Param("rate", 250.0, "control cycles per second, as many as fit on the wire", (20.0, 2000.0), fixed=True),
+    Param("rate", 250.0, "control cycles per second; what does not fit on the wire is refused", (20.0, 2000.0), "Hz",
+          fixed=True),
     *MOTOR_PARAMETERS,
     *LIMIT_PARAMETERS,
     *REAL_TIME_PARAMETERS,
 )
 COMPENSATOR = (
-    Param("side", "right", "which arm: its base is mirrored", choices=SIDES, fixed=True),
+    Param("side", "right", "which arm; the right arm mirrors the left", choices=SIDES, fixed=True),
     JOINT_NAMES,
-    Param("link_length", [0.05, 0.13, 0.30, 0.30], "l_n, link lengths in m", (0.0, MAX_LENGTH), fixed=True),
-    Param("law", "exact", "how gravity's torque is computed", choices=LAW_NAMES),
+    Param("link_length", [0.05, 0.13, 0.30, 0.30], "l_n, link lengths", (0.0, MAX_LENGTH), "m", fixed=True),
+    param_of(Settings, "law"),
     Param("anfis_file", "", "model for the law anfis, written by train_anfis"),
-    Param("mode", "one_g", "one_g carries the robot, zero_g the wearer's arm too", choices=MODES),
-    Param("support", 1.0, "share of the wearer's arm that zero_g carries", (0.0, 1.0)),
+    param_of(Settings, "mode"),
+    param_of(Settings, "support"),
     Param("gain", [1.0, 1.0, 1.0, 1.0], "c_n, scales the torque of joint n", (0.0, MAX_GAIN)),
-    Param("gravity", STANDARD_GRAVITY, "g, acceleration of gravity in m/s^2", (0.0, MAX_GRAVITY)),
-    Param("robot.mass", [0.585, 0.468, 0.598, 0.203], "m_n, link masses in kg", (0.0, MAX_MASS)),
-    Param("robot.cog", [0.046, 0.113, 0.237, 0.128], "d_n, centre of gravity from joint n in m", (0.0, MAX_LENGTH)),
-    Param("wearer.mass", [0.0, 0.0, 0.0, 0.0], "the wearer's mass on each link in kg", (0.0, MAX_MASS)),
-    Param("wearer.cog", [0.0, 0.0, 0.0, 0.0], "its centre of gravity from joint n in m", (0.0, MAX_LENGTH)),
-    Param("wearer.body_mass", 0.0, "body mass in kg; fills wearer.mass and cog where they are 0", (0.0, 300.0)),
-    Param("wearer.sex", "male", "for the table of segment masses", choices=SEX),
+    Param("gravity", STANDARD_GRAVITY, "g, acceleration of gravity", (0.0, MAX_GRAVITY), "m/s^2"),
+    Param("robot.mass", [0.585, 0.468, 0.598, 0.203], "m_n, link masses", (0.0, MAX_MASS), "kg"),
+    Param("robot.cog", [0.046, 0.113, 0.237, 0.128], "d_n, centre of gravity from joint n", (0.0, MAX_LENGTH), "m"),
+    Param("wearer.mass", [0.0, 0.0, 0.0, 0.0], "the wearer's mass on each link", (0.0, MAX_MASS), "kg"),
+    Param("wearer.cog", [0.0, 0.0, 0.0, 0.0], "its centre of gravity from joint n", (0.0, MAX_LENGTH), "m"),
+    Param("wearer.body_mass", 0.0, "body mass; fills wearer.mass and wearer.cog where they are 0", (0.0, 300.0), "kg"),
+    Param("wearer.sex", "male", "selects the column of the segment table", choices=SEX),
     Param("wearer.table", "de_leva", "table of segment masses and centres of gravity", choices=tuple(TABLES)),
-    Param("wearer.segment_length", list(TYPICAL_LENGTH), "upper arm, forearm, hand in m", (0.0, 0.6)),
-    Param("max_total_mass", 10.0, "most that may be carried in all, in kg", (0.5, MAX_TOTAL_MASS), fixed=True),
-    Param("max_effort", [3.0, 9.0, 3.0, 3.0], "largest torque per joint in Nm", (0.0, MOST_EFFORT)),
-    Param("max_effort_rate", 50.0, "fastest change of torque in Nm/s", (1.0, 1000.0)),
-    Param("transition_time", 1.0, "time in s over which a change of mass, mode or law reaches the arm", (0.2, 30.0)),
+    Param("wearer.segment_length", list(TYPICAL_LENGTH), "upper arm, forearm, hand", (0.0, 0.6), "m"),
+    param_of(Settings, "max_total_mass", fixed=True),
+    param_of(Settings, "max_effort"),
+    param_of(Settings, "max_effort_rate"),
+    param_of(Settings, "transition_time"),
     Param("use_imu", True, "false: the trunk counts as upright (the paper's seated wearer)", fixed=True),
-    Param("tilt_timeout", 0.08, "age of the trunk tilt in s after which the arm is let down", (0.01, 0.5)),
+    param_of(Settings, "tilt_timeout"),
     *REAL_TIME_PARAMETERS,
 )
 # fmt: on
@@ -127,15 +115,14 @@ def settings_of(values: Mapping[str, Any], anfis: AnfisLaw | None = None) -> Set
             raise ParameterError(f"robot.{error.name}", error.value, error.expected) from None
         raise
     mass, cog = wearer_of(values)
-    same = ("law", "mode", "support", "max_total_mass", "max_effort", "max_effort_rate", "transition_time")
     return Settings(
         side=values["side"],
         robot=robot,
         wearer_mass=mass,
         wearer_cog=cog,
-        tilt_timeout=values["tilt_timeout"] if values["use_imu"] else 0.0,
+        use_imu=values["use_imu"],
         anfis=anfis,
-        **{name: values[name] for name in same},
+        **{param.name: values[param.name] for param in params_of(Settings)},
     )
 
 

@@ -4,8 +4,8 @@
 `paper_static` is EQ2-EQ5 and `paper_mobile` EQ1m-EQ4m of the paper, word for word. They agree with `exact` where
 every centre of gravity sits at its link's far end (d_n = l_n) and the trunk is upright; elsewhere they do not.
 
-Each formula is written once, on `xp`: the module `math` for one pose in plain floats (the control loop), or `numpy`
-for whole arrays (analysis). Symbols: t1..t4 joint angles in rad, M1..M4 first moments in kg m, g gravity in m/s^2,
+Each formula is written once, for `xp`: the module `math` for one pose in plain floats (control loop), or `numpy` for
+whole arrays (analysis). Symbols: t1..t4 joint angles in rad, M1..M4 first moments in kg m, g gravity in m/s^2,
 l, d, m1..m4 as in the paper.
 """
 
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.tilt import Tilt
 
 Torque = tuple[float, float, float, float]
-BLOCK = 4096  # poses computed at once: what is worked out of them on the way stays in the processor's cache
+BLOCK = 4096  # poses computed at once: intermediate arrays then fit the processor's cache
 
 
 def _exact(xp, arm: ArmModel, theta, direction):
@@ -134,30 +134,41 @@ def _in_blocks(formula, arm: ArmModel, theta: np.ndarray, *inputs: np.ndarray) -
     return torque.reshape(theta.shape)
 
 
-class Law(NamedTuple):
-    """One pose in plain floats, as the control loop wants it: `torque(arm, theta, tilt)` -> 4 Nm."""
+class Law(Protocol):
+    """A law as the control loop uses it: one pose in plain floats."""
 
-    name: str
-    torque: Callable[[ArmModel, Sequence[float], Tilt], Torque]
+    def torque(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
+        """Return the torque (4,) in Nm that holds `arm` at `theta` (4,) rad."""
+        ...
+
+    def outside(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> str:
+        """Return a sentence why the law does not apply to this arm, pose or tilt; '' where it does.
+
+        The sentence holds no measured value, so that it stays the same for as long as the reason does.
+        """
+        ...
 
 
-def _loop_law(name: str, formula) -> Law:
-    def torque(arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
+class ClosedForm(NamedTuple):
+    """A law given by a formula, which applies everywhere: `unscaled(arm, theta, tilt)` -> torque / (c_n g)."""
+
+    unscaled: Callable[[ArmModel, Sequence[float], Tilt], Torque]
+
+    def torque(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
+        """Return the torque (4,) in Nm."""
         scale = arm.scale
-        tau = formula(arm, theta, tilt)
+        tau = self.unscaled(arm, theta, tilt)
         return scale[0] * tau[0], scale[1] * tau[1], scale[2] * tau[2], scale[3] * tau[3]
 
-    return Law(name, torque)
+    def outside(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> str:
+        """Return '': a closed form applies everywhere."""
+        return ""
 
 
 LAWS: dict[str, Law] = {
-    law.name: law
-    for law in (
-        _loop_law("exact", lambda arm, t, tilt: _exact(math, arm, t, tilt.direction)),
-        _loop_law("paper_static", lambda arm, t, tilt: _paper_static(math, arm, (tilt.axis_angle, *t[1:]))),
-        _loop_law(
-            "paper_mobile",
-            lambda arm, t, tilt: _paper_mobile(math, arm, (tilt.axis_angle, *t[1:]), tilt.beta, tilt.phi),
-        ),
-    )
+    "exact": ClosedForm(lambda arm, t, tilt: _exact(math, arm, t, tilt.direction)),
+    "paper_static": ClosedForm(lambda arm, t, tilt: _paper_static(math, arm, (tilt.axis_angle, *t[1:]))),
+    "paper_mobile": ClosedForm(
+        lambda arm, t, tilt: _paper_mobile(math, arm, (tilt.axis_angle, *t[1:]), tilt.beta, tilt.phi)
+    ),
 }

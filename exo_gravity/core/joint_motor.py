@@ -1,4 +1,4 @@
-"""A motor as it sits on a joint: joint angle, effort and damping <-> the frames of `core.motors`."""
+"""A motor on a joint: joint angle, effort and damping <-> the frames of `core.motors`."""
 
 from __future__ import annotations
 
@@ -8,15 +8,19 @@ from dataclasses import dataclass
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors import MotorReply, MotorSpec, pack_command, standstill, unpack_reply
 
+# The first byte of a reply is the motor's ID; that of our commands, whose position is always 0, is 0x7f or 0x80. With
+# IDs below 0x7f a bus that echoes cannot make a command look like a reply.
+MAX_CAN_ID = 126
+TORQUE_SCALE_BOUNDS = (0.2, 2.0)
+
 
 @dataclass(frozen=True)
 class JointMotor:
-    """One motor as it sits on one joint.
+    """One motor on one joint.
 
-    can_id: 1..126, so that the first byte of a reply (this ID) never is the first byte of our commands, whose position
-    is always 0 (0x7f or 0x80): a bus that echoes can't make a command look like a reply.
-    direction: +1 or -1; joint angle = direction * (motor angle - zero). zero: motor angle in rad where the joint is 0.
-    torque_scale: real output torque per commanded Nm (0.75 is reported of one AK80-9); 0.2..2.
+    can_id: 1..MAX_CAN_ID. direction: +1 or -1; joint angle = direction * (motor angle - zero). zero: motor angle in rad
+    at which the joint angle is 0. torque_scale: real output torque per commanded Nm (0.75 is reported for one AK80-9).
+    Raises ParameterError.
     """
 
     spec: MotorSpec
@@ -25,16 +29,17 @@ class JointMotor:
     zero: float = 0.0
     torque_scale: float = 1.0
 
-    def __post_init__(self):
-        if not isinstance(self.can_id, int) or not 1 <= self.can_id <= 126:
-            raise ParameterError("can_id", self.can_id, "a whole number from 1 to 126")
+    def __post_init__(self) -> None:
+        if not isinstance(self.can_id, int) or not 1 <= self.can_id <= MAX_CAN_ID:
+            raise ParameterError("can_id", self.can_id, f"a whole number from 1 to {MAX_CAN_ID}")
         if self.direction not in (1, -1):
             raise ParameterError("direction", self.direction, "1 or -1")
         if not abs(self.zero) <= self.spec.position_range - math.pi:
             limit = self.spec.position_range - math.pi
             raise ParameterError("zero", self.zero, f"from {-limit:.2f} to {limit:.2f} rad, or the angle wraps")
-        if not 0.2 <= self.torque_scale <= 2.0:
-            raise ParameterError("torque_scale", self.torque_scale, "from 0.2 to 2")
+        low, high = TORQUE_SCALE_BOUNDS
+        if not low <= self.torque_scale <= high:
+            raise ParameterError("torque_scale", self.torque_scale, f"from {low:g} to {high:g}")
 
     def command(self, effort: float, damping: float) -> bytes:
         """Return the frame for a joint `effort` in Nm and a `damping` in Nm s/rad, clamped to the wire.
@@ -42,14 +47,14 @@ class JointMotor:
         Raises ParameterError on NaN or infinity.
         """
         torque = self.direction * effort / self.torque_scale
-        if damping:  # no code is exactly 0 rad/s: what standstill leaves as would push with damping times that
+        if damping:  # no code is exactly 0 rad/s: the nearest one would push with damping times its velocity
             torque -= damping * standstill(self.spec)
         if math.isfinite(torque) and abs(torque) > self.spec.torque_range:
             torque = math.copysign(self.spec.torque_range, torque)
         return pack_command(self.spec, 0.0, 0.0, 0.0, damping, torque)
 
     def joint_reply(self, data: bytes) -> MotorReply:
-        """Return what a reply's bytes say of the joint: rad, rad/s and Nm are the joint's. Raises FrameError."""
+        """Return a reply's bytes in the joint's rad, rad/s and Nm. Raises FrameError."""
         reply = unpack_reply(self.spec, data)
         return MotorReply(
             reply.motor_id,

@@ -1,4 +1,4 @@
-"""AK60-6 and AK80-9: what each motor can do, and the bytes of its MIT mode on V1 and V2 boards.
+"""AK60-6 and AK80-9: their physical limits, and the frames of their MIT mode on V1 and V2 boards.
 
 Command, 8 bytes, a big-endian bit stream, arbitration ID = motor ID (CubeMars driver manual V1.0.15, "MIT mode"):
 
@@ -24,6 +24,7 @@ EXIT = b"\xff" * 7 + b"\xfd"
 SET_ZERO = b"\xff" * 7 + b"\xfe"
 SPECIAL_FRAMES = (ENTER, EXIT, SET_ZERO)
 
+WIRE_RANGE_BOUNDS = (1.0, 100.0)  # rad/s or Nm
 MOTOR_ERRORS = {
     0: "none",
     1: "motor over-temperature",
@@ -55,10 +56,11 @@ class MotorSpec:
     kd_max: float = 5.0
 
     def with_ranges(self, velocity_range: float, torque_range: float) -> MotorSpec:
-        """Return this motor with another firmware's velocity and torque range: no bus query tells them."""
+        """Return this motor with another firmware's velocity range (rad/s) and torque range (Nm). No bus query gives them."""
         for name, value in (("velocity_range", velocity_range), ("torque_range", torque_range)):
-            if not 1.0 <= value <= 100.0:
-                raise ParameterError(name, value, "from 1 to 100, as the firmware's manual says")
+            low, high = WIRE_RANGE_BOUNDS
+            if not low <= value <= high:
+                raise ParameterError(name, value, f"from {low:g} to {high:g}, as in the firmware's manual")
         return replace(self, velocity_range=velocity_range, torque_range=torque_range)
 
 
@@ -72,7 +74,7 @@ MOTORS = {
 
 
 class MotorCommand(NamedTuple):
-    """What a command frame asks: rad, rad/s, Nm/rad, Nm s/rad, Nm."""
+    """The content of a command frame: rad, rad/s, Nm/rad, Nm s/rad, Nm."""
 
     position: float
     velocity: float
@@ -82,7 +84,7 @@ class MotorCommand(NamedTuple):
 
 
 class MotorReply(NamedTuple):
-    """What a motor answers: rad, rad/s, Nm; temperature in degC and error code are None from 6-byte firmware."""
+    """The content of a reply: rad, rad/s, Nm; temperature (degC) and error code are None from 6-byte firmware."""
 
     motor_id: int
     position: float
@@ -106,14 +108,14 @@ def pack_command(spec: MotorSpec, position: float, velocity: float, kp: float, k
         | _code("torque", torque, -spec.torque_range, spec.torque_range, 0xFFF)
     )
     data = word.to_bytes(8, "big")
-    # All other fields at their maximum, the top torque codes spell enter, exit and set zero: ask for a little less.
+    # With all other fields at their maximum, the top torque codes are ENTER, EXIT and SET_ZERO: send one code less.
     return data if data not in SPECIAL_FRAMES else data[:7] + b"\xfb"
 
 
 def unpack_command(spec: MotorSpec, data: bytes) -> MotorCommand:
-    """Return what a command frame asks. Raises FrameError unless it is 8 bytes and no special frame."""
+    """Return the content of a command frame. Raises FrameError unless it is 8 bytes and not a special frame."""
     if len(data) != 8 or bytes(data) in SPECIAL_FRAMES:
-        raise FrameError(data, "a command of 8 bytes that is no special frame")
+        raise FrameError(data, "8 bytes and not a special frame")
     word = int.from_bytes(data, "big")
     return MotorCommand(
         _value(word >> 48, -spec.position_range, spec.position_range, 0xFFFF),
@@ -150,7 +152,7 @@ def pack_reply(
 
 
 def unpack_reply(spec: MotorSpec, data: bytes) -> MotorReply:
-    """Return what a motor answers. Raises FrameError unless it is 6 or 8 bytes."""
+    """Return the content of a reply. Raises FrameError unless it is 6 or 8 bytes."""
     if len(data) not in (6, 8):
         raise FrameError(data, "a reply of 6 or 8 bytes")
     word = int.from_bytes(data[:6], "big")
@@ -165,7 +167,7 @@ def unpack_reply(spec: MotorSpec, data: bytes) -> MotorReply:
 
 
 def standstill(spec: MotorSpec) -> float:
-    """Return the velocity in rad/s that a motor reads where 0 was asked."""
+    """Return the velocity in rad/s that a motor decodes when 0 is sent."""
     span = spec.velocity_range
     return _value(_code("velocity", 0.0, -span, span, 0xFFF), -span, span, 0xFFF)
 

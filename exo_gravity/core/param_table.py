@@ -1,85 +1,138 @@
-"""Parameters: a table of them for each node, and how a value given is checked against it.
+"""Parameters: one table for each node, and the check of each given value against it.
 
-What a table does not know is refused: a misspelt safety limit must not be a silent default. What values mean together
-is checked where they become a frozen dataclass.
+A name that is not in the table is refused: a misspelt safety limit must not silently keep its default. Where a frozen
+dataclass uses a parameter, the dataclass owns its default, bounds, unit and description (`owned`), and the table takes
+them from there (`param_of`). Rules that relate several values are checked by those dataclasses.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
+from exo_gravity.core.arm import four_floats, one_float
 from exo_gravity.core.errors import ParameterError
 
-# Every node's, declared by ROS itself; `ros2 param dump` writes them, too.
-OF_ROS = ("use_sim_time", "start_type_description_service")
-QOS_OF_ROS = "qos_overrides."
+# ROS declares these on every node, and `ros2 param dump` writes them.
+ROS_PARAMETERS = ("use_sim_time", "start_type_description_service")
+ROS_QOS_PREFIX = "qos_overrides."
 KINDS = {float: "number", int: "whole number", str: "text", bool: "true or false"}
 
 
 @dataclass(frozen=True)
 class Param:
-    """One parameter. `default` also says its type; an empty `required` list or string must be given by the user.
+    """One parameter. The type of `default` is the parameter's type.
 
-    bounds: lowest and highest value, of the number or of each number of a list. fixed: set at start, then read-only.
+    unit: of the value, '' for none. bounds: lowest and highest value, also of each number in a list. fixed: read-only
+    once the node runs. required: the user must give a non-empty value.
     """
 
     name: str
     default: Any
     description: str
     bounds: tuple[float, float] | None = None
+    unit: str = ""
     choices: tuple[str, ...] = ()
     fixed: bool = False
     required: bool = False
 
     def check(self, value: Any) -> Any:
-        """Return `value` in this parameter's type, or raise ParameterError: whole numbers count as floats."""
-        listed = isinstance(value, Sequence) and not isinstance(value, str)
-        items, wanted = list(value) if listed else [value], type(self.default)
-        if wanted is list:
-            wanted = type(self.default[0]) if self.default else str
-            # A list of four is a list of the four joints.
-            if not listed or len(items) != len(self.default or items):
+        """Return `value` in this parameter's type, whole numbers as floats where floats are wanted.
+
+        Raises ParameterError where the type, the length of a list, or a value is wrong.
+        """
+        is_list = isinstance(value, Sequence) and not isinstance(value, str)
+        items, kind = list(value) if is_list else [value], type(self.default)
+        if kind is list:
+            kind = type(self.default[0]) if self.default else str
+            # A list with a default has one entry per joint, and keeps that length.
+            if not is_list or len(items) != len(self.default or items):
                 raise ParameterError(self.name, value, self.expected)
-        elif listed:
+        elif is_list:
             raise ParameterError(self.name, value, self.expected)
-        if wanted is float:
+        if kind is float:
             items = [float(item) if type(item) is int else item for item in items]
         if self.required and not (items and all(item != "" for item in items)):
             raise ParameterError(self.name, value, f"given: {self.expected}")
-        low, high = self.bounds or (None, None)
-        if (
-            any(type(item) is not wanted for item in items)
-            or (low is not None and not all(low <= item <= high for item in items))
-            or (self.choices and not all(item in self.choices for item in items))
-        ):
+        if not all(self._allows(item, kind) for item in items):
             raise ParameterError(self.name, value, self.expected)
         return items if isinstance(self.default, list) else items[0]
 
+    def _allows(self, item: Any, kind: type) -> bool:
+        if type(item) is not kind or (self.choices and item not in self.choices):
+            return False
+        return self.bounds is None or self.bounds[0] <= item <= self.bounds[1]
+
+    @property
+    def range(self) -> str:
+        """The permitted values: the choices, or the bounds and the unit; '' where any value of the type will do."""
+        if self.choices:
+            return f"one of {', '.join(self.choices)}"
+        unit = f" {self.unit}" if self.unit else ""
+        return f"from {self.bounds[0]:g} to {self.bounds[1]:g}{unit}" if self.bounds else ""
+
     @property
     def expected(self) -> str:
-        """What would be right, in words."""
+        """A description of what is permitted, for error messages."""
         if isinstance(self.default, list):
             kind = KINDS[type(self.default[0]) if self.default else str]
             text = f"{len(self.default)} {kind}s" if self.default else f"a list of {kind}s"
         else:
             kind = KINDS[type(self.default)]
             text = kind if isinstance(self.default, bool) else f"a {kind}"
-        if self.choices:
-            return f"{text}, one of {', '.join(self.choices)}"
-        return f"{text} from {self.bounds[0]:g} to {self.bounds[1]:g}" if self.bounds else text
+        return f"{text}{', ' if self.choices else ' '}{self.range}".rstrip()
+
+
+def owned(
+    default: Any,
+    description: str,
+    bounds: tuple[float, float] | None = None,
+    unit: str = "",
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """Return a dataclass field that owns a parameter; a tuple as default stands for a list with one entry per joint."""
+    plain = list(default) if isinstance(default, tuple) else default
+    return field(default=default, metadata={"param": Param("", plain, description, bounds, unit, choices)})
+
+
+def param_of(owner: type, name: str, fixed: bool = False) -> Param:
+    """Return the parameter that field `name` of the dataclass `owner` owns."""
+    found: Param = owner.__dataclass_fields__[name].metadata["param"]  # type: ignore[attr-defined]
+    return replace(found, name=name, fixed=fixed)
+
+
+def params_of(owner: type, fixed: bool = False) -> tuple[Param, ...]:
+    """Return all parameters that the dataclass `owner` owns, in the order of its fields."""
+    return tuple(param_of(owner, f.name, fixed) for f in fields(owner) if "param" in f.metadata)
+
+
+def check_owned(instance: Any) -> None:
+    """Check every owned field of a frozen dataclass `instance`, and convert numbers to float or a tuple of floats.
+
+    Raises ParameterError that names the field.
+    """
+    for param in params_of(type(instance)):
+        value = getattr(instance, param.name)
+        if param.choices:
+            if value not in param.choices:
+                raise ParameterError(param.name, value, param.range)
+        elif param.bounds and isinstance(param.default, list):
+            checked = tuple(four_floats(param.name, value, *param.bounds, param.unit).tolist())
+            object.__setattr__(instance, param.name, checked)
+        elif param.bounds:
+            object.__setattr__(instance, param.name, one_float(param.name, value, *param.bounds, param.unit))
 
 
 def values_of(table: Sequence[Param], given: Mapping[str, Any], free_prefix: str = "") -> dict[str, Any]:
-    """Return every value of the table by name: the one given, or the default.
+    """Return the value of every parameter of the table by name: the given one, or the default.
 
-    Names that start with `free_prefix`, and those of ROS itself, are left out. Raises ParameterError for a value that a
-    parameter refuses, and for a name that the table does not have.
+    Names that start with `free_prefix`, and ROS's own, are ignored. Raises ParameterError for an impossible value, and
+    for a name that is not in the table.
     """
     names = {param.name for param in table}
+    prefixes = (ROS_QOS_PREFIX, free_prefix) if free_prefix else (ROS_QOS_PREFIX,)
     for name, value in given.items():
-        free = name in OF_ROS or name.startswith((QOS_OF_ROS, free_prefix or QOS_OF_ROS))
-        if name not in names and not free:
+        if name not in names and name not in ROS_PARAMETERS and not name.startswith(prefixes):
             raise ParameterError(name, value, f"one of {', '.join(sorted(names))}")
     return {param.name: param.check(given.get(param.name, param.default)) for param in table}

@@ -26,7 +26,8 @@ from enum import Enum
 from typing import NamedTuple
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.limits import UNKNOWN, Fault, JointSample, Limits
+from exo_gravity.core.faults import Fault, FaultCode
+from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.sign_check import SignCheck
 
 AT_REST = 0.1  # rad/s; two to four codes of the 12-bit velocity
@@ -117,7 +118,7 @@ class SafetyMachine:
         self._enter(State.DISABLED, now)
         return True
 
-    def trip(self, code: str, reason: str, now: float) -> None:
+    def trip(self, code: FaultCode, reason: str, now: float) -> None:
         """Latch a fault found outside (a broken bus, an impossible command); the first one stays."""
         if self.state in (State.DISABLED, State.FAULT):
             return
@@ -172,7 +173,7 @@ class SafetyMachine:
         fault = self.limits.find_fault(now, joints, self._before, overshoot=0.0)
         if not fault and not self._known:
             fault = self.limits.find_wrong_zero(joints)
-        if fault and fault.code not in ("motor_silent", "over_speed"):
+        if fault and fault.code not in (FaultCode.MOTOR_SILENT, FaultCode.OVER_SPEED):
             return self.trip(*fault, now)
         if fault:
             self.waiting_for = fault.reason
@@ -194,10 +195,10 @@ class SafetyMachine:
     def _watch(self, now, joints, effort, effort_time) -> None:
         fault = self.limits.find_fault(now, joints, self._before)
         if fault is None and effort is None:
-            fault = Fault("command_withdrawn", "the compensator withdrew; its diagnostics say why")
+            fault = Fault(FaultCode.COMMAND_WITHDRAWN, "the compensator withdrew; its diagnostics say why")
         elif fault is None and not now - effort_time <= self.limits.command_timeout:
             limit = self.limits.command_timeout * 1000
-            fault = Fault("command_stale", f"effort commands stopped: none fresher than {limit:.0f} ms")
+            fault = Fault(FaultCode.COMMAND_STALE, f"effort commands stopped: none fresher than {limit:.0f} ms")
         if fault:
             self.trip(*fault, now)
 
@@ -223,7 +224,7 @@ class SafetyMachine:
         try:
             shaped, acted = self.limits.shape(effort, ramp, joints, self._effort, dt)
         except ParameterError as error:
-            self.trip("command_impossible", str(error), now)
+            self.trip(FaultCode.COMMAND_IMPOSSIBLE, str(error), now)
             return self._descend(now, False, dt)
         self.acted.update(dict.fromkeys(acted, now))
         return Drive(shaped, 0.0, True)
@@ -251,7 +252,7 @@ class SafetyMachine:
 
     def _note(self, now: float, joints: Sequence[JointSample]) -> bool:
         """Note whether the arm is at rest, as far as its motors answer; return whether one of them is silent."""
-        silent = [self.limits.silent(now, joint) for joint in joints]
+        silent = [self.limits.is_silent(now, joint) for joint in joints]
         if any(silent):
             self._known = False  # it may have lost its power, and with it the turns of its encoder
         if any(

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from exo_gravity.core.limits import Fault, JointSample
+from exo_gravity.core.faults import Fault, FaultCode
+from exo_gravity.core.limits import JointSample
 
 RISE = 2.0  # Nm/s
 FALL = 10.0  # Nm/s
@@ -47,11 +48,11 @@ class SignCheck:
         elif self._still < STILLNESS:
             return self._settle(dt, joints[self._joint].position)
         elif moved <= -GAVE_WAY:
-            return self._fault("wrong_sign", f"{push:.2f} Nm moved it backwards: torque or encoder is reversed")
+            return self._fault(FaultCode.WRONG_SIGN, f"{push:.2f} Nm moved it backwards: torque or encoder is reversed")
         elif moved >= GAVE_WAY:
             self._passed = True
         elif push >= most and self._waited > PATIENCE:
-            return self._fault("sign_unproven", f"{push:.2f} Nm did not move it: it must hang freely at the start")
+            return self._fault(FaultCode.SIGN_UNPROVEN, f"{push:.2f} Nm did not move it: let it hang freely")
         else:
             self._waited += dt if push >= most else 0.0
             self.effort[self._joint] = min(most, push + self._rise * dt)
@@ -74,8 +75,8 @@ class SignCheck:
         if self._still >= STILLNESS:
             self._waited = 0.0
         elif self._waited > 10 * PATIENCE:
-            return self._fault("sign_unproven", "it does not come to rest: it must hang freely at the start")
+            return self._fault(FaultCode.SIGN_UNPROVEN, "it does not come to rest: let it hang freely")
         return None
 
-    def _fault(self, code: str, reason: str) -> Fault:
+    def _fault(self, code: FaultCode, reason: str) -> Fault:
         return Fault(code, f"{self._names[self._joint]}: {reason}")

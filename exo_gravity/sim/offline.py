@@ -122,7 +122,7 @@ class OfflineTrial:
         if self._safety.state in CARRIED:
             self._carried[:] = (*self._carried[:1], now)
         position = [joint.position for joint in self._samples]
-        if not any(arm.limits.silent(now, joint) for joint in self._samples):
+        if not any(arm.limits.is_silent(now, joint) for joint in self._samples):
             self._record(now, position, effort)
             if arm.tilt and now - self._tilted >= TILT_PERIOD:
                 self._compensator.tilt(now, *arm.tilt)

@@ -26,7 +26,7 @@ def make(**changes) -> Settings:
         "wearer_mass": (0.0, 0.0, 2.0, 1.6),
         "wearer_cog": (0.0, 0.0, 0.16, 0.17),
         "max_effort": (9.0, 18.0, 9.0, 9.0),
-        "tilt_timeout": 0.0,
+        "use_imu": False,
     }
     return Settings(**{**defaults, **changes})
 
@@ -60,7 +60,7 @@ def test_after_the_ramp_the_torque_is_the_laws():
 
 
 def test_a_tilted_trunk_changes_the_torque():
-    run = Run(tilt_timeout=0.08)
+    run = Run(use_imu=True)
     for _ in range(600):
         run.compensator.tilt(run.now, pitch=0.3, roll=-0.2)
         run.cycle()
@@ -69,7 +69,7 @@ def test_a_tilted_trunk_changes_the_torque():
 
 
 def test_without_a_fresh_tilt_there_is_no_torque_and_a_reason():
-    run = Run(tilt_timeout=0.08)
+    run = Run(use_imu=True)
     assert run.cycle()[:2] == (None, "no trunk tilt yet")
     run.compensator.tilt(run.now, 0.0, 0.0)
     assert run.cycle().effort is not None
@@ -90,7 +90,7 @@ def test_impossible_angles_get_no_torque(theta):
 
 @pytest.mark.parametrize("angle", [math.nan, math.inf, 4.0])
 def test_an_impossible_tilt_is_refused_and_the_last_one_stays(angle):
-    run = Run(tilt_timeout=0.08)
+    run = Run(use_imu=True)
     run.compensator.tilt(run.now, 0.1, 0.0)
     with pytest.raises(ParameterError):
         run.compensator.tilt(run.now, angle, 0.0)

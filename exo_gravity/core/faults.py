@@ -1,0 +1,53 @@
+"""Every reason for which a worn arm is let down or not carried: one code for programs, one sentence for people."""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import NamedTuple
+
+
+class FaultCode(str, Enum):
+    """A fault's code, as on /diagnostics; `meaning` says what it stands for.
+
+    Each one latches: the arm is let down, or stays off, until the operator clears the fault.
+    """
+
+    meaning: str
+
+    def __new__(cls, value: str, meaning: str) -> FaultCode:
+        code = str.__new__(cls, value)
+        code._value_ = value
+        code.meaning = meaning
+        return code
+
+    def __str__(self) -> str:
+        return str(self.value)
+
+    # The motors
+    MOTOR_SILENT = "motor_silent", "a motor has not replied within `reply_timeout`"
+    MOTOR_ERROR = "motor_error", "a motor reports an error"
+    OVER_TEMPERATURE = "over_temperature", "a motor is hotter than `max_temperature`"
+    # The motion
+    OVER_SPEED = "over_speed", "a joint turns faster than `max_velocity`"
+    OUTSIDE_LIMITS = "outside_limits", "a joint is more than 0.1 rad beyond `position_min` or `position_max`"
+    POSITION_JUMP = "position_jump", "an angle changed by more than `max_velocity` and 0.05 rad explain"
+    # The start gate
+    IMPLAUSIBLE_ZERO = "implausible_zero", "a joint is not within `home_tolerance` of `home` at the first start"
+    WRONG_SIGN = "wrong_sign", "a joint moved against a small test torque at the first start"
+    SIGN_UNPROVEN = "sign_unproven", "a joint did not move under a small test torque at the first start"
+    # The efforts
+    COMMAND_STALE = "command_stale", "no effort command answers a joint state younger than `command_timeout`"
+    COMMAND_WITHDRAWN = "command_withdrawn", "the compensator withdrew its efforts; its diagnostics give the reason"
+    COMMAND_IMPOSSIBLE = "command_impossible", "an effort is NaN, beyond 40 Nm, misnamed or missing"
+    SECOND_COMMANDER = "second_commander", "two publishers send effort commands"
+    # The computer
+    BUS_ERROR = "bus_error", "the CAN bus cannot be opened, or sending or receiving failed"
+    WATCHDOG_DEAD = "watchdog_dead", "the watchdog process has died"
+    INTERNAL_ERROR = "internal_error", "the control loop raised an unexpected exception"
+
+
+class Fault(NamedTuple):
+    """A fault that occurred: its code, and a sentence that names the joint, the value and the limit."""
+
+    code: FaultCode
+    reason: str
