@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +19,8 @@ from rosbags.typesys import Stores, get_typestore
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.bag.writer import BagWriter, offered_qos
 from exo_gravity.core.errors import DataError
-from exo_gravity.bag import writer
+
+from ..support import ROOT
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 JOINT_STATE, STRING = "sensor_msgs/msg/JointState", "std_msgs/msg/String"
@@ -104,7 +104,7 @@ def test_what_waits_is_written_before_the_end(tmp_path):
 
 def test_a_disk_that_never_answers_ends_the_recording_and_holds_nobody_up(tmp_path, monkeypatch):
     answer = threading.Event()
-    monkeypatch.setattr(writer, "MAX_WAITING", 10)
+    monkeypatch.setattr("exo_gravity.bag.writer.MAX_WAITING", 10)
     monkeypatch.setattr(BagWriter, "_take", lambda self, item: answer.wait())
     writer = BagWriter(tmp_path / "bag")
     for k in range(20):
@@ -114,24 +114,13 @@ def test_a_disk_that_never_answers_ends_the_recording_and_holds_nobody_up(tmp_pa
     writer.close()
 
 
-WRITE_UNTIL_KILLED = """
-import sys, time
-sys.path.insert(0, {folder!r})
-from test_bag_writer import *
-writer = BagWriter({path!r})
-writer.add_topic("/right/joint_states", JOINT_STATE, RELIABLE)
-while True:
-    now = time.time_ns()
-    writer.write([("/right/joint_states", now, joint_state(0))])
-    print(now, flush=True)
-    time.sleep(0.2)  # so slow that no buffer fills by itself
-"""
+def process_command(name, path):
+    return [sys.executable, "-m", "test.support.bag_processes", name, str(path)]
 
 
 def test_killed_at_any_moment_it_loses_at_most_the_last_second(tmp_path):
     path = tmp_path / "bag"
-    code = WRITE_UNTIL_KILLED.format(folder=str(Path(__file__).parent), path=str(path))
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(process_command("until_killed", path), cwd=ROOT, stdout=subprocess.PIPE, text=True)
     stamps = []
     while len(stamps) < 2 or stamps[-1] - stamps[0] < 1.7e9:
         stamps.append(int(process.stdout.readline()))
@@ -145,26 +134,9 @@ def test_killed_at_any_moment_it_loses_at_most_the_last_second(tmp_path):
     assert "cut short" in read.notes[0]
 
 
-FILL_THE_DISK = """
-import resource, sys
-sys.path.insert(0, {folder!r})
-from test_bag_writer import *
-resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
-writer = BagWriter({path!r})
-writer.add_topic("/right/joint_states", JOINT_STATE, RELIABLE)
-for k in range(2_000):
-    if writer.error:
-        break
-    writer.write([("/right/joint_states", START + k * 1_000_000, joint_state(k))])
-writer.close()
-print(writer.error)
-"""
-
-
 def test_a_file_that_may_not_grow_ends_the_recording_with_the_reason_and_keeps_what_fits(tmp_path):
     path = tmp_path / "bag"
-    code = FILL_THE_DISK.format(folder=str(Path(__file__).parent), path=str(path))
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    done = subprocess.run(process_command("until_disk_full", path), cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0 and done.stderr == ""
     assert "recording ended after" in done.stdout and "File too large" in done.stdout
     assert len(read_bag(path).recordings[0].time) > 500
