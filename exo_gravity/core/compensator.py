@@ -114,7 +114,7 @@ class Compensator:
             raise ParameterError("side", settings.side, f"{self.settings.side}: the side cannot change")
         self._pending = settings
 
-    def tilt(self, now: float, pitch: float, roll: float) -> None:
+    def set_tilt(self, now: float, pitch: float, roll: float) -> None:
         """Set the trunk's pitch and roll in rad, measured at `now` (s).
 
         Raises ParameterError unless a trunk can have moved there since the last measurement.

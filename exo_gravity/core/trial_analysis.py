@@ -88,7 +88,7 @@ class Release:
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class TrialAnalysis:
     """What `analyse` found."""
 
     holds: tuple[Hold, ...]
@@ -96,7 +96,7 @@ class Trial:
     releases: tuple[Release, ...]
 
 
-def analyse(recording: Recording, min_hold: float = MIN_HOLD) -> Trial:
+def analyse(recording: Recording, min_hold: float = MIN_HOLD) -> TrialAnalysis:
     """Return the holds of at least `min_hold` s, the motions between them and, with a script, the releases."""
     blocks = in_blocks(recording)
     resolution = np.array([position_resolution(column) for column in recording.position.T])
@@ -106,7 +106,7 @@ def analyse(recording: Recording, min_hold: float = MIN_HOLD) -> Trial:
     kinds = ["start", *(motion.kind for motion in motions)]
     holds = tuple(_hold(recording, blocks, resolution, span, kind) for span, kind in zip(spans, kinds, strict=False))
     motions += tuple(_after(recording, blocks, spans[-1])) if spans else ()
-    return Trial(holds, motions, tuple(_releases(recording, blocks)))
+    return TrialAnalysis(holds, motions, tuple(_releases(recording, blocks)))
 
 
 def _after(recording: Recording, blocks: Blocks, last: Span) -> Iterator[Motion]:

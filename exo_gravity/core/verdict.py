@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from exo_gravity.core.recording import Recording
-from exo_gravity.core.trial_analysis import Trial
+from exo_gravity.core.trial_analysis import TrialAnalysis
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class HoldCriteria:
     rated_from: float = 0.0
 
 
-def failures(recording: Recording, trial: Trial, limits: HoldCriteria) -> list[str]:
+def failures(recording: Recording, trial: TrialAnalysis, limits: HoldCriteria) -> list[str]:
     """Return one sentence for each way in which the arm did not hold; none if it held."""
     found = []
     if not trial.holds:

@@ -125,7 +125,7 @@ class OfflineTrial:
         if not any(arm.limits.is_silent(now, joint) for joint in self._samples):
             self._record(now, position, effort)
             if arm.tilt and now - self._tilted >= TILT_PERIOD:
-                self._compensator.tilt(now, *arm.tilt)
+                self._compensator.set_tilt(now, *arm.tilt)
                 self._tilted = now
             answer = self._compensator.step(now, position)
             self._asked = answer.effort, min(joint.time for joint in self._samples)

@@ -21,7 +21,7 @@ from rich.progress import Progress
 from exo_gravity.bag.reader import Bag, read_bag
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.recording import Recording
-from exo_gravity.core.trial_analysis import MIN_HOLD, Trial
+from exo_gravity.core.trial_analysis import MIN_HOLD, TrialAnalysis
 from exo_gravity.core.trial_analysis import analyse as analyse_arm
 from exo_gravity.core.verdict import HoldCriteria, failures
 from exo_gravity.tools.reporting import figures, page, table
@@ -42,7 +42,7 @@ class Report:
 
     bag: Bag
     limits: HoldCriteria
-    arms: tuple[tuple[Recording, Trial], ...]
+    arms: tuple[tuple[Recording, TrialAnalysis], ...]
     failures: tuple[str, ...]
     notes: tuple[str, ...]
 
@@ -108,7 +108,7 @@ def print_report(report: Report, console: Console | None = None) -> None:
     console.print("[red bold]It did not hold.[/]" if report.failures else f"[green bold]{held}[/]")
 
 
-def _arm_section(report: Report, recording: Recording, trial: Trial, folder: Path) -> str:
+def _arm_section(report: Report, recording: Recording, trial: TrialAnalysis, folder: Path) -> str:
     drawn = {"overview": figures.overview(recording, trial)}
     captions = {
         "overview": "Positions, velocities and torques over time; holds are shaded and numbered, dashes are commanded.",

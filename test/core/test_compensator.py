@@ -62,7 +62,7 @@ def test_after_the_ramp_the_torque_is_the_laws():
 def test_a_tilted_trunk_changes_the_torque():
     run = Run(use_imu=True)
     for _ in range(600):
-        run.compensator.tilt(run.now, pitch=0.3, roll=-0.2)
+        run.compensator.set_tilt(run.now, pitch=0.3, roll=-0.2)
         run.cycle()
     expected = gravity_torque(ROBOT, THETA, Tilt.of("left", 0.3, -0.2).direction)
     np.testing.assert_allclose(run.efforts[-1], expected, rtol=1e-12)
@@ -71,7 +71,7 @@ def test_a_tilted_trunk_changes_the_torque():
 def test_without_a_fresh_tilt_there_is_no_torque_and_a_reason():
     run = Run(use_imu=True)
     assert run.cycle()[:2] == (None, "no trunk tilt yet")
-    run.compensator.tilt(run.now, 0.0, 0.0)
+    run.compensator.set_tilt(run.now, 0.0, 0.0)
     assert run.cycle().effort is not None
     assert "older than 80 ms" in run.cycle(0.1).reason
 
@@ -91,9 +91,9 @@ def test_impossible_angles_get_no_torque(theta):
 @pytest.mark.parametrize("angle", [math.nan, math.inf, 4.0])
 def test_an_impossible_tilt_is_refused_and_the_last_one_stays(angle):
     run = Run(use_imu=True)
-    run.compensator.tilt(run.now, 0.1, 0.0)
+    run.compensator.set_tilt(run.now, 0.1, 0.0)
     with pytest.raises(ParameterError):
-        run.compensator.tilt(run.now, angle, 0.0)
+        run.compensator.set_tilt(run.now, angle, 0.0)
     assert run.cycle().effort is not None
 
 
@@ -240,7 +240,7 @@ def test_inside_its_box_the_anfis_answers():
 )
 def test_where_the_anfis_was_not_trained_the_exact_law_answers_and_says_why(theta, pitch, moments, why):
     run = Run(law="anfis", anfis=learned(moments))
-    run.compensator.tilt(run.now, pitch, 0.0)
+    run.compensator.set_tilt(run.now, pitch, 0.0)
     answer = run.cycle(1.2, theta)
     assert why in answer.fallback
     np.testing.assert_allclose(answer.effort, gravity_torque(ROBOT, theta, Tilt.of("left", pitch).direction))

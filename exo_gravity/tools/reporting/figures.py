@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from exo_gravity.core.recording import Recording
-from exo_gravity.core.trial_analysis import Hold, Trial
+from exo_gravity.core.trial_analysis import Hold, TrialAnalysis
 from exo_gravity.core.verdict import HoldCriteria
 from exo_gravity.tools.reporting.table import degrees, joint_labels, per_minute
 
@@ -25,7 +25,7 @@ STRETCHES = 2_000
 WIDTH = 11.0  # inches
 
 
-def overview(recording: Recording, trial: Trial) -> Figure:
+def overview(recording: Recording, trial: TrialAnalysis) -> Figure:
     """Return positions, velocities and torques over time, holds and pushes shaded, each hold numbered."""
     figure = Figure(figsize=(WIDTH, 8.2), layout="constrained")
     axes = figure.subplots(3, 1, sharex=True, height_ratios=(1.25, 1.0, 1.25))
@@ -53,7 +53,7 @@ def overview(recording: Recording, trial: Trial) -> Figure:
     return figure
 
 
-def drift(recording: Recording, trial: Trial, limits: HoldCriteria) -> Figure:
+def drift(recording: Recording, trial: TrialAnalysis, limits: HoldCriteria) -> Figure:
     """Return how far each joint went from where each hold began, and the rate of drift of each hold."""
     figure = Figure(figsize=(WIDTH, 6.6), layout="constrained")
     grid = figure.add_gridspec(2, 4, height_ratios=(1.0, 1.1))
@@ -75,7 +75,7 @@ def drift(recording: Recording, trial: Trial, limits: HoldCriteria) -> Figure:
     return figure
 
 
-def _rates(axis: Axes, recording: Recording, trial: Trial, limits: HoldCriteria) -> None:
+def _rates(axis: Axes, recording: Recording, trial: TrialAnalysis, limits: HoldCriteria) -> None:
     for joint, (name, colour) in enumerate(zip(joint_labels(recording), JOINT_COLOURS, strict=True)):
         numbers = np.arange(1, len(trial.holds) + 1) + 0.12 * (joint - 1.5)
         rate = [per_minute(hold.drift_rate[joint]) for hold in trial.holds]
@@ -113,7 +113,7 @@ def _envelope(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndar
     return np.repeat(time[edges], 2), ends.ravel()
 
 
-def _shade(axis: Axes, trial: Trial) -> None:
+def _shade(axis: Axes, trial: TrialAnalysis) -> None:
     for hold in trial.holds:
         axis.axvspan(hold.start, hold.end, color=HOLD_COLOUR, lw=0, zorder=0)
     for motion in trial.motions:
@@ -121,7 +121,7 @@ def _shade(axis: Axes, trial: Trial) -> None:
             axis.axvspan(motion.start, motion.end, color=PUSH_COLOUR, lw=0, zorder=0)
 
 
-def _legend(figure: Figure, recording: Recording, trial: Trial, commanded: bool) -> None:
+def _legend(figure: Figure, recording: Recording, trial: TrialAnalysis, commanded: bool) -> None:
     entries = [
         Line2D([], [], color=colour, lw=2.5, label=name)
         for name, colour in zip(joint_labels(recording), JOINT_COLOURS, strict=True)

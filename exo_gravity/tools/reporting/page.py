@@ -9,7 +9,7 @@ from itertools import groupby
 from typing import Any
 
 from exo_gravity.core.recording import Recording
-from exo_gravity.core.trial_analysis import Trial
+from exo_gravity.core.trial_analysis import TrialAnalysis
 from exo_gravity.tools.reporting.figures import JOINT_COLOURS
 from exo_gravity.tools.reporting.table import Row, hold_rows, joint_labels, motion_rows, per_minute, shown
 
@@ -66,7 +66,7 @@ def figure_html(png: bytes, caption: str) -> str:
     )
 
 
-def arm_html(recording: Recording, trial: Trial, figures: Iterable[str]) -> str:
+def arm_html(recording: Recording, trial: TrialAnalysis, figures: Iterable[str]) -> str:
     """Return the section of one arm: its key numbers, figures and tables."""
     labels = joint_labels(recording)
     holds = _table("hold", labels, hold_rows(recording, trial), HOLD_COLUMNS)
@@ -109,7 +109,7 @@ def parameters_html(parameters: dict[str, str]) -> str:
     return f"<details><summary>Parameters at the start</summary><pre>{escape(text)}</pre></details>" if text else ""
 
 
-def _key(trial: Trial, recording: Recording) -> str:
+def _key(trial: TrialAnalysis, recording: Recording) -> str:
     numbers = [(str(len(trial.holds)), "holds"), (f"{sum(h.duration for h in trial.holds):.0f} s", "held in all")]
     if trial.holds:
         _, number, joint = max(

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from exo_gravity.core.recording import Recording
-from exo_gravity.core.trial_analysis import Hold, Motion, Trial
+from exo_gravity.core.trial_analysis import Hold, Motion, TrialAnalysis
 
 Row = dict[str, Any]
 SPARE_COLUMNS = ("v deg/s", "peak speed deg/s", "error Nm", "torque Nm", "at s", "deg in 10 s")  # the first goes first
@@ -35,7 +35,7 @@ def joint_labels(recording: Recording) -> list[str]:
     return [name.removeprefix(f"{recording.name}_").replace("_", " ") for name in recording.joint_names]
 
 
-def hold_rows(recording: Recording, trial: Trial) -> Iterator[Row]:
+def hold_rows(recording: Recording, trial: TrialAnalysis) -> Iterator[Row]:
     """Yield one row for each hold and joint."""
     for number, hold in enumerate(trial.holds, 1):
         for joint, name in enumerate(recording.joint_names):
@@ -57,7 +57,7 @@ def hold_rows(recording: Recording, trial: Trial) -> Iterator[Row]:
             }
 
 
-def motion_rows(recording: Recording, trial: Trial) -> Iterator[Row]:
+def motion_rows(recording: Recording, trial: TrialAnalysis) -> Iterator[Row]:
     """Yield one row for each motion between holds and joint."""
     for number, motion in enumerate(trial.motions, 1):
         for joint, name in enumerate(recording.joint_names):
@@ -95,7 +95,7 @@ def shown(value: float, digits: int) -> str:
     return f"{round(float(value), digits) + 0.0:.{digits}f}" if math.isfinite(value) else "–"
 
 
-def print_tables(console: Console, recording: Recording, trial: Trial) -> None:
+def print_tables(console: Console, recording: Recording, trial: TrialAnalysis) -> None:
     """Print the holds and the motions of one arm, each cell with the four joints in order."""
     console.print(f"\n[bold]{recording.name}[/], joints in order: {', '.join(joint_labels(recording))}")
     if trial.holds:
