@@ -1,4 +1,4 @@
-"""The parameters of `can_bridge` and `compensator`, and the limits, motors and settings that their values describe."""
+"""The parameters of `can_bridge`, `compensator`, `imu` and `recorder`, and the limits, motors and settings that their values describe."""
 
 from __future__ import annotations
 
@@ -78,6 +78,18 @@ COMPENSATOR = (
     Param("use_imu", True, "false: the trunk counts as upright (the paper's seated wearer)", fixed=True),
     param_of(Settings, "tilt_timeout"),
     *REAL_TIME_PARAMETERS,
+)
+IMU = (
+    Param("input_topic", "/imu/data_raw", "topic of the IMU driver's sensor_msgs/Imu", fixed=True),
+    # No rotation is a safe default: four zeros are not a rotation, and are refused.
+    Param("rotation_trunk_from_imu", [0.0] * 4, "mounting of the IMU, unit quaternion x, y, z, w; required",
+          (-1.0, 1.0), fixed=True),
+    Param("rate", 100.0, "approximate sample rate of the IMU", (20.0, 2000.0), "Hz", fixed=True),
+    Param("timeout", 0.1, "silence of the IMU that is an error", (0.02, 1.0), "s", fixed=True),
+)
+RECORDER = (
+    Param("output", "", "new folder for the recording", fixed=True, required=True),
+    Param("live", False, "print the latest state as one line of JSON, ten times a second", fixed=True),
 )
 # fmt: on
 

@@ -1,4 +1,4 @@
-"""The state machine between what is asked of the arm and what its motors get. Pure: time is an argument.
+"""The state machine between the requested efforts and the motors. Pure: time is an argument.
 
     DISABLED --enable--> CHECKING --all well--> PROVING --signs right--> RAMPING_IN --ramp_time--> ACTIVE
         ^                 |    |                   |                         |                       |
@@ -7,15 +7,15 @@
         +------clear------- FAULT <--------- LETTING_DOWN <------------------+-----------------------+
         +-------------------------------------------+ at rest: FAULT after a fault, else DISABLED
 
-- DISABLED, CHECKING, FAULT: the motors are off. They are asked for their position with commands that ask for nothing.
-- CHECKING waits until for a whole second every motor has answered, free of faults and at rest within its limits, and
-  fresh efforts have come. The first time since the motors answer, the arm must hang as `Limits.home` says.
-- PROVING, that first time too: each joint is pushed a little, and must give way the right way (core/sign_check.py).
-- LETTING_DOWN: the last torques fade to nothing over `fade_time` under the motors' own damping, which stays until the
-  arm is at rest. The motors are switched off only then. A motor that can't be reached goes on pushing: should it answer
-  again, however late, it gets damping before it is switched off.
-- FAULT is latched with the first fault's code and reason. Only `clear` leaves it, and only to DISABLED: clearing a
-  fault never arms anything.
+- DISABLED, CHECKING, FAULT: the motors are off. Zero commands poll their positions.
+- CHECKING waits until, for one second, every motor has replied without a fault, at rest and within its limits, and
+  fresh efforts have arrived. The first time after the motors began to reply, the arm must hang at `Limits.home`.
+- PROVING, also that first time: each joint is pushed gently, and must move the right way (core/sign_check.py).
+- LETTING_DOWN: the last torques fade to zero over `fade_time` under the motors' own damping, which stays on until the
+  arm is at rest. Only then are the motors switched off. A motor that cannot be reached keeps applying its torque: if it
+  replies again, however late, it is damped before it is switched off.
+- FAULT latches the code and reason of the first fault. Only `clear` leaves it, and only to DISABLED: clearing a fault
+  never enables the arm.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.sign_check import SignCheck
 
 AT_REST = 0.1  # rad/s; two to four codes of the 12-bit velocity
-# Down is where no joint turns by more than this in this time. Velocity is too coarse: a damped arm creeps below one of
-# its codes, and would drop the rest of the way.
+# The arm is down when no joint turns by more than SETTLED in SETTLING_TIME. Velocity is too coarse for this: a damped
+# arm creeps at less than one velocity code, and would drop the rest of the way.
 SETTLED = 0.005  # rad
 SETTLING_TIME = 0.5  # s
-LONGEST_SILENCE = 5.0  # s for which a silent motor is waited for on the way down
-LONGEST_DESCENT = 20.0  # s after which the motors are switched off even if somebody keeps the arm moving
-CALM = 1.0  # s without trouble before the motors are switched on: while nodes start, middleware and machine stutter
-DAMPING_RISE = 0.2  # s: damping that comes at once is a torque step of its own
+LONGEST_SILENCE = 5.0  # s for which the way down waits for a silent motor
+LONGEST_DESCENT = 20.0  # s after which the motors are switched off even if the arm is kept moving
+CALM = 1.0  # s without a fault before the motors are switched on: middleware and machine stutter while nodes start
+DAMPING_RISE = 0.2  # s; damping that starts at once would be a torque step
 NOTHING = (0.0, 0.0, 0.0, 0.0)
 
 
 class State(str, Enum):
-    """Where the arm is between off and carried."""
+    """The state of the arm between off and carried."""
 
     DISABLED = "disabled"
     CHECKING = "checking"
@@ -55,26 +55,26 @@ class State(str, Enum):
 
 
 class Drive(NamedTuple):
-    """What the motors get: (4,) Nm, one damping in Nm s/rad, and whether they are switched on."""
+    """What the motors receive: effort (4,) Nm, one damping in Nm s/rad, and whether they are switched on."""
 
     effort: tuple[float, ...]
     damping: float
     powered: bool
 
 
-# The states in which torque flows because somebody asks for it.
+# The states in which torque is applied on request.
 CARRYING = (State.PROVING, State.RAMPING_IN, State.ACTIVE)
 
 OFF = Drive(NOTHING, 0.0, False)
 
 
 class SafetyMachine:
-    """Decides, cycle by cycle, what the motors of one arm get. Not thread-safe: one thread owns it.
+    """Decides, cycle by cycle, what the motors of one arm receive. Not thread-safe: one thread owns it.
 
-    period: s of a cycle. After a pause the torque goes on as if no more than that had passed: it never catches up.
+    period: s of a cycle. After a pause the torque continues as if only one period had passed: it never catches up.
 
-    state: the State. fault: the latched Fault or None. waiting_for: why CHECKING goes on. acted: when each limit that
-    ever acted did so last, by name.
+    state: the State. fault: the latched Fault or None. waiting_for: what CHECKING waits for. acted: for each limit that
+    has acted, by name, the last time.
     """
 
     def __init__(self, limits: Limits, period: float):
@@ -86,32 +86,32 @@ class SafetyMachine:
         self.acted: dict[str, float] = {}
         self._since = 0.0
         self._now = -math.inf
-        self._effort = NOTHING  # what the motors got last
-        self._from = NOTHING  # what they got when the way down began
+        self._effort = NOTHING  # last sent to the motors
+        self._from = NOTHING  # sent when the way down began
         self._rest_since = 0.0
-        self._rest: Sequence[JointSample] = (UNKNOWN,) * 4  # where the arm was then
+        self._rest: Sequence[JointSample] = (UNKNOWN,) * 4  # where the arm was at that time
         self._before: Sequence[JointSample] = (UNKNOWN,) * 4
         self._unreached = False  # whether a motor was silent when the way down ended
-        self._known = False  # whether zeros and signs have been checked since the motors answer
+        self._known = False  # whether zeros and signs have been checked since the motors began to reply
         self._sign_check: SignCheck | None = None  # while PROVING
 
     def enable(self, now: float) -> bool:
-        """Begin the checks, after which torque ramps in. Refused (False) unless DISABLED."""
+        """Start the checks, after which torque ramps in. Return False, and do nothing, unless DISABLED."""
         if self.state is not State.DISABLED:
             return False
-        self.waiting_for = "the motors' first replies"
+        self.waiting_for = "the first replies of the motors"
         self._enter(State.CHECKING, now)
         return True
 
     def disable(self, now: float) -> None:
-        """Let the arm down if it is carried; then DISABLED. A latched fault stays."""
+        """Let the arm down if it is carried, then go to DISABLED. A latched fault stays."""
         if self.state in CARRYING:
             self._let_down(now)
         elif self.state is State.CHECKING:
             self._enter(State.DISABLED, now)
 
     def clear(self, now: float) -> bool:
-        """Forget a latched fault, by the operator's word alone. Refused (False) unless in FAULT."""
+        """Clear a latched fault, on the operator's request only. Return False, and do nothing, unless in FAULT."""
         if self.state is not State.FAULT:
             return False
         self.fault = None
@@ -119,7 +119,7 @@ class SafetyMachine:
         return True
 
     def trip(self, code: FaultCode, reason: str, now: float) -> None:
-        """Latch a fault found outside (a broken bus, an impossible command); the first one stays."""
+        """Latch a fault detected elsewhere (a broken bus, an impossible command). The first fault stays."""
         if self.state in (State.DISABLED, State.FAULT):
             return
         self.fault = self.fault or Fault(code, reason)
@@ -129,27 +129,27 @@ class SafetyMachine:
             self._let_down(now)
 
     def take_over(self, effort: Sequence[float], now: float) -> None:
-        """Let down an arm that gets `effort` (4,) Nm from a controller that is no more."""
+        """Let down an arm whose controller has died while its motors applied `effort` (4,) Nm."""
         limits = self.limits.max_effort
         self._effort = tuple(max(-most, min(most, e)) for e, most in zip(effort, limits, strict=True))
         self._let_down(now)
 
     def settled(self, now: float) -> bool:
-        """Return whether no joint that answers has left its place for `SETTLING_TIME`."""
+        """Return whether no replying joint has moved for `SETTLING_TIME`."""
         return now - self._rest_since >= SETTLING_TIME
 
     def step(
         self, now: float, joints: Sequence[JointSample], effort: Sequence[float] | None, effort_time: float
     ) -> Drive:
-        """Return what the motors get in the cycle at `now` s.
+        """Return what the motors receive in the cycle at `now` s.
 
-        joints: 4 newest readings. effort: (4,) Nm asked, or None if nothing was ever asked; effort_time: when the joint
-        readings that it answers were taken. All times on one monotonic clock.
+        joints: the 4 newest readings. effort: (4,) Nm requested, None if withdrawn or never requested; effort_time:
+        when the joint readings that it answers were taken. All times are on one monotonic clock.
         """
-        now = max(now, self._now)  # an order may have been timed a little later than the cycle that it precedes
+        now = max(now, self._now)  # a call may carry a slightly later time than the cycle that follows it
         dt = min(now - self._now, self._period)
         self._now = now
-        silent = self._note(now, joints)
+        silent = self._track_rest(now, joints)
         if self.state is State.CHECKING:
             self._check(now, joints, effort, effort_time)
         if self.state in CARRYING:
@@ -169,7 +169,7 @@ class SafetyMachine:
         return drive
 
     def _check(self, now, joints, effort, effort_time) -> None:
-        """Start gate: go on to RAMPING_IN, or say what is missing, or trip over what must not be waited out."""
+        """Start gate: continue to RAMPING_IN, or note what is missing, or trip on what must not be waited out."""
         fault = self.limits.find_fault(now, joints, self._before, overshoot=0.0)
         if not fault and not self._known:
             fault = self.limits.find_wrong_zero(joints)
@@ -187,7 +187,7 @@ class SafetyMachine:
             self._enter(State.RAMPING_IN if self._known else State.PROVING, now)
             return None
         else:
-            self.waiting_for = f"{CALM:g} s without trouble"
+            self.waiting_for = f"{CALM:g} s without a fault"
             return None
         self._since = now
         return None
@@ -195,10 +195,10 @@ class SafetyMachine:
     def _watch(self, now, joints, effort, effort_time) -> None:
         fault = self.limits.find_fault(now, joints, self._before)
         if fault is None and effort is None:
-            fault = Fault(FaultCode.COMMAND_WITHDRAWN, "the compensator withdrew; its diagnostics say why")
+            fault = Fault(FaultCode.COMMAND_WITHDRAWN, "the compensator withdrew its efforts; see its diagnostics")
         elif fault is None and not now - effort_time <= self.limits.command_timeout:
             limit = self.limits.command_timeout * 1000
-            fault = Fault(FaultCode.COMMAND_STALE, f"effort commands stopped: none fresher than {limit:.0f} ms")
+            fault = Fault(FaultCode.COMMAND_STALE, f"no effort command younger than {limit:.0f} ms")
         if fault:
             self.trip(*fault, now)
 
@@ -250,18 +250,18 @@ class SafetyMachine:
     def _damping(self, now: float) -> float:
         return self.limits.damping * min(1.0, (now - self._since) / DAMPING_RISE)
 
-    def _note(self, now: float, joints: Sequence[JointSample]) -> bool:
-        """Note whether the arm is at rest, as far as its motors answer; return whether one of them is silent."""
+    def _track_rest(self, now: float, joints: Sequence[JointSample]) -> bool:
+        """Note whether the arm is at rest, as far as its motors reply; return whether one of them is silent."""
         silent = [self.limits.is_silent(now, joint) for joint in joints]
         if any(silent):
-            self._known = False  # it may have lost its power, and with it the turns of its encoder
+            self._known = False  # it may have lost power, and with it the turn count of its encoder
         if any(
-            not mute and not abs(joint.position - rest.position) <= SETTLED
-            for joint, rest, mute in zip(joints, self._rest, silent, strict=True)
+            not is_silent and not abs(joint.position - rest.position) <= SETTLED
+            for joint, rest, is_silent in zip(joints, self._rest, silent, strict=True)
         ):
             self._rest_since, self._rest = now, joints
-        # When it answers again it has moved, for all we know.
-        self._rest = [UNKNOWN if mute else rest for rest, mute in zip(self._rest, silent, strict=True)]
+        # It may have moved by the time it replies again.
+        self._rest = [UNKNOWN if is_silent else rest for rest, is_silent in zip(self._rest, silent, strict=True)]
         return any(silent)
 
     def _let_down(self, now: float) -> None:

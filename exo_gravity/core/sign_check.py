@@ -1,10 +1,10 @@
-"""Before an arm is carried: does each motor push its joint the way its encoder counts?
+"""Checks, before an arm is carried, that each motor pushes its joint the way its encoder counts.
 
-Joint after joint, while the arm hangs: wait until it is still, push gently and slowly under damping, see it give way by
-about a degree, let go. A joint that gives way backwards has its torque or its encoder reversed, and gravity
-compensation would double its weight; one that does not give way at all has no torque, or is held.
+While the arm hangs, joint after joint: wait until it is still, push it gently and slowly under damping until it moves
+by about a degree, release. A joint that moves backwards has its torque or its encoder reversed: gravity compensation
+would double its weight. A joint that does not move has no torque, or is held.
 
-What this can't see: a `direction` that reverses torque and encoder alike. Such a joint gives way as it should.
+This check cannot detect a `direction` that reverses torque and encoder alike: such a joint moves as expected.
 """
 
 from __future__ import annotations
@@ -16,27 +16,28 @@ from exo_gravity.core.limits import JointSample
 
 RISE = 2.0  # Nm/s
 FALL = 10.0  # Nm/s
-GAVE_WAY = 0.02  # rad; a hundred codes of the encoder
-STILL = 0.003  # rad within which a joint is still,
-STILLNESS = 0.2  # s for so long
-PATIENCE = 0.5  # s at full torque; and ten times that for the joint to come to rest
+MOVED = 0.02  # rad; fifty codes of the position
+STILL = 0.003  # rad within which a joint counts as still
+STILL_TIME = 0.2  # s for which it must stay within STILL
+PUSH_TIMEOUT = 0.5  # s at full torque
+REST_TIMEOUT = 5.0  # s for the joint to come to rest
 
 
 class SignCheck:
-    """The check of four joints. effort: (4,) Nm to be given now. done: whether every joint has passed.
+    """The check of four joints. effort: (4,) Nm to apply now. done: whether every joint has passed.
 
-    torque: the most that each joint is pushed with, in Nm; a joint with 0 is passed over. rate: Nm/s at most.
+    torque: (4,) Nm, the largest push on each joint; a joint with 0 is skipped. rate: Nm/s, the fastest change.
     """
 
-    def __init__(self, names: Sequence[str], torque: Sequence[float], rate: float):
+    def __init__(self, names: Sequence[str], torque: Sequence[float], rate: float) -> None:
         self.effort = [0.0] * len(names)
         self._names = names
         self._torque = torque
         self._rise, self._fall = min(RISE, rate), min(FALL, rate)
-        self._begin(0)
+        self._start_joint(0)
 
     def step(self, dt: float, joints: Sequence[JointSample]) -> Fault | None:
-        """Go on by `dt` s, given the joints' readings; return the fault that they show, if any."""
+        """Advance by `dt` s with the joints' readings; return the fault that they show, if any."""
         if self.done:
             return None
         moved = joints[self._joint].position - self._start
@@ -44,21 +45,21 @@ class SignCheck:
         if self._passed:
             self.effort[self._joint] = max(0.0, push - self._fall * dt)
             if push == 0.0:
-                self._begin(self._joint + 1)
-        elif self._still < STILLNESS:
+                self._start_joint(self._joint + 1)
+        elif self._still < STILL_TIME:
             return self._settle(dt, joints[self._joint].position)
-        elif moved <= -GAVE_WAY:
+        elif moved <= -MOVED:
             return self._fault(FaultCode.WRONG_SIGN, f"{push:.2f} Nm moved it backwards: torque or encoder is reversed")
-        elif moved >= GAVE_WAY:
+        elif moved >= MOVED:
             self._passed = True
-        elif push >= most and self._waited > PATIENCE:
+        elif push >= most and self._waited > PUSH_TIMEOUT:
             return self._fault(FaultCode.SIGN_UNPROVEN, f"{push:.2f} Nm did not move it: let it hang freely")
         else:
             self._waited += dt if push >= most else 0.0
             self.effort[self._joint] = min(most, push + self._rise * dt)
         return None
 
-    def _begin(self, joint: int) -> None:
+    def _start_joint(self, joint: int) -> None:
         while joint < len(self._names) and not self._torque[joint]:
             joint += 1
         self._joint = joint
@@ -72,9 +73,9 @@ class SignCheck:
         self._waited += dt
         if not abs(position - self._start) <= STILL:
             self._start, self._still = position, 0.0
-        if self._still >= STILLNESS:
+        if self._still >= STILL_TIME:
             self._waited = 0.0
-        elif self._waited > 10 * PATIENCE:
+        elif self._waited > REST_TIMEOUT:
             return self._fault(FaultCode.SIGN_UNPROVEN, "it does not come to rest: let it hang freely")
         return None
 

@@ -1,7 +1,7 @@
-"""The control thread of one arm: decide, command all motors, collect their replies, hand them on; at a fixed rate.
+"""The control thread of one arm: get the efforts, decide, command all motors, collect replies; at a fixed rate.
 
-Other threads reach it in two ways only: `ask` puts the newest efforts into a mailbox, `order` runs a function on the
-control thread between two cycles. Paced by absolute monotonic deadlines, so that the rate does not drift.
+Each cycle fetches the newest efforts from `get_efforts`. Other threads use `call` to run a function on the control
+thread between two cycles. The loop is paced by absolute monotonic deadlines, so that the rate does not drift.
 """
 
 from __future__ import annotations
@@ -12,27 +12,38 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from queue import Empty, SimpleQueue
-from typing import Any
+from typing import Any, NamedTuple
 
 from exo_gravity.core.errors import BusError
+from exo_gravity.core.faults import FaultCode
 from exo_gravity.core.limits import JointSample
 from exo_gravity.core.safety import CARRYING, NOTHING, Drive, SafetyMachine, State
 from exo_gravity.hardware.motor_bus import MotorBus
 
-PATIENCE = 0.5  # share of the time that its work leaves of a cycle, for which it may wait for efforts
-SMOOTHING = 0.02  # of the time that the work takes, a cycle
-COLLECTING = 0.8  # share of a cycle in which replies are awaited; the rest is for handing them on
-BLUNDERS = 3  # unforeseen errors in a row after which the machine itself is not trusted any more
-LAST_RESORT = 3.0  # s of plain damping then
+EFFORT_WAIT = 0.5  # share of a cycle's idle time for which the loop may wait for late efforts
+SMOOTHING = 0.02  # per cycle, of the measured work time
+REPLY_WAIT = 0.8  # share of a cycle in which replies are awaited; the rest is for publishing them
+MAX_ERRORS = 3  # unexpected exceptions in a row after which the state machine is no longer trusted
+LAST_RESORT = 3.0  # s of damping alone after that
+
+
+class EffortCommand(NamedTuple):
+    """effort: (4,) Nm, or None to withdraw. answered: monotonic s, when the joint states that it answers were taken."""
+
+    effort: Sequence[float] | None
+    answered: float
+
+
+NO_COMMAND = EffortCommand(None, -math.inf)
 
 
 class ControlLoop:
     """Owns `bus` and `safety` from `start` until its thread has ended.
 
-    before_cycle(latest) is called before every exchange, to `ask` for the newest efforts, for which it may wait until
-    `latest` (monotonic s); on_cycle(now, samples) after it.
-    cycles, late, incomplete count all cycles, those that began more than a period late, and those in which not every
-    motor replied in time.
+    get_efforts(latest) is called before every exchange and returns the newest efforts, for which it may wait until
+    `latest` (monotonic s). on_cycle(now, samples) is called after every exchange.
+    cycles, late, incomplete: counts of all cycles, of those that began more than a period late, and of those in which
+    not every motor replied in time.
     """
 
     def __init__(
@@ -41,32 +52,27 @@ class ControlLoop:
         safety: SafetyMachine,
         period: float,
         on_cycle: Callable[[float, Sequence[JointSample]], None],
-        before_cycle: Callable[[float], None] = lambda latest: None,
-    ):
+        get_efforts: Callable[[float], EffortCommand] = lambda latest: NO_COMMAND,
+    ) -> None:
         self.cycles = self.late = self.incomplete = 0
         self.safety = safety
         self._bus = bus
         self._period = period
         self._on_cycle = on_cycle
-        self._before_cycle = before_cycle
-        self._work = period  # s that a cycle takes without its waiting for efforts
-        self._asked: tuple[Sequence[float] | None, float] = (None, -math.inf)
-        self._orders: SimpleQueue[tuple[Callable[[], Any], Future]] = SimpleQueue()
+        self._get_efforts = get_efforts
+        self._work = period  # s per cycle, without waiting for efforts; smoothed
+        self._calls: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="control", daemon=True)
 
     def start(self) -> None:
-        """Start the thread; the machine begins where it is, DISABLED unless `order`ed otherwise."""
+        """Start the thread. The state machine starts in its present state, DISABLED unless a `call` changed it."""
         self._thread.start()
 
-    def ask(self, effort: Sequence[float] | None, answers: float) -> None:
-        """Ask for `effort` (4,) Nm, computed from joint states taken at `answers` (monotonic s). None withdraws."""
-        self._asked = (effort, answers)
-
-    def order(self, function: Callable[[], Any]) -> Future:
+    def call(self, function: Callable[[], Any]) -> Future[Any]:
         """Run `function` on the control thread between two cycles; the future has its result."""
-        future: Future = Future()
-        self._orders.put((function, future))
+        future: Future[Any] = Future()
+        self._calls.put((function, future))
         return future
 
     @property
@@ -76,41 +82,41 @@ class ControlLoop:
 
     @property
     def ignored(self) -> dict[str, int]:
-        """How many frames were no reply of this arm's motors, by kind."""
+        """Count of frames that were not replies of this arm's motors, by kind."""
         return dict(self._bus.ignored)
 
     def set_zero(self) -> None:
-        """Make the present pose the motors' zero; to be `order`ed, and only while they are off."""
+        """Make the present pose the motors' zero. Use it within a `call`, and only while they are off."""
         self._bus.set_zero()
 
-    def trip(self, code: str, reason: str) -> None:
-        """Let the arm down for a fault seen from outside."""
-        self.order(lambda: self.safety.trip(code, reason, time.monotonic()))
+    def trip(self, code: FaultCode, reason: str) -> None:
+        """Let the arm down for a fault detected outside the loop."""
+        self.call(lambda: self.safety.trip(code, reason, time.monotonic()))
 
-    def trip_if_carried(self, code: str, reason: str) -> None:
-        """The same, for what is a fault only once torque flows."""
+    def trip_if_carried(self, code: FaultCode, reason: str) -> None:
+        """Let the arm down for something that is a fault only while torque is applied."""
         if self.safety.state in CARRYING:
             self.trip(code, reason)
 
     def stop(self) -> None:
-        """Let the arm down, send the last frames, close the bus; returns when that is done."""
+        """Let the arm down, send the last frames, close the bus; return when that is done."""
         self._stopping = True
         if self._thread.ident is not None:
             self._thread.join()
 
     def _run(self) -> None:
         deadline = time.monotonic()
-        blunders = 0
+        errors = 0
         try:
-            while blunders < BLUNDERS and not self._finished():
+            while errors < MAX_ERRORS and not self._finished():
                 try:
                     self._cycle(deadline)
-                    blunders = 0
-                except Exception as error:  # whatever it is, the arm must come down
-                    blunders += 1
-                    self.safety.trip("internal_error", f"{type(error).__name__}: {error}", time.monotonic())
+                    errors = 0
+                except Exception as error:  # whatever happened, the arm must come down
+                    errors += 1
+                    self.safety.trip(FaultCode.INTERNAL_ERROR, f"{type(error).__name__}: {error}", time.monotonic())
                 deadline = self._wait(deadline + self._period)
-            if blunders:
+            if errors:
                 self._damp()
         finally:
             self._bus.stop()
@@ -119,26 +125,26 @@ class ControlLoop:
         return self._stopping and self.safety.state in (State.DISABLED, State.FAULT)
 
     def _cycle(self, due: float) -> None:
-        self._before_cycle(due + PATIENCE * (self._period - self._work))
-        self._obey()
+        efforts = self._get_efforts(due + EFFORT_WAIT * (self._period - self._work))
+        self._run_calls()
         now = time.monotonic()
         if self._stopping:
             self.safety.disable(now)
-        drive = self.safety.step(now, tuple(self._bus.samples), *self._asked)
+        drive = self.safety.step(now, tuple(self._bus.samples), *efforts)
         try:
-            complete = self._bus.exchange(drive, now + COLLECTING * self._period)
+            complete = self._bus.exchange(drive, now + REPLY_WAIT * self._period)
         except BusError as error:
-            self.safety.trip("bus_error", str(error), now)
+            self.safety.trip(FaultCode.BUS_ERROR, str(error), now)
             complete = False
         self.cycles += 1
         self.incomplete += not complete
         self._on_cycle(time.monotonic(), self._bus.samples)
         self._work += SMOOTHING * (time.monotonic() - now - self._work)
 
-    def _obey(self) -> None:
+    def _run_calls(self) -> None:
         while True:
             try:
-                function, future = self._orders.get_nowait()
+                function, future = self._calls.get_nowait()
             except Empty:
                 return
             try:
@@ -147,7 +153,7 @@ class ControlLoop:
                 future.set_exception(error)
 
     def _wait(self, deadline: float) -> float:
-        """Sleep until `deadline`; return it, or the present where that is already more than a period late."""
+        """Sleep until `deadline`; return it, or the present time if that is more than a period late."""
         remaining = deadline - time.monotonic()
         if remaining > 0.0:
             time.sleep(remaining)
@@ -157,7 +163,7 @@ class ControlLoop:
         return deadline
 
     def _damp(self) -> None:
-        """The last resort, without the machine: damping alone, for as long as an arm takes to come down."""
+        """The last resort, without the state machine: damping alone, for as long as an arm takes to come down."""
         end = time.monotonic() + LAST_RESORT
         while time.monotonic() < end:
             try:

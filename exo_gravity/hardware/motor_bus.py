@@ -1,12 +1,11 @@
 """The AK motors of one arm on one python-can bus, in MIT mode: command all, collect the replies until a deadline.
 
-A motor answers only when commanded, 200-400 us later, with its own ID or the master's (0). What else arrives is told
-apart and counted: error and remote frames, extended IDs, frames of other devices, and our own commands where the bus
-echoes them (udp_multicast does). A command's first byte is 0x7f, 0x80 or 0xff, a reply's is the motor's ID, and
-`JointMotor` keeps IDs below those: a command is never taken for a reply.
+A motor replies only when commanded, 200-400 us later, with its own ID or the master's (0). Other frames are ignored and
+counted by kind: error and remote frames, extended IDs, frames of other devices, and our own commands where the bus
+echoes them (udp_multicast does). The first byte of a command is 0x7f, 0x80 or 0xff; that of a reply is the motor's ID,
+which `JointMotor` keeps below those. So a command is never taken for a reply.
 
-Order of the special frames: a command that asks for nothing before ENTER, since the motor remembers its last one
-and would act on it; and the same before EXIT.
+A zero command precedes ENTER and EXIT: the motor remembers its last command, and ENTER would carry it out.
 """
 
 from __future__ import annotations
@@ -25,25 +24,25 @@ from exo_gravity.core.limits import UNKNOWN, JointSample
 from exo_gravity.core.motors import ENTER, EXIT, SET_ZERO
 from exo_gravity.core.safety import OFF, Drive
 
-MASTER_ID = 0  # the arbitration ID under which some firmwares answer
-DRAIN = 256  # frames looked at before each cycle: what udp_multicast keeps at most, and more than any cycle makes
-REPEAT_EXIT = 0.5  # s: a motor that missed its EXIT gets another
+MASTER_ID = 0  # the arbitration ID of some firmwares' replies
+MAX_STALE_FRAMES = 256  # frames read before each cycle: the capacity of udp_multicast, more than any cycle produces
+EXIT_PERIOD = 0.5  # s between two EXIT frames to motors that are off, in case one was lost
 
 
 def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:
-    """Open a python-can bus of any kind, or raise BusError that says which and why not."""
+    """Open a python-can bus of any kind. Raises BusError that names the bus and the reason."""
     try:
         return can.Bus(interface=interface, channel=channel, **options)
     except (can.CanError, OSError, TypeError, ValueError) as error:
-        raise BusError(f"CAN bus {interface} {channel} {dict(options)} can't be opened: {error}") from error
+        raise BusError(f"CAN bus {interface} {channel} {dict(options)} cannot be opened: {error}") from error
 
 
 class MotorBus:
-    """Four motors on one bus. One thread owns it.
+    """Four motors on one bus. Not thread-safe: one thread owns it.
 
-    powered: whether the motors are on already. note: is called with each drive before its frames leave.
+    powered: whether the motors are already on. note: called with each drive before its frames are sent.
     samples: the newest JointSample of each joint, UNKNOWN before the first reply; times are `time.monotonic`.
-    ignored: how many frames were no reply of ours, by kind.
+    ignored: count of frames that were not replies of these motors, by kind.
     """
 
     def __init__(
@@ -52,7 +51,7 @@ class MotorBus:
         motors: Sequence[JointMotor],
         powered: bool = False,
         note: Callable[[Drive], None] = lambda drive: None,
-    ):
+    ) -> None:
         ids = [motor.can_id for motor in motors]
         if len(motors) != JOINT_COUNT or len(set(ids)) != JOINT_COUNT:
             raise ParameterError("can_id", ids, "4 different IDs")
@@ -67,10 +66,10 @@ class MotorBus:
         self.ignored: Counter[str] = Counter()
 
     def exchange(self, drive: Drive, deadline: float) -> bool:
-        """Send every motor its share of `drive`, then collect replies until all came or `deadline` (monotonic s).
+        """Send every motor its part of `drive`, then collect replies until all arrived or `deadline` (monotonic s).
 
-        Switches the motors on or off where `drive.powered` asks for a change. Returns whether all replied in time.
-        Raises BusError if the bus fails.
+        Switches the motors on or off when `drive.powered` changes. Returns whether all motors replied in time. Raises
+        BusError if the bus fails.
         """
         self._note(drive)
         try:
@@ -79,7 +78,7 @@ class MotorBus:
                 self._send_commands(OFF)
                 self._send_all(ENTER)
             self._send_commands(drive)
-            if not drive.powered and (self._powered or time.monotonic() - self._exit_sent > REPEAT_EXIT):
+            if not drive.powered and (self._powered or time.monotonic() - self._exit_sent > EXIT_PERIOD):
                 self._send_all(EXIT)
                 self._exit_sent = time.monotonic()
             self._powered = drive.powered
@@ -96,9 +95,9 @@ class MotorBus:
         return len(self._answered) == JOINT_COUNT
 
     def set_zero(self) -> None:
-        """Make the present pose every motor's zero; only while they are off. They are silent up to 1.5 s afterwards."""
+        """Make the present pose every motor's zero; only while they are off. They are silent for up to 1.5 s."""
         if self._powered:
-            raise BusError("set_zero while the motors are on: switch them off first")
+            raise BusError("set_zero: refused while the motors are on")
         try:
             self._send_commands(OFF)
             self._send_all(SET_ZERO)
@@ -106,7 +105,7 @@ class MotorBus:
             raise BusError(f"CAN bus {self._bus.channel_info}: {error}") from error
 
     def stop(self) -> None:
-        """The last frames: ask for nothing, then EXIT, twice. Never raises; closes the bus."""
+        """Send the last frames, a zero command and EXIT, twice; then close the bus. Never raises."""
         for _ in range(2):
             for motor in self._motors:
                 for data in (motor.command(0.0, 0.0), EXIT):
@@ -129,8 +128,8 @@ class MotorBus:
         self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
 
     def _drain(self) -> None:
-        """Read what came too late for its cycle, so that it is not taken for an answer to this one."""
-        for _ in range(DRAIN):
+        """Read replies that arrived after their cycle, so that they do not count for this one."""
+        for _ in range(MAX_STALE_FRAMES):
             message = self._bus.recv(0.0)
             if message is None:
                 return
@@ -147,7 +146,7 @@ class MotorBus:
         self.samples[joint] = JointSample(*reading, time.monotonic())
 
     def _foreign(self, message: can.Message) -> str:
-        """Return what kind of frame this is if it is no reply of our motors, else ''."""
+        """Return the kind of a frame that is not a reply of our motors, else ''."""
         if message.is_error_frame:
             return "error frame"
         if message.is_extended_id or message.is_remote_frame or message.is_fd:

@@ -1,8 +1,8 @@
-"""What the system is asked for: nice values, timers that end on time, real-time threads, memory that stays in memory.
+"""Requests to the operating system: nice values, precise timers, real-time threads, locked memory.
 
-The last two are options, off by default. A thread under SCHED_FIFO is run at once, whatever else is ready; but while
-others wait on its processor Linux keeps it from running now and then, on some kernels for up to 50 ms (measured, 6.18),
-which lets the arm down.
+Real-time threads and locked memory are options, off by default. A SCHED_FIFO thread runs at once, whatever else is
+ready; but while other threads wait for its processor, Linux sometimes throttles it, on some kernels for up to 50 ms
+(measured, 6.18), which lets the arm down.
 """
 
 from __future__ import annotations
@@ -13,25 +13,25 @@ import os
 import threading
 
 PR_SET_TIMERSLACK = 29  # prctl(2), in <sys/prctl.h>
-# Of mlockall(2), in <sys/mman.h>: what is mapped now, and later, once it is used.
+# Flags of mlockall(2), in <sys/mman.h>: pages mapped now, pages mapped later, and only once they are used.
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
 
 
 def favour(priority: int) -> None:
-    """Ask for a nice value of -`priority` (1..20), and for sleeps that end on time: Linux lets them last 50 us longer.
+    """Request nice value -`priority` (1..20) and precise sleeps: by default Linux ends them up to 50 us late.
 
-    For this thread and those that it starts later. Where it is not permitted they run like any other.
+    This applies to the calling thread and those that it starts later. A nice value that is not permitted is ignored.
     """
     ctypes.CDLL(None).prctl(PR_SET_TIMERSLACK, 1)  # ns
     with contextlib.suppress(PermissionError):
         os.setpriority(os.PRIO_PROCESS, 0, -priority)
 
 
-def ask_real_time(priority: int, lock_memory: bool) -> list[str]:
-    """Do what is asked for and return what was not permitted.
+def request_real_time(priority: int, lock_memory: bool) -> list[str]:
+    """Request real-time scheduling and locked memory; return one sentence for each request that was not permitted.
 
-    priority: of all threads of this process but the caller's, the middleware's included, which hands the messages
-    over, under SCHED_FIFO; 0 leaves them as they are.
+    priority: SCHED_FIFO priority for all threads of this process except the caller's. It includes the middleware's
+    threads, which deliver the messages. 0 leaves them unchanged.
     """
     refused = []
     if priority:
@@ -40,7 +40,7 @@ def ask_real_time(priority: int, lock_memory: bool) -> list[str]:
                 if thread != threading.get_native_id():
                     os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
         except PermissionError:
-            refused.append(f"thread_priority {priority} is not permitted here: it needs an rtprio limit")
+            refused.append(f"thread_priority {priority} is not permitted: raise the rtprio limit in limits.conf")
     if lock_memory and ctypes.CDLL(None).mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT):
-        refused.append("lock_memory is not permitted here: it needs a higher memlock limit")
+        refused.append("lock_memory is not permitted: raise the memlock limit in limits.conf")
     return refused

@@ -1,11 +1,11 @@
 """Samples of an inertial measurement unit (IMU) on the trunk -> the trunk's orientation, pitch and roll.
 
-An IMU that reports its orientation is believed; where it reports none, imufusion (x-io Technologies' AHRS, the revised
-algorithm of chapter 7 of S. Madgwick's thesis) fuses its gyroscope and accelerometer. Without a magnetometer the
-heading drifts; neither pitch nor roll depends on it.
+An orientation that the IMU reports is used as it is. Without one, imufusion (x-io Technologies' AHRS, the revised
+algorithm of chapter 7 of S. Madgwick's thesis) fuses gyroscope and accelerometer. Without a magnetometer the heading
+drifts, on which neither pitch nor roll depends.
 
-Every sample is accepted, or refused with the reason. After a start, a gap or a jump the estimator gives nothing until
-it has settled again, and it gives nothing that contradicts the accelerometer at rest: what it gives never jumps.
+Every sample is accepted, or refused with the reason. After a start, a gap or a jump there is no output until the
+estimate has settled again, nor while the estimate contradicts the accelerometer at rest: the output never jumps.
 """
 
 from __future__ import annotations
@@ -22,19 +22,18 @@ from exo_gravity.core.tilt import gravity_from_orientation, pitch_roll, rotation
 
 try:
     import imufusion
-except ImportError:  # needed by an IMU that reports no orientation, and by no other
+except ImportError:  # needed only for an IMU that reports no orientation
     imufusion = None
 
-MAX_GAP = 0.1  # s between two samples: at 6 rad/s the trunk has turned by 34 degrees unseen
-SETTLE_TIME = 1.0  # s of continuous samples before a reported orientation is given
-MAX_RATE = 15.0  # rad/s about any axis: no trunk turns that fast, but a gyroscope in deg/s says so at once
-# m/s^2: below is free fall, a dead accelerometer or one that counts in g; above is more than a knock.
+MAX_GAP = 0.1  # s between two samples: at 6 rad/s the trunk turns by 34 degrees in it
+SETTLE_TIME = 1.0  # s of continuous samples before a reported orientation is used
+MAX_RATE = 15.0  # rad/s about any axis: no trunk turns faster; a gyroscope that reports deg/s exceeds it at once
+# m/s^2. Below: free fall, a dead accelerometer or one that reports g. Above: more than a knock.
 ACCELERATION_RANGE = (2.0, 80.0)
-# While the trunk accelerates, estimate and accelerometer differ. Where they differ and the accelerometer shows 1 g for
-# long, a driver reports an orientation that it does not have, its world's z points down, or the gyroscope's unit or an
-# axis is wrong.
+# Estimate and accelerometer differ while the trunk accelerates. If they differ for long while the accelerometer shows
+# 1 g, the driver reports an orientation it does not have, its world z points down, or a unit or an axis is wrong.
 MAX_CONTRADICTION = math.radians(20.0)
-CONTRADICTION_TIME = 0.5  # s; less than SETTLE_TIME, so that a wrong orientation is never given
+CONTRADICTION_TIME = 0.5  # s; less than SETTLE_TIME, so that a wrong orientation is never used
 NEAR_GRAVITY = 0.1  # share of 1 g
 
 
@@ -42,8 +41,8 @@ class ImuSample(NamedTuple):
     """One sample in the IMU's own axes.
 
     time: s, when it was taken, not when it arrived. angular_velocity: (3,) rad/s; acceleration: (3,) m/s^2, +9.8
-    upward at rest (REP-145). orientation: (x, y, z, w), world from IMU, world z up. None is what the IMU does not
-    report: without an orientation, the other two are needed.
+    upward at rest (REP-145). orientation: (x, y, z, w), world from IMU, world z up. None marks what the IMU does not
+    report; without an orientation the other two are required.
     """
 
     time: float
@@ -55,7 +54,7 @@ class ImuSample(NamedTuple):
 class TrunkOrientation(NamedTuple):
     """pitch, roll: rad (REP-103: pitch > 0 bows forward, roll > 0 leans right).
 
-    orientation: (x, y, z, w), world from trunk, with a heading of its own.
+    orientation: (x, y, z, w), world from trunk; its heading is arbitrary.
     """
 
     pitch: float
@@ -69,11 +68,11 @@ class TrunkEstimator:
     rotation: (3, 3), trunk from IMU. settling: why there is no orientation yet; empty once there is.
     """
 
-    def __init__(self, rotation_trunk_from_imu: Sequence[float], rate: float = 100.0):
-        """Make one for an IMU mounted at `rotation_trunk_from_imu`, (x, y, z, w), which a calibration finds.
+    def __init__(self, rotation_trunk_from_imu: Sequence[float], rate: float = 100.0) -> None:
+        """Create an estimator for an IMU mounted at `rotation_trunk_from_imu`, (x, y, z, w), known from a calibration.
 
-        rate: roughly, samples per s. The fusion counts in samples how long it settles (3 s) and when it learns the
-        gyroscope's bias. Raises ParameterError.
+        rate: approximate sample rate in Hz, from which the fusion derives how long it settles (3 s) and when it
+        estimates the gyroscope's bias. Raises ParameterError.
         """
         self.rotation = rotation_matrix(rotation_trunk_from_imu, "rotation_trunk_from_imu")
         self.settling = "no sample yet"
@@ -89,18 +88,18 @@ class TrunkEstimator:
 
     @property
     def gyroscope_bias(self) -> np.ndarray:
-        """What the fusion has learnt to take off the gyroscope, (3,) rad/s in the IMU's axes."""
+        """The gyroscope bias that the fusion estimates and subtracts, (3,) rad/s in the IMU's axes."""
         return self._fused.bias if self._fused else np.zeros(3)
 
     def update(self, sample: ImuSample) -> TrunkOrientation | None:
-        """Take a sample; return the trunk's orientation, or None while settling.
+        """Process a sample; return the trunk's orientation, or None while settling.
 
-        Raises ParameterError where the sample is impossible or not later than the last (it is then left out), and
-        where the orientation has contradicted the accelerometer for CONTRADICTION_TIME.
+        Raises ParameterError if the sample is impossible or not later than the last one (it is then ignored), or if
+        the orientation has contradicted the accelerometer for CONTRADICTION_TIME.
         """
         source = self._fused if sample.orientation is None else self._reported
         if source is None:
-            raise ParameterError("orientation", None, "reported by the IMU, or fused: pip install imufusion")
+            raise ParameterError("orientation", None, "reported by the IMU, or install imufusion to fuse it")
         acceleration = source.check(sample)
         dt = self._step(sample.time)
         if source is not self._source or abs(dt) > MAX_GAP:
@@ -118,10 +117,10 @@ class TrunkEstimator:
         return TrunkOrientation(*pitch_roll(down), _product(quaternion, self._imu_from_trunk))
 
     def _step(self, time: float) -> float:
-        """Return s since the last sample; far into the past is another clock, hence a gap."""
+        """Return s since the last sample. A stamp far in the past comes from another clock, and counts as a gap."""
         dt = time - self._time
         if not math.isfinite(time) or -MAX_GAP <= dt <= 0.0:
-            raise ParameterError("stamp", time, "a number, later than the last one")
+            raise ParameterError("stamp", time, "a finite number, later than the last stamp")
         return dt
 
     def _restart(self, source: _Fused | _Reported, acceleration: np.ndarray | None, why: str) -> None:
@@ -135,17 +134,17 @@ class TrunkEstimator:
             self._contradicted = self._contradicted + dt if contradicts else 0.0
         if self._contradicted > CONTRADICTION_TIME:
             limit = math.degrees(MAX_CONTRADICTION)
-            expected = f"within {limit:g} degrees of the accelerometer at rest, or its axes, unit or sign are wrong"
+            expected = f"within {limit:g} degrees of the accelerometer at rest: check the IMU's axes, units and signs"
             raise ParameterError("gravity_in_trunk", down.round(2), expected)
 
 
 class _Fused:
-    """Orientation by imufusion, which speaks deg/s, g and (w, x, y, z)."""
+    """Orientation by imufusion, which uses deg/s, g and (w, x, y, z)."""
 
-    # Its own defaults: 3 s to settle, and a gain of 0.5, that is 2 s to forget an error. Rejection of accelerations
-    # stays off: on a hand-recorded IMU it left up to 3 degrees at the end of a movement, against 0.6 without.
+    # imufusion's defaults: 3 s to settle, and a gain of 0.5, with which an error decays in 2 s. Acceleration rejection
+    # is off: on an IMU moved by hand it left up to 3 degrees at the end of a movement, against 0.6 without.
 
-    def __init__(self, rate: float):
+    def __init__(self, rate: float) -> None:
         self._ahrs = imufusion.Ahrs()
         self._ahrs.set_settings(imufusion.AhrsSettings(sample_rate=rate, convention=imufusion.CONVENTION_NWU, gain=0.5))
         self._bias = imufusion.Bias()
@@ -166,13 +165,13 @@ class _Fused:
         acceleration = _vector("linear_acceleration", sample.acceleration)
         low, high = ACCELERATION_RANGE
         if not low <= np.linalg.norm(acceleration) <= high:
-            raise ParameterError("linear_acceleration", acceleration, f"from {low:g} to {high:g} m/s^2 in all")
+            raise ParameterError("linear_acceleration", acceleration, f"from {low:g} to {high:g} m/s^2 in magnitude")
         return acceleration
 
     def restart(self, acceleration: np.ndarray) -> None:
         self._ahrs.restart()
-        # From the accelerometer's tilt, not from level: an IMU mounted upside down, 180 degrees from level, finds no
-        # direction to turn in and would settle there.
+        # Start from the accelerometer's tilt, not from level: an IMU mounted upside down is 180 degrees from level, has
+        # no direction to turn in, and would stay there.
         x, y, z = acceleration / np.linalg.norm(acceleration)
         quaternion = np.array((1.0 + z, y, -x, 0.0)) if z > -0.999 else np.array((0.0, 1.0, 0.0, 0.0))
         self._ahrs.set_quaternion(quaternion / np.linalg.norm(quaternion))
@@ -186,9 +185,9 @@ class _Fused:
 
 
 class _Reported:
-    """The orientation that the IMU reports itself."""
+    """The orientation that the IMU reports."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._since_restart = 0.0  # s
 
     @property
@@ -216,7 +215,7 @@ def _vector(name: str, values: Sequence[float] | None) -> np.ndarray:
 
 def _angle(a: np.ndarray, b: np.ndarray) -> float:
     a, b = a / math.hypot(*a), b / math.hypot(*b)
-    return 2.0 * math.atan2(math.hypot(*(a - b)), math.hypot(*(a + b)))  # accurate for small angles too
+    return 2.0 * math.atan2(math.hypot(*(a - b)), math.hypot(*(a + b)))  # accurate for small angles, too
 
 
 def _product(p: Sequence[float], q: Sequence[float]) -> np.ndarray:

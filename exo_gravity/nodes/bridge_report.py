@@ -1,4 +1,4 @@
-"""What `can_bridge` tells: in its log what it starts with, on /diagnostics state, fault, limits, loop and wire."""
+"""What `can_bridge` reports: its limits in the log at the start; state, fault, loop and bus load on /diagnostics."""
 
 from __future__ import annotations
 
@@ -15,47 +15,51 @@ from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics
 from exo_gravity.nodes.run import open_to_others
 
-RECENT = 2.0  # s for which a limit that acted is still named
+RECENT = 2.0  # s for which a limit that acted is still shown
 
 
-def introduce(node: Node, limits: Limits, wire: Load, rate: float) -> None:
-    """Log what the arm will be held to, what `rate` (Hz) asks of the wire, and who else could command the arm."""
+def log_limits(node: Node, limits: Limits, wire: Load, rate: float) -> None:
+    """Log the limits, the bus load at `rate` (Hz), and whether other hosts can command the arm."""
     log = node.get_logger()
     efforts = ", ".join(f"{effort:g}" for effort in limits.max_effort)
     log.info(
-        f"at most {efforts} Nm, {limits.max_effort_rate:g} Nm/s, {max(limits.max_velocity):g} rad/s, "
-        f"{limits.max_temperature:g} degC; efforts no older than {limits.command_timeout * 1000:.0f} ms"
+        f"limits: {efforts} Nm, {limits.max_effort_rate:g} Nm/s, {max(limits.max_velocity):g} rad/s, "
+        f"{limits.max_temperature:g} degC, effort commands at most {limits.command_timeout * 1000:.0f} ms old"
     )
     worst = load(rate, len(limits.joint_names), worst=True)
     log.info(
-        f"{rate:g} Hz load the bus with {wire.bits_per_second / 1000:.0f} kbit/s, {wire.share:.0%} of it, "
-        f"{worst.share:.0%} at worst; {int(wire.largest_rate)} Hz would fill it"
+        f"bus load at {rate:g} Hz: {wire.bits_per_second / 1000:.0f} kbit/s, {wire.share:.0%} of the bus, "
+        f"{worst.share:.0%} at worst; the bus is full at {int(wire.largest_rate)} Hz"
     )
     opening = open_to_others()
     if opening:
-        log.warning(f"{opening}: other hosts can command this arm; set LOCALHOST, or enforce SROS2")
+        log.warning(
+            f"{opening}: other hosts can command this arm; set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST or enforce SROS2"
+        )
 
 
 class BridgeReport:
-    """The report of one bridge. wire: the load of a whole `period` (s)."""
+    """The status of one bridge. wire: the bus load at full rate. period: s of a cycle."""
 
-    def __init__(self, node: Node, names: Sequence[str], wire: Load, period: float):
+    def __init__(self, node: Node, names: Sequence[str], wire: Load, period: float) -> None:
         self._diagnostics = Diagnostics(node)
         self._names = names
-        self._load = wire.share * period  # of one cycle, in s of the bus
+        self._load = wire.share * period  # s on the bus per cycle
         self._rate = Rate()
 
-    def send(self, loop: ControlLoop | None, refusal: str, answers: float) -> None:
+    def send(self, loop: ControlLoop | None, refusal: str, answered: float) -> None:
         """Report on `loop`, None while the node is inactive.
 
-        refusal: the last message that was refused, and why. answers: when the joint states were taken that the newest
-        efforts answer, monotonic s.
+        refusal: why the last message was refused. answered: monotonic s, when the joint states were measured that the
+        newest efforts answer.
         """
         if loop is None:
             self._diagnostics.report(WARN, "inactive")
             return
         now, safety = time.monotonic(), loop.safety
-        acting = ", ".join(sorted(limit for limit, when in tuple(safety.acted.items()) if when > now - RECENT))
+        acting = ", ".join(
+            sorted(limit for limit, time_acted in tuple(safety.acted.items()) if time_acted > now - RECENT)
+        )
         rate = self._rate.update(now, loop.cycles)
         values = {
             "state": safety.state.value,
@@ -63,7 +67,7 @@ class BridgeReport:
             "limits acting": acting or "none",
             "rate (Hz)": f"{rate:.1f}",
             "bus load (%)": f"{100.0 * self._load * rate:.0f}",
-            "age of efforts (ms)": f"{1000.0 * (now - answers):.1f}",
+            "age of efforts (ms)": f"{1000.0 * (now - answered):.1f}",
             "cycles": loop.cycles,
             "late cycles": loop.late,
             "incomplete cycles": loop.incomplete,

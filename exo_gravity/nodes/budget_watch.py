@@ -1,9 +1,9 @@
-"""Whether the motors can give what the compensator's settings ask for: looked at beside the control loop, never in it.
+"""Checks whether the motors can provide the torque that the compensator's settings require, outside the control loop.
 
-The motors and the joint limits are those of `can_bridge`, which is asked for its parameters once. A budget takes about
-0.2 s of arithmetic, so it is made in a thread of its own, with a pause after each millisecond: in one go, at whatever
-priority, it kept threads of the loop from their processor for up to 0.1 s (measured, Linux 6.18, two busy cores). While
-one is made, newer settings wait, and only the newest of them is looked at next.
+Motors and joint limits are parameters of `can_bridge`, which are requested once. A budget takes about 0.2 s of
+arithmetic. It runs in a separate thread, and pauses after each millisecond: without pauses, at any priority, it kept
+the loop's threads from their processor for up to 0.1 s (measured, Linux 6.18, two busy cores). While a budget is
+computed, newer settings wait; the newest of them comes next.
 """
 
 from __future__ import annotations
@@ -27,56 +27,56 @@ from exo_gravity.core.param_table import values_of
 from exo_gravity.core.wearer import LinkLoad
 
 WITHIN = "within rated torque everywhere"
-PAUSE = 0.005  # s, some 500 times a budget
-ASKED = ("motor", "torque_scale", "position_min", "position_max")
+PAUSE = 0.005  # s, about 500 times per budget
+BRIDGE_PARAMETERS = ("motor", "torque_scale", "position_min", "position_max")
 
 
 class BudgetWatch:
-    """Call `update` regularly; `text` says how the newest settings looked at stand."""
+    """Call `update` regularly; `text` is the result for the newest settings that were checked."""
 
-    def __init__(self, node: Node, joint_names: Sequence[str], max_tilt: float):
-        self.text = "unknown: can_bridge has not told its motors yet"
+    def __init__(self, node: Node, joint_names: Sequence[str], max_tilt: float) -> None:
+        self.text = "unknown: waiting for can_bridge's parameters"
         self._node = node
         self._names = tuple(joint_names)
         self._max_tilt = max_tilt
         self._client = node.create_client(GetParameters, "can_bridge/get_parameters")
-        self._asked: rclpy.Future | None = None
+        self._reply: rclpy.Future | None = None
         self._bridge: Sequence[ParameterValue] | None = None
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="budget")
         self._job: Future | None = None
-        self._looked_at: tuple | None = None
+        self._checked: tuple | None = None
 
     def update(self, settings: Settings) -> None:
-        """Take up what is ready, and begin what is to be done for `settings`; never waits."""
+        """Collect a finished budget, and start one for `settings` if they are new. Never blocks."""
         if self._bridge is None:
-            self._ask()
+            self._request()
         elif self._job is not None and self._job.done():
             self.text, self._job = self._job.result(), None
             if self.text != WITHIN:
-                self._node.get_logger().warning(f"{self.text}; the clamp to max_effort holds")
+                self._node.get_logger().warning(f"{self.text}; efforts stay clamped to max_effort")
         elif self._job is None:
             support = settings.support if settings.mode == "zero_g" else 0.0
             work = settings.robot, tuple(settings.wearer_mass), tuple(settings.wearer_cog), support
-            if work != self._looked_at:
-                self._looked_at = work
+            if work != self._checked:
+                self._checked = work
                 self._job = self._pool.submit(self._sentence, *work)
 
-    def _ask(self) -> None:
-        """Get motors and joint limits, a bit further with each call."""
-        if self._asked is None:
+    def _request(self) -> None:
+        """Request motors and joint limits; each call takes the next step."""
+        if self._reply is None:
             if self._client.service_is_ready():
-                self._asked = self._client.call_async(GetParameters.Request(names=list(ASKED)))
-        elif self._asked.done():
-            self._bridge = self._asked.result().values
-            self._node.destroy_client(self._client)  # one thing less for the executor to wait on
+                self._reply = self._client.call_async(GetParameters.Request(names=list(BRIDGE_PARAMETERS)))
+        elif self._reply.done():
+            self._bridge = self._reply.result().values
+            self._node.destroy_client(self._client)  # the executor then waits for one entity less
 
     def _sentence(self, robot: ArmModel, mass: Sequence[float], cog: Sequence[float], support: float) -> str:
         try:
-            told = dict(zip(ASKED, map(parameter_value_to_python, self._bridge), strict=False))
-            bridge = values_of([param for param in CAN_BRIDGE if param.name in ASKED], told)
+            values = dict(zip(BRIDGE_PARAMETERS, map(parameter_value_to_python, self._bridge), strict=False))
+            bridge = values_of([param for param in CAN_BRIDGE if param.name in BRIDGE_PARAMETERS], values)
             workspace = Workspace(bridge["position_min"], bridge["position_max"], self._max_tilt)
             torques = motor_torques(bridge["motor"], bridge["torque_scale"])
             joints = budget(robot, LinkLoad(mass, cog), support, workspace, *torques, lambda: time.sleep(PAUSE))
             return overload(self._names, joints) or WITHIN
         except ParameterError as error:
-            return f"unknown: can_bridge tells {error}"
+            return f"unknown: can_bridge has {error}"

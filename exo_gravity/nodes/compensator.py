@@ -1,8 +1,8 @@
 """compensator: joint states and trunk tilt in, effort commands out, at the rate at which joint states arrive.
 
-It keeps no clock of its own: each joint state is answered at once, with its own stamp, so that whoever applies the
-torque can tell how old its ground is. Where there is no safe answer it withdraws: a command without efforts, and the
-reason on /diagnostics. Silence means the same to `can_bridge`, a little later.
+It has no timer: each joint state is answered at once, with the joint state's stamp, so that `can_bridge` can tell how
+old the reading is. Where there is no safe answer it withdraws: it sends a command without efforts, and puts the reason
+on /diagnostics. To `can_bridge` silence means the same, a little later.
 """
 
 from __future__ import annotations
@@ -12,10 +12,12 @@ import threading
 import time
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from geometry_msgs.msg import Vector3Stamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
@@ -24,21 +26,21 @@ from exo_gravity.core.budget import USUAL_TILT
 from exo_gravity.core.compensator import Answer, Compensator, Settings
 from exo_gravity.core.control_params import COMPENSATOR, settings_of
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.hardware.scheduling import ask_real_time
+from exo_gravity.hardware.scheduling import request_real_time
 from exo_gravity.nodes.budget_watch import BudgetWatch
 from exo_gravity.nodes.conversions import by_name
-from exo_gravity.nodes.declare import changed, declare, prepared
+from exo_gravity.nodes.declare import declare, values_after, with_floats
 from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics
 from exo_gravity.nodes.hot_path import HotPath
 from exo_gravity.nodes.run import run
 from exo_gravity.nodes.sole_publisher import SolePublisher
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-DISTRUST = 0.2  # s for which nothing is answered after a second publisher of an input was seen
-SILENCE = 0.5  # s without joint states after which diagnostics say so
+DISTRUST = 0.2  # s without efforts after a second publisher of an input was seen
+SILENCE = 0.5  # s without joint states until diagnostics report it
 
 
-def read_settings(values: dict) -> Settings:
+def read_settings(values: dict[str, Any]) -> Settings:
     """Return the settings that parameter values describe, with the model in `anfis_file`, or raise ParameterError."""
     path = values["anfis_file"]
     try:
@@ -51,7 +53,7 @@ def read_settings(values: dict) -> Settings:
 class CompensatorNode(Node):
     """The ROS shell around `core.compensator.Compensator`."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("compensator", automatically_declare_parameters_from_overrides=True)
         values = declare(self, COMPENSATOR)
         self._names = values["joint_names"]
@@ -59,41 +61,42 @@ class CompensatorNode(Node):
         self._diagnostics = Diagnostics(self)
         self._budget = BudgetWatch(self, self._names, math.radians(USUAL_TILT) if values["use_imu"] else 0.0)
         self._answer = Answer(None)
-        self._answered = -math.inf
+        self._last_answer = -math.inf
         self._answers = 0
         self._refusal = "none"
         self._sources = {"joint_states": SolePublisher(), "/imu/pitch_yaw": SolePublisher()}
-        self._intruder, self._intruded = "", -math.inf  # what a second publisher was seen of, and when
+        # Which input had a second publisher, as a sentence, and when (monotonic s).
+        self._intruder, self._intruded = "", -math.inf
         self._publisher = self.create_publisher(JointState, "effort_commands", 1)
-        self._command = JointState(name=self._names)  # the one message that is sent, over and over
-        self._lock = threading.Lock()  # of the compensator: joint states come on a thread of their own
+        self._command = JointState(name=self._names)  # one message, reused
+        self._lock = threading.Lock()  # guards the compensator: joint states arrive on another thread
         self._joint_states = HotPath(self, JointState, "joint_states", self._on_joint_states, NEWEST)
         if values["use_imu"]:
             self.create_subscription(Vector3Stamped, "/imu/pitch_yaw", self._on_pitch_yaw, NEWEST)
-        self.add_pre_set_parameters_callback(lambda changes: prepared(self, COMPENSATOR, changes))
+        self.add_pre_set_parameters_callback(lambda changes: with_floats(self, COMPENSATOR, changes))
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         self.create_timer(0.5, self._report)
         self._log(self._compensator.settings)
         self._joint_states.start()
-        for refused in ask_real_time(values["thread_priority"], values["lock_memory"]):
+        for refused in request_real_time(values["thread_priority"], values["lock_memory"]):
             self.get_logger().warning(refused)
 
     @property
     def failure(self) -> Exception | None:
-        """What went wrong on the thread of the joint states."""
+        """The exception that ended the thread of the joint states."""
         return self._joint_states.failure
 
     def close(self) -> None:
-        """Answer no more."""
+        """Stop answering joint states."""
         self._joint_states.stop()
 
-    def _on_joint_states(self, message: JointState, info: dict) -> None:
+    def _on_joint_states(self, message: JointState, info: dict[str, Any]) -> None:
         command = self._command
         command.header.stamp = message.header.stamp
         now = time.monotonic()
         try:
-            self._watch("joint_states", info, now)
+            self._check_publisher("joint_states", info, now)
             theta = by_name(message, "position", self._names)
             with self._lock:
                 answer = self._compensator.step(now, theta)
@@ -104,42 +107,42 @@ class CompensatorNode(Node):
         command.effort = answer.effort or ()
         self._answers += answer.effort is not None
         self._publisher.publish(command)
-        news = answer.reason != self._answer.reason
-        self._answer, self._answered = answer, now
-        if news:
+        changed = answer.reason != self._answer.reason
+        self._answer, self._last_answer = answer, now
+        if changed:
             self._report()
 
-    def _on_pitch_yaw(self, message: Vector3Stamped, info: dict) -> None:
+    def _on_pitch_yaw(self, message: Vector3Stamped, info: dict[str, Any]) -> None:
         now = time.monotonic()
         try:
-            self._watch("/imu/pitch_yaw", info, now)
+            self._check_publisher("/imu/pitch_yaw", info, now)
             with self._lock:
-                self._compensator.tilt(now, pitch=message.vector.y, roll=message.vector.x)
-        except ParameterError as error:  # not taken: the last tilt grows old, and the arm is let down
+                self._compensator.set_tilt(now, pitch=message.vector.y, roll=message.vector.x)
+        except ParameterError as error:  # the last tilt then grows old, and the efforts are withdrawn
             self._refused("/imu/pitch_yaw", error)
 
-    def _watch(self, topic: str, info: dict, now: float) -> None:
-        """Withdraw for a while where somebody else publishes what only one node may."""
-        if self._sources[topic].another(info):
+    def _check_publisher(self, topic: str, info: dict, now: float) -> None:
+        """Withdraw for a while if a second publisher sends on `topic`."""
+        if self._sources[topic].is_another(info):
             self._intruder, self._intruded = f"more than one publisher of {topic}", now
 
     def _refused(self, topic: str, error: ParameterError) -> str:
-        """Note an impossible message; its value goes to /diagnostics only, or a hostile sender would fill the log."""
+        """Note an impossible message. Its value goes to /diagnostics only: a hostile sender could fill the log."""
         self._refusal = f"{topic}: {error}"
         return f"{topic}: {error.name} must be {error.expected}"
 
-    def _check_parameters(self, changes) -> SetParametersResult:
+    def _check_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         try:
-            read_settings(changed(self, COMPENSATOR, changes))
+            read_settings(values_after(self, COMPENSATOR, changes))
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    def _apply_parameters(self, _changes) -> None:
+    def _apply_parameters(self, _changes: list[Parameter]) -> None:
         try:
-            settings = read_settings(changed(self, COMPENSATOR))
-        except ParameterError as error:  # it was checked just now: anfis_file must have gone since
-            self.get_logger().error(f"not applied: {error}")
+            settings = read_settings(values_after(self, COMPENSATOR))
+        except ParameterError as error:  # checked just before: only anfis_file can have changed since
+            self.get_logger().error(f"parameters not applied: {error}")
             return
         with self._lock:
             self._compensator.apply(settings)
@@ -148,12 +151,12 @@ class CompensatorNode(Node):
     def _log(self, s: Settings) -> None:
         of_wearer = f", wearer {_row(s.wearer_mass)} kg at {_row(s.wearer_cog)} m" if any(s.wearer_mass) else ""
         self.get_logger().info(
-            f"{s.side} arm, law {s.law}, mode {s.mode}, support {s.support:g}: carries {s.arm.total_mass:.2f} kg, "
+            f"{s.side} arm, law {s.law}, mode {s.mode}, support {s.support:g}: compensates {s.arm.total_mass:.2f} kg, "
             f"at most {_row(s.max_effort)} Nm; robot {_row(s.robot.mass)} kg at {_row(s.robot.cog)} m{of_wearer}"
         )
 
     def _values(self) -> dict[str, object]:
-        """Return the values in force, for /diagnostics."""
+        """Return the current values for /diagnostics."""
         s = self._compensator.settings
         return {
             "law": s.law,
@@ -174,12 +177,14 @@ class CompensatorNode(Node):
         answer = self._answer
         self._budget.update(self._compensator.settings)
         values = self._values()
-        if time.monotonic() - self._answered > SILENCE:
+        if time.monotonic() - self._last_answer > SILENCE:
             self._diagnostics.report(WARN, "waiting for joint_states", values)
         elif answer.effort is None:
             self._diagnostics.report(ERROR, f"withdrawn: {answer.reason}", values)
         elif answer.fallback:
-            self._diagnostics.report(WARN, f"exact law in place of the ANFIS: {answer.fallback}", values)
+            self._diagnostics.report(
+                WARN, f"the exact law replaces {self._compensator.settings.law}: {answer.fallback}", values
+            )
         elif answer.clamped:
             joints = ", ".join(self._names[joint] for joint in answer.clamped)
             self._diagnostics.report(WARN, f"gravity exceeds max_effort: {joints}", values)

@@ -1,4 +1,4 @@
-"""ROS messages <-> plain values, in one place. Joints are looked up by name, never by index."""
+"""ROS messages <-> plain values. Joints are looked up by name, never by index."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ def to_nanoseconds(stamp: Time) -> int:
 def by_name(message: JointState, field: str, names: Sequence[str]) -> tuple[float, ...]:
     """Return `message`'s position, velocity or effort (n,) in the order of `names`.
 
-    Raises ParameterError where the names are not exactly these, each once, where the field has another length, or
-    where a value is NaN or infinite: an absent joint is an error, never 0.
+    Raises ParameterError unless the message has exactly these names, each once, and one finite value for each. An
+    absent joint is an error, never 0.
     """
     values, given = getattr(message, field), message.name
     if len(values) != len(given):
-        raise ParameterError(field, list(values), f"as long as its {len(given)} names")
+        raise ParameterError(field, list(values), f"{len(given)} values, one for each name")
     if given != list(names):
         if sorted(given) != sorted(names):
             raise ParameterError("name", list(given), f"exactly {', '.join(names)}, each once")
         values = [values[given.index(name)] for name in names]
     result = tuple(values)
     if not all(map(math.isfinite, result)):
-        raise ParameterError(field, list(result), "finite")
+        raise ParameterError(field, list(result), "finite numbers")
     return result

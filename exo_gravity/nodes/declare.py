@@ -1,4 +1,4 @@
-"""Declares the parameters of `core.params` tables on a node, and describes them to `ros2 param` and rqt."""
+"""Declares the parameter tables of `core` on a node, with descriptions for `ros2 param` and rqt."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def declare(node: Node, table: Sequence[Param], free_prefix: str = "") -> dict[s
     """Declare the table's parameters on `node` and return their values by name.
 
     The node must have been created with `automatically_declare_parameters_from_overrides=True`. Names that start with
-    `free_prefix` are left as given. Raises ParameterError for a value that a parameter refuses, and for a name that
-    the table does not have.
+    `free_prefix` are left as given. Raises ParameterError for an impossible value, and for a name that is not in the
+    table.
     """
     given = {name: _plain(parameter.value) for name, parameter in node.get_parameters_by_prefix("").items()}
     values = values_of(table, given, free_prefix)
@@ -30,17 +30,17 @@ def declare(node: Node, table: Sequence[Param], free_prefix: str = "") -> dict[s
     return values
 
 
-def changed(node: Node, table: Sequence[Param], changes: Sequence[Parameter] = ()) -> dict[str, Any]:
-    """Return the table's values by name as they would be after `changes`, or raise ParameterError."""
+def values_after(node: Node, table: Sequence[Param], changes: Sequence[Parameter] = ()) -> dict[str, Any]:
+    """Return the values of the table by name as they would be after `changes`, or raise ParameterError."""
     values = {param.name: node.get_parameter(param.name).value for param in table}
     values.update({change.name: change.value for change in changes})
     return values_of(table, {name: _plain(value) for name, value in values.items()})
 
 
-def prepared(node: Node, table: Sequence[Param], changes: Sequence[Parameter]) -> list[Parameter]:
-    """Return `changes` with whole numbers as floats where the table wants floats: `ros2 param set ... support 1`.
+def with_floats(node: Node, table: Sequence[Param], changes: Sequence[Parameter]) -> list[Parameter]:
+    """Return `changes` with whole numbers converted to float where needed, as in `ros2 param set ... support 1`.
 
-    Raises rclpy's own ParameterNotDeclaredException, which by itself forgets the unknown names.
+    Raises ParameterNotDeclaredException with the unknown names, which rclpy itself leaves out.
     """
     unknown = [change.name for change in changes if not node.has_parameter(change.name)]
     if unknown:
@@ -56,10 +56,11 @@ def bus_of(node: Node, values: dict[str, Any]) -> tuple[str, str, dict[str, Any]
 
 
 def descriptor_of(param: Param) -> ParameterDescriptor:
-    """Return what `ros2 param describe` shows."""
-    descriptor = ParameterDescriptor(description=param.description, read_only=param.fixed)
+    """Return the descriptor that `ros2 param describe` shows."""
+    unit = f" [{param.unit}]" if param.unit else ""
+    descriptor = ParameterDescriptor(description=f"{param.description}{unit}", read_only=param.fixed)
     if param.choices:
-        descriptor.additional_constraints = "one of " + ", ".join(param.choices)
+        descriptor.additional_constraints = param.range
     elif param.bounds and isinstance(param.default, list):
         descriptor.additional_constraints = param.expected
     elif param.bounds and isinstance(param.default, float):

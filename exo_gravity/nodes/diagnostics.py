@@ -1,4 +1,4 @@
-"""What a node says of itself: regularly on /diagnostics, and in the log once for each change."""
+"""A node's status: regularly on /diagnostics, and in the log whenever it changes."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from rclpy.node import Node
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
-PERIOD = 0.45  # s; a little less than twice a node's own timer, whose beat is not exact
+PERIOD = 0.45  # s; a little less than a multiple of the nodes' timer periods, which jitter
 
 
 class Diagnostics:
-    """Publishes a DiagnosticStatus: news at once, the rest twice a second. Logs level and text when they change."""
+    """Publishes a DiagnosticStatus: a change at once, otherwise twice a second. Logs level and message on a change."""
 
-    def __init__(self, node: Node):
+    def __init__(self, node: Node) -> None:
         self._node = node
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._name = node.get_fully_qualified_name().lstrip("/")
-        self._said: tuple[bytes, str] | None = None
+        self._last: tuple[bytes, str] | None = None
         self._sent = -math.inf
 
     def report(self, level: bytes, message: str, values: dict[str, object] | None = None) -> None:
-        """Publish `level` (OK, WARN or ERROR) with `message` and `values` if it is time; log it if it is news."""
-        now, news = time.monotonic(), (level, message) != self._said
-        if not news and now - self._sent < PERIOD:
+        """Publish `level` (OK, WARN or ERROR), `message` and `values` if they are due; log them if they changed."""
+        now, changed = time.monotonic(), (level, message) != self._last
+        if not changed and now - self._sent < PERIOD:
             return
         self._sent = now
         status = DiagnosticStatus(
@@ -39,8 +39,8 @@ class Diagnostics:
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(array)
-        if news:
-            self._said = (level, message)
+        if changed:
+            self._last = (level, message)
             logger = self._node.get_logger()
             # One call site per severity: rclpy refuses a call site whose severity changes.
             if level == OK:

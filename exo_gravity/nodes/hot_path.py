@@ -1,9 +1,9 @@
-"""A subscription that its user looks after alone: on a thread with a wait set of its own, or by looking when it suits.
+"""A subscription outside the executor: on a thread with a wait set for it alone, or polled by its owner.
 
-rclpy's executor rebuilds its wait set, services and all, for every message: most of what a message costs (measured, out
-and back at 500 Hz: 35 + 21 % of a core, against 14 + 11 %). Here the wait set holds one subscription. `WaitSet` and
-`take_message` are rclpy's inner interface, which its own `wait_for_message` uses; where they have changed, the executor
-calls back as for any other subscription, and only the speed is lost.
+rclpy's executor rebuilds its wait set, services included, for every message. That is most of a message's cost
+(measured, there and back at 500 Hz: 35 + 21 % of a core, against 14 + 11 % here). `WaitSet` and `take_message` are
+inner interfaces of rclpy, which `wait_for_message` uses. Where they have changed, the executor serves the subscription
+as usual, and only speed is lost.
 """
 
 from __future__ import annotations
@@ -17,27 +17,31 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-PATIENCE = 0.1  # s between two looks at whether to stop
+STOP_CHECK_PERIOD = 0.1  # s
+
+Callback = Callable[[Any, dict[str, Any]], None]
 
 
 class Unexecuted(CallbackGroup):
     """Keeps its subscriptions out of the executor's wait set."""
 
-    def can_execute(self, entity) -> bool:
+    def can_execute(self, entity: Any) -> bool:
         return False
 
-    def beginning_execution(self, entity) -> bool:
+    def beginning_execution(self, entity: Any) -> bool:
         return False
 
-    def ending_execution(self, entity) -> None:
+    def ending_execution(self, entity: Any) -> None:
         pass
 
 
 class HotPath:
     """Calls `callback(message, info)` for each message of `topic`: on a thread after `start`, or in each `poll`."""
 
-    def __init__(self, node: Node, msgtype: type, topic: str, callback: Callable[[Any, dict], None], qos: QoSProfile):
-        self.failure: Exception | None = None  # of the callback; ends the thread
+    def __init__(
+        self, node: Node, msgtype: type, topic: str, callback: Callable[[Any, dict[str, Any]], None], qos: QoSProfile
+    ) -> None:
+        self.failure: Exception | None = None  # raised by the callback; ends the thread
         self._callback = callback
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name=topic, daemon=True)
@@ -46,7 +50,7 @@ class HotPath:
             self._wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
             self._take = subscription.handle.take_message
         except (AttributeError, TypeError) as error:
-            node.get_logger().warning(f"{topic} is left to the executor: another rclpy ({error})")
+            node.get_logger().warning(f"{topic}: served by the executor, more slowly: rclpy has changed ({error})")
             node.destroy_subscription(subscription)
             node.create_subscription(msgtype, topic, callback, qos)
             self._wait_set, self._take = None, lambda *_: None
@@ -58,7 +62,7 @@ class HotPath:
             self._thread.start()
 
     def poll(self, timeout: float = 0.0) -> None:
-        """Call back for every message that waits, on the caller's thread; wait for one for up to `timeout` s."""
+        """Call back for each queued message, on the caller's thread; wait up to `timeout` s for the first one."""
         subscription = self._subscription
         if timeout > 0.0 and self._wait_set is not None:
             self._wait(timeout)
@@ -74,7 +78,7 @@ class HotPath:
     def _run(self) -> None:
         try:
             while not self._stopping:
-                self.poll(PATIENCE)
+                self.poll(STOP_CHECK_PERIOD)
         except Exception as error:
             self.failure = error
 

@@ -1,20 +1,21 @@
-"""imu: another driver's `sensor_msgs/Imu` in, the trunk's pitch and roll out, one for each sample.
+"""imu: `sensor_msgs/Imu` from an IMU driver in, the trunk's pitch and roll out, one for each sample.
 
-While samples are missing, impossible or not yet settled it publishes nothing: whoever needs the tilt sees it grow old,
-and `can_bridge` latches the fault. The reason stands in the log once, and on /diagnostics for as long as it lasts.
+While samples are missing, impossible or not yet settled, it publishes nothing: the tilt grows old, the compensator
+withdraws, and `can_bridge` latches the fault. The reason is logged once, and stays on /diagnostics while it lasts.
 """
 
 from __future__ import annotations
 
 import time
+from typing import Any
 
-from geometry_msgs.msg import Vector3Stamped
+from geometry_msgs.msg import Vector3, Vector3Stamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
+from exo_gravity.core.control_params import IMU
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.param_table import Param
 from exo_gravity.core.rate import Rate
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator, TrunkOrientation
 from exo_gravity.nodes.conversions import to_nanoseconds
@@ -24,37 +25,26 @@ from exo_gravity.nodes.hot_path import HotPath
 from exo_gravity.nodes.run import run
 
 PITCH_YAW, DATA = "/imu/pitch_yaw", "/imu/data"
-# The fusion integrates every sample: a queue of the newest alone would lose some whenever the node is kept waiting.
+# The fusion integrates every sample. A queue of depth 1 would lose samples whenever the node is delayed.
 DEPTH = 50
 WATCH_PERIOD = 0.1  # s
-
-# fmt: off
-PARAMETERS = (
-    Param("input_topic", "/imu/data_raw", "topic of the driver's sensor_msgs/Imu", fixed=True),
-    # No default turns an IMU the right way: four zeros are no rotation, and refused.
-    Param("rotation_trunk_from_imu", [0.0, 0.0, 0.0, 0.0], "unit quaternion x, y, z, w, from calibration; required",
-          (-1.0, 1.0), fixed=True),
-    Param("rate", 100.0, "roughly, samples per s of the IMU", (20.0, 2000.0), fixed=True),
-    Param("timeout", 0.1, "silence in s that is an error", (0.02, 1.0), fixed=True),
-)
-# fmt: on
 
 
 class ImuNode(Node):
     """The ROS shell around `hardware.imu.TrunkEstimator`."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("imu", automatically_declare_parameters_from_overrides=True)
-        values = declare(self, PARAMETERS)
+        values = declare(self, IMU)
         self._topic = self.resolve_topic_name(values["input_topic"])
         if self._topic in (PITCH_YAW, DATA):
-            raise ParameterError("input_topic", values["input_topic"], "a topic that this node does not publish itself")
+            raise ParameterError("input_topic", values["input_topic"], "a topic that this node does not publish")
         self._estimator = TrunkEstimator(values["rotation_trunk_from_imu"], values["rate"])
         self._timeout = values["timeout"]
         self._arrived = time.monotonic()
         self._received = self._published = self._refused = 0
         self._rate = Rate()
-        self._refusal: ParameterError | None = None  # since the last look
+        self._refusal: ParameterError | None = None  # since the last report
         self._last_refusal = "none"
         self._diagnostics = Diagnostics(self)
         self._pitch_yaw = self.create_publisher(Vector3Stamped, PITCH_YAW, DEPTH)
@@ -67,35 +57,35 @@ class ImuNode(Node):
 
     @property
     def failure(self) -> Exception | None:
-        """What went wrong on the thread of the samples."""
+        """The exception that ended the thread of the samples."""
         return self._samples.failure
 
     def close(self) -> None:
-        """Take no more samples."""
+        """Stop taking samples."""
         self._samples.stop()
 
-    def _on_imu(self, message: Imu, _info: dict) -> None:
+    def _on_imu(self, message: Imu, _info: dict[str, Any]) -> None:
         self._arrived = time.monotonic()
         self._received += 1
         try:
-            answer = self._estimator.update(sample_of(message))
+            orientation = self._estimator.update(sample_of(message))
         except ParameterError as error:
             self._refused += 1
             self._refusal, self._last_refusal = error, str(error)
             return
-        if answer is not None:
+        if orientation is not None:
             self._published += 1
-            self._publish(message, answer)
+            self._publish(message, orientation)
 
-    def _publish(self, message: Imu, answer: TrunkOrientation) -> None:
+    def _publish(self, message: Imu, orientation: TrunkOrientation) -> None:
         tilt = Vector3Stamped()
         tilt.header.stamp, tilt.header.frame_id = message.header.stamp, "trunk"
-        tilt.vector.x, tilt.vector.y = answer.roll, answer.pitch
+        tilt.vector.x, tilt.vector.y = orientation.roll, orientation.pitch
         self._pitch_yaw.publish(tilt)
         data = Imu(header=tilt.header)
         q, rate, acceleration = data.orientation, data.angular_velocity, data.linear_acceleration
-        q.x, q.y, q.z, q.w = answer.orientation.tolist()
-        # In the trunk's axes; a covariance of zeros means unknown, one of -1 not reported (REP-145).
+        q.x, q.y, q.z, q.w = orientation.orientation.tolist()
+        # In the trunk's axes. A covariance of zeros means unknown, one of -1 means not reported (REP-145).
         rotation = self._estimator.rotation
         rate.x, rate.y, rate.z = (rotation @ _vector(message.angular_velocity)).tolist()
         acceleration.x, acceleration.y, acceleration.z = (rotation @ _vector(message.linear_acceleration)).tolist()
@@ -128,7 +118,7 @@ class ImuNode(Node):
 
 
 def sample_of(message: Imu) -> ImuSample:
-    """Return the sample that a message holds; what its covariances say is not reported becomes None."""
+    """Return the message's sample; a quantity whose covariance says 'not reported' (-1, REP-145) becomes None."""
     q = message.orientation
     return ImuSample(
         to_nanoseconds(message.header.stamp) * 1e-9,
@@ -138,7 +128,7 @@ def sample_of(message: Imu) -> ImuSample:
     )
 
 
-def _vector(message) -> tuple[float, float, float]:
+def _vector(message: Vector3) -> tuple[float, float, float]:
     return message.x, message.y, message.z
 
 

@@ -1,7 +1,7 @@
-"""How every node lives: start, spin, and a clean stop on Ctrl-C, SIGTERM or an error.
+"""The life of every node: start, spin, and a clean stop on Ctrl-C, SIGTERM or an error.
 
-rclpy's own signal handlers close the context before anybody can react. Here a signal only asks for the end, so that a
-node's `close` still has a living context, and the last CAN frames do leave.
+rclpy's own signal handlers close the context before a node can react. Here a signal only sets a flag, so that a node's
+`close` still has a valid context, and its last CAN frames are sent.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ from rclpy.signals import SignalHandlerOptions
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.hardware.scheduling import favour
 
-LOOK = 0.1  # s between two looks at whether a node is still needed
-CLOSING = 5  # s that the middleware may take to close
-SWITCH_INTERVAL = 2e-4  # s that a thread back from the bus may have to wait for the interpreter; Python's own is 5 ms
+NEEDED_CHECK_PERIOD = 0.1  # s
+CLOSE_TIMEOUT = 5  # s for the middleware to close
+SWITCH_INTERVAL = 2e-4  # s that a thread may wait for the interpreter's lock; Python's default is 5 ms
 
 
 def keep_to_this_machine() -> None:
-    """Set the middleware's defaults, before `rclpy.init`, for what the user's environment leaves open."""
-    # Without this, anybody on the subnet could publish torques to a worn robot.
+    """Set middleware defaults that the user's environment leaves open; call it before `rclpy.init`."""
+    # With ROS's own default, every host on the subnet could publish torques to a worn robot.
     reach = os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     if reach == "LOCALHOST":
         os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name("fastdds.xml")))
 
 
 def open_to_others() -> str:
-    """Return which setting lets other hosts publish to our topics, or '' if only this machine can, or security must."""
+    """Return the setting that lets other hosts publish to our topics; '' if none does, or if SROS2 is enforced."""
     get = os.environ.get
     if get("ROS_SECURITY_ENABLE") == "true" and get("ROS_SECURITY_STRATEGY") == "Enforce":
         return ""
     if get("ROS_DISCOVERY_SERVER"):
         return f"ROS_DISCOVERY_SERVER={get('ROS_DISCOVERY_SERVER')}"
     reach = get("ROS_AUTOMATIC_DISCOVERY_RANGE")
-    if get("ROS_LOCALHOST_ONLY") == "1" or reach == "OFF":  # rcl then ignores what follows
+    if get("ROS_LOCALHOST_ONLY") == "1" or reach == "OFF":  # rcl then ignores the settings below
         return ""
     if get("ROS_STATIC_PEERS"):
         return f"ROS_STATIC_PEERS={get('ROS_STATIC_PEERS')}"
@@ -55,11 +55,11 @@ def open_to_others() -> str:
 def run(make_node: Callable[[], Node], priority: int = 0, args: list[str] | None = None) -> int:
     """Run one node until a signal or an error; return the exit code (1 failed, 2 wrong parameters).
 
-    priority: 1..20, how much nicer than others the system is asked to be to this node, where the user may ask that.
-    Not SCHED_FIFO: four such nodes can fill a core, and Linux then stops them all for 50 ms a second.
+    priority: 1..20, requests nice value -priority, where permitted. Not SCHED_FIFO: four such nodes can fill a core,
+    and Linux then stops them all for 50 ms in every second.
 
-    A node may have `close()`, called on every way out, `failure`, an exception found in a thread of its own, and
-    `needed`: as long as it is true the node outlives a launcher that died.
+    A node may have `close()`, which is called however the node ends; `failure`, an exception raised in one of its
+    threads; and `needed`: while it is true the node keeps running after its launcher has died.
     """
     keep_to_this_machine()
     ending: list[int] = []
@@ -73,11 +73,11 @@ def run(make_node: Callable[[], Node], priority: int = 0, args: list[str] | None
         node = make_node()
     except (ExoGravityError, RuntimeError) as error:  # RuntimeError: rcl could not read its own arguments
         get_logger(executable).fatal(str(error))
-        os._exit(2)  # without closing Fast DDS: it can hang when it is closed while it discovers others
+        os._exit(2)  # without closing Fast DDS, which can hang when it is closed during discovery
     if os.environ.get("EXO_GRAVITY_SUPERVISED"):
         threading.Thread(target=_end_with_launcher, args=(node, ending), daemon=True).start()
     gc.collect()
-    gc.freeze()  # what was imported stays: later collections need not look at it
+    gc.freeze()  # imported modules stay: later collections can skip them
     sys.setswitchinterval(SWITCH_INTERVAL)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
@@ -93,15 +93,15 @@ def run(make_node: Callable[[], Node], priority: int = 0, args: list[str] | None
     finally:
         getattr(node, "close", lambda: None)()
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
-        signal.alarm(CLOSING)  # ends the process even where Fast DDS hangs with the interpreter's lock in its hands
+        signal.alarm(CLOSE_TIMEOUT)  # ends the process even if Fast DDS hangs while it holds the interpreter's lock
         executor.shutdown()
         node.destroy_node()
         rclpy.try_shutdown()
 
 
 def _end_with_launcher(node: Node, ending: list[int]) -> None:
-    """Wait until the launcher, which holds our standard input open, is no more."""
+    """Wait until the launcher, which holds our standard input open, has died; then end the node."""
     sys.stdin.read()
     while getattr(node, "needed", False):
-        time.sleep(LOOK)
+        time.sleep(NEEDED_CHECK_PERIOD)
     ending.append(0)

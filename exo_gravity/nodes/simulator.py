@@ -22,7 +22,7 @@ from exo_gravity.core.control_params import OPTIONS
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.hardware.motor_bus import open_bus
-from exo_gravity.nodes.declare import bus_of, changed, declare
+from exo_gravity.nodes.declare import bus_of, declare, values_after
 from exo_gravity.nodes.run import run
 from exo_gravity.sim import SimulatedImu, VirtualWearer
 from exo_gravity.sim.device_params import SIMULATOR, device_of, imu_of, set_faults
@@ -149,7 +149,7 @@ class Simulator(Node):
 
     def _check_parameters(self, changes) -> SetParametersResult:
         try:
-            values = changed(self, SIMULATOR, changes)
+            values = values_after(self, SIMULATOR, changes)
             if values["trial"]:
                 script_of(values["trial"])
         except ParameterError as error:
@@ -157,7 +157,7 @@ class Simulator(Node):
         return SetParametersResult(successful=True)
 
     def _apply_parameters(self, changes) -> None:
-        values = changed(self, SIMULATOR)
+        values = values_after(self, SIMULATOR)
         self._trunk = (values["trunk.pitch"], values["trunk.roll"])
         set_faults(self._device, values)
         if any(change.name == "trial" for change in changes) and values["trial"]:

@@ -1,21 +1,23 @@
-"""Whether all messages of a topic come from one publisher.
+"""Detects a second publisher on a topic from the messages themselves.
 
-Each publisher counts its own messages, from 1: of one alone the numbers rise. They tell two publishers apart at once,
-and need no discovery, which still knows a killed publisher for 20 s. Not every middleware counts: then this sees
-nothing.
+Each publisher numbers its messages from 1, so from a single publisher the numbers rise. A second one shows at once,
+without discovery, which still lists a killed publisher for 20 s. Not every middleware numbers messages: then a second
+publisher goes undetected.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 
 class SolePublisher:
-    """Looks at the `info` of each message of one topic, as rclpy hands it to callbacks of two arguments."""
+    """Checks the `info` of each message of one topic, which rclpy passes to callbacks of two arguments."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._number = 0
 
-    def another(self, info: dict) -> bool:
-        """Return whether this message comes from another publisher than the one before it."""
+    def is_another(self, info: dict[str, Any]) -> bool:
+        """Return whether this message comes from a different publisher than the previous one."""
         number = info["publication_sequence_number"]
-        before, self._number = self._number, number or 0
-        return number is not None and number <= before
+        previous, self._number = self._number, number or 0
+        return number is not None and number <= previous

@@ -103,7 +103,7 @@ def test_the_last_frames_switch_every_motor_off_twice(wires):
 def test_the_zero_is_refused_while_the_motors_are_on(wires):
     bus = MotorBus(wires[0], MOTORS_OF_ARM)
     bus.exchange(ON, time.monotonic())
-    with pytest.raises(BusError, match="switch them off"):
+    with pytest.raises(BusError, match="motors are on"):
         bus.set_zero()
     assert SET_ZERO not in [data for _, data in sent(wires[1])]
 

@@ -187,5 +187,5 @@ def test_the_law_anfis_runs_from_its_file_and_gives_way_to_the_exact_law_where_i
     watcher.until(lambda: watcher.said("compensator", "compensating"))
     assert watcher.set("compensator", wearer__body_mass=75.0, mode="zero_g", atomically=True).successful
     watcher.until(
-        lambda: watcher.said("compensator", "exact law in place of the ANFIS: the ANFIS was trained for another")
+        lambda: watcher.said("compensator", "exact law in use instead of anfis: the ANFIS was trained for another")
     )
