@@ -32,9 +32,9 @@ RATE = 500  # Hz, of the recording
 def work(quick: bool) -> Iterator[Row]:
     """Yield the rows of the work besides the loop."""
     repeats = 3 if quick else 5
-    space = configured_arm(None, "right")
-    samples = from_gravload(space)
-    seconds = _timed(lambda: train_law(samples, space.arm, 4), repeats)
+    configured = configured_arm(None, "right")
+    samples = from_gravload(configured)
+    seconds = _timed(lambda: train_law(samples, configured.robot, 4), repeats)
     yield Row("ANFIS, training: limit", float(np.median(seconds)), TRAINING_LIMIT, "s", _range(seconds))
 
     speeds = [length / taken for length, taken in (_offline(60.0 if quick else 300.0) for _ in range(repeats))]

@@ -35,10 +35,10 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
 
 
 def _run(options: argparse.Namespace) -> None:
-    space = configured_arm(options.params, options.side)
+    configured = configured_arm(options.params, options.side)
     functions = options.functions or (2 if options.bag else 4)
-    samples = from_bag(options.bag, space, functions) if options.bag else from_gravload(space)
-    law, results = train_law(samples, space.arm, functions, RECORDED_RIDGE if options.bag else RIDGE)
+    samples = from_bag(options.bag, configured, functions) if options.bag else from_gravload(configured)
+    law, results = train_law(samples, configured.robot, functions, RECORDED_RIDGE if options.bag else RIDGE)
     output = Path(options.output)
     output.write_text(law.dump(), encoding="utf-8")
     print(f"{law.source}; {law.model.rules} rules, {law.model.parameters} parameters a joint")

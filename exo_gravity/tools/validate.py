@@ -41,21 +41,21 @@ LINK_ENDS, CONFIGURED = "at the link ends", "as configured"
 class Part:
     """One arm's results: its rows, its ANFIS and how that was trained."""
 
-    space: ConfiguredArm
+    configured: ConfiguredArm
     rows: list[Row]
     law: AnfisLaw
     trained: list[Trained]
 
 
-def evaluate(cog: str, space: ConfiguredArm, count: int) -> Part:
+def evaluate(cog: str, configured: ConfiguredArm, count: int) -> Part:
     """Return all laws against all references over the workspace and `count` random poses per tilt."""
-    law, trained = train_law(from_gravload(space), space.arm)
-    references = {name: build(space.arm) for name, build in REFERENCES.items()}
+    law, trained = train_law(from_gravload(configured), configured.robot)
+    references = {name: build(configured.robot) for name, build in REFERENCES.items()}
     rows: list[Row] = []
     total = (math.prod(GRID) + len(TILTS) * count) * len(references)
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(f"comparing, CoGs {cog}", total=total)
-        for case in cases(cog, space, count):
+        for case in cases(cog, configured, count):
             torque = {name: given(case) for name, given in laws(law).items()}
             for name, reference in references.items():
                 expected = []
@@ -64,7 +64,7 @@ def evaluate(cog: str, space: ConfiguredArm, count: int) -> Part:
                     expected.append(reference(case.theta[chunk], case.direction[chunk]))
                     progress.update(task, advance=len(expected[-1]))
                 rows += compare(case, torque, name, np.concatenate(expected))
-    return Part(space, rows, law, trained)
+    return Part(configured, rows, law, trained)
 
 
 def checks(paper: Part, configured: Part) -> Iterator[tuple[bool, str]]:
@@ -87,18 +87,18 @@ def checks(paper: Part, configured: Part) -> Iterator[tuple[bool, str]]:
         )
 
 
-def _growth(space: ConfiguredArm) -> list[growth.Growth]:
+def _growth(configured: ConfiguredArm) -> list[growth.Growth]:
     print(f"\nGrowth of an ANFIS for joint 3, inputs {', '.join(growth.INPUTS)}; Nm; the last rows take a minute")
     print(growth_line())
     rows = []
     for functions, inputs in growth.sizes():
-        rows.append(growth.growth(space, functions, inputs))
+        rows.append(growth.growth(configured, functions, inputs))
         print(growth_line(rows[-1]), flush=True)
     return rows
 
 
 def _draw(output: Path, part: Part, rows: Sequence[Row]) -> None:
-    arm = part.space.arm
+    arm = part.configured.robot
     reference = REFERENCES["gravload"](arm)
 
     def expected(theta: np.ndarray) -> np.ndarray:
@@ -110,7 +110,7 @@ def _draw(output: Path, part: Part, rows: Sequence[Row]) -> None:
         "ANFIS": lambda theta: arm.gain * np.pad(part.law.torques(theta[:, 1:]), ((0, 0), (1, 0))),
     }
     errors = {name: lambda theta, law=law: law(theta) - expected(theta) for name, law in given.items()}
-    workspace_figure(output / "workspace.png", part.space, errors)
+    workspace_figure(output / "workspace.png", part.configured, errors)
     tilt_figure(output / "tilt.png", rows)
 
 
@@ -127,24 +127,24 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
 
 
 def _run(options: argparse.Namespace) -> bool:
-    space = configured_arm(options.params, options.side)
+    configured = configured_arm(options.params, options.side)
     output = Path(options.output)
     output.mkdir(parents=True, exist_ok=True)
     count = QUICK_COUNT if options.quick else COUNT
-    paper = evaluate(LINK_ENDS, replace(space, arm=with_cog_at_link_ends(space.arm)), count)
-    configured = evaluate(CONFIGURED, space, count)
-    rows = paper.rows + configured.rows
+    paper = evaluate(LINK_ENDS, replace(configured, robot=with_cog_at_link_ends(configured.robot)), count)
+    as_configured = evaluate(CONFIGURED, configured, count)
+    rows = paper.rows + as_configured.rows
     print("\n".join(law_table(rows)))
     print("\nThe paper's comparison (d_n = l_n, g = 9.8 m/s^2, torques in Nm, not scaled)")
     print("\n".join(paper_table(paper.rows, paper.law, paper.trained)))
     write_csv(output / "laws.csv", rows)
-    _draw(output, configured, rows)
+    _draw(output, as_configured, rows)
     written = ["laws.csv", "workspace.png", "tilt.png"]
     if options.growth:
-        write_csv(output / "growth.csv", _growth(space))
+        write_csv(output / "growth.csv", _growth(configured))
         written.append("growth.csv")
     print()
-    verdicts = list(checks(paper, configured))
+    verdicts = list(checks(paper, as_configured))
     for held, sentence in verdicts:
         print(f"{'held' if held else 'FAILED':<7}{sentence}")
     print(f"{', '.join(written)} in {output}")

@@ -28,16 +28,18 @@ def params_file(folder):
     values = {"side": "right", "joint_names": list(made.NAMES), "link_length": made.ARM.length.tolist()}
     values["robot"] = {"mass": made.ARM.mass.tolist(), "cog": made.ARM.cog.tolist()}
     path = folder / "arm.yaml"
-    path.write_text(yaml.safe_dump({"/right/compensator": {"ros__parameters": values}}), encoding="utf-8")
+    bridge = {"can": {"interface": "virtual", "channel": "test"}}
+    content = {"/right/compensator": {"ros__parameters": values}, "/right/can_bridge": {"ros__parameters": bridge}}
+    path.write_text(yaml.safe_dump(content), encoding="utf-8")
     return path
 
 
 @pytest.fixture(scope="module")
 def learned():
     """The packaged arm's samples and the law trained on them."""
-    space = configured_arm()
-    samples = from_gravload(space)
-    return space, samples, train_law(samples, space.arm)[0]
+    configured = configured_arm()
+    samples = from_gravload(configured)
+    return configured, samples, train_law(samples, configured.robot)[0]
 
 
 @pytest.fixture(scope="module")
@@ -65,9 +67,9 @@ def test_the_held_out_error_is_below_the_papers_training_error_on_each_joint(lea
 
 
 def test_the_law_holds_the_arm_as_the_exact_one_does_anywhere_in_its_box(learned):
-    space, _, law = learned
-    theta = np.random.default_rng(2).uniform(space.low, space.high, (2000, 4))
-    assert law.torques(theta[:, 1:]) == pytest.approx(gravity_torque(space.arm, theta)[:, 1:], abs=2e-3)
+    configured, _, law = learned
+    theta = np.random.default_rng(2).uniform(configured.low, configured.high, (2000, 4))
+    assert law.torques(theta[:, 1:]) == pytest.approx(gravity_torque(configured.robot, theta)[:, 1:], abs=2e-3)
 
 
 def test_the_reported_errors_are_those_of_the_saved_law(learned):
@@ -122,7 +124,7 @@ def test_gains_of_the_arm_do_not_change_what_is_learned(tmp_path):
 
 
 def test_from_a_recording_it_learns_the_torques_that_were_measured(bag, recorded):
-    law, _ = train_law(from_bag(bag, recorded, 2), recorded.arm, 2, ridge=0.03)
+    law, _ = train_law(from_bag(bag, recorded, 2), recorded.robot, 2, ridge=0.03)
     inside = np.random.default_rng(3).uniform(law.low, law.high, (500, 3))
     exact = gravity_torque(made.ARM, np.pad(inside, ((0, 0), (1, 0))))[:, 1:]
     assert np.all(np.sqrt(np.mean((law.torques(inside) - exact) ** 2, axis=0)) < 0.15)

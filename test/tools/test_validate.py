@@ -39,9 +39,12 @@ def quick(tmp_path_factory):
 
 
 def write_params(folder, arm, bridge=None):
-    content = {"/right/compensator": {"ros__parameters": arm}}
-    if bridge:
-        content["/right/can_bridge"] = {"ros__parameters": bridge}
+    """Write a parameter file of one arm: its compensator's parameters, and those of its bridge beyond the CAN bus."""
+    bus = {"can": {"interface": "virtual", "channel": "test"}}
+    content = {
+        "/right/compensator": {"ros__parameters": arm},
+        "/right/can_bridge": {"ros__parameters": {**bus, **(bridge or {})}},
+    }
     path = folder / "arm.yaml"
     path.write_text(yaml.safe_dump(content), encoding="utf-8")
     return path
@@ -60,17 +63,17 @@ def test_a_reference_gives_the_torque_of_a_straight_horizontal_arm_by_hand(name)
 
 @pytest.mark.parametrize("name", list(REFERENCES))
 def test_a_reference_scales_with_the_gains(name):
-    space = configured_arm()
-    arm = replace(space.arm, gain=(0.5, 1.0, 1.5, 2.0))
+    configured = configured_arm()
+    arm = replace(configured.robot, gain=(0.5, 1.0, 1.5, 2.0))
     pose = np.array(((0.3, 0.5, 0.7, 0.9),))
-    assert REFERENCES[name](arm)(pose, DOWN) == pytest.approx(REFERENCES[name](space.arm)(pose, DOWN) * arm.gain)
+    assert REFERENCES[name](arm)(pose, DOWN) == pytest.approx(REFERENCES[name](configured.robot)(pose, DOWN) * arm.gain)
 
 
 @pytest.mark.parametrize(("name", "module"), [("gravload", "roboticstoolbox"), ("Pinocchio", "pinocchio")])
 def test_a_reference_that_is_not_installed_is_named_with_what_installs_it(name, module, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(DataError, match=rf"{module}.*pip install 'exo_gravity\[report,validate\]'"):
-        REFERENCES[name](configured_arm().arm)
+        REFERENCES[name](configured_arm().robot)
 
 
 def test_the_first_case_is_the_1053_positions_with_an_upright_trunk():
@@ -81,11 +84,11 @@ def test_the_first_case_is_the_1053_positions_with_an_upright_trunk():
 
 
 def test_the_random_cases_turn_joint_1_and_tilt_the_trunk_within_their_limits():
-    space = configured_arm()
-    cases = list(laws.cases("", space, 500))[1:]
+    configured = configured_arm()
+    cases = list(laws.cases("", configured, 500))[1:]
     assert [case.limit for case in cases] == [0, 5, 10, 20, 30]
     for case in cases:
-        assert np.all((case.theta >= space.low) & (case.theta <= space.high)) and np.ptp(case.theta[:, 0]) > 3
+        assert np.all((case.theta >= configured.low) & (case.theta <= configured.high)) and np.ptp(case.theta[:, 0]) > 3
         for angle in (case.beta, case.phi):
             assert np.abs(angle).max() == pytest.approx(math.radians(case.limit), rel=0.05)
 
@@ -114,7 +117,7 @@ def test_the_arm_is_read_from_dotted_and_nested_names_alike(tmp_path):
     mass, cog = [0.1, 0.2, 0.3, 0.4], [0.01, 0.02, 0.03, 0.04]
     nested = configured_arm(write_params(tmp_path, {"robot": {"mass": mass, "cog": cog}, "gravity": 9.8}))
     dotted = configured_arm(write_params(tmp_path, {"robot.mass": mass, "robot.cog": cog, "gravity": 9.8}))
-    assert nested.arm == dotted.arm == ArmModel((0.05, 0.13, 0.3, 0.3), cog, mass, gravity=9.8)
+    assert nested.robot == dotted.robot == ArmModel((0.05, 0.13, 0.3, 0.3), cog, mass, gravity=9.8)
 
 
 def test_the_joint_limits_are_those_of_the_bridge_beside_the_compensator(tmp_path):
@@ -125,9 +128,11 @@ def test_the_joint_limits_are_those_of_the_bridge_beside_the_compensator(tmp_pat
 @pytest.mark.parametrize(
     ("arm", "bridge", "named"),
     [
-        ({"robot.mass": [1.0, 2.0, 3.0]}, None, "robot.mass"),
-        ({"robot.cog": [1.0, 1.0, 1.0, 1.0]}, None, "robot.cog"),
-        ({}, {"position_min": ["a", "b", "c", "d"]}, "position_min"),
+        ({"robot.mass": [1.0, 2.0, 3.0]}, None, "^/right/compensator robot.mass"),
+        ({"robot.cog": [1.0, 1.0, 1.0, 1.0]}, None, "^/right/compensator robot.cog"),
+        ({"robot.masses": [1.0, 1.0, 1.0, 1.0]}, None, "^/right/compensator robot.masses"),
+        ({}, {"position_min": ["a", "b", "c", "d"]}, "^/right/can_bridge position_min"),
+        ({}, {"positions_min": [0.0, 0.0, 0.0, 0.0]}, "^/right/can_bridge positions_min"),
         ({}, {"position_min": [2.0, 2.0, 2.0, 2.0], "position_max": [1.0, 1.0, 1.0, 1.0]}, "position_min"),
         ({"side": "left"}, None, "right"),
     ],
@@ -216,4 +221,4 @@ def test_the_growth_of_one_model_counts_its_rules_parameters_and_positions():
 
 def test_gravload_is_told_gravity_in_its_own_sign():
     abducted = np.array(((0.0, 0.1, 0.0, 0.0),))
-    assert gravload(configured_arm().arm)(abducted, DOWN)[0, 1] > 0
+    assert gravload(configured_arm().robot)(abducted, DOWN)[0, 1] > 0

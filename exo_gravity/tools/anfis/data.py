@@ -30,11 +30,11 @@ class Samples:
     source: str
 
 
-def from_gravload(space: ConfiguredArm) -> Samples:
+def from_gravload(configured: ConfiguredArm) -> Samples:
     """Return the torques of the upright arm by the Robotics Toolbox, on the grid and between its positions."""
-    low, high = space.low[1:], space.high[1:]
+    low, high = configured.low[1:], configured.high[1:]
     axes = [np.linspace(a, b, count) for a, b, count in zip(low, high, GRID, strict=True)]
-    reference = gravload(replace(space.arm, gain=np.ones(4)))
+    reference = gravload(replace(configured.robot, gain=np.ones(4)))
     sets = []
     for positions in (axes, [(axis[1:] + axis[:-1]) / 2 for axis in axes]):
         angle = np.array(list(product(*positions)))

@@ -28,7 +28,7 @@ HELD_OUT = 5
 TILT_TOPIC, TILT_TYPE = "/imu/pitch_yaw", "geometry_msgs/msg/Vector3Stamped"
 
 
-def from_bag(path: str | Path, space: ConfiguredArm, functions: int) -> Samples:
+def from_bag(path: str | Path, configured: ConfiguredArm, functions: int) -> Samples:
     """Return the mean measured torque of each hold of a rosbag2 in which the trunk was upright.
 
     The box is that of the poses held, within the joint limits. Raises DataError, one sentence, where they do not
@@ -36,15 +36,15 @@ def from_bag(path: str | Path, space: ConfiguredArm, functions: int) -> Samples:
     """
     bag = read_bag(path)
     names = {recording.name: recording for recording in bag.recordings}
-    recording = names.get(space.side) or (next(iter(names.values())) if len(names) == 1 else None)
+    recording = names.get(configured.side) or (next(iter(names.values())) if len(names) == 1 else None)
     if recording is None:
-        raise DataError(f"{path}: arms {', '.join(names)}: must have one named {space.side}")
-    if sorted(recording.joint_names) != sorted(space.joint_names):
-        wanted = ", ".join(space.joint_names) or "listed as joint_names of the compensator in the parameter file"
+        raise DataError(f"{path}: arms {', '.join(names)}: must have one named {configured.side}")
+    if sorted(recording.joint_names) != sorted(configured.joint_names):
+        wanted = ", ".join(configured.joint_names) or "listed as joint_names of the compensator in the parameter file"
         raise DataError(f"{path}: joints are {', '.join(recording.joint_names)}: must be {wanted}")
-    order = [recording.joint_names.index(name) for name in space.joint_names]
-    angle, torque = (part[:, order] for part in held(recording, _tilted(path, space.side, bag.start)))
-    kept = np.all((angle >= space.low) & (angle <= space.high), axis=1)
+    order = [recording.joint_names.index(name) for name in configured.joint_names]
+    angle, torque = (part[:, order] for part in held(recording, _tilted(path, configured.side, bag.start)))
+    kept = np.all((angle >= configured.low) & (angle <= configured.high), axis=1)
     angle, torque = angle[kept, 1:], torque[kept, 1:]
     checked = np.arange(len(angle)) % HELD_OUT == HELD_OUT - 1
     if len(angle) < HELD_OUT:

@@ -29,9 +29,10 @@ STYLES = {
 Error = Callable[[np.ndarray], np.ndarray]  # theta (n, 4) rad -> error (n, 4) Nm
 
 
-def workspace_figure(path: Path, space: ConfiguredArm, errors: dict[str, Error]) -> None:
+def workspace_figure(path: Path, configured: ConfiguredArm, errors: dict[str, Error]) -> None:
     """Draw the RMSE over the elbow of joints 2 to 4 (rows) and each law (columns) over abduction and flexion."""
-    axes = [np.linspace(low, high, n) for low, high, n in zip(space.low[1:], space.high[1:], GRID, strict=True)]
+    box = zip(configured.low[1:], configured.high[1:], GRID, strict=True)
+    axes = [np.linspace(low, high, n) for low, high, n in box]
     theta = np.array(list(product((0.0,), *axes)))
     degrees = [np.degrees(axis) for axis in axes]
     figure, grid = plt.subplots(3, len(errors), figsize=(3.2 * len(errors) + 1.6, 8.4), sharex=True, sharey=True)

@@ -47,14 +47,16 @@ class Growth:
     held_out_rmse: float
 
 
-def growth(space: ConfiguredArm, functions: int, inputs: int) -> Growth:
+def growth(configured: ConfiguredArm, functions: int, inputs: int) -> Growth:
     """Return what a model of joint 3 with `functions` per input and the first `inputs` of `INPUTS` costs and gives."""
     consequents = functions**inputs * (inputs + 1)
     count = math.ceil((SAMPLES * consequents) ** (1 / inputs))
     positions = np.array(list(product(np.linspace(-1, 1, count), repeat=inputs)))
-    trained = train(positions, _torque(space, positions), functions, max_evaluations=STEPS if consequents < MANY else 1)
+    trained = train(
+        positions, _torque(configured, positions), functions, max_evaluations=STEPS if consequents < MANY else 1
+    )
     between = np.random.default_rng(0).uniform(-1, 1, (HELD_OUT, inputs))
-    error = trained.model.output(between)[:, 0] - _torque(space, between)
+    error = trained.model.output(between)[:, 0] - _torque(configured, between)
     model = trained.model
     return Growth(
         inputs,
@@ -75,14 +77,14 @@ def sizes() -> Iterator[tuple[int, int]]:
     yield from product((2, 3), range(2, len(INPUTS) + 1))
 
 
-def _torque(space: ConfiguredArm, scaled: np.ndarray) -> np.ndarray:
+def _torque(configured: ConfiguredArm, scaled: np.ndarray) -> np.ndarray:
     """Return joint 3's torque (n,) for inputs (n, d) in -1..1 over the workspace; the others are 0."""
-    low, high = np.append(space.low, (-TILT, -TILT)), np.append(space.high, (TILT, TILT))
+    low, high = np.append(configured.low, (-TILT, -TILT)), np.append(configured.high, (TILT, TILT))
     state = np.zeros((len(scaled), len(INPUTS)))
     chosen = list(COLUMNS[: scaled.shape[1]])
     state[:, chosen] = low[chosen] + (scaled + 1) / 2 * (high - low)[chosen]
-    direction = np.array([Tilt.of(space.side, pitch, roll).direction for pitch, roll in state[:, 4:].tolist()])
-    return gravity_torque(space.arm, state[:, :4], direction)[:, 2]
+    direction = np.array([Tilt.of(configured.side, pitch, roll).direction for pitch, roll in state[:, 4:].tolist()])
+    return gravity_torque(configured.robot, state[:, :4], direction)[:, 2]
 
 
 def _inference_time(model: Anfis, inputs: np.ndarray) -> float:

@@ -81,21 +81,22 @@ def laws(anfis: AnfisLaw) -> dict[str, Torques]:
     }
 
 
-def cases(cog: str, space: ConfiguredArm, count: int) -> Iterator[Case]:
+def cases(cog: str, configured: ConfiguredArm, count: int) -> Iterator[Case]:
     """Yield the case of the 1,053 positions, then one of `count` random poses for each of `TILTS`."""
-    axes = [np.linspace(low, high, n) for low, high, n in zip(space.low[1:], space.high[1:], GRID, strict=True)]
-    yield _case(cog, "workspace", 0, space, np.array(list(product((0.0,), *axes))))
+    box = zip(configured.low[1:], configured.high[1:], GRID, strict=True)
+    axes = [np.linspace(low, high, n) for low, high, n in box]
+    yield _case(cog, "workspace", 0, configured, np.array(list(product((0.0,), *axes))))
     for limit in TILTS:
         rng = np.random.default_rng(limit)
-        yield _case(cog, "random", limit, space, rng.uniform(space.low, space.high, (count, 4)), rng)
+        yield _case(cog, "random", limit, configured, rng.uniform(configured.low, configured.high, (count, 4)), rng)
 
 
-def _case(cog: str, positions: str, limit: int, space: ConfiguredArm, theta: np.ndarray, rng=None) -> Case:
+def _case(cog: str, positions: str, limit: int, configured: ConfiguredArm, theta: np.ndarray, rng=None) -> Case:
     bound = math.radians(limit)
     tilt = rng.uniform(-bound, bound, (len(theta), 2)) if limit else np.zeros((len(theta), 2))
-    tilts = [Tilt.of(space.side, pitch, roll) for pitch, roll in tilt.tolist()]
+    tilts = [Tilt.of(configured.side, pitch, roll) for pitch, roll in tilt.tolist()]
     felt = (np.array([getattr(t, name) for t in tilts]) for name in ("direction", "axis_angle", "beta", "phi"))
-    return Case(cog, positions, limit, space.arm, theta, *felt)
+    return Case(cog, positions, limit, configured.robot, theta, *felt)
 
 
 def compare(case: Case, torque: dict[str, np.ndarray], reference: str, expected: np.ndarray) -> list[Row]:

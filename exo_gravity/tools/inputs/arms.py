@@ -1,53 +1,134 @@
-"""The arm of a parameter file, and the workspace it moves in: what `validate` and `train_anfis` work on."""
+"""The arms of a parameter file: the one reader that the tools share.
+
+An arm is a namespace with a `can_bridge` and a `compensator`. Both are checked as the nodes check them at start, so an
+unknown parameter is an error here too. Errors name node and parameter: `/right/can_bridge position_min`.
+"""
 
 from __future__ import annotations
 
-import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm import ArmModel, four_floats
-from exo_gravity.core.errors import ParameterError
-from exo_gravity.tools.budget import DEFAULTS, NAMES
-from exo_gravity.tools.inputs.parameter_file import load, packaged_config
+from exo_gravity.core.anfis_law import AnfisLaw
+from exo_gravity.core.arm import ArmModel
+from exo_gravity.core.compensator import Settings
+from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR, OPTIONS, limits_of, motors_of, settings_of
+from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.limits import Limits
+from exo_gravity.core.param_table import Param, values_of
+from exo_gravity.tools.inputs.parameter_file import Nodes, load, packaged_config
 
 
 @dataclass(frozen=True, eq=False)
 class ConfiguredArm:
-    """The robot's own arm, without a wearer (One-G), its side, its joints' names and limits low and high, (4,) rad."""
+    """One arm of a parameter file, checked.
 
-    arm: ArmModel
-    side: str
-    joint_names: tuple[str, ...]
-    low: np.ndarray
-    high: np.ndarray
+    namespace: e.g. '/right'. can_bridge, compensator: all parameter values by name. robot: the arm without a wearer.
+    """
+
+    namespace: str
+    can_bridge: Mapping[str, Any]
+    compensator: Mapping[str, Any]
+    motors: tuple[JointMotor, ...]
+    limits: Limits
+    robot: ArmModel
+
+    @property
+    def name(self) -> str:
+        """The namespace without slashes, 'arm' for the root namespace."""
+        return self.namespace.strip("/") or "arm"
+
+    @property
+    def side(self) -> str:
+        """'left' or 'right'."""
+        return str(self.compensator["side"])
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """The four joints from the shoulder to the elbow."""
+        return tuple(self.compensator["joint_names"])
+
+    @property
+    def low(self) -> np.ndarray:
+        """Lower joint limits (4,) in rad."""
+        return np.array(self.limits.position_min)
+
+    @property
+    def high(self) -> np.ndarray:
+        """Upper joint limits (4,) in rad."""
+        return np.array(self.limits.position_max)
+
+    def settings(self) -> Settings:
+        """Return the compensator's settings, with the model in `anfis_file`. Raises ParameterError."""
+        with named(f"{self.namespace}/compensator"):
+            return settings_of(self.compensator, _anfis_model(self.compensator["anfis_file"]))
+
+
+def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:
+    """Return the arm of `namespace` ('/right') in the nodes of a parameter file.
+
+    Raises ParameterError where a node is missing or a parameter is unknown or impossible.
+    """
+    can_bridge = node_values(nodes, f"{namespace}/can_bridge", CAN_BRIDGE)
+    compensator = node_values(nodes, f"{namespace}/compensator", COMPENSATOR)
+    with named(f"{namespace}/can_bridge"):
+        motors, limits = motors_of(can_bridge), limits_of(can_bridge)
+    with named(f"{namespace}/compensator"):
+        # The robot does not depend on the law, and the model of `law: anfis` may not be trained yet.
+        robot = settings_of({**compensator, "law": "exact"}).robot
+    return ConfiguredArm(namespace, can_bridge, compensator, motors, limits, robot)
+
+
+def configured_arms(params: str | Path) -> list[ConfiguredArm]:
+    """Return every arm of a parameter file. Raises ParameterError if there is none."""
+    nodes = load(params)
+    namespaces = [node.removesuffix("/compensator") for node in nodes if node.endswith("/compensator")]
+    if not namespaces:
+        raise ParameterError("params", str(params), "a file with a compensator")
+    return [read_arm(nodes, namespace) for namespace in namespaces]
 
 
 def configured_arm(params: str | Path | None = None, side: str = "right") -> ConfiguredArm:
-    """Return the workspace of the `side` arm of a parameter file, by default the packaged exo.yaml.
-
-    Raises ParameterError that names the file or the parameter.
-    """
-    path = Path(params) if params else packaged_config("exo.yaml")
-    nodes = load(path)
-    compensators = {node: values for node, values in nodes.items() if node.endswith("/compensator")}
-    found = [node for node, values in compensators.items() if values.get("side", "right") == side]
+    """Return the only arm of `side` in a parameter file, by default in the packaged exo.yaml. Raises ParameterError."""
+    path = params or packaged_config("exo.yaml")
+    found = [arm for arm in configured_arms(path) if arm.side == side]
     if len(found) != 1:
         raise ParameterError("params", str(path), f"a file with one compensator whose side is {side}, not {len(found)}")
-    namespace = found[0].removesuffix("/compensator")
-    value = {**DEFAULTS, **nodes.get(f"{namespace}/can_bridge", {}), **nodes[found[0]]}
-    try:
-        arm = ArmModel(*(value[key] for key in ("link_length", "robot.cog", "robot.mass", "gain", "gravity")))
-        low, high = (four_floats(key, value[key], -math.pi, math.pi, "rad") for key in ("position_min", "position_max"))
-        if not np.all(low < high):
-            raise ParameterError("position_min", low, f"below position_max = {high.tolist()} rad")
-    except ParameterError as error:
-        raise ParameterError(f"{namespace} {NAMES.get(error.name, error.name)}", error.value, error.expected) from None
-    return ConfiguredArm(arm, side, tuple(map(str, value.get("joint_names", ()))), low, high)
+    return found[0]
 
 
 def with_cog_at_link_ends(arm: ArmModel) -> ArmModel:
-    """Return the arm as the paper's equations have it: d_n = l_n, c_n = 1 and g = 9.8 m/s^2."""
+    """Return the arm under the paper's assumptions: d_n = l_n, c_n = 1 and g = 9.8 m/s^2."""
     return ArmModel(arm.length, arm.length, arm.mass, gravity=9.8)
+
+
+def node_values(nodes: Nodes, node: str, table: tuple[Param, ...]) -> dict[str, Any]:
+    """Return every parameter of `node` by name, checked against its `table`. Raises ParameterError."""
+    if node not in nodes:
+        raise ParameterError("params", sorted(nodes), f"a file with {node}")
+    with named(node):
+        return values_of(table, nodes[node], OPTIONS)
+
+
+@contextmanager
+def named(node: str) -> Iterator[None]:
+    """Add the name of `node` to any ParameterError raised inside the context."""
+    try:
+        yield
+    except ParameterError as error:
+        name = error.name if error.name.startswith(node) else f"{node} {error.name}"
+        raise ParameterError(name, error.value, error.expected) from None
+
+
+def _anfis_model(path: str) -> AnfisLaw | None:
+    """Return the model of a file, None for no file."""
+    try:
+        return AnfisLaw.load(Path(path).read_text(encoding="utf-8")) if path else None
+    except (OSError, DataError) as error:
+        raise ParameterError("anfis_file", path, f"a file written by train_anfis ({error})") from None

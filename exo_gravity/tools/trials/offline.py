@@ -6,28 +6,22 @@ Of all tools this one alone imports `sim`: without ROS there are no nodes to sta
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import yaml
 from rich.console import Console
 from rich.progress import Progress
 
 from exo_gravity.bag.reader import Bag, Event
-from exo_gravity.core.anfis_law import AnfisLaw
-from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR, OPTIONS, limits_of, motors_of, settings_of
-from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.param_table import Param, values_of
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.recording import Recording
 from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.sim import SimulatedImu
 from exo_gravity.sim.device_params import SIMULATOR, device_of, imu_of, set_faults
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial, told_tilt
-from exo_gravity.tools.inputs.parameter_file import load
-
-Nodes = dict[str, dict[str, Any]]
+from exo_gravity.tools.inputs.arms import named, node_values, read_arm
+from exo_gravity.tools.inputs.parameter_file import Nodes, load
 
 
 def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
@@ -80,54 +74,24 @@ def _played(trial: OfflineTrial, console: Console, should_stop: Callable[[], boo
     return recording
 
 
-def _trial(nodes: Nodes, space: str, script: TrialScript, tilt: tuple[float, float] | None) -> OfflineTrial:
-    """Return the trial of the arm in the namespace `space`."""
-    bridge = _values(nodes, f"{space}/can_bridge", CAN_BRIDGE)
-    compensator = _values(nodes, f"{space}/compensator", COMPENSATOR)
-    simulator = _values(nodes, f"{space}/simulator", SIMULATOR)
-    with _named(f"{space}/can_bridge"):
-        motors, limits = motors_of(bridge), limits_of(bridge)
-    with _named(f"{space}/compensator"):
-        settings = settings_of(compensator, _anfis(compensator["anfis_file"]))
-    with _named(f"{space}/simulator"):
+def _trial(nodes: Nodes, namespace: str, script: TrialScript, tilt: tuple[float, float] | None) -> OfflineTrial:
+    """Return the trial of the arm in `namespace`."""
+    arm = read_arm(nodes, namespace)
+    simulator = node_values(nodes, f"{namespace}/simulator", SIMULATOR)
+    with named(f"{namespace}/simulator"):
         device = device_of(simulator)
         set_faults(device, simulator)
-    arm = ArmSetup(space.strip("/") or "arm", device, motors, limits, settings, bridge["rate"], tilt)
-    return OfflineTrial(arm, script, simulator["trial_delay"])
-
-
-def _anfis(path: str) -> AnfisLaw | None:
-    """Return the model of a file, None for no file."""
-    try:
-        return AnfisLaw.load(Path(path).read_text(encoding="utf-8")) if path else None
-    except (OSError, DataError) as error:
-        raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
+    setup = ArmSetup(arm.name, device, arm.motors, arm.limits, arm.settings(), arm.can_bridge["rate"], tilt)
+    return OfflineTrial(setup, script, simulator["trial_delay"])
 
 
 def _tilt(nodes: Nodes, spaces: list[str]) -> tuple[float, float] | None:
     """Return the trunk's pitch and roll (rad) as its IMU tells them, None without an IMU."""
     for space in spaces:
-        simulator = _values(nodes, f"{space}/simulator", SIMULATOR)
+        simulator = node_values(nodes, f"{space}/simulator", SIMULATOR)
         if simulator["imu.topic"] and "/imu" in nodes:
-            with _named("/imu"):
+            with named("/imu"):
                 believed = nodes["/imu"].get("rotation_trunk_from_imu", [])
                 trunk = simulator["trunk.pitch"], simulator["trunk.roll"]
                 return told_tilt(*trunk, SimulatedImu(imu_of(simulator)), believed)
     return None
-
-
-def _values(nodes: Nodes, node: str, table: tuple[Param, ...]) -> dict[str, Any]:
-    if node not in nodes:
-        raise ParameterError("params", sorted(nodes), f"with {node}")
-    with _named(node):
-        return values_of(table, nodes[node], OPTIONS)
-
-
-@contextmanager
-def _named(node: str) -> Iterator[None]:
-    """Let a ParameterError from within name the node, too."""
-    try:
-        yield
-    except ParameterError as error:
-        name = error.name if error.name.startswith(node) else f"{node} {error.name}"
-        raise ParameterError(name, error.value, error.expected) from None
