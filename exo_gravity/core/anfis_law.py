@@ -1,8 +1,9 @@
-"""The ANFIS as a law of the control loop: learned torques of joints 2 to 4, inside the box they were learned in.
+"""ANFIS as a control law: learned torques for joints 2 to 4, valid inside the box of joint angles it was trained in.
 
-It was trained with an upright trunk, for one arm: joint 1 then needs no torque, and gets none. Outside the box, on a
-tilted trunk or for another arm it would extrapolate, and nobody knows what: `outside` says so in a sentence, and the
-caller falls back to the exact law. Gains c_n and gravity scale the torque as they do in every law.
+The model was trained for one arm with an upright trunk. There joint 1 needs no torque, and the law gives it none.
+Outside the box, on a tilted trunk or with another arm the model would extrapolate with an unknown error. `outside`
+then returns the reason, and the caller uses the exact law instead. Gains c_n and gravity scale the torque as in every
+other law.
 """
 
 from __future__ import annotations
@@ -17,26 +18,27 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.anfis import Anfis
-from exo_gravity.core.arm import ArmModel
+from exo_gravity.core.arm import ArmModel, Vector
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.gravity import Torque
 from exo_gravity.core.tilt import Tilt
 
 INPUTS = ("theta_2", "theta_3", "theta_4")
 JOINTS = ("2", "3", "4")
-# rad between joint 1's axis and gravity that still counts as upright: a trunk 0.5 degrees off changes the torques of
-# the paper's arm by 0.04 Nm at most, a few steps of the motors' 12-bit torque.
+# Largest angle in rad between joint 1's axis and gravity that counts as upright. A trunk tilt of 0.5 degrees changes
+# the torques of the paper's arm by at most 0.04 Nm, a few steps of the motors' 12-bit torque.
 UPRIGHT = math.radians(0.5)
 FORMAT = "exo_gravity ANFIS law 1"
 
 
 @dataclass(frozen=True, eq=False)
 class AnfisLaw:
-    """Torques of an upright arm, learned over a box of joint angles.
+    """Torques of an arm on an upright trunk, learned over a box of joint angles.
 
-    model: one output per joint 2, 3, 4 in Nm at `gravity` m/s^2 and gain 1; its inputs are theta_2..theta_4, scaled to
-    -1..1 over the box. low, high: (3,) rad, the box. first_moment: M2..M4 in kg m of the arm it was trained for.
-    source: a sentence on the data. error: {'training': (3,) Nm, 'held_out': (3,) Nm}, RMSE of joints 2 to 4.
+    model: one output in Nm for each of joints 2, 3 and 4, at `gravity` m/s^2 and gain 1. Its inputs are
+    theta_2..theta_4, scaled to -1..1 over the box. low, high: (3,) rad, the box. first_moment: M2..M4 in kg m of the
+    arm it was trained for. source: a sentence on the training data. error: {'training': (3,) Nm, 'held_out': (3,) Nm},
+    the RMSE of joints 2 to 4.
     """
 
     model: Anfis
@@ -49,7 +51,7 @@ class AnfisLaw:
 
     @classmethod
     def load(cls, content: str | Mapping[str, Any]) -> AnfisLaw:
-        """Return the law that JSON text, or the mapping it holds, describes. Raises DataError that names the flaw."""
+        """Return the law from JSON text or its parsed mapping. Raises DataError that names what is wrong."""
         try:
             content = json.loads(content) if isinstance(content, str) else content
             if content["format"] != FORMAT:
@@ -67,15 +69,16 @@ class AnfisLaw:
                 {kind: [float(joint[f"{kind}_rmse"]) for joint in joints] for kind in ("training", "held_out")},
             )
         except KeyError as error:
-            raise DataError(f"ANFIS file: {error.args[0]} is missing") from None
+            raise DataError(f"ANFIS file: the key {error.args[0]} is missing") from None
         except (TypeError, ValueError) as error:
-            raise DataError(f"ANFIS file: {error}: must be what train_anfis writes") from None
+            raise DataError(f"ANFIS file: {error}: must be a file from train_anfis") from None
         law._check()
         return law
 
     def _check(self) -> None:
-        if self.model.centre.shape[1] != len(INPUTS):
-            raise DataError(f"ANFIS file: {self.model.centre.shape[1]} inputs: must be {', '.join(INPUTS)}")
+        inputs = self.model.centre.shape[1]
+        if inputs != len(INPUTS):
+            raise DataError(f"ANFIS file: {inputs} inputs: must be {len(INPUTS)}, {', '.join(INPUTS)}")
         for name, low, high in zip(INPUTS, self.low, self.high, strict=True):
             if not -2 * math.pi <= low < high <= 2 * math.pi:
                 raise DataError(f"ANFIS file: box of {name} = {[low, high]}: must be [low, high] in rad")
@@ -103,32 +106,32 @@ class AnfisLaw:
         return re.sub(r"\[[^\[\]]*\]", lambda found: " ".join(found[0].split()), json.dumps(content, indent=1)) + "\n"
 
     def outside(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> str:
-        """Return a sentence that says why the law was not trained for this arm, pose or tilt, or '' if it was.
+        """Return why the law was not trained for this arm, pose or tilt, in a sentence; '' if it was.
 
-        The sentence holds no measured value: it stays the same for as long as the reason does.
+        The sentence contains no measured value, so it stays the same as long as the reason does.
         """
         if not tilt.axis_angle <= UPRIGHT:
-            return f"the trunk is tilted by more than {math.degrees(UPRIGHT):g} degrees: the ANFIS was trained upright"
+            return f"the trunk is tilted by more than {math.degrees(UPRIGHT):g} degrees; the ANFIS was trained upright"
         for joint, angle, low, high in zip(JOINTS, theta[1:], self.low, self.high, strict=True):
             if not low <= angle <= high:
-                return f"theta_{joint} is outside the ANFIS's training box, {low:.3f} to {high:.3f} rad"
+                return f"theta_{joint} is outside the ANFIS's training range, {low:.3f} to {high:.3f} rad"
         for joint, moment, trained in zip(JOINTS, arm.first_moment[1:], self.first_moment, strict=True):
             if not math.isclose(moment, trained, rel_tol=1e-6, abs_tol=1e-12):
-                return f"the ANFIS was trained for another arm: its M{joint} is {trained:.4f} kg m"
+                return f"the ANFIS was trained for another arm, whose M{joint} is {trained:.4f} kg m"
         return ""
 
     def torque(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
-        """Return the torque in Nm at pose `theta` (4,) rad, as the other laws do; meaningless where `outside`."""
+        """Return the torque (4,) in Nm at pose `theta` (4,) rad; meaningless where `outside` gives a reason."""
         tau = self.torques(np.array((theta[1:],)))[0].tolist()
         scale = arm.scale
         return (0.0, *(scale[joint] * value / self.gravity for joint, value in enumerate(tau, start=1)))
 
     def torques(self, theta: np.ndarray) -> np.ndarray:
-        """Return the torques (n, 3) in Nm of joints 2 to 4 at their angles (n, 3) rad, at gain 1."""
+        """Return the torques (n, 3) in Nm of joints 2 to 4 for their angles (n, 3) in rad, at gain 1."""
         return self.model.output(scaled(theta, self.low, self.high))
 
 
-def scaled(theta: np.ndarray, low: Sequence[float], high: Sequence[float]) -> np.ndarray:
-    """Return angles (n, d) rad scaled to -1..1 over the box from `low` to `high` (d,)."""
-    low, high = np.asarray(low), np.asarray(high)
-    return (2.0 * theta - low - high) / (high - low)
+def scaled(theta: np.ndarray, low: Vector, high: Vector) -> np.ndarray:
+    """Return angles (n, d) in rad, scaled to -1..1 over the box from `low` to `high` (d,)."""
+    fraction: np.ndarray = (2.0 * theta - low - high) / np.subtract(high, low)
+    return fraction
