@@ -1,38 +1,41 @@
-"""The laws: joint angles -> the torque that each motor must give to hold the arm against gravity.
+"""The gravity laws: joint angles -> the torque that each motor must give to hold the arm against gravity.
 
-`exact` is the closed form of Newton-Euler for gravity alone, with any centre of gravity and any trunk tilt.
-`paper_static` is EQ2-EQ5 and `paper_mobile` EQ1m-EQ4m of the paper, word for word. They agree with `exact` where
-every centre of gravity sits at its link's far end (d_n = l_n) and the trunk is upright; elsewhere they do not.
+`exact` is the closed form of Newton-Euler for gravity alone, valid for any centre of gravity and any trunk tilt.
+`paper_static` is EQ2-EQ5 and `paper_mobile` is EQ1m-EQ4m of the paper, word for word. They agree with `exact` only
+if every centre of gravity is at the far end of its link (d_n = l_n) and the trunk is upright.
 
-Each formula is written once, for `xp`: the module `math` for one pose in plain floats (control loop), or `numpy` for
-whole arrays (analysis). Symbols: t1..t4 joint angles in rad, M1..M4 first moments in kg m, g gravity in m/s^2,
-l, d, m1..m4 as in the paper.
+Each formula is written once, for a module `xp`: `math` for one pose in plain floats (control loop), `numpy` for whole
+arrays (analysis). Symbols: t1..t4 joint angles in rad, M1..M4 first moments in kg m, g gravity in m/s^2; l, d and
+m1..m4 as in the paper.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from collections.abc import Callable, Iterable, Sequence
+from types import ModuleType
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from exo_gravity.core.arm import ArmModel
+from exo_gravity.core.arm import JOINT_COUNT, ArmModel
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.tilt import Tilt
 
-Torque = tuple[float, float, float, float]
-BLOCK = 4096  # poses computed at once: intermediate arrays then fit the processor's cache
+Torque = tuple[float, ...]  # (4,) Nm in joint order
+Values = Iterable[Any]  # plain floats if xp is `math`, arrays (n,) if it is `numpy`
+BLOCK = 4096  # poses computed at once, so that intermediate arrays fit the processor's cache
 
 
-def _exact(xp, arm: ArmModel, theta, direction):
-    """Closed form of Newton-Euler for gravity: `direction` is gravity's unit vector in the arm's base frame."""
+def _exact(xp: ModuleType, arm: ArmModel, theta: Values, direction: Values) -> tuple[Any, ...]:
+    """Closed form of Newton-Euler for gravity; `direction` is gravity's unit vector in the arm's base frame."""
     t1, t2, t3, t4 = theta
     gx, gy, gz = direction
     M1, M2, M3, M4 = arm.first_moment
     s1, c1, s2, c2 = xp.sin(t1), xp.cos(t1), xp.sin(t2), xp.cos(t2)
     s34, c34 = xp.sin(t3 + t4), xp.cos(t3 + t4)
-    # Gravity along joint 1's rotating axes: A across the shoulder, B forward of it.
+    # Gravity along the axes that rotate with joint 1: A across the shoulder, B forward.
     A = gx * c1 + gy * s1
     B = gy * c1 - gx * s1
     # First moment of the planar part (links 3 and 4) along link 2 and across it.
@@ -47,7 +50,7 @@ def _exact(xp, arm: ArmModel, theta, direction):
     )
 
 
-def _paper_static(xp, arm: ArmModel, theta):
+def _paper_static(xp: ModuleType, arm: ArmModel, theta: Values) -> tuple[Any, ...]:
     """EQ2-EQ5; theta_1 is the angle between joint 1's axis and gravity."""
     t1, t2, t3, t4 = theta
     (_, l2, l3, l4), (d1, d2, d3, d4), (m1, m2, m3, m4) = (a.tolist() for a in (arm.length, arm.cog, arm.mass))
@@ -60,10 +63,10 @@ def _paper_static(xp, arm: ArmModel, theta):
     )  # fmt: skip
 
 
-def _paper_mobile(xp, arm: ArmModel, theta, beta, phi):
-    """EQ1m-EQ4m: EQ2-EQ5 with theta_3 + beta and theta_2 + phi, times the factors of the tilt.
+def _paper_mobile(xp: ModuleType, arm: ArmModel, theta: Values, beta: Any, phi: Any) -> tuple[Any, ...]:
+    """EQ1m-EQ4m: EQ2-EQ5 at theta_2 + phi and theta_3 + beta, times cos(phi) cos(beta).
 
-    They are what EQ2-EQ5 give at the shifted angles, times cos(phi) cos(beta), and for joints 2 to 4 cos(theta_1).
+    Joints 2 to 4 have the additional factor cos(theta_1).
     """
     t1, t2, t3, t4 = theta
     tau1, tau2, tau3, tau4 = _paper_static(xp, arm, (t1, t2 + phi, t3 + beta, t4))
@@ -72,56 +75,59 @@ def _paper_mobile(xp, arm: ArmModel, theta, beta, phi):
     return tau1 * upright, tau2 * axis, tau3 * axis, tau4 * axis
 
 
-def gravity_torque(arm: ArmModel, theta, direction=(0.0, 0.0, 1.0)) -> np.ndarray:
-    """Return the torque in Nm, shape of `theta`, that holds `arm` against gravity: the exact law.
+def gravity_torque(arm: ArmModel, theta: ArrayLike, direction: ArrayLike = (0.0, 0.0, 1.0)) -> np.ndarray:
+    """Return the torque in Nm that holds `arm` against gravity by the exact law, in the shape of `theta`.
 
-    theta: (4,) or (n, 4) rad. direction: (3,) or (n, 3), unit vector of gravity in the arm's base frame;
-    upright it is (0, 0, 1). Raises ParameterError on other shapes, on NaN or infinity, or if it is no unit vector.
+    theta: (4,) or (n, 4) rad. direction: (3,) or (n, 3), unit vector of gravity in the arm's base frame; (0, 0, 1) if
+    the trunk is upright. Raises ParameterError if a shape is wrong, a number is not finite, or a direction is not a
+    unit vector.
     """
-    theta = _poses(theta)
-    direction = np.asarray(direction, dtype=float)
-    if direction.shape not in ((3,), (*theta.shape[:-1], 3)):
-        raise ParameterError("direction", direction, f"of shape (3,) or {(*theta.shape[:-1], 3)}")
-    if not np.allclose(np.linalg.norm(direction, axis=-1), 1.0, atol=1e-6, rtol=0):
-        raise ParameterError("direction", direction, "a unit vector")
-    return _in_blocks(_exact, arm, theta, direction)
+    poses = _poses(theta)
+    down = np.asarray(direction, dtype=float)
+    if down.shape not in ((3,), (*poses.shape[:-1], 3)):
+        raise ParameterError("direction", down, f"of shape (3,) or {(*poses.shape[:-1], 3)}")
+    if not np.allclose(np.linalg.norm(down, axis=-1), 1.0, atol=1e-6, rtol=0):
+        raise ParameterError("direction", down, "a unit vector")
+    return _in_blocks(_exact, arm, poses, down)
 
 
-def paper_static_torque(arm: ArmModel, theta) -> np.ndarray:
-    """Return EQ2-EQ5 in Nm, shape of `theta`.
+def paper_static_torque(arm: ArmModel, theta: ArrayLike) -> np.ndarray:
+    """Return the torque of EQ2-EQ5 in Nm, in the shape of `theta`.
 
-    theta: (4,) or (n, 4) rad, theta_1 being the angle between joint 1's axis and gravity (0 for an upright wearer),
-    not joint 1's encoder angle. Raises ParameterError on other shapes, on NaN or infinity.
+    theta: (4,) or (n, 4) rad. Here theta_1 is the angle between joint 1's axis and gravity (0 for an upright wearer),
+    not joint 1's encoder angle. Raises ParameterError if the shape is wrong or a number is not finite.
     """
     return _in_blocks(_paper_static, arm, _poses(theta))
 
 
-def paper_mobile_torque(arm: ArmModel, theta, pitch, yaw) -> np.ndarray:
-    """Return EQ1m-EQ4m in Nm, shape of `theta`.
+def paper_mobile_torque(arm: ArmModel, theta: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> np.ndarray:
+    """Return the torque of EQ1m-EQ4m in Nm, in the shape of `theta`.
 
-    theta: (4,) or (n, 4) rad, theta_1 as in `paper_static_torque`. pitch, yaw: the paper's beta and phi in rad,
-    a number or (n,) each; `Tilt` gives them, and theta_1, for a trunk. Raises ParameterError as above.
+    theta: (4,) or (n, 4) rad, with theta_1 as in `paper_static_torque`. pitch, yaw: the paper's beta and phi in rad, a
+    number or (n,) each. `Tilt` computes beta, phi and theta_1 for a trunk. Raises ParameterError as above.
     """
-    theta = _poses(theta)
+    poses = _poses(theta)
     beta, phi = (np.asarray(angle, dtype=float) for angle in (pitch, yaw))
     for name, angle in (("pitch", beta), ("yaw", phi)):
-        if angle.shape not in ((), theta.shape[:-1]) or not np.all(np.isfinite(angle)):
-            raise ParameterError(name, angle, f"a finite number or an array of shape {theta.shape[:-1]}")
+        if angle.shape not in ((), poses.shape[:-1]) or not np.all(np.isfinite(angle)):
+            raise ParameterError(name, angle, f"a finite number or an array of shape {poses.shape[:-1]}")
     tilt = np.stack(np.broadcast_arrays(beta, phi), axis=-1)
-    return _in_blocks(lambda xp, arm, angles, tilt: _paper_mobile(xp, arm, angles, *tilt), arm, theta, tilt)
+    return _in_blocks(lambda xp, arm, angles, tilt: _paper_mobile(xp, arm, angles, *tilt), arm, poses, tilt)
 
 
-def _poses(theta) -> np.ndarray:
-    theta = np.asarray(theta, dtype=float)
-    if theta.ndim not in (1, 2) or theta.shape[-1] != 4:
-        raise ParameterError("theta", theta, f"of shape (4,) or (n, 4), not {theta.shape}")
-    if not np.all(np.isfinite(theta)):
-        raise ParameterError("theta", theta, "finite angles in rad")
-    return theta
+def _poses(theta: ArrayLike) -> np.ndarray:
+    poses = np.asarray(theta, dtype=float)
+    if poses.ndim not in (1, 2) or poses.shape[-1] != JOINT_COUNT:
+        raise ParameterError("theta", poses, f"of shape (4,) or (n, 4), not {poses.shape}")
+    if not np.all(np.isfinite(poses)):
+        raise ParameterError("theta", poses, "finite angles in rad")
+    return poses
 
 
-def _in_blocks(formula, arm: ArmModel, theta: np.ndarray, *inputs: np.ndarray) -> np.ndarray:
-    """Return `formula` of whole arrays, scaled, in the shape of `theta`; inputs: (k,), or (n, k) with one per pose."""
+def _in_blocks(
+    formula: Callable[..., tuple[Any, ...]], arm: ArmModel, theta: np.ndarray, *inputs: np.ndarray
+) -> np.ndarray:
+    """Return the scaled torque by `formula` in the shape of `theta`; inputs: (k,) for all poses, or (n, k)."""
     scale = arm.gain * arm.gravity
     poses = np.atleast_2d(theta)
     rows = [np.atleast_2d(values) for values in inputs]
@@ -142,15 +148,15 @@ class Law(Protocol):
         ...
 
     def outside(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> str:
-        """Return a sentence why the law does not apply to this arm, pose or tilt; '' where it does.
+        """Return why the law does not apply to this arm, pose or tilt, in a sentence; '' if it does.
 
-        The sentence holds no measured value, so that it stays the same for as long as the reason does.
+        The sentence contains no measured value, so it stays the same as long as the reason does.
         """
         ...
 
 
 class ClosedForm(NamedTuple):
-    """A law given by a formula, which applies everywhere: `unscaled(arm, theta, tilt)` -> torque / (c_n g)."""
+    """A law given by a formula that applies everywhere: `unscaled(arm, theta, tilt)` returns torque / (c_n g)."""
 
     unscaled: Callable[[ArmModel, Sequence[float], Tilt], Torque]
 

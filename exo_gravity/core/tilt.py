@@ -1,30 +1,29 @@
-"""Trunk tilt: orientation of the trunk -> pitch, roll -> the direction of gravity in each arm's base frame.
+"""Trunk tilt: orientation of the trunk -> pitch and roll -> direction of gravity in each arm's base frame.
 
-Axes of the trunk (REP-103): x forward, y left, z up. Roll r about x, then pitch p about y, both fixed axes:
-p > 0 bows forward, r > 0 leans to the right. Heading does not matter to gravity. Base frame of the left arm in trunk
-axes: x0 left, y0 forward, z0 down; the right arm is its mirror image, so it sees the same with r replaced by -r.
+Trunk axes (REP-103): x forward, y left, z up. The trunk rolls by r about x, then pitches by p about y, both fixed axes:
+p > 0 bows forward, r > 0 leans to the right. The heading does not affect gravity. Base frame of the left arm in trunk
+axes: x0 left, y0 forward, z0 down. The right arm is its mirror image: its gravity is the left arm's at roll -r.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm import one_float
+from exo_gravity.core.arm import Vector, one_float
 from exo_gravity.core.errors import ParameterError
 
 SIDES = ("left", "right")
 
 
 class Tilt(NamedTuple):
-    """The tilt of a trunk as one arm feels it; make it with `Tilt.of`.
+    """The trunk's tilt in one arm's base frame; create it with `Tilt.of`.
 
     pitch, roll: the trunk's, in rad (REP-103). direction: (3,) unit vector of gravity in the arm's base frame.
-    axis_angle: rad in 0..pi between joint 1's axis and gravity, the paper's theta_1. beta, phi: the paper's letters,
-    added to theta_3 and theta_2.
+    axis_angle: angle between joint 1's axis and gravity in rad, 0..pi; the paper's theta_1. beta, phi: the paper's tilt
+    angles, which its mobile law adds to theta_3 and theta_2.
     """
 
     pitch: float
@@ -48,7 +47,7 @@ class Tilt(NamedTuple):
 
 
 def _gravity(pitch: float, roll: float) -> tuple[float, float, float]:
-    """Gravity's unit vector along forward, right and down."""
+    """Return the components of gravity's unit vector along forward, right and down."""
     return math.sin(pitch), math.sin(roll) * math.cos(pitch), math.cos(roll) * math.cos(pitch)
 
 
@@ -58,19 +57,19 @@ def gravity_in_trunk(pitch: float, roll: float) -> np.ndarray:
     return np.array((forward, -right, -down))
 
 
-def pitch_roll(gravity_in_trunk: Sequence[float]) -> tuple[float, float]:
-    """Return pitch in -pi/2..pi/2 and roll in -pi..pi, rad, of a trunk that sees gravity in that direction (3,)."""
+def pitch_roll(gravity_in_trunk: Vector) -> tuple[float, float]:
+    """Return the trunk's pitch (-pi/2..pi/2) and roll (-pi..pi) in rad for a gravity vector (3,) in its axes."""
     x, y, z = (float(component) for component in gravity_in_trunk)
     norm = math.sqrt(x * x + y * y + z * z)
     if not 0.0 < norm < math.inf:
-        raise ParameterError("gravity_in_trunk", gravity_in_trunk, "a finite vector other than zero")
+        raise ParameterError("gravity_in_trunk", gravity_in_trunk, "a finite, non-zero vector")
     return math.asin(max(-1.0, min(1.0, x / norm))), math.atan2(-y, -z)
 
 
-def rotation_matrix(quaternion: Sequence[float], name: str = "quaternion") -> np.ndarray:
+def rotation_matrix(quaternion: Vector, name: str = "quaternion") -> np.ndarray:
     """Return the rotation matrix (3, 3) of a unit quaternion (x, y, z, w), ROS order.
 
-    Raises ParameterError under `name` unless it is finite and its norm is within 1 % of 1 (what drivers round to).
+    Raises ParameterError that names `name` unless its norm is within 1 % of 1, which allows for rounding in drivers.
     """
     q = np.asarray(quaternion, dtype=float)
     norm = float(np.linalg.norm(q)) if q.shape == (4,) else math.nan
@@ -86,10 +85,10 @@ def rotation_matrix(quaternion: Sequence[float], name: str = "quaternion") -> np
     )
 
 
-def gravity_from_orientation(quaternion: Sequence[float], rotation_trunk_from_imu: np.ndarray) -> np.ndarray:
+def gravity_from_orientation(quaternion: Vector, rotation_trunk_from_imu: np.ndarray) -> np.ndarray:
     """Return gravity's unit vector (3,) in the trunk's axes from an IMU's orientation.
 
     quaternion: (x, y, z, w), world from IMU, world z up (REP-145). rotation_trunk_from_imu: (3, 3).
     """
-    down_in_imu = -rotation_matrix(quaternion, "orientation")[2]  # world z up, seen from the IMU, is the last row
-    return rotation_trunk_from_imu @ down_in_imu
+    down_in_imu = -rotation_matrix(quaternion, "orientation")[2]  # the last row is the world's z axis in the IMU frame
+    return np.asarray(rotation_trunk_from_imu @ down_in_imu)
