@@ -1,0 +1,104 @@
+"""Writes the tables of docs/parameters.md and docs/safety.md from the declarations in the code.
+
+`python docs/tables.py` renews them. With `--check` it changes nothing, names each table that differs, and exits with 1.
+A table stands between the lines `<!-- table: NAME -->` and `<!-- end of table -->`. Needs the extra `sim`, not ROS.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR, IMU, RECORDER
+from exo_gravity.core.faults import FaultCode
+from exo_gravity.core.param_table import Param
+from exo_gravity.sim.device_params import SIMULATOR
+
+DOCS = Path(__file__).parent
+COMMAND = "python docs/tables.py"
+PARAMETERS = {
+    "can_bridge": CAN_BRIDGE,
+    "compensator": COMPENSATOR,
+    "imu": IMU,
+    "simulator": SIMULATOR,
+    "recorder": RECORDER,
+}
+TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
+
+
+def parameter_table(params: Sequence[Param]) -> str:
+    """Return the Markdown table of one node's parameters."""
+    head = ("parameter", "default", "unit", "range", "change", "meaning")
+    return markdown(head, ((f"`{p.name}`", _default(p), p.unit, _range(p), _change(p), p.description) for p in params))
+
+
+def fault_table() -> str:
+    """Return the Markdown table of the fault codes, with the default of each limit that a meaning names."""
+    limits = {p.name: f"`{p.name}` {_shown(p.default)} {p.unit}".rstrip() for p in CAN_BRIDGE if p.bounds}
+    rows = []
+    for code in FaultCode:
+        named = [limits[name] for name in re.findall(r"`(\w+)`", code.meaning) if name in limits]
+        rows.append((f"`{code}`", code.meaning, "; ".join(named)))
+    return markdown(("fault", "meaning", "default limit"), rows)
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |\n" for line in lines)
+
+
+def renewed(text: str) -> str:
+    """Return a document's text with every table as the code declares it. Raises KeyError for an unknown table."""
+    tables = {name: parameter_table(params) for name, params in PARAMETERS.items()} | {"faults": fault_table()}
+    return TABLE.sub(lambda found: f"{found[1]}\n{tables[found[2]]}\n{found[3]}", text)
+
+
+def stale_tables(text: str) -> list[str]:
+    """Return the names of the tables in a document that differ from the declarations."""
+    pairs = zip(TABLE.finditer(text), TABLE.finditer(renewed(text)), strict=True)
+    return [old[2] for old, new in pairs if old[0] != new[0]]
+
+
+def _default(param: Param) -> str:
+    return "required" if param.required else _shown(param.default) or "empty"
+
+
+def _range(param: Param) -> str:
+    if param.choices:
+        return ", ".join(param.choices)
+    return f"{param.bounds[0]:g} to {param.bounds[1]:g}" if param.bounds else ""
+
+
+def _change(param: Param) -> str:
+    return "read-only" if param.fixed else "live"
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(_shown(item) for item in value)
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def main() -> None:
+    """Renew or check the documents."""
+    parser = argparse.ArgumentParser(description="Renew the tables in docs/ from the code's declarations.")
+    parser.add_argument("--check", action="store_true", help="change nothing; exit with 1 if a table differs")
+    parser.add_argument("documents", nargs="*", type=Path, default=sorted(DOCS.glob("*.md")), help="(docs/*.md)")
+    options = parser.parse_args()
+    stale = {path: stale_tables(path.read_text(encoding="utf-8")) for path in options.documents}
+    for path, names in stale.items():
+        if names and not options.check:
+            path.write_text(renewed(path.read_text(encoding="utf-8")), encoding="utf-8")
+        for name in names:
+            print(f"{path}: table {name} {f'differs from the code; run {COMMAND}' if options.check else 'renewed'}")
+    raise SystemExit(1 if options.check and any(stale.values()) else 0)
+
+
+if __name__ == "__main__":
+    main()

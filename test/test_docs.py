@@ -1,0 +1,90 @@
+"""The documents agree with the code: generated tables, links, paths, and the library example of the README."""
+
+import contextlib
+import io
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from exo_gravity.core.faults import FaultCode
+
+ROOT = Path(__file__).parents[1]
+TABLES = ROOT / "docs" / "tables.py"
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+NODES = ("can_bridge", "compensator", "imu", "simulator", "recorder")
+FOLDERS = "bench|config|docs|examples|exo_gravity|launch|test|core|hardware|sim|bag|nodes|tools"
+
+
+def name(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+def run_tables(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(TABLES), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+def anchors(path: Path) -> set[str]:
+    """Return the anchors of a document's headings, as GitHub forms them."""
+    headings = re.findall(r"^#+ (.*)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_the_tables_in_docs_equal_the_declarations():
+    checked = run_tables("--check")
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+
+
+def test_every_table_has_its_place_in_a_document():
+    places = {n for path in DOCUMENTS for n in re.findall(r"<!-- table: (\w+) -->", path.read_text(encoding="utf-8"))}
+    assert places == {*NODES, "faults"}
+
+
+@pytest.mark.parametrize(
+    ("document", "table", "declared", "changed"),
+    [
+        ("parameters.md", "can_bridge", "| `max_effort_rate` | 50 |", "| `max_effort_rate` | 60 |"),
+        ("safety.md", "faults", f"| {FaultCode.MOTOR_SILENT.meaning} |", "| a motor is quiet |"),
+    ],
+)
+def test_a_document_that_differs_from_the_code_is_reported_with_the_command_that_renews_it(
+    tmp_path, document, table, declared, changed
+):
+    copy = Path(shutil.copy(TABLES.with_name(document), tmp_path))
+    text = copy.read_text(encoding="utf-8")
+    assert declared in text
+    copy.write_text(text.replace(declared, changed), encoding="utf-8")
+    checked = run_tables("--check", copy)
+    assert checked.returncode == 1
+    assert f"table {table} differs from the code; run python docs/tables.py" in checked.stdout
+    run_tables(copy)
+    assert copy.read_text(encoding="utf-8") == text
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=name)
+def test_every_link_leads_to_a_file_and_a_heading(path):
+    for link in re.findall(r"\]\((?!https?:)([^)]+)\)", path.read_text(encoding="utf-8")):
+        file, _, anchor = link.partition("#")
+        target = path.parent / file if file else path
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=name)
+def test_every_path_in_backticks_exists(path):
+    for text in re.findall(rf"`((?:{FOLDERS})/[\w./]*)`", path.read_text(encoding="utf-8")):
+        assert (ROOT / text).exists() or (ROOT / "exo_gravity" / text).exists(), text
+
+
+def test_the_readmes_library_example_prints_what_the_readme_shows():
+    code, shown = re.search(
+        r"```python\n(.*?)```\s*```text\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL
+    ).groups()
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        exec(code, {})
+    assert printed.getvalue() == shown
