@@ -1,5 +1,6 @@
-"""budget: from a parameter file to a table, a verdict, pictures and an exit code."""
+"""budget: from a parameter file to a table, a verdict, figures and an exit code."""
 
+import sys
 from pathlib import Path
 
 import matplotlib.image
@@ -32,12 +33,13 @@ def run(tmp_path, capsys):
 
 @pytest.fixture
 def plain(monkeypatch):
-    """Pictures take longest: leave them blank where they are not looked at."""
-    monkeypatch.setattr("exo_gravity.tools.budget.joint_figure", lambda *_: Figure(figsize=(1, 1)))
+    """Figures take longest: draw blank ones in tests that do not look at them."""
+    blank = Figure(figsize=(1, 1))
+    monkeypatch.setattr("exo_gravity.tools.reporting.budget_figures.joint_figure", lambda *_: blank)
 
 
 @pytest.mark.usefixtures("plain")
-def test_full_zero_g_of_75_kg_is_said_to_be_beyond_the_papers_motors_and_by_how_much(run):
+def test_full_zero_g_of_75_kg_is_reported_as_beyond_the_papers_motors_and_by_how_much(run):
     code, text = run("--body-mass", 75)
     assert code == 1
     assert "Full Zero-G of a wearer of 75 kg is beyond the motors of /right." in text
@@ -52,7 +54,7 @@ def test_the_support_that_it_recommends_is_within_rated_torque_everywhere(run):
     assert code == 0 and "within rated torque everywhere on /right" in text
 
 
-def test_every_joint_gets_a_picture(run, tmp_path):
+def test_every_joint_gets_a_figure(run, tmp_path):
     run("--body-mass", 40, "--support", 0.5)
     pictures = sorted((tmp_path / "out").iterdir())
     assert [path.name for path in pictures] == [f"right_joint_{number}.png" for number in (1, 2, 3, 4)]
@@ -68,22 +70,23 @@ def test_both_arms_of_a_file_are_reported(tmp_path, capsys):
 
 
 @pytest.mark.usefixtures("plain")
-def test_a_motor_that_gives_three_quarters_counts_with_three_quarters(run):
+def test_a_motor_that_gives_three_quarters_of_its_torque_counts_as_three_quarters(run):
     _, text = run("--body-mass", 75, changes={BRIDGE: {"torque_scale": [1.0, 0.75, 1.0, 1.0]}})
     assert "its AK80-9 (6.75 Nm), beyond its peak (13.5 Nm)" in text
 
 
 @pytest.mark.usefixtures("plain")
-def test_a_robot_that_is_too_heavy_by_itself_is_told(run):
+def test_a_robot_that_is_too_heavy_by_itself_is_reported(run):
     _, text = run("--body-mass", 75, changes={COMPENSATOR: {"robot": {"mass": [1.0, 1.0, 3.0, 1.0]}}})
-    assert "The robot alone asks for more than rated torque somewhere" in text
+    assert "The robot alone needs more than rated torque somewhere" in text
 
 
 WRONG = {
-    "three masses": (COMPENSATOR, {"robot": {"mass": [0.5] * 3}}, "/right robot.mass = [0.5, 0.5, 0.5]: must be 4"),
-    "an unknown motor": (BRIDGE, {"motor": ["AK99"] * 4}, "must be 4, each one of AK60-6, AK80-9"),
-    "three motors": (BRIDGE, {"motor": ["AK80-9"] * 3}, "/right motor = ['AK80-9', 'AK80-9', 'AK80-9']: must be 4"),
-    "limits the wrong way": (BRIDGE, {"position_min": [1.7, 0.0, 0.0, 0.0]}, "/right position_max"),
+    "three masses": (COMPENSATOR, {"robot": {"mass": [0.5] * 3}}, "robot.mass = [0.5, 0.5, 0.5]: must be 4"),
+    "an unknown motor": (BRIDGE, {"motor": ["AK99"] * 4}, "one of AK60-6, AK80-9"),
+    "three motors": (BRIDGE, {"motor": ["AK80-9"] * 3}, "motor = ['AK80-9', 'AK80-9', 'AK80-9']: must be 4"),
+    "limits the wrong way": (BRIDGE, {"position_min": [1.7, 0.0, 0.0, 0.0]}, "position_max"),
+    "a misspelt parameter": (BRIDGE, {"max_efforts": [1.0] * 4}, "max_efforts"),
     "a forearm too long": (COMPENSATOR, {"link_length": [0.05, 0.13, 0.3, 0.15]}, "forearm and hand"),
 }
 
@@ -91,7 +94,7 @@ WRONG = {
 @pytest.mark.parametrize(("node", "values", "sentence"), WRONG.values(), ids=WRONG)
 def test_a_wrong_file_ends_with_one_sentence(run, node, values, sentence):
     code, text = run("--body-mass", 75, changes={node: values})
-    assert code == 2 and sentence in text
+    assert code == 2 and text.startswith(f"budget: {node} ") and sentence in text
 
 
 def test_an_arm_without_a_bridge_is_refused(run):
@@ -110,3 +113,12 @@ def test_an_impossible_wearer_ends_with_exit_code_2(run, arguments):
 def test_a_missing_file_ends_with_exit_code_2(capsys):
     assert main(["--params", "nowhere.yaml", "--body-mass", "75"]) == 2
     assert "nowhere.yaml" in capsys.readouterr().err
+
+
+def test_without_matplotlib_the_table_is_printed_and_the_missing_package_is_named(run, monkeypatch, tmp_path):
+    monkeypatch.delitem(sys.modules, "exo_gravity.tools.reporting.budget_figures", raising=False)
+    monkeypatch.setitem(sys.modules, "matplotlib.axes", None)
+    code, text = run("--body-mass", 75, "--support", 0.068)
+    assert code == 0 and "within rated torque everywhere on /right" in text
+    assert "matplotlib is not installed" in text and "exo_gravity[report]" in text
+    assert not (tmp_path / "out").exists()

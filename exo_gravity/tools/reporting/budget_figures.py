@@ -1,9 +1,8 @@
-"""The picture of a joint's torque budget: how much of the workspace asks for how much torque, and where."""
+"""The figure of a joint's torque budget: how much of the workspace needs how much torque, and where."""
 
 from __future__ import annotations
 
 from itertools import product
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,41 +10,39 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
 from exo_gravity.core.budget import torque_at
+from exo_gravity.tools.reporting.budget_table import JOINTS, ArmBudget
+from exo_gravity.tools.reporting.colours import ALONE_COLOUR, CARRYING_COLOUR, INK, PEAK_COLOUR, RATED_COLOUR
 
-if TYPE_CHECKING:
-    from exo_gravity.tools.budget import Arm
-
-# Okabe and Ito (2008): told apart with any colour vision.
-ALONE, CARRYING, RATED, PEAK, INK = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#222222"
-CELLS = 31
-REST = 60  # random settings of the angles that a map does not show, beside their ends and zeros; the same for each cell
-# Beside the joint's own angle a map shows the one that matters most to it, by joint.
-OTHER = (1, 2, 3, 2)
+CELLS = 31  # of a map, along each axis
+REST = 60  # random settings of the angles that a map does not show, the same for each cell
+OTHER = (1, 2, 3, 2)  # the second axis of each joint's map: the angle that affects it most
 
 
-def joint_figure(arm: Arm, joint: int, name: str) -> Figure:
-    """Return the picture of one joint (0..3), called `name`."""
+def joint_figure(arm: ArmBudget, joint: int) -> Figure:
+    """Return the figure of one joint (0..3)."""
     figure = Figure(figsize=(11.0, 4.6), layout="constrained")
-    figure.suptitle(f"{arm.name} joint {joint + 1}, {name}: {arm.motors[joint]}", x=0.01, ha="left", weight="bold")
+    title = f"{arm.name} joint {joint + 1}, {JOINTS[joint]}: {arm.motors[joint]}"
+    figure.suptitle(title, x=0.01, ha="left", weight="bold")
     shares, where = figure.subplots(1, 2, width_ratios=(1.1, 1.0))
     _shares(shares, arm, joint)
     _where(figure, where, arm, joint)
     return figure
 
 
-def _shares(axis: Axes, arm: Arm, joint: int) -> None:
-    """Draw the share of the workspace that needs at most a torque, for the robot alone and at the support asked for."""
+def _shares(axis: Axes, arm: ArmBudget, joint: int) -> None:
+    """Draw the share of the workspace that needs at most a torque, for the robot alone and at the chosen support."""
     points = arm.workspace.points()
     carrying = arm.robot.with_wearer(*arm.load, arm.support)
     percent = np.linspace(0.0, 100.0, len(points))
     for model, colour, label in (
-        (arm.robot, ALONE, "robot alone (One-G)"),
-        (carrying, CARRYING, f"with the wearer's arm at support {arm.support:g}"),
+        (arm.robot, ALONE_COLOUR, "robot alone (One-G)"),
+        (carrying, CARRYING_COLOUR, f"with the wearer's arm at support {arm.support:g}"),
     ):
         axis.plot(np.sort(np.abs(torque_at(model, points)[:, joint])), percent, color=colour, lw=1.8, label=label)
-    for limit, colour, label in ((arm.joints[joint].rated, RATED, "rated"), (arm.joints[joint].peak, PEAK, "peak")):
+    rated, peak = arm.joints[joint].rated, arm.joints[joint].peak
+    for limit, colour, label in ((rated, RATED_COLOUR, "rated"), (peak, PEAK_COLOUR, "peak")):
         axis.axvline(limit, color=colour, lw=1.2, ls="--", label=f"{label}: {limit:g} Nm")
-    axis.set_xlim(0.0, 1.05 * max(arm.joints[joint].torque, arm.joints[joint].peak))
+    axis.set_xlim(0.0, 1.05 * max(arm.joints[joint].torque, peak))
     axis.set_ylim(0.0, 102.0)
     axis.set_xlabel("Torque (Nm)")
     axis.set_ylabel("Share of the workspace that needs at most this (%)")
@@ -53,8 +50,8 @@ def _shares(axis: Axes, arm: Arm, joint: int) -> None:
     axis.legend(loc="lower right", edgecolor="none", framealpha=0.9)
 
 
-def _where(figure: Figure, axis: Axes, arm: Arm, joint: int) -> None:
-    """Map the largest torque over two joint angles, whatever the other angles and the trunk do."""
+def _where(figure: Figure, axis: Axes, arm: ArmBudget, joint: int) -> None:
+    """Map the largest torque over two joint angles, the maximum over the other angles and the trunk's tilt."""
     other = OTHER[joint]
     low, high = arm.workspace.bounds
     across, up = (np.linspace(low[n], high[n], CELLS) for n in (joint, other))
@@ -75,6 +72,6 @@ def _where(figure: Figure, axis: Axes, arm: Arm, joint: int) -> None:
             lines.set_path_effects(outline)
             for text in axis.clabel(lines, fmt=f"{limit:g} Nm"):
                 text.set_path_effects(outline)
-    axis.set_title("whatever the other joints and the trunk do", fontsize=10)
+    axis.set_title("maximum over the other joints and the trunk's tilt", fontsize=10)
     axis.set_xlabel(f"Joint {joint + 1} (deg)")
     axis.set_ylabel(f"Joint {other + 1} (deg)")

@@ -1,0 +1,38 @@
+"""Packages that only some tools need, and how to install them.
+
+A tool imports them inside `extras`, after it has parsed its arguments: `--help` works without them, and a missing one
+ends the tool with one line instead of a traceback.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+# Ubuntu 24.04 has these; all others come from PyPI only.
+APT = {
+    "matplotlib": "python3-matplotlib",
+    "rich": "python3-rich",
+    "scipy": "python3-scipy",
+    "threadpoolctl": "python3-threadpoolctl",
+}
+
+
+def missing(module: str, extra: str) -> str:
+    """Return a sentence that names the missing `module` and how to install it; extra: e.g. 'report'."""
+    module = module.partition(".")[0]
+    apt = f"apt install {APT[module]}, or " if module in APT else ""
+    return f"the Python package {module} is not installed: {apt}pip install 'exo_gravity[{extra}]'"
+
+
+@contextmanager
+def extras(tool: str, extra: str) -> Iterator[None]:
+    """End `tool` with exit code 2 and one line if an import inside the context finds a package missing."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if not error.name or error.name.startswith("exo_gravity"):
+            raise  # not a package that an extra installs
+        print(f"{tool}: {missing(error.name, extra)}", file=sys.stderr)
+        raise SystemExit(2) from None
