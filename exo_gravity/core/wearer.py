@@ -1,13 +1,13 @@
-"""The wearer's arm: body mass and segment lengths -> what each link of the robot carries of it.
+"""The wearer's arm: body mass and segment lengths -> the mass that each link of the robot carries.
 
-Segments by statistics of the human body: a mass as a share of body mass, and a centre of gravity as a share of the
-segment's length from its proximal joint. Mass and centre come from one table, never mixed:
+Body segment tables give a segment's mass as a share of body mass, and its centre of gravity as a share of the segment's
+length from the proximal joint. Mass and centre always come from the same table:
 
-    de_leva   P. de Leva, J. Biomech. 29 (1996): scans of young adults; a hand ends at the third metacarpal
-    winter    D. A. Winter, Biomechanics and Motor Control of Human Movement: cadavers, both sexes alike
+    de_leva   P. de Leva, J. Biomech. 29 (1996): scans of young adults; the hand ends at the third metacarpal
+    winter    D. A. Winter, Biomechanics and Motor Control of Human Movement: cadavers, same values for both sexes
 
-The upper arm rides on link 3, forearm and hand on link 4, where the robot's joints 3 and 4 turn about the wearer's
-shoulder and elbow. A table is an average: one person's arm can differ from it by a good 10 %.
+Link 3 carries the upper arm and link 4 the forearm and hand; the robot's joints 3 and 4 turn about the wearer's
+shoulder and elbow. A table is an average: a person's arm can differ from it by more than 10 %.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm import four_floats, one_float
+from exo_gravity.core.arm import Vector, four_floats, one_float
 from exo_gravity.core.errors import ParameterError
 
 
 class Segment(NamedTuple):
-    """mass: share of body mass. cog: centre of gravity as a share of the segment's length, from its proximal joint."""
+    """mass: share of body mass. cog: centre of gravity from the proximal joint, as a share of the segment's length."""
 
     mass: float
     cog: float
@@ -39,12 +39,12 @@ TABLES = {
     },
     "winter": {"female": _WINTER, "male": _WINTER},
 }
-# m, an adult man's, rounded: shoulder to elbow, elbow to wrist, wrist to third knuckle. Measure the wearer instead.
+# m, rounded values of an adult man: shoulder to elbow, elbow to wrist, wrist to third knuckle. Prefer measured lengths.
 TYPICAL_LENGTH = (0.28, 0.27, 0.086)
 
 
 class LinkLoad(NamedTuple):
-    """What the robot's links carry of the wearer: mass (4,) kg; cog (4,) m from joint n along link n."""
+    """The wearer's mass on each link of the robot: mass (4,) kg; cog (4,) m from joint n along link n."""
 
     mass: np.ndarray
     cog: np.ndarray
@@ -52,10 +52,10 @@ class LinkLoad(NamedTuple):
 
 @dataclass(frozen=True)
 class Wearer:
-    """A person, as far as gravity on the arm is concerned.
+    """The body data that determine the weight of a wearer's arm.
 
     body_mass: kg. sex: 'female' or 'male'. table: 'de_leva' or 'winter'. segment_length: (3,) m, upper arm, forearm,
-    hand (wrist to third knuckle). Raises ParameterError that names the offending value.
+    hand (wrist to third knuckle). Raises ParameterError that names the invalid value.
     """
 
     body_mass: float
@@ -63,7 +63,7 @@ class Wearer:
     table: str = "de_leva"
     segment_length: Sequence[float] = TYPICAL_LENGTH
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         object.__setattr__(self, "body_mass", one_float("body_mass", self.body_mass, 10.0, 300.0, "kg"))
         for name, value, choices in (("sex", self.sex, SEX), ("table", self.table, tuple(TABLES))):
             if value not in choices:
@@ -75,25 +75,25 @@ class Wearer:
         lengths = four_floats("segment_length", (upper_arm, forearm, hand, 0.0), 0.0, 0.6, "m")[:3]
         object.__setattr__(self, "segment_length", tuple(lengths.tolist()))
 
-    def on_links(self, link_length: Sequence[float]) -> LinkLoad:
-        """Return what a robot with links of `link_length` (4,) m carries of this wearer.
+    def on_links(self, link_length: Vector) -> LinkLoad:
+        """Return the load of this wearer's arm on a robot with links of `link_length` (4,) m.
 
-        Raises ParameterError where a segment's centre of gravity lies beyond the link that must carry it.
+        Raises ParameterError if the centre of gravity of a segment lies beyond the link that must carry it.
         """
         upper_arm, forearm, hand = self.segments
         elbow_to_wrist = self.segment_length[1]
         lower = forearm[0] + hand[0]
         moment = forearm[0] * forearm[1] + hand[0] * (elbow_to_wrist + hand[1])  # about the elbow
         cog = (0.0, 0.0, upper_arm[1], moment / lower)
-        for link, what in ((2, "the upper arm"), (3, "forearm and hand")):
+        for link, what in ((2, "the upper arm"), (3, "the forearm and hand")):
             if cog[link] > link_length[link]:
-                beyond = f"{what} has its centre of gravity at {cog[link]:.3f} m, beyond link {link + 1}"
+                beyond = f"the centre of gravity of {what} is at {cog[link]:.3f} m, beyond link {link + 1}"
                 raise ParameterError("link_length", [*map(float, link_length)], f"long enough for the wearer: {beyond}")
         return LinkLoad(np.array((0.0, 0.0, upper_arm[0], lower)), np.array(cog))
 
     @property
     def segments(self) -> tuple[tuple[float, float], ...]:
-        """Mass in kg and centre of gravity in m from the proximal joint, of upper arm, forearm and hand."""
+        """Mass in kg and centre of gravity in m from the proximal joint of the upper arm, forearm and hand."""
         table = TABLES[self.table][self.sex]
         return tuple(
             (self.body_mass * segment.mass, length * segment.cog)

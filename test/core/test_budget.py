@@ -1,4 +1,4 @@
-"""The torque budget, against what the worst pose of each joint must be, and against poses drawn at random."""
+"""The torque budget, against the known worst pose of each joint and against random poses."""
 
 import functools
 import math
@@ -26,7 +26,7 @@ def needs(support=1.0, tilt=20.0, rated=RATED, peak=PEAK, robot=ROBOT):
 
 
 @pytest.mark.parametrize("support", [0.0, 0.4, 1.0])
-def test_each_joints_largest_torque_is_that_of_the_stretched_horizontal_arm(support):
+def test_each_joints_largest_torque_is_that_of_the_straight_horizontal_arm(support):
     carrying = ROBOT.with_wearer(*LOAD, support)
     _, m2, m3, m4 = (carrying.gravity * moment for moment in carrying.first_moment)
     expected = [0.0, m2 + m3 + m4, m3 + m4, m4]
@@ -41,7 +41,7 @@ def test_joint_1_of_a_tilted_trunk_needs_the_horizontal_part_of_gravity_times_th
     assert needs()[0].torque == pytest.approx(whole, abs=2e-3)
 
 
-def test_no_pose_of_either_arm_needs_more_than_the_budget_says():
+def test_no_pose_of_either_arm_needs_more_than_the_budgets_largest_torque():
     joints = needs()
     rng = np.random.default_rng(11)
     pose, tilts = rng.uniform(LOW, HIGH, (20_000, 4)), np.radians(rng.uniform(-20, 20, (20_000, 2)))
@@ -59,13 +59,13 @@ def test_the_torque_at_a_point_is_that_of_the_left_arm_at_its_tilt():
         assert torque_at(ROBOT, point[None])[0] == pytest.approx(gravity_torque(ROBOT, point[:4], direction), abs=1e-12)
 
 
-def test_the_worst_pose_needs_what_the_budget_says():
+def test_the_worst_pose_needs_the_budgets_largest_torque():
     for number, joint in enumerate(needs()):
         torque = torque_at(ROBOT.with_wearer(*LOAD), joint.worst[None])[0, number]
         assert abs(torque) == pytest.approx(joint.torque, abs=5e-3)
 
 
-def test_the_shares_are_those_of_poses_drawn_anew():
+def test_the_shares_agree_with_those_of_other_random_poses():
     joints = needs()
     rng = np.random.default_rng(12)
     points = rng.uniform(
@@ -76,39 +76,39 @@ def test_the_shares_are_those_of_poses_drawn_anew():
     assert [joint.within_peak for joint in joints] == pytest.approx(np.mean(torque <= PEAK, axis=0), abs=0.015)
 
 
-def test_all_of_the_workspace_is_never_claimed_beside_one_pose_beyond():
+def test_a_share_is_below_1_if_a_single_pose_is_overloaded():
     worst = needs()[1].torque
     (_, joint, *_), (_, within, *_) = (needs(rated=(3, worst + margin, 3, 3)) for margin in (-0.01, 0.01))
     assert joint.within_rated < 1.0 and within.within_rated == 1.0
 
 
-def test_at_the_largest_support_the_joint_needs_its_rated_torque_and_no_more():
+def test_at_the_largest_support_the_joint_needs_exactly_its_rated_torque():
     for number, joint in enumerate(needs()):
         assert needs(joint.support)[number].torque == pytest.approx(RATED[number], abs=0.02)
 
 
 def test_an_arm_that_bends_the_other_way_gets_the_same_support():
-    flexion = (-1.65, -0.17, 0.3, -0.17), (1.65, 0.5, 2.53, 3.14)  # joint 3 is pulled one way only
+    flexion = (-1.65, -0.17, 0.3, -0.17), (1.65, 0.5, 2.53, 3.14)  # gravity always pulls joint 3 in the same direction
     other_way = tuple(-angle for angle in flexion[1]), tuple(-angle for angle in flexion[0])
     one, other = (budget(ROBOT, LOAD, 1.0, Workspace(*limits, 0.1), RATED, PEAK)[2] for limits in (flexion, other_way))
     assert other.support == pytest.approx(one.support, abs=2e-3)
 
 
-def test_a_motor_strong_enough_supports_all_of_the_arm():
+def test_strong_enough_motors_support_the_whole_arm():
     assert [joint.support for joint in needs(rated=(50, 50, 50, 50))] == [1.0] * 4
 
 
-def test_no_support_is_within_rated_torque_where_the_robot_alone_is_beyond():
+def test_there_is_no_support_if_the_robot_alone_needs_more_than_rated_torque():
     assert needs(rated=(3, 3.7, 3, 3))[1].support is None
     assert needs(rated=(3, 3.8, 3, 3))[1].support == pytest.approx(0.0, abs=0.005)
 
 
-def test_the_full_arm_of_a_man_of_75_kg_is_beyond_the_papers_motors():
+def test_the_whole_arm_of_a_75_kg_man_overloads_the_papers_motors():
     assert [joint.torque > rated for joint, rated in zip(needs(), RATED, strict=True)] == [True] * 4
     assert needs()[1].torque > PEAK[1]
 
 
-def test_the_least_motor_that_covers_a_torque_is_named():
+def test_motor_for_returns_the_smallest_motor_that_covers_the_torque():
     assert [motor_for(torque) for torque in (2.9, 3.1, 9.5, 13.4, 19.6, 50.0)] == [
         "AK60-6", "AK80-9", "AK70-10", "AK10-9", "AK80-64", None,
     ]  # fmt: skip
@@ -124,14 +124,14 @@ def test_an_impossible_workspace_is_refused(arguments):
         Workspace(*arguments)
 
 
-def test_what_is_beyond_is_told_by_name_with_the_support_that_fits():
+def test_overload_names_each_overloaded_joint_and_the_support_that_fits():
     text = overload(("a", "b", "c", "d"), needs())
     assert "b needs 19.6 Nm in its worst pose (rated 9, peak 18)" in text
-    assert text.startswith("beyond the motors: a needs") and text.endswith("the largest support that fits is 0.068")
-    assert "the robot alone is beyond" in overload("abcd", needs(rated=(3, 3.7, 3, 3)))
+    assert text.startswith("motors overloaded: a needs") and text.endswith("the largest support that fits is 0.068")
+    assert "the robot alone needs too much" in overload("abcd", needs(rated=(3, 3.7, 3, 3)))
     assert overload("abcd", needs(support=0.068)) == ""
 
 
-def test_a_motor_that_gives_less_than_told_has_so_much_less_and_one_that_gives_more_no_more():
+def test_a_torque_scale_below_1_reduces_the_motors_torque_and_one_above_1_does_not_raise_it():
     rated, peak = motor_torques(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), (1.0, 0.5, 1.5, 1.0))
     assert rated.tolist() == [3.0, 4.5, 3.0, 3.0] and peak.tolist() == [9.0, 9.0, 9.0, 9.0]
