@@ -24,7 +24,6 @@ from exo_gravity.core.compensator import Settings
 from exo_gravity.core.control_params import CAN_BRIDGE
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.param_table import values_of
-from exo_gravity.core.wearer import LinkLoad
 
 WITHIN = "within rated torque everywhere"
 PAUSE = 0.005  # s, about 500 times per budget
@@ -76,7 +75,7 @@ class BudgetWatch:
             bridge = values_of([param for param in CAN_BRIDGE if param.name in BRIDGE_PARAMETERS], values)
             workspace = Workspace(bridge["position_min"], bridge["position_max"], self._max_tilt)
             torques = motor_torques(bridge["motor"], bridge["torque_scale"])
-            joints = budget(robot, LinkLoad(mass, cog), support, workspace, *torques, lambda: time.sleep(PAUSE))
+            joints = budget(robot, (mass, cog), support, workspace, *torques, lambda: time.sleep(PAUSE))
             return overload(self._names, joints) or WITHIN
         except ParameterError as error:
             return f"unknown: can_bridge has {error}"

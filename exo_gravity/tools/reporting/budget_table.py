@@ -45,7 +45,7 @@ class ArmBudget:
     @property
     def beyond(self) -> list[int]:
         """Indices of the joints that need more than rated torque somewhere."""
-        return [number for number, joint in enumerate(self.joints) if joint.beyond]
+        return [number for number, joint in enumerate(self.joints) if joint.overloaded]
 
 
 def arm_budget(configured: ConfiguredArm, wearer: Wearer, support: float, max_tilt: float) -> ArmBudget:
@@ -80,7 +80,7 @@ def table_lines(arm: ArmBudget, colour: bool = False) -> Iterator[str]:
             "none" if joint.support is None else f"{rounded_down(joint.support):.3f}",
         )
         mark = RED if joint.torque > joint.peak else YELLOW
-        yield f"{mark}{line}{PLAIN}" if colour and joint.beyond else line
+        yield f"{mark}{line}{PLAIN}" if colour and joint.overloaded else line
 
 
 def _line(*cells: str) -> str:
