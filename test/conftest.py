@@ -1,61 +1,54 @@
-"""Every test run has a ROS domain of its own, and speaks to this machine alone.
+"""Each test run has its own ROS domain, and its nodes communicate on this machine only.
 
-A machine that stands still for longer than the nodes' patience lets the arm down, as it must, and then a test of worn
-processes (`real_time`) says nothing. So a clock runs beside them: where one fails while the clock stood still, it fails
-with `Stalled`, and is played again.
+Nodes let the arm down when the machine stands still for longer than their time-outs, as they must. A test of running
+nodes (marker `real_time`) then shows nothing about them. A stall clock therefore runs beside these tests: a test that
+fails while the clock stood still fails with `Stalled` and runs again.
 """
 
-import multiprocessing
+from __future__ import annotations
+
 import os
-import time
+from collections.abc import Iterator
 
 import pytest
 
-from .support.clock import beat
+from .support.stall_clock import StallClock
 
-STALL = 0.03  # s between two beats
+STALL = 0.03  # s between two wake-ups of the clock
 
 os.environ["ROS_DOMAIN_ID"] = str(os.getpid() % 100 + 1)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 
 class Stalled(AssertionError):
-    """A test failed on a machine that stood still meanwhile."""
+    """A test failed while the machine stood still."""
 
 
 @pytest.fixture(scope="session")
-def longest_beat():
-    """The longest time between two beats of the clock since it was set to 0, in s."""
-    spawn = multiprocessing.get_context("spawn")
-    longest = spawn.Value("d", 0.0)
-    clock = spawn.Process(target=beat, args=(longest,), daemon=True)
-    clock.start()
-    while not longest.value:
-        time.sleep(0.005)
-    yield longest
-    clock.terminate()
-    clock.join()
+def stall_clock() -> Iterator[StallClock]:
+    """The clock that measures how long the machine stands still."""
+    clock = StallClock()
+    yield clock
+    clock.close()
 
 
-def pytest_configure(config):
-    config.addinivalue_line("markers", "real_time: nodes run as processes, and the machine must keep up with them")
-
-
-def pytest_collection_modifyitems(items):
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.get_closest_marker("real_time"):
-            item.fixturenames.append("longest_beat")
+            item.fixturenames.append("stall_clock")
             item.add_marker(pytest.mark.flaky(reruns=2, only_rerun="Stalled"))
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_pyfunc_call(pyfuncitem):
-    longest = pyfuncitem.funcargs.get("longest_beat")
-    if longest is not None:
-        longest.value = 0.0
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Iterator[None]:
+    clock = pyfuncitem.funcargs.get("stall_clock")
+    if clock is None:
+        return (yield)
+    clock.longest_gap()
     try:
         return (yield)
     except Exception as error:
-        if longest is not None and longest.value > STALL:
-            raise Stalled(f"the machine stood still for {longest.value:.3f} s: {error}") from error
+        gap = clock.longest_gap()
+        if gap > STALL:
+            raise Stalled(f"the machine stood still for {gap:.3f} s: {error}") from error
         raise

@@ -1,157 +1,90 @@
-"""`make faults`: every row of the fault matrix on the simulated device, with real processes; a table and JSON.
+"""`make faults`: run the fault matrix on the simulated device, with real processes; print a table and write JSON.
 
-    run.py [--only TEXT] [--start N] [--output build/faults.json]
+    python -m test.faults.run [--only TEXT] [--start N] [--output build/faults.json]
 
-Exits with 1 if a row is unsafe: too late, a joint above 1 rad/s, a torque step above 50 Nm/s times the period, a motor
-switched on again, or an exception printed.
+The JSON file is written after every case. The exit code is 1 if a case was unsafe or could not be run: a reaction that
+is too late, a joint above 1 rad/s, a torque step above 50 Nm/s times the period, a motor that is switched on again, or
+an exception in the log. An interrupted run prints its table too, and its exit code is 130.
 """
+
+from __future__ import annotations
 
 import argparse
 import json
 import os
+import signal
 import sys
 import tempfile
-import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-os.environ.setdefault("ROS_DOMAIN_ID", str(os.getpid() % 100 + 1))
+os.environ.setdefault("ROS_DOMAIN_ID", str(os.getpid() % 100 + 1))  # before rclpy is imported
 
 from rich.console import Console
 from rich.table import Table
 
-from ..faults.judge import SPEED, seen
-from ..faults.rows import ROWS
+from .cases import CASES, FaultCase
+from .runner import Result, RigPool, not_run
 
-WATCHED = 3.0  # s for which an arm that may stay carried is watched
-CALM = 1.0  # s for which one that was let down must stay down, its inputs being well again
-DOWN = 40.0  # s until it must be down
+INTERRUPTED = 130  # the shell's exit code after Ctrl-C
 
 
-def play(row, stage):
-    """Do `row` to the carried arm on `stage`; return its line of the table. On a punctual stage it may be too late."""
-    stage.carry()
-    said, told = stage.watcher.said, len(stage.log)
-    since = time.time()
-    row.do(stage)
-    if row.within is None:
-        end = time.monotonic() + WATCHED
-        stage.watcher.until(lambda: time.monotonic() > end or said("can_bridge", "fault"))
-    if row.within is not None or said("can_bridge", "letting down") or said("can_bridge", "fault"):
-        down = stage.listener.switched_off
-        stage.watcher.until(lambda: (stage.over and down()) or said("can_bridge", "fault"), DOWN)
-    result = _result(row, stage)
-    row.undo(stage)
-    if not result.startswith("active"):  # a motor that could not be reached is switched off once it can
-        stage.watcher.until(stage.listener.switched_off, DOWN)
-    end = time.monotonic() + CALM
-    stage.watcher.until(lambda: time.monotonic() > end)
-    return _line(row, stage, since, result, stage.log[told:])
-
-
-def _result(row, stage):
-    if stage.over:
-        return "stopped"
-    status = stage.watcher.diagnostics["/right/can_bridge"].message
-    return status.split(": ")[1] if status.startswith("fault") else status
-
-
-def _line(row, stage, since, result, log):
-    frames = list(stage.listener.frames)
-    whole = seen(frames, since, 1.0 / stage.rate)
-    carried = result.startswith("active")
-    wrong = [
-        text
-        for bad, text in (
-            (not carried and whole.reaction is None, "not let down"),
-            (carried and row.within is not None, "stayed carried"),
-            (stage.punctual and row.within is not None and (whole.reaction or 0.0) > row.within, "too late"),
-            (whole.speed > SPEED, "too fast"),
-            (whole.excess > 0.0, "torque step"),
-            (whole.armed, "armed again"),
-            (any("Traceback" in line for line in log), "exception"),
-        )
-        if bad
-    ]
-    return {
-        "fault": row.name,
-        "result": result,
-        "reaction_ms": None if carried else round((whole.reaction or 0.0) * 1000),
-        "limit_ms": row.within and round(row.within * 1000),
-        "top_speed_rad_s": round(whole.speed, 2),
-        "torque_step_nm": round(whole.step, 3),
-        "latched": "held" if carried else "yes" if not whole.armed else "NO",
-        "unsafe": ", ".join(wrong),
-    }
-
-
-class Theatre:
-    """Keeps a stage as long as it can be used again."""
-
-    def __init__(self, folder, punctual=True):
-        self._folder, self._punctual = Path(folder), punctual
-        self._stage, self._count = None, 0
-
-    def play(self, row):
-        if self._stage is not None and (type(self._stage) is not row.on or self._stage.over):
-            self.close()
-        if self._stage is None:
-            self._count += 1
-            folder = self._folder / str(self._count)
-            folder.mkdir()
-            self._stage = row.on(folder, self._punctual)
-        try:
-            line = play(row, self._stage)
-        except BaseException:
-            self.close()  # wherever it stands
-            raise
-        if row.spent or line["unsafe"]:  # a dead compensator, or who knows what
-            stage = self._stage
-            self.close()
-            line["log"] = stage.log[-20:] if line["unsafe"] else []
-        return line
-
-    def close(self):
-        if self._stage is not None:
-            self._stage.close()
-            self._stage = None
-
-
-def main():
-    """Play all rows; exit with 1 if one is unsafe."""
-    parser = argparse.ArgumentParser(prog="make faults", description=__doc__.splitlines()[0])
-    parser.add_argument("--only", default="", metavar="TEXT", help="only rows whose name contains TEXT")
+def main() -> int:
+    """Run the cases; return the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m test.faults.run", description="Run the fault matrix.")
+    parser.add_argument("--only", default="", metavar="TEXT", help="only cases whose name contains TEXT")
     parser.add_argument("--start", default=1, type=int, metavar="N", help="begin with the Nth of them")
-    parser.add_argument("--output", default="build/faults.json", type=Path)
+    parser.add_argument("--output", default=Path("build/faults.json"), type=Path, metavar="FILE", help="(%(default)s)")
     arguments = parser.parse_args()
-    rows = [row for row in ROWS if arguments.only in row.name][arguments.start - 1 :]
+    cases = [case for case in CASES if arguments.only in case.name][arguments.start - 1 :]
     console = Console(width=max(120, Console().width))
-    lines = []
-    with tempfile.TemporaryDirectory() as folder:
-        theatre = Theatre(folder)
-        try:
-            for number, row in enumerate(rows, 1):
-                console.print(f"[{number}/{len(rows)}] {row.name} ...", end=" ", markup=False)
-                lines.append(theatre.play(row))
-                console.print(lines[-1]["result"], lines[-1]["unsafe"] or "safe", markup=False)
-                for entry in lines[-1].pop("log", ()):
-                    console.print("    ", entry, markup=False)
-        finally:
-            theatre.close()
-    arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    arguments.output.write_text(json.dumps(lines, indent=1) + "\n")
-    console.print(table(lines))
-    sys.exit(1 if any(line["unsafe"] for line in lines) else 0)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    results: list[Result] = []
+    interrupted = False
+    try:
+        for result in run_all(cases, console):
+            results.append(result)
+            save(results, arguments.output)
+    except KeyboardInterrupt:
+        interrupted = True
+        console.print(f"interrupted after {len(results)} of {len(cases)} cases")
+    finally:
+        console.print(table(results))
+    if interrupted:
+        return INTERRUPTED
+    return int(any(result["unsafe"] for result in results))
 
 
-def table(lines):
-    """Return the lines as a table."""
-    grid = Table("fault", "what came of it", "after ms", "top rad/s", "step Nm", "latched", "verdict")
-    for line in lines:
-        cells = (line["reaction_ms"], line["top_speed_rad_s"], line["torque_step_nm"], line["latched"])
-        shown = ["-" if cell is None else str(cell) for cell in cells]
-        grid.add_row(line["fault"], line["result"], *shown, line["unsafe"] or "safe")
+def run_all(cases: Sequence[FaultCase], console: Console) -> Iterator[Result]:
+    """Run the cases, show their progress, and yield their results."""
+    with tempfile.TemporaryDirectory() as folder, RigPool(Path(folder)) as pool:
+        for number, case in enumerate(cases, 1):
+            console.print(f"[{number}/{len(cases)}] {case.name} ...", end=" ", markup=False)
+            try:
+                result = pool.run(case)
+            except Exception as error:  # the other cases may still show something
+                result = not_run(case, error)
+            console.print(result["result"], result["unsafe"] or "safe", markup=False)
+            for line in result.pop("log", ()):
+                console.print("    ", line, markup=False)
+            yield result
+
+
+def save(results: Sequence[Result], path: Path) -> None:
+    """Write the results as JSON."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(results, indent=1) + "\n")
+
+
+def table(results: Sequence[Result]) -> Table:
+    """Return the results as a table."""
+    grid = Table("fault", "result", "after ms", "top rad/s", "step Nm", "latched", "verdict")
+    for result in results:
+        figures = (result["reaction_ms"], result["top_speed_rad_s"], result["torque_step_nm"], result["latched"])
+        cells = ["-" if figure is None else str(figure) for figure in figures]
+        grid.add_row(result["fault"], result["result"], *cells, result["unsafe"] or "safe")
     return grid
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

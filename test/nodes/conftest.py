@@ -1,33 +1,60 @@
-"""Real nodes in processes of their own, and a real node beside them that watches, asks and sets parameters."""
+"""Fixtures for the tests of running nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 
-from ..faults.stage import Stack, Watcher
+from ..support.bus_listener import BusListener
+from ..support.launched_nodes import LaunchedNodes
+from ..support.ros_probe import RosProbe
 
 
 @pytest.fixture
-def watcher():
-    watcher = Watcher()
-    yield watcher
-    watcher.close()
+def probe() -> Iterator[RosProbe]:
+    """A ROS node in this process that observes the right arm."""
+    probe = RosProbe()
+    yield probe
+    probe.close()
 
 
 @pytest.fixture
-def make(tmp_path):
-    """Write the parameter files of stacks, without starting them."""
-    return lambda **changes: Stack(tmp_path, **changes)
+def prepare(tmp_path: Path) -> Callable[..., LaunchedNodes]:
+    """A function that writes a changed parameter file without starting its nodes."""
+
+    def prepare(**changes: Any) -> LaunchedNodes:
+        return LaunchedNodes(tmp_path, **changes)
+
+    return prepare
 
 
 @pytest.fixture
-def start(make):
-    """Start stacks that end with the test."""
-    stacks = []
+def launch(prepare: Callable[..., LaunchedNodes]) -> Iterator[Callable[..., LaunchedNodes]]:
+    """A function that starts nodes, which end with the test."""
+    launched: list[LaunchedNodes] = []
 
-    def start(**changes):
-        stacks.append(make(**changes).start())
-        return stacks[-1]
+    def launch(**changes: Any) -> LaunchedNodes:
+        launched.append(prepare(**changes).start())
+        return launched[-1]
 
-    yield start
-    for stack in stacks:
-        stack.stop()
-        print("\n".join(stack.log))  # which pytest shows where a test failed
+    yield launch
+    for nodes in launched:
+        nodes.stop()
+        print("\n".join(nodes.log))  # pytest shows it if the test failed
+
+
+@pytest.fixture
+def listen() -> Iterator[Callable[[LaunchedNodes], BusListener]]:
+    """A function that records the frames on the bus of some nodes."""
+    listeners: list[BusListener] = []
+
+    def listen(nodes: LaunchedNodes) -> BusListener:
+        listeners.append(BusListener(nodes.bus))
+        return listeners[-1]
+
+    yield listen
+    for listener in listeners:
+        listener.close()

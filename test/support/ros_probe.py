@@ -1,0 +1,166 @@
+"""A ROS node in the test's process that records what the nodes under test publish, and calls their services."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+
+from exo_gravity.nodes.run import keep_to_this_machine
+
+keep_to_this_machine()
+
+
+class Timeout(AssertionError):
+    """A condition did not hold in time."""
+
+
+class RosProbe:
+    """Listens to the arm in the namespace `arm`, on a thread of its own.
+
+    joint_states, effort_commands, wearer_steps: the messages so far. statuses: the newest DiagnosticStatus by node.
+    """
+
+    def __init__(self, arm: str = "/right") -> None:
+        self.arm = arm
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self.node = rclpy.create_node("ros_probe", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.joint_states: list[JointState] = []
+        self.effort_commands: list[JointState] = []
+        self.wearer_steps: list[String] = []
+        self.statuses: dict[str, DiagnosticStatus] = {}
+        self.node.create_subscription(JointState, f"{arm}/joint_states", self.joint_states.append, 1000)
+        self.node.create_subscription(JointState, f"{arm}/effort_commands", self.effort_commands.append, 1000)
+        self.node.create_subscription(String, f"{arm}/wearer_step", self.wearer_steps.append, 10)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
+        self._clients: dict[str, Any] = {}
+        self._deadline = float("inf")
+        self._news = threading.Condition()
+        self._closing = False
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._closing = True
+        self._thread.join()
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+    def _spin(self) -> None:
+        while not self._closing:
+            self.executor.spin_once(timeout_sec=0.1)
+            with self._news:
+                self._news.notify_all()
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self.statuses[f"/{status.name}"] = status
+
+    def status_contains(self, node: str, text: str) -> bool:
+        """Return whether the newest status message of the arm's `node` contains `text`."""
+        status = self.statuses.get(f"{self.arm}/{node}")
+        return status is not None and text in status.message
+
+    def diagnostic(self, node: str, key: str) -> str | None:
+        """Return the newest value of `key` in the diagnostics of the arm's `node`, None if there is none."""
+        status = self.statuses.get(f"{self.arm}/{node}")
+        return next((pair.value for pair in status.values if pair.key == key), None) if status else None
+
+    @property
+    def state(self) -> str | None:
+        """The state that can_bridge reports."""
+        return self.diagnostic("can_bridge", "state")
+
+    @property
+    def fault(self) -> str | None:
+        """The code of the latched fault that can_bridge reports, or 'none'."""
+        return self.diagnostic("can_bridge", "fault")
+
+    def wait_until(self, condition: Callable[[], Any], timeout: float = 60.0) -> None:
+        """Wait until `condition()` holds. Raises Timeout after `timeout` s, or earlier within a `time_limit`."""
+        deadline = min(time.monotonic() + timeout, self._deadline)
+        with self._news:
+            while not condition():
+                if time.monotonic() > deadline:
+                    messages = {name: status.message for name, status in self.statuses.items()}
+                    raise Timeout(f"the condition did not hold in time; diagnostics: {messages}")
+                self._news.wait(0.01)  # not every condition is about ROS messages
+
+    @contextmanager
+    def time_limit(self, seconds: float) -> Iterator[None]:
+        """Limit all waiting in the `with` block to `seconds` s together."""
+        self._deadline = time.monotonic() + seconds
+        try:
+            yield
+        finally:
+            self._deadline = float("inf")
+
+    def call(self, service_type: Any, name: str, request: Any) -> Any:
+        """Return the response of the service `name`."""
+        client = self._clients.get(name) or self._clients.setdefault(name, self.node.create_client(service_type, name))
+        self.wait_until(client.service_is_ready)
+        future = client.call_async(request)
+        self.wait_until(future.done)
+        return future.result()
+
+    def trigger(self, name: str) -> Trigger.Response:
+        """Call one of can_bridge's Trigger services."""
+        return self.call(Trigger, f"{self.arm}/can_bridge/{name}", Trigger.Request())
+
+    def enable(self, on: bool) -> SetBool.Response:
+        """Call can_bridge's service `enable`."""
+        return self.call(SetBool, f"{self.arm}/can_bridge/enable", SetBool.Request(data=on))
+
+    def set_parameters(self, node: str, atomically: bool = False, **values: Any) -> SetParametersResult:
+        """Set parameters as `ros2 param set` does; `__` in a name stands for a dot."""
+        parameters = [Parameter(name.replace("__", "."), value=value) for name, value in values.items()]
+        messages = [parameter.to_parameter_msg() for parameter in parameters]
+        if atomically:
+            name, request = f"{self.arm}/{node}/set_parameters_atomically", SetParametersAtomically.Request()
+            request.parameters = messages
+            return self.call(SetParametersAtomically, name, request).result
+        name = f"{self.arm}/{node}/set_parameters"
+        return self.call(SetParameters, name, SetParameters.Request(parameters=messages)).results[0]
+
+    def joint_angles(self) -> list[float]:
+        """Return the newest joint angles in rad."""
+        return list(self.joint_states[-1].position)
+
+    def wearer_is_at(self, action: str) -> bool:
+        """Return whether the virtual wearer's newest step is a 'move', 'hold' or 'push', or the end, 'done'."""
+        return bool(self.wearer_steps) and json.loads(self.wearer_steps[-1].data)["action"] == action
+
+    def wait_until_carried(self) -> None:
+        """Wait until the arm is carried; a fault, such as a busy machine causes, is cleared and the bridge enabled."""
+        self.wait_until(lambda: self.state in ("active", "fault", "disabled"))
+        while self.state != "active":
+            if self.state == "fault":
+                assert self.trigger("clear_fault").success
+                self.wait_until(lambda: self.state == "disabled")
+            assert self.enable(True).success
+            self.wait_until(lambda: self.state in ("active", "fault"))
+
+    def bring_to(self, script: object) -> None:
+        """Let the virtual wearer move the carried arm as the trial script at the path `script` says, and let go."""
+        self.wait_until_carried()
+        self.wearer_steps.clear()
+        assert self.set_parameters("simulator", trial="").successful
+        assert self.set_parameters("simulator", trial=str(script)).successful
+        self.wait_until(lambda: self.wearer_is_at("hold"))
