@@ -26,10 +26,11 @@ from exo_gravity.core.errors import DataError, ExoGravityError, ParameterError
 from exo_gravity.core.trial_analysis import MIN_HOLD
 from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.core.verdict import HoldCriteria
-from exo_gravity.tools import report
+from exo_gravity.tools.cli.arguments import non_negative
 from exo_gravity.tools.inputs.parameter_file import load, packaged_config
 from exo_gravity.tools.launcher import Launcher, stop_on_signals
-from exo_gravity.tools.report import Report
+from exo_gravity.tools.reporting import trial_report
+from exo_gravity.tools.reporting.trial_report import Report
 from exo_gravity.tools.trials.live import Progress
 from exo_gravity.tools.trials.offline import run_offline, simulated_trials
 
@@ -197,12 +198,12 @@ def run(options: argparse.Namespace, console: Console) -> int:
             _complain(trouble)
             return code
     guided = is_guided(params)
-    found = report.analyse(bag, limits_for(script, options.max_rate), shortest_hold(script, guided))
+    found = trial_report.analyse(bag, limits_for(script, options.max_rate), shortest_hold(script, guided))
     if guided and not trouble:
         trouble = missed(script, found)
         code = int(bool(trouble))
-    report.write(found, folder)
-    report.print_report(found)
+    trial_report.write(found, folder)
+    trial_report.print_report(found)
     if trouble:
         console.print(f"trial: {trouble}", markup=False, soft_wrap=True)
     contents = "Report and parameters" if options.offline else "Report, recording, log and parameters"
@@ -224,7 +225,7 @@ def main(args: Sequence[str] | None = None) -> int:
     option("--offline", action="store_true", help="on the simulated device, without ROS and faster than real time")
     option(
         "--max-rate",
-        type=report.at_least_0,
+        type=non_negative,
         metavar="DEG/MIN",
         help=f"drift allowed over a hold (default: {MAX_RATE:g} if every hold lasts {LONG_HOLD:g} s, else no limit)",
     )

@@ -283,7 +283,7 @@ def test_without_commands_the_rest_is_reported_with_a_note(recording, content, t
 def test_what_is_no_step_is_a_problem_in_one_sentence_and_the_rest_is_read(content, recording, tmp_path, text):
     wrong = ("/right/wearer_step", "std_msgs/msg/String", content[-1][2], made.string(text))
     read = read_bag(made.write_bag(tmp_path / "bag", [*content, wrong]))
-    assert read.problems == ("/right/wearer_step: a message of it is no step that a wearer was told",)
+    assert read.problems == ("/right/wearer_step: invalid wearer_step message",)
     assert_same(read.recordings[0], recording)
 
 

@@ -8,6 +8,7 @@ import dataclasses
 import io
 import math
 import re
+import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -16,10 +17,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from exo_gravity.bag.reader import Bag, Event, read_bag
+from exo_gravity.bag.content import Bag, Event
+from exo_gravity.bag.reader import read_bag
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.verdict import HoldCriteria
-from exo_gravity.tools.report import analyse, main, print_report, write
+from exo_gravity.tools.report import main
+from exo_gravity.tools.reporting.trial_report import analyse, print_report, write
 
 from ..support import made_bags as made
 
@@ -28,7 +31,7 @@ PUSH = [0.05, 0.25, -0.15, 0.1]
 
 
 def bag_of(*recordings, **more):
-    """A bag as if it had been read."""
+    """A bag with these recordings, not read from a file."""
     empty = {"events": (), "parameters": {}, "notes": (), "problems": ()}
     return Bag(Path("demo"), made.START, recordings, **{**empty, **more})
 
@@ -73,12 +76,12 @@ def test_an_arm_that_held_is_0_and_one_that_fell_is_1(held, fell):
     assert (held.exit_code, fell.exit_code) == (0, 1)
 
 
-def test_what_could_not_be_read_is_2_even_if_the_rest_held(held):
+def test_an_unreadable_part_is_2_even_if_the_rest_held(held):
     problem = bag_of(*held.bag.recordings, problems=("left: damaged",))
     assert analyse(problem).exit_code == 2
 
 
-def test_limits_make_the_same_recording_fail(held):
+def test_stricter_criteria_make_the_same_recording_fail(held):
     assert analyse(held.bag, HoldCriteria(max_stray=1e-6)).exit_code == 1
 
 
@@ -135,10 +138,30 @@ def test_the_page_is_well_formed_and_refers_to_nothing_outside_itself(folder):
     assert "url(" not in (folder / "report.html").read_text(encoding="utf-8")
 
 
-def test_the_pictures_in_the_page_are_those_beside_it(folder):
+def test_the_pictures_in_the_page_are_the_png_files(folder):
     page = Page((folder / "report.html").read_text(encoding="utf-8"))
     embedded = [base64.b64decode(ref.partition(",")[2]) for ref in page.references]
     assert embedded == [(folder / f"right_{kind}.png").read_bytes() for kind in ("overview", "drift")]
+
+
+@pytest.mark.parametrize(
+    ("path", "arms", "title"),
+    [
+        ("trials/two_poses_20231114_221320/bag", ("right",), "two poses, right arm, 2023-11-1"),
+        ("trials/demo_20231114_221320", ("left", "right"), "demo, left and right arms, 2023-11-1"),
+        ("rosbag2_monday", ("arm",), "rosbag2 monday, arm, 2023-11-1"),
+        ("monday.mcap", ("right",), "monday, right arm, 2023-11-1"),
+    ],
+)
+def test_the_title_is_the_trials_name_the_arms_and_the_date(held, path, arms, title):
+    (recording,) = held.bag.recordings
+    named = tuple(dataclasses.replace(recording, name=name) for name in arms)
+    bag = dataclasses.replace(held.bag, path=Path(path), recordings=named)
+    assert dataclasses.replace(held, bag=bag).title[:-1] == title
+
+
+def test_the_page_has_the_title(held, folder):
+    assert f"<h1>{held.title}</h1>" in (folder / "report.html").read_text(encoding="utf-8")
 
 
 def test_a_figure_is_large_enough_to_print_and_not_blank(folder):
@@ -146,64 +169,67 @@ def test_a_figure_is_large_enough_to_print_and_not_blank(folder):
     assert picture.shape[1] >= 1600 and picture[..., :3].std() > 0.05
 
 
-def test_the_page_tells_the_verdict_and_each_reason(fell, tmp_path):
+def test_the_page_shows_the_verdict_and_each_reason(fell, tmp_path):
     write(fell, tmp_path)
     text = Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
     assert "It did not hold." in text and all(sentence in text for sentence in fell.failures)
 
 
-def test_what_a_recording_says_cannot_become_markup(held, tmp_path):
-    said = {"events": (Event(1.0, "<script>alert(1)</script>"),), "parameters": {"/a": "/a: <b>\n"}}
-    write(analyse(bag_of(*held.bag.recordings, **said, notes=("<i>",))), tmp_path)
+def test_text_from_a_recording_cannot_become_markup(held, tmp_path):
+    texts = {"events": (Event(1.0, "<script>alert(1)</script>"),), "parameters": {"/a": "/a: <b>\n"}}
+    write(analyse(bag_of(*held.bag.recordings, **texts, notes=("<i>",))), tmp_path)
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "<script>" not in text and "<b>\n" not in text and "&lt;script&gt;" in text
 
 
 @pytest.fixture(scope="module")
 def unscripted():
-    """A recording as of a real arm, whose wearer nobody recorded, carried all the while."""
+    """A recording of a real arm: no script, and carried throughout."""
     whole = made.trial(POSES, hold=4.0)
     return analyse(bag_of(dataclasses.replace(whole, steps=(), carried=((0.0, whole.time[-1]),))))
 
 
-def test_without_a_script_what_was_still_is_a_hold_and_the_report_says_so(unscripted):
+def test_without_a_script_every_still_phase_is_a_hold_and_the_report_says_so(unscripted):
     ((_, trial),) = unscripted.arms
     assert len(trial.holds) == 2 and unscripted.exit_code == 0
-    assert "right: nobody recorded what the wearer was told" in " ".join(printed(unscripted).split())
+    assert "right: the recording has no trial script" in " ".join(printed(unscripted).split())
 
 
 def test_the_page_has_the_note_too(unscripted, tmp_path):
     write(unscripted, tmp_path)
-    assert "nobody recorded what the wearer was told" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "the recording has no trial script" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-def test_where_nothing_tells_when_the_arm_was_carried_the_report_says_so(held, unscripted):
-    assert "its way down may be taken for a slip" in " ".join(printed(held).split())
-    assert "its way down" not in printed(unscripted)
+def test_a_recording_that_does_not_show_when_the_arm_was_carried_gets_a_note(held, unscripted):
+    assert "letting it down may count as a slip" in " ".join(printed(held).split())
+    assert "letting it down" not in printed(unscripted)
 
 
-def test_a_trial_that_was_not_done_is_judged_up_to_there_and_the_report_says_so(held):
+def test_an_unfinished_trial_is_judged_up_to_its_end_and_gets_a_note(held):
     (whole,) = held.bag.recordings
     report = analyse(bag_of(dataclasses.replace(whole, carried=((0.0, 15.0),))))
     assert report.exit_code == 0
-    assert "let down at 15.0 s, before the trial was done" in " ".join(printed(report).split())
+    assert "let down at 15.0 s, before the script ended" in " ".join(printed(report).split())
 
 
-def test_a_trial_that_was_done_has_no_such_note(held):
+def test_a_finished_trial_gets_no_note(held):
     (whole,) = held.bag.recordings
     assert not analyse(bag_of(dataclasses.replace(whole, carried=((0.0, whole.time[-1]),)))).notes
 
 
-def test_what_could_be_read_of_a_damaged_recording_held_as_far_as_it_goes(held):
-    assert "It held, as far as it could be read." in printed(analyse(bag_of(*held.bag.recordings, problems=("x",))))
+def test_the_verdict_on_a_damaged_recording_is_limited_to_the_readable_part(held):
+    assert "It held, as far as the recording could be read." in printed(
+        analyse(bag_of(*held.bag.recordings, problems=("x",)))
+    )
 
 
 @pytest.mark.parametrize("option", ["--max-drift", "--max-drift-after-push", "--max-rate", "--min-hold"])
 @pytest.mark.parametrize("value", ["nan", "-1", "half"])
-def test_a_limit_that_is_no_number_from_0_up_is_refused(short_bag, capsys, option, value):
+def test_a_limit_that_is_not_a_number_of_0_or_more_is_refused(short_bag, capsys, option, value):
     with pytest.raises(SystemExit) as caught:
         main([str(short_bag), f"{option}={value}"])
-    assert caught.value.code == 2 and option in capsys.readouterr().err
+    assert caught.value.code == 2
+    assert f"argument {option}: {value}: must be a number, 0 or more" in capsys.readouterr().err
 
 
 def test_the_table_shows_every_hold_and_the_push(held):
@@ -226,7 +252,7 @@ def test_no_hold_is_reported_with_figures_and_1(tmp_path, capsys):
     assert (tmp_path / "out" / "report.html").exists() and (tmp_path / "out" / "right_overview.png").exists()
 
 
-def test_a_report_lies_beside_its_recording_by_default(short_bag, capsys):
+def test_the_report_is_written_next_to_its_recording_by_default(short_bag, capsys):
     assert main([str(short_bag)]) == 0
     assert sorted(path.name for path in short_bag.with_name("short_report").iterdir()) == [
         "holds.csv", "motions.csv", "report.html", "right_drift.png", "right_overview.png",
@@ -268,3 +294,25 @@ def test_the_holds_of_a_bag_are_those_of_its_arrays(short_bag):
     ((_, trial),) = analyse(read_bag(short_bag)).arms
     assert len(trial.holds) == 2
     np.testing.assert_allclose([hold.pose[:3] for hold in trial.holds], np.array(POSES)[:, :3], atol=1e-3)
+
+
+def test_without_matplotlib_the_report_is_written_without_figures_and_says_so(short_bag, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert main([str(short_bag), "--output", str(tmp_path / "out")]) == 0
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"holds.csv", "motions.csv", "report.html"}
+    assert "matplotlib is not installed" in " ".join(capsys.readouterr().out.split())
+
+
+def test_without_the_bag_library_the_missing_extra_is_named_and_help_still_works(short_bag, capsys, monkeypatch):
+    for module in ("exo_gravity.bag.reader", "exo_gravity.bag.storage"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    monkeypatch.setitem(sys.modules, "rosbags.serde", None)
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
+    with pytest.raises(SystemExit) as ended:
+        main([str(short_bag)])
+    assert ended.value.code == 2
+    expected = "report: the Python package rosbags is not installed: pip install 'exo_gravity[report]'\n"
+    assert capsys.readouterr().err == expected
+    with pytest.raises(SystemExit) as ended:
+        main(["--help"])
+    assert ended.value.code == 0

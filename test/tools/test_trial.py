@@ -16,10 +16,11 @@ import pytest
 import yaml
 from rich.console import Console
 
-from exo_gravity.bag.reader import Bag
+from exo_gravity.bag.content import Bag
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.trial_script import TrialScript
-from exo_gravity.tools import launcher, report
+from exo_gravity.tools import launcher
+from exo_gravity.tools.reporting import trial_report
 from exo_gravity.tools.trial import follow, is_guided, limits_for, main, missed, read_script, shortest_hold
 from exo_gravity.tools.trials.live import LEAD, Progress
 
@@ -291,7 +292,7 @@ def found(holds):
     """A report of one arm with that many holds."""
     recording = made.trial([[0.1 * n] * 4 for n in range(holds)], hold=4.0, rate=100.0)
     still = dataclasses.replace(recording, steps=(), carried=((0.0, recording.time[-1]),))
-    return report.analyse(Bag(Path("bag"), 0, (still,), (), {}, (), ()))
+    return trial_report.analyse(Bag(Path("bag"), 0, (still,), (), {}, (), ()))
 
 
 def test_a_hold_that_a_real_arm_never_came_to_rest_in_is_missed():

@@ -1,7 +1,6 @@
 """The figures of a report: the paper's plot of positions, velocities and torques, and a closer look at the drift.
 
-The colours are those of Okabe and Ito (2008), told apart with any colour vision. A recording of an hour is drawn as the
-least and greatest value of each of two thousand stretches, so that no peak is lost.
+A long recording is drawn as the minimum and maximum of each of 2,000 intervals, so that no peak is lost.
 """
 
 from __future__ import annotations
@@ -17,16 +16,15 @@ from matplotlib.patches import Patch
 from exo_gravity.core.recording import Recording
 from exo_gravity.core.trial_analysis import Hold, TrialAnalysis
 from exo_gravity.core.verdict import HoldCriteria
+from exo_gravity.tools.reporting.colours import FAINT, GRID_LINE, HOLD_COLOUR, INK, JOINT_COLOURS, PUSH_COLOUR
 from exo_gravity.tools.reporting.table import degrees, joint_labels, per_minute
 
-JOINT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
-HOLD_COLOUR, PUSH_COLOUR, INK, FAINT = "#E8EEF4", "#F9E3B4", "#222222", "#9AA3AB"
-STRETCHES = 2_000
+INTERVALS = 2_000  # per curve
 WIDTH = 11.0  # inches
 
 
 def overview(recording: Recording, trial: TrialAnalysis) -> Figure:
-    """Return positions, velocities and torques over time, holds and pushes shaded, each hold numbered."""
+    """Return positions, velocities and torques over time, with holds and pushes shaded and holds numbered."""
     figure = Figure(figsize=(WIDTH, 8.2), layout="constrained")
     axes = figure.subplots(3, 1, sharex=True, height_ratios=(1.25, 1.0, 1.25))
     panels = ((degrees(1.0), recording.position), (degrees(1.0), recording.velocity), (1.0, recording.effort))
@@ -53,8 +51,8 @@ def overview(recording: Recording, trial: TrialAnalysis) -> Figure:
     return figure
 
 
-def drift(recording: Recording, trial: TrialAnalysis, limits: HoldCriteria) -> Figure:
-    """Return how far each joint went from where each hold began, and the rate of drift of each hold."""
+def drift(recording: Recording, trial: TrialAnalysis, criteria: HoldCriteria) -> Figure:
+    """Return the deviation of each joint from the start of each hold, and the drift rate of each hold."""
     figure = Figure(figsize=(WIDTH, 6.6), layout="constrained")
     grid = figure.add_gridspec(2, 4, height_ratios=(1.0, 1.1))
     first = figure.add_subplot(grid[0, 0])
@@ -68,22 +66,22 @@ def drift(recording: Recording, trial: TrialAnalysis, limits: HoldCriteria) -> F
         axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
         _plain(axis)
         axis.tick_params(labelleft=joint == 0)
-    first.set_ylabel("Away from its start (deg)")
+    first.set_ylabel("Deviation from the start (deg)")
     reach = max([0.1, *(abs(value) for axis in axes for value in axis.dataLim.intervaly if math.isfinite(value))])
     first.set_ylim(-1.15 * reach, 1.15 * reach)
-    _rates(figure.add_subplot(grid[1, :]), recording, trial, limits)
+    _rates(figure.add_subplot(grid[1, :]), recording, trial, criteria)
     return figure
 
 
-def _rates(axis: Axes, recording: Recording, trial: TrialAnalysis, limits: HoldCriteria) -> None:
+def _rates(axis: Axes, recording: Recording, trial: TrialAnalysis, criteria: HoldCriteria) -> None:
     for joint, (name, colour) in enumerate(zip(joint_labels(recording), JOINT_COLOURS, strict=True)):
         numbers = np.arange(1, len(trial.holds) + 1) + 0.12 * (joint - 1.5)
         rate = [per_minute(hold.drift_rate[joint]) for hold in trial.holds]
         error = [per_minute(hold.drift_rate_uncertainty[joint]) for hold in trial.holds]
         axis.errorbar(numbers, rate, error, fmt="o", ms=4.5, lw=1.2, capsize=2, color=colour, label=name)
     axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
-    if math.isfinite(limits.max_rate):
-        bound = per_minute(limits.max_rate)
+    if math.isfinite(criteria.max_rate):
+        bound = per_minute(criteria.max_rate)
         axis.axhspan(-bound, bound, color=HOLD_COLOUR, zorder=-1, label=f"allowed: ±{bound:g} deg/min")
         axis.legend(loc="upper left", bbox_to_anchor=(0, 1.14), ncols=5, frameon=False, fontsize=9)
     axis.set_xticks(range(1, len(trial.holds) + 1))
@@ -94,10 +92,10 @@ def _rates(axis: Axes, recording: Recording, trial: TrialAnalysis, limits: HoldC
 
 
 def _from_start(recording: Recording, hold: Hold, joint: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the time in the hold and the means over tenths of a second, less the first half second's."""
+    """Return time in the hold, and the joint's mean over each 0.1 s minus its mean over the first 0.5 s."""
     first, last = np.searchsorted(recording.time, (hold.start, hold.end))
     time = recording.time[first:last] - hold.start
-    edges = np.unique(np.searchsorted(time, np.arange(0.0, hold.duration, max(0.1, hold.duration / STRETCHES))))
+    edges = np.unique(np.searchsorted(time, np.arange(0.0, hold.duration, max(0.1, hold.duration / INTERVALS))))
     edges = edges[edges < len(time)]
     count = np.diff(np.append(edges, len(time)))
     mean = np.add.reduceat(recording.position[first:last, joint], edges, dtype=float) / count
@@ -105,10 +103,10 @@ def _from_start(recording: Recording, hold: Hold, joint: int) -> tuple[np.ndarra
 
 
 def _envelope(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a line through the least and the greatest value of each stretch of time."""
-    if len(time) <= 2 * STRETCHES:
+    """Return a line through the minimum and maximum of each interval."""
+    if len(time) <= 2 * INTERVALS:
         return time, values
-    edges = np.linspace(0, len(time), STRETCHES, endpoint=False).astype(int)
+    edges = np.linspace(0, len(time), INTERVALS, endpoint=False).astype(int)
     ends = np.stack([np.minimum.reduceat(values, edges), np.maximum.reduceat(values, edges)], axis=1)
     return np.repeat(time[edges], 2), ends.ravel()
 
@@ -139,6 +137,6 @@ def _plain(axis: Axes) -> None:
     axis.spines[["top", "right"]].set_visible(False)
     axis.spines[["left", "bottom"]].set_color(FAINT)
     axis.tick_params(color=FAINT, labelcolor=INK, labelsize=9)
-    axis.grid(axis="y", color="#D5DADF", lw=0.5)
+    axis.grid(axis="y", color=GRID_LINE, lw=0.5)
     axis.set_axisbelow(True)
     axis.margins(x=0)

@@ -1,4 +1,4 @@
-"""The report as one HTML page that needs nothing else: figures are embedded, so that it can be sent as it is."""
+"""The report as one self-contained HTML page, figures embedded."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 from exo_gravity.core.recording import Recording
 from exo_gravity.core.trial_analysis import TrialAnalysis
-from exo_gravity.tools.reporting.figures import JOINT_COLOURS
+from exo_gravity.tools.reporting.colours import JOINT_COLOURS
 from exo_gravity.tools.reporting.table import Row, hold_rows, joint_labels, motion_rows, per_minute, shown
 
 STYLE = """
@@ -38,7 +38,7 @@ HOLD_COLUMNS = (
     ("Pose<br>deg", "pose_deg", 1),
     ("Drift<br>deg/min", "drift_deg_per_min", 2),
     ("±<br>deg/min", "drift_uncertainty_deg_per_min", 2),
-    ("Drift in all<br>deg", "drift_deg", 2),
+    ("Total drift<br>deg", "drift_deg", 2),
     ("Within 10 s<br>deg", "stray_in_10_s_deg", 2),
     ("RMS velocity<br>deg/s", "rms_velocity_deg_per_s", 2),
     ("RMS torque<br>Nm", "rms_torque_nm", 2),
@@ -49,16 +49,17 @@ MOTION_COLUMNS = (
     ("Residual<br>deg", "residual_deg", 1),
     ("Peak speed<br>deg/s", "peak_speed_deg_per_s", 0),
 )
-LEGEND = """<b>Drift</b> is the slope of a robust line (Huber) through the hold, with its standard uncertainty, never
-less than one position code over the length of the hold. <b>Within 10 s</b> is the widest range of a joint in any 10 s.
-<b>RMS velocity</b> is as the motors report it: at rest half a velocity code, 0.6 to 0.7 deg/s, since they have none for
-zero. <b>Torque error</b> is the RMS of commanded less measured. <b>Residual</b> is the pose after a motion less the
-pose before it: feed-forward compensation has no stiffness, so a pushed arm stays where it was pushed. <b>Let down</b>
-is the way down under the motors' own damping, after a stop, a fault or the end: no hold, and no slip."""
+LEGEND = """<b>Drift</b> is the slope of a robust line (Huber) through the hold. Its uncertainty is at least one
+position code over the length of the hold. <b>Within 10 s</b> is the widest range of a joint in any 10 s.
+<b>RMS velocity</b> is as the motors report it: at rest half a velocity code, 0.6 to 0.7 deg/s, since no code stands for
+zero. <b>Torque error</b> is the RMS of commanded minus measured torque. <b>Residual</b> is the pose after a motion
+minus the pose before it: feed-forward compensation has no stiffness, so a pushed arm stays where it was pushed.
+<b>Let down</b> is the way down under the motors' own damping, after a stop, a fault or the end of the trial: neither a
+hold nor a slip."""
 
 
 def figure_html(png: bytes, caption: str) -> str:
-    """Return a figure with its picture inside."""
+    """Return a figure element with the PNG embedded."""
     data = base64.b64encode(png).decode()
     return (
         f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{data}">'
@@ -83,7 +84,7 @@ def arm_html(recording: Recording, trial: TrialAnalysis, figures: Iterable[str])
 
 
 def page_html(title: str, when: str, verdict: Sequence[str], sections: Iterable[str], ending: str) -> str:
-    """Return the page. verdict: what failed, empty if the arm held."""
+    """Return the page. when: the line below the title. verdict: the failures, empty if the arm held."""
     reasons = "".join(f"<li>{escape(sentence)}</li>" for sentence in verdict)
     banner = (
         f'<div class="verdict not"><b>It did not hold.</b><ul>{reasons}</ul></div>'
@@ -99,18 +100,19 @@ def page_html(title: str, when: str, verdict: Sequence[str], sections: Iterable[
 
 
 def list_html(heading: str, lines: Sequence[str]) -> str:
-    """Return a heading and a list, nothing if there are no lines."""
+    """Return a heading and a list, or '' if there are no lines."""
     return f"<h3>{heading}</h3><ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>" if lines else ""
 
 
 def parameters_html(parameters: dict[str, str]) -> str:
-    """Return the parameters of every node, folded, as YAML that can start it again."""
+    """Return the parameters of every node, collapsed, as a ROS 2 parameter file."""
     text = "\n".join(parameters[node].rstrip() for node in sorted(parameters))
     return f"<details><summary>Parameters at the start</summary><pre>{escape(text)}</pre></details>" if text else ""
 
 
 def _key(trial: TrialAnalysis, recording: Recording) -> str:
-    numbers = [(str(len(trial.holds)), "holds"), (f"{sum(h.duration for h in trial.holds):.0f} s", "held in all")]
+    """Return the key numbers: holds, their total time, the fastest drift."""
+    numbers = [(str(len(trial.holds)), "holds"), (f"{sum(h.duration for h in trial.holds):.0f} s", "total hold time")]
     if trial.holds:
         _, number, joint = max(
             (abs(rate), number, joint)
@@ -119,9 +121,10 @@ def _key(trial: TrialAnalysis, recording: Recording) -> str:
         )
         hold = trial.holds[number]
         rate, error = per_minute(hold.drift_rate[joint]), per_minute(hold.drift_rate_uncertainty[joint])
-        told = f"fastest drift: {joint_labels(recording)[joint]}, hold {number + 1}"
-        numbers.append((f"{shown(rate, 2)} ± {shown(error, 2)} deg/min", told))
-    return f'<div class="key">{"".join(f"<div><b>{n}</b>{escape(text)}</div>" for n, text in numbers)}</div>'
+        label = f"fastest drift: {joint_labels(recording)[joint]}, hold {number + 1}"
+        numbers.append((f"{shown(rate, 2)} ± {shown(error, 2)} deg/min", label))
+    cells = "".join(f"<div><b>{number}</b>{escape(label)}</div>" for number, label in numbers)
+    return f'<div class="key">{cells}</div>'
 
 
 def _table(key: str, labels: Sequence[str], rows: Iterable[Row], columns: Sequence[tuple[str, str, int]]) -> str:
@@ -135,7 +138,7 @@ def _table(key: str, labels: Sequence[str], rows: Iterable[Row], columns: Sequen
 
 
 def _group(rows: Sequence[Row], labels: Sequence[str], columns: Sequence[tuple[str, str, int]]) -> str:
-    """Return the rows of one hold or motion; what all joints share stands beside them once."""
+    """Return the rows of one hold or motion; cells that all joints share span them."""
     span = f'<td rowspan="{len(rows)}">'
     first: dict[str, Any] = rows[0]
     label = str(first["hold"]) if "hold" in first else escape(first["kind"])

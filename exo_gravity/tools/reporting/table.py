@@ -1,4 +1,4 @@
-"""The numbers of a report: rows for CSV and the page, and the tables on the terminal. Degrees here, radians inside."""
+"""The numbers of a report, in degrees: rows for the CSV files and the page, and the tables on the terminal."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from exo_gravity.core.recording import Recording
 from exo_gravity.core.trial_analysis import Hold, Motion, TrialAnalysis
 
 Row = dict[str, Any]
-SPARE_COLUMNS = ("v deg/s", "peak speed deg/s", "error Nm", "torque Nm", "at s", "deg in 10 s")  # the first goes first
+# Dropped in this order where the terminal is too narrow
+SPARE_COLUMNS = ("v deg/s", "peak speed deg/s", "error Nm", "torque Nm", "at s", "deg in 10 s")
 
 
 def degrees(values: np.ndarray | float) -> np.ndarray:
@@ -31,7 +32,7 @@ def per_minute(values: np.ndarray | float) -> np.ndarray:
 
 
 def joint_labels(recording: Recording) -> list[str]:
-    """Return the joints' names for a reader: without the arm's, and with spaces."""
+    """Return readable joint names: without the arm's name, with spaces."""
     return [name.removeprefix(f"{recording.name}_").replace("_", " ") for name in recording.joint_names]
 
 
@@ -75,7 +76,7 @@ def motion_rows(recording: Recording, trial: TrialAnalysis) -> Iterator[Row]:
 
 
 def write_csv(path: Path, rows: Iterable[Row]) -> None:
-    """Write rows with their names on top; an unknown number is left empty. No rows, no file."""
+    """Write rows with a header; an unknown number is an empty cell. Without rows no file is written."""
     rows = [{key: _csv_value(value) for key, value in row.items()} for row in rows]
     if rows:
         with path.open("w", newline="", encoding="utf-8") as file:
@@ -91,12 +92,12 @@ def _csv_value(value: Any) -> Any:
 
 
 def shown(value: float, digits: int) -> str:
-    """Return a number for a reader: a dash if unknown, and no minus before what rounds to 0."""
+    """Return a readable number: a dash if unknown, and no minus sign on a rounded 0."""
     return f"{round(float(value), digits) + 0.0:.{digits}f}" if math.isfinite(value) else "–"
 
 
 def print_tables(console: Console, recording: Recording, trial: TrialAnalysis) -> None:
-    """Print the holds and the motions of one arm, each cell with the four joints in order."""
+    """Print the holds and motions of one arm; a cell holds the four joints in order."""
     console.print(f"\n[bold]{recording.name}[/], joints in order: {', '.join(joint_labels(recording))}")
     if trial.holds:
         console.print(_table(_hold_columns(trial.holds), console.width))
@@ -131,13 +132,13 @@ def _push_columns(motions: Sequence[Motion]) -> dict[str, list[str]]:
 
 
 def _until_still(motion: Motion) -> str:
-    # Nobody asks that of an arm on its way down.
+    # An arm on its way down need not come to rest.
     known = math.isfinite(motion.until_still) or motion.kind == "let down"
     return shown(motion.until_still, 1) if known else "never"
 
 
 def _table(columns: dict[str, list[str]], width: int) -> Table:
-    """Return the columns as a table; on a narrow terminal without the ones that the files have room for."""
+    """Return the columns as a table; a narrow terminal drops `SPARE_COLUMNS`, which are in the CSV files."""
     for spare in SPARE_COLUMNS:
         if sum(2 + max(map(len, (head, *cells))) for head, cells in columns.items()) > width:
             columns.pop(spare, None)
@@ -150,7 +151,7 @@ def _table(columns: dict[str, list[str]], width: int) -> Table:
 
 
 def _fours(rows: Iterable[np.ndarray], digits: int) -> list[str]:
-    """Return one cell a row with its four numbers, each below the one of the row above."""
+    """Return one cell per row: its four numbers, aligned with those of the other rows."""
     texts = [[shown(value, digits) for value in row] for row in rows]
     width = max((len(text) for row in texts for text in row), default=0)
     return [" ".join(text.rjust(width) for text in row) for row in texts]

@@ -13,7 +13,7 @@ import yaml
 from rich.console import Console
 from rich.progress import Progress
 
-from exo_gravity.bag.reader import Bag, Event
+from exo_gravity.bag.content import Bag, Event
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.recording import Recording
 from exo_gravity.core.trial_script import TrialScript

@@ -1,0 +1,171 @@
+"""The report of a recorded trial: analysis and verdict of each arm, printed, and written as CSV, figures and a page."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from importlib.util import find_spec
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.markup import escape
+
+from exo_gravity.bag.content import Bag
+from exo_gravity.core.errors import DataError
+from exo_gravity.core.recording import Recording
+from exo_gravity.core.trial_analysis import MIN_HOLD, TrialAnalysis
+from exo_gravity.core.trial_analysis import analyse as analyse_arm
+from exo_gravity.core.verdict import HoldCriteria, failures
+from exo_gravity.tools.cli.extras import missing
+from exo_gravity.tools.reporting import page, table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+DPI = 150
+MAX_EVENTS = 200
+EARLY = 0.2  # s; can_bridge publishes its state every 0.1 s, so a shorter gap to the script's end means nothing
+TIMESTAMP = re.compile(r"_\d{8}_\d{6}$")  # which `trial` adds to the script's name
+CAPTIONS = {
+    "overview": "Positions, velocities and torques over time. Holds are shaded and numbered; dashes show the command.",
+    "drift": "Deviation of each joint from the start of each hold, and the drift of each hold with its uncertainty.",
+}
+
+
+@dataclass(frozen=True)
+class Report:
+    """A recording, the analysis of each arm, and the verdict.
+
+    failures: one sentence for each way in which an arm did not hold. notes: what limits the trust in the verdict.
+    """
+
+    bag: Bag
+    criteria: HoldCriteria
+    arms: tuple[tuple[Recording, TrialAnalysis], ...]
+    failures: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def exit_code(self) -> int:
+        """0: held. 1: did not hold. 2: some of the recording could not be read."""
+        return 2 if self.bag.problems else int(bool(self.failures))
+
+    @property
+    def title(self) -> str:
+        """Name of the trial, arms and date: 'demo, right arm, 2026-03-14'."""
+        path = self.bag.path.resolve()
+        # `trial` records into NAME_DATE_TIME/bag.
+        name = TIMESTAMP.sub("", path.parent.name if path.stem == "bag" else path.stem)
+        sides = " and ".join(recording.name for recording in self.bag.recordings)
+        arms = sides if sides == "arm" else f"{sides} arm{'s' if len(self.bag.recordings) > 1 else ''}"
+        return f"{name.replace('_', ' ')}, {arms}, {self.start:%Y-%m-%d}"
+
+    @property
+    def start(self) -> datetime:
+        """Start of the recording, local time."""
+        return datetime.fromtimestamp(self.bag.start / 1e9, timezone.utc).astimezone()
+
+
+def analyse(bag: Bag, criteria: HoldCriteria | None = None, min_hold: float = MIN_HOLD) -> Report:
+    """Return the report of a recording: holds of at least `min_hold` s, judged by `criteria`."""
+    criteria = criteria or HoldCriteria()
+    arms = tuple((recording, analyse_arm(recording, min_hold)) for recording in bag.recordings)
+    found = tuple(sentence for recording, analysis in arms for sentence in failures(recording, analysis, criteria))
+    return Report(bag, criteria, arms, found, (*bag.notes, *_reservations(bag)))
+
+
+def _reservations(bag: Bag) -> Iterator[str]:
+    """Yield what is missing, and what the report does instead."""
+    if not find_spec("matplotlib"):
+        yield f"no figures: {missing('matplotlib', 'report')}"
+    unscripted = [recording.name for recording in bag.recordings if not recording.steps]
+    if unscripted:
+        yield f"{', '.join(unscripted)}: the recording has no trial script: every still phase counts as a hold"
+    unknown = [recording.name for recording in bag.recordings if recording.carried is None]
+    if unknown:
+        names = ", ".join(unknown)
+        yield f"{names}: the recording does not show when the arm was carried: letting it down may count as a slip"
+    for recording in bag.recordings:
+        if recording.steps and recording.carried and recording.steps[-1].end > recording.carried[-1][1] + EARLY:
+            end = f"{recording.carried[-1][1]:.1f} s"
+            yield f"{recording.name}: let down at {end}, before the script ended: only the time until then counts"
+
+
+def write(report: Report, folder: str | Path) -> list[Path]:
+    """Write holds.csv, motions.csv, a PNG of each figure and report.html into `folder`; return the files.
+
+    Without matplotlib the figures are left out. Raises DataError if the folder can't be written.
+    """
+    folder = Path(folder)
+    sections = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for kind, rows in (("holds", table.hold_rows), ("motions", table.motion_rows)):
+            table.write_csv(folder / f"{kind}.csv", (row for arm in report.arms for row in rows(*arm)))
+        for recording, analysis in report.arms:
+            pictures = []
+            for kind, figure in _figures(report, recording, analysis).items():
+                png = _png(figure)
+                (folder / f"{recording.name.replace('/', '_')}_{kind}.png").write_bytes(png)
+                pictures.append(page.figure_html(png, CAPTIONS[kind]))
+            sections.append(page.arm_html(recording, analysis, pictures))
+        (folder / "report.html").write_text(_page(report, sections), encoding="utf-8")
+    except OSError as error:
+        raise DataError(f"{folder}: cannot write the report there ({error.strerror})") from None
+    return sorted(path for path in folder.iterdir() if path.suffix in (".csv", ".png", ".html"))
+
+
+def print_report(report: Report, console: Console | None = None) -> None:
+    """Print the tables, the notes and the verdict."""
+    console = console or report_console()
+    for recording, analysis in report.arms:
+        table.print_tables(console, recording, analysis)
+    for note in report.notes:
+        console.print(f"[yellow]Note:[/] {escape(note)}.")
+    for problem in report.bag.problems:
+        console.print(f"[red]Not reported:[/] {escape(problem)}.")
+    for sentence in report.failures:
+        console.print(f"[red]{escape(sentence)}.[/]")
+    held = "It held, as far as the recording could be read." if report.bag.problems else "It held."
+    console.print("[red bold]It did not hold.[/]" if report.failures else f"[green bold]{held}[/]")
+
+
+def report_console() -> Console:
+    """Return a console for standard output; in a log or a pipe it is wide enough for the tables."""
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=140)
+
+
+def _figures(report: Report, recording: Recording, analysis: TrialAnalysis) -> dict[str, Figure]:
+    if not find_spec("matplotlib"):
+        return {}
+    from exo_gravity.tools.reporting import figures
+
+    drawn = {"overview": figures.overview(recording, analysis)}
+    if analysis.holds:
+        drawn["drift"] = figures.drift(recording, analysis, report.criteria)
+    return drawn
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI)
+    return buffer.getvalue()
+
+
+def _page(report: Report, sections: Sequence[str]) -> str:
+    bag = report.bag
+    length = max((float(recording.time[-1]) for recording in bag.recordings), default=0.0)
+    events = [f"{table.shown(event.time, 1)} s  {event.text}" for event in bag.events]
+    more = [f"and {len(events) - MAX_EVENTS} more"] if len(events) > MAX_EVENTS else []
+    ending = (
+        page.list_html("Notes", [*bag.problems, *report.notes])
+        + page.list_html("Faults and changed parameters", events[:MAX_EVENTS] + more)
+        + page.parameters_html(bag.parameters)
+    )
+    when = f"{report.start:%Y-%m-%d %H:%M:%S}, {length:.0f} s, {bag.path}"
+    return page.page_html(report.title, when, report.failures, sections, ending)
