@@ -17,11 +17,11 @@ from rosbags.typesys import Stores, get_typestore
 from bench.table import Row
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.core.trial_script import TrialScript
-from exo_gravity.tools import report
 from exo_gravity.tools.anfis.data import from_gravload
 from exo_gravity.tools.anfis.training import train_law
 from exo_gravity.tools.inputs.arms import configured_arm
 from exo_gravity.tools.inputs.parameter_file import packaged_config
+from exo_gravity.tools.reporting import trial_report
 from exo_gravity.tools.trials.offline import run_offline, simulated_trials
 
 TRAINING_LIMIT = 10.0  # s that somebody waits before a terminal without wondering
@@ -101,7 +101,7 @@ def _recording(path: Path, seconds: int) -> Path:
 
 
 def _report(bag: Path, folder: Path) -> None:
-    report.write(report.analyse(read_bag(bag)), folder)
+    trial_report.write(trial_report.analyse(read_bag(bag)), folder)
 
 
 def _read_all(bag: Path) -> None:
