@@ -1,4 +1,4 @@
-"""The parameters of `can_bridge`, `compensator`, `imu` and `recorder`, and the limits, motors and settings that their values describe."""
+"""The parameters of `can_bridge`, `compensator`, `imu` and `recorder`, and the objects built from their values."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from exo_gravity.core.param_table import Param, param_of, params_of
 from exo_gravity.core.tilt import SIDES
 from exo_gravity.core.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
 
-OPTIONS = "can.options"  # everything below this prefix is passed to python-can unchanged
+OPTIONS = "can.options"  # parameters below this prefix go to python-can unchanged
 
 JOINT_NAMES = Param(
     "joint_names",
@@ -26,10 +26,10 @@ JOINT_NAMES = Param(
 )
 # fmt: off
 REAL_TIME_PARAMETERS = (
-    Param("thread_priority", 0, "SCHED_FIFO priority of the control loop's threads; 0: none", (0, 99), fixed=True),
-    Param("lock_memory", False, "lock the process's memory (mlockall), where permitted", fixed=True),
+    Param("thread_priority", 0, "SCHED_FIFO priority of the control loop's threads; 0 for none", (0, 99), fixed=True),
+    Param("lock_memory", False, "lock the process's memory (mlockall) if permitted", fixed=True),
 )
-# `can_bridge` believes these values of its motors; for `simulator` they are the truth.
+# `can_bridge` assumes these properties of its motors; `simulator` builds motors that have them.
 MOTOR_PARAMETERS = (
     Param("can.interface", "", "python-can interface, e.g. socketcan, udp_multicast", fixed=True, required=True),
     Param("can.channel", "", "python-can channel, e.g. can0", fixed=True, required=True),
@@ -37,7 +37,7 @@ MOTOR_PARAMETERS = (
     Param("can_id", [1, 2, 3, 4], "CAN IDs", (1, MAX_CAN_ID), fixed=True),
     Param("direction", [1, 1, 1, 1], "1 or -1: joint angle = direction * (motor angle - zero)", (-1, 1), fixed=True),
     Param("zero", [0.0] * 4, "motor angle at which the joint angle is 0", (-12.5, 12.5), "rad", fixed=True),
-    Param("torque_scale", [1.0] * 4, "real torque per commanded Nm", TORQUE_SCALE_BOUNDS, fixed=True),
+    Param("torque_scale", [1.0] * 4, "real output torque per commanded Nm", TORQUE_SCALE_BOUNDS, fixed=True),
     Param("velocity_range", [45.0, 50.0, 45.0, 45.0], "velocity range of the firmware's wire format",
           WIRE_RANGE_BOUNDS, "rad/s", fixed=True),
     Param("torque_range", [15.0, 18.0, 15.0, 15.0], "torque range of the firmware's wire format",
@@ -46,15 +46,15 @@ MOTOR_PARAMETERS = (
 LIMIT_PARAMETERS = params_of(Limits, fixed=True)
 CAN_BRIDGE = (
     JOINT_NAMES,
-    Param("autostart", True, "configure and activate at start, without an operator", fixed=True),
-    Param("rate", 250.0, "control cycles per second; what does not fit on the wire is refused", (20.0, 2000.0), "Hz",
+    Param("autostart", True, "configure and activate at start without an operator", fixed=True),
+    Param("rate", 250.0, "control cycles per second, as far as the CAN bus allows", (20.0, 2000.0), "Hz",
           fixed=True),
     *MOTOR_PARAMETERS,
     *LIMIT_PARAMETERS,
     *REAL_TIME_PARAMETERS,
 )
 COMPENSATOR = (
-    Param("side", "right", "which arm; the right arm mirrors the left", choices=SIDES, fixed=True),
+    Param("side", "right", "side of the arm; the right arm mirrors the left", choices=SIDES, fixed=True),
     JOINT_NAMES,
     Param("link_length", [0.05, 0.13, 0.30, 0.30], "l_n, link lengths", (0.0, MAX_LENGTH), "m", fixed=True),
     param_of(Settings, "law"),
@@ -65,9 +65,9 @@ COMPENSATOR = (
     Param("gravity", STANDARD_GRAVITY, "g, acceleration of gravity", (0.0, MAX_GRAVITY), "m/s^2"),
     Param("robot.mass", [0.585, 0.468, 0.598, 0.203], "m_n, link masses", (0.0, MAX_MASS), "kg"),
     Param("robot.cog", [0.046, 0.113, 0.237, 0.128], "d_n, centre of gravity from joint n", (0.0, MAX_LENGTH), "m"),
-    Param("wearer.mass", [0.0, 0.0, 0.0, 0.0], "the wearer's mass on each link", (0.0, MAX_MASS), "kg"),
-    Param("wearer.cog", [0.0, 0.0, 0.0, 0.0], "its centre of gravity from joint n", (0.0, MAX_LENGTH), "m"),
-    Param("wearer.body_mass", 0.0, "body mass; fills wearer.mass and wearer.cog where they are 0", (0.0, 300.0), "kg"),
+    Param("wearer.mass", [0.0, 0.0, 0.0, 0.0], "mass of the wearer's arm on each link", (0.0, MAX_MASS), "kg"),
+    Param("wearer.cog", [0.0, 0.0, 0.0, 0.0], "centre of gravity of that mass from joint n", (0.0, MAX_LENGTH), "m"),
+    Param("wearer.body_mass", 0.0, "body mass; computes wearer.mass and wearer.cog if these are 0", (0.0, 300.0), "kg"),
     Param("wearer.sex", "male", "selects the column of the segment table", choices=SEX),
     Param("wearer.table", "de_leva", "table of segment masses and centres of gravity", choices=tuple(TABLES)),
     Param("wearer.segment_length", list(TYPICAL_LENGTH), "upper arm, forearm, hand", (0.0, 0.6), "m"),
@@ -75,17 +75,17 @@ COMPENSATOR = (
     param_of(Settings, "max_effort"),
     param_of(Settings, "max_effort_rate"),
     param_of(Settings, "transition_time"),
-    Param("use_imu", True, "false: the trunk counts as upright (the paper's seated wearer)", fixed=True),
+    Param("use_imu", True, "false assumes an upright trunk (the paper's seated wearer)", fixed=True),
     param_of(Settings, "tilt_timeout"),
     *REAL_TIME_PARAMETERS,
 )
 IMU = (
     Param("input_topic", "/imu/data_raw", "topic of the IMU driver's sensor_msgs/Imu", fixed=True),
-    # No rotation is a safe default: four zeros are not a rotation, and are refused.
+    # No rotation would be a safe default. Four zeros are not a rotation, so the node rejects them.
     Param("rotation_trunk_from_imu", [0.0] * 4, "mounting of the IMU, unit quaternion x, y, z, w; required",
           (-1.0, 1.0), fixed=True),
     Param("rate", 100.0, "approximate sample rate of the IMU", (20.0, 2000.0), "Hz", fixed=True),
-    Param("timeout", 0.1, "silence of the IMU that is an error", (0.02, 1.0), "s", fixed=True),
+    Param("timeout", 0.1, "time without IMU data that counts as an error", (0.02, 1.0), "s", fixed=True),
 )
 RECORDER = (
     Param("output", "", "new folder for the recording", fixed=True, required=True),
@@ -116,7 +116,7 @@ def limits_of(values: Mapping[str, Any]) -> Limits:
 def settings_of(values: Mapping[str, Any], anfis: AnfisLaw | None = None) -> Settings:
     """Return the settings that `compensator`'s parameter values describe, or raise ParameterError.
 
-    anfis: the model in `anfis_file`, if one is named.
+    anfis: the model in `anfis_file`, or None if no file is given.
     """
     try:
         robot = ArmModel(
@@ -139,11 +139,12 @@ def settings_of(values: Mapping[str, Any], anfis: AnfisLaw | None = None) -> Set
 
 
 def wearer_of(values: Mapping[str, Any]) -> tuple[Sequence[float], Sequence[float]]:
-    """Return mass and centre of gravity (4,) of the wearer on each link; explicit ones win over the table's."""
+    """Return mass and centre of gravity (4,) of the wearer on each link; explicit values override the table's."""
     if any(values["wearer.mass"]) or not values["wearer.body_mass"]:
         return values["wearer.mass"], values["wearer.cog"]
     person = {name: values[f"wearer.{name}"] for name in ("body_mass", "sex", "table", "segment_length")}
     try:
-        return Wearer(**person).on_links(values["link_length"])
+        load = Wearer(**person).on_links(values["link_length"])
     except ParameterError as error:
         raise ParameterError(f"wearer.{error.name}", error.value, error.expected) from None
+    return load.mass.tolist(), load.cog.tolist()

@@ -1,28 +1,28 @@
-"""Every error that the package raises on purpose.
+"""The errors that the package raises.
 
     ExoGravityError
-    ├── ParameterError    a parameter or argument is impossible; nothing was changed
-    ├── FrameError        bytes that an AK motor does not send or must not get
-    ├── BusError          the CAN bus can't be opened, or failed
-    └── DataError         a recording or a file does not hold what was asked of it
+    ├── ParameterError    a parameter or argument is invalid; nothing was changed
+    ├── FrameError        bytes are not a valid frame of an AK motor
+    ├── BusError          the CAN bus cannot be opened, or has failed
+    └── DataError         a recording or a model file is missing, truncated or invalid
 
-The message of each names the thing, its value and what would be right.
+Each message names the item, its value and what would be valid.
 """
 
 from __future__ import annotations
 
 
 class ExoGravityError(Exception):
-    """Base of all errors below: catch it to catch what the package foresees."""
+    """Base class of all errors below."""
 
 
 class ParameterError(ExoGravityError, ValueError):
-    """A parameter is impossible.
+    """A parameter or argument is invalid.
 
-    Attributes: `name` of the parameter, the `value` refused, and `expected`, what would be right.
+    Attributes: `name` of the parameter, the rejected `value`, and `expected`, a description of valid values.
     """
 
-    def __init__(self, name: str, value: object, expected: str):
+    def __init__(self, name: str, value: object, expected: str) -> None:
         super().__init__(f"{name} = {_shown(value)}: must be {expected}")
         self.name = name
         self.value = value
@@ -30,19 +30,19 @@ class ParameterError(ExoGravityError, ValueError):
 
 
 class FrameError(ExoGravityError, ValueError):
-    """Bytes are not the frame they should be. Attribute: `data`, the bytes."""
+    """Bytes are not a valid frame. Attribute: `data`, the bytes."""
 
-    def __init__(self, data: bytes, expected: str):
+    def __init__(self, data: bytes, expected: str) -> None:
         super().__init__(f"frame [{bytes(data).hex(' ')}]: must be {expected}")
         self.data = bytes(data)
 
 
 class BusError(ExoGravityError):
-    """The CAN bus can't be opened, or sending or receiving on it failed."""
+    """The CAN bus cannot be opened, or sending or receiving on it failed."""
 
 
 class DataError(ExoGravityError):
-    """A recording or a model file is missing, cut short, or lacks what was asked of it."""
+    """A recording or a model file is missing, truncated or invalid."""
 
 
 def _shown(value: object) -> str:

@@ -1,4 +1,4 @@
-"""Every reason for which a worn arm is let down or not carried: one code for programs, one sentence for people."""
+"""The faults that let a worn arm down or keep it from being enabled: a code for programs, a sentence for people."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 
 class FaultCode(str, Enum):
-    """A fault's code, as on /diagnostics; `meaning` says what it stands for.
+    """The code of a fault, as published on /diagnostics; `meaning` explains it.
 
-    Each one latches: the arm is let down, or stays off, until the operator clears the fault.
+    Every fault latches: the arm is let down, or stays off, until the operator clears the fault.
     """
 
     meaning: str
@@ -30,7 +30,7 @@ class FaultCode(str, Enum):
     # The motion
     OVER_SPEED = "over_speed", "a joint turns faster than `max_velocity`"
     OUTSIDE_LIMITS = "outside_limits", "a joint is more than 0.1 rad beyond `position_min` or `position_max`"
-    POSITION_JUMP = "position_jump", "an angle changed by more than `max_velocity` and 0.05 rad explain"
+    POSITION_JUMP = "position_jump", "an angle changed by over 0.05 rad more than `max_velocity` allows"
     # The start gate
     IMPLAUSIBLE_ZERO = "implausible_zero", "a joint is not within `home_tolerance` of `home` at the first start"
     WRONG_SIGN = "wrong_sign", "a joint moved against a small test torque at the first start"

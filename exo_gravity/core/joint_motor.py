@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors import MotorReply, MotorSpec, pack_command, standstill, unpack_reply
 
-# The first byte of a reply is the motor's ID; that of our commands, whose position is always 0, is 0x7f or 0x80. With
-# IDs below 0x7f a bus that echoes cannot make a command look like a reply.
+# The first byte of a reply is the motor's ID. The first byte of our commands is 0x7f or 0x80, because their position is
+# always 0. With IDs below 0x7f a command echoed by the bus cannot look like a reply.
 MAX_CAN_ID = 126
 TORQUE_SCALE_BOUNDS = (0.2, 2.0)
 
@@ -19,7 +19,7 @@ class JointMotor:
     """One motor on one joint.
 
     can_id: 1..MAX_CAN_ID. direction: +1 or -1; joint angle = direction * (motor angle - zero). zero: motor angle in rad
-    at which the joint angle is 0. torque_scale: real output torque per commanded Nm (0.75 is reported for one AK80-9).
+    at which the joint angle is 0. torque_scale: real output torque per commanded Nm (users report 0.75 for one AK80-9).
     Raises ParameterError.
     """
 
@@ -36,25 +36,25 @@ class JointMotor:
             raise ParameterError("direction", self.direction, "1 or -1")
         if not abs(self.zero) <= self.spec.position_range - math.pi:
             limit = self.spec.position_range - math.pi
-            raise ParameterError("zero", self.zero, f"from {-limit:.2f} to {limit:.2f} rad, or the angle wraps")
+            raise ParameterError("zero", self.zero, f"from {-limit:.2f} to {limit:.2f} rad, or the angle would wrap")
         low, high = TORQUE_SCALE_BOUNDS
         if not low <= self.torque_scale <= high:
             raise ParameterError("torque_scale", self.torque_scale, f"from {low:g} to {high:g}")
 
     def command(self, effort: float, damping: float) -> bytes:
-        """Return the frame for a joint `effort` in Nm and a `damping` in Nm s/rad, clamped to the wire.
+        """Return the frame for a joint `effort` in Nm and a `damping` in Nm s/rad; the torque is clamped to its range.
 
         Raises ParameterError on NaN or infinity.
         """
         torque = self.direction * effort / self.torque_scale
-        if damping:  # no code is exactly 0 rad/s: the nearest one would push with damping times its velocity
+        if damping:  # No code is exactly 0 rad/s. Without this term the nearest one adds damping times its velocity.
             torque -= damping * standstill(self.spec)
         if math.isfinite(torque) and abs(torque) > self.spec.torque_range:
             torque = math.copysign(self.spec.torque_range, torque)
         return pack_command(self.spec, 0.0, 0.0, 0.0, damping, torque)
 
     def joint_reply(self, data: bytes) -> MotorReply:
-        """Return a reply's bytes in the joint's rad, rad/s and Nm. Raises FrameError."""
+        """Return the content of a reply in the joint's rad, rad/s and Nm. Raises FrameError."""
         reply = unpack_reply(self.spec, data)
         return MotorReply(
             reply.motor_id,
@@ -74,5 +74,5 @@ class JointMotor:
         return self.direction * joint_position + self.zero
 
     def joint_effort(self, motor_torque: float) -> float:
-        """Return the joint torque in Nm for a torque in the motor's own Nm."""
+        """Return the joint torque in Nm for a torque in the motor's Nm."""
         return self.direction * motor_torque * self.torque_scale

@@ -22,9 +22,9 @@ MAX_COMMAND = 40.0  # Nm: no arm needs half of it, so a larger effort command is
 PEAK_TORQUE = max(spec.peak_torque for spec in MOTORS.values())  # Nm
 WALL_WIDTH = 0.1  # rad before a joint limit, as in crisp_controllers
 WALL_TORQUE = 5.0  # Nm at the joint limit
-OVERSHOOT = 0.1  # rad past a joint limit that is not yet a fault: mechanical stops are not infinitely stiff
+OVERSHOOT = 0.1  # rad past a joint limit that is not yet a fault, because mechanical stops are not infinitely stiff
 DERATING = 10.0  # degC below max_temperature over which the permitted torque falls to half
-JUMP = 0.05  # rad between two readings, beyond what max_velocity explains
+JUMP = 0.05  # rad that two readings may differ by in addition to what max_velocity allows
 
 
 class JointSample(NamedTuple):
@@ -43,24 +43,24 @@ UNKNOWN = JointSample(math.nan, math.nan, math.nan, None, None, -math.inf)
 
 @dataclass(frozen=True)
 class Limits:
-    """The limits that the worn arm must never exceed: one entry per joint (4,), or one number for all.
+    """The limits that the worn arm must never exceed: one entry per joint (4,), or one number for all joints.
 
-    `joint_names` aside, the fields are parameters of `can_bridge`. A single encoder's zero may be off by whole turns of
-    the motor (60 degrees of an AK60-6, 40 of an AK80-9): the defaults of `home_tolerance` are below half of that.
-    Raises ParameterError that names the offending value.
+    All fields except `joint_names` are parameters of `can_bridge`. The zero of a motor with a single encoder may be off
+    by whole turns of the rotor (60 degrees of an AK60-6's output, 40 of an AK80-9's): the defaults of `home_tolerance`
+    are below half of that. Raises ParameterError that names the invalid value.
     """
 
     joint_names: tuple[str, ...]
     position_min: Sequence[float] = owned((-1.65, -0.17, -0.78, -0.17), "lower joint limits", (-3.15, 3.15), "rad")
     position_max: Sequence[float] = owned((1.65, 3.14, 2.53, 3.14), "upper joint limits", (-3.15, 3.15), "rad")
-    max_velocity: Sequence[float] = owned((5.0, 5.0, 5.0, 6.0), "joint speed that is a fault", (0.1, 20.0), "rad/s")
+    max_velocity: Sequence[float] = owned((5.0, 5.0, 5.0, 6.0), "joint speed that trips a fault", (0.1, 20.0), "rad/s")
     max_effort: Sequence[float] = owned(
         (3.0, 9.0, 3.0, 3.0), "torque limit, by default the motors' rated torque", (0.0, PEAK_TORQUE), "Nm"
     )
     max_effort_rate: float = owned(50.0, "fastest change of torque", (1.0, 1000.0), "Nm/s")
-    max_temperature: float = owned(80.0, "motor temperature that is a fault", (30.0, 120.0), "degC")
-    command_timeout: float = owned(0.05, "age of effort commands that is a fault", (0.01, 0.1), "s")
-    reply_timeout: float = owned(0.05, "silence of a motor that is a fault", (0.01, 0.1), "s")
+    max_temperature: float = owned(80.0, "motor temperature that trips a fault", (30.0, 120.0), "degC")
+    command_timeout: float = owned(0.05, "age of effort commands that trips a fault", (0.01, 0.1), "s")
+    reply_timeout: float = owned(0.05, "time without a reply from a motor that trips a fault", (0.01, 0.1), "s")
     ramp_time: float = owned(1.0, "time from zero to full torque when the arm is enabled", (0.5, 30.0), "s")
     fade_time: float = owned(2.0, "time from full to zero torque when the arm is let down", (0.5, 30.0), "s")
     damping: float = owned(5.0, "motor-side damping (kd) while the arm is let down", (0.5, 5.0), "Nm s/rad")
@@ -68,7 +68,7 @@ class Limits:
     home_tolerance: Sequence[float] = owned(
         (0.5, 0.34, 0.5, 0.5), "largest distance from home at the first start", (0.01, 6.3), "rad"
     )
-    sign_check_torque: float = owned(1.5, "largest test torque of the sign check; 0: no check", (0.0, 3.0), "Nm")
+    sign_check_torque: float = owned(1.5, "largest test torque of the sign check; 0 skips the check", (0.0, 3.0), "Nm")
 
     def __post_init__(self) -> None:
         if len(set(self.joint_names)) != JOINT_COUNT or not all(self.joint_names):
@@ -79,15 +79,15 @@ class Limits:
             raise ParameterError("position_max", list(self.position_max), expected)
 
     def is_silent(self, now: float, joint: JointSample) -> bool:
-        """Return whether the reading `joint` is so old at `now` (s) that its motor counts as silent."""
+        """Return whether the motor counts as silent: its reading `joint` is older than `reply_timeout` at `now` (s)."""
         return not now - joint.time <= self.reply_timeout
 
     def find_fault(
         self, now: float, joints: Sequence[JointSample], before: Sequence[JointSample], overshoot: float = OVERSHOOT
     ) -> Fault | None:
-        """Return the first fault in the readings `joints` at `now`, given those `before` them, or None.
+        """Return the first fault in the readings `joints` at `now` (s), or None.
 
-        overshoot: rad past a joint limit that is not yet a fault.
+        before: the previous readings. overshoot: rad past a joint limit that is not yet a fault.
         """
         for i, (joint, last) in enumerate(zip(joints, before, strict=True)):
             fault = self._motor_fault(now, i, joint) or self._motion_fault(i, joint, last, overshoot)
@@ -115,20 +115,20 @@ class Limits:
         if not low - overshoot <= joint.position <= high + overshoot:
             reason = f"{name}: {joint.position:.3f} rad, the limits are {low:g} to {high:g}"
             return Fault(FaultCode.OUTSIDE_LIMITS, reason)
-        # False while `last` is UNKNOWN.
+        # This is False while `last` is UNKNOWN.
         if abs(joint.position - last.position) > JUMP + limit * (joint.time - last.time):
             reason = f"{name}: from {last.position:.3f} to {joint.position:.3f} rad in one step"
             return Fault(FaultCode.POSITION_JUMP, reason)
         return None
 
     def find_wrong_zero(self, joints: Sequence[JointSample]) -> Fault | None:
-        """Return the fault of an arm that should hang at `home` but reports another pose, or None."""
+        """Return the fault of the first joint that is not near `home`, where the arm must hang, or None."""
         columns = (self.joint_names, joints, self.home, self.home_tolerance)
         for name, joint, home, tolerance in zip(*columns, strict=True):
             if not abs(joint.position - home) <= tolerance:
                 reason = (
                     f"{name}: {joint.position:.3f} rad at the start, must be within {tolerance:g} of home = {home:g}: "
-                    "let the arm hang, or correct its zero"
+                    "let the arm hang, or correct the parameter zero"
                 )
                 return Fault(FaultCode.IMPLAUSIBLE_ZERO, reason)
         return None
@@ -138,8 +138,8 @@ class Limits:
     ) -> tuple[tuple[float, ...], set[str]]:
         """Return the limited torque (4,) in Nm, and the names of the limits that acted.
 
-        effort: (4,) Nm, requested. share: 0..1, the part of effort and soft wall that is applied while the arm ramps
-        in. before: (4,) Nm applied `dt` s ago. Raises ParameterError where an effort is NaN or beyond MAX_COMMAND.
+        effort: (4,) Nm, requested. share: 0..1, the ramp's factor on effort and soft wall. before: (4,) Nm, applied
+        `dt` s ago. Raises ParameterError if an effort is NaN or beyond MAX_COMMAND.
         """
         step = self.max_effort_rate * dt
         shaped, acted = [], set()

@@ -1,15 +1,16 @@
-"""AK60-6 and AK80-9: their physical limits, and the frames of their MIT mode on V1 and V2 boards.
+"""The AK60-6 and AK80-9 motors: physical limits, and the frames of MIT mode on V1 and V2 boards.
 
 Command, 8 bytes, a big-endian bit stream, arbitration ID = motor ID (CubeMars driver manual V1.0.15, "MIT mode"):
 
     position 16 | velocity 12 | kp 12 | kd 12 | torque 12        tau = kp (p - p_motor) + kd (v - v_motor) + torque
 
-Reply, 6 bytes, or 8 on newer firmware, arbitration ID = the motor's own or the master's (0):
+Reply, 6 bytes, or 8 on newer firmware, arbitration ID = the motor's ID or the master's (0):
 
     motor ID 8 | position 16 | velocity 12 | torque 12 | temperature + 40 8 | error 8
 
-All on the output side of the gear. A field of b bits spans its range with 2^b - 1 steps, rounded to the nearest: the
-manual's own 2^b overflows at the maximum, and truncation turns 0 Nm into a push. No code is exactly 0 Nm.
+All values refer to the output side of the gear. A field of b bits divides its range into 2^b - 1 steps, and values are
+rounded to the nearest step: the manual's 2^b overflows at the maximum, and truncation would turn 0 Nm into a push. No
+code is exactly 0 Nm.
 """
 
 from __future__ import annotations
@@ -39,10 +40,11 @@ MOTOR_ERRORS = {
 
 @dataclass(frozen=True)
 class MotorSpec:
-    """A motor type: wire ranges of its firmware (each symmetric about 0), and its physical limits.
+    """A motor type: the ranges of its wire format, which are not physical limits, and its physical limits.
 
-    position_range rad, velocity_range rad/s, torque_range Nm, kp_max Nm/rad, kd_max Nm s/rad: what the wire codes span.
-    rated_torque, peak_torque: Nm at the output. gear_ratio. A wire range is not a physical limit.
+    position_range rad, velocity_range rad/s, torque_range Nm: the wire range is +- this value. kp_max Nm/rad, kd_max
+    Nm s/rad: the wire range starts at 0. rated_torque, peak_torque: Nm at the output. gear_ratio: motor turns per turn
+    of the output.
     """
 
     name: str
@@ -56,7 +58,7 @@ class MotorSpec:
     kd_max: float = 5.0
 
     def with_ranges(self, velocity_range: float, torque_range: float) -> MotorSpec:
-        """Return this motor with another firmware's velocity range (rad/s) and torque range (Nm). No bus query gives them."""
+        """Return this motor with another firmware's wire ranges in rad/s and Nm, which no CAN message reports."""
         for name, value in (("velocity_range", velocity_range), ("torque_range", torque_range)):
             low, high = WIRE_RANGE_BOUNDS
             if not low <= value <= high:
@@ -95,7 +97,7 @@ class MotorReply(NamedTuple):
 
 
 def pack_command(spec: MotorSpec, position: float, velocity: float, kp: float, kd: float, torque: float) -> bytes:
-    """Return the 8 bytes of a command; never those of a special frame.
+    """Return the 8 bytes of a command, which are never those of a special frame.
 
     position rad, velocity rad/s, kp 0..500 Nm/rad, kd 0..5 Nm s/rad, torque Nm. Raises ParameterError on NaN, infinity
     or a value outside the spec's range.
@@ -108,7 +110,7 @@ def pack_command(spec: MotorSpec, position: float, velocity: float, kp: float, k
         | _code("torque", torque, -spec.torque_range, spec.torque_range, 0xFFF)
     )
     data = word.to_bytes(8, "big")
-    # With all other fields at their maximum, the top torque codes are ENTER, EXIT and SET_ZERO: send one code less.
+    # With all other fields at their maximum, the top torque codes spell ENTER, EXIT or SET_ZERO. Send the code below.
     return data if data not in SPECIAL_FRAMES else data[:7] + b"\xfb"
 
 
@@ -135,7 +137,7 @@ def pack_reply(
     temperature: int | None = None,
     error: int | None = None,
 ) -> bytes:
-    """Return the bytes of a reply: 8 of them, or 6 without `temperature` (degC, -40..215) and `error` (0..255).
+    """Return the bytes of a reply: 8, or 6 without `temperature` (degC, -40..215) and `error` (0..255).
 
     Raises ParameterError on NaN, infinity or a value outside the spec's range.
     """
@@ -167,13 +169,13 @@ def unpack_reply(spec: MotorSpec, data: bytes) -> MotorReply:
 
 
 def standstill(spec: MotorSpec) -> float:
-    """Return the velocity in rad/s that a motor decodes when 0 is sent."""
+    """Return the velocity in rad/s that a motor decodes from a command of 0 rad/s."""
     span = spec.velocity_range
     return _value(_code("velocity", 0.0, -span, span, 0xFFF), -span, span, 0xFFF)
 
 
 def _code(name: str, value: float, low: float, high: float, codes: int) -> int:
-    if not low <= value <= high:  # NaN fails this too
+    if not low <= value <= high:  # rejects NaN too
         raise ParameterError(name, value, f"from {low:g} to {high:g}")
     return round((value - low) * (codes / (high - low)))
 
@@ -182,7 +184,7 @@ def _value(code: int, low: float, high: float, codes: int) -> float:
     return low + code * ((high - low) / codes)
 
 
-def _whole(name: str, value: int, low: int, high: int) -> int:
+def _whole(name: str, value: int | None, low: int, high: int) -> int:
     if not isinstance(value, int) or not low <= value <= high:
         raise ParameterError(name, value, f"a whole number from {low} to {high}")
     return value

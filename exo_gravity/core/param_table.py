@@ -1,8 +1,8 @@
-"""Parameters: one table for each node, and the check of each given value against it.
+"""Parameters: a table for each node, and the check of given values against it.
 
-A name that is not in the table is refused: a misspelt safety limit must not silently keep its default. Where a frozen
-dataclass uses a parameter, the dataclass owns its default, bounds, unit and description (`owned`), and the table takes
-them from there (`param_of`). Rules that relate several values are checked by those dataclasses.
+A name that is not in the table is an error, because a misspelt safety limit must not silently keep its default. If a
+frozen dataclass uses a parameter, the dataclass owns its default, bounds, unit and description (`owned`) and the table
+takes them from there (`param_of`). These dataclasses also check the rules that relate several values.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from typing import Any
 from exo_gravity.core.arm import four_floats, one_float
 from exo_gravity.core.errors import ParameterError
 
-# ROS declares these on every node, and `ros2 param dump` writes them.
+# ROS declares these on every node, and `ros2 param dump` writes them to files.
 ROS_PARAMETERS = ("use_sim_time", "start_type_description_service")
 ROS_QOS_PREFIX = "qos_overrides."
-KINDS = {float: "number", int: "whole number", str: "text", bool: "true or false"}
+KINDS = {float: "number", int: "whole number", str: "string", bool: "true or false"}
 
 
 @dataclass(frozen=True)
 class Param:
     """One parameter. The type of `default` is the parameter's type.
 
-    unit: of the value, '' for none. bounds: lowest and highest value, also of each number in a list. fixed: read-only
-    once the node runs. required: the user must give a non-empty value.
+    unit: '' for none. bounds: lowest and highest value, also for each number in a list. fixed: read-only while the
+    node runs. required: the user must give a non-empty value.
     """
 
     name: str
@@ -38,9 +38,9 @@ class Param:
     required: bool = False
 
     def check(self, value: Any) -> Any:
-        """Return `value` in this parameter's type, whole numbers as floats where floats are wanted.
+        """Return `value` in this parameter's type; an integer is converted if the type is float.
 
-        Raises ParameterError where the type, the length of a list, or a value is wrong.
+        Raises ParameterError if the type, the length of a list or a value is wrong.
         """
         is_list = isinstance(value, Sequence) and not isinstance(value, str)
         items, kind = list(value) if is_list else [value], type(self.default)
@@ -54,19 +54,19 @@ class Param:
         if kind is float:
             items = [float(item) if type(item) is int else item for item in items]
         if self.required and not (items and all(item != "" for item in items)):
-            raise ParameterError(self.name, value, f"given: {self.expected}")
+            raise ParameterError(self.name, value, f"set to {self.expected}")
         if not all(self._allows(item, kind) for item in items):
             raise ParameterError(self.name, value, self.expected)
         return items if isinstance(self.default, list) else items[0]
 
-    def _allows(self, item: Any, kind: type) -> bool:
+    def _allows(self, item: Any, kind: type[Any]) -> bool:
         if type(item) is not kind or (self.choices and item not in self.choices):
             return False
         return self.bounds is None or self.bounds[0] <= item <= self.bounds[1]
 
     @property
     def range(self) -> str:
-        """The permitted values: the choices, or the bounds and the unit; '' where any value of the type will do."""
+        """The permitted values: the choices, or the bounds and the unit; '' if every value of the type is valid."""
         if self.choices:
             return f"one of {', '.join(self.choices)}"
         unit = f" {self.unit}" if self.unit else ""
@@ -74,7 +74,7 @@ class Param:
 
     @property
     def expected(self) -> str:
-        """A description of what is permitted, for error messages."""
+        """A description of the permitted values, for error messages."""
         if isinstance(self.default, list):
             kind = KINDS[type(self.default[0]) if self.default else str]
             text = f"{len(self.default)} {kind}s" if self.default else f"a list of {kind}s"
@@ -91,15 +91,15 @@ def owned(
     unit: str = "",
     choices: tuple[str, ...] = (),
 ) -> Any:
-    """Return a dataclass field that owns a parameter; a tuple as default stands for a list with one entry per joint."""
+    """Return a dataclass field that owns a parameter; a tuple as default makes it a list with one entry per joint."""
     plain = list(default) if isinstance(default, tuple) else default
     return field(default=default, metadata={"param": Param("", plain, description, bounds, unit, choices)})
 
 
 def param_of(owner: type, name: str, fixed: bool = False) -> Param:
     """Return the parameter that field `name` of the dataclass `owner` owns."""
-    found: Param = owner.__dataclass_fields__[name].metadata["param"]  # type: ignore[attr-defined]
-    return replace(found, name=name, fixed=fixed)
+    param: Param = next(f for f in fields(owner) if f.name == name).metadata["param"]
+    return replace(param, name=name, fixed=fixed)
 
 
 def params_of(owner: type, fixed: bool = False) -> tuple[Param, ...]:
@@ -108,7 +108,7 @@ def params_of(owner: type, fixed: bool = False) -> tuple[Param, ...]:
 
 
 def check_owned(instance: Any) -> None:
-    """Check every owned field of a frozen dataclass `instance`, and convert numbers to float or a tuple of floats.
+    """Check every owned field of a frozen dataclass instance, and convert numbers to a float or a tuple of floats.
 
     Raises ParameterError that names the field.
     """
@@ -125,10 +125,10 @@ def check_owned(instance: Any) -> None:
 
 
 def values_of(table: Sequence[Param], given: Mapping[str, Any], free_prefix: str = "") -> dict[str, Any]:
-    """Return the value of every parameter of the table by name: the given one, or the default.
+    """Return the value of every parameter of the table by name: the given value, or the default.
 
-    Names that start with `free_prefix`, and ROS's own, are ignored. Raises ParameterError for an impossible value, and
-    for a name that is not in the table.
+    Names that start with `free_prefix` and names that ROS declares are ignored. Raises ParameterError for an invalid
+    value and for a name that is not in the table.
     """
     names = {param.name for param in table}
     prefixes = (ROS_QOS_PREFIX, free_prefix) if free_prefix else (ROS_QOS_PREFIX,)

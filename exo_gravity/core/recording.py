@@ -1,7 +1,7 @@
-"""One arm's recorded arrays, and the stretches in which it was carried, left alone and still.
+"""The recorded arrays of one arm, and the time spans in which it was carried, left alone and still.
 
-Stillness is judged by position alone. The motors send velocity in steps of 22 to 24 mrad/s without a code for 0, so one
-at rest reports half a step; position comes in steps of 0.38 mrad, ten of which are `STILL_SPEED` over two blocks.
+Stillness is judged from position only. Motors report velocity in steps of 22 to 24 mrad/s without a code for 0, so a
+motor at rest reports half a step. Position has steps of 0.38 mrad, and `STILL_SPEED` over two blocks is ten of them.
 """
 
 from __future__ import annotations
@@ -16,16 +16,15 @@ import numpy as np
 from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.errors import DataError
 
-BLOCK = 0.1  # s, the grain of the analysis
-STILL_SPEED = 0.02  # rad/s: 69 degrees per minute is no hold any more
-MARGIN = 0.2  # s at both ends of a stillness, in which a smooth motion is still, or already, slower than that
+BLOCK = 0.1  # s, the time resolution of the analysis
+STILL_SPEED = 0.02  # rad/s, or 69 degrees per minute: an arm that moves faster is not held
+MARGIN = 0.2  # s cut off at both ends of a still span, where a smooth motion can be slower than STILL_SPEED
 
-
-Span = tuple[float, float]  # from, to, in s
+Span = tuple[float, float]  # start and end in s
 
 
 class ScriptedStep(NamedTuple):
-    """A step that the wearer was told: its action ('move', 'hold' or 'push'), when it began and ended, in s."""
+    """A step of the trial script: its action ('move', 'hold' or 'push'), and when it started and ended, in s."""
 
     action: str
     start: float
@@ -34,12 +33,12 @@ class ScriptedStep(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """One arm over time. Raises DataError where shapes differ, time runs back or a position is not finite.
+    """The recording of one arm. Raises DataError if shapes differ, time decreases or a position is not finite.
 
-    name: of the arm. time: (n,) s. position, velocity, effort (measured), command (effort asked for): (n, 4), NaN
-    where unknown, but for position. steps: what the wearer was told, empty if nobody recorded it. carried: when the
-    motors carried the arm, in order; outside of it, it is off or on its way down. None if nobody recorded that: then it
-    counts as carried all the while.
+    name: of the arm. time: (n,) s. position, velocity, effort (measured), command (requested effort): (n, 4), NaN where
+    unknown, except for position. steps: the script's steps, empty if they were not recorded. carried: the spans in
+    which the motors carried the arm, in order; outside of them the arm is off or being let down. None if these were
+    not recorded: the arm then counts as carried throughout.
     """
 
     name: str
@@ -52,28 +51,34 @@ class Recording:
     steps: tuple[ScriptedStep, ...] = ()
     carried: tuple[Span, ...] | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if len(self.joint_names) != JOINT_COUNT:
-            raise DataError(f"{self.name}: joints are {', '.join(self.joint_names)}: must be {JOINT_COUNT}")
+            raise DataError(f"{self.name}: joints = {', '.join(self.joint_names)}: must be {JOINT_COUNT} joints")
         shape = (len(self.time), JOINT_COUNT)
         for field in ("position", "velocity", "effort", "command"):
             if getattr(self, field).shape != shape:
-                raise DataError(f"{self.name}: {field} has the shape {getattr(self, field).shape}: must be {shape}")
-        if len(self.time) < 2 or np.any(np.diff(self.time) < 0):
-            raise DataError(f"{self.name}: {len(self.time)} samples: must be at least 2, in the order of their times")
+                raise DataError(f"{self.name}: shape of {field} = {getattr(self, field).shape}: must be {shape}")
+        if len(self.time) < 2:
+            raise DataError(f"{self.name}: {len(self.time)} samples: must be at least 2")
+        if np.any(np.diff(self.time) < 0):
+            raise DataError(f"{self.name}: time decreases between two samples: must be in ascending order")
         if not np.all(np.isfinite(self.position)):
             raise DataError(f"{self.name}: position has NaN or infinite values: must be finite")
 
     def while_carried(self, start: float, end: float) -> Iterator[Span]:
-        """Yield the parts of `start` to `end` (s) in which the arm was carried."""
+        """Yield the parts of the span from `start` to `end` (s) in which the arm was carried."""
         for first, last in ((start, end),) if self.carried is None else self.carried:
             if max(start, first) < min(end, last):
                 yield max(start, first), min(end, last)
 
 
 class Blocks(NamedTuple):
-    """The recording in blocks of 0.1 s: their first times (m + 1,), first samples (m + 1,), and for each block the mean
-    position (m, 4), whether the arm was still (m,) and whether nothing was recorded (m,)."""
+    """The recording in blocks of 0.1 s.
+
+    time: (m + 1,) s, the start of each block and the end of the last. sample: (m + 1,), the first sample of each block
+    and the end. mean: (m, 4), mean position. still: (m,), whether the arm was still. empty: (m,), whether the block has
+    no samples.
+    """
 
     time: np.ndarray
     sample: np.ndarray
@@ -87,13 +92,13 @@ class Blocks(NamedTuple):
         return float(self.time[1] - self.time[0])
 
     def between(self, start: float, end: float) -> slice:
-        """Return the blocks that lie within [start, end], at least one."""
+        """Return the slice of the blocks within [start, end], at least one block."""
         first = min(int(np.searchsorted(self.time, start - 1e-6)), len(self.still) - 1)
         return slice(first, max(first + 1, int(np.searchsorted(self.time, end + 1e-6, "right")) - 1))
 
 
 def in_blocks(recording: Recording) -> Blocks:
-    """Return the recording in blocks of 0.1 s, or of three samples where it is slower than 30 Hz."""
+    """Return the recording in blocks of 0.1 s, or of three samples if its rate is below 30 Hz."""
     time, position = recording.time, recording.position
     length = max(BLOCK, 3.0 * float(np.median(np.diff(time))))
     count = int((time[-1] - time[0]) / length) + 1
@@ -101,7 +106,7 @@ def in_blocks(recording: Recording) -> Blocks:
     sample = np.searchsorted(time, starts)
     sample[-1] = len(time)
     filled = np.diff(sample)
-    # Of an empty block reduceat gives the sample that comes next.
+    # For an empty block, reduceat returns the next sample.
     first = np.minimum(sample[:-1], len(time) - 1)
     mean = np.add.reduceat(position, first, axis=0, dtype=float) / np.maximum(filled, 1)[:, None]
     low, high = (extreme.reduceat(position, first, axis=0) for extreme in (np.minimum, np.maximum))
@@ -111,17 +116,17 @@ def in_blocks(recording: Recording) -> Blocks:
 
 
 def still_spans(recording: Recording, blocks: Blocks) -> Iterator[Span]:
-    """Yield (start, end) in s of every stretch in which the arm was carried, still, and by the script left alone."""
+    """Yield every span in which the arm was carried, still and, if there is a script, in one of its holds."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], blocks.still, [False])).astype(np.int8)))
     windows = [(step.start, step.end) for step in recording.steps if step.action == "hold"]
     for first, beyond in zip(edges[::2], edges[1::2], strict=True):
-        # Block k is still together with block k - 1.
+        # A block counts as still if it is still together with the block before it.
         start, end = blocks.time[max(first - 1, 0)] + MARGIN, blocks.time[beyond] - MARGIN
         for low, high in windows if recording.steps else ((start, end),):
             yield from recording.while_carried(float(max(start, low)), float(min(end, high)))
 
 
 def position_resolution(values: np.ndarray) -> float:
-    """Return the smallest step (rad) between one sample and the next: one position code, or 0 if it never changed."""
+    """Return the smallest step in rad between two samples, which is one position code; 0 if no step occurred."""
     steps = np.abs(np.diff(values))
     return float(steps.min(initial=math.inf, where=steps > 1e-6)) if steps.max() > 1e-6 else 0.0

@@ -1,8 +1,9 @@
-"""What a trial showed: the holds of a recording, how far the arm drifted in each, and its answer to pushes.
+"""The analysis of a trial: the holds of a recording, the drift in each, and the response to pushes.
 
-Drift is the slope of Huber's M-estimator (Huber 1964) on means over parts of the hold: averaging sees below one
-position code, and a touch of the arm weighs little. Its standard uncertainty adds to the scatter one code over the
-length of the hold: a reading that changed once may have been about to at the start.
+Drift is the slope of Huber's M-estimator (Huber 1964) fitted to means over parts of the hold. Averaging resolves less
+than one position code, and a brief touch of the arm has little weight. The standard uncertainty combines the scatter
+with one code over the length of the hold, because a reading that changed once may have been about to change at the
+start.
 
 SI units throughout: rad, rad/s, Nm, s. Arrays (4,) are in the order of the recording's joints.
 """
@@ -21,20 +22,20 @@ from exo_gravity.core.recording import MARGIN, Blocks, Recording, Span, in_block
 
 MIN_HOLD = 2.0  # s
 WINDOW = 10.0  # s, over which `Hold.stray` is judged
-SIDE = 0.5  # s beside a motion that give the pose before and after it
-PUSH_OFFSET = 0.35  # rad (20 degrees): a motion that ends farther off than this is a move to another pose
-HUBER = 1.345  # standard deviations; 95 % efficiency on normal noise
-MAX_PARTS = 30  # of a hold, whose means the slope is fitted to
+POSE_TIME = 0.5  # s before and after a motion, over which its first and last pose are averaged
+PUSH_OFFSET = 0.35  # rad (20 degrees); a motion that ends farther away is a move to another pose
+HUBER = 1.345  # standard deviations; gives 95 % efficiency on normal noise
+MAX_PARTS = 30  # parts of a hold, to whose means the slope is fitted
 
 
 @dataclass(frozen=True, eq=False)
 class Hold:
-    """The arm left alone and still from `start` to `end` (s); each array (4,).
+    """A span from `start` to `end` (s) in which the arm was left alone and still; each array is (4,).
 
-    pose: rad, its mean. drift: rad, from the first part of the hold to its last. drift_rate and its standard
-    uncertainty: rad/s. stray: rad, the widest range within any 10 s. velocity_rms: rad/s as measured, which for a motor
-    at rest is half a velocity code. torque_rms: Nm measured. torque_error: Nm, RMS of commanded less measured.
-    after: what ended before it: 'start', or the kind of the motion.
+    pose: rad, mean. drift: rad, from the first part of the hold to its last. drift_rate and its standard uncertainty:
+    rad/s. stray: rad, the largest range within any 10 s. velocity_rms: rad/s as measured, which is half a velocity code
+    for a motor at rest. torque_rms: Nm, measured. torque_error: Nm, RMS of commanded minus measured. after: the kind of
+    the motion before it, or 'start'.
     """
 
     start: float
@@ -57,13 +58,13 @@ class Hold:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """What happened between two holds, or after the last.
+    """A motion between two holds, or after the last one.
 
-    kind: 'push', 'move', 'slip' (it moved while the script left it alone), 'gap' (nothing was recorded) or 'let down'
-    (it was not carried all the while: the motors let it down, after a fault or at the end). Without a script, what ends
-    within 20 degrees of where it began counts as a push.
-    peak: (4,) rad, signed, farthest from the pose before. residual: (4,) rad, pose after less pose before; NaN where
-    the arm was not still again. until_still: s from the first movement, NaN likewise. speed: (4,) rad/s, peak.
+    kind: 'push', 'move', 'slip' (the arm moved during a hold of the script), 'gap' (nothing was recorded) or 'let down'
+    (the arm was not carried throughout: the motors let it down after a fault or at the end). Without a script, a motion
+    that ends within 20 degrees of its start counts as a push.
+    peak: (4,) rad, signed, largest distance from the pose before. residual: (4,) rad, pose after minus pose before; NaN
+    if the arm was not still again. until_still: s from the first movement, NaN likewise. speed: (4,) rad/s, peak.
     """
 
     kind: str
@@ -77,8 +78,10 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Release:
-    """A scripted hold from the moment of letting go, as long as the arm was carried: offset (4,) rad at its end, and
-    whether it was still then."""
+    """A scripted hold from release on, for as long as the arm was carried.
+
+    after: the script's action before it. offset: (4,) rad, at its end. still: whether the arm was still at its end.
+    """
 
     start: float
     end: float
@@ -89,7 +92,7 @@ class Release:
 
 @dataclass(frozen=True, eq=False)
 class TrialAnalysis:
-    """What `analyse` found."""
+    """The result of `analyse`."""
 
     holds: tuple[Hold, ...]
     motions: tuple[Motion, ...]
@@ -100,26 +103,26 @@ def analyse(recording: Recording, min_hold: float = MIN_HOLD) -> TrialAnalysis:
     """Return the holds of at least `min_hold` s, the motions between them and, with a script, the releases."""
     blocks = in_blocks(recording)
     resolution = np.array([position_resolution(column) for column in recording.position.T])
-    shortest = max(min_hold, 4 * blocks.length) - 1e-6  # a slope wants three whole blocks
+    shortest = max(min_hold, 4 * blocks.length) - 1e-6  # a slope requires three whole blocks
     spans = [(start, end) for start, end in still_spans(recording, blocks) if end - start >= shortest]
     motions = tuple(_motion(recording, blocks, *ends) for ends in pairwise(spans))
     kinds = ["start", *(motion.kind for motion in motions)]
     holds = tuple(_hold(recording, blocks, resolution, span, kind) for span, kind in zip(spans, kinds, strict=False))
-    motions += tuple(_after(recording, blocks, spans[-1])) if spans else ()
+    motions += tuple(_last_motions(recording, blocks, spans[-1])) if spans else ()
     return TrialAnalysis(holds, motions, tuple(_releases(recording, blocks)))
 
 
-def _after(recording: Recording, blocks: Blocks, last: Span) -> Iterator[Motion]:
-    """Yield what came after the `last` hold: a motion, and the arm's way down."""
-    done = float(recording.time[-1])
-    down = recording.carried[-1][1] if recording.carried else done
-    end = min([down, *(step.end for step in recording.steps[-1:])])
+def _last_motions(recording: Recording, blocks: Blocks, last: Span) -> Iterator[Motion]:
+    """Yield the motions after the `last` hold: one while the arm was carried, and the let-down."""
+    recorded = float(recording.time[-1])
+    released = recording.carried[-1][1] if recording.carried else recorded
+    end = min([released, *(step.end for step in recording.steps[-1:])])
     if end - last[1] > MIN_HOLD:
         yield _motion(recording, blocks, last, (end, end))
-    # A virtual wearer goes on with the next step, whoever carries the arm: that is no part of the way down.
-    led = min([done, *(step.start for step in recording.steps if step.start > down)])
-    if led - down > blocks.length:
-        yield _motion(recording, blocks, (last[0], down), (led, led))
+    # A virtual wearer continues with the next step even if the arm is not carried. That is not part of the let-down.
+    down = min([recorded, *(step.start for step in recording.steps if step.start > released)])
+    if down - released > blocks.length:
+        yield _motion(recording, blocks, (last[0], released), (down, down))
 
 
 def _hold(recording: Recording, blocks: Blocks, resolution: np.ndarray, span: Span, after: str) -> Hold:
@@ -150,7 +153,7 @@ def _hold(recording: Recording, blocks: Blocks, resolution: np.ndarray, span: Sp
 def robust_slope(x: np.ndarray, y: np.ndarray, resolution: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the slope (k,) of y (m, k) over x (m,), m > 2, and its standard uncertainty (k,) from the scatter.
 
-    Huber's M-estimator by reweighted least squares. resolution: (k,), a scatter below half of it tells nothing.
+    This is Huber's M-estimator by reweighted least squares. resolution: (k,); half of it is the smallest scale used.
     """
     weight = np.ones_like(y)
     for _ in range(30):
@@ -166,9 +169,9 @@ def robust_slope(x: np.ndarray, y: np.ndarray, resolution: np.ndarray) -> tuple[
 
 
 def _motion(recording: Recording, blocks: Blocks, left: Span, right: Span) -> Motion:
-    """Return the motion from the end of `left` to the beginning of `right`, which is empty if it was never still."""
-    before = blocks.mean[blocks.between(max(left[0], left[1] - SIDE), left[1])].mean(axis=0)
-    after = blocks.mean[blocks.between(right[0], min(right[1], right[0] + SIDE))].mean(axis=0)
+    """Return the motion from the end of span `left` to the start of `right`, which is empty if no hold followed."""
+    before = blocks.mean[blocks.between(max(left[0], left[1] - POSE_TIME), left[1])].mean(axis=0)
+    after = blocks.mean[blocks.between(right[0], min(right[1], right[0] + POSE_TIME))].mean(axis=0)
     within = blocks.between(left[1], right[0])
     samples = slice(*blocks.sample[[within.start, within.stop]])
     away = recording.position[samples] - before
@@ -202,7 +205,7 @@ def _releases(recording: Recording, blocks: Blocks) -> Iterator[Release]:
     for step in recording.steps:
         parts = recording.while_carried(step.start, min(step.end, float(recording.time[-1])))
         start, end = next(parts, (step.start, step.start))
-        # Cut short at once, it tells of the hand that has just let go and not of the arm.
+        # A hold that was cut short shows the hand that has just let go, not the arm.
         if step.action == "hold" and end - start >= min(MIN_HOLD, step.end - step.start):
             within = blocks.between(start, end)
             offset = blocks.mean[within.stop - 1] - blocks.mean[within.start]
@@ -211,7 +214,9 @@ def _releases(recording: Recording, blocks: Blocks) -> Iterator[Release]:
 
 
 def _rms(values: np.ndarray) -> np.ndarray:
-    """Return the root mean square (4,) of the finite of values (n, 4); NaN where there is none."""
+    """Return the root mean square (4,) of the finite values among (n, 4); NaN for a joint that has none."""
     known = np.isfinite(values)
+    squares = np.square(values, where=known, out=np.zeros(values.shape))
     with np.errstate(invalid="ignore"):
-        return np.sqrt(np.square(values, where=known, out=np.zeros(values.shape)).sum(axis=0) / known.sum(axis=0))
+        rms: np.ndarray = np.sqrt(squares.sum(axis=0) / known.sum(axis=0))
+    return rms

@@ -1,4 +1,4 @@
-"""What a trial asks of the wearer: a list of steps, each of which takes its time.
+"""The script of a trial: a list of timed steps for the wearer.
 
     name: demo
     steps:
@@ -6,7 +6,7 @@
       - {hold: 10.0}                                 leave it alone
       - {push: [0.0, 2.0, 1.5, 1.0], over: 0.4}      push it with these joint torques (Nm)
 
-A person reads the steps from the screen; the virtual wearer of the simulator carries them out.
+A human wearer reads the steps from the screen; the simulator's virtual wearer executes them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MAX_DURATION = 3600.0  # s
 
 @dataclass(frozen=True)
 class Step:
-    """One step: `action` is 'move', 'hold' or 'push'; `value` (4,) is the pose in rad or the torque in Nm, if any."""
+    """One step: `action` is 'move', 'hold' or 'push'; `value` is the pose (4,) in rad, () or the torque (4,) in Nm."""
 
     action: str
     duration: float
@@ -34,7 +34,7 @@ class Step:
 
     @classmethod
     def parse(cls, entry: Any, where: str) -> Step:
-        """Return the step that a mapping from YAML describes; `where` names it in a ParameterError."""
+        """Return the step described by a mapping from YAML; `where` is its name in a ParameterError."""
         if isinstance(entry, Mapping) and set(entry) == {"hold"}:
             return cls("hold", one_float(f"{where}.hold", entry["hold"], 0.1, MAX_DURATION, "s"))
         for action, bound, unit in (("move", 3.5, "rad"), ("push", 20.0, "Nm")):
@@ -53,9 +53,9 @@ class TrialScript:
 
     @classmethod
     def parse(cls, content: Any) -> TrialScript:
-        """Return the script that YAML content describes, or raise ParameterError that names the wrong entry."""
+        """Return the script described by YAML content. Raises ParameterError that names the invalid entry."""
         if not isinstance(content, Mapping) or set(content) != {"name", "steps"}:
-            raise ParameterError("script", content, "a mapping with just name and steps")
+            raise ParameterError("script", content, "a mapping with the keys name and steps only")
         steps = content["steps"]
         if not isinstance(steps, list) or not steps:
             raise ParameterError("steps", steps, "a list of at least one step")
@@ -63,18 +63,18 @@ class TrialScript:
 
     @property
     def duration(self) -> float:
-        """Length of all steps together in s."""
+        """Total length of all steps in s."""
         return sum(step.duration for step in self.steps)
 
     @property
     def pose_count(self) -> int:
-        """How many poses the arm is brought to."""
+        """Number of poses to which the arm is moved."""
         return sum(step.action == "move" for step in self.steps)
 
     def at(self, elapsed: float) -> tuple[int, float]:
-        """Return the index of the step under way `elapsed` s after the start, and the time since that step began.
+        """Return the index of the active step `elapsed` s after the start, and the time since that step began.
 
-        After the end the index is len(steps).
+        After the last step the index is len(steps).
         """
         index = bisect_right(self._ends, elapsed)
         return index, elapsed - (self._ends[index - 1] if index else 0.0)
