@@ -1,1 +1,1 @@
-"""Benchmarks: `make bench` runs them all and prints one table; nothing here is asserted in tests."""
+"""Benchmarks: `make bench` runs them all and prints one table. They measure and assert nothing."""

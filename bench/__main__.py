@@ -1,6 +1,6 @@
-"""python -m bench [--quick] [--only law,loop,work] [--output build/bench.json]: one table, and the same as JSON.
+"""python -m bench [--quick] [--only law,loop,work] [--output build/bench.json]: print one table and write it as JSON.
 
-12 minutes on two quiet cores; noisy runs are repeated, twice at most.
+It takes 12 minutes on two quiet cores. Disturbed runs are repeated up to twice.
 """
 
 from __future__ import annotations
@@ -11,21 +11,21 @@ from pathlib import Path
 
 from rich.console import Console
 
-# One thread each for the numbers of all: what the machine's other cores would do is not what is measured.
+# Every library uses one thread, so that the other cores do not affect the figures.
 os.environ["OMP_NUM_THREADS"] = "1"
 
-from bench.laws import laws
-from bench.loops import loops
-from bench.table import Row, save, show
-from bench.work import work
+from .laws import measure_laws
+from .loops import measure_loops
+from .table import Row, save, show
+from .work import measure_work
 
 
 def main() -> None:
-    """Run what was asked for."""
+    """Run the chosen parts."""
     parser = argparse.ArgumentParser(prog="bench", description="Measure the laws, the loop and the tools.")
     parser.add_argument("--quick", action="store_true", help="fewer rates and shorter runs, for development")
-    parser.add_argument("--only", default="law,loop,work", help="which parts (%(default)s)")
-    parser.add_argument("--output", type=Path, default=Path("build/bench.json"), help="(%(default)s)")
+    parser.add_argument("--only", default="law,loop,work", metavar="PARTS", help="parts to run (%(default)s)")
+    parser.add_argument("--output", type=Path, default=Path("build/bench.json"), metavar="FILE", help="(%(default)s)")
     options = parser.parse_args()
     console = Console(width=None if Console().is_terminal else 150, highlight=False)
     rows: list[Row] = []
@@ -37,15 +37,15 @@ def main() -> None:
                 console.print(text)
 
         parts = {
-            "law": lambda: laws(options.quick),
-            "loop": lambda: loops(options.quick, progress),
-            "work": lambda: work(options.quick),
+            "law": lambda: measure_laws(options.quick),
+            "loop": lambda: measure_loops(options.quick, progress),
+            "work": lambda: measure_work(options.quick),
         }
         for part in options.only.split(","):
             progress(part)
             for row in parts[part]():
                 rows.append(row)
-                save(rows, options.output)  # what is measured is kept, should the rest be stopped
+                save(rows, options.output)  # an interrupted run keeps its figures
     show(rows, console)
     load = os.getloadavg()
     console.print(f"{os.cpu_count()} cores, load {load[0]:.1f} at the end; {options.output}")

@@ -1,4 +1,4 @@
-"""The law, against compiled Pinocchio and the Robotics Toolbox, all called from Python for the same arm and poses."""
+"""The law, against compiled Pinocchio and the Robotics Toolbox, all called from Python on the same arm and poses."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from bench.table import Row, race
 from exo_gravity.core import gravity_torque
 from exo_gravity.core.control_params import COMPENSATOR, settings_of
 from exo_gravity.core.gravity import LAWS
@@ -14,11 +13,13 @@ from exo_gravity.core.param_table import values_of
 from exo_gravity.core.tilt import Tilt
 from exo_gravity.tools.inputs.references import pinocchio_model, toolbox_robot
 
+from .table import Row, race
+
 POSES = 100_000
-LOOP = 2_000  # of them, for the peers, which take one after the other
+LOOP = 2_000  # of these poses, for the peers, which compute one pose per call
 
 
-def laws(quick: bool) -> Iterator[Row]:
+def measure_laws(quick: bool) -> Iterator[Row]:
     """Yield the rows of the law."""
     arm = settings_of(values_of(COMPENSATOR, {})).arm
     poses = np.random.default_rng(1).uniform(-1.5, 1.5, (POSES, 4))
@@ -53,11 +54,11 @@ def laws(quick: bool) -> Iterator[Row]:
     ours, pinocchio, toolbox = race(
         ((lambda: gravity_torque(arm, poses), 1), (pinocchio_loop, 1), (toolbox_loop, 1)), blocks
     )
-    mine, spread = ours.median / POSES * 1e6, ours.text(1e6 / POSES)
-    yield Row("law, 100,000 poses, per pose: Pinocchio in a loop", mine, pinocchio.median / LOOP * 1e6, "us", spread)
+    each, spread = ours.median / POSES * 1e6, ours.text(1e6 / POSES)
+    yield Row("law, 100,000 poses, per pose: Pinocchio in a loop", each, pinocchio.median / LOOP * 1e6, "us", spread)
     yield Row(
         "law, 100,000 poses, per pose: Robotics Toolbox in a loop",
-        mine,
+        each,
         toolbox.median / (LOOP // 100) * 1e6,
         "us",
         spread,

@@ -1,4 +1,4 @@
-"""The rows of the loop: each rate, with the same law without ROS and on bare rclpy beside it."""
+"""The rows of the loop: every rate, against the same law without ROS and on bare rclpy."""
 
 from __future__ import annotations
 
@@ -6,71 +6,75 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from bench.latency import percentile
-from bench.loop import OURS, Result, run
-from bench.table import Row
 from exo_gravity.core.safety import CALM
+
+from .loop import THREAD_PRIORITY, LoopRun, run_loop
+from .table import Row
+from .timing import percentile
 
 RATES = (("one arm", False, 200), ("one arm", False, 500), ("one arm", False, 1000), ("both arms", True, 200),
          ("both arms", True, 500))  # fmt: skip
-QUICK = (RATES[1], RATES[3])
+QUICK_RATES = (RATES[1], RATES[3])
 RAMP = 1.0  # s, can_bridge's ramp_time
 KINDS = ("nodes", "fifo", "python", "rclpy")
 PEERS = ("python", "Python without ROS"), ("rclpy", "bare rclpy")
-TRIES = 3
+ATTEMPTS = 3
 QUIET = 0.01  # share of a core that a hypervisor may give to others in a run that counts as quiet
-PARTS = 5  # of the time, whose least and largest figure are the spread
+PARTS = 5  # of a run; the lowest and the highest of their figures are the spread
+
+Runs = dict[str, LoopRun]  # by kind
+Progress = Callable[[str], None]
 
 
-def loops(quick: bool, progress: Callable[[str], None]) -> Iterator[Row]:
+def measure_loops(quick: bool, progress: Progress) -> Iterator[Row]:
     """Yield the rows of every rate, then of the start."""
     starts = []
-    for arms, both, rate in QUICK if quick else RATES:
-        results = {}
+    for arms, both_arms, rate in QUICK_RATES if quick else RATES:
+        runs: Runs = {}
         for kind in KINDS:
-            if kind == "fifo" and (both or rate < 500):  # they would leave no processor to two devices
+            if kind == "fifo" and (both_arms or rate < 500):  # two devices would get no processor
                 continue
             progress(f"loop, {arms}, {rate} Hz: {kind}")
-            if result := _quietest(kind, rate, both, 5.0 if quick else 20.0, progress):
-                results[kind] = result
+            if run := _quietest_run(kind, rate, both_arms, 5.0 if quick else 20.0, progress):
+                runs[kind] = run
         name = f"loop, {arms}, {rate} Hz"
-        yield from _rows(name, rate, results, "nodes")
-        if "fifo" in results:
-            yield from _rows(f"{name}, thread_priority {OURS['fifo']}", rate, results, "fifo")
-        if "nodes" in results:
-            starts.append(results["nodes"].start)
+        yield from _rows(name, rate, runs, "nodes")
+        if "fifo" in runs:
+            yield from _rows(f"{name}, thread_priority {THREAD_PRIORITY['fifo']}", rate, runs, "fifo")
+        if "nodes" in runs:
+            starts.append(runs["nodes"].start)
     if starts:
         median = float(np.median(starts))
-        yield Row("start, launch to active: the checks and the ramp", median, CALM + RAMP, "s", _ends(starts))
+        yield Row("start, launch to active: the checks and the ramp", median, CALM + RAMP, "s", _range(starts))
 
 
-def _quietest(kind: str, rate: int, both: bool, seconds: float, progress: Callable[[str], None]) -> Result | None:
-    """Return the run in which the hypervisor took least, of no more than `TRIES`; None if none carried the arm."""
+def _quietest_run(kind: str, rate: int, both_arms: bool, seconds: float, progress: Progress) -> LoopRun | None:
+    """Return the run from which the hypervisor took least, of up to `ATTEMPTS`; None if none carried the arm."""
     best = None
-    for _ in range(TRIES):
+    for _ in range(ATTEMPTS):
         try:
-            result = run(kind, rate, both, seconds)
+            run = run_loop(kind, rate, both_arms, seconds)
         except RuntimeError as error:
             progress(f"  {error}")
             continue
-        best = result if best is None or result.stolen < best.stolen else best
+        best = run if best is None or run.stolen < best.stolen else best
         if best.stolen <= QUIET:
             break
-        progress(f"  the hypervisor took {100 * result.stolen:.1f}% of a core")
+        progress(f"  the hypervisor took {100 * run.stolen:.1f}% of a core")
     return best
 
 
-def _rows(name: str, rate: int, results: dict[str, Result], kind: str) -> Iterator[Row]:
+def _rows(name: str, rate: int, runs: Runs, kind: str) -> Iterator[Row]:
     period, allowed = 1e3 / rate, 1.0 if rate == 1000 else 0.1
-    if kind not in results:
+    if kind not in runs:
         yield Row(f"{name}, missed (it did not run): limit", 100.0, allowed, "%")
         return
-    ours = results[kind]
+    ours = runs[kind]
     for share in (50, 99, 99.9):
         figure, spread = _latency(ours, share)
-        for other, peer in PEERS:
-            if other in results:
-                yield Row(f"{name}, p{share:g}: {peer}", figure, _latency(results[other], share)[0], "ms", spread)
+        for peer_kind, peer in PEERS:
+            if peer_kind in runs:
+                yield Row(f"{name}, p{share:g}: {peer}", figure, _latency(runs[peer_kind], share)[0], "ms", spread)
         if share == 99:
             yield Row(f"{name}, p99: one period", figure, period, "ms", spread)
     spacing = np.concatenate([arm.spacing for arm in ours.arms]) * 1e3
@@ -78,42 +82,44 @@ def _rows(name: str, rate: int, results: dict[str, Result], kind: str) -> Iterat
         yield Row(f"{name}, spacing p{share:g}: one period", percentile(spacing, share), period, "ms")
     for what in ("missed", "late", "incomplete", "lost"):
         percents = _percents(ours, what)
-        yield Row(f"{name}, {what}: limit", float(np.mean(percents)), allowed, "%", _ends(percents))
-        for other, peer in PEERS:
-            if other in results:
-                theirs = float(np.mean(_percents(results[other], what)))
-                yield Row(f"{name}, {what}: {peer}", float(np.mean(percents)), theirs, "%", _ends(percents))
+        yield Row(f"{name}, {what}: limit", float(np.mean(percents)), allowed, "%", _range(percents))
+        for peer_kind, peer in PEERS:
+            if peer_kind in runs:
+                theirs = float(np.mean(_percents(runs[peer_kind], what)))
+                yield Row(f"{name}, {what}: {peer}", float(np.mean(percents)), theirs, "%", _range(percents))
     yield Row(f"{name}, taken by the hypervisor: quiet", 100.0 * ours.stolen, 100.0 * QUIET, "%")
-    yield from _cpu(name, results, kind)
+    yield from _cpu_rows(name, runs, kind)
 
 
-def _cpu(name: str, results: dict[str, Result], kind: str) -> Iterator[Row]:
-    """Yield what each node takes of a core: against what does the same without the rest, or against the core."""
-    peers = {"can_bridge": ("rclpy", "bridge", "bare rclpy"), "compensator": ("rclpy", "answer", "bare rclpy")}
-    for node in sorted({full.rpartition("/")[2] for full in results[kind].cpu}):
-        other, part, peer = peers.get(node, ("", "", "a core"))
-        limit = _share(results[other], part) if other in results else 100.0
-        shares = [100.0 * used for full, used in results[kind].cpu.items() if full.endswith(node)]
-        peer = peer if other in results else "a core"
-        yield Row(f"{name}, CPU of {node}: {peer}", sum(shares), limit, "%", _ends(shares))
+def _cpu_rows(name: str, runs: Runs, kind: str) -> Iterator[Row]:
+    """Yield each node's share of a core, against its bare counterpart, or against the core."""
+    counterparts = {"can_bridge": "bridge", "compensator": "compensator"}
+    for node in sorted({full_name.rpartition("/")[2] for full_name in runs[kind].cpu}):
+        shares = _cpu_shares(runs[kind], node)
+        if node in counterparts and "rclpy" in runs:
+            peer, limit = "bare rclpy", sum(_cpu_shares(runs["rclpy"], counterparts[node]))
+        else:
+            peer, limit = "a core", 100.0
+        yield Row(f"{name}, CPU of {node}: {peer}", sum(shares), limit, "%", _range(shares))
 
 
-def _share(result: Result, part: str) -> float:
-    return sum(100.0 * used for full, used in result.cpu.items() if full.endswith(f"/{part}"))
+def _cpu_shares(run: LoopRun, node: str) -> list[float]:
+    """Return the share of a core in percent of each process of this node, for one arm or two."""
+    return [100.0 * share for full_name, share in run.cpu.items() if full_name.rpartition("/")[2] == node]
 
 
-def _percents(result: Result, what: str) -> list[float]:
-    """Return the share of cycles, in percent of each arm's, that were `what`: missed, late, incomplete or lost."""
-    return [100.0 * getattr(arm, what) / arm.cycles for arm in result.arms]
+def _percents(run: LoopRun, what: str) -> list[float]:
+    """Return the share of each arm's cycles in percent that were `what`: missed, late, incomplete or lost."""
+    return [100.0 * getattr(arm, what) / arm.cycles for arm in run.arms]
 
 
-def _latency(result: Result, share: float) -> tuple[float, str]:
-    """Return the percentile in ms over all arms, and its range over parts of the time."""
+def _latency(run: LoopRun, share: float) -> tuple[float, str]:
+    """Return the percentile in ms over all arms, and its range over parts of the run."""
     parts = [
-        percentile(part, share) * 1e3 for arm in result.arms for part in np.array_split(arm.latency, PARTS) if len(part)
+        percentile(part, share) * 1e3 for arm in run.arms for part in np.array_split(arm.latency, PARTS) if len(part)
     ]
-    return percentile(np.concatenate([arm.latency for arm in result.arms]), share) * 1e3, _ends(parts)
+    return percentile(np.concatenate([arm.latency for arm in run.arms]), share) * 1e3, _range(parts)
 
 
-def _ends(values: Sequence[float]) -> str:
+def _range(values: Sequence[float]) -> str:
     return f"{min(values):.3g} to {max(values):.3g}" if len(values) > 1 else ""

@@ -1,4 +1,4 @@
-"""A row of the benchmark: a figure of ours against a peer's, or a limit's, of the same run; the table, and the file."""
+"""The rows of the benchmark, each with our figure and that of a peer or a limit; their table and file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rich.table import Table
 
 @dataclass(frozen=True)
 class Row:
-    """name: of what, and against what. ours, peer: in `unit`. spread: of ours, in words. more_is_better: of ours."""
+    """One comparison. name: what is measured, and against what. ours, peer: in `unit`. spread: of our figure."""
 
     name: str
     ours: float
@@ -32,25 +32,25 @@ class Row:
 
 @dataclass(frozen=True)
 class Timing:
-    """Seconds a call of each block; `text` has the range that holds the middle half of them."""
+    """Seconds per call in each block of calls."""
 
     blocks: tuple[float, ...]
 
     @property
     def median(self) -> float:
-        """Seconds a call."""
+        """Seconds per call."""
         return statistics.median(self.blocks)
 
     def text(self, scale: float) -> str:
-        """Return the middle half, in units of 1/`scale` s."""
+        """Return the interquartile range in units of 1/`scale` s."""
         low, _, high = statistics.quantiles(self.blocks, n=4)
         return f"{low * scale:.3g} to {high * scale:.3g}"
 
 
 def race(calls: Sequence[tuple[Callable[[], object], int]], blocks: int) -> list[Timing]:
-    """Time functions in turns, so that whatever else the machine does meets them all alike.
+    """Time functions in turns, so that other load on the machine affects all of them alike.
 
-    calls: of each the function, and how often a block calls it.
+    calls: each function, and how often a block calls it.
     """
     times: list[list[float]] = [[] for _ in calls]
     for _ in range(blocks):

@@ -1,4 +1,4 @@
-"""The work besides the loop: the ANFIS's training, an offline trial against real time, the report against rosbags."""
+"""The rows of the tools: training the ANFIS, an offline trial against real time, the report against rosbags."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from bench.table import Row
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.tools.anfis.data import from_gravload
@@ -24,13 +23,15 @@ from exo_gravity.tools.inputs.parameter_file import packaged_config
 from exo_gravity.tools.reporting import trial_report
 from exo_gravity.tools.trials.offline import run_offline, simulated_trials
 
-TRAINING_LIMIT = 10.0  # s that somebody waits before a terminal without wondering
+from .table import Row
+
+TRAINING_LIMIT = 10.0  # s that a user waits without concern
 JOINT_STATE = "sensor_msgs/msg/JointState"
-RATE = 500  # Hz, of the recording
+RATE = 500  # Hz of the recording
 
 
-def work(quick: bool) -> Iterator[Row]:
-    """Yield the rows of the work besides the loop."""
+def measure_work(quick: bool) -> Iterator[Row]:
+    """Yield the rows of the tools."""
     repeats = 3 if quick else 5
     configured = configured_arm(None, "right")
     samples = from_gravload(configured)
@@ -69,7 +70,7 @@ def _range(values: list[float]) -> str:
 
 
 def _offline(hold: float) -> tuple[float, float]:
-    """Return the length in s of a trial on the simulated right arm, and how long it took."""
+    """Return the simulated length of a trial on the right arm, and its run time, in s."""
     steps = [{"move": [0.1, 0.8, 0.7, 0.6], "over": 3.0}, {"hold": hold}]
     script = TrialScript.parse({"name": "bench", "steps": steps})
     params = packaged_config("sim.yaml")
@@ -80,7 +81,7 @@ def _offline(hold: float) -> tuple[float, float]:
 
 
 def _recording(path: Path, seconds: int) -> Path:
-    """Write joint states and efforts of an arm that is led from pose to pose, as rosbag2 in MCAP."""
+    """Write a rosbag2 in MCAP with joint states and efforts of an arm that moves from pose to pose."""
     store = get_typestore(Stores.ROS2_JAZZY)
     header, stamp = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
     names = yaml.safe_load(packaged_config("sim.yaml").read_text())["/right/compensator"]["ros__parameters"]

@@ -1,9 +1,9 @@
-"""The floor for rclpy: the same messages between two bare nodes on executors, on the same bus, with the same pacing.
+"""A peer for the loop: the same messages between two bare rclpy nodes, on the same bus, with the same pacing.
 
-    python -m bench.relay bridge|answer PARAMS ARM RATE
+    python -m bench.bare_rclpy bridge|compensator PARAMS NAMESPACE RATE
 
-No safety machine, parameters, diagnostics or ramps: `bridge` commands the motors and publishes joint states, `answer`
-sends efforts back. Each ends on SIGTERM.
+`bridge` commands the motors and publishes joint states, `compensator` replies with efforts. There is no safety machine,
+and there are no parameters, diagnostics or ramps. Each ends on SIGTERM.
 """
 
 from __future__ import annotations
@@ -16,50 +16,53 @@ import time
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
-from bench.arm import Arm, paced
 from exo_gravity.core.limits import UNKNOWN
 from exo_gravity.core.safety import NOTHING, Drive
-from exo_gravity.hardware.control_loop import COLLECTING
+from exo_gravity.hardware.control_loop import REPLY_WAIT
 from exo_gravity.hardware.scheduling import favour
 from exo_gravity.nodes.run import keep_to_this_machine
+
+from .direct_arm import DirectArm, run_paced
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-def bridge(node, arm: Arm, period: float, stopping: list) -> threading.Thread:
+def bridge_thread(node: Node, arm: DirectArm, period: float, stopping: list[bool]) -> threading.Thread:
     """Return the thread that commands the motors and publishes what they reply."""
-    bus, asked = arm.open(), [NOTHING]
+    bus, newest = arm.open(), {"effort": NOTHING}
     publisher = node.create_publisher(JointState, "joint_states", 1)
-    node.create_subscription(JointState, "effort_commands", lambda m: asked.__setitem__(0, tuple(m.effort)), 1)
+    node.create_subscription(JointState, "effort_commands", lambda m: newest.update(effort=tuple(m.effort)), 1)
 
     def cycle() -> None:
-        known = UNKNOWN not in bus.samples  # switched on before that, a motor might not have heard it
-        bus.exchange(Drive(asked[0], 0.0, powered=known), time.monotonic() + COLLECTING * period)
-        if known:
+        all_replied = UNKNOWN not in bus.samples  # an ENTER sent earlier might be lost
+        drive = Drive(newest["effort"], 0.0, powered=all_replied)
+        bus.exchange(drive, time.monotonic() + REPLY_WAIT * period)
+        if all_replied:
             position, velocity, effort, *_ = zip(*bus.samples, strict=True)
-            message = JointState(name=arm.names, position=position, velocity=velocity, effort=effort)
+            message = JointState(name=arm.joint_names, position=position, velocity=velocity, effort=effort)
             message.header.stamp = node.get_clock().now().to_msg()
             publisher.publish(message)
 
     def run() -> None:
         try:
-            paced(period, cycle, stopping)
+            run_paced(period, cycle, stopping)
         finally:
             bus.stop()
 
     return threading.Thread(target=run)
 
 
-def answer(node, arm: Arm) -> None:
-    """Answer each joint state."""
+def compensate(node: Node, arm: DirectArm) -> None:
+    """Reply to each joint state with efforts."""
     publisher = node.create_publisher(JointState, "effort_commands", 1)
 
     def on_joint_states(message: JointState) -> None:
-        command = JointState(name=arm.names, effort=arm.law(message.position))
+        command = JointState(name=arm.joint_names, effort=arm.law(message.position))
         command.header.stamp = message.header.stamp
         publisher.publish(command)
 
@@ -68,27 +71,27 @@ def answer(node, arm: Arm) -> None:
 
 def main() -> None:
     """Run one of the two nodes."""
-    part, params, space, rate = sys.argv[1:]
+    part, params, namespace, rate = sys.argv[1:]
     keep_to_this_machine()
     stopping: list[bool] = []
     signal.signal(signal.SIGTERM, lambda *_: stopping.append(True))
     favour(20 if part == "bridge" else 15)
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    node = rclpy.create_node(f"relay_{part}", namespace=space)
-    arm = Arm(params, space)
+    node = rclpy.create_node(f"bare_{part}", namespace=namespace)
+    arm = DirectArm(params, namespace)
     thread = None
     if part == "bridge":
-        thread = bridge(node, arm, 1.0 / float(rate), stopping)
+        thread = bridge_thread(node, arm, 1.0 / float(rate), stopping)
         thread.start()
     else:
-        answer(node, arm)
+        compensate(node, arm)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     while not stopping:
         executor.spin_once(timeout_sec=0.1)
     if thread:
         thread.join()
-    os._exit(0)  # without closing Fast DDS: it can hang
+    os._exit(0)  # without closing Fast DDS, which can hang
 
 
 if __name__ == "__main__":

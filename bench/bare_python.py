@@ -1,0 +1,45 @@
+"""A peer for the loop: the same law on the same bus in one process, without ROS, safety machine or messages.
+
+    python -m bench.bare_python PARAMS NAMESPACE RATE
+
+Ends on SIGTERM.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+
+from exo_gravity.core.limits import UNKNOWN
+from exo_gravity.core.safety import NOTHING, Drive
+from exo_gravity.hardware.control_loop import REPLY_WAIT
+from exo_gravity.hardware.scheduling import favour
+
+from .direct_arm import DirectArm, run_paced
+
+
+def main() -> None:
+    """Run the loop."""
+    params, namespace, rate = sys.argv[1:]
+    arm = DirectArm(params, namespace)
+    period = 1.0 / float(rate)
+    stopping: list[bool] = []
+    signal.signal(signal.SIGTERM, lambda *_: stopping.append(True))
+    favour(20)
+    bus = arm.open()
+
+    def cycle() -> None:
+        now = time.monotonic()
+        all_replied = UNKNOWN not in bus.samples  # an ENTER sent earlier might be lost
+        effort = arm.law([joint.position for joint in bus.samples]) if all_replied else NOTHING
+        bus.exchange(Drive(effort, 0.0, powered=all_replied), now + REPLY_WAIT * period)
+
+    try:
+        run_paced(period, cycle, stopping)
+    finally:
+        bus.stop()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,57 @@
+"""One arm of a parameter file without its nodes: its motors, its bus and its law, for an upright trunk."""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from exo_gravity.core.control_params import OPTIONS
+from exo_gravity.core.gravity import LAWS, Torque
+from exo_gravity.core.tilt import Tilt
+from exo_gravity.hardware.motor_bus import MotorBus, open_bus
+from exo_gravity.tools.inputs.arms import read_arm
+from exo_gravity.tools.inputs.parameter_file import load
+
+
+class DirectArm:
+    """The arm in the namespace `namespace` (e.g. /right), with the parameters of its `can_bridge` and `compensator`.
+
+    joint_names: from shoulder to elbow. motors: in the same order. interface, channel, options: of the CAN bus.
+    """
+
+    def __init__(self, params: str | Path, namespace: str) -> None:
+        nodes = load(params)
+        arm = read_arm(nodes, namespace)
+        self.joint_names = arm.joint_names
+        self.motors = arm.motors
+        self.interface, self.channel = str(arm.can_bridge["can.interface"]), str(arm.can_bridge["can.channel"])
+        bridge = nodes[f"{namespace}/can_bridge"]
+        prefix = f"{OPTIONS}."
+        self.options = {name.removeprefix(prefix): bridge[name] for name in bridge if name.startswith(prefix)}
+        settings = arm.settings()
+        self._model, self._law, self._tilt = settings.arm, LAWS[settings.law], Tilt.of(settings.side)
+
+    def law(self, theta: Sequence[float]) -> Torque:
+        """Return the torque (4,) in Nm for joint angles (4,) in rad."""
+        return self._law.torque(self._model, theta, self._tilt)
+
+    def open(self) -> MotorBus:
+        """Open the bus."""
+        return MotorBus(open_bus(self.interface, self.channel, self.options), self.motors)
+
+
+def run_paced(period: float, cycle: Callable[[], None], stopping: Sequence[object]) -> None:
+    """Call `cycle` every `period` s, paced like the control thread of `can_bridge`, until `stopping` is not empty."""
+    gc.collect()
+    gc.freeze()
+    deadline = time.monotonic()
+    while not stopping:
+        cycle()
+        deadline += period
+        remaining = deadline - time.monotonic()
+        if remaining > 0.0:
+            time.sleep(remaining)
+        elif remaining < -period:
+            deadline = time.monotonic()

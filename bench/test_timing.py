@@ -1,0 +1,109 @@
+"""The loop timing that the benchmark reads from a bus, on frames with known delays."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Sequence
+
+import numpy as np
+import pytest
+
+from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.motors import ENTER, MOTORS, pack_reply
+
+from .timing import LoopTiming, analyse, split_cycles
+
+MOTOR_SPECS = ("AK60-6", "AK80-9", "AK60-6", "AK60-6")
+ARM_MOTORS = tuple(JointMotor(MOTORS[name], can_id) for can_id, name in enumerate(MOTOR_SPECS, 1))
+PERIOD = 0.002  # s
+REPLY_DELAY = 0.0003  # s from a command to its reply
+START = 1_700_000_000.0  # s
+
+Frames = dict[str, np.ndarray]
+
+
+def law(theta: Sequence[float]) -> tuple[float, ...]:
+    return tuple(2.0 * angle for angle in theta)
+
+
+def true_angles(k: int) -> tuple[float, ...]:
+    return tuple(0.2 + 0.01 * k + 0.1 * joint for joint in range(4))
+
+
+def measured_angle(angle: float, motor: JointMotor) -> float:
+    """Return `angle` rounded to the position code of a reply."""
+    return motor.joint_reply(pack_reply(motor.spec, motor.can_id, angle, 0.0, 0.0, 30, 0)).position
+
+
+def loop_frames(
+    count: int,
+    depth: int = 1,
+    missing: Container[int] = (),
+    without_replies: Container[int] = (),
+    late: Container[int] = (),
+) -> Frames:
+    """Return the frames of a loop whose commands answer the replies of `depth` cycles before.
+
+    The cycles `missing` are left out, `late` ones come 0.6 periods late.
+    """
+    rows = []
+    for k in (k for k in range(count) if k not in missing):
+        for joint, motor in enumerate(ARM_MOTORS):
+            time = START + (k + 0.6 * (k in late)) * PERIOD + joint * 20e-6
+            answered = list(map(measured_angle, true_angles(max(0, k - depth)), ARM_MOTORS))
+            rows.append((time, motor.can_id, motor.command(law(answered)[joint], 0.0)))
+            if k not in without_replies:
+                reply = pack_reply(motor.spec, joint + 1, true_angles(k)[joint], 0, 0, 30, 0)
+                rows.append((time + REPLY_DELAY, motor.can_id, reply))
+    return {
+        "time": np.array([time for time, _, _ in rows]),
+        "id": np.array([can_id for _, can_id, _ in rows]),
+        "length": np.array([len(data) for _, _, data in rows]),
+        "data": np.array([list(data) for _, _, data in rows], dtype=np.uint8),
+    }
+
+
+def timing_of(frames: Frames) -> LoopTiming:
+    return analyse(split_cycles(frames, ARM_MOTORS, START, START + 1e9), ARM_MOTORS, law, PERIOD)
+
+
+@pytest.mark.parametrize("depth", [1, 2, 3])
+def test_latency_runs_from_each_motors_reply_to_the_first_command_computed_from_it(depth):
+    timing = timing_of(loop_frames(200, depth))
+    assert timing.latency == pytest.approx(depth * PERIOD - REPLY_DELAY, abs=1e-6)
+    assert len(timing.latency) > 400
+    assert (timing.missed, timing.late, timing.incomplete, timing.lost) == (0, 0, 0, 0)
+
+
+def test_a_period_without_commands_is_a_missed_cycle_and_shows_in_the_spacing():
+    timing = timing_of(loop_frames(200, missing=(50, 51)))
+    assert (timing.cycles, timing.missed, timing.late) == (199, 2, 1)
+    assert timing.spacing.max() == pytest.approx(3 * PERIOD, abs=1e-6)
+
+
+def test_a_late_cycle_is_not_missed_once_the_loop_has_caught_up():
+    timing = timing_of(loop_frames(200, late=(50, 120)))
+    assert (timing.cycles, timing.missed, timing.late) == (199, 0, 2)
+
+
+def test_a_cycle_without_all_replies_is_incomplete():
+    assert timing_of(loop_frames(200, without_replies=(50,))).incomplete == 1
+
+
+def test_an_answer_that_never_comes_is_lost():
+    # The commands answer replies of 60 cycles before, which is more than `GIVE_UP`.
+    timing = timing_of(loop_frames(400, depth=60))
+    assert timing.lost > 0 and len(timing.latency) == 0
+
+
+def test_an_arm_at_rest_shows_no_latency_because_all_its_answers_are_equal():
+    one_cycle = loop_frames(1)
+    frames = {name: np.concatenate([values] * 100) for name, values in one_cycle.items()}
+    frames["time"] = np.concatenate([one_cycle["time"] + k * PERIOD for k in range(100)])
+    assert len(timing_of(frames).latency) == 0
+
+
+def test_special_frames_and_foreign_frames_are_ignored():
+    frames = loop_frames(100)
+    extra = {"time": [START + 0.01, START + 0.0301], "id": [1, 77], "length": [8, 8], "data": [list(ENTER), [0] * 8]}
+    both = {name: np.concatenate([values, np.array(extra[name], values.dtype)]) for name, values in frames.items()}
+    assert timing_of(both).latency == pytest.approx(timing_of(frames).latency)

@@ -1,0 +1,133 @@
+"""The timing of a loop from the frames on its bus: latency from reply to torque, cycle spacing, missed cycles.
+
+The content of a command shows which replies it answers. The arm moves to and fro, so that its angles change by a few
+position codes each cycle. The four angles of a cycle determine, by the law under test, the four command frames that
+answer it, bit for bit: while the arm is carried within its limits on an upright trunk, the loop changes nothing else.
+An answer that equals one of the last cycles' is left out: the arm turned too little to tell them apart. Every other
+answer is searched in the later cycles; where a newer answer overtook it, that one counts. The latency of each motor
+runs from its reply to its command.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.motors import SPECIAL_FRAMES
+
+DISTINCT = 8  # cycles before, from whose answers an answer must differ
+GIVE_UP = 0.1  # s after which an answer counts as lost
+
+Law = Callable[[Sequence[float]], Sequence[float]]
+Answer = tuple[bytes, ...]  # the command frames to all motors
+
+
+@dataclass(frozen=True)
+class LoopTiming:
+    """The timing of one arm's loop.
+
+    latency: s, of each answer and motor. spacing: s, between the starts of consecutive cycles. cycles: the number that
+    was due. missed: cycles that never came. late: cycles that came half a period late or more; the loop may have caught
+    up by the next one. incomplete: cycles without a reply from every motor. lost: answers that never came.
+    """
+
+    latency: np.ndarray
+    spacing: np.ndarray
+    cycles: int
+    missed: int
+    late: int
+    incomplete: int
+    lost: int
+
+
+class Cycle:
+    """Commands and replies from one command to the first motor until the next; by joint: (time, bytes)."""
+
+    def __init__(self) -> None:
+        self.commands: dict[int, tuple[float, bytes]] = {}
+        self.replies: dict[int, tuple[float, bytes]] = {}
+
+
+def split_cycles(frames: dict[str, np.ndarray], motors: Sequence[JointMotor], begin: float, end: float) -> list[Cycle]:
+    """Return the cycles between two times (s)."""
+    joint_of = {motor.can_id: joint for joint, motor in enumerate(motors)}
+    inside = (frames["time"] >= begin) & (frames["time"] < end)
+    order = np.flatnonzero(inside)[np.argsort(frames["time"][inside], kind="stable")]
+    cycles: list[Cycle] = []
+    for i in order:
+        joint = joint_of.get(int(frames["id"][i]))
+        data = frames["data"][i, : frames["length"][i]].tobytes()
+        if joint is None or data in SPECIAL_FRAMES:
+            continue
+        is_reply = data[0] == motors[joint].can_id
+        if joint == 0 and not is_reply:
+            cycles.append(Cycle())
+        if cycles:
+            (cycles[-1].replies if is_reply else cycles[-1].commands)[joint] = float(frames["time"][i]), data
+    return cycles[:-1]  # the last one may be cut off
+
+
+def analyse(cycles: Sequence[Cycle], motors: Sequence[JointMotor], law: Law, period: float) -> LoopTiming:
+    """Return the timing of a loop that should run every `period` s and apply `law`: (4,) rad -> (4,) Nm."""
+    starts = np.array([cycle.commands[0][0] for cycle in cycles])
+    spacing = np.diff(starts)
+    cycles_due = round(float(starts[-1] - starts[0]) / period) + 1
+    answers = [_expected_answer(cycle, motors, law) for cycle in cycles]
+    sent = [_sent_answer(cycle, len(motors)) for cycle in cycles]
+    latency: list[float] = []
+    lost = 0
+    for k, answer in enumerate(answers):
+        if k < DISTINCT or answer is None or answer in answers[k - DISTINCT : k] or starts[-1] - starts[k] < GIVE_UP:
+            continue
+        n = _first_answer(k, answers, sent, starts)
+        if n is None:
+            lost += 1
+            continue
+        latency += [cycles[n].commands[j][0] - cycles[k].replies[j][0] for j in range(len(motors))]
+    return LoopTiming(
+        np.array(latency),
+        spacing,
+        cycles_due,
+        max(0, cycles_due - len(cycles)),
+        int(np.count_nonzero(spacing >= 1.5 * period)),
+        sum(answer is None for answer in answers),
+        lost,
+    )
+
+
+def _expected_answer(cycle: Cycle, motors: Sequence[JointMotor], law: Law) -> Answer | None:
+    """Return the commands that answer a cycle's replies, None if a reply is missing."""
+    if len(cycle.replies) != len(motors):
+        return None
+    angles = [motor.joint_reply(cycle.replies[joint][1]).position for joint, motor in enumerate(motors)]
+    return tuple(motor.command(torque, 0.0) for motor, torque in zip(motors, law(angles), strict=True))
+
+
+def _sent_answer(cycle: Cycle, motor_count: int) -> Answer | None:
+    """Return a cycle's commands, None if one is missing."""
+    if len(cycle.commands) != motor_count:
+        return None
+    return tuple(cycle.commands[joint][1] for joint in range(motor_count))
+
+
+def _first_answer(
+    k: int, expected: Sequence[Answer | None], sent: Sequence[Answer | None], starts: np.ndarray
+) -> int | None:
+    """Return the index of the first cycle whose commands answer cycle k or a later one."""
+    wanted = set()
+    for n in range(k + 1, len(sent)):
+        wanted.add(expected[n - 1])
+        if sent[n] is not None and sent[n] in wanted:
+            return n
+        if starts[n] - starts[k] > GIVE_UP:
+            return None
+    return None
+
+
+def percentile(values: np.ndarray, share: float) -> float:
+    """Return the percentile, NaN of an empty array."""
+    return float(np.percentile(values, share)) if len(values) else math.nan
