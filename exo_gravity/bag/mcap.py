@@ -1,8 +1,8 @@
-"""Serialised messages out of an MCAP file, whole or cut short, without its index.
+"""Serialised messages of an MCAP file, complete or cut short, read without its index.
 
-Records follow each other (https://mcap.dev/spec): one byte of opcode, eight of length, the content; a chunk's content,
-once unpacked, is such records again. Messages are taken out of it here and not by the `mcap` library, which makes an
-object of each; seven million of them are to be read in seconds.
+The file is a sequence of records (https://mcap.dev/spec): one byte of opcode, eight of length, the content. A chunk's
+content, once decompressed, is such records again. This module extracts messages itself, because the `mcap` library
+creates an object for each one, and seven million must be read in seconds.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from mcap.stream_reader import get_chunk_data_stream
 from exo_gravity.core.errors import DataError
 
 MAGIC = b"\x89MCAP0\r\n"
-RECORD = struct.Struct("<BQ")  # opcode, length of what follows
-MESSAGE = struct.Struct("<BQHIQQ")  # the same, channel, sequence, log time, publish time
-FULL = 5_000  # messages of a batch
+RECORD = struct.Struct("<BQ")  # opcode, length of the content
+MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
+BATCH_SIZE = 5_000  # messages
 
 Wanted = Callable[[str, str], bool]  # (topic, type) -> whether to yield its messages
 
 
 class Batch(NamedTuple):
-    """Messages of one topic: `stamps`, the times of their arrival in ns since 1970, and their bytes."""
+    """Messages of one topic: their times of arrival `stamps` in ns since 1970, and their bytes."""
 
     topic: str
     msgtype: str
@@ -40,13 +40,13 @@ class Batch(NamedTuple):
 class McapMessages:
     """The messages of one MCAP file, collected by channel.
 
-    `cut_short` says, after reading, where the file ends too early; None if it does not. Types by topic go to `topics`.
+    After reading, `cut_short` describes where the file ends too early; None for a complete file.
     """
 
-    def __init__(self, stream: BinaryIO, topics: dict[str, str], wanted: Wanted):
-        """Begin at the start of `stream`. Raises DataError if that is not the start of an MCAP file."""
+    def __init__(self, stream: BinaryIO, topics: dict[str, str], wanted: Wanted) -> None:
+        """Begin at the start of `stream`; topics: filled with the type of each topic. Raises DataError if not MCAP."""
         if stream.read(len(MAGIC)) != MAGIC:
-            raise DataError(f"{stream.name}: must begin as an MCAP file does; it is empty or something else")
+            raise DataError(f"{stream.name}: not an MCAP file, or empty")
         self.cut_short: str | None = None
         self._stream = stream
         self._topics = topics
@@ -55,16 +55,16 @@ class McapMessages:
         self._batches: dict[int, Batch] = {}
 
     def batches(self) -> Iterator[Batch]:
-        """Yield the wanted messages, each batch of one topic."""
+        """Yield the wanted messages; a batch has one topic."""
         try:
             for body in _bodies(self._stream):
                 self._collect(body)
-                if any(len(batch.stamps) >= FULL for batch in self._batches.values()):
+                if any(len(batch.stamps) >= BATCH_SIZE for batch in self._batches.values()):
                     yield from self._collected()
         except EOFError as error:
             self.cut_short = str(error)
         except (McapError, struct.error, ValueError):
-            self.cut_short = "ends within a record, or it is damaged"
+            self.cut_short = "ends within a record, or is damaged"
         yield from self._collected()
 
     def _collect(self, body: bytes) -> None:
@@ -105,7 +105,7 @@ class McapMessages:
 
 
 def _bodies(stream: BinaryIO) -> Iterator[bytes]:
-    """Yield the content of each chunk, and the records that stand outside of one; skip the rest. EOFError at a cut."""
+    """Yield the content of each chunk and each relevant record outside chunks. Raises EOFError at a cut."""
     while True:
         head = stream.read(RECORD.size)
         if len(head) < RECORD.size:
@@ -120,15 +120,15 @@ def _bodies(stream: BinaryIO) -> Iterator[bytes]:
         if opcode != Opcode.CHUNK:
             yield head + record
         else:
-            yield _unpacked(Chunk.read(ReadDataStream(BytesIO(record))))
+            yield _decompressed(Chunk.read(ReadDataStream(BytesIO(record))))
         if len(record) < length:
             raise EOFError("ends within a chunk")
 
 
-def _unpacked(chunk: Chunk) -> bytes:
+def _decompressed(chunk: Chunk) -> bytes:
     if not chunk.compression:
         return chunk.data
     try:
         return get_chunk_data_stream(chunk)[0].read(chunk.uncompressed_size)
-    except Exception as error:  # each decompressor has its own
-        raise EOFError(f"ends within a compressed chunk, or it is damaged ({error})") from None
+    except Exception as error:  # each decompressor raises its own type
+        raise EOFError(f"ends within a compressed chunk, or is damaged ({error})") from None

@@ -17,7 +17,8 @@ from rosbags.typesys import Stores, get_typestore
 from exo_gravity.bag.content import Bag
 from exo_gravity.bag.events import EventLog
 from exo_gravity.bag.joints import FIELDS, JointArrays
-from exo_gravity.bag.storage import Batch, Storage
+from exo_gravity.bag.mcap import Batch
+from exo_gravity.bag.storage import Storage
 from exo_gravity.bag.topics import COMMANDS, JOINT_STATE, STATES, arm_of, is_wanted, leaf
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.recording import Recording

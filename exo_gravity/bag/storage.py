@@ -1,8 +1,8 @@
-"""Serialised messages out of a rosbag2 recording, in batches: MCAP or sqlite3, whole or cut short.
+"""Serialised messages of a rosbag2 recording, in batches: MCAP or sqlite3, complete or cut short.
 
-A recorder that was killed leaves no metadata.yaml and no index, so neither is needed: an MCAP file is read record after
-record, a database row after row, and what is there is yielded. Recordings that rosbag2 compressed as a whole or message
-by message are left to rosbags' own reader, which wants them whole.
+A killed recorder leaves neither metadata.yaml nor an index, so neither is needed: MCAP files are read record by record,
+databases row by row, up to the cut. Recordings that rosbag2 compressed by file or by message go through rosbags'
+own reader, which requires complete files.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO
 from urllib.parse import quote
 
 from rosbags.rosbag2 import Reader, ReaderError
@@ -22,20 +22,20 @@ from rosbags.rosbag2 import Reader, ReaderError
 from exo_gravity.bag.mcap import Batch, McapMessages, Wanted
 from exo_gravity.core.errors import DataError
 
-ROWS = 5_000  # messages a batch
+BATCH_SIZE = 5_000  # messages
 Topic = tuple[str, str]  # name, type
 Row = tuple[Topic, int, bytes]
 
 
 class Storage:
-    """A recording: a folder of rosbag2, or one of its files.
+    """A recording: a rosbag2 folder, or one of its files.
 
-    Filled while `batches` is read: `topics`, type by topic, wanted or not; `cut_short`, what was wrong with the end of
-    the last file, None if nothing; `done` of `size` bytes.
+    `batches` fills: `topics`, the type of each topic, wanted or not; `cut_short`, where the last file ends too early,
+    None for complete files; `done`, the bytes read of `size`.
     """
 
-    def __init__(self, path: str | Path):
-        """Find the files. Raises DataError if there is none."""
+    def __init__(self, path: str | Path) -> None:
+        """Find the files. Raises DataError if there are none."""
         self.path = Path(path)
         self.topics: dict[str, str] = {}
         self.cut_short: str | None = None
@@ -45,11 +45,11 @@ class Storage:
         files = sorted(self.path.iterdir(), key=_natural) if self.path.is_dir() else [self.path]
         self.files = [file for file in files if file.suffix in (".mcap", ".db3", ".zstd")]
         if not self.files:
-            raise DataError(f"{path}: must be a rosbag2 recording, a folder with an .mcap or .db3 file, or such a file")
+            raise DataError(f"{path}: must be a rosbag2 folder with an .mcap or .db3 file, or such a file")
         self.size = sum(file.stat().st_size for file in self.files)
 
     def batches(self, wanted: Wanted) -> Iterator[Batch]:
-        """Yield the messages of the topics that are `wanted`. Raises DataError where a file is of no known form."""
+        """Yield the messages of the `wanted` topics. Raises DataError for a file of unknown format."""
         if any(file.suffix == ".zstd" for file in self.files) or self._compressed_messages():
             yield from self._by_rosbags(wanted)
             return
@@ -77,7 +77,7 @@ class Storage:
         try:
             database, topics = _open_database(file)
         except sqlite3.Error as error:
-            raise DataError(f"{file}: must be a database of rosbag2 ({error})") from None
+            raise DataError(f"{file}: not a rosbag2 database ({error})") from None
         self.topics.update(topics.values())
         chosen = {key: topic for key, topic in topics.items() if wanted(*topic)}
         for batch in _grouped(self._rows(database, chosen, file.name)):
@@ -101,11 +101,11 @@ class Storage:
                 messages = reader.messages(chosen) if chosen else ()
                 yield from _grouped(((c.topic, c.msgtype), stamp, bytes(data)) for c, stamp, data in messages)
         except (ReaderError, FileNotFoundError) as error:
-            raise DataError(f"{self.path}: a compressed recording must be whole ({error})") from None
+            raise DataError(f"{self.path}: a compressed recording must be complete ({error})") from None
 
 
 def _grouped(rows: Iterator[Row]) -> Iterator[Batch]:
-    while part := list(islice(rows, ROWS)):
+    while part := list(islice(rows, BATCH_SIZE)):
         batches: dict[str, Batch] = {}
         for topic, stamp, data in part:
             batch = batches.get(topic[0]) or batches.setdefault(topic[0], Batch(*topic, [], []))
@@ -115,12 +115,12 @@ def _grouped(rows: Iterator[Row]) -> Iterator[Batch]:
 
 
 def _open_database(file: Path) -> tuple[sqlite3.Connection, dict[int, Topic]]:
-    """Return the database and its topics. sqlite3.Error if that can't be had in any of three ways."""
+    """Open a database in one of three ways and return it with its topics. Raises sqlite3.Error if all of them fail."""
     with tempfile.NamedTemporaryFile(suffix=file.suffix) as copy:
-        # A recorder that was killed may leave a journal, which sqlite plays back where it may write beside the file.
+        # A killed recorder may leave a journal, which sqlite replays if it may write next to the file.
         for name, mode in ((file, "mode=ro"), (file, "immutable=1"), (copy.name, "immutable=1")):
             if name == copy.name:
-                _copy_as_long_as_it_is(file, copy)
+                _copy_without_page_count(file, copy)
             database = sqlite3.connect(f"file:{quote(str(Path(name).resolve()))}?{mode}", uri=True)
             try:
                 rows = database.execute("SELECT id, name, type FROM topics").fetchall()
@@ -131,8 +131,8 @@ def _open_database(file: Path) -> tuple[sqlite3.Connection, dict[int, Topic]]:
         raise failure
 
 
-def _copy_as_long_as_it_is(file: Path, copy: BinaryIO) -> None:
-    """Copy a database that ends before the size in its header, without which sqlite goes by the size of the file.
+def _copy_without_page_count(file: Path, copy: IO[bytes]) -> None:
+    """Copy a truncated database and invalidate the size in its header, so that sqlite uses the size of the file.
 
     The size is valid if the counter at byte 92 equals the one at 24 (https://www.sqlite.org/fileformat.html, 1.3.7).
     """
@@ -145,6 +145,6 @@ def _copy_as_long_as_it_is(file: Path, copy: BinaryIO) -> None:
     copy.flush()
 
 
-def _natural(path: Path) -> list:
-    """Order bag_2 before bag_10."""
+def _natural(path: Path) -> list[int | str]:
+    """Return a sort key that puts bag_2 before bag_10."""
     return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]

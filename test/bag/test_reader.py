@@ -78,11 +78,11 @@ def test_an_mcap_file_of_another_writer_is_read(recording, content, tmp_path, ch
     assert_same(only(tmp_path / "other.mcap"), recording)
 
 
-def test_time_is_that_of_the_stamps_from_the_first_arrival_on(recording, bag):
+def test_time_comes_from_the_stamps_and_is_0_at_the_first_arrival(recording, bag):
     np.testing.assert_allclose(only(bag).time, recording.time - 200e-6, atol=1e-8)
 
 
-def test_without_stamps_time_is_that_of_arrival(recording, tmp_path):
+def test_without_stamps_time_is_the_time_of_arrival(recording, tmp_path):
     states = [
         ("/joint_states", made.JOINT_STATE, made.START + round(time * 1e9), made.joint_state(0, made.NAMES, pose))
         for time, pose in zip(recording.time.tolist(), recording.position, strict=True)
@@ -92,13 +92,13 @@ def test_without_stamps_time_is_that_of_arrival(recording, tmp_path):
     assert read.name == "arm"
 
 
-def test_a_command_stands_beside_the_state_after_the_one_that_it_answers(recording, bag):
+def test_a_command_is_paired_with_the_state_after_the_one_that_it_answers(recording, bag):
     read = only(bag)
     np.testing.assert_allclose(read.command[1:], recording.command[:-1], rtol=1e-6)
     assert np.all(np.isnan(read.command[0]))
 
 
-def test_commands_that_ceased_do_not_count_for_longer_than_they_are_in_force(recording, content, tmp_path):
+def test_the_last_command_expires_when_commands_stop(recording, content, tmp_path):
     last = made.START + 2 * 10**9
     some = [item for item in content if item[0] != "/right/effort_commands" or item[2] < last]
     read = only(made.write_bag(tmp_path / "bag", some))
@@ -157,7 +157,7 @@ def test_the_layout_of_any_joint_state_is_what_rosbags_decodes(names, frame, pre
         np.testing.assert_array_equal(layout.values(rows, names, (field,))[0, 0], expected)
 
 
-def test_what_the_wearer_was_told_is_the_script(recording, bag):
+def test_the_recorded_wearer_steps_are_the_script(recording, bag):
     steps = only(bag).steps
     assert [step.action for step in steps] == ["move", "hold", "move", "hold"]
     np.testing.assert_allclose([step.start for step in steps], [step.start for step in recording.steps], atol=0.006)
@@ -175,7 +175,7 @@ def test_a_recording_cut_short_gives_what_was_written_before(recording, bag, sha
     assert "cut short" in read.notes[0]
 
 
-def test_a_recording_that_lacks_its_index_alone_is_whole(recording, bag):
+def test_a_recording_that_lacks_only_its_index_is_complete(recording, bag):
     file = bag / "bag.mcap"
     file.write_bytes(file.read_bytes()[:-40])
     read = read_bag(bag)
@@ -214,26 +214,26 @@ def test_the_parts_of_a_recording_are_read_in_the_order_of_their_numbers(recordi
     np.testing.assert_allclose(read.time, recording.time - 200e-6, atol=1e-8)
 
 
-def test_an_empty_recording_says_so(tmp_path):
+def test_an_empty_recording_is_reported_as_empty(tmp_path):
     topics = [("/right/joint_states", made.JOINT_STATE)]
     with pytest.raises(DataError, match="empty"):
         read_bag(made.write_bag(tmp_path / "bag", [], topics=topics))
 
 
-def test_a_recording_without_joint_states_says_what_it_has(tmp_path):
+def test_the_error_for_a_recording_without_joint_states_lists_its_topics(tmp_path):
     content = [("/chatter", "std_msgs/msg/String", made.START, made.string("hello"))]
     with pytest.raises(DataError, match=r"no topic joint_states .* it has /chatter"):
         read_bag(made.write_bag(tmp_path / "bag", content))
 
 
-def test_joint_states_of_another_type_do_not_count(tmp_path):
+def test_joint_states_of_another_type_are_ignored(tmp_path):
     content = [("/right/joint_states", "std_msgs/msg/String", made.START, made.string("hello"))]
     with pytest.raises(DataError, match="joint_states"):
         read_bag(made.write_bag(tmp_path / "bag", content))
 
 
 @pytest.mark.parametrize("name", ["missing", "folder", "text.mcap", "text.db3", "text.txt"])
-def test_what_is_no_recording_is_refused_by_its_name(tmp_path, name):
+def test_a_file_that_is_not_a_recording_is_refused_by_name(tmp_path, name):
     (tmp_path / "folder").mkdir()
     for file in ("text.mcap", "text.db3", "text.txt"):
         (tmp_path / file).write_text("no recording at all, though long enough to look at\n" * 20)
@@ -241,7 +241,7 @@ def test_what_is_no_recording_is_refused_by_its_name(tmp_path, name):
         read_bag(tmp_path / name)
 
 
-def test_commands_for_other_joints_leave_positions_reported_and_say_so(recording, tmp_path):
+def test_commands_for_other_joints_are_a_problem_and_positions_are_still_read(recording, tmp_path):
     content = made.messages(recording, command_names=("a", "b", "c", "d"))
     read = read_bag(made.write_bag(tmp_path / "bag", content))
     assert_same(read.recordings[0], recording)
@@ -256,7 +256,7 @@ def test_joint_states_whose_names_change_are_refused(recording, content, tmp_pat
         read_bag(made.write_bag(tmp_path / "bag", [*content, ("/right/joint_states", made.JOINT_STATE, stamp, other)]))
 
 
-def test_an_arm_that_cannot_be_read_leaves_the_other_reported(recording, content, tmp_path):
+def test_an_unreadable_arm_is_a_problem_and_the_other_arm_is_still_read(recording, content, tmp_path):
     bad = [
         ("/left/joint_states", made.JOINT_STATE, made.START + k * 10**6, made.joint_state(0, ["a"], [0.0]))
         for k in range(9)
@@ -272,7 +272,7 @@ def test_a_damaged_message_is_named_by_its_topic(content, tmp_path):
         read_bag(made.write_bag(tmp_path / "bag", broken))
 
 
-def test_without_commands_the_rest_is_reported_with_a_note(recording, content, tmp_path):
+def test_without_commands_the_rest_is_read_with_a_note(recording, content, tmp_path):
     states = [item for item in content if item[0] != "/right/effort_commands"]
     read = read_bag(made.write_bag(tmp_path / "bag", states))
     assert_same(read.recordings[0], recording)
@@ -280,7 +280,7 @@ def test_without_commands_the_rest_is_reported_with_a_note(recording, content, t
 
 
 @pytest.mark.parametrize("text", ["no JSON", "[1]", "{}", '{"action": "hold", "duration": null}'])
-def test_what_is_no_step_is_a_problem_in_one_sentence_and_the_rest_is_read(content, recording, tmp_path, text):
+def test_an_invalid_step_is_one_problem_and_the_rest_is_read(content, recording, tmp_path, text):
     wrong = ("/right/wearer_step", "std_msgs/msg/String", content[-1][2], made.string(text))
     read = read_bag(made.write_bag(tmp_path / "bag", [*content, wrong]))
     assert read.problems == ("/right/wearer_step: invalid wearer_step message",)
@@ -288,7 +288,7 @@ def test_what_is_no_step_is_a_problem_in_one_sentence_and_the_rest_is_read(conte
 
 
 def status(level, text, **values):
-    """What a bridge says of itself, but for the time."""
+    """Topic, type and bytes of a bridge's diagnostics."""
     types = made.STORE.types
     pairs = [types["diagnostic_msgs/msg/KeyValue"](key=key, value=value) for key, value in values.items()]
     entry = types["diagnostic_msgs/msg/DiagnosticStatus"](level, "right/can_bridge", text, "", pairs)
@@ -298,7 +298,7 @@ def status(level, text, **values):
     return "/diagnostics", kind, bytes(made.STORE.serialize_cdr(message, kind))
 
 
-def test_the_arm_is_carried_from_the_bridges_first_word_of_that_to_its_last(content, tmp_path):
+def test_the_arm_counts_as_carried_from_the_first_to_the_last_carrying_state(content, tmp_path):
     states = ["checking", "ramping in", "active", "active", "letting down", "fault", "checking", "active", "active"]
     for tenth, state in enumerate(states):
         topic, kind, data = status(0, state, state=state)
@@ -309,11 +309,11 @@ def test_the_arm_is_carried_from_the_bridges_first_word_of_that_to_its_last(cont
     np.testing.assert_allclose(only(made.write_bag(tmp_path / "bag", content)).carried, expected, atol=1e-9)
 
 
-def test_where_no_bridge_tells_its_state_nobody_knows_when_the_arm_was_carried(content, bag):
+def test_without_a_reported_state_it_is_unknown_when_the_arm_was_carried(content, bag):
     assert only(bag).carried is None
 
 
-def test_faults_changed_parameters_and_parameters_at_the_start_are_told(content, tmp_path):
+def test_faults_changed_parameters_and_parameters_at_the_start_are_read(content, tmp_path):
     types = made.STORE.types
     stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
 
@@ -328,7 +328,7 @@ def test_faults_changed_parameters_and_parameters_at_the_start_are_told(content,
         return "/parameter_events", kind, bytes(made.STORE.serialize_cdr(message, kind))
 
     snapshot = "/right/compensator:\n  ros__parameters: {law: exact}\n"
-    told = [
+    messages = [
         (1.0, ("/recorder/parameters", "std_msgs/msg/String", made.string(snapshot))),
         (2.0, status(0, "fine")),
         (3.0, status(2, "motor 2 is silent")),
@@ -336,7 +336,7 @@ def test_faults_changed_parameters_and_parameters_at_the_start_are_told(content,
         (4.0, status(0, "fine")),
         (5.0, change("support", 0.5)),
     ]
-    extra = [(topic, kind, made.START + 200_000 + round(s * 1e9), data) for s, (topic, kind, data) in told]
+    extra = [(topic, kind, made.START + 200_000 + round(s * 1e9), data) for s, (topic, kind, data) in messages]
     read = read_bag(made.write_bag(tmp_path / "bag", sorted([*content, *extra], key=lambda item: item[2])))
     assert [(round(event.time, 6), event.text) for event in read.events] == [
         (3.0, "right/can_bridge: motor 2 is silent"),
@@ -353,7 +353,7 @@ def test_progress_reaches_the_size_of_the_recording(bag):
     assert 0 < seen[0][0] <= seen[-1][0] <= seen[-1][1]
 
 
-def test_a_step_that_is_no_json_is_a_problem_and_not_the_end(content, recording, tmp_path):
+def test_steps_that_are_all_invalid_leave_the_joint_states_readable(content, recording, tmp_path):
     steps = [("/right/wearer_step", "std_msgs/msg/String", made.START, made.string("gibberish"))]
     states = [item for item in content if not item[0].endswith("wearer_step")]
     read = read_bag(made.write_bag(tmp_path / "bag", [*steps, *states]))
@@ -361,7 +361,7 @@ def test_a_step_that_is_no_json_is_a_problem_and_not_the_end(content, recording,
     assert_same(read.recordings[0], recording)
 
 
-def test_a_step_of_the_virtual_wearer_has_more_than_is_needed(content, tmp_path):
+def test_additional_fields_of_a_virtual_wearers_step_are_ignored(content, tmp_path):
     done = json.dumps({"step": 4, "of": 4, "action": "done", "duration": 0.0})
     stamp = content[-1][2] + 1
     last = ("/right/wearer_step", "std_msgs/msg/String", stamp, made.string(done))

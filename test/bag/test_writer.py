@@ -1,4 +1,4 @@
-"""What `BagWriter` leaves on disk, seen by independent readers; killed, and on a disk that is full."""
+"""Recordings of `BagWriter`, read by independent readers; also of a killed process, and on a full disk."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_rosbags_reads_topics_types_and_messages(bag):
     assert [(stamp, state.position[0]) for _, stamp, state in messages] == [(START + k, k) for k in range(100)]
 
 
-def test_the_quality_of_service_that_was_offered_is_kept(bag):
+def test_the_offered_quality_of_service_is_recorded(bag):
     with AnyReader([bag]) as reader:
         offered = {c.topic: c.ext.offered_qos_profiles[0] for c in reader.connections}
     assert offered["/right/joint_states"].reliability == QosReliability.RELIABLE
@@ -75,7 +75,7 @@ def test_the_quality_of_service_that_was_offered_is_kept(bag):
     assert offered["/right/wearer_step"].durability == QosDurability.TRANSIENT_LOCAL
 
 
-def test_metadata_is_that_of_rosbag2_with_the_hash_of_each_type(bag):
+def test_metadata_has_rosbag2s_form_and_the_hash_of_each_type(bag):
     metadata = yaml.safe_load((bag / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert metadata["storage_identifier"] == "mcap" and metadata["message_count"] == 100
     topic = metadata["topics_with_message_count"][0]["topic_metadata"]
@@ -84,17 +84,17 @@ def test_metadata_is_that_of_rosbag2_with_the_hash_of_each_type(bag):
     assert topic["type_description_hash"] == expected
 
 
-def test_a_folder_that_exists_is_not_written_over(bag):
+def test_an_existing_folder_is_not_overwritten(bag):
     with pytest.raises(DataError, match="exists already"):
         BagWriter(bag)
 
 
-def test_a_type_that_is_not_known_is_refused_by_its_name(tmp_path):
+def test_an_unknown_type_is_refused_by_name(tmp_path):
     with BagWriter(tmp_path / "bag") as writer, pytest.raises(DataError, match="my_msgs/msg/Mine"):
         writer.add_topic("/mine", "my_msgs/msg/Mine", RELIABLE)
 
 
-def test_what_waits_is_written_before_the_end(tmp_path):
+def test_queued_messages_are_written_before_the_end(tmp_path):
     with BagWriter(tmp_path / "bag") as writer:
         writer.add_topic("/right/joint_states", JOINT_STATE, RELIABLE)
         for k in range(1500):
@@ -102,7 +102,7 @@ def test_what_waits_is_written_before_the_end(tmp_path):
     assert writer.count == len(read_bag(tmp_path / "bag").recordings[0].time) == 1500
 
 
-def test_a_disk_that_never_answers_ends_the_recording_and_holds_nobody_up(tmp_path, monkeypatch):
+def test_a_disk_that_never_answers_ends_the_recording_without_blocking_the_caller(tmp_path, monkeypatch):
     answer = threading.Event()
     monkeypatch.setattr("exo_gravity.bag.writer.MAX_WAITING", 10)
     monkeypatch.setattr(BagWriter, "_take", lambda self, item: answer.wait())
@@ -118,7 +118,7 @@ def process_command(name, path):
     return [sys.executable, "-m", "test.support.bag_processes", name, str(path)]
 
 
-def test_killed_at_any_moment_it_loses_at_most_the_last_second(tmp_path):
+def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path):
     path = tmp_path / "bag"
     process = subprocess.Popen(process_command("until_killed", path), cwd=ROOT, stdout=subprocess.PIPE, text=True)
     stamps = []
@@ -134,7 +134,7 @@ def test_killed_at_any_moment_it_loses_at_most_the_last_second(tmp_path):
     assert "cut short" in read.notes[0]
 
 
-def test_a_file_that_may_not_grow_ends_the_recording_with_the_reason_and_keeps_what_fits(tmp_path):
+def test_a_full_disk_ends_the_recording_with_the_reason_and_keeps_what_fits(tmp_path):
     path = tmp_path / "bag"
     done = subprocess.run(process_command("until_disk_full", path), cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0 and done.stderr == ""
