@@ -2,31 +2,35 @@
 
     /right/can_bridge  ->  the executable `can_bridge`, as node `can_bridge` in the namespace /right
 
-Bridges are stopped first, and waited for: they let the arms down, and nothing they need may vanish under them. The
-nodes stop by themselves, too, if the launcher dies: it holds the other end of their standard input.
+It stops the bridges first and waits for them, because they need the other nodes while they let the arms down. If the
+launcher dies, the nodes stop by themselves: each watches its standard input, whose other end the launcher holds.
+
+Exit code 0: stopped by Ctrl-C or SIGTERM. 1: a node ended. 2: wrong use or wrong file.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from exo_gravity.core.control_params import CAN_BRIDGE
 from exo_gravity.core.errors import ExoGravityError, ParameterError
-from exo_gravity.tools.inputs.parameter_file import load, packaged_config
+from exo_gravity.tools.inputs.executables import executable, node_names
+from exo_gravity.tools.inputs.parameter_file import Nodes, load, packaged_config
 
-DESCENT = 30.0  # s that a bridge may take to let its arm down before it is killed
-FAREWELL = 5.0  # s that any other node may take to end
+DESCENT_TIMEOUT = 30.0  # s for a bridge to let its arm down, after which it is killed
+STOP_TIMEOUT = 5.0  # s for any other node to end
+DEFAULT_CAN_IDS = next(param.default for param in CAN_BRIDGE if param.name == "can_id")
 LOG_FORMAT = "{severity} {message}"
 
-OnLine = Callable[[str, str], None]
+OnLine = Callable[[str, str], None]  # (node, line of its log)
 
 
 def print_line(node: str, line: str) -> None:
@@ -39,12 +43,13 @@ def print_line(node: str, line: str) -> None:
 class Launcher:
     """The processes of one parameter file."""
 
-    def __init__(self, params: str | Path, on_line: OnLine = print_line):
+    def __init__(self, params: str | Path, on_line: OnLine = print_line) -> None:
+        """Read the parameter file; on_line is called with each line that a node prints. Raises ParameterError."""
         self._path = Path(params).resolve()
         nodes = load(self._path)
         _check_buses(nodes)
         self._commands = {node: self._command(node) for node in nodes}
-        self._processes: dict[str, subprocess.Popen] = {}
+        self._processes: dict[str, subprocess.Popen[str]] = {}
         self._readers: dict[str, threading.Thread] = {}
         self._on_line = on_line
 
@@ -62,21 +67,21 @@ class Launcher:
                 stderr=subprocess.STDOUT,
                 text=True,
                 errors="replace",
-                start_new_session=True,  # a Ctrl-C in the terminal reaches the launcher alone
+                start_new_session=True,  # Ctrl-C in the terminal reaches only the launcher
             )
             self._processes[node] = process
             reader = threading.Thread(target=self._read, args=(node, process), daemon=True)
             reader.start()
             self._readers[node] = reader
 
-    def process(self, node: str) -> subprocess.Popen:
+    def process(self, node: str) -> subprocess.Popen[str]:
         """Return the process of a node by its full name."""
         return self._processes[node]
 
     def dead(self) -> tuple[str, int] | None:
-        """Return the name and exit code of a node that has ended, or None while all run.
+        """Return the name and exit code of a node that has ended, None while all run.
 
-        A recorder does not count: a full disk must not let the arm down.
+        A recorder may end, because a full disk must not let the arm down.
         """
         for node, process in self._processes.items():
             code = process.poll()
@@ -85,30 +90,30 @@ class Launcher:
         return None
 
     def stop(self) -> None:
-        """Stop every node: bridges first, gently, then the rest."""
+        """Stop every node: first the bridges, which let the arms down, then the rest."""
         bridges = [node for node in self._processes if node.endswith("/can_bridge")]
         others = [node for node in self._processes if node not in bridges]
-        self._end(bridges, DESCENT)
-        self._end(others, FAREWELL)
+        self._terminate(bridges, DESCENT_TIMEOUT)
+        self._terminate(others, STOP_TIMEOUT)
 
-    def _end(self, nodes: list[str], patience: float) -> None:
-        """Ask `nodes` to end and wait until they have, and all they started; kill those that do not."""
+    def _terminate(self, nodes: list[str], timeout: float) -> None:
+        """Terminate `nodes` and wait for them and their children; kill those that run for more than `timeout` s."""
         processes = [self._processes[node] for node in nodes]
         for process in processes:
             if process.poll() is None:
-                process.terminate()  # SIGTERM: unlike SIGINT it leaves no traceback in a node that is still importing
-        deadline = time.monotonic() + patience
+                process.terminate()  # SIGTERM: SIGINT would print a traceback in a node that is still importing
+        deadline = time.monotonic() + timeout
         for process in processes:
             try:
                 process.wait(max(0.0, deadline - time.monotonic()))
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-        for node in nodes:  # a dead bridge's watchdog may still be letting the arm down: it has the same output
-            self._readers[node].join(max(FAREWELL, deadline - time.monotonic()))
+        for node in nodes:  # the watchdog of a dead bridge may still let the arm down, and keeps the output open
+            self._readers[node].join(max(STOP_TIMEOUT, deadline - time.monotonic()))
 
-    def run(self, stopping: StopFlag | threading.Event) -> tuple[str, int] | None:
-        """Start all, wait until `stopping` is set or a node ends, stop all; return the node that ended, if any."""
+    def run(self, stopping: Stopping) -> tuple[str, int] | None:
+        """Run the nodes until `stopping` is set or one ends; return the name and exit code of the one that ended."""
         try:
             self.start()
             while not stopping.wait(0.05):
@@ -122,49 +127,35 @@ class Launcher:
     def _command(self, node: str) -> list[str]:
         namespace, name = node.rsplit("/", 1)
         remaps = ("-r", f"__node:={name}", "-r", f"__ns:={namespace or '/'}")
-        return [executable(node, name), "--ros-args", *remaps, "--enclave", node, "--params-file", str(self._path)]
+        return [executable(node), "--ros-args", *remaps, "--enclave", node, "--params-file", str(self._path)]
 
-    def _read(self, node: str, process: subprocess.Popen) -> None:
-        for line in process.stdout:
+    def _read(self, node: str, process: subprocess.Popen[str]) -> None:
+        for line in process.stdout or ():
             self._on_line(node, line.rstrip())
 
 
-def executable(node: str, name: str) -> str:
-    """Return the path of the executable `name` of this package, or raise ParameterError that names the YAML's key."""
-    prefixes = filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(":"))
-    folders = (
-        Path(sys.argv[0]).resolve().parent,
-        Path(sys.executable).parent,
-        *(Path(prefix, "lib", "exo_gravity") for prefix in prefixes),
-    )
-    found = shutil.which(name, path=os.pathsep.join(map(str, folders)))
-    if found is None or name not in ("can_bridge", "imu", "compensator", "simulator", "recorder"):
-        raise ParameterError("node name", node, "one that ends in can_bridge, imu, compensator, simulator or recorder")
-    return found
-
-
-def _check_buses(nodes: dict[str, dict]) -> None:
-    """Raise ParameterError where two bridges would command the same motor."""
-    owner: dict[tuple, str] = {}
+def _check_buses(nodes: Nodes) -> None:
+    """Raise ParameterError if two bridges would command the same motor."""
+    owner: dict[tuple[object, ...], str] = {}
     for node, parameters in nodes.items():
         if not node.endswith("/can_bridge"):
             continue
         bus = tuple(sorted((k, str(v)) for k, v in parameters.items() if k.startswith("can.")))
-        ids = parameters.get("can_id", [1, 2, 3, 4])
+        ids = parameters.get("can_id", DEFAULT_CAN_IDS)
         for can_id in ids if isinstance(ids, list) else ():
             other = owner.setdefault((bus, can_id), node)
             if other != node:
-                raise ParameterError(f"{node} can_id", ids, f"other IDs than {other} has on the same bus")
+                raise ParameterError(f"{node} can_id", ids, f"different from the IDs of {other} on the same bus")
 
 
 class StopFlag:
-    """Set once and for all. Unlike threading.Event it may be set by a signal that interrupts its own setting."""
+    """A flag that is set once. Unlike threading.Event it is safe to set in a signal handler that interrupts `set`."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._set = False
 
     def set(self, *_: object) -> None:
-        """Set the flag; fits as a signal handler."""
+        """Set the flag; usable as a signal handler."""
         self._set = True
 
     def is_set(self) -> bool:
@@ -178,6 +169,9 @@ class StopFlag:
         return self._set
 
 
+Stopping = StopFlag | threading.Event
+
+
 def stop_on_signals() -> StopFlag:
     """Return a flag that Ctrl-C or SIGTERM sets."""
     stopping = StopFlag()
@@ -186,18 +180,27 @@ def stop_on_signals() -> StopFlag:
     return stopping
 
 
-def main() -> None:
-    """Entry point of the executable `launcher`."""
-    parser = argparse.ArgumentParser(prog="launcher", description="Start every node of a parameter file.")
+def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="launcher",
+        description="Start every node of a parameter file, and stop them all when one ends.",
+        epilog="Each top-level key of the file is a node to start, /namespace/executable: /right/can_bridge starts the "
+        f"executable can_bridge in the namespace /right, /imu starts imu. Executables: {', '.join(node_names())}.",
+    )
     parser.add_argument("--params", metavar="FILE", help="ROS 2 parameter file (default: the packaged sim.yaml)")
-    arguments = parser.parse_args()
+    return parser.parse_args(args)
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Entry point of the executable `launcher`."""
+    options = _arguments(args)
     stopping = stop_on_signals()
     try:
-        dead = Launcher(arguments.params or packaged_config("sim.yaml")).run(stopping)
+        dead = Launcher(options.params or packaged_config("sim.yaml")).run(stopping)
     except ExoGravityError as error:
         print(f"launcher: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     if dead:
         node, code = dead
-        print(f"launcher: {node.lstrip('/')} ended with exit code {code}; everything was stopped", file=sys.stderr)
+        print(f"launcher: {node.lstrip('/')} ended with exit code {code}; all nodes were stopped", file=sys.stderr)
         raise SystemExit(1)

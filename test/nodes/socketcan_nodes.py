@@ -63,7 +63,7 @@ def nodes(tmp_path, monkeypatch):
     params = tmp_path / "params.yaml"
     params.write_text(yaml.safe_dump(content))
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(launcher, "DESCENT", launcher.DESCENT * SLOWER)
+    monkeypatch.setattr(launcher, "DESCENT_TIMEOUT", launcher.DESCENT_TIMEOUT * SLOWER)
     log = []
     nodes = Launcher(params, lambda node, line: log.append(f"{node}: {line}"))
     nodes.start()

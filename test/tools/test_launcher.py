@@ -1,0 +1,70 @@
+"""launcher: which keys of a parameter file it accepts, and how it refuses the others. test/nodes starts real nodes."""
+
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from exo_gravity.tools.inputs.executables import node_names
+from exo_gravity.tools.launcher import Launcher, main
+
+NODES = Path(__file__).parents[2] / "exo_gravity" / "nodes"
+SIM = Path(__file__).parents[2] / "config" / "sim.yaml"
+
+
+@pytest.fixture
+def refused(tmp_path, capsys):
+    """Launch the packaged simulated arm with `changes` {node: {parameter: value}} and `more` YAML; return the error."""
+
+    def refused(changes, more=""):
+        content = yaml.safe_load(SIM.read_text())
+        for node, values in changes.items():
+            content.setdefault(node, {"ros__parameters": {}})["ros__parameters"].update(values)
+        path = tmp_path / "params.yaml"
+        path.write_text(yaml.safe_dump(content) + more)
+        with pytest.raises(SystemExit) as ended:
+            main(["--params", str(path)])
+        assert ended.value.code == 2
+        return capsys.readouterr().err
+
+    return refused
+
+
+def test_the_node_names_are_the_modules_with_an_entry_point():
+    modules = {path.stem for path in NODES.glob("*.py") if "\ndef main(" in path.read_text(encoding="utf-8")}
+    assert set(node_names()) == modules >= {"can_bridge", "imu", "compensator", "simulator", "recorder"}
+
+
+def test_help_lists_the_nodes_and_shows_a_key(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert ended.value.code == 0 and "/right/can_bridge" in text and ", ".join(node_names()) in text
+
+
+def test_a_key_that_is_not_a_node_is_refused_with_the_list_of_nodes(refused):
+    error = refused({"/right/can_brigde": {}})
+    assert error.startswith("launcher: node name = '/right/can_brigde'") and ", ".join(node_names()) in error
+
+
+def test_a_tool_is_not_a_node(refused):
+    assert "node name = '/right/budget'" in refused({"/right/budget": {}})
+
+
+def test_a_list_of_200_000_numbers_is_refused_at_once_and_named(refused):
+    numbers = ", ".join(["1.0"] * 200_000)
+    before = time.process_time()
+    error = refused({}, f"/left/compensator: {{ros__parameters: {{gain: [{numbers}]}}}}\n")
+    assert time.process_time() - before < 10.0  # s; ROS's own reader needs minutes
+    assert "/left/compensator gain = [1.0, 1.0" in error and "at most 100 entries; it has 200,000" in error
+
+
+def test_two_bridges_with_one_motor_on_the_same_bus_are_refused(refused):
+    bus = yaml.safe_load(SIM.read_text())["/right/can_bridge"]["ros__parameters"]["can"]
+    error = refused({"/left/can_bridge": {"can": bus, "can_id": [9, 8, 7, 1]}})
+    assert "/right/can_bridge can_id = [1, 2, 3, 4]: must be different from the IDs of /left/can_bridge" in error
+
+
+def test_the_packaged_file_is_accepted():
+    Launcher(SIM)
