@@ -113,14 +113,14 @@ def test_the_papers_assumptions_are_cog_at_link_ends_gain_1_and_its_own_gravity(
     assert np.array_equal(arm.cog, arm.length) and arm.gravity == 9.8 and np.all(arm.gain == 1)
 
 
-def test_the_arm_is_read_from_dotted_and_nested_names_alike(tmp_path):
+def test_the_arm_is_read_from_dotted_and_nested_names(tmp_path):
     mass, cog = [0.1, 0.2, 0.3, 0.4], [0.01, 0.02, 0.03, 0.04]
     nested = configured_arm(write_params(tmp_path, {"robot": {"mass": mass, "cog": cog}, "gravity": 9.8}))
     dotted = configured_arm(write_params(tmp_path, {"robot.mass": mass, "robot.cog": cog, "gravity": 9.8}))
     assert nested.robot == dotted.robot == ArmModel((0.05, 0.13, 0.3, 0.3), cog, mass, gravity=9.8)
 
 
-def test_the_joint_limits_are_those_of_the_bridge_beside_the_compensator(tmp_path):
+def test_the_joint_limits_are_those_of_the_bridge_next_to_the_compensator(tmp_path):
     path = write_params(tmp_path, {}, {"position_min": [-1.0, 0.0, 0.0, 0.0], "position_max": [1.0, 1.5, 1.5, 2.0]})
     assert configured_arm(path).high.tolist() == [1.0, 1.5, 1.5, 2.0]
 
@@ -172,7 +172,7 @@ def test_the_figures_are_pictures_with_something_in_them(quick, name):
     assert matplotlib.image.imread(quick[2] / name)[..., :3].std() > 0.05
 
 
-def test_an_exact_law_that_is_off_by_a_billionth_somewhere_fails_its_check(quick):
+def test_an_exact_law_that_is_off_by_a_billionth_of_a_newton_metre_fails_its_check(quick):
     part = quick[3].as_configured
     rows = [replace(row, largest=1e-9) if (row.law, row.joint) == ("exact", 3) else row for row in part.rows]
     spoilt = replace(quick[3], as_configured=replace(part, rows=rows))
