@@ -1,4 +1,6 @@
-"""What can only be shown where SocketCAN exists, on vcan0: a link that goes down."""
+"""A SocketCAN link that goes down, on vcan0: `make socketcan`."""
+
+from __future__ import annotations
 
 import subprocess
 import time
@@ -16,11 +18,11 @@ AK60 = MOTORS["AK60-6"]
 IDS = (1, 2, 3, 4)
 
 
-def set_link(state):
+def set_link(state: str) -> None:
     subprocess.run(["ip", "link", "set", "vcan0", state], check=True)
 
 
-def test_a_link_that_goes_down_is_a_bus_error_and_the_motors_are_switched_off_when_it_is_back():
+def test_a_link_that_is_down_is_a_bus_error_and_the_motors_are_switched_off_once_it_is_up():
     ours, other = (open_bus(*VCAN, {}) for _ in range(2))
     bus = MotorBus(ours, [JointMotor(AK60, can_id) for can_id in IDS])
     bus.exchange(Drive((0.0,) * 4, 0.0, True), time.monotonic())
@@ -39,7 +41,7 @@ def test_a_link_that_goes_down_is_a_bus_error_and_the_motors_are_switched_off_wh
     bus.stop()
 
 
-def test_the_last_frames_on_a_link_that_is_down_raise_nothing():
+def test_stop_raises_nothing_on_a_link_that_is_down():
     bus = MotorBus(open_bus(*VCAN, {}), [JointMotor(AK60, can_id) for can_id in IDS])
     set_link("down")
     try:
