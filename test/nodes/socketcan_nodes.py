@@ -1,10 +1,13 @@
 """The nodes as processes on vcan0, where SocketCAN exists: `make socketcan`.
 
-The nodes are judged from outside, by the frames on the bus and by their log. An emulated machine is 10 to 20 times
-slower than a real one, so the nodes' clock is slowed down in proportion: the limits stay those of a worn arm.
+The test observes the frames on the bus and the nodes' log. An emulated machine is 10 to 20 times slower than a real
+one, so the nodes' clock is slowed down in proportion: the limits stay those of a worn arm.
 """
 
+from __future__ import annotations
+
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import can
@@ -21,10 +24,10 @@ VCAN = ("socketcan", "vcan0")
 AK60 = MOTORS["AK60-6"]
 IDS = (1, 2, 3, 4)
 SLOWER = 10
-# Found by every Python process that has its folder in PYTHONPATH, before anything else is imported.
+# Python imports it at the start of every process that has its folder in PYTHONPATH.
 SITECUSTOMIZE = f"""
 import os, select, time
-def refuse(*_): raise PermissionError  # what the nodes gain, whoever shares two slow cores with them lacks
+def refuse(*_): raise PermissionError  # on two slow cores a higher priority would starve the other processes
 os.setpriority = refuse
 monotonic, sleep, wait = time.monotonic, time.sleep, select.select
 time.monotonic = lambda: monotonic() / {SLOWER}
@@ -41,16 +44,16 @@ CHANGES = {
 
 
 @pytest.fixture
-def frames():
-    """Every frame on vcan0 as it comes."""
-    frames = []
+def frames() -> Iterator[list[can.Message]]:
+    """All frames on vcan0 so far."""
+    frames: list[can.Message] = []
     with open_bus(*VCAN, {}) as bus, can.Notifier(bus, [frames.append]):
         yield frames
 
 
 @pytest.fixture
-def nodes(tmp_path, monkeypatch):
-    """Bridge, compensator and simulator as processes on vcan0 with a slow clock, and their log as it grows."""
+def nodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Launcher, list[str]]]:
+    """Bridge, compensator and simulator as processes on vcan0 with a slow clock, and their log so far."""
     (tmp_path / "sitecustomize.py").write_text(SITECUSTOMIZE)
     (tmp_path / "trial.yaml").write_text(yaml.safe_dump(TRIAL))
     content = yaml.safe_load(CONFIG.read_text())
@@ -64,7 +67,7 @@ def nodes(tmp_path, monkeypatch):
     params.write_text(yaml.safe_dump(content))
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(launcher, "DESCENT_TIMEOUT", launcher.DESCENT_TIMEOUT * SLOWER)
-    log = []
+    log: list[str] = []
     nodes = Launcher(params, lambda node, line: log.append(f"{node}: {line}"))
     nodes.start()
     yield nodes, log
@@ -72,27 +75,27 @@ def nodes(tmp_path, monkeypatch):
     print("\n".join(log))
 
 
-def wait_for(text, nodes, log):
-    """Wait until a node has said `text`."""
+def wait_for(text: str, nodes: Launcher, log: list[str]) -> None:
+    """Wait until a line of the log contains `text`."""
     end = time.monotonic() + 120.0
     while not any(text in line for line in log):
         assert nodes.dead() is None
-        assert time.monotonic() < end, f"waited in vain for: {text}"
+        assert time.monotonic() < end, f"not logged in time: {text}"
         time.sleep(0.1)
 
 
-def angles(frames):
-    """Return the motors' angles in rad from the newest reply of each."""
+def angles(frames: list[can.Message]) -> list[float]:
+    """Return the angle in rad from the newest reply of each motor."""
     newest = {frame.arbitration_id: frame.data for frame in frames[-100:] if frame.data[0] == frame.arbitration_id}
     return [unpack_reply(AK60, newest[can_id]).position for can_id in IDS]
 
 
-def asked(frames, can_id):
-    """Return the torque in Nm that this motor was asked for last."""
+def commanded_torque(frames: list[can.Message], can_id: int) -> float:
+    """Return the torque in Nm of the newest command to a motor."""
     return [unpack_command(AK60, frame.data).torque for frame in frames[-100:] if is_command(frame, can_id)][-1]
 
 
-def is_command(frame, can_id):
+def is_command(frame: can.Message, can_id: int) -> bool:
     return frame.arbitration_id == can_id and frame.data[0] in (0x7F, 0x80)
 
 
@@ -100,10 +103,10 @@ def test_the_nodes_carry_the_arm_and_switch_the_motors_off(nodes, frames):
     nodes, log = nodes
     wait_for("can_bridge: INFO active", nodes, log)
     wait_for("wearer: hold", nodes, log)
-    let_go = angles(frames)
+    released = angles(frames)
     wait_for("wearer: done", nodes, log)
-    assert angles(frames) == pytest.approx(let_go, abs=0.01)
-    assert abs(asked(frames, 3)) > 1.0  # five times what friction could hold
+    assert angles(frames) == pytest.approx(released, abs=0.01)
+    assert abs(commanded_torque(frames, 3)) > 1.0  # five times the friction
 
     bridge = nodes.process("/right/can_bridge")
     bridge.terminate()
