@@ -1,0 +1,156 @@
+"""The start of the safety machine: the checks before torque flows, the sign check, and the ramp."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import pytest
+
+from exo_gravity.core.safety import OFF, State
+
+from ..support.safety_run import EFFORT, LIMITS, PERIOD, SafetyRun
+
+
+def test_a_new_machine_keeps_the_motors_off():
+    arm = SafetyRun().cycle(1.0)
+    assert arm.machine.state is State.DISABLED
+    assert arm.drive == OFF
+
+
+def test_torque_ramps_in_over_the_ramp_time_without_a_step():
+    arm = SafetyRun()
+    arm.enable()
+    arm.cycle(1.5)
+    assert arm.machine.state is State.RAMPING_IN
+    assert arm.drive.effort[1] == pytest.approx(-2.0, abs=0.05)
+    arm.cycle(1.0)
+    assert arm.drive.effort == pytest.approx(EFFORT)
+    assert max(arm.steps) <= LIMITS.max_effort_rate * PERIOD
+
+
+@pytest.mark.parametrize(
+    ("spoil", "waits_for"),
+    [
+        (lambda arm: arm.silent.add(2), "c: no reply"),
+        (lambda arm: arm.changes[1].update(velocity=0.5), "at rest"),
+        (lambda arm: setattr(arm, "effort", None), "effort commands"),
+        (lambda arm: setattr(arm, "effort_age", 0.06), "effort commands"),
+    ],
+)
+def test_the_checks_wait_and_name_what_they_wait_for(spoil, waits_for):
+    arm = SafetyRun()
+    spoil(arm)
+    arm.enable()
+    arm.cycle(2.0)
+    assert arm.machine.state is State.CHECKING
+    assert waits_for in arm.machine.waiting_for
+    assert not arm.drive.powered
+
+
+def test_the_checks_require_a_whole_second_without_trouble():
+    arm = SafetyRun()
+    arm.enable()
+    for _ in range(5):
+        arm.cycle(0.9)
+        arm.silent.add(1)
+        arm.cycle(0.1)
+        arm.silent.clear()
+    assert arm.machine.state is State.CHECKING
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        ({"position": 2.51}, "outside_limits"),
+        ({"error": 5}, "motor_error"),
+        ({"temperature": 95}, "over_temperature"),
+    ],
+)
+def test_a_fault_during_the_checks_is_latched(change, code):
+    arm = SafetyRun()
+    arm.changes[2].update(change)
+    arm.enable()
+    arm.cycle(1.0)
+    assert arm.machine.state is State.FAULT
+    assert arm.fault_code == code
+    assert "c:" in arm.machine.fault.reason
+
+
+def test_an_arm_away_from_home_is_refused_until_it_has_been_carried_once():
+    arm = SafetyRun()
+    arm.changes[1].update(position=0.5 + math.radians(40.0))  # a turn of an AK80-9's motor
+    arm.enable()
+    arm.cycle(1.0)
+    assert arm.fault_code == "implausible_zero"
+    assert "b: 1.198 rad at the start" in arm.machine.fault.reason
+
+    arm = SafetyRun().until_active()
+    arm.machine.disable(arm.now)
+    arm.cycle(4.0)
+    arm.changes[1].update(position=1.1)
+    arm.cycle(0.1)
+    arm.enable()
+    arm.cycle(3.0)
+    assert arm.machine.state is State.ACTIVE
+
+    arm.machine.disable(arm.now)
+    arm.cycle(4.0)
+    arm.silent.add(2)  # its supply was interrupted, and its zero may have changed
+    arm.cycle(0.1)
+    arm.silent.clear()
+    arm.enable()
+    arm.cycle(1.0)
+    assert arm.fault_code == "implausible_zero"
+
+
+class YieldingArm(SafetyRun):
+    """An arm whose joints yield to torque: by `mobility` (4,) rad/s per Nm beyond 0.3 Nm of friction.
+
+    largest_effort: Nm of each joint so far.
+    """
+
+    def __init__(self, mobility: Sequence[float]) -> None:
+        super().__init__(sign_check_torque=1.5)
+        self.mobility = mobility
+        self.position = [0.5] * 4
+        self.largest_effort = [0.0] * 4
+
+    def cycle(self, seconds: float = PERIOD) -> YieldingArm:
+        for _ in range(max(1, round(seconds / PERIOD))):
+            for i, (effort, mobility) in enumerate(zip(self.drive.effort, self.mobility, strict=True)):
+                self.largest_effort[i] = max(self.largest_effort[i], effort)
+                self.position[i] += max(0.0, effort - 0.3) * mobility * PERIOD
+                self.changes[i] = {"position": self.position[i]}
+            super().cycle()
+        return self
+
+
+def test_each_joints_sign_is_checked_once_and_gently_before_the_arm_is_carried():
+    arm = YieldingArm((0.5, 0.2, 0.5, 0.5))
+    arm.effort = (0.0,) * 4
+    arm.enable()
+    arm.cycle(1.5)
+    assert arm.machine.state is State.PROVING
+    arm.cycle(6.0)
+    assert arm.machine.state is State.ACTIVE
+    assert all(0.52 < position < 0.6 for position in arm.position)
+    assert max(arm.steps) <= LIMITS.max_effort_rate * PERIOD
+    arm.machine.disable(arm.now)
+    arm.cycle(4.0)
+    arm.largest_effort = [0.0] * 4
+    arm.enable()
+    arm.cycle(3.0)
+    assert arm.machine.state is State.ACTIVE
+    assert arm.largest_effort == [0.0] * 4
+
+
+@pytest.mark.parametrize(("mobility", "code"), [(-0.5, "wrong_sign"), (0.0, "sign_unproven")])
+def test_a_joint_that_moves_backwards_or_not_at_all_under_the_test_torque_is_refused(mobility, code):
+    arm = YieldingArm((0.5, 0.2, mobility, 0.5))
+    arm.enable()
+    arm.cycle(8.0)
+    assert arm.machine.state is State.FAULT
+    assert arm.fault_code == code
+    assert arm.machine.fault.reason.startswith("c: ")
+    assert arm.largest_effort[3] == 0.0

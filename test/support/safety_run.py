@@ -1,0 +1,73 @@
+"""A safety machine that a test drives through time, with the readings and efforts that the test sets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
+from exo_gravity.core.safety import OFF, SafetyMachine, State
+
+PERIOD = 0.004  # s
+LIMITS = Limits(
+    joint_names=("a", "b", "c", "d"),
+    position_min=(-1.6, -0.2, -0.8, -0.2),
+    position_max=(1.6, 3.1, 2.5, 3.1),
+    max_velocity=(5.0, 5.0, 5.0, 6.0),
+    max_effort=(3.0, 9.0, 3.0, 3.0),
+    home=(0.5, 0.5, 0.5, 0.5),
+    sign_check_torque=0.0,
+)
+EFFORT = (0.5, -4.0, 2.0, 1.0)  # Nm
+
+
+def reading(**changes: Any) -> JointSample:
+    """Return the reading of a joint at rest at home, with `changes`."""
+    return JointSample(**{"position": 0.5, "velocity": 0.0, "effort": 0.0, "temperature": 30, "error": 0, **changes})
+
+
+class SafetyRun:
+    """A machine and its inputs.
+
+    changes: of each joint's reading. silent: the joints whose motors do not reply. effort: Nm, with `effort_age` in s.
+    drive: the machine's last output. steps: the largest torque step in Nm of each cycle.
+    """
+
+    def __init__(self, **limits: Any) -> None:
+        self.machine = SafetyMachine(replace(LIMITS, **limits), PERIOD)
+        self.now = 100.0
+        self.changes: list[dict[str, Any]] = [{} for _ in range(4)]
+        self.silent: set[int] = set()
+        self.effort: Sequence[float] | None = EFFORT
+        self.effort_age = 0.002
+        self.joints = [UNKNOWN] * 4
+        self.drive = OFF
+        self.steps: list[float] = []
+
+    def cycle(self, seconds: float = PERIOD) -> SafetyRun:
+        """Run the machine for `seconds`, at least one cycle."""
+        for _ in range(max(1, round(seconds / PERIOD))):
+            self.now += PERIOD
+            for i, change in enumerate(self.changes):
+                if i not in self.silent:
+                    self.joints[i] = reading(time=self.now - 0.001, **change)
+            before = self.drive
+            self.drive = self.machine.step(self.now, tuple(self.joints), self.effort, self.now - self.effort_age)
+            self.steps.append(max(abs(a - b) for a, b in zip(self.drive.effort, before.effort, strict=True)))
+        return self
+
+    def enable(self) -> SafetyRun:
+        self.machine.enable(self.now)
+        return self
+
+    def until_active(self) -> SafetyRun:
+        """Enable the machine and run it until the arm is carried."""
+        self.enable().cycle(3.0)
+        assert self.machine.state is State.ACTIVE
+        return self
+
+    @property
+    def fault_code(self) -> str | None:
+        """The code of the latched fault."""
+        return self.machine.fault.code if self.machine.fault else None
