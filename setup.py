@@ -3,7 +3,7 @@ from glob import glob
 from setuptools import find_packages, setup
 
 package_name = "exo_gravity"
-# The one list of executables: the launcher derives the nodes from the entry points, each module is named after its own.
+# The one list of executables, each named after its module. The launcher reads the nodes from the entry points.
 nodes = ("can_bridge", "imu", "compensator", "simulator", "recorder")
 tools = ("launcher", "trial", "report", "budget", "validate", "train_anfis")
 
