@@ -1,5 +1,7 @@
 """The compensator gives no torque without fresh and finite input, and no change of settings steps the torque."""
 
+from __future__ import annotations
+
 import math
 
 import numpy as np
@@ -7,50 +9,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.anfis import Anfis
-from exo_gravity.core.anfis_law import AnfisLaw
-from exo_gravity.core.compensator import LONGEST_STEP, Compensator, Settings
+from exo_gravity.core import gravity_torque
+from exo_gravity.core.compensator import LONGEST_STEP
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.tilt import Tilt
 
-ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
-THETA = (0.2, 0.7, 0.6, 0.5)
-PERIOD = 0.002
-
-
-def make(**changes) -> Settings:
-    defaults = {
-        "side": "left",
-        "robot": ROBOT,
-        "wearer_mass": (0.0, 0.0, 2.0, 1.6),
-        "wearer_cog": (0.0, 0.0, 0.16, 0.17),
-        "max_effort": (9.0, 18.0, 9.0, 9.0),
-        "use_imu": False,
-    }
-    return Settings(**{**defaults, **changes})
-
-
-class Run:
-    def __init__(self, **changes):
-        self.compensator = Compensator(make(**changes))
-        self.now = 50.0
-        self.efforts = []
-
-    def cycle(self, seconds=PERIOD, theta=THETA, period=PERIOD):
-        for _ in range(max(1, round(seconds / period))):
-            self.now += period
-            answer = self.compensator.step(self.now, theta)
-            self.efforts.append(answer.effort)
-        return answer
-
-    @property
-    def largest_step(self):
-        return float(np.abs(np.diff(np.array(self.efforts), axis=0)).max())
+from ..support.compensator_run import PERIOD, ROBOT, THETA, CompensatorRun, settings_with
 
 
 def test_after_the_ramp_the_torque_equals_that_of_the_law():
-    run = Run()
+    run = CompensatorRun()
     assert run.cycle().effort == (0.0, 0.0, 0.0, 0.0)
     run.cycle(0.5)
     half = run.efforts[-1]
@@ -60,7 +28,7 @@ def test_after_the_ramp_the_torque_equals_that_of_the_law():
 
 
 def test_a_tilted_trunk_changes_the_torque():
-    run = Run(use_imu=True)
+    run = CompensatorRun(use_imu=True)
     for _ in range(600):
         run.compensator.set_tilt(run.now, pitch=0.3, roll=-0.2)
         run.cycle()
@@ -69,7 +37,7 @@ def test_a_tilted_trunk_changes_the_torque():
 
 
 def test_without_a_fresh_tilt_there_is_a_reason_instead_of_a_torque():
-    run = Run(use_imu=True)
+    run = CompensatorRun(use_imu=True)
     assert run.cycle()[:2] == (None, "no trunk tilt yet")
     run.compensator.set_tilt(run.now, 0.0, 0.0)
     assert run.cycle().effort is not None
@@ -81,7 +49,7 @@ def test_without_a_fresh_tilt_there_is_a_reason_instead_of_a_torque():
     [(0.0, 0.0, 0.0), (0.0, 0.0, math.nan, 0.0), (math.inf, 0.0, 0.0, 0.0), (0.0, 0.0, 1e308, 1e308), (0, -27, 0, 0)],
 )
 def test_impossible_joint_angles_get_no_torque(theta):
-    run = Run()
+    run = CompensatorRun()
     run.cycle(2.0)
     answer = run.cycle(theta=theta)
     assert answer.effort is None
@@ -90,7 +58,7 @@ def test_impossible_joint_angles_get_no_torque(theta):
 
 @pytest.mark.parametrize("angle", [math.nan, math.inf, 4.0])
 def test_an_impossible_tilt_is_rejected_and_the_last_one_stays(angle):
-    run = Run(use_imu=True)
+    run = CompensatorRun(use_imu=True)
     run.compensator.set_tilt(run.now, 0.1, 0.0)
     with pytest.raises(ParameterError):
         run.compensator.set_tilt(run.now, angle, 0.0)
@@ -98,26 +66,26 @@ def test_an_impossible_tilt_is_rejected_and_the_last_one_stays(angle):
 
 
 def test_after_a_break_the_torque_ramps_in_again():
-    run = Run()
+    run = CompensatorRun()
     run.cycle(2.0)
     run.now += 0.2
     assert run.cycle().effort == (0.0, 0.0, 0.0, 0.0)
 
 
 def test_zero_g_carries_the_wearers_arm_in_proportion_to_the_support():
-    run = Run(mode="zero_g", support=0.5)
+    run = CompensatorRun(mode="zero_g", support=0.5)
     run.cycle(1.2)
     arm = ROBOT.with_wearer((0.0, 0.0, 2.0, 1.6), (0.0, 0.0, 0.16, 0.17), 0.5)
     np.testing.assert_allclose(run.efforts[-1], gravity_torque(arm, THETA), rtol=1e-12)
 
 
 def test_a_change_of_mode_reaches_the_arm_without_a_step():
-    run = Run()
+    run = CompensatorRun()
     run.cycle(1.5)
     run.efforts.clear()
-    run.compensator.apply(make(mode="zero_g"))
+    run.compensator.apply(settings_with(mode="zero_g"))
     run.cycle(0.5)
-    one, two = (gravity_torque(make(mode=mode).arm, THETA) for mode in ("one_g", "zero_g"))
+    one, two = (gravity_torque(settings_with(mode=mode).arm, THETA) for mode in ("one_g", "zero_g"))
     np.testing.assert_allclose(run.efforts[-1], (one + two) / 2, rtol=0.01)
     run.cycle(1.0)
     np.testing.assert_allclose(run.efforts[-1], two, rtol=1e-12)
@@ -125,31 +93,31 @@ def test_a_change_of_mode_reaches_the_arm_without_a_step():
 
 
 def test_a_transition_takes_the_transition_time_of_the_new_settings():
-    run = Run(transition_time=0.3)
+    run = CompensatorRun(transition_time=0.3)
     run.cycle(1.5)
-    run.compensator.apply(make(mode="zero_g", transition_time=4.0))
+    run.compensator.apply(settings_with(mode="zero_g", transition_time=4.0))
     run.cycle(1.0)
-    one, two = (gravity_torque(make(mode=mode).arm, THETA) for mode in ("one_g", "zero_g"))
+    one, two = (gravity_torque(settings_with(mode=mode).arm, THETA) for mode in ("one_g", "zero_g"))
     np.testing.assert_allclose(run.efforts[-1], one + (two - one) / 4, rtol=0.01)
     run.cycle(3.1)
     np.testing.assert_allclose(run.efforts[-1], two, rtol=1e-12)
 
 
 def test_a_sweep_of_settings_is_followed_without_a_step():
-    run = Run(mode="zero_g", support=0.0)
+    run = CompensatorRun(mode="zero_g", support=0.0)
     run.cycle(1.5)
     run.efforts.clear()
     for support in np.linspace(0.0, 1.0, 101):
-        run.compensator.apply(make(mode="zero_g", support=support))
+        run.compensator.apply(settings_with(mode="zero_g", support=support))
         run.cycle(0.02)
     run.cycle(1.0)
-    one, two = (gravity_torque(make(mode=mode).arm, THETA) for mode in ("one_g", "zero_g"))
+    one, two = (gravity_torque(settings_with(mode=mode).arm, THETA) for mode in ("one_g", "zero_g"))
     np.testing.assert_allclose(run.efforts[-1], two, rtol=1e-12)
     assert run.largest_step <= np.abs(two - one).max() / 1.0 * PERIOD * 1.1
 
 
 def test_too_large_a_torque_is_clamped_and_the_joint_named():
-    run = Run(max_effort=(3.0, 1.0, 3.0, 3.0))
+    run = CompensatorRun(max_effort=(3.0, 1.0, 3.0, 3.0))
     answer = run.cycle(2.0)
     assert answer.effort[1] == 1.0
     assert answer.clamped == (1,)
@@ -173,10 +141,10 @@ PERIODS = st.sampled_from([0.001, 0.002, 0.004, 0.009, 0.011, 0.03, 0.045])  # l
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(CHANGES, st.lists(PERIODS, max_size=60), st.tuples(*[st.floats(-1.5, 1.5)] * 4)), max_size=9))
 def test_no_sequence_of_changes_poses_and_late_cycles_exceeds_the_torque_rate(sequence):
-    run = Run()
+    run = CompensatorRun()
     run.cycle(1.2)
     for change, periods, theta in sequence:
-        run.compensator.apply(make(**change))
+        run.compensator.apply(settings_with(**change))
         for period in periods:
             run.cycle(period, theta, period)
             allowed = change.get("max_effort_rate", 50.0) * min(period, LONGEST_STEP)
@@ -200,52 +168,16 @@ def test_no_sequence_of_changes_poses_and_late_cycles_exceeds_the_torque_rate(se
 )
 def test_impossible_settings_are_rejected_by_name(field, value):
     with pytest.raises(ParameterError) as caught:
-        make(**{field: value})
+        settings_with(**{field: value})
     assert caught.value.name.replace(".", "_") == field
 
 
 def test_too_large_a_total_mass_is_rejected_in_every_mode():
-    make(max_total_mass=5.5)  # 1.854 kg of robot, 3.6 kg of wearer
+    settings_with(max_total_mass=5.5)  # 1.854 kg of robot, 3.6 kg of wearer
     for mode in ("one_g", "zero_g"):
         with pytest.raises(ParameterError, match=r"total mass in kg = 5.45: must be at most max_total_mass = 5 "):
-            make(mode=mode, max_total_mass=5.0)
+            settings_with(mode=mode, max_total_mass=5.0)
 
 
 def test_only_the_supported_share_of_the_wearer_counts_towards_the_total_mass():
-    assert make(mode="zero_g", support=0.5, max_total_mass=5.0).arm.total_mass == pytest.approx(3.654)
-
-
-def learned(moments=ROBOT.first_moment[1:]):
-    """An ANFIS of constant 0.5, 1.0 and 0.25 Nm on joints 2 to 4, in a box of 0 to 1 rad."""
-    rules = np.zeros((3, 8, 4))
-    rules[:, :, 0] = [[0.5], [1.0], [0.25]]
-    model = Anfis(np.tile([-1.0, 1.0], (3, 3, 1)), np.ones((3, 3, 2)), rules)
-    return AnfisLaw(model, (0.0,) * 3, (1.0,) * 3, moments, ROBOT.gravity, "made up", {})
-
-
-def test_inside_its_box_the_anfis_gives_the_torque():
-    run = Run(law="anfis", anfis=learned())
-    answer = run.cycle(1.2)
-    assert answer.fallback == ""
-    np.testing.assert_allclose(answer.effort, (0.0, 0.5, 1.0, 0.25), rtol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("theta", "pitch", "moments", "why"),
-    [
-        ((0.2, 1.2, 0.6, 0.5), 0.0, ROBOT.first_moment[1:], "theta_2 is outside"),
-        (THETA, 0.1, ROBOT.first_moment[1:], "tilted"),
-        (THETA, 0.0, (0.3, 0.2, 0.1), "another arm"),
-    ],
-)
-def test_where_the_anfis_was_not_trained_the_exact_law_replaces_it_and_the_reason_is_given(theta, pitch, moments, why):
-    run = Run(law="anfis", anfis=learned(moments))
-    run.compensator.set_tilt(run.now, pitch, 0.0)
-    answer = run.cycle(1.2, theta)
-    assert why in answer.fallback
-    np.testing.assert_allclose(answer.effort, gravity_torque(ROBOT, theta, Tilt.of("left", pitch).direction))
-
-
-def test_the_law_anfis_without_a_file_is_rejected():
-    with pytest.raises(ParameterError, match="anfis_file"):
-        make(law="anfis")
+    assert settings_with(mode="zero_g", support=0.5, max_total_mass=5.0).arm.total_mass == pytest.approx(3.654)
