@@ -1,0 +1,219 @@
+"""The simulated device in real time on a bus."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import socket
+import threading
+import time
+from types import SimpleNamespace
+
+import can
+import pytest
+
+from exo_gravity.core.errors import BusError
+from exo_gravity.core.motors import ENTER, unpack_reply
+from exo_gravity.sim import Firmware, can_link
+from exo_gravity.sim import device as device_module
+
+from ..support.simulated_device import SPECS, command, frame, make_device
+
+GROUP = "239.74.163.2"
+channels = itertools.count()
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.fixture(params=["virtual", "udp_multicast"])
+def options(request):
+    """The options of a bus that no other test uses."""
+    if request.param == "virtual":
+        return {"interface": "virtual", "channel": f"device-{next(channels)}"}
+    return {"interface": "udp_multicast", "channel": GROUP, "port": free_port(), "hop_limit": 0}
+
+
+@contextlib.contextmanager
+def running(device, options, **own):
+    """Run `device` in a thread; yield the host's bus."""
+    stop = threading.Event()
+    with can.Bus(**options) as host, can.Bus(**options, **own) as bus:
+        thread = threading.Thread(target=device.run, args=(bus, stop.is_set))
+        thread.start()
+        try:
+            yield host
+        finally:
+            stop.set()
+            thread.join()
+
+
+def next_reply(host, timeout=5.0):
+    """Return the next frame from a motor, or None. The first byte tells it from echoes of the host's commands."""
+    deadline = time.monotonic() + timeout
+    while (remaining := deadline - time.monotonic()) > 0:
+        message = host.recv(remaining)
+        if message is not None and message.data and message.data[0] < 0x7F and not message.is_extended_id:
+            return message
+    return None
+
+
+def test_every_command_gets_one_reply(options):
+    device = make_device()
+    with running(device, options) as host:
+        for joint in [0, 1, 2, 3] * 10:
+            host.send(frame(joint + 1, command(joint)))
+            reply = next_reply(host)
+            assert (reply.arbitration_id, reply.data[0]) == (joint + 1, joint + 1)
+        assert next_reply(host, timeout=0.05) is None
+
+
+def test_commands_sent_at_once_are_all_answered(options):
+    with running(make_device(), options) as host:
+        for joint in range(4):
+            host.send(frame(joint + 1, command(joint)))
+        assert {next_reply(host).arbitration_id for _ in range(4)} == {1, 2, 3, 4}
+
+
+def test_an_echo_of_a_reply_is_not_taken_for_a_command(options):
+    device = make_device()
+    with running(device, options) as host:
+        host.send(frame(1, ENTER))
+        next_reply(host)
+        for _ in range(50):
+            host.send(frame(1, command(0, 1.0)))
+            reply = next_reply(host)
+            assert unpack_reply(SPECS[0], reply.data).torque == pytest.approx(1.0, abs=0.01)
+    assert device.motors[0].torque(0.0, 0.0) == pytest.approx(1.0, abs=0.01)
+
+
+def test_an_echo_that_the_bus_marks_is_not_taken_for_a_command():
+    options = {"interface": "virtual", "channel": f"device-{next(channels)}"}
+    with running(make_device(), options, receive_own_messages=True) as host:
+        host.send(frame(1, command(0)))
+        assert next_reply(host) is not None
+        assert next_reply(host, timeout=0.05) is None
+
+
+def test_on_a_bus_without_echo_a_command_with_the_bytes_of_a_reply_is_executed():
+    options = {"interface": "virtual", "channel": f"device-{next(channels)}"}
+    with running(make_device(), options) as host:
+        for _ in range(can_link.MAX_PENDING_ECHOES + 5):
+            host.send(frame(1, command(0)))
+            reply = next_reply(host)
+        host.send(frame(1, bytes(reply.data)))
+        assert next_reply(host) is not None
+
+
+def test_frames_that_are_not_for_a_motor_are_ignored(options):
+    device = make_device()
+    foreign_frames = [
+        frame(0, ENTER),
+        frame(5, ENTER),
+        frame(0x7FF, b""),
+        frame(1, b""),
+        frame(1, ENTER[:7]),
+        frame(1, ENTER, is_extended_id=True),
+        frame(1, None, is_remote_frame=True, dlc=8),
+        frame(1, ENTER, is_error_frame=True),
+        frame(1, ENTER, is_fd=True),
+    ]
+    with running(device, options) as host:
+        for message in foreign_frames:
+            host.send(message)
+        host.send(frame(1, command(0, 2.0)))
+        assert next_reply(host).arbitration_id == 1
+        assert next_reply(host, timeout=0.05) is None
+    assert device.motors[0].torque(0.0, 0.0) == 0.0  # none of them switched it on
+
+
+def test_a_datagram_that_is_not_a_frame_is_ignored():
+    options = {"interface": "udp_multicast", "channel": GROUP, "port": free_port(), "hop_limit": 0}
+    with running(make_device(), options) as host, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as noise:
+        noise.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+        for data in (b"", b"no frame", b"\xc1", b"\x80"):
+            noise.sendto(data, (GROUP, options["port"]))
+        host.send(frame(1, command(0)))
+        replies = []
+        while not replies:
+            with contextlib.suppress(can.CanOperationError):  # the host receives the noise too
+                replies = [next_reply(host)]
+        assert replies[0].arbitration_id == 1
+
+
+def test_no_reply_is_faster_than_a_real_motors():
+    options = {"interface": "virtual", "channel": f"device-{next(channels)}"}
+    with running(make_device(), options) as host:
+        for _ in range(20):
+            sent = time.monotonic()
+            host.send(frame(1, command(0)))
+            next_reply(host)
+            assert time.monotonic() - sent >= 200e-6
+
+
+def test_replies_can_carry_the_masters_id_and_six_bytes(options):
+    with running(make_device(Firmware(reply_to_master=True, reply_length=6)), options) as host:
+        host.send(frame(3, command(2)))
+        reply = next_reply(host)
+        assert (reply.arbitration_id, reply.data[0], len(reply.data)) == (0, 3, 6)
+
+
+def test_a_failing_bus_ends_the_run_with_a_bus_error():
+    bus = can.Bus(interface="virtual", channel=f"device-{next(channels)}")
+    bus.shutdown()
+    with pytest.raises(BusError, match="receiving"):
+        make_device().run(bus, lambda: False)
+
+
+class BusyBus:
+    """A bus on which four commands arrive at once; `events` keeps the order of replies and other work."""
+
+    def __init__(self):
+        self.events = []
+        self._waiting = [frame(can_id, command(can_id - 1)) for can_id in (1, 2, 3, 4)]
+
+    def recv(self, timeout):
+        if self._waiting:
+            return self._waiting.pop(0)
+        time.sleep(timeout)
+
+    def send(self, message):
+        self.events.append(message.data[0])
+
+    def aside(self, now):
+        self.events.append("aside")
+
+
+def test_other_work_waits_until_every_command_has_been_answered():
+    bus = BusyBus()
+    make_device().run(bus, lambda: "aside" in bus.events, bus.aside)
+    assert sorted(bus.events[:-1]) == [1, 2, 3, 4]
+
+
+class LateBus:
+    """A bus without frames and its clock: each wait takes as long as the test sets."""
+
+    def __init__(self, waits):
+        self.now = 0.0
+        self.waits = list(waits)
+
+    def recv(self, timeout):
+        self.now += self.waits.pop(0)
+
+    def done(self):
+        return not self.waits
+
+
+@pytest.mark.parametrize(
+    ("waits", "simulated", "slip"),
+    [([0.002] * 50, 0.1, 0.0), ([0.002, 0.04, 0.002], 0.044, 0.0), ([0.002, 0.3, 0.002], 0.054, 0.25)],
+)
+def test_physics_catches_up_after_a_late_wake_up_and_more_than_50_ms_count_as_slip(monkeypatch, waits, simulated, slip):
+    bus, device = LateBus(waits), make_device()
+    monkeypatch.setattr(device_module, "time", SimpleNamespace(monotonic=lambda: bus.now))
+    device.run(bus, bus.done)
+    assert device.time == pytest.approx(simulated, abs=1e-9)
+    assert device.slip == pytest.approx(slip)

@@ -1,0 +1,32 @@
+"""A simulated device with default motors, and the frames that a bridge sends to it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import can
+
+from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.motors import MOTORS, pack_command
+from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
+
+SPECS = [MOTORS[name] for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6")]
+RAISED = (0.3, 0.8, 0.7, 0.6)  # rad
+
+
+def make_device(
+    firmware: Firmware | None = None, ids: Sequence[int] = (1, 2, 3, 4), config: ArmConfig | None = None
+) -> SimulatedDevice:
+    joints = [JointMotor(spec, can_id) for spec, can_id in zip(SPECS, ids, strict=True)]
+    return SimulatedDevice(SimulatedArm(config), [SimulatedMotor(joint, firmware) for joint in joints])
+
+
+def command(joint: int, torque: float = 0.0, kd: float = 0.0) -> bytes:
+    """Return the data of a command to the motor of `joint`; torque: Nm, kd: Nm s/rad."""
+    return pack_command(SPECS[joint], 0.0, 0.0, 0.0, kd, torque)
+
+
+def frame(can_id: int, data: bytes | None, **changes: Any) -> can.Message:
+    """Return a CAN message with an 11-bit ID."""
+    return can.Message(**{"arbitration_id": can_id, "data": data, "is_extended_id": False, **changes})
