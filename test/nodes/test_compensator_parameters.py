@@ -1,20 +1,15 @@
-"""The parameters of a running compensator: what it refuses, what it describes, and what a dump of them starts."""
+"""The parameters of a running compensator: what it refuses and how it describes them."""
 
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Iterable, Iterator
-from pathlib import Path
+from collections.abc import Iterator
 
 import pytest
-import yaml
-from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParametersAtomically
-from rclpy.parameter import parameter_value_to_python
+from rcl_interfaces.srv import DescribeParameters, SetParametersAtomically
 
 from exo_gravity.core.control_params import COMPENSATOR
 from exo_gravity.core.trial_script import TrialScript
-from exo_gravity.tools.trials.offline import simulated_trials
 
 from ..support.launched_nodes import NO_IMU, LaunchedNodes
 from ..support.random_parameters import parameter_message
@@ -38,22 +33,6 @@ def compensator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosProbe]:
     print("\n".join(nodes.log))
 
 
-def dump(probe: RosProbe, nodes: Iterable[str]) -> dict[str, dict]:
-    """Return what `ros2 param dump` writes for the nodes."""
-    content: dict[str, dict] = {}
-    for node in nodes:
-        names = probe.call(ListParameters, f"{node}/list_parameters", ListParameters.Request()).result.names
-        values = probe.call(GetParameters, f"{node}/get_parameters", GetParameters.Request(names=names)).values
-        content[node] = {"ros__parameters": {}}
-        for name, value in zip(names, values, strict=True):
-            *branches, leaf = name.split(".")
-            parameters = content[node]["ros__parameters"]
-            for branch in branches:
-                parameters = parameters.setdefault(branch, {})
-            parameters[leaf] = parameter_value_to_python(value)
-    return content
-
-
 REFUSALS = [
     ({"robot.mass": [0.6, 0.5, 0.6]}, "robot.mass = [0.6, 0.5, 0.6]: must be 4 numbers from 0 to 20"),
     ({"robot.mass": [0.6, 0.5, 900.0, 0.2]}, "must be 4 numbers from 0 to 20"),
@@ -69,14 +48,14 @@ REFUSALS = [
 
 
 def test_an_invalid_value_is_refused_with_one_sentence_and_changes_nothing(compensator):
-    before = dump(compensator, [NODE])
+    before = compensator.dump_parameters([NODE])
     for values, sentence in REFUSALS:
         messages = [parameter_message(*item) for item in values.items()]
         request = SetParametersAtomically.Request(parameters=messages)
         result = compensator.call(SetParametersAtomically, f"{NODE}/set_parameters_atomically", request).result
         assert not result.successful
         assert sentence in result.reason
-    assert dump(compensator, [NODE]) == before
+    assert compensator.dump_parameters([NODE]) == before
 
 
 def test_an_integer_is_accepted_where_a_float_is_declared(compensator):
@@ -95,42 +74,3 @@ def test_parameter_descriptions_have_units_and_ranges(compensator):
     assert "[kg]" in mass.description and mass.read_only and mass.floating_point_range[0].to_value == 40.0
     assert descriptors["wearer.mass"].additional_constraints == "4 numbers from 0 to 20 kg"
     assert descriptors["mode"].additional_constraints == "one of one_g, zero_g"
-
-
-def test_a_parameter_dump_starts_the_same_nodes_without_changes(tmp_path, prepare, launch, probe):
-    first = launch(compensator={"wearer": {"body_mass": 70.0}})
-    nodes = list(yaml.safe_load(first.path.read_text()))
-    assert probe.set_parameters("compensator", support=0.3, transition_time=2, atomically=True).successful
-    dumped = dump(probe, nodes)
-    first.stop()
-    for node in nodes:  # a dump also has these if a publisher's quality of service can be set
-        dumped[node]["ros__parameters"]["qos_overrides"] = {"/parameter_events": {"publisher": {"depth": 1000}}}
-    assert dumped["/right/compensator"]["ros__parameters"]["use_sim_time"] is False
-    second = prepare()
-    second.path = tmp_path / "dump.yaml"
-    second.path.write_text(yaml.dump(dumped, default_flow_style=False))
-    second.start()
-    try:
-        assert dump(probe, nodes) == dumped
-        assert simulated_trials(second.path, SCRIPT)  # the tools read it too
-    finally:
-        second.stop()
-    assert second.ended_node is None
-
-
-def test_real_time_threads_and_locked_memory_are_used_or_the_log_states_that_they_are_not_permitted(launch, probe):
-    nodes = launch(without=OTHER_NODES, compensator={**NO_IMU, "thread_priority": 10, "lock_memory": True})
-    probe.wait_until(lambda: "waiting for joint_states" in "".join(nodes.log))
-    process = Path(f"/proc/{nodes.process('compensator').pid}")
-    real_time_threads = {
-        thread.name: (thread / "comm").read_text()
-        for thread in (process / "task").iterdir()
-        if os.sched_getscheduler(int(thread.name)) == os.SCHED_FIFO
-    }
-    memory_is_locked = "VmLck:\t       0 kB" not in (process / "status").read_text()
-    log = "\n".join(nodes.log)
-    assert bool(real_time_threads) != ("thread_priority 10 is not permitted" in log)
-    assert memory_is_locked != ("lock_memory is not permitted" in log)
-    if real_time_threads:
-        assert process.name not in real_time_threads  # the main thread, which serves parameters
-        assert any(name.startswith("dds.") for name in real_time_threads.values())

@@ -1,17 +1,25 @@
-"""How nodes start: a bad parameter file ends them with one sentence, and packaged defaults are enough for one."""
+"""How nodes start: with bad parameters, without a file, from a parameter dump, and with real-time threads."""
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
+from pathlib import Path
 
 import pytest
+import yaml
 
 from exo_gravity.core.motors import ENTER
+from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.tools.trials.offline import simulated_trials
 
-from ..support.launched_nodes import executable
+from ..support.launched_nodes import NO_IMU, executable
 
 pytestmark = pytest.mark.real_time
+
+OTHER_NODES = ("can_bridge", "simulator", "imu")
+SCRIPT = TrialScript.parse({"name": "hold", "steps": [{"hold": 1.0}]})
 
 BAD_PARAMETERS = [
     ("can_bridge", {"max_efort": [3.0, 9.0, 3.0, 3.0]}, "max_efort", "must be one of"),
@@ -52,3 +60,42 @@ def test_a_compensator_without_a_parameter_file_starts_and_waits_for_joint_state
     finally:
         process.send_signal(signal.SIGINT)
         assert process.wait(10) == 0
+
+
+def test_a_parameter_dump_starts_the_same_nodes_without_changes(tmp_path, prepare, launch, probe):
+    first = launch(compensator={"wearer": {"body_mass": 70.0}})
+    nodes = list(yaml.safe_load(first.path.read_text()))
+    assert probe.set_parameters("compensator", support=0.3, transition_time=2, atomically=True).successful
+    dumped = probe.dump_parameters(nodes)
+    first.stop()
+    for node in nodes:  # a dump also has these if a publisher's quality of service can be set
+        dumped[node]["ros__parameters"]["qos_overrides"] = {"/parameter_events": {"publisher": {"depth": 1000}}}
+    assert dumped["/right/compensator"]["ros__parameters"]["use_sim_time"] is False
+    second = prepare()
+    second.path = tmp_path / "dump.yaml"
+    second.path.write_text(yaml.dump(dumped, default_flow_style=False))
+    second.start()
+    try:
+        assert probe.dump_parameters(nodes) == dumped
+        assert simulated_trials(second.path, SCRIPT)  # the tools read it too
+    finally:
+        second.stop()
+    assert second.ended_node is None
+
+
+def test_real_time_threads_and_locked_memory_are_used_or_the_log_states_that_they_are_not_permitted(launch, probe):
+    nodes = launch(without=OTHER_NODES, compensator={**NO_IMU, "thread_priority": 10, "lock_memory": True})
+    probe.wait_until(lambda: "waiting for joint_states" in "".join(nodes.log))
+    process = Path(f"/proc/{nodes.process('compensator').pid}")
+    real_time_threads = {
+        thread.name: (thread / "comm").read_text()
+        for thread in (process / "task").iterdir()
+        if os.sched_getscheduler(int(thread.name)) == os.SCHED_FIFO
+    }
+    memory_is_locked = "VmLck:\t       0 kB" not in (process / "status").read_text()
+    log = "\n".join(nodes.log)
+    assert bool(real_time_threads) != ("thread_priority 10 is not permitted" in log)
+    assert memory_is_locked != ("lock_memory is not permitted" in log)
+    if real_time_threads:
+        assert process.name not in real_time_threads  # the main thread, which serves parameters
+        assert any(name.startswith("dds.") for name in real_time_threads.values())

@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
-from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters, SetParametersAtomically
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter, parameter_value_to_python
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
@@ -138,6 +138,21 @@ class RosProbe:
             return self.call(SetParametersAtomically, name, request).result
         name = f"{self.arm}/{node}/set_parameters"
         return self.call(SetParameters, name, SetParameters.Request(parameters=messages)).results[0]
+
+    def dump_parameters(self, nodes: Iterable[str]) -> dict[str, dict[str, Any]]:
+        """Return what `ros2 param dump` writes for the nodes, by their full names."""
+        content: dict[str, dict[str, Any]] = {}
+        for node in nodes:
+            names = self.call(ListParameters, f"{node}/list_parameters", ListParameters.Request()).result.names
+            values = self.call(GetParameters, f"{node}/get_parameters", GetParameters.Request(names=names)).values
+            content[node] = {"ros__parameters": {}}
+            for name, value in zip(names, values, strict=True):
+                *branches, leaf = name.split(".")
+                parameters = content[node]["ros__parameters"]
+                for branch in branches:
+                    parameters = parameters.setdefault(branch, {})
+                parameters[leaf] = parameter_value_to_python(value)
+        return content
 
     def joint_angles(self) -> list[float]:
         """Return the newest joint angles in rad."""
