@@ -26,7 +26,7 @@ from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 REPLY_DELAY = (200e-6, 400e-6)  # s
 MAX_CATCH_UP = 0.05  # s of physics simulated at once; after a longer stall the rest of the time is lost
-IDLE_PERIOD = 0.002  # s after which physics advances even without a frame
+IDLE_PERIOD = 0.005  # s after which physics advances even without a frame
 
 
 class SimulatedDevice:
@@ -110,7 +110,7 @@ class SimulatedDevice:
     ) -> None:
         """Play the device on `bus` in real time until `should_stop()`. Raises BusError when the bus fails.
 
-        on_idle(now), `now` in monotonic s, is called whenever no reply is due, at the latest 2 ms after the last frame.
+        on_idle(now), `now` in monotonic s, is called whenever no reply is due, at the latest 5 ms after the last frame.
         """
         link = CanLink(bus)
         outbox: list[tuple[float, Frame]] = []  # replies by the time at which they are due, a heap

@@ -1,63 +1,61 @@
-"""trial: script files, the offline run from file to report, what a person at a real arm is told, a run over ROS."""
+"""trial, from script to report: offline, over ROS, interrupted, and used wrongly."""
+
+from __future__ import annotations
 
 import csv
-import dataclasses
-import io
 import itertools
-import json
-import math
 import os
 import signal
 import threading
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 import pytest
 import yaml
-from rich.console import Console
 
-from exo_gravity.bag.content import Bag
-from exo_gravity.core import ArmModel, Tilt, gravity_torque
-from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.tools import launcher
-from exo_gravity.tools.reporting import trial_report
-from exo_gravity.tools.trial import follow, is_guided, limits_for, main, missed, read_script, shortest_hold
-from exo_gravity.tools.trials.live import LEAD, Progress
-
-from ..support import made_bags as made
+from exo_gravity.tools.launcher import OnLine, StopFlag
+from exo_gravity.tools.trial import main
+from exo_gravity.tools.trials import real_time, session
 
 CONFIG = Path(__file__).parents[2] / "config"
 SHORT = {"name": "short", "steps": [{"move": [0.1, 0.6, 1.2, 0.5], "over": 2.0}, {"hold": 4.0}]}
 RATED = (3.0, 9.0, 3.0, 3.0)  # Nm
-PORTS = itertools.count(30_000 + os.getpid() % 10_000)  # apart from those of test/nodes
+PORTS = itertools.count(30_000 + os.getpid() % 10_000)  # different from those of test/nodes
+Changes = dict[str, dict[str, Any]]  # parameters by node
+
+
+class RunTrial(Protocol):
+    def __call__(self, *arguments: str, script: Any = SHORT, changes: Changes | None = None) -> tuple[int, Path]: ...
 
 
 @pytest.fixture
-def run(tmp_path):
-    """Run `trial`; return its exit code and the folder that it wrote, None if it wrote none."""
+def run(tmp_path: Path) -> Iterator[RunTrial]:
+    """Run `trial`; return its exit code and the folder that it wrote, `tmp_path` if it wrote none."""
     handlers = [(number, signal.getsignal(number)) for number in (signal.SIGINT, signal.SIGTERM)]
 
-    def run(*arguments, script=SHORT, changes=None):
+    def run(*arguments: str, script: Any = SHORT, changes: Changes | None = None) -> tuple[int, Path]:
         (tmp_path / "script.yaml").write_text(yaml.safe_dump(script))
         output = tmp_path / f"out_{next(PORTS)}"
         params = changed(tmp_path, changes or {})
-        given = [str(tmp_path / "script.yaml"), "--params", str(params), "--output", str(output), *arguments]
-        code = main(given)
-        return code, next(output.iterdir(), None) if output.exists() else None
+        code = main([str(tmp_path / "script.yaml"), "--params", str(params), "--output", str(output), *arguments])
+        return code, next(output.iterdir()) if output.exists() else tmp_path
 
     yield run
     for number, handler in handlers:
         signal.signal(number, handler)
 
 
-def changed(folder, changes):
-    """Write the packaged simulated arm with `changes` {node: {parameter: value}}, on a bus of its own."""
+def changed(folder: Path, changes: Changes) -> Path:
+    """Write config/sim.yaml with `changes` and an unused bus; return its path."""
     content = yaml.safe_load((CONFIG / "sim.yaml").read_text())
     port = next(PORTS)
     for node, entry in content.items():
         values = entry["ros__parameters"]
         if node == "/right/can_bridge":
-            values.update(sign_check_torque=0.0, ramp_time=0.5, fade_time=0.5, damping=1.5)  # seconds less
+            values.update(sign_check_torque=0.0, ramp_time=0.5, fade_time=0.5, damping=1.5)  # saves seconds
         elif node == "/right/simulator":
             values["trial_delay"] = 1.5
         values.update(changes.get(node, {}))
@@ -68,12 +66,12 @@ def changed(folder, changes):
     return path
 
 
-def holds(folder):
+def holds(folder: Path) -> list[dict[str, str]]:
     with (folder / "holds.csv").open() as file:
         return list(csv.DictReader(file))
 
 
-def test_offline_runs_a_protocol_to_a_report(run, capsys):
+def test_an_offline_trial_ends_with_a_report(run, capsys):
     code, folder = run("--offline")
     assert code == 0
     written = {path.name for path in folder.iterdir()}
@@ -99,7 +97,7 @@ def test_an_arm_that_does_not_hold_ends_with_exit_code_1(run, capsys):
     assert code == 1 and "It did not hold." in capsys.readouterr().out
 
 
-def thirteen(hold):
+def thirteen(hold: float) -> dict[str, Any]:
     content = yaml.safe_load((CONFIG / "trials" / "thirteen_poses.yaml").read_text())
     steps = [{"hold": hold} if "hold" in step else step for step in content["steps"]]
     return {"name": "thirteen", "steps": steps}
@@ -117,44 +115,7 @@ def test_with_masses_a_tenth_off_and_half_the_friction_the_report_names_the_pose
     slippery = {"friction": {"coulomb": [0.1, 0.2, 0.1, 0.1]}}
     changes = {"/right/compensator": heavy, "/right/simulator": slippery}
     code, _ = run("--offline", script=thirteen(2.5), changes=changes)
-    text = capsys.readouterr().out
-    assert code == 1 and "from where it was let go" in text
-
-
-@pytest.mark.parametrize("name", ["demo", "two_poses", "thirteen_poses"])
-def test_a_packaged_trial_stays_within_rated_torque_and_clear_of_the_joint_limits(name):
-    _, script = read_script(name)
-    values = yaml.safe_load((CONFIG / "exo.yaml").read_text())
-    bridge, robot = (values[f"/right/{node}"]["ros__parameters"] for node in ("can_bridge", "compensator"))
-    poses = np.array([step.value for step in script.steps if step.action == "move"])
-    assert np.all(poses > np.array(bridge["position_min"]) + 0.15)
-    assert np.all(poses < np.array(bridge["position_max"]) - 0.15)
-    arm = ArmModel(robot["link_length"], robot["robot"]["cog"], robot["robot"]["mass"])
-    for pitch, roll in itertools.product((-0.35, 0.0, 0.35), repeat=2):  # 20 degrees
-        torque = gravity_torque(arm, poses, Tilt.of("right", pitch, roll).direction)
-        assert np.all(np.abs(torque) < RATED)
-
-
-def test_the_second_trial_has_thirteen_different_poses_of_a_minute_each():
-    _, script = read_script("thirteen_poses")
-    poses = {step.value for step in script.steps if step.action == "move"}
-    assert len(poses) == 13
-    assert [step.duration for step in script.steps if step.action == "hold"] == [60.0] * 13
-
-
-def test_the_push_of_the_first_trial_lasts_from_17_to_20_s():
-    _, script = read_script("two_poses")
-    assert [script.steps[script.at(time)[0]].action for time in (16.9, 17.1, 19.9, 20.1)] == [
-        "hold", "push", "push", "hold",
-    ]  # fmt: skip
-
-
-def test_only_holds_of_a_minute_are_judged_by_their_rate_unless_asked_for():
-    _, demo = read_script("demo")
-    _, thirteen_poses = read_script("thirteen_poses")
-    assert limits_for(demo, None).max_rate == math.inf
-    assert limits_for(thirteen_poses, None).max_rate == pytest.approx(math.radians(0.2) / 60)
-    assert limits_for(demo, 1.0).max_rate == pytest.approx(math.radians(1.0) / 60)
+    assert code == 1 and capsys.readouterr().out.count("the arm was still moving at the end of a hold") > 5
 
 
 WRONG = {
@@ -168,9 +129,9 @@ WRONG = {
 @pytest.mark.parametrize(("changes", "thing"), WRONG.values(), ids=WRONG)
 def test_a_wrong_parameter_ends_with_exit_code_2_one_sentence_and_no_folder(run, capsys, changes, thing):
     code, folder = run("--offline", changes=changes)
-    told = capsys.readouterr().err
-    assert code == 2 and folder is None
-    assert thing in told and told.count("\n") == 1
+    error = capsys.readouterr().err
+    assert code == 2 and not list(folder.glob("out_*"))
+    assert thing in error and error.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -183,176 +144,78 @@ def test_a_wrong_parameter_ends_with_exit_code_2_one_sentence_and_no_folder(run,
 )
 def test_a_wrong_file_ends_with_exit_code_2_and_one_sentence(tmp_path, capsys, arguments, thing):
     assert main([*arguments, "--output", str(tmp_path)]) == 2
-    told = capsys.readouterr().err
-    assert thing in told and told.count("\n") == 1
+    error = capsys.readouterr().err
+    assert thing in error and error.count("\n") == 1
 
 
-class Person:
-    """Somebody at a real arm: a clock that is set by hand, and what they read on the screen."""
-
-    def __init__(self, script, guided=True):
-        self.now, self.out = 0.0, io.StringIO()
-        self.console = Console(file=self.out, width=120)
-        self.progress = Progress(TrialScript.parse(script), guided, self.console, lambda: self.now)
-
-    def at(self, now, position=(0.0,) * 4, faults=(), **more):
-        self.now = now
-        arm = {"position": list(position), "effort": [0.0] * 4, **more}
-        self.progress.take(json.dumps({"right": arm, "faults": list(faults)}))
-        return self.screen
-
-    @property
-    def read(self):
-        return self.out.getvalue().splitlines()
-
-    @property
-    def screen(self):
-        with self.console.capture() as capture:
-            self.console.print(self.progress.screen())
-        return capture.get()
-
-
-def test_a_person_is_told_to_wait_until_the_arm_is_carried():
-    person = Person(SHORT)
-    screen = person.at(10.0, faults=["right/can_bridge: checking: waiting for effort commands"])
-    assert "waiting for the arm to be carried" in screen and "checking" in screen
-    assert "take hold of the arm: in 5 s, bring the arm to 6 34 69 29 deg, then let go" in person.at(11.0)
-    assert person.read == []
-
-
-def test_a_person_is_led_through_the_steps_by_the_clock():
-    person = Person(SHORT)
-    person.at(0.0)
-    person.at(LEAD + 0.1)
-    assert "then: hands off for 4 s" in person.at(LEAD + 1.0)
-    person.at(LEAD + 2.1)
-    person.at(LEAD + 3.0)
-    assert "drift 1.00 deg" in person.at(LEAD + 4.0, position=(0.0, 0.0, math.radians(1.0), 0.0))
-    assert not person.progress.done
-    person.at(LEAD + 6.1)
-    assert person.progress.done
-    assert [line[5:] for line in person.read] == [
-        "bring the arm to 6 34 69 29 deg, then let go",
-        "hands off for 4 s",
-        "drifted 0.00 deg",
-    ]
-
-
-def test_at_a_simulated_arm_the_virtual_wearer_leads():
-    person = Person(SHORT, guided=False)
-    person.at(100.0)
-    assert person.read == []
-    person.at(101.0, step={"step": 0})
-    assert person.read == ["1/2  the wearer brings the arm to 6 34 69 29 deg"]
-    person.at(102.0, step={"step": 2})
-    assert person.progress.done
-
-
-def test_half_a_line_of_a_killed_recorder_is_let_go():
-    person = Person(SHORT)
-    person.at(1.0)
-    person.progress.take('{"right": {"posi')
-    assert person.progress.silence == 0.0
-    person.now = 4.0
-    assert person.progress.silence == 3.0
-
-
-@pytest.fixture
-def running():
-    """A thread that stands for the nodes."""
-    ending = threading.Event()
-    thread = threading.Thread(target=ending.wait)
-    thread.start()
-    yield thread
-    ending.set()
-
-
-def test_a_recorder_that_ends_is_noticed_at_once(running):
-    person = Person(SHORT)
-    person.at(0.0)
-    why = follow(person.progress, TrialScript.parse(SHORT), threading.Event(), lambda: -9, running)
-    assert why == "the recorder ended with exit code -9 before the trial was done"
-
-
-def test_a_recorder_that_says_nothing_is_noticed(running):
-    person = Person(SHORT)
-    person.at(0.0)
-    person.now = 10.1
-    why = follow(person.progress, TrialScript.parse(SHORT), threading.Event(), lambda: None, running)
-    assert why == "the recorder has said nothing for 10 s"
-
-
-def test_a_latched_fault_ends_the_trial_with_its_reason(running):
-    person, fault = Person(SHORT), "right/can_bridge: letting down: motor_silent: elbow"
-    person.at(0.0, faults=[fault])
-    assert follow(person.progress, TrialScript.parse(SHORT), threading.Event(), lambda: None, running) == fault
-
-
-def found(holds):
-    """A report of one arm with that many holds."""
-    recording = made.trial([[0.1 * n] * 4 for n in range(holds)], hold=4.0, rate=100.0)
-    still = dataclasses.replace(recording, steps=(), carried=((0.0, recording.time[-1]),))
-    return trial_report.analyse(Bag(Path("bag"), 0, (still,), (), {}, (), ()))
-
-
-def test_a_hold_that_a_real_arm_never_came_to_rest_in_is_missed():
-    two = TrialScript.parse({"name": "two", "steps": SHORT["steps"] * 2})
-    assert missed(two, found(2)) == ""
-    assert missed(two, found(1)) == "right: 1 of 2 holds were found"
-
-
-def test_a_person_who_keeps_the_arm_still_for_a_moment_makes_no_hold():
-    script = TrialScript.parse({"name": "p", "steps": [{"hold": 60.0}, {"hold": 14.0}]})
-    assert shortest_hold(script, guided=True) == 7.0
-    assert shortest_hold(script, guided=False) == 2.0
-
-
-def test_only_a_simulator_carries_out_a_protocol_without_a_person():
-    assert is_guided(CONFIG / "exo.yaml") and not is_guided(CONFIG / "sim_both.yaml")
-
-
-def test_ctrl_c_lets_the_arm_down_and_reports_what_there_is(run, capsys, monkeypatch):
-    def stop_on_signals():
+def test_ctrl_c_lets_the_arm_down_and_reports_what_was_recorded(run, capsys, monkeypatch):
+    def stop_on_signals() -> StopFlag:
         stopped = launcher.stop_on_signals()
         threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
         return stopped
 
-    monkeypatch.setattr("exo_gravity.tools.trial.stop_on_signals", stop_on_signals)
+    monkeypatch.setattr(session, "stop_on_signals", stop_on_signals)
     code, folder = run("--offline", script={"name": "long", "steps": [SHORT["steps"][0], {"hold": 3000.0}]})
     assert code == 1 and (folder / "report.html").exists()
-    told = capsys.readouterr().out
-    assert "stopped by the operator" in told and "slipped" not in told
+    text = capsys.readouterr().out
+    assert "stopped by the operator" in text and "slipped" not in text
 
 
-# The longest that there may be: tests share a machine that is busy with others.
-PATIENT = {
-    "/right/can_bridge": {"command_timeout": 0.1, "reply_timeout": 0.1},
-    "/right/compensator": {"tilt_timeout": 0.5},
-}
+class Listening(launcher.Launcher):
+    """Calls `react(self)` when a node first prints a line that contains `phrase`."""
+
+    phrase = ""
+
+    def __init__(self, params: Path, on_line: OnLine) -> None:
+        reacted = False
+
+        def listen(node: str, line: str) -> None:
+            nonlocal reacted
+            on_line(node, line)
+            if self.phrase in line and not reacted:
+                reacted = True
+                self.react()
+
+        super().__init__(params, listen)
+
+    def react(self) -> None:
+        raise NotImplementedError
 
 
 @pytest.mark.real_time
-def test_a_recorder_that_is_killed_ends_the_trial_at_once_with_what_it_wrote(run, capsys, monkeypatch):
-    class Killer(launcher.Launcher):
-        """Kills the recorder two seconds into the hold."""
+def test_a_killed_recorder_ends_the_trial_with_a_report_of_what_it_wrote(run, capsys, monkeypatch):
+    class KillRecorder(Listening):
+        phrase = "wearer: hold"
 
-        def __init__(self, params, on_line):
-            def listen(node, line):
-                on_line(node, line)
-                if "wearer: hold" in line:
-                    threading.Timer(2.0, self.process("/recorder").kill).start()
+        def react(self) -> None:
+            threading.Timer(2.0, self.process("/recorder").kill).start()
 
-            super().__init__(params, listen)
-
-    monkeypatch.setattr("exo_gravity.tools.trial.Launcher", Killer)
-    code, folder = run(changes=PATIENT, script={"name": "long", "steps": [SHORT["steps"][0], {"hold": 90.0}]})
+    monkeypatch.setattr(real_time, "Launcher", KillRecorder)
+    code, folder = run(script={"name": "long", "steps": [SHORT["steps"][0], {"hold": 90.0}]})
     assert code == 1 and (folder / "report.html").exists()
     assert "the recorder ended with exit code -9 before the trial was done" in capsys.readouterr().out
 
 
 @pytest.mark.real_time
+def test_a_simulator_that_the_computer_does_not_run_ends_the_trial_with_exit_code_3(run, capsys, monkeypatch):
+    class FreezeSimulator(Listening):
+        phrase = "wearer: hold"
+
+        def react(self) -> None:
+            simulator = self.process("/right/simulator")
+            simulator.send_signal(signal.SIGSTOP)
+            threading.Timer(0.4, simulator.send_signal, (signal.SIGCONT,)).start()
+
+    monkeypatch.setattr(real_time, "Launcher", FreezeSimulator)
+    monkeypatch.setattr(session, "ATTEMPTS", 1)
+    code, _ = run()
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert code == 3 and last.startswith("trial: this computer was too busy: right/simulator was not run for ")
+
+
+@pytest.mark.real_time
 def test_over_ros_the_arm_holds_in_the_pose_that_it_has_offline(run):
-    code, folder = run(changes=PATIENT)
+    code, folder = run()
     assert code == 0, (folder / "log.txt").read_text()
     assert {"bag", "log.txt", "params.yaml", "report.html"} <= {path.name for path in folder.iterdir()}
     _, offline = run("--offline")

@@ -1,7 +1,7 @@
-"""What a trial shows while it runs: the step under way, the time left, and of each arm angles, torques and drift.
+"""The screen of a running trial: the current step, the time left, and angles, torques and drift of each arm.
 
-It reads the lines of JSON that the `recorder` writes ten times a second. Where a simulator carries out the script,
-the recorder passes its steps on; at a real arm the script's own clock tells the person what to do.
+It reads the lines of JSON that `recorder` prints ten times a second. If a simulator performs the script, its steps are
+in those lines. At a real arm a clock leads the person through the script.
 """
 
 from __future__ import annotations
@@ -9,63 +9,73 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
+from exo_gravity.core.safety import State
 from exo_gravity.core.trial_script import Step, TrialScript
 
-SETTLING = 0.5  # s after letting go before the live drift is counted from
-LEAD = 5.0  # s for a person to get ready once the arm is carried
+SETTLING = 0.5  # s between letting go and the position from which drift is measured
+LEAD = 5.0  # s for a person to get ready when the arm is carried
 
 
 class Progress:
     """Follows a script through the recorder's lines.
 
-    done: the last step has ended. faults: what the nodes say is wrong. guided: nobody but this clock leads the arm.
+    guided: a person performs the script, led by the clock, which starts when all `bridges` are active. done: the last
+    step has ended. status: of each node on /diagnostics. faults: warnings and errors of the nodes, as text.
     """
 
     def __init__(
-        self, script: TrialScript, guided: bool, console: Console, clock: Callable[[], float] = time.monotonic
-    ):
+        self,
+        script: TrialScript,
+        guided: bool,
+        console: Console,
+        bridges: Collection[str],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self.done = False
+        self.status: dict[str, dict[str, Any]] = {}
         self.faults: list[str] = []
         self._script = script
         self._guided = guided
+        self._bridges = bridges
         self._console = console
         self._clock = clock
         self._arms: dict[str, dict[str, Any]] = {}
-        self._index = -1  # of the step under way
-        self._since = self._heard = clock()
-        self._start = math.inf  # of the script, where it is guided
-        self._origin: dict[str, list[float]] = {}  # position of each arm when its drift began to count
+        self._index = -1  # of the current step
+        self._step_start = self._last_line = clock()
+        self._start = math.inf  # of a guided script
+        self._origin: dict[str, list[float]] = {}  # position of each arm from which drift is measured
         self._ending = ""
         self._live = Live(console=console, refresh_per_second=10, get_renderable=self.screen, transient=True)
 
     def __enter__(self) -> Progress:
         if self._console.is_terminal:
-            self._live.__enter__()
+            self._live.start()
         return self
 
     def __exit__(self, *error: object) -> None:
         if self._console.is_terminal:
-            self._live.__exit__(*error)
+            self._live.stop()
 
     def end(self, text: str) -> None:
-        """Show `text` in place of the steps, which count no longer."""
+        """Print `text`, and stop following the script."""
         self._ending = text
         self._console.print(text)
 
     def take(self, line: str) -> None:
-        """Take one line of the recorder's JSON; half a line, which one that is killed leaves, is let go."""
+        """Process one line of the recorder's JSON; ignore half a line, which a killed recorder leaves."""
         try:
             content = json.loads(line)
         except json.JSONDecodeError:
             return
-        self._heard = self._clock()
+        self._last_line = self._clock()
+        self.status = content.pop("status", {})
         self.faults = content.pop("faults", [])
         self._arms = {name: arm for name, arm in content.items() if "position" in arm}
         if not self._ending:
@@ -74,27 +84,32 @@ class Progress:
     @property
     def silence(self) -> float:
         """Time in s since the recorder's last line; 0 before its first."""
-        return self._clock() - self._heard if self._arms else 0.0
+        return self._clock() - self._last_line if self._arms else 0.0
 
-    def _follow(self, told: list[int]) -> None:
+    def _follow(self, simulated_steps: list[int]) -> None:
         index, now = self._index, self._clock()
         if not self._guided:
-            index = min(told, default=-1)
+            index = min(simulated_steps, default=-1)
         elif self._start == math.inf:
-            if self._arms and not self.faults:
+            if self._all_active:
                 self._start = now + LEAD
         elif now >= self._start:
             index = self._script.at(now - self._start)[0]
         if index != self._index:
             self._begin(index)
-        elif not self._origin and now - self._since > SETTLING and self._holding:
+        elif not self._origin and now - self._step_start > SETTLING and self._holding:
             self._origin = {name: arm["position"] for name, arm in self._arms.items()}
         self.done = index >= len(self._script.steps)
+
+    @property
+    def _all_active(self) -> bool:
+        states = {name: values.get("state") for name, values in self.status.items() if name.endswith("can_bridge")}
+        return bool(states) and set(self._bridges) <= set(states) and set(states.values()) == {State.ACTIVE.value}
 
     def _begin(self, index: int) -> None:
         if self._origin:
             self._console.print(f"     drifted {self._drift():.2f} deg")
-        self._index, self._since, self._origin = index, self._clock(), {}
+        self._index, self._step_start, self._origin = index, self._clock(), {}
         if index < len(self._script.steps):
             number = f"{index + 1}/{len(self._script.steps)}"
             self._console.print(f"{number:<5}{describe(self._script.steps[index], self._guided)}", soft_wrap=True)
@@ -104,7 +119,7 @@ class Progress:
         return 0 <= self._index < len(self._script.steps) and self._script.steps[self._index].action == "hold"
 
     def _drift(self) -> float:
-        """Return the largest change of any joint since it was let go, in degrees."""
+        """Return the largest drift of any joint since it was let go, in degrees."""
         moved = (
             abs(now - then)
             for name, origin in self._origin.items()
@@ -113,10 +128,10 @@ class Progress:
         return math.degrees(max(moved, default=0.0))
 
     def screen(self) -> Group:
-        """Return what changes: the time left and the drift, what comes next, each arm, and what is wrong."""
+        """Return the changing part of the screen: time left, drift, next step, each arm, warnings and errors."""
         lines = [Text(self._headline(), style="bold")]
         for name, arm in self._arms.items():
-            angles, torques = fours(map(math.degrees, arm["position"]), 1), fours(arm["effort"], 2)
+            angles, torques = columns(map(math.degrees, arm["position"]), 1), columns(arm["effort"], 2)
             lines.append(Text(f"     {name:<6} deg {angles}    Nm {torques}", no_wrap=True))
         lines += [Text(f"     {fault}", style="yellow") for fault in self.faults]
         return Group(*lines)
@@ -126,7 +141,7 @@ class Progress:
         if self._ending or self._index >= len(steps):
             return ""
         if self._index >= 0:
-            left = max(0.0, steps[self._index].duration - now + self._since)
+            left = max(0.0, steps[self._index].duration - now + self._step_start)
             then = describe(steps[self._index + 1], self._guided) if self._index + 1 < len(steps) else "done"
             drift = f"drift {self._drift():.2f} deg    " if self._origin else ""
             return f"     {left:.0f} s left    {drift}then: {then}"
@@ -137,7 +152,7 @@ class Progress:
 
 
 def describe(step: Step, guided: bool) -> str:
-    """Return what a step asks, for a reader or for the person at the arm."""
+    """Return a step as a sentence: an instruction for the person at the arm, or what the virtual wearer does."""
     if step.action == "move":
         pose = " ".join(f"{math.degrees(angle):.0f}" for angle in step.value)
         return f"bring the arm to {pose} deg, then let go" if guided else f"the wearer brings the arm to {pose} deg"
@@ -147,6 +162,6 @@ def describe(step: Step, guided: bool) -> str:
     return f"hands off for {step.duration:g} s"
 
 
-def fours(values: Iterable[float], digits: int) -> str:
-    """Return numbers in columns."""
+def columns(values: Iterable[float], digits: int) -> str:
+    """Return `values` in columns, with `digits` decimal places."""
     return " ".join(f"{value:{digits + 5}.{digits}f}" for value in values)

@@ -1,6 +1,6 @@
-"""trial --offline: the simulated arms of a parameter file carry out a script without ROS, faster than real time.
+"""trial --offline: the simulated arms of a parameter file perform a script without ROS, faster than real time.
 
-Of all tools this one alone imports `sim`: without ROS there are no nodes to start by their names.
+This is the only tool that imports `sim`: without ROS it cannot start the simulator as a node.
 """
 
 from __future__ import annotations
@@ -25,38 +25,38 @@ from exo_gravity.tools.inputs.parameter_file import Nodes, load
 
 
 def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
-    """Return a trial of each simulated arm of a parameter file, ready to run.
+    """Return a trial of each simulated arm of a parameter file.
 
     Raises ParameterError that names the node and the parameter.
     """
     nodes = load(params)
-    spaces = [node.removesuffix("/simulator") for node in nodes if node.endswith("/simulator")]
-    if not spaces:
-        raise ParameterError("params", str(params), "a file with a simulator: --offline is for the simulated device")
-    tilt = _tilt(nodes, spaces)
-    return [_trial(nodes, space, script, tilt) for space in spaces]
+    namespaces = [node.removesuffix("/simulator") for node in nodes if node.endswith("/simulator")]
+    if not namespaces:
+        raise ParameterError("params", str(params), "a file with a simulator: --offline runs the simulated device only")
+    tilt = _tilt(nodes, namespaces)
+    return [_trial(nodes, namespace, script, tilt) for namespace in namespaces]
 
 
 def run_offline(
     trials: Sequence[OfflineTrial], params: Path, console: Console, should_stop: Callable[[], bool]
 ) -> tuple[Bag, str]:
-    """Return what a recording of the trials would hold, and what went wrong, or ''; params: file in their folder.
+    """Run the trials; return what a recording of them would hold, and why a trial ended early, or ''.
 
-    Raises DataError where nothing moved.
+    params: parameter file in the folder of the trial. Raises DataError if nothing was recorded.
     """
     start = time.time_ns()
-    recordings = tuple(_played(trial, console, should_stop) for trial in trials)
+    recordings = tuple(_run_one(trial, console, should_stop) for trial in trials)
     events = sorted(Event(*event) for trial in trials for event in trial.events)
     texts = {
         node: yaml.safe_dump({node: {"ros__parameters": values}}, default_flow_style=None, width=120)
         for node, values in load(params).items()
     }
-    notes = ("simulated offline: there is no recording beside this report",)
+    notes = ("simulated offline: this report has no recording",)
     troubles = (trial.trouble for trial in trials if trial.trouble)
     return Bag(params.parent, start, recordings, tuple(events), texts, notes, ()), next(troubles, "")
 
 
-def _played(trial: OfflineTrial, console: Console, should_stop: Callable[[], bool]) -> Recording:
+def _run_one(trial: OfflineTrial, console: Console, should_stop: Callable[[], bool]) -> Recording:
     name, script = trial.arm.name, trial.script
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task(name, total=script.duration)
@@ -85,13 +85,13 @@ def _trial(nodes: Nodes, namespace: str, script: TrialScript, tilt: tuple[float,
     return OfflineTrial(setup, script, simulator["trial_delay"])
 
 
-def _tilt(nodes: Nodes, spaces: list[str]) -> tuple[float, float] | None:
-    """Return the trunk's pitch and roll (rad) as its IMU tells them, None without an IMU."""
-    for space in spaces:
-        simulator = node_values(nodes, f"{space}/simulator", SIMULATOR)
+def _tilt(nodes: Nodes, namespaces: list[str]) -> tuple[float, float] | None:
+    """Return the trunk's pitch and roll (rad) as its IMU measures them, None without an IMU."""
+    for namespace in namespaces:
+        simulator = node_values(nodes, f"{namespace}/simulator", SIMULATOR)
         if simulator["imu.topic"] and "/imu" in nodes:
             with named("/imu"):
-                believed = nodes["/imu"].get("rotation_trunk_from_imu", [])
+                rotation = nodes["/imu"].get("rotation_trunk_from_imu", [])
                 trunk = simulator["trunk.pitch"], simulator["trunk.roll"]
-                return measured_tilt(*trunk, SimulatedImu(imu_of(simulator)), believed)
+                return measured_tilt(*trunk, SimulatedImu(imu_of(simulator)), rotation)
     return None

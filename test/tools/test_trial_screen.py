@@ -1,0 +1,141 @@
+"""trial's screen: instructions for a person at a real arm, the virtual wearer's steps, and why a trial ends early."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import threading
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.tools.trials.live import LEAD, Progress
+from exo_gravity.tools.trials.real_time import follow
+
+SCRIPT = TrialScript.parse(
+    {"name": "short", "steps": [{"move": [0.1, 0.6, 1.2, 0.5], "over": 2.0}, {"hold": 4.0}]},
+)
+ACTIVE = {"level": 0, "message": "active", "state": "active", "fault": "none"}
+
+
+class Screen:
+    """The screen of a trial, whose clock and recorder's lines the test sets."""
+
+    def __init__(self, guided: bool = True, bridges: Sequence[str] = ("right/can_bridge",)) -> None:
+        self.now, self.out = 0.0, io.StringIO()
+        self.console = Console(file=self.out, width=120)
+        self.progress = Progress(SCRIPT, guided, self.console, bridges, lambda: self.now)
+
+    def at(self, now: float, position: Sequence[float] = (0.0,) * 4, bridge: Any = ACTIVE, **arm: Any) -> str:
+        """Process a line of the recorder at `now`, in which the bridge has the status `bridge`; return the screen."""
+        self.now = now
+        status = {"right/can_bridge": bridge}
+        faults = [f"{name}: {values['message']}" for name, values in status.items() if values["level"]]
+        arm = {"position": list(position), "effort": [0.0] * 4, **arm}
+        self.progress.take(json.dumps({"right": arm, "status": status, "faults": faults}))
+        with self.console.capture() as capture:
+            self.console.print(self.progress.screen())
+        return capture.get()
+
+    @property
+    def printed(self) -> list[str]:
+        """The lines that stay on the screen."""
+        return self.out.getvalue().splitlines()
+
+
+def checking(what: str) -> dict[str, Any]:
+    return {"level": 1, "message": f"checking: waiting for {what}", "state": "checking", "fault": "none"}
+
+
+def test_a_person_waits_until_the_arm_is_active():
+    screen = Screen()
+    text = screen.at(10.0, bridge=checking("effort commands"))
+    assert "waiting for the arm to be carried" in text and "checking" in text
+    ramping = {"level": 0, "message": "ramping in", "state": "ramping in", "fault": "none"}
+    assert "waiting for the arm to be carried" in screen.at(11.0, bridge=ramping)
+    assert "take hold of the arm: in 5 s, bring the arm to 6 34 69 29 deg, then let go" in screen.at(12.0)
+    assert screen.printed == []
+
+
+def test_a_limit_that_acts_does_not_keep_a_person_waiting():
+    limited = {**ACTIVE, "level": 1, "message": "active, limited by max_effort (right_elbow_flexion)"}
+    assert "take hold of the arm" in Screen().at(10.0, bridge=limited)
+
+
+def test_a_person_with_two_arms_waits_for_both():
+    screen = Screen(bridges=("left/can_bridge", "right/can_bridge"))
+    assert "waiting for the arm to be carried" in screen.at(10.0)
+
+
+def test_the_clock_leads_a_person_through_the_steps():
+    screen = Screen()
+    screen.at(0.0)
+    screen.at(LEAD + 0.1)
+    assert "then: hands off for 4 s" in screen.at(LEAD + 1.0)
+    screen.at(LEAD + 2.1)
+    screen.at(LEAD + 3.0)
+    assert "drift 1.00 deg" in screen.at(LEAD + 4.0, position=(0.0, 0.0, math.radians(1.0), 0.0))
+    assert not screen.progress.done
+    screen.at(LEAD + 6.1)
+    assert screen.progress.done
+    assert [line[5:] for line in screen.printed] == [
+        "bring the arm to 6 34 69 29 deg, then let go",
+        "hands off for 4 s",
+        "drifted 0.00 deg",
+    ]
+
+
+def test_at_a_simulated_arm_the_virtual_wearer_leads():
+    screen = Screen(guided=False)
+    screen.at(100.0)
+    assert screen.printed == []
+    screen.at(101.0, step={"step": 0})
+    assert screen.printed == ["1/2  the wearer brings the arm to 6 34 69 29 deg"]
+    screen.at(102.0, step={"step": 2})
+    assert screen.progress.done
+
+
+def test_half_a_line_of_a_killed_recorder_is_ignored():
+    screen = Screen()
+    screen.at(1.0)
+    screen.progress.take('{"right": {"posi')
+    assert screen.progress.silence == 0.0
+    screen.now = 4.0
+    assert screen.progress.silence == 3.0
+
+
+@pytest.fixture
+def nodes() -> Iterator[threading.Thread]:
+    """A thread in place of the one that runs the nodes."""
+    ending = threading.Event()
+    thread = threading.Thread(target=ending.wait)
+    thread.start()
+    yield thread
+    ending.set()
+
+
+def test_a_recorder_that_ends_ends_the_trial(nodes):
+    screen = Screen()
+    screen.at(0.0)
+    why = follow(screen.progress, SCRIPT, threading.Event(), lambda: -9, nodes)
+    assert why == "the recorder ended with exit code -9 before the trial was done"
+
+
+def test_a_recorder_that_prints_nothing_ends_the_trial(nodes):
+    screen = Screen()
+    screen.at(0.0)
+    screen.now = 10.1
+    why = follow(screen.progress, SCRIPT, threading.Event(), lambda: None, nodes)
+    assert why == "the recorder has sent no data for 10 s"
+
+
+@pytest.mark.parametrize("state", ["letting down", "fault"])
+def test_a_latched_fault_ends_the_trial_with_its_reason(nodes, state):
+    screen, message = Screen(), f"{state}: motor_silent: elbow"
+    screen.at(0.0, bridge={"level": 2, "message": message, "state": state, "fault": "motor_silent"})
+    why = follow(screen.progress, SCRIPT, threading.Event(), lambda: None, nodes)
+    assert why == f"right/can_bridge: {message}"
