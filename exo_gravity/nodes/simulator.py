@@ -38,7 +38,7 @@ def script_of(path: str) -> TrialScript:
     """Return the script in a YAML file. Raises ParameterError."""
     try:
         return TrialScript.parse(yaml.safe_load(Path(path).read_text(encoding="utf-8")))
-    except (OSError, yaml.YAMLError) as error:
+    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
         raise ParameterError("trial", path, f"a readable script file ({error})") from None
 
 
