@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import yaml
@@ -19,7 +19,7 @@ from exo_gravity.tools.inputs.parameter_file import load
 
 from ..support import CONFIG
 from ..support.bus_listener import BusListener
-from ..support.launched_nodes import GENTLE, NO_IMU, LaunchedNodes, LauncherProcess, Parameters, full_name
+from ..support.launched_nodes import GENTLE, NO_IMU, REAL, LaunchedNodes, LauncherProcess, Parameters, full_name
 from ..support.ros_probe import RosProbe
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -33,17 +33,15 @@ ChangeMessage = Callable[[JointState], object]
 class Rig:
     """Nodes that carry the arm in a horizontal pose, with a probe and a bus listener. End it with `close`.
 
-    shipped_timeouts: whether the nodes have their default time-outs, or longer ones for a busy machine.
+    timing: rate and time-outs of the nodes, `REAL` or, for a busy machine, `SIMULATED`.
     """
 
-    rate = 250.0  # Hz
-
-    def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
-        self.folder, self.shipped_timeouts = folder, shipped_timeouts
+    def __init__(self, folder: Path, timing: Mapping[str, Parameters] = REAL) -> None:
+        self.folder, self.timing = folder, timing
         self.script = folder / "horizontal.yaml"
         self.script.write_text(yaml.safe_dump(HORIZONTAL))
-        self.probe = RosProbe()
         self.nodes = self._make_nodes()
+        self.probe = RosProbe()
         self.listener = BusListener(self.nodes[0].bus)
         for nodes in self.nodes:
             nodes.start()
@@ -53,7 +51,12 @@ class Rig:
         return [self._nodes(can_bridge=GENTLE)]
 
     def _nodes(self, without: tuple[str, ...] = (), port: int | None = None, **changes: Parameters) -> LaunchedNodes:
-        return LaunchedNodes(self.folder, without=without, port=port, shipped_timeouts=self.shipped_timeouts, **changes)
+        return LaunchedNodes(self.folder, without=without, port=port, timing=self.timing, **changes)
+
+    @property
+    def rate(self) -> float:
+        """The rate of the control loop in Hz."""
+        return float(self.timing["can_bridge"]["rate"])
 
     def carry(self) -> None:
         """Clear what the last fault left and bring the arm to the pose, in several attempts on a busy machine.
@@ -107,10 +110,8 @@ class TwoLaunchersRig(Rig):
 class CommandedRig(Rig):
     """This process commands the arm, at 100 Hz; `change_message` may spoil each message before it leaves."""
 
-    rate = 100.0
-
-    def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
-        super().__init__(folder, shipped_timeouts)
+    def __init__(self, folder: Path, timing: Mapping[str, Parameters] = REAL) -> None:
+        super().__init__(folder, timing)
         self.change_message: ChangeMessage = lambda message: None
         parameters = load(CONFIG / "sim.yaml")["/right/compensator"]
         self._arm = ArmModel(*(parameters[name] for name in ("link_length", "robot.cog", "robot.mass")))
@@ -121,6 +122,11 @@ class CommandedRig(Rig):
     def _make_nodes(self) -> list[LaunchedNodes]:
         bridge = {**GENTLE, "rate": self.rate}
         return [self._nodes(without=("compensator", "imu"), can_bridge=bridge, simulator=UPRIGHT)]
+
+    @property
+    def rate(self) -> float:
+        """100 Hz, at which this process can command the arm."""
+        return 100.0
 
     def _on_joint_states(self, state: JointState) -> None:
         message = JointState(header=state.header, name=state.name)
@@ -136,8 +142,8 @@ class CommandedRig(Rig):
 class ExternalClockRig(Rig):
     """Bridge and compensator use /clock, which this process publishes, `clock_offset` s off the system's clock."""
 
-    def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
-        super().__init__(folder, shipped_timeouts)
+    def __init__(self, folder: Path, timing: Mapping[str, Parameters] = REAL) -> None:
+        super().__init__(folder, timing)
         self.clock_offset = 0.0
         self._publisher = self.probe.node.create_publisher(Clock, "/clock", 10)
         self.probe.node.create_timer(0.002, self._publish_clock)
@@ -157,7 +163,7 @@ class LauncherRig(Rig):
     """The launcher is a process, as for users; `launcher` is that process."""
 
     def _make_nodes(self) -> list[LaunchedNodes]:
-        self._launcher = LauncherProcess(self.folder, shipped_timeouts=self.shipped_timeouts, can_bridge=GENTLE)
+        self._launcher = LauncherProcess(self.folder, timing=self.timing, can_bridge=GENTLE)
         return [self._launcher]
 
     @property

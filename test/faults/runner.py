@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from ..support.launched_nodes import REAL, Parameters
 from .cases import FaultCase
 from .response import Response, measure_response
 from .rigs import Rig
@@ -23,7 +25,7 @@ Result = dict[str, Any]  # a row of the table; `unsafe` is empty, or says why th
 def run_case(case: FaultCase, rig: Rig) -> Result:
     """Inject the fault into the carried arm and return the result.
 
-    Too late a reaction is unsafe only with the shipped time-outs.
+    Too late a reaction is unsafe only with the time-outs of a real device.
     """
     rig.carry()
     probe, first_line, fault_time = rig.probe, len(rig.log), time.time()
@@ -56,7 +58,7 @@ def _result(case: FaultCase, rig: Rig, outcome: str, response: Response, log: li
     failures = {
         "not let down": not carried and response.reaction is None,
         "stayed carried": carried and case.limit is not None,
-        "too late": rig.shipped_timeouts and case.limit is not None and (response.reaction or 0.0) > case.limit,
+        "too late": rig.timing is REAL and case.limit is not None and (response.reaction or 0.0) > case.limit,
         "too fast": response.top_speed > MAX_SPEED,
         "torque step": response.excess > 0.0,
         "enabled again": response.re_enabled,
@@ -84,8 +86,8 @@ def not_run(case: FaultCase, error: BaseException) -> Result:
 class RigPool:
     """Keeps a rig for the next case of its type. A context manager: the rig ends with it."""
 
-    def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
-        self._folder, self._shipped_timeouts = folder, shipped_timeouts
+    def __init__(self, folder: Path, timing: Mapping[str, Parameters] = REAL) -> None:
+        self._folder, self._timing = folder, timing
         self._rig: Rig | None = None
         self._count = 0
 
@@ -118,7 +120,7 @@ class RigPool:
             self._count += 1
             folder = self._folder / str(self._count)
             folder.mkdir()
-            self._rig = case.rig(folder, self._shipped_timeouts)
+            self._rig = case.rig(folder, self._timing)
         return self._rig
 
     def _close(self) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from ..faults.cases import CASES, FaultCase
 from ..faults.runner import RigPool
+from ..support.launched_nodes import SIMULATED
 
 pytestmark = pytest.mark.real_time
 
@@ -16,7 +17,7 @@ CHOSEN = [case for case in CASES if case.in_tests]
 
 @pytest.fixture(scope="module")
 def pool(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RigPool]:
-    with RigPool(tmp_path_factory.mktemp("faults"), shipped_timeouts=False) as pool:
+    with RigPool(tmp_path_factory.mktemp("faults"), SIMULATED) as pool:
         yield pool
 
 

@@ -25,10 +25,14 @@ FAST: Parameters = {"sign_check_torque": 0.0, "ramp_time": 0.5, "fade_time": 0.5
 GENTLE: Parameters = {**FAST, "ramp_time": 1.0, "fade_time": 2.0, "damping": 5.0}
 # config/sim.yaml relaxes these for busy computers; the defaults are those of a real arm.
 RELAXED = ("rate", "command_timeout", "reply_timeout", "tilt_timeout")
-# The longest time-outs within the bounds: the tests share a busy machine.
-LONG_TIMEOUTS: dict[str, Parameters] = {
-    "can_bridge": {"command_timeout": 0.1, "reply_timeout": 0.1},
+# Rate and time-outs of config/sim.yaml, which suit a busy machine, and those of a real device.
+SIMULATED: dict[str, Parameters] = {
+    "can_bridge": {"rate": 100.0, "command_timeout": 0.1, "reply_timeout": 0.1},
     "compensator": {"tilt_timeout": 0.5},
+}
+REAL: dict[str, Parameters] = {
+    "can_bridge": {"rate": 250.0, "command_timeout": 0.05, "reply_timeout": 0.05},
+    "compensator": {"tilt_timeout": 0.08},
 }
 
 
@@ -36,8 +40,8 @@ class LaunchedNodes:
     """The nodes of a parameter file, on a CAN bus of their own.
 
     base: the file in config/. without: nodes to leave out, by the last part of their names. port: of the bus, a new one
-    by default. changes: of the parameters, by node. The bridge gets `FAST`, and all nodes `LONG_TIMEOUTS` unless
-    `shipped_timeouts`; `changes` come last. The attribute `ended_node` is what `Launcher.run` returned.
+    by default. timing: rate and time-outs by node, `SIMULATED` or `REAL`. changes: of the parameters, by node; they
+    come last, after `FAST` for the bridge. The attribute `ended_node` is what `Launcher.run` returned.
     """
 
     def __init__(
@@ -46,7 +50,7 @@ class LaunchedNodes:
         base: str | Path = "sim.yaml",
         without: Iterable[str] = (),
         port: int | None = None,
-        shipped_timeouts: bool = False,
+        timing: Mapping[str, Parameters] = SIMULATED,
         **changes: Parameters,
     ) -> None:
         port = port or next(PORTS)
@@ -59,7 +63,7 @@ class LaunchedNodes:
             for relaxed in RELAXED:
                 parameters.pop(relaxed, None)
             parameters.update(FAST if node == "can_bridge" else {})
-            parameters.update({} if shipped_timeouts else LONG_TIMEOUTS.get(node, {}))
+            parameters.update(timing.get(node, {}))
         for node, values in changes.items():
             content[full_name(node)]["ros__parameters"].update(values)
         self.bus = {"interface": "udp_multicast", "channel": "239.74.163.2", "port": port, "hop_limit": 0}
