@@ -1,0 +1,94 @@
+"""The programs in examples/ run, and the physics of what they print is right."""
+
+from __future__ import annotations
+
+import re
+import runpy
+from typing import Any
+
+import numpy as np
+import pytest
+
+from exo_gravity.core import ArmModel
+from exo_gravity.core.wearer import Wearer
+
+from .support import ROOT
+
+LENGTH, COG, MASS = (0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203)
+ROUNDING = 0.006  # Nm
+
+
+def run(name: str, capsys: pytest.CaptureFixture[str]) -> tuple[dict[str, Any], str]:
+    """Return the variables of an example and what it printed."""
+    variables = runpy.run_path(str(ROOT / "examples" / name))
+    return variables, capsys.readouterr().out
+
+
+def potential_energy(theta: np.ndarray, arm: ArmModel, down: np.ndarray) -> float:
+    """Return the potential energy in J, by the standard Denavit-Hartenberg frames of the paper's Table 1.
+
+    down: unit vector of gravity in the base frame.
+    """
+    rotation, origin, energy = np.eye(3), np.zeros(3), 0.0
+    offset, twist = (0.0, -np.pi / 2, 0.0, 0.0), (-np.pi / 2, np.pi / 2, 0.0, 0.0)
+    for joint in range(4):
+        angle, alpha = theta[joint] + offset[joint], twist[joint]
+        link = np.array((np.cos(angle), np.sin(angle), 0.0))
+        x, z = (
+            rotation @ link,
+            rotation @ np.array((np.sin(angle) * np.sin(alpha), -np.cos(angle) * np.sin(alpha), np.cos(alpha))),
+        )
+        energy -= arm.mass[joint] * arm.gravity * float(down @ (origin + arm.cog[joint] * x))
+        origin = origin + arm.length[joint] * x
+        rotation = np.column_stack((x, np.cross(z, x), z))
+    return energy
+
+
+def holding_torque(theta: np.ndarray, arm: ArmModel, down: np.ndarray) -> np.ndarray:
+    """Return the derivative of the potential energy by each joint angle, (4,) Nm."""
+    step = 1e-5
+    steps = np.eye(4) * step
+    return np.array(
+        [(potential_energy(theta + d, arm, down) - potential_energy(theta - d, arm, down)) / (2 * step) for d in steps]
+    )
+
+
+def test_one_pose_prints_the_torques_that_the_potential_energy_gives(capsys):
+    _, output = run("one_pose.py", capsys)
+    rows = {line[:28].strip(): np.array(line[28:].split(), dtype=float) for line in output.splitlines()[1:]}
+    robot = ArmModel(LENGTH, COG, MASS)
+    wearer = Wearer(body_mass=75.0).on_links(LENGTH)
+    arms = {"One-G": robot, "Zero-G": robot.with_wearer(*wearer)}
+    pitch = np.radians(20.0)
+    # Base axes of the right arm: x0 to the right, y0 forward, z0 down. A bow turns gravity forward.
+    directions = {
+        "upright": np.array((0.0, 0.0, 1.0)),
+        "bowed by 20 degrees": np.array((0.0, np.sin(pitch), np.cos(pitch))),
+    }
+    assert list(rows) == [f"{mode}, {posture}" for mode in arms for posture in directions]
+    for mode, arm in arms.items():
+        for posture, down in directions.items():
+            expected = holding_torque(np.radians((0.0, 30.0, 40.0, 30.0)), arm, down)
+            np.testing.assert_allclose(rows[f"{mode}, {posture}"], expected, atol=ROUNDING)
+
+
+def moved(output: str) -> float:
+    """Return the movement in degrees that simulated_loop.py printed."""
+    match = re.fullmatch(r"After 10 s each joint is within ([0-9.]+) degrees of where it was\.\n", output)
+    assert match
+    return float(match[1])
+
+
+def test_the_simulated_loop_holds_the_arm(capsys):
+    variables, output = run("simulated_loop.py", capsys)
+    assert moved(output) < 0.2
+    assert moved(output) == pytest.approx(
+        np.degrees(np.abs(np.subtract(variables["device"].arm.positions, (0.3, 0.8, 0.7, 0.6)))).max(), abs=0.005
+    )
+    assert not any(motor.entered for motor in variables["device"].motors)
+
+
+def test_without_torque_the_same_simulated_arm_falls(capsys, monkeypatch):
+    monkeypatch.setattr("exo_gravity.core.gravity_torque", lambda arm, theta: [0.0] * 4)
+    _, output = run("simulated_loop.py", capsys)
+    assert moved(output) > 20.0
