@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -154,16 +155,7 @@ def budget(
     rated, peak: (4,) Nm at the joints. pause: called about 500 times, before each chunk of about a millisecond of
     computation. Raises ParameterError if the load does not fit the robot.
     """
-    full = robot.with_wearer(*load)
-
-    def torques(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        chunks = []
-        for chunk in np.array_split(points, len(points) // CHUNK + 1):
-            pause()
-            chunks.append((torque_at(robot, chunk), torque_at(full, chunk)))
-        own, with_all = map(np.concatenate, zip(*chunks, strict=True))
-        return own, with_all
-
+    torques = partial(_torques, robot, robot.with_wearer(*load), pause)
     points = workspace.points()
     starts = np.vstack((points[: SAMPLES // 5] * (1, 1, 1, 1, 0, 0), points))  # those with an upright trunk first
     at_starts = torques(starts)
@@ -195,6 +187,18 @@ def budget(
         )
 
     return tuple(map(of_joint, range(JOINT_COUNT)))
+
+
+def _torques(
+    robot: ArmModel, full: ArmModel, pause: Callable[[], None], points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the torques (n, 4) in Nm of `robot` and of `full`, the robot with the wearer's arm, at points (n, 6)."""
+    chunks = []
+    for chunk in np.array_split(points, len(points) // CHUNK + 1):
+        pause()
+        chunks.append((torque_at(robot, chunk), torque_at(full, chunk)))
+    own, with_all = map(np.concatenate, zip(*chunks, strict=True))
+    return own, with_all
 
 
 def _support(own: np.ndarray, with_all: np.ndarray, limit: float) -> np.ndarray:
