@@ -35,8 +35,12 @@ NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 def bridge_thread(node: Node, arm: DirectArm, period: float, stopping: list[bool]) -> threading.Thread:
     """Return the thread that commands the motors and publishes what they reply."""
     bus, newest = arm.open(), {"effort": NOTHING}
+
+    def on_effort_commands(message: JointState) -> None:
+        newest["effort"] = tuple(message.effort)
+
     publisher = node.create_publisher(JointState, "joint_states", 1)
-    node.create_subscription(JointState, "effort_commands", lambda m: newest.update(effort=tuple(m.effort)), 1)
+    node.create_subscription(JointState, "effort_commands", on_effort_commands, 1)
 
     def cycle() -> None:
         all_replied = UNKNOWN not in bus.samples  # an ENTER sent earlier might be lost

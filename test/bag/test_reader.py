@@ -18,7 +18,7 @@ from exo_gravity.bag.joints import FIELDS, Layout
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.core.errors import DataError
 
-from ..support import made_bags as made
+from ..support import synthetic_bags as made
 
 POSES = [[0.1, 0.4, 0.5, 0.6], [-0.2, 0.8, 0.3, 0.9]]
 FORMS = {

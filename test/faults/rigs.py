@@ -7,6 +7,7 @@ import subprocess
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import yaml
 from builtin_interfaces.msg import Time
@@ -50,7 +51,7 @@ class Rig:
         """Return the nodes of each launcher; the first one has the bridge."""
         return [self._nodes(can_bridge=GENTLE)]
 
-    def _nodes(self, without: tuple[str, ...] = (), port: int | None = None, **changes: Parameters) -> LaunchedNodes:
+    def _nodes(self, without: tuple[str, ...] = (), port: int | None = None, **changes: Any) -> LaunchedNodes:
         return LaunchedNodes(self.folder, without=without, port=port, timing=self.timing, **changes)
 
     @property

@@ -14,7 +14,7 @@ import time
 
 from exo_gravity.bag.writer import BagWriter, offered_qos
 
-from .made_bags import JOINT_STATE, NAMES, START, joint_state
+from .synthetic_bags import JOINT_STATE, NAMES, START, joint_state
 
 TOPIC = "/right/joint_states"
 SLOW = 0.2  # s between messages: so slow that no buffer fills up and is flushed

@@ -66,7 +66,12 @@ class LaunchedNodes:
             parameters.update(timing.get(node, {}))
         for node, values in changes.items():
             content[full_name(node)]["ros__parameters"].update(values)
-        self.bus = {"interface": "udp_multicast", "channel": "239.74.163.2", "port": port, "hop_limit": 0}
+        self.bus: dict[str, Any] = {
+            "interface": "udp_multicast",
+            "channel": "239.74.163.2",
+            "port": port,
+            "hop_limit": 0,
+        }
         self.path = folder / f"params_{port}_{'_'.join(without)}.yaml"
         self.path.write_text(yaml.safe_dump(content))
         self.log: list[str] = []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from exo_gravity.core.recording import Recording, ScriptedStep
 
@@ -23,7 +22,7 @@ def smooth(begin: np.ndarray, end: np.ndarray, seconds: float) -> np.ndarray:
     return begin + (end - begin) * (10 * s**3 - 15 * s**4 + 6 * s**5)
 
 
-def still(pose: np.ndarray, seconds: float, drift: ArrayLike = 0.0) -> np.ndarray:
+def still(pose: np.ndarray, seconds: float, drift: float | np.ndarray = 0.0) -> np.ndarray:
     """Return a pose that drifts by `drift` (rad/s, one number or one per joint), (n, 4)."""
     return pose + np.arange(round(seconds * RATE))[:, None] / RATE * drift
 

@@ -24,7 +24,7 @@ from exo_gravity.core.verdict import HoldCriteria
 from exo_gravity.tools.report import main
 from exo_gravity.tools.reporting.trial_report import analyse, print_report, write
 
-from ..support import made_bags as made
+from ..support import synthetic_bags as made
 
 POSES = [[0.1, 0.4, 0.5, 0.6], [-0.2, 0.8, 0.3, 0.9]]
 PUSH = [0.05, 0.25, -0.15, 0.1]

@@ -19,14 +19,14 @@ from exo_gravity.tools.inputs.arms import configured_arm
 from exo_gravity.tools.inputs.paper import PAPER_ANFIS
 from exo_gravity.tools.train_anfis import main
 
-from ..support import made_bags as made
+from ..support import synthetic_bags as made
 
 RNG = np.random.default_rng(1)
 SPREAD = RNG.uniform((-1.0, 0.0, -0.5, 0.0), (1.0, 1.5, 1.5, 1.5), (45, 4))
 
 
 def params_file(folder):
-    """A parameter file of the arm that `made_bags` records."""
+    """A parameter file of the arm that `synthetic_bags` records."""
     values = {"side": "right", "joint_names": list(made.NAMES), "link_length": made.ARM.length.tolist()}
     values["robot"] = {"mass": made.ARM.mass.tolist(), "cog": made.ARM.cog.tolist()}
     path = folder / "arm.yaml"

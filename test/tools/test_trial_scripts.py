@@ -19,7 +19,7 @@ from exo_gravity.tools.reporting import trial_report
 from exo_gravity.tools.trials.criteria import criteria_for, missing_holds, shortest_hold
 from exo_gravity.tools.trials.scripts import is_guided, read_script
 
-from ..support import made_bags as made
+from ..support import synthetic_bags as made
 
 CONFIG = Path(__file__).parents[2] / "config"
 RATED = (3.0, 9.0, 3.0, 3.0)  # Nm
