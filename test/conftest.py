@@ -36,7 +36,7 @@ def stall_clock() -> Iterator[StallClock]:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
-        if item.get_closest_marker("real_time"):
+        if isinstance(item, pytest.Function) and item.get_closest_marker("real_time"):
             item.fixturenames.append("stall_clock")
             item.add_marker(pytest.mark.flaky(reruns=2, only_rerun="Stalled"))
 

@@ -23,8 +23,6 @@ PORTS = itertools.count(20_000 + os.getpid() % 10_000)  # a bus for each, apart 
 NO_IMU: Parameters = {"use_imu": False}  # for the compensator, which then starts without waiting for a tilt
 FAST: Parameters = {"sign_check_torque": 0.0, "ramp_time": 0.5, "fade_time": 0.5, "damping": 1.5}
 GENTLE: Parameters = {**FAST, "ramp_time": 1.0, "fade_time": 2.0, "damping": 5.0}
-# config/sim.yaml relaxes these for busy computers; the defaults are those of a real arm.
-RELAXED = ("rate", "command_timeout", "reply_timeout", "tilt_timeout")
 # Rate and time-outs of config/sim.yaml, which suit a busy machine, and those of a real device.
 SIMULATED: dict[str, Parameters] = {
     "can_bridge": {"rate": 100.0, "command_timeout": 0.1, "reply_timeout": 0.1},
@@ -60,8 +58,6 @@ class LaunchedNodes:
             node, parameters = name.split("/")[-1], entry["ros__parameters"]
             if "can" in parameters:
                 parameters["can"]["options"]["port"] = port
-            for relaxed in RELAXED:
-                parameters.pop(relaxed, None)
             parameters.update(FAST if node == "can_bridge" else {})
             parameters.update(timing.get(node, {}))
         for node, values in changes.items():

@@ -27,6 +27,7 @@ class StallClock:
 
     def longest_gap(self) -> float:
         """Return the longest time in s between two wake-ups since the last call."""
+        assert self._process.stdin and self._process.stdout
         self._process.stdin.write("\n")
         return float(self._process.stdout.readline())
 
