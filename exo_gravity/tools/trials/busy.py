@@ -12,6 +12,19 @@ from typing import Any
 from exo_gravity.core.faults import FaultCode
 
 LONG_GAP = 50.0  # ms; a simulated device loses time after such a stall
+# Faults that a busy computer can cause; '' stands for a trial that failed without a fault.
+POSSIBLE = (
+    "",
+    FaultCode.MOTOR_SILENT.value,
+    FaultCode.COMMAND_STALE.value,
+    FaultCode.COMMAND_WITHDRAWN.value,
+    FaultCode.SIGN_UNPROVEN.value,
+)
+# A connected simulated motor always replies and the compensator always answers: if they are late, the computer is.
+LATE = {
+    FaultCode.MOTOR_SILENT.value: "the replies of the simulated motors came too late",
+    FaultCode.COMMAND_STALE.value: "the efforts came too late",
+}
 ADVICE = "Close other programs and try again. The arm has no fault."
 
 Status = Mapping[str, Mapping[str, Any]]  # of each node on /diagnostics, as in the recorder's live lines
@@ -26,12 +39,13 @@ def fault_of(status: Status) -> tuple[str, str]:
 
 
 def too_busy(status: Status) -> str:
-    """Return which simulated device or bridge was not run for how long, or ''.
+    """Return what was late and, if it is known, by how much; '' if the simulated device ran in time.
 
     status: of all nodes, at the end of a trial that failed. A simulated fault explains a failure by itself.
     """
     simulators = {name: values for name, values in status.items() if "longest stall (ms)" in values}
-    if any(values["disconnected"] == "yes" for values in simulators.values()):
+    code, _ = fault_of(status)
+    if code not in POSSIBLE or any(values["disconnected"] == "yes" for values in simulators.values()):
         return ""
     for name, values in simulators.items():
         stall, silence = float(values["longest stall (ms)"]), float(values["longest silence (ms)"])
@@ -39,6 +53,4 @@ def too_busy(status: Status) -> str:
             return f"{name} was not run for {stall:.0f} ms"
         if silence >= LONG_GAP:
             return f"{name.removesuffix('simulator')}can_bridge was not run for {silence:.0f} ms"
-    if simulators and fault_of(status)[0] == FaultCode.COMMAND_STALE:
-        return "the efforts came too late"
-    return ""
+    return LATE.get(code, "") if simulators else ""

@@ -28,8 +28,8 @@ RECORDER_TIMEOUT = 10.0  # s without a line from the recorder
 class Outcome:
     """How the nodes ended.
 
-    trouble: why the trial ended before the script, or ''. code: the exit code for it. busy: which simulated device or
-    bridge this computer did not run for how long, or ''.
+    trouble: why the trial ended before the script, or ''. code: the exit code for it. busy: what was late because this
+    computer was too busy, or ''.
     """
 
     trouble: str
