@@ -29,7 +29,7 @@ BLOCK = 4096  # poses computed at once, so that intermediate arrays fit the proc
 
 
 def _exact(xp: ModuleType, arm: ArmModel, theta: Values, direction: Values) -> tuple[Any, ...]:
-    """Closed form of Newton-Euler for gravity; `direction` is gravity's unit vector in the arm's base frame."""
+    """Return the closed form of Newton-Euler; `direction` is gravity's unit vector in the arm's base frame."""
     t1, t2, t3, t4 = theta
     gx, gy, gz = direction
     M1, M2, M3, M4 = arm.first_moment

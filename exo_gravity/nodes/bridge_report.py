@@ -61,7 +61,7 @@ class BridgeReport:
             sorted(limit for limit, time_acted in tuple(safety.acted.items()) if time_acted > now - RECENT)
         )
         rate = self._rate.update(now, loop.cycles)
-        values = {
+        values: dict[str, object] = {
             "state": safety.state.value,
             "fault": safety.fault.code if safety.fault else "none",
             "limits acting": acting or "none",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
@@ -23,7 +24,7 @@ class Diagnostics:
         self._last: tuple[bytes, str] | None = None
         self._sent = -math.inf
 
-    def report(self, level: bytes, message: str, values: dict[str, object] | None = None) -> None:
+    def report(self, level: bytes, message: str, values: Mapping[str, object] | None = None) -> None:
         """Publish `level` (OK, WARN or ERROR), `message` and `values` if they are due; log them if they changed."""
         now, changed = time.monotonic(), (level, message) != self._last
         if not changed and now - self._sent < PERIOD:

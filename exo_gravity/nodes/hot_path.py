@@ -26,13 +26,15 @@ class Unexecuted(CallbackGroup):
     """Keeps its subscriptions out of the executor's wait set."""
 
     def can_execute(self, entity: Any) -> bool:
+        """Return that no entity may be executed."""
         return False
 
     def beginning_execution(self, entity: Any) -> bool:
+        """Return that no entity may be executed."""
         return False
 
     def ending_execution(self, entity: Any) -> None:
-        pass
+        """Do nothing: no entity is executed."""
 
 
 class HotPath:

@@ -84,8 +84,8 @@ def run(make_node: Callable[[], Node], priority: int = 0, args: list[str] | None
     try:
         while not ending:
             executor.spin_once(timeout_sec=0.1)
-            if getattr(node, "failure", None):
-                raise node.failure
+            if failure := getattr(node, "failure", None):
+                raise failure
         return 0
     except Exception as error:
         node.get_logger().fatal(f"stopped by {type(error).__name__}: {error}")
