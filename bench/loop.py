@@ -38,8 +38,10 @@ Watch = Callable[[dict[str, int]], None]
 
 @dataclass(frozen=True)
 class LoopRun:
-    """One run. arms: the timing of each. cpu: share of a core by process. stolen: share of a core that the hypervisor
-    gave to others. start: s from launch to carried.
+    """One run.
+
+    arms: the timing of each. cpu: share of a core by process. stolen: share of a core that the hypervisor gave to
+    others. start: s from launch to carried.
     """
 
     arms: list[LoopTiming]

@@ -15,6 +15,7 @@ class NodeLog:
         self._changed = threading.Condition()
 
     def __call__(self, node: str, line: str) -> None:
+        """Take one line of the log of `node`."""
         with self._changed:
             self._lines.append((time.monotonic(), f"{node}: {line}"))
             self._changed.notify()

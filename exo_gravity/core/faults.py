@@ -15,6 +15,7 @@ class FaultCode(str, Enum):
     meaning: str
 
     def __new__(cls, value: str, meaning: str) -> FaultCode:
+        """Create a code from its text and its meaning."""
         code = str.__new__(cls, value)
         code._value_ = value
         code.meaning = meaning

@@ -318,7 +318,12 @@ def test_faults_changed_parameters_and_parameters_at_the_start_are_read(content,
     stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
 
     def change(name, value):
-        nothing = dict(bool_value=False, integer_value=0, string_value="", byte_array_value=np.zeros(0, np.uint8))
+        nothing = {
+            "bool_value": False,
+            "integer_value": 0,
+            "string_value": "",
+            "byte_array_value": np.zeros(0, np.uint8),
+        }
         nothing.update(bool_array_value=np.zeros(0, bool), integer_array_value=np.zeros(0, np.int64))
         nothing.update(double_array_value=np.zeros(0), string_array_value=[])
         value = types["rcl_interfaces/msg/ParameterValue"](type=3, double_value=value, **nothing)
