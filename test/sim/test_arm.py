@@ -1,4 +1,6 @@
-"""The simulated arm's mechanics, against the exact law, energy, and common sense."""
+"""The mechanics of the simulated arm, against the exact law and the energy balance."""
+
+from __future__ import annotations
 
 import mujoco
 import numpy as np
@@ -9,22 +11,22 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.sim import STEP, ArmConfig, SimulatedArm
 
 UPRIGHT = (0.0, 0.0, 1.0)
-OUT = (0.3, 0.8, 0.7, 0.6)  # a pose where every link is lifted
-FREE = {"coulomb_friction": (0.0,) * 4, "viscous_friction": (0.0,) * 4}
+RAISED = (0.3, 0.8, 0.7, 0.6)  # rad
+FRICTIONLESS = {"coulomb_friction": (0.0,) * 4, "viscous_friction": (0.0,) * 4}
 
 
-def play(arm, torque, duration):
+def simulate(arm, torque, duration):
     for _ in range(round(duration / STEP)):
         arm.step(torque)
 
 
 def moved(arm, start):
-    """Largest angle in degrees by which a joint has left `start`."""
+    """Return the largest angle in degrees by which a joint has left `start`."""
     return np.degrees(np.abs(np.subtract(arm.positions, start)).max())
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_static_torque_is_that_of_the_exact_law_in_any_pose_and_tilt(side):
+def test_the_static_torque_agrees_with_the_exact_law_in_any_pose_and_tilt(side):
     random = np.random.default_rng(1)
     for _ in range(100):
         length = random.uniform(0.02, 0.4, 4)
@@ -37,63 +39,63 @@ def test_static_torque_is_that_of_the_exact_law_in_any_pose_and_tilt(side):
         np.testing.assert_allclose(arm.data.qfrc_bias, gravity_torque(links, theta, direction), atol=1e-12)
 
 
-def test_static_torque_with_a_worn_arm_is_that_of_both_together():
+def test_the_static_torque_of_a_worn_arm_includes_the_wearers_arm():
     mass, cog = (0.0, 0.0, 2.0, 1.7), (0.0, 0.0, 0.16, 0.2)
     arm = SimulatedArm(ArmConfig(wearer_mass=mass, wearer_cog=cog))
-    arm.reset(OUT)
-    expected = gravity_torque(arm.config.links.with_wearer(mass, cog), OUT)
+    arm.reset(RAISED)
+    expected = gravity_torque(arm.config.links.with_wearer(mass, cog), RAISED)
     np.testing.assert_allclose(arm.data.qfrc_bias, expected, atol=1e-12)
 
 
-def test_it_falls_without_torque():
+def test_the_arm_falls_without_torque():
     arm = SimulatedArm()
-    arm.reset(OUT)
-    play(arm, (0.0,) * 4, 1.0)
-    assert moved(arm, OUT) > 30
+    arm.reset(RAISED)
+    simulate(arm, (0.0,) * 4, 1.0)
+    assert moved(arm, RAISED) > 30
 
 
-def test_the_exact_torque_holds_it():
+def test_the_exact_torque_holds_the_arm():
     arm = SimulatedArm()
-    arm.reset(OUT)
-    play(arm, gravity_torque(arm.config.links, OUT), 10.0)
-    assert moved(arm, OUT) < 1e-6
+    arm.reset(RAISED)
+    simulate(arm, gravity_torque(arm.config.links, RAISED), 10.0)
+    assert moved(arm, RAISED) < 1e-6
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_friction_holds_it_against_a_small_imbalance_without_creep(sign):
+def test_friction_holds_the_arm_against_a_small_imbalance_without_creep(sign):
     arm = SimulatedArm()
-    arm.reset(OUT)
-    play(arm, gravity_torque(arm.config.links, OUT) + sign * 0.05, 10.0)
-    assert moved(arm, OUT) < 0.01
+    arm.reset(RAISED)
+    simulate(arm, gravity_torque(arm.config.links, RAISED) + sign * 0.05, 10.0)
+    assert moved(arm, RAISED) < 0.01
 
 
-def test_an_imbalance_beyond_friction_moves_it():
+def test_an_imbalance_beyond_friction_moves_the_arm():
     arm = SimulatedArm()
-    arm.reset(OUT)
-    play(arm, gravity_torque(arm.config.links, OUT) - 0.5, 1.0)
-    assert moved(arm, OUT) > 5
+    arm.reset(RAISED)
+    simulate(arm, gravity_torque(arm.config.links, RAISED) - 0.5, 1.0)
+    assert moved(arm, RAISED) > 5
 
 
-def test_without_friction_the_same_small_imbalance_moves_it():
-    arm = SimulatedArm(ArmConfig(**FREE))
-    arm.reset(OUT)
-    play(arm, gravity_torque(arm.config.links, OUT) + 0.05, 1.0)
-    assert moved(arm, OUT) > 5
+def test_without_friction_the_same_small_imbalance_moves_the_arm():
+    arm = SimulatedArm(ArmConfig(**FRICTIONLESS))
+    arm.reset(RAISED)
+    simulate(arm, gravity_torque(arm.config.links, RAISED) + 0.05, 1.0)
+    assert moved(arm, RAISED) > 5
 
 
-def test_without_friction_it_falls_as_the_energy_balance_says():
-    arm = SimulatedArm(ArmConfig(**FREE))
+def test_a_frictionless_fall_conserves_energy():
+    arm = SimulatedArm(ArmConfig(**FRICTIONLESS))
     arm.model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
     arm.reset((0.0, 0.3, 0.8, 0.6))
     start = arm.data.energy.sum()
-    play(arm, (0.0,) * 4, 0.25)
+    simulate(arm, (0.0,) * 4, 0.25)
     potential, kinetic = arm.data.energy
     assert kinetic > 0.5
     assert potential + kinetic == pytest.approx(start, abs=0.01 * kinetic)
 
 
 @pytest.mark.parametrize("rotor", [0.0, 0.01])
-def test_the_elbow_has_the_inertia_of_a_tube_about_its_joint_and_of_the_rotor(rotor):
+def test_the_elbow_has_the_inertia_of_its_tube_and_of_the_rotor(rotor):
     arm = SimulatedArm(ArmConfig(rotor_inertia=(0.0, 0.0, 0.0, rotor)))
     column = np.zeros(4)
     mujoco.mj_mulM(arm.model, arm.data, column, np.array((0.0, 0.0, 0.0, 1.0)))
@@ -113,38 +115,38 @@ def test_joint_stops_hold_against_the_motors_peak_torque(joint, side):
     arm.reset(theta)
     torque = np.zeros(4)
     torque[joint] = (9.0, 18.0, 9.0, 9.0)[joint] * (-1 if side == "position_min" else 1)
-    play(arm, torque, 1.0)
+    simulate(arm, torque, 1.0)
     assert abs(np.degrees(arm.positions[joint] - stop)) < 1.0
 
 
-def test_each_joint_turns_190_degrees_in_all():
+def test_each_joint_has_a_range_of_190_degrees():
     config = ArmConfig()
     np.testing.assert_allclose(np.degrees(np.subtract(config.position_max, config.position_min)), 190.0)
 
 
-def test_the_wearers_arm_sinks_where_the_bare_arm_is_held():
+def test_a_torque_that_holds_the_bare_arm_does_not_hold_the_wearers():
     arm = SimulatedArm(ArmConfig(wearer_mass=(0, 0, 2.0, 1.7), wearer_cog=(0, 0, 0.16, 0.2)))
-    arm.reset(OUT)
-    play(arm, gravity_torque(arm.config.links, OUT), 1.0)
-    assert moved(arm, OUT) > 20
+    arm.reset(RAISED)
+    simulate(arm, gravity_torque(arm.config.links, RAISED), 1.0)
+    assert moved(arm, RAISED) > 20
 
 
-def test_tilting_the_trunk_turns_gravity_live():
+def test_a_change_of_gravitys_direction_moves_the_arm():
     arm = SimulatedArm()
     arm.reset((0.0,) * 4)
-    play(arm, (0.0,) * 4, 0.5)
+    simulate(arm, (0.0,) * 4, 0.5)
     assert moved(arm, (0.0,) * 4) < 1e-6
     arm.set_gravity(Tilt.of("right", pitch=0.6).direction)
-    play(arm, (0.0,) * 4, 2.0)
+    simulate(arm, (0.0,) * 4, 2.0)
     assert moved(arm, (0.0,) * 4) > 10
 
 
-def test_reset_brings_it_to_rest():
+def test_reset_puts_the_arm_at_rest_in_a_pose():
     arm = SimulatedArm()
-    arm.reset(OUT)
-    play(arm, (0.0,) * 4, 0.3)
-    arm.reset(OUT)
-    assert arm.positions == list(OUT)
+    arm.reset(RAISED)
+    simulate(arm, (0.0,) * 4, 0.3)
+    arm.reset(RAISED)
+    assert arm.positions == list(RAISED)
     assert arm.velocities == [0.0] * 4
 
 
@@ -160,7 +162,7 @@ def test_reset_brings_it_to_rest():
         ({"links": ArmModel((0.05, 0.13, 0.3, 0.3), (0,) * 4, (0.5, 0.5, 0.0, 0.2))}, "links.mass"),
     ],
 )
-def test_an_impossible_configuration_is_refused_by_name(change, name):
+def test_an_impossible_configuration_is_rejected_by_name(change, name):
     with pytest.raises(ParameterError) as caught:
         ArmConfig(**change)
     assert caught.value.name == name

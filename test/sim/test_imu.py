@@ -1,4 +1,6 @@
-"""The simulated IMU: frames, signs, and errors of the size it was given."""
+"""The simulated IMU: axes, signs, noise and bias."""
+
+from __future__ import annotations
 
 import math
 
@@ -15,19 +17,19 @@ EXACT = {"gyroscope_noise": 0.0, "accelerometer_noise": 0.0, "gyroscope_bias": 0
 MOUNTED = (0.5, 0.5, 0.5, 0.5)
 
 
-def test_at_rest_the_accelerometer_reads_g_upward():
+def test_at_rest_the_accelerometer_measures_g_upward():
     gyroscope, accelerometer = SimulatedImu(ImuConfig(**EXACT)).sample(0.0, 0.0)
     np.testing.assert_allclose(accelerometer, (0, 0, G))
     np.testing.assert_allclose(gyroscope, 0)
 
 
-def test_bowing_forward_shows_on_x_and_leaning_right_on_y():
+def test_a_bow_acts_on_the_x_axis_and_a_lean_to_the_right_on_the_y_axis():
     imu = SimulatedImu(ImuConfig(**EXACT))
     np.testing.assert_allclose(imu.sample(0.3, 0.0)[1], (-G * math.sin(0.3), 0, G * math.cos(0.3)))
     np.testing.assert_allclose(imu.sample(0.0, 0.3)[1], (0, G * math.sin(0.3), G * math.cos(0.3)))
 
 
-def test_gravity_is_opposite_to_what_the_accelerometer_reads():
+def test_the_accelerometer_measures_the_opposite_of_gravity():
     for pitch, roll in np.random.default_rng(0).uniform(-1.5, 1.5, (50, 2)):
         _, accelerometer = SimulatedImu(ImuConfig(**EXACT)).sample(pitch, roll)
         assert pitch_roll(-accelerometer) == pytest.approx((pitch, roll))
@@ -39,7 +41,7 @@ def test_readings_are_in_the_imus_own_axes():
     np.testing.assert_allclose(gyroscope, (0.2, 0, 0.1), atol=1e-12)
 
 
-def test_rotating_readings_back_to_the_trunk_undoes_the_mounting():
+def test_rotating_readings_to_the_trunks_axes_undoes_the_mounting():
     mounting = np.array((0.1, -0.4, 0.3, 0.8)) / np.linalg.norm((0.1, -0.4, 0.3, 0.8))
     there = SimulatedImu(ImuConfig(rotation_trunk_from_imu=mounting, **EXACT)).sample(0.3, -0.2, 0.5, 0.7)
     here = SimulatedImu(ImuConfig(**EXACT)).sample(0.3, -0.2, 0.5, 0.7)
@@ -47,7 +49,7 @@ def test_rotating_readings_back_to_the_trunk_undoes_the_mounting():
         np.testing.assert_allclose(rotation_matrix(mounting) @ a, b)
 
 
-def test_the_gyroscope_is_the_rate_at_which_the_accelerometers_vector_turns():
+def test_the_gyroscope_agrees_with_the_change_of_the_accelerometers_vector():
     # A fixed vector seen from a turning frame changes by -omega x vector.
     imu, step = SimulatedImu(ImuConfig(**EXACT)), 1e-6
     pitch, roll, pitch_rate, roll_rate = 0.4, -0.7, 0.9, -1.3
@@ -56,7 +58,7 @@ def test_the_gyroscope_is_the_rate_at_which_the_accelerometers_vector_turns():
     np.testing.assert_allclose((after - before) / step, -np.cross(gyroscope, before), atol=1e-4)
 
 
-def test_noise_has_the_density_it_was_given():
+def test_noise_has_the_configured_density():
     rate = 200.0
     imu = SimulatedImu(ImuConfig(rate=rate))
     samples = np.array([imu.sample(0.0, 0.0) for _ in range(4000)])
@@ -65,7 +67,7 @@ def test_noise_has_the_density_it_was_given():
     np.testing.assert_allclose(spread[1], 180e-6 * G, rtol=0.05)
 
 
-def test_biases_stay_and_have_the_size_they_were_given():
+def test_biases_are_constant_and_have_the_configured_size():
     quiet = {"gyroscope_noise": 0.0, "accelerometer_noise": 0.0}
     biases = []
     for seed in range(400):
@@ -90,7 +92,7 @@ def test_the_same_seed_gives_the_same_samples():
         ({"gyroscope_bias": -1.0}, "gyroscope_bias"),
     ],
 )
-def test_an_impossible_configuration_is_refused_by_name(change, name):
+def test_an_impossible_configuration_is_rejected_by_name(change, name):
     with pytest.raises(ParameterError) as caught:
         ImuConfig(**change)
     assert caught.value.name == name

@@ -1,4 +1,6 @@
-"""The simulated motor's protocol, case by case."""
+"""The protocol of the simulated motor."""
+
+from __future__ import annotations
 
 import pytest
 
@@ -21,14 +23,14 @@ def entered(firmware=None, **joint):
     return motor
 
 
-def told(motor, data, position=0.0, velocity=0.0, now=0.0):
-    """The decoded reply to `data`."""
+def reply_to(motor, data, position=0.0, velocity=0.0, now=0.0):
+    """Return the decoded reply to `data`."""
     return unpack_reply(motor.joint.spec, motor.receive(data, position, velocity, now))
 
 
 def test_no_torque_before_enter():
     motor = SimulatedMotor(JointMotor(SPEC, 5))
-    assert told(motor, command(torque=2.0)).torque == pytest.approx(0.0, abs=TORQUE_CODE)
+    assert reply_to(motor, command(torque=2.0)).torque == pytest.approx(0.0, abs=TORQUE_CODE)
     assert motor.torque(0.0, 0.0) == 0.0
 
 
@@ -40,7 +42,7 @@ def test_torque_flows_between_enter_and_exit():
     assert motor.torque(0.0, 0.0) == 0.0
 
 
-def test_enter_carries_out_the_last_command_again():
+def test_enter_executes_the_last_command_again():
     motor = entered()
     motor.receive(command(torque=2.0), 0.0, 0.0, 0.0)
     motor.receive(EXIT, 0.0, 0.0, 0.0)
@@ -48,33 +50,33 @@ def test_enter_carries_out_the_last_command_again():
     assert motor.torque(0.0, 0.0) == pytest.approx(2.0, abs=TORQUE_CODE / 2)
 
 
-def test_a_command_given_before_enter_is_kept_for_it():
+def test_a_command_before_enter_is_executed_by_it():
     motor = SimulatedMotor(JointMotor(SPEC, 5))
     motor.receive(command(torque=2.0), 0.0, 0.0, 0.0)
     motor.receive(ENTER, 0.0, 0.0, 0.0)
     assert motor.torque(0.0, 0.0) == pytest.approx(2.0, abs=TORQUE_CODE / 2)
 
 
-def test_a_zero_command_before_exit_leaves_nothing_to_remember():
+def test_after_a_zero_command_and_exit_enter_gives_no_torque():
     motor = entered()
     for data in (command(torque=2.0), command(), EXIT, ENTER):
         motor.receive(data, 0.0, 0.0, 0.0)
     assert abs(motor.torque(0.0, 0.0)) <= TORQUE_CODE / 2
 
 
-def test_the_last_command_stays_in_force_for_ever():
+def test_the_last_command_stays_in_force():
     motor = entered()
     motor.receive(command(torque=2.0), 0.0, 0.0, now=0.0)
-    assert told(motor, ENTER, now=3600.0).torque == pytest.approx(2.0, abs=TORQUE_CODE)
+    assert reply_to(motor, ENTER, now=3600.0).torque == pytest.approx(2.0, abs=TORQUE_CODE)
 
 
-def test_torque_comes_in_12_bit_codes_of_which_none_is_zero():
+def test_no_12_bit_code_is_exactly_zero_torque():
     motor = entered()
     motor.receive(command(torque=0.0), 0.0, 0.0, 0.0)
     assert abs(motor.torque(0.0, 0.0)) == pytest.approx(TORQUE_CODE / 2)
 
 
-def test_the_impedance_law_acts_on_the_joint_now():
+def test_stiffness_and_damping_act_on_the_present_joint_state():
     motor = entered()
     motor.receive(command(position=0.5, velocity=1.0, kp=4.0, kd=0.5), 0.0, 0.0, 0.0)
     for position, velocity in ((0.0, 0.0), (0.7, -2.0)):
@@ -82,31 +84,31 @@ def test_the_impedance_law_acts_on_the_joint_now():
         assert motor.torque(position, velocity) == pytest.approx(expected, rel=0.02, abs=0.02)
 
 
-def test_a_reversed_motor_damps_and_springs_the_joint_all_the_same():
+def test_a_reversed_motor_has_stiffness_and_damping_of_the_right_sign():
     motor = entered(direction=-1, zero=0.4)
     motor.receive(command(position=0.4, kp=4.0, kd=0.5), 0.0, 0.0, 0.0)
     assert motor.torque(0.3, 0.0) == pytest.approx(-1.2, abs=0.02)
     assert motor.torque(0.0, 2.0) == pytest.approx(-1.0, abs=0.02)
 
 
-def test_direction_and_zero_show_in_the_reply():
-    reply = told(entered(direction=-1, zero=0.4), command(torque=1.0), position=0.3, velocity=2.0)
+def test_a_reply_is_in_motor_coordinates():
+    reply = reply_to(entered(direction=-1, zero=0.4), command(torque=1.0), position=0.3, velocity=2.0)
     assert reply.position == pytest.approx(0.1, abs=2e-4)
     assert reply.velocity == pytest.approx(-2.0, abs=0.012)
     assert reply.torque == pytest.approx(1.0, abs=TORQUE_CODE)
 
 
-def test_a_weak_motor_gives_less_than_it_reports():
+def test_a_motor_with_a_torque_scale_below_1_gives_less_than_it_reports():
     motor = entered(torque_scale=0.75)
-    reply = told(motor, command(torque=2.0))
+    reply = reply_to(motor, command(torque=2.0))
     assert motor.torque(0.0, 0.0) == pytest.approx(1.5, abs=TORQUE_CODE)
     assert reply.torque == pytest.approx(2.0, abs=TORQUE_CODE)
 
 
-@pytest.mark.parametrize("asked", [15.0, -15.0])
-def test_torque_ends_at_the_peak_whatever_the_wire_can_ask(asked):
+@pytest.mark.parametrize("commanded", [15.0, -15.0])
+def test_torque_is_limited_to_the_motors_peak(commanded):
     motor = entered()
-    reply = told(motor, command(torque=asked))
+    reply = reply_to(motor, command(torque=commanded))
     assert abs(motor.torque(0.0, 0.0)) == SPEC.peak_torque
     assert abs(reply.torque) == pytest.approx(SPEC.peak_torque, abs=TORQUE_CODE)
 
@@ -120,11 +122,11 @@ def test_a_wrong_firmware_range_scales_the_torque():
 def test_set_zero_makes_the_present_angle_zero():
     motor = entered(direction=-1, zero=0.4)
     motor.receive(SET_ZERO, 0.3, 0.0, 0.0)
-    assert told(motor, command(), position=0.3, now=2.0).position == pytest.approx(0.0, abs=2e-4)
-    assert told(motor, command(), position=0.5, now=2.0).position == pytest.approx(-0.2, abs=2e-4)
+    assert reply_to(motor, command(), position=0.3, now=2.0).position == pytest.approx(0.0, abs=2e-4)
+    assert reply_to(motor, command(), position=0.5, now=2.0).position == pytest.approx(-0.2, abs=2e-4)
 
 
-def test_set_zero_is_not_answered_and_leaves_the_motor_deaf_for_a_while():
+def test_a_motor_does_not_reply_to_set_zero_nor_for_a_while_after_it():
     motor = entered(Firmware(zero_silence=0.8))
     assert motor.receive(SET_ZERO, 0.0, 0.0, 10.0) is None
     assert motor.receive(command(torque=2.0), 0.0, 0.0, 10.79) is None
@@ -134,7 +136,7 @@ def test_set_zero_is_not_answered_and_leaves_the_motor_deaf_for_a_while():
 
 @pytest.mark.parametrize("data", [ENTER, EXIT, command()])
 def test_enter_exit_and_commands_are_answered(data):
-    assert told(SimulatedMotor(JointMotor(SPEC, 5)), data).motor_id == 5
+    assert reply_to(SimulatedMotor(JointMotor(SPEC, 5)), data).motor_id == 5
 
 
 @pytest.mark.parametrize("data", [b"", b"\x05", ENTER[:7], ENTER + b"\x00", b"\xff" * 64])
@@ -145,42 +147,42 @@ def test_frames_of_a_wrong_length_are_ignored(data):
     assert motor.torque(0.0, 0.0) == pytest.approx(2.0, abs=TORQUE_CODE / 2)
 
 
-def test_any_eight_bytes_are_a_command():
+def test_any_8_bytes_are_a_command():
     motor = entered()
     assert motor.receive(b"\xff" * 8, 0.0, 0.0, 0.0) is not None
     assert motor.torque(0.0, 0.0) == SPEC.peak_torque
 
 
 @pytest.mark.parametrize(("length", "temperature", "error"), [(8, 47, 6), (6, None, None)])
-def test_temperature_and_error_come_with_eight_bytes(length, temperature, error):
+def test_only_8_byte_replies_have_temperature_and_error(length, temperature, error):
     motor = entered(Firmware(reply_length=length))
     motor.temperature, motor.error = 46.6, 6
     assert len(motor.receive(command(), 0.0, 0.0, 0.0)) == length
-    reply = told(motor, command())
+    reply = reply_to(motor, command())
     assert (reply.temperature, reply.error) == (temperature, error)
 
 
-def test_a_temperature_beyond_the_byte_is_reported_as_its_end():
+def test_a_temperature_beyond_the_range_of_its_byte_is_clamped():
     motor = entered()
     motor.temperature = 300.0
-    assert told(motor, command()).temperature == 215
+    assert reply_to(motor, command()).temperature == 215
 
 
 @pytest.mark.parametrize(("to_master", "reply_id"), [(False, 5), (True, 0)])
 def test_replies_carry_the_motors_id_or_the_masters(to_master, reply_id):
     motor = entered(Firmware(reply_to_master=to_master))
     assert motor.reply_id == reply_id
-    assert told(motor, command()).motor_id == 5
+    assert reply_to(motor, command()).motor_id == 5
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_readings_beyond_the_wire_end_at_its_range(sign):
-    reply = told(entered(), command(), position=sign * 20.0, velocity=sign * 90.0)
+def test_readings_beyond_the_range_of_a_reply_are_clamped(sign):
+    reply = reply_to(entered(), command(), position=sign * 20.0, velocity=sign * 90.0)
     assert reply.position == sign * SPEC.position_range
     assert reply.velocity == pytest.approx(sign * SPEC.velocity_range)
 
 
-def test_an_unplugged_motor_is_silent_and_limp():
+def test_an_unplugged_motor_neither_replies_nor_gives_torque():
     motor = entered()
     motor.receive(command(torque=2.0), 0.0, 0.0, 0.0)
     motor.unplugged = True
@@ -188,21 +190,21 @@ def test_an_unplugged_motor_is_silent_and_limp():
     assert motor.receive(command(torque=2.0), 0.0, 0.0, 0.0) is None
 
 
-def test_a_motor_plugged_in_again_has_forgotten_all_but_its_zero():
+def test_a_motor_that_is_plugged_in_again_keeps_only_its_zero():
     motor = entered(zero=0.4)
     motor.receive(command(torque=2.0), 0.0, 0.0, 0.0)
     motor.unplugged = True
     motor.torque(0.0, 0.0)
     motor.unplugged = False
     assert motor.torque(0.0, 0.0) == 0.0
-    assert told(motor, ENTER, position=0.1).position == pytest.approx(0.5, abs=2e-4)
+    assert reply_to(motor, ENTER, position=0.1).position == pytest.approx(0.5, abs=2e-4)
     assert motor.torque(0.0, 0.0) == 0.0
 
 
 @pytest.mark.parametrize(
     ("change", "name"), [({"reply_length": 7}, "reply_length"), ({"zero_silence": -1}, "zero_silence")]
 )
-def test_an_impossible_firmware_is_refused_by_name(change, name):
+def test_an_impossible_firmware_is_rejected_by_name(change, name):
     with pytest.raises(ParameterError) as caught:
         Firmware(**change)
     assert caught.value.name == name

@@ -1,4 +1,6 @@
-"""A trial without bus and clock: the arm is carried as over a real bus, and comes down whatever happens."""
+"""A trial without a bus and in simulated time: the arm is carried as on a real bus, and always let down at the end."""
+
+from __future__ import annotations
 
 from dataclasses import replace
 
@@ -29,8 +31,8 @@ MOTORS_AS_MOUNTED = (
 LIMITS = Limits(NAMES, (-1.65, -0.17, -0.78, -0.17), (1.65, 3.14, 2.53, 3.14), (5.0,) * 4, (3.0, 9.0, 3.0, 3.0))
 
 
-class Tap:
-    """Notes every frame that a device is given."""
+class FrameRecorder:
+    """Records every frame that a device receives."""
 
     def __init__(self, device):
         self.frames, self._exchange = [], device.exchange
@@ -43,13 +45,13 @@ class Tap:
 
 @pytest.fixture
 def make():
-    """Make a trial of a simulated arm whose controller believes in `links`."""
+    """A function that makes a trial of a simulated arm whose controller assumes `links`."""
 
     def make(links=DEFAULT_LINKS, tilt=(0.1, -0.06), ids=(1, 2, 3, 4)):
         device = SimulatedDevice(SimulatedArm(ArmConfig()), [SimulatedMotor(motor) for motor in MOTORS_AS_MOUNTED])
         device.pitch, device.roll = 0.1, -0.06
-        believed = [replace(motor, can_id=can_id) for motor, can_id in zip(MOTORS_AS_MOUNTED, ids, strict=True)]
-        arm = ArmSetup("right", device, believed, LIMITS, Settings("right", links), 250.0, tilt)
+        assumed = [replace(motor, can_id=can_id) for motor, can_id in zip(MOTORS_AS_MOUNTED, ids, strict=True)]
+        arm = ArmSetup("right", device, assumed, LIMITS, Settings("right", links), 250.0, tilt)
         return OfflineTrial(arm, SCRIPT, 6.0)
 
     return make
@@ -60,7 +62,7 @@ def held(recording):
     return recording.position[(recording.time >= hold.start) & (recording.time <= hold.end)]
 
 
-def test_the_arm_stays_where_the_wearer_let_it_go(make):
+def test_the_arm_stays_where_the_wearer_released_it(make):
     trial = make()
     position = held(trial.run())
     assert trial.trouble == "" and trial.events == []
@@ -68,41 +70,41 @@ def test_the_arm_stays_where_the_wearer_let_it_go(make):
     assert np.ptp(position, axis=0).max() < 0.001
 
 
-def test_an_arm_that_is_believed_half_as_heavy_falls(make):
+def test_an_arm_modelled_at_half_its_mass_falls(make):
     links = ArmModel(DEFAULT_LINKS.length, DEFAULT_LINKS.cog, DEFAULT_LINKS.mass / 2)
     assert np.ptp(held(make(links=links).run()), axis=0).max() > 0.2
 
 
-def test_afterwards_the_arm_is_let_down_gently_and_the_motors_are_off(make):
+def test_at_the_end_the_arm_is_let_down_gently_and_the_motors_are_off(make):
     trial = make()
     recording = trial.run()
     end = recording.steps[-1].end
     assert np.abs(recording.velocity[recording.time > end]).max() < 1.0
-    assert abs(recording.position[-1, 2]) < 0.2  # what friction holds
+    assert abs(recording.position[-1, 2]) < 0.2  # friction holds it there
     assert not any(motor.entered for motor in trial.arm.device.motors)
 
 
-def test_motors_get_frames_in_the_order_of_the_bus(make):
+def test_the_motors_receive_frames_in_the_order_of_a_real_bus(make):
     trial = make()
-    tap = Tap(trial.arm.device)
+    recorder = FrameRecorder(trial.arm.device)
     trial.run()
     for motor in MOTORS_AS_MOUNTED:
-        frames = [data for can_id, data in tap.frames if can_id == motor.can_id]
+        frames = [data for can_id, data in recorder.frames if can_id == motor.can_id]
         enter = frames.index(ENTER)
-        nothing = motor.command(0.0, 0.0)
-        assert frames[enter - 1] == frames[0] == nothing
-        assert frames[-2:] == [nothing, EXIT] and frames.count(ENTER) == frames.count(EXIT) == 1
+        zero = motor.command(0.0, 0.0)
+        assert frames[enter - 1] == frames[0] == zero
+        assert frames[-2:] == [zero, EXIT] and frames.count(ENTER) == frames.count(EXIT) == 1
         assert all(unpack_command(motor.spec, data).kp == 0 for data in frames if data not in (ENTER, EXIT))
 
 
-def test_the_recorded_command_is_the_torque_that_the_motors_then_report(make):
+def test_the_recorded_command_is_the_torque_that_the_motors_report(make):
     recording = make().run()
     hold = recording.steps[-1]
     during = (recording.time > hold.start) & (recording.time < hold.end)
     np.testing.assert_allclose(recording.command[during], recording.effort[during], atol=0.01)
 
 
-def test_a_motor_that_fails_lets_the_arm_down_and_is_named(make):
+def test_after_a_motor_failure_the_arm_is_let_down_and_the_joint_named(make):
     trial = make()
 
     def unplug(now):
@@ -114,7 +116,7 @@ def test_a_motor_that_fails_lets_the_arm_down_and_is_named(make):
     assert recording.time[-1] < 5.1  # an unknown angle is never recorded
 
 
-def test_a_stop_lets_the_arm_down_and_keeps_what_was_recorded(make):
+def test_a_stop_lets_the_arm_down_and_keeps_the_recording(make):
     trial = make()
     recording = trial.run(lambda now: now >= 4.0)
     assert trial.trouble == "right: stopped by the operator"
@@ -122,34 +124,34 @@ def test_a_stop_lets_the_arm_down_and_keeps_what_was_recorded(make):
     assert not any(motor.entered for motor in trial.arm.device.motors)
 
 
-def test_the_recording_tells_when_the_motors_carried_the_arm(make):
+def test_the_recording_has_the_time_in_which_the_arm_was_carried(make):
     recording = make().run(lambda now: now >= 10.0)
     ((start, end),) = recording.carried
-    assert 2.0 < start < 6.0  # the start gate wants a calm second, and then tries four signs
-    assert end == pytest.approx(10.0, abs=0.01) and recording.time[-1] > end + 2.0  # of fading
+    assert 2.0 < start < 6.0  # the checks take a second without trouble, then the sign check of four joints
+    assert end == pytest.approx(10.0, abs=0.01) and recording.time[-1] > end + 2.0  # of letting down
 
 
-def test_an_arm_that_was_never_carried_has_a_recording_that_says_so(make):
+def test_the_recording_of_an_arm_that_was_never_carried_has_no_such_time(make):
     assert make(tilt=None).run().carried == ()
 
 
-def test_without_a_tilt_the_arm_is_never_carried_and_the_reason_told(make):
+def test_without_a_tilt_the_arm_is_not_carried_and_the_reason_is_given(make):
     trial = make(tilt=None)
     trial.run()
     assert "waiting for effort commands" in trial.trouble and "no trunk tilt yet" in trial.trouble
 
 
-def test_motors_that_never_answer_are_an_error(make):
+def test_motors_that_never_reply_are_an_error(make):
     with pytest.raises(DataError, match="no reply"):
         make(ids=(11, 12, 13, 14)).run()
 
 
-def test_the_same_trial_twice_is_the_same_recording(make):
+def test_the_same_trial_gives_the_same_recording(make):
     one, other = make().run(), make().run()
     np.testing.assert_array_equal(one.position, other.position)
 
 
-def test_a_second_of_imu_samples_tells_the_tilt_of_the_trunk():
+def test_the_tilt_of_the_trunk_follows_from_a_second_of_imu_samples():
     mounted = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
     tilt = measured_tilt(0.1, -0.06, SimulatedImu(ImuConfig(mounted)), mounted)
     np.testing.assert_allclose(tilt, (0.1, -0.06), atol=0.01)

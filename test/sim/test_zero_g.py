@@ -1,7 +1,9 @@
-"""A wearer's passive arm on the simulated device: One-G lets it sink, Zero-G holds it, and the way there is smooth.
+"""A wearer's passive arm on the simulated device: One-G lets it sink, Zero-G holds it, with a smooth transition.
 
-The controller believes in a robot and a wearer that are a few per cent off the true ones.
+The controller's masses of robot and wearer are a few per cent off the true ones.
 """
+
+from __future__ import annotations
 
 from dataclasses import replace
 
@@ -25,7 +27,7 @@ LIMITS = Limits(NAMES, (-1.65, -0.17, -0.78, -0.17), (1.65, 3.14, 2.53, 3.14), (
 MOTORS_OF_ARM = [JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1)]
 ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
 MASS, COG = Wearer(75.0).on_links(ROBOT.length)
-BELIEVED = Settings("right", ROBOT, mode="zero_g", wearer_mass=MASS, wearer_cog=COG)
+CONTROLLER = Settings("right", ROBOT, mode="zero_g", wearer_mass=MASS, wearer_cog=COG)
 
 # Within the motors' limits with all of a 75 kg wearer's arm.
 UPRIGHT, BENT = (0.0, 0.0), (0.06, -0.04)
@@ -38,17 +40,17 @@ HELD = [
 
 
 def carried(settings, pose, tilt=UPRIGHT, seconds=30.0, after=()):
-    """Return the trial in which a wearer's hand leads the passive arm to `pose` and lets go of it."""
+    """Return a trial in which a hand moves the passive arm to `pose` and releases it."""
     arm = SimulatedArm(ArmConfig(wearer_mass=1.03 * MASS, wearer_cog=COG))
     device = SimulatedDevice(arm, [SimulatedMotor(motor) for motor in MOTORS_OF_ARM])
     device.pitch, device.roll = tilt
     steps = [{"move": pose, "over": 3.0}, *after, {"hold": seconds}]
-    script = TrialScript.parse({"name": "let go", "steps": steps})
+    script = TrialScript.parse({"name": "release", "steps": steps})
     return OfflineTrial(ArmSetup("right", device, MOTORS_OF_ARM, LIMITS, settings, 250.0, tilt), script, 8.0)
 
 
 def moved(trial):
-    """Return by how many degrees each joint strays in the last step of a trial."""
+    """Return the movement of each joint in degrees in the last step of a trial."""
     recording = trial.run()
     hold = recording.steps[-1]
     position = recording.position[(recording.time >= hold.start) & (recording.time <= hold.end)]
@@ -59,29 +61,29 @@ def moved(trial):
 def test_zero_g_holds_the_wearers_arm_for_30_s_within_half_a_degree(tilt, pose):
     needed = gravity_torque(ROBOT.with_wearer(MASS, COG), pose, Tilt.of("right", *tilt).direction)
     assert np.all(np.abs(needed) < RATED)
-    trial = carried(BELIEVED, pose, tilt)
+    trial = carried(CONTROLLER, pose, tilt)
     assert moved(trial).max() < 0.5
     assert trial.trouble == ""
 
 
 @pytest.mark.parametrize(("tilt", "pose"), HELD[:3])
 def test_one_g_lets_the_same_arm_sink(tilt, pose):
-    assert moved(carried(replace(BELIEVED, mode="one_g"), pose, tilt))[1] > 10.0
+    assert moved(carried(replace(CONTROLLER, mode="one_g"), pose, tilt))[1] > 10.0
 
 
-def test_support_swept_while_a_hand_holds_the_arm_moves_the_torque_smoothly_until_it_holds_alone():
+def test_a_sweep_of_the_support_changes_the_torque_smoothly_until_it_holds_the_arm_alone():
     pose = [0.3, 0.45, 0.10, 0.4]
-    trial = carried(replace(BELIEVED, support=0.0), pose, seconds=5.0, after=[{"move": pose, "over": 24.0}])
+    trial = carried(replace(CONTROLLER, support=0.0), pose, seconds=5.0, after=[{"move": pose, "over": 24.0}])
     support = iter(np.linspace(0.05, 1.0, 20))
 
     def every_second(now):
         if now > 5.0:
-            trial.apply(replace(BELIEVED, support=next(support, 1.0)))
+            trial.apply(replace(CONTROLLER, support=next(support, 1.0)))
         return False
 
     recording = trial.run(every_second)
     sweep = (recording.time > 4.0) & (recording.time < recording.steps[-1].end)
-    with_all = gravity_torque(BELIEVED.arm, pose)
+    with_all = gravity_torque(CONTROLLER.arm, pose)
     largest_step = np.abs(np.diff(recording.command[sweep], axis=0)).max()
     assert largest_step < 0.02  # Nm; half of it is the 12-bit code of an angle
     np.testing.assert_allclose(recording.command[sweep][-1], with_all, atol=0.1)
