@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.faults import FaultCode
 from exo_gravity.core.limits import JointSample
-from exo_gravity.core.safety import CARRYING, NOTHING, Drive, SafetyMachine, State
+from exo_gravity.core.drive import CARRYING, NOTHING, Drive, State
+from exo_gravity.core.safety import SafetyMachine
 from exo_gravity.hardware.motor_bus import MotorBus
 
 EFFORT_WAIT = 0.5  # share of a cycle's idle time for which the loop may wait for late efforts

@@ -22,7 +22,7 @@ from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import UNKNOWN, JointSample
 from exo_gravity.core.motors import ENTER, EXIT, SET_ZERO
-from exo_gravity.core.safety import OFF, Drive
+from exo_gravity.core.drive import OFF, Drive
 
 MASTER_ID = 0  # the arbitration ID of some firmwares' replies
 MAX_STALE_FRAMES = 256  # frames read before each cycle: the capacity of udp_multicast, more than any cycle produces

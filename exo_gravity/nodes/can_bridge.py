@@ -22,7 +22,8 @@ from exo_gravity.core.control_params import CAN_BRIDGE, OPTIONS, limits_of, moto
 from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.faults import FaultCode
 from exo_gravity.core.limits import JointSample
-from exo_gravity.core.safety import SafetyMachine, State
+from exo_gravity.core.drive import State
+from exo_gravity.core.safety import SafetyMachine
 from exo_gravity.core.wire import check_rate
 from exo_gravity.hardware.control_loop import NO_COMMAND, ControlLoop, EffortCommand
 from exo_gravity.hardware.motor_bus import MotorBus, open_bus

@@ -24,7 +24,8 @@ from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.motors import ENTER, EXIT
 from exo_gravity.core.recording import Recording, ScriptedStep
-from exo_gravity.core.safety import Drive, SafetyMachine, State
+from exo_gravity.core.drive import Drive, State
+from exo_gravity.core.safety import SafetyMachine
 from exo_gravity.core.tilt import pitch_roll, rotation_matrix
 from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.sim.device import SimulatedDevice

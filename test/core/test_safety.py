@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
-from exo_gravity.core.safety import CARRYING, OFF, SafetyMachine, State
+from exo_gravity.core.drive import CARRYING, OFF, State
+from exo_gravity.core.safety import SafetyMachine
 
 PERIOD = 0.004
 LIMITS = Limits(
