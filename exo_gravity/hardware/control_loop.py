@@ -168,6 +168,8 @@ class ControlLoop:
         end = time.monotonic() + LAST_RESORT
         while time.monotonic() < end:
             try:
-                self._bus.exchange(Drive(NOTHING, self.safety.limits.damping, True), time.monotonic() + self._period)
+                self._bus.exchange(
+                    Drive(NOTHING, (self.safety.limits.damping,) * 4, True), time.monotonic() + self._period
+                )
             except BusError:
                 time.sleep(self._period)

@@ -117,8 +117,12 @@ class MotorBus:
         self._bus.shutdown()
 
     def _send_commands(self, drive: Drive) -> None:
-        for motor, effort in zip(self._motors, drive.effort, strict=True):
-            self._send(motor.can_id, motor.command(effort, drive.damping))
+        for motor, effort, damping, enter in zip(self._motors, *drive[:2], drive.enter, strict=True):
+            command = motor.command(effort, damping)
+            if enter:
+                self._send(motor.can_id, command)
+                self._send(motor.can_id, ENTER)
+            self._send(motor.can_id, command)
 
     def _send_all(self, data: bytes) -> None:
         for motor in self._motors:

@@ -36,7 +36,7 @@ from exo_gravity.hardware.motor_bus import MotorBus, open_bus
 FROZEN = 0.08  # s without a note, while the watchdog itself runs
 POLL = 0.01  # s
 OPEN_TIMEOUT = 1.0  # s for which opening the bus is retried
-NOTE = struct.Struct("=7d")  # monotonic time, powered, damping, effort (4,)
+NOTE = struct.Struct("=10d")  # monotonic time, powered, effort (4,), damping (4,)
 
 
 class Charge(NamedTuple):
@@ -77,7 +77,7 @@ class Watchdog:
 
     def note(self, drive: Drive) -> None:
         """Note the drive that the motors are about to receive."""
-        NOTE.pack_into(self._memory, 0, time.monotonic(), drive.powered, drive.damping, *drive.effort)
+        NOTE.pack_into(self._memory, 0, time.monotonic(), drive.powered, *drive.effort, *drive.damping)
 
 
 def _watch(watched: int, memory: mmap.mmap, receiver: Connection, log: Callable[[str], None]) -> None:
@@ -102,10 +102,10 @@ def _watch(watched: int, memory: mmap.mmap, receiver: Connection, log: Callable[
                 why = f"was frozen for {FROZEN * 1000:.0f} ms and has been killed"
                 os.kill(watched, signal.SIGKILL)  # it sends nothing from here on, even if it takes long to die
                 break
-    _, powered, _, *effort = NOTE.unpack_from(memory)
+    _, powered, *applied = NOTE.unpack_from(memory)
     if charge and powered:
         log(f"can_bridge {why}: letting the arm down")
-        let_down(charge, effort, log)
+        let_down(charge, applied[:4], applied[4:], log)
 
 
 def _load(interface: str) -> None:
@@ -114,8 +114,8 @@ def _load(interface: str) -> None:
         importlib.import_module(can.interfaces.BACKENDS[interface][0])
 
 
-def let_down(charge: Charge, effort: Sequence[float], log: Callable[[str], None]) -> None:
-    """Let down an arm whose motors are on with `effort` (4,) Nm after its bridge has died."""
+def let_down(charge: Charge, effort: Sequence[float], damping: Sequence[float], log: Callable[[str], None]) -> None:
+    """Let down an arm whose motors apply `effort` (4,) Nm and `damping` (4,) Nm s/rad after its bridge has died."""
     end = time.monotonic() + OPEN_TIMEOUT
     while True:
         try:
@@ -125,8 +125,8 @@ def let_down(charge: Charge, effort: Sequence[float], log: Callable[[str], None]
             if time.monotonic() > end:
                 return log(str(error))
             time.sleep(POLL)
-    machine = SafetyMachine(charge.limits, charge.period)
-    machine.take_over(effort, time.monotonic())
+    machine = SafetyMachine(charge.limits, charge.period, [motor.peak_effort for motor in charge.motors])
+    machine.take_over(effort, damping, time.monotonic())
     loop = ControlLoop(MotorBus(bus, charge.motors, powered=True), machine, charge.period, lambda now, joints: None)
     loop.start()
     loop.stop()

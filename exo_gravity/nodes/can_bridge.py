@@ -95,7 +95,7 @@ class CanBridge(LifecycleNode):
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start the control loop, and enable the arm once it passes the start gate."""
-        safety = SafetyMachine(self._limits, self._period)
+        safety = SafetyMachine(self._limits, self._period, [motor.peak_effort for motor in self._motors])
         self._loop = ControlLoop(self._bus, safety, self._period, self._publish, get_efforts=self._get_efforts)
         self._bus = None  # now owned by the loop
         self._loop.call(lambda: self._loop.safety.enable(time.monotonic()))

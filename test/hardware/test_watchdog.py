@@ -33,7 +33,7 @@ from exo_gravity.hardware.watchdog import Watchdog
 watchdog = Watchdog()
 while True:
     print("carrying", flush=True)
-    watchdog.note(Drive((0.0,) * 4, 0.0, {powered}))
+    watchdog.note(Drive((0.0,) * 4, (0.0,) * 4, {powered}))
     time.sleep(0.01)
 """
 
@@ -59,7 +59,7 @@ def wire():
 def test_it_goes_on_from_the_last_torques_and_ends_with_the_motors_off(wire):
     channel, device, listener = wire
     told = []
-    let_down(Charge(("virtual", channel, {}), MOTORS_OF_ARM, QUICKLY, PERIOD), EFFORT, told.append)
+    let_down(Charge(("virtual", channel, {}), MOTORS_OF_ARM, QUICKLY, PERIOD), EFFORT, (0.0,) * 4, told.append)
     assert told == ["the arm is down, its motors are off"]
     frames = [(m.arbitration_id, bytes(m.data)) for m in iter(lambda: listener.recv(0.0), None)]
     torques = [unpack_command(MOTORS["AK80-9"], data).torque for to, data in frames if to == 2 and data[0] == 0x80]
@@ -73,7 +73,7 @@ def test_it_goes_on_from_the_last_torques_and_ends_with_the_motors_off(wire):
 
 def test_a_bus_that_can_not_be_opened_is_told():
     told = []
-    let_down(Charge(("no_such_interface", "x", {}), MOTORS_OF_ARM, QUICKLY, PERIOD), EFFORT, told.append)
+    let_down(Charge(("no_such_interface", "x", {}), MOTORS_OF_ARM, QUICKLY, PERIOD), EFFORT, (0.0,) * 4, told.append)
     assert len(told) == 1
     assert "CAN bus no_such_interface x" in told[0]
 
