@@ -182,7 +182,8 @@ class SafetyMachine:
 
     def _check_delivery(self, now: float, joints: Sequence[JointSample], dt: float) -> None:
         fault = self._delivery.step(dt, joints, self._sent.effort, self._sent.damping)
-        if fault and self.state in CARRYING:
+        is_proven = self.state in (State.RAMPING_IN, State.ACTIVE) or self._proving.switched_on
+        if fault and self.state in CARRYING and is_proven:
             self.trip(*fault, now)
 
     def _watch(

@@ -88,6 +88,11 @@ class Proving:
         return tuple((self._signs if self._switch_on.done else self._switch_on).effort)
 
     @property
+    def switched_on(self) -> bool:
+        """Whether all motors have shown that they are on."""
+        return self._switch_on.done
+
+    @property
     def done(self) -> bool:
         """Whether all joints have passed."""
         return self._switch_on.done and self._signs.done

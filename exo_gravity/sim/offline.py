@@ -75,7 +75,7 @@ class OfflineTrial:
         self._delay = delay
         self._start = math.inf  # of the script, s
         self._carried: list[float] = []  # the first and the last time that the motors carried the arm, s
-        self._safety = SafetyMachine(arm.limits, 1.0 / arm.rate)
+        self._safety = SafetyMachine(arm.limits, 1.0 / arm.rate, [motor.peak_effort for motor in arm.motors])
         self._compensator = Compensator(arm.settings)
         self._asked: tuple[Sequence[float] | None, float] = (None, -math.inf)
         self._reason = ""  # why the compensator gives no torque
@@ -138,12 +138,12 @@ class OfflineTrial:
     def _exchange(self, drive: Drive, now: float) -> None:
         """Give every motor its share of `drive`, and take what it answers: the frames that `MotorBus` sends."""
         give = self.arm.device.exchange
-        for joint, (motor, effort) in enumerate(zip(self.arm.motors, drive.effort, strict=True)):
+        for joint, motor in enumerate(self.arm.motors):
             command = self._packed[joint]
-            if drive.powered and not self._powered:
+            if drive.powered and (drive.enter[joint] or not self._powered):
                 give(motor.can_id, command(0.0, 0.0))
                 give(motor.can_id, ENTER)
-            reply = give(motor.can_id, command(effort, drive.damping))
+            reply = give(motor.can_id, command(drive.effort[joint], drive.damping[joint]))
             if self._powered and not drive.powered:
                 reply = give(motor.can_id, EXIT)
             if reply:

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.anfis import Anfis
 from exo_gravity.core.anfis_law import AnfisLaw
-from exo_gravity.core.compensator import LONGEST_STEP, Compensator, Settings
+from exo_gravity.core.compensator import FALLBACK_TIME, LONGEST_STEP, MAX_LEAD, Compensator, Settings
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.tilt import Tilt, pitch_roll
 
 ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
 THETA = (0.2, 0.7, 0.6, 0.5)
@@ -74,6 +74,63 @@ def test_without_a_fresh_tilt_there_is_no_torque_and_a_reason():
     run.compensator.set_tilt(run.now, 0.0, 0.0)
     assert run.cycle().effort is not None
     assert "older than 80 ms" in run.cycle(0.1).reason
+
+
+def gravity_at(bow, lean):
+    """Gravity in the trunk's axes after a bow by any angle of a trunk that leans: true at 90 degrees and beyond."""
+    down = np.array((0.0, math.sin(lean), -math.cos(lean)))
+    turn = np.array(((math.cos(bow), 0, -math.sin(bow)), (0, 1, 0), (math.sin(bow), 0, math.cos(bow))))
+    return turn @ down
+
+
+@pytest.mark.parametrize("lean", [-0.2, -1e-9, 0.0, 1e-3, 0.3])
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_a_bow_through_90_degrees_and_lying_down_stay_compensated(lean, way):
+    run = Run(use_imu=True)
+    base_from_trunk = np.array(((0, 1, 0), (1, 0, 0), (0, 0, -1)))  # left arm: x0 left, y0 forward, z0 down
+    for k in range(2400):
+        bow = way * min(math.pi, 2.0 * max(0.0, k * PERIOD - 1.1))  # 2 rad/s, to 180 degrees
+        gravity = gravity_at(bow, lean)
+        run.compensator.set_tilt(run.now, *pitch_roll(gravity))
+        assert run.cycle().reason == ""
+        if k * PERIOD > 1.1:
+            expected = gravity_torque(ROBOT, THETA, base_from_trunk @ gravity)
+            np.testing.assert_allclose(run.efforts[-1], expected, atol=1e-6)
+
+
+def test_a_tilt_that_turns_faster_than_a_trunk_is_refused_whichever_way_it_turns():
+    for pitch, roll in ((0.3, 0.0), (0.0, -0.3), (-math.pi / 2, 0.0)):
+        run = Run(use_imu=True)
+        run.compensator.set_tilt(run.now, 0.0, 0.0)
+        with pytest.raises(ParameterError, match=r"trunk tilt = .*: must be within 0.1 rad plus 5 rad/s"):
+            run.compensator.set_tilt(run.now + 0.01, pitch, roll)
+
+
+def test_a_tilt_is_as_old_as_its_stamp():
+    run = Run(use_imu=True)
+    for _ in range(100):
+        run.compensator.set_tilt(run.now, 0.1, 0.0, age=0.07)
+        assert run.cycle().effort is not None
+    run.compensator.set_tilt(run.now, 0.1, 0.0, age=0.0799)
+    assert run.cycle().reason == "trunk tilt older than 80 ms by its stamp: the IMU driver lags, or its clock differs"
+
+
+def test_a_stamp_ahead_of_the_clock_makes_a_tilt_no_younger_than_its_arrival():
+    run = Run(use_imu=True)
+    run.compensator.set_tilt(run.now, 0.0, 0.0, age=-MAX_LEAD)
+    assert run.cycle(0.078).effort is not None
+    assert run.cycle(0.004).reason == "trunk tilt older than 80 ms"
+
+
+@pytest.mark.parametrize("age", [-3600.0, -0.06, 1.01, 3600.0, math.nan, math.inf])
+def test_a_stamp_of_another_clock_is_refused_and_the_reason_names_it(age):
+    run = Run(use_imu=True)
+    with pytest.raises(ParameterError, match="synchronise the clocks"):
+        run.compensator.set_tilt(run.now, 0.0, 0.0, age)
+    reason = run.cycle().reason
+    assert "no trunk tilt yet (the newest was refused: age of the trunk tilt by its stamp must be from" in reason
+    run.compensator.set_tilt(run.now, 0.0, 0.0)
+    assert run.cycle().effort is not None
 
 
 @pytest.mark.parametrize(
@@ -244,6 +301,68 @@ def test_where_the_anfis_was_not_trained_the_exact_law_answers_and_says_why(thet
     answer = run.cycle(1.2, theta)
     assert why in answer.fallback
     np.testing.assert_allclose(answer.effort, gravity_torque(ROBOT, theta, Tilt.of("left", pitch).direction))
+
+
+def wobble(run, seconds, width=0.02, hertz=3.0):
+    """Swing theta_2 about the edge of the box, 1 rad, by `width` rad; return the laws' replaced state per cycle."""
+    replaced = []
+    for k in range(round(seconds / PERIOD)):
+        theta_2 = 1.0 + width * math.sin(2 * math.pi * hertz * k * PERIOD)
+        replaced.append(bool(run.cycle(theta=(0.2, theta_2, 0.6, 0.5)).fallback))
+    return replaced
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(0.001, 0.2), st.floats(0.1, 10.0))
+def test_along_a_path_across_the_edge_of_the_box_the_torque_neither_steps_nor_chatters(width, hertz):
+    run = Run(law="anfis", anfis=learned())
+    run.cycle(2.0)
+    run.efforts.clear()
+    replaced = wobble(run, 4.0, width, hertz)
+    # The laws differ by up to 2 Nm, which fades over 1 s; the exact law changes by up to 3 Nm/rad along the path.
+    remainders = 2.0 * PERIOD / 1.0
+    path = 3.0 * width * 2 * math.pi * hertz * PERIOD
+    assert run.largest_step <= 2 * remainders + path
+    switches = np.flatnonzero(np.diff(replaced))
+    assert all(b - a >= FALLBACK_TIME / PERIOD - 1 for a, b in zip(switches[::2], switches[1::2], strict=False))
+
+
+def test_the_anfis_returns_half_a_second_after_it_applies_again():
+    run = Run(law="anfis", anfis=learned())
+    run.cycle(1.5)
+    assert run.cycle(theta=(0.2, 1.01, 0.6, 0.5)).fallback
+    assert "theta_2" in run.cycle(FALLBACK_TIME - 2 * PERIOD).fallback
+    assert run.cycle(2 * PERIOD).fallback == ""
+    run.cycle(1.1)
+    np.testing.assert_allclose(run.efforts[-1], (0.0, 0.5, 1.0, 0.25), rtol=1e-9)
+
+
+def test_a_change_of_settings_in_the_cycle_that_leaves_the_box_is_bridged_too():
+    run = Run(law="anfis", anfis=learned())
+    run.cycle(2.0)
+    before = run.efforts[-1]
+    run.compensator.apply(make(law="anfis", anfis=learned(), mode="zero_g"))
+    run.cycle(theta=(0.2, 1.001, 0.6, 0.5))
+    np.testing.assert_allclose(run.efforts[-1], before, atol=0.01)
+
+
+def test_another_law_does_not_wait_for_the_anfis():
+    run = Run(law="anfis", anfis=learned())
+    run.cycle(1.5, (0.2, 1.2, 0.6, 0.5))
+    run.compensator.apply(make(law="paper_static"))
+    assert run.cycle(theta=(0.2, 1.2, 0.6, 0.5)).fallback == ""
+
+
+@pytest.mark.parametrize(("gain", "gravity"), [(2.0, 25.0), (2.0, 10.01), (0.9, 25.0), (1.3, 16.0)])
+def test_gain_and_gravity_together_may_not_double_the_earths(gain, gravity):
+    with pytest.raises(ParameterError, match=r"gain times gravity = .*: must be at most 20 m/s\^2"):
+        make(robot=ArmModel(ROBOT.length, ROBOT.cog, ROBOT.mass, (1.0, gain, 1.0, 1.0), gravity))
+
+
+@pytest.mark.parametrize(("gain", "gravity"), [(2.0, 9.83), (1.3, 9.81), (0.8, 25.0), (1.0, 1.62), (0.0, 25.0)])
+def test_calibrated_gains_and_other_planets_are_accepted(gain, gravity):
+    scaled = ArmModel(ROBOT.length, ROBOT.cog, ROBOT.mass, [gain] * 4, gravity)
+    assert make(robot=scaled).arm.scale == pytest.approx([gain * gravity] * 4)
 
 
 def test_the_anfis_without_a_file_is_refused():
