@@ -1,60 +1,57 @@
-# make demo    the main job on the simulated device, about 75 s once everything is installed
-# make test    all tests
-# make bench   the laws, the loop and the tools against peers, 12 minutes, longer on a busy machine; QUICK=1: some of it
-# make faults  the whole fault matrix on the simulated device, 11 minutes; a table and build/faults.json
-# make socketcan  motor bus and nodes on vcan0; RUN=COMMAND puts a command before it, one that enters a virtual machine
-# make clean   remove what these made
+# make demo         four nodes as processes on the simulated device, about 75 s; a table and figures in trials/
+# make test         all tests
+# make lint         ruff, mypy, ament's flake8 and pep257, shellcheck
+# make faults       the whole fault matrix on the simulated device, 11 minutes; a table and build/faults.json
+# make bench        the laws, the loop and the tools against peers, 12 minutes on a quiet machine; QUICK=1: part of it
+# make socketcan    motor bus and nodes on vcan0; RUN=COMMAND runs the tests through COMMAND, in a virtual machine for example
+# make pythons      for each supported Python found here: set-up from nothing, a short trial, the nodes
+# make constraints  renews the versions in constraints/
+# make clean        removes what these made
 #
-# Each sets up a virtual environment in .venv. Where ROS 2 is sourced its rclpy is used; elsewhere Jazzy's wheels are.
+# Each first installs what it needs in .venv; PYTHON=... selects the interpreter. Where ROS 2 is sourced its rclpy is
+# used; elsewhere Jazzy's wheels from PyPI.
 
 VENV := .venv
 BIN := $(VENV)/bin
-SETUP := setup.py Makefile
+DEMO := imu sim report
+TEST := $(DEMO) validate test
+SETUP := VENV=$(VENV) .ci/setup
 
-ifdef ROS_DISTRO
-PYTHON ?= python3
-VENV_OPTIONS := --system-site-packages
-# ROS's messages are compiled against NumPy 1.
-ROS := "numpy<2"
-EXTRAS := imu,sim,report
-else
-# The first Python that runs: pyenv's shim alone may refuse.
-PYTHON ?= $(shell for p in "$$(pyenv root 2>/dev/null)"/versions/3.12*/bin/python \
-	python3.12 python3.13 python3.11 python3.10 python3; do \
-	"$$p" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null && echo "$$p" && break; done)
-EXTRAS := ros,imu,sim,report
-endif
+.PHONY: demo test lint faults bench socketcan pythons constraints clean
 
-.PHONY: demo test bench faults socketcan clean
-
-demo: $(VENV)/demo
+demo:
+	@$(SETUP) $(DEMO)
 	$(BIN)/trial demo
 
-test: $(VENV)/test
-	$(BIN)/python -m pytest
+# The nodes' tests need a quiet machine; the others share its cores.
+test:
+	@$(SETUP) $(TEST)
+	$(BIN)/python -m pytest -m "not real_time" -n auto
+	$(BIN)/python -m pytest -m real_time
 
-bench: $(VENV)/test
+lint:
+	@$(SETUP) $(TEST) dev
+	@VENV=$(VENV) .ci/lint
+
+faults:
+	@$(SETUP) $(TEST)
+	$(BIN)/python -m test.faults.run
+
+bench:
+	@$(SETUP) $(TEST)
 	$(BIN)/python -m bench $(if $(QUICK),--quick)
 
-faults: $(VENV)/test
-	$(BIN)/python test/faults/run.py
-
-socketcan: $(VENV)/test
+socketcan:
+	@$(SETUP) $(TEST)
 	EXO_TEST_CAN_INTERFACE=socketcan EXO_TEST_CAN_CHANNEL=vcan0 PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 \
 		$(RUN) $(BIN)/python -m pytest --noconftest -p no:cacheprovider \
 		test/hardware/test_motor_bus.py test/nodes/socketcan_link.py test/nodes/socketcan_nodes.py
 
-$(VENV)/demo: $(SETUP) | $(BIN)/python
-	$(BIN)/python -m pip install --quiet $(ROS) --editable ".[$(EXTRAS)]"
-	touch $@
+pythons:
+	.ci/pythons
 
-$(VENV)/test: $(SETUP) | $(BIN)/python
-	$(BIN)/python -m pip install --quiet $(ROS) --editable ".[$(EXTRAS),validate,test]"
-	touch $@ $(VENV)/demo
-
-$(BIN)/python:
-	@test -n "$(PYTHON)" || { echo "exo_gravity needs Python 3.10 to 3.13; none was found" >&2; exit 1; }
-	"$(PYTHON)" -m venv $(VENV_OPTIONS) $(VENV)
+constraints:
+	.ci/constraints
 
 clean:
-	rm -rf $(VENV) build install log trials exo_gravity.egg-info
+	rm -rf $(VENV) build install log trials exo_gravity.egg-info .mypy_cache .ruff_cache

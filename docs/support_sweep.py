@@ -1,7 +1,7 @@
-"""Draws docs/support_sweep.png: `support` swept from 0 to 1 under a wearer's passive arm, on the simulated device.
+"""Draws docs/support_sweep.png: `support` increases from 0 to 1 under a wearer's passive arm on the simulated device.
 
-A hand leads the arm to a pose and holds it there; once a second `support` is set 0.05 higher, as `ros2 param set` would
-do it. Then the hand lets go. Run it as `python docs/support_sweep.py`; it takes a few seconds and needs no ROS.
+A hand moves the arm to a pose and holds it there. Once a second `support` increases by 0.05, as with `ros2 param set`.
+Then the hand lets go. `python docs/support_sweep.py` takes a few seconds and does not need ROS.
 """
 
 from dataclasses import replace
@@ -15,34 +15,41 @@ from exo_gravity.core.compensator import Settings
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import Limits
 from exo_gravity.core.motors import MOTORS
+from exo_gravity.core.recording import Recording
 from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.core.wearer import Wearer
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial
 
-POSE = [0.3, 0.45, 0.10, 0.4]  # rad, within rated torque with all of the wearer's arm
-BEGIN, LED, ALONE = 10.0, 30.0, 10.0  # s: support 0 until then; the hand holds the arm; nobody does
+POSE = [0.3, 0.45, 0.10, 0.4]  # rad; carrying the whole arm of the wearer takes less than rated torque here
+HELD, RELEASED = 30.0, 10.0  # s, how long the hand holds the arm in the pose, and how long the arm is alone
+SETTLING, PAUSE = 3, 2  # s in the pose: before the figure begins, and from there until the sweep
 RATED = (3.0, 9.0, 3.0, 3.0)
 JOINTS = ("shoulder rotation", "shoulder abduction", "shoulder flexion", "elbow flexion")
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")  # Okabe and Ito (2008)
 
 
-def sweep():
-    """Return the recording of the sweep, and support over time in rows of s and share."""
+def sweep() -> tuple[Recording, np.ndarray]:
+    """Return the recording of the sweep, and its support settings in rows of (time in s, support)."""
     robot = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
-    mass, cog = Wearer(75.0).on_links(robot.length)
+    load = Wearer(75.0).on_links(robot.length)
+    mass, cog = load.mass.tolist(), load.cog.tolist()
     settings = Settings("right", robot, mode="zero_g", support=0.0, wearer_mass=mass, wearer_cog=cog)
     motors = [JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1)]
     limits = Limits(JOINTS, (-1.65, -0.17, -0.78, -0.17), (1.65, 3.14, 2.53, 3.14), (5.0, 5.0, 5.0, 6.0), RATED)
-    true_arm = SimulatedArm(ArmConfig(wearer_mass=1.03 * mass, wearer_cog=cog))  # 3 % heavier than believed
+    # 3 % heavier than configured
+    true_arm = SimulatedArm(ArmConfig(wearer_mass=[1.03 * m for m in mass], wearer_cog=cog))
     device = SimulatedDevice(true_arm, [SimulatedMotor(motor) for motor in motors])
-    steps = [{"move": POSE, "over": 3.0}, {"move": POSE, "over": LED}, {"hold": ALONE}]
+    steps = [{"move": POSE, "over": 3.0}, {"move": POSE, "over": HELD}, {"hold": RELEASED}]
     script = TrialScript.parse({"name": "support sweep", "steps": steps})
     trial = OfflineTrial(ArmSetup("right", device, motors, limits, settings, 250.0, (0.0, 0.0)), script, 8.0)
     supports = [(0.0, 0.0)]
+    in_pose = 0  # s
 
-    def every_second(now):
-        if now >= BEGIN and supports[-1][1] < 1.0:
+    def every_second(now: float) -> bool:
+        nonlocal in_pose
+        in_pose += trial.step == 1
+        if in_pose > SETTLING + PAUSE and supports[-1][1] < 1.0:
             supports.append((now, round(supports[-1][1] + 0.05, 2)))
             trial.apply(replace(settings, support=supports[-1][1]))
         return False
@@ -50,29 +57,29 @@ def sweep():
     return trial.run(every_second), np.array(supports)
 
 
-def draw(recording, supports):
+def draw(recording: Recording, supports: np.ndarray) -> Figure:
     """Return the figure."""
-    start, let_go, end = BEGIN - 2.0, recording.steps[2].start, recording.steps[2].end
+    start, let_go, end = recording.steps[1].start + SETTLING, recording.steps[2].start, recording.steps[2].end
     during = (recording.time >= start) & (recording.time <= end)
     time = recording.time[during] - start
     figure = Figure(figsize=(9.0, 6.0), layout="constrained")
     set_to, torque, angle = figure.subplots(3, 1, sharex=True, height_ratios=(1.0, 2.2, 1.6))
     set_to.step(np.append(supports[:, 0] - start, end - start), np.append(supports[:, 1], 1.0), "k", where="post")
-    set_to.set_ylabel("support, as set")
+    set_to.set_ylabel("support setting")
     position = np.degrees(recording.position[during])
     for joint, (name, colour) in enumerate(zip(JOINTS, COLOURS, strict=True)):
         torque.plot(time, recording.effort[during][:, joint], color=colour, lw=1.6, label=name)
         angle.plot(time, position[:, joint] - position[0, joint], color=colour, lw=1.2)
     torque.set_ylabel("motor torque (Nm)")
     torque.legend(loc="upper left", frameon=False, fontsize=9)
-    angle.set_ylabel("moved (deg)")
+    angle.set_ylabel("displacement (deg)")
     angle.set_ylim(-0.5, 0.5)
     angle.set_xlabel("time (s)")
     for axis in (set_to, torque, angle):
         axis.axvspan(let_go - start, end - start, color="0.92", zorder=0)
         axis.spines[["top", "right"]].set_visible(False)
         axis.set_xlim(0.0, end - start)
-    set_to.text(let_go - start + 0.2, 0.05, "nobody touches it", fontsize=9)
+    set_to.text(let_go - start + 0.2, 0.05, "arm released", fontsize=9)
     return figure
 
 

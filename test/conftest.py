@@ -27,6 +27,8 @@ class Stalled(AssertionError):
 @pytest.fixture(scope="session")
 def stall_clock() -> Iterator[StallClock]:
     """The clock that measures how long the machine stands still."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        pytest.fail("nothing may run in parallel with tests marked real_time: run them with `-m real_time`, without -n")
     clock = StallClock()
     yield clock
     clock.close()

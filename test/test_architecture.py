@@ -1,4 +1,4 @@
-"""Who may import whom, and the promises that hold for every file."""
+"""Which package may import which, and the rules for every file."""
 
 import ast
 import sys
@@ -17,8 +17,8 @@ MAY_IMPORT = {
     "bag": {"core", "bag"},
     "tools": {"core", "bag", "tools"},
 }
-# Without ROS there are no nodes to start by their names: `trial --offline` alone reaches for the simulated device.
-ALSO = {"exo_gravity/tools/trials/offline.py": {"sim"}}
+# `trial --offline` runs without ROS, so it starts no nodes and uses the simulated device directly.
+EXCEPTIONS = {"exo_gravity/tools/trials/offline.py": {"sim"}}
 
 
 def imported(path: Path) -> set[str]:
@@ -31,7 +31,7 @@ def imported(path: Path) -> set[str]:
     return names
 
 
-def layer(path: Path) -> str:
+def package(path: Path) -> str:
     return path.relative_to(PACKAGE).parts[0]
 
 
@@ -39,31 +39,31 @@ def name(path: Path) -> str:
     return str(path.relative_to(ROOT))
 
 
-@pytest.mark.parametrize("path", [p for p in FILES if layer(p) in MAY_IMPORT], ids=name)
-def test_a_module_imports_only_the_layers_it_may(path):
+@pytest.mark.parametrize("path", [p for p in FILES if package(p) in MAY_IMPORT], ids=name)
+def test_a_module_imports_only_what_its_package_may(path):
     ours = {module.split(".")[1] for module in imported(path) if module.startswith("exo_gravity.")}
-    assert ours <= MAY_IMPORT[layer(path)] | ALSO.get(name(path), set())
+    assert ours <= MAY_IMPORT[package(path)] | EXCEPTIONS.get(name(path), set())
 
 
-@pytest.mark.parametrize("path", [p for p in FILES if layer(p) == "core"], ids=name)
-def test_core_needs_numpy_and_the_standard_library_alone(path):
+@pytest.mark.parametrize("path", [p for p in FILES if package(p) == "core"], ids=name)
+def test_core_imports_only_numpy_and_the_standard_library(path):
     roots = {module.split(".")[0] for module in imported(path)}
     assert roots - {"exo_gravity", "numpy"} <= sys.stdlib_module_names
     assert not roots & {"time", "socket", "subprocess", "threading"}
 
 
-@pytest.mark.parametrize("path", [p for p in FILES if layer(p) != "nodes"], ids=name)
-def test_rclpy_appears_in_nodes_alone(path):
+@pytest.mark.parametrize("path", [p for p in FILES if package(p) != "nodes"], ids=name)
+def test_only_nodes_import_rclpy(path):
     assert "rclpy" not in {module.split(".")[0] for module in imported(path)}
 
 
-@pytest.mark.parametrize("path", [p for p in FILES if layer(p) != "tools"], ids=name)
+@pytest.mark.parametrize("path", [p for p in FILES if package(p) != "tools"], ids=name)
 def test_only_tools_print(path):
     calls = (n.func for n in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(n, ast.Call))
     assert "print" not in {call.id for call in calls if isinstance(call, ast.Name)}
 
 
 @pytest.mark.parametrize("path", FILES, ids=name)
-def test_every_module_says_what_it_is_for(path):
+def test_every_module_has_a_docstring(path):
     text = path.read_text(encoding="utf-8")
     assert not text.strip() or ast.get_docstring(ast.parse(text))

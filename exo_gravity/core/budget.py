@@ -57,8 +57,8 @@ def motor_torques(motors: Sequence[str], torque_scale: Sequence[float]) -> tuple
 class Workspace:
     """Joint limits (4,) in rad, and the largest trunk pitch and roll in either direction in rad (up to pi/2)."""
 
-    position_min: Sequence[float]
-    position_max: Sequence[float]
+    position_min: Vector
+    position_max: Vector
     max_tilt: float
 
     def __post_init__(self) -> None:

@@ -32,7 +32,7 @@ class ParameterError(ExoGravityError, ValueError):
 class FrameError(ExoGravityError, ValueError):
     """Bytes are not a valid frame. Attribute: `data`, the bytes."""
 
-    def __init__(self, data: bytes, expected: str) -> None:
+    def __init__(self, data: bytes | bytearray, expected: str) -> None:
         super().__init__(f"frame [{bytes(data).hex(' ')}]: must be {expected}")
         self.data = bytes(data)
 

@@ -59,7 +59,7 @@ class JointMotor:
             torque = math.copysign(self.spec.torque_range, torque)
         return pack_command(self.spec, 0.0, 0.0, 0.0, kd, torque)
 
-    def joint_reply(self, data: bytes) -> MotorReply:
+    def joint_reply(self, data: bytes | bytearray) -> MotorReply:
         """Return the content of a reply in the joint's rad, rad/s and Nm. Raises FrameError."""
         reply = unpack_reply(self.spec, data)
         return MotorReply(

@@ -114,7 +114,7 @@ def pack_command(spec: MotorSpec, position: float, velocity: float, kp: float, k
     return data if data not in SPECIAL_FRAMES else data[:7] + b"\xfb"
 
 
-def unpack_command(spec: MotorSpec, data: bytes) -> MotorCommand:
+def unpack_command(spec: MotorSpec, data: bytes | bytearray) -> MotorCommand:
     """Return the content of a command frame. Raises FrameError unless it is 8 bytes and not a special frame."""
     if len(data) != 8 or bytes(data) in SPECIAL_FRAMES:
         raise FrameError(data, "8 bytes and not a special frame")
@@ -153,7 +153,7 @@ def pack_reply(
     return data + bytes((_whole("temperature", temperature, -40, 215) + 40, _whole("error", error, 0, 255)))
 
 
-def unpack_reply(spec: MotorSpec, data: bytes) -> MotorReply:
+def unpack_reply(spec: MotorSpec, data: bytes | bytearray) -> MotorReply:
     """Return the content of a reply. Raises FrameError unless it is 6 or 8 bytes."""
     if len(data) not in (6, 8):
         raise FrameError(data, "a reply of 6 or 8 bytes")

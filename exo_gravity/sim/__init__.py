@@ -1,20 +1,20 @@
-"""The simulated device: a MuJoCo arm, four AK motors that speak real CAN frames, a trunk IMU and a virtual wearer.
+"""The simulated device: a MuJoCo arm, four AK motors that exchange real CAN frames, a trunk IMU and a virtual wearer.
 
-It knows nothing of the compensator: CAN frames and IMU samples are all that joins them.
+It knows nothing of the compensator: CAN frames and IMU samples are the only connection.
 
     motors = [SimulatedMotor(JointMotor(MOTORS["AK60-6"], can_id=1)), ...]     four, shoulder to elbow
     device = SimulatedDevice(SimulatedArm(ArmConfig()), motors, side="right")
-    device.start(VirtualWearer(script), delay=2.0)                           device.elapsed, wearer.step: how far
+    device.start(VirtualWearer(script), delay=2.0)                           progress: device.elapsed, wearer.step
     device.run(bus, stop.is_set)                                               real time, on any python-can bus
 
-or without a bus, as fast as it goes:
+or without a bus, as fast as possible:
 
     reply = device.exchange(can_id, data)                                      (ID, data) of the reply, or None
     device.advance(0.005)
 
-Faults and tilt, live and from any thread: `device.pitch`, `device.roll`, `device.bus_silent`,
-`device.motors[n].unplugged`, `.temperature`, `.error`. The truth: `device.time`, `device.arm.positions`, `.velocities`.
-The trunk's IMU: `SimulatedImu(ImuConfig(...)).sample(pitch, roll, pitch_rate, roll_rate)`.
+Faults and tilt may be set from any thread: `device.pitch`, `device.roll`, `device.bus_silent`,
+`device.motors[n].unplugged`, `.temperature`, `.error`. The true state: `device.time`, `device.arm.positions`,
+`.velocities`. The trunk's IMU: `SimulatedImu(ImuConfig(...)).sample(pitch, roll, pitch_rate, roll_rate)`.
 """
 
 from exo_gravity.sim.arm import STEP, ArmConfig, SimulatedArm

@@ -1,9 +1,9 @@
-"""A trial without bus, ROS or clock: the control code of `core` on the simulated device, as fast as it goes.
+"""A trial without bus, ROS or clock: the control code of `core` on the simulated device, as fast as possible.
 
-A cycle is that of `can_bridge` and `compensator` together, in their order: the safety machine decides on the newest
-readings and the torque asked, every motor gets its frame and answers, the compensator answers the angles read, and time
-goes on. Torques and angles pass as the bytes of CAN frames. Nothing is late here: what a busy computer adds to the
-delay of a cycle, and frames that get lost, only the run in real time shows.
+One cycle does what `can_bridge` and `compensator` do in one cycle, in the same order: the safety machine processes the
+newest readings and efforts, every motor gets a command and replies, the compensator computes efforts from the new
+angles, and time advances. Torques and angles pass through CAN frames. Nothing is ever late: only a run in real time
+shows the delays and lost frames of a busy computer.
 """
 
 from __future__ import annotations
@@ -19,35 +19,32 @@ import numpy as np
 
 from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.compensator import Compensator, Settings
+from exo_gravity.core.drive import Drive, State
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.motors import ENTER, EXIT
 from exo_gravity.core.recording import Recording, ScriptedStep
-from exo_gravity.core.drive import Drive, State
 from exo_gravity.core.safety import SafetyMachine
-from exo_gravity.core.tilt import pitch_roll, rotation_matrix
 from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.sim.device import SimulatedDevice
-from exo_gravity.sim.imu import SimulatedImu
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
-LONGEST_START = 60.0  # s until the arm must be carried
-GRACE = 0.5  # s from the script's end until the arm is let down
-TILT_PERIOD = 0.01  # s between two tilts that the compensator is given
-IMU_SAMPLES = 100
-REMEMBERED = 64  # frames
+START_TIMEOUT = 60.0  # s for the motors to be switched on
+GRACE = 0.5  # s from the end of the script until the arm is let down
+TILT_PERIOD = 0.01  # s between two tilts for the compensator
+CACHED_FRAMES = 64
 COLUMNS = 1 + 4 * JOINT_COUNT  # of the recording: time, position, velocity, effort, command
-UNASKED = (math.nan,) * JOINT_COUNT
-STANDING = (State.DISABLED, State.FAULT)
+NO_COMMAND = (math.nan,) * JOINT_COUNT
+MOTORS_OFF = (State.DISABLED, State.FAULT)
 CARRIED = (State.RAMPING_IN, State.ACTIVE)
 
 
 @dataclass(frozen=True)
 class ArmSetup:
-    """One arm: `device` is what is true of it; motors, limits and settings are what its controller believes.
+    """One arm: `device` is the truth; motors, limits and settings are the controller's parameters.
 
-    rate: control cycles per s. tilt: pitch and roll of the trunk in rad as its IMU tells, None without an IMU.
+    rate: control cycles per s. tilt: pitch and roll of the trunk in rad as measured, None without an IMU.
     """
 
     name: str
@@ -60,109 +57,108 @@ class ArmSetup:
 
 
 class OfflineTrial:
-    """One arm, its controller, and a wearer who carries out a script once, `delay` s after the motors went on.
+    """One arm, its controller, and a wearer who performs a script once, `delay` s after the motors are switched on.
 
-    step: index of the wearer's step under way, None before the first. events: (s, what went wrong). trouble: why the
-    trial ended before the script did, or ''.
+    events: (s, text) of everything that went wrong. trouble: why the trial ended before the script, or ''.
     """
 
-    def __init__(self, arm: ArmSetup, script: TrialScript, delay: float):
+    def __init__(self, arm: ArmSetup, script: TrialScript, delay: float) -> None:
         self.arm = arm
         self.script = script
         self.events: list[tuple[float, str]] = []
         self.trouble = ""
         self._wearer = VirtualWearer(script)
         self._delay = delay
-        self._start = math.inf  # of the script, s
-        self._carried: list[float] = []  # the first and the last time that the motors carried the arm, s
+        self._start = math.inf  # s, of the script
+        self._carried: list[float] = []  # s, the first and the last time at which the motors carried the arm
         self._safety = SafetyMachine(arm.limits, 1.0 / arm.rate, [motor.peak_effort for motor in arm.motors])
         self._compensator = Compensator(arm.settings)
-        self._asked: tuple[Sequence[float] | None, float] = (None, -math.inf)
-        self._reason = ""  # why the compensator gives no torque
-        self._tilted = -math.inf  # when the compensator was last told the tilt
+        # The newest efforts, and when the readings that they answer were taken.
+        self._efforts: tuple[Sequence[float] | None, float] = (None, -math.inf)
+        self._reason = ""  # why the compensator has withdrawn
+        self._tilt_time = -math.inf  # of the compensator's newest tilt
         self._samples = [UNKNOWN] * JOINT_COUNT
         self._powered = False
-        # Both are pure, and an arm at rest asks for the same again and again: the largest gain in speed there is.
-        self._packed = [lru_cache(REMEMBERED)(motor.command) for motor in arm.motors]
-        self._unpacked = [lru_cache(REMEMBERED)(motor.joint_reply) for motor in arm.motors]
+        # Both are pure, and an arm at rest repeats its frames: caching them saves the most time.
+        self._pack = [lru_cache(CACHED_FRAMES)(motor.command) for motor in arm.motors]
+        self._unpack = [lru_cache(CACHED_FRAMES)(motor.joint_reply) for motor in arm.motors]
         self._rows = array("d")
 
     @property
     def step(self) -> int | None:
-        """Index of the wearer's step under way."""
+        """Index of the wearer's current step, None before the first."""
         return self._wearer.step
 
     def apply(self, settings: Settings) -> None:
-        """Let the compensator go on with other settings, as when its parameters are set live."""
+        """Change the compensator's settings, as when its parameters are set live."""
         self._compensator.apply(settings)
 
     def run(self, should_stop: Callable[[float], bool] = lambda now: False) -> Recording:
-        """Carry the arm through the script, let it down, and return what `recorder` would have recorded.
+        """Run the script, let the arm down, and return what `recorder` would have recorded.
 
-        should_stop: is asked once per simulated second, with the time in s. DataError: nothing was recorded.
+        should_stop(now) is called once per simulated second, `now` in s. Raises DataError if nothing was recorded.
         """
         self._safety.enable(0.0)
         second = 0.0
         for cycle in itertools.count():
             now = cycle / self.arm.rate
             self._cycle(now)
-            if self._safety.state in STANDING:
+            if self._safety.state in MOTORS_OFF:
                 break
             if now >= second:
                 second += 1.0
                 if should_stop(now) and not self.trouble:
-                    self._end(now, "stopped by the operator")
-            self._watch(now)
+                    self._abort(now, "stopped by the operator")
+            self._follow_script(now)
         if self._safety.fault:
-            self._end(now, f"fault: {self._safety.fault.code}: {self._safety.fault.reason}")
+            self._abort(now, f"fault: {self._safety.fault.code}: {self._safety.fault.reason}")
         return self._recording()
 
     def _cycle(self, now: float) -> None:
-        arm, (effort, _) = self.arm, self._asked
-        self._exchange(self._safety.step(now, tuple(self._samples), *self._asked), now)
+        arm, (effort, _) = self.arm, self._efforts
+        self._exchange(self._safety.step(now, tuple(self._samples), *self._efforts), now)
         if self._safety.state in CARRIED:
             self._carried[:] = (*self._carried[:1], now)
         position = [joint.position for joint in self._samples]
         if not any(arm.limits.is_silent(now, joint) for joint in self._samples):
             self._record(now, position, effort)
-            if arm.tilt and now - self._tilted >= TILT_PERIOD:
+            if arm.tilt and now - self._tilt_time >= TILT_PERIOD:
                 self._compensator.set_tilt(now, *arm.tilt)
-                self._tilted = now
+                self._tilt_time = now
             answer = self._compensator.step(now, position)
-            self._asked = answer.effort, min(joint.time for joint in self._samples)
+            self._efforts = answer.effort, min(joint.time for joint in self._samples)
             if answer.reason and answer.reason != self._reason:
                 self._note(now, f"withdrawn: {answer.reason}")
             self._reason = answer.reason
         arm.device.advance(1.0 / arm.rate)
 
     def _exchange(self, drive: Drive, now: float) -> None:
-        """Give every motor its share of `drive`, and take what it answers: the frames that `MotorBus` sends."""
-        give = self.arm.device.exchange
+        """Send `drive` to the motors and read their replies, with the same frames as `MotorBus`."""
+        send = self.arm.device.exchange
         for joint, motor in enumerate(self.arm.motors):
-            command = self._packed[joint]
+            command = self._pack[joint]
             if drive.powered and (drive.enter[joint] or not self._powered):
-                give(motor.can_id, command(0.0, 0.0))
-                give(motor.can_id, ENTER)
-            reply = give(motor.can_id, command(drive.effort[joint], drive.damping[joint]))
+                send(motor.can_id, command(0.0, 0.0))
+                send(motor.can_id, ENTER)
+            reply = send(motor.can_id, command(drive.effort[joint], drive.damping[joint]))
             if self._powered and not drive.powered:
-                reply = give(motor.can_id, EXIT)
+                reply = send(motor.can_id, EXIT)
             if reply:
-                _, *reading = self._unpacked[joint](reply[1])
-                self._samples[joint] = JointSample(*reading, now)
+                self._samples[joint] = JointSample(*self._unpack[joint](reply[1])[1:], now)
         self._powered = drive.powered
 
-    def _watch(self, now: float) -> None:
-        """Let the wearer begin once the motors are on, and the arm down once the script or patience has ended."""
+    def _follow_script(self, now: float) -> None:
+        """Start the wearer when the motors are on, and let the arm down after the script or the start time-out."""
         if self._start == math.inf:
             if self._powered:
                 self.arm.device.start(self._wearer, self._delay)
                 self._start = now + self._delay
-            elif now > LONGEST_START:
-                self._end(now, f"the arm was never carried: waiting for {self._safety.waiting_for}")
+            elif now > START_TIMEOUT:
+                self._abort(now, f"the arm was never carried: waiting for {self._safety.waiting_for}")
         elif now > self._start + self.script.duration + GRACE:
             self._safety.disable(now)
 
-    def _end(self, now: float, why: str) -> None:
+    def _abort(self, now: float, why: str) -> None:
         why = f"{why} ({self._reason})" if self._reason else why
         self._note(now, why)
         self.trouble = self.trouble or self.events[-1][1]
@@ -176,32 +172,21 @@ class OfflineTrial:
         self._rows.extend(position)
         self._rows.extend([joint.velocity for joint in self._samples])
         self._rows.extend([joint.effort for joint in self._samples])
-        self._rows.extend(effort or UNASKED)
+        self._rows.extend(effort or NO_COMMAND)
 
     def _recording(self) -> Recording:
         if not self._rows:
             raise DataError(self.trouble or f"{self.arm.name}: nothing was recorded")
         table = np.array(self._rows).reshape(-1, COLUMNS)
-        columns = np.split(table[:, 1:], 4, axis=1)
+        position, velocity, effort, command = np.split(table[:, 1:], 4, axis=1)
         steps = self.script.steps
         starts = itertools.accumulate((step.duration for step in steps), initial=self._start)
-        done = float(table[-1, 0])
+        end = float(table[-1, 0])
         script = tuple(
-            ScriptedStep(step.action, start, min(start + step.duration, done))
+            ScriptedStep(step.action, start, min(start + step.duration, end))
             for step, start in zip(steps, starts, strict=False)
-            if start < done
+            if start < end
         )
-        carried = (tuple(self._carried),) if len(self._carried) == 2 else ()
-        return Recording(self.arm.name, self.arm.limits.joint_names, table[:, 0], *columns, script, carried)
-
-
-def told_tilt(
-    pitch: float, roll: float, imu: SimulatedImu, rotation_trunk_from_imu: Sequence[float]
-) -> tuple[float, float]:
-    """Return pitch and roll (rad) as a second of IMU samples tells them of a trunk at rest at `pitch` and `roll`.
-
-    rotation_trunk_from_imu: unit quaternion (x, y, z, w), as the controller believes.
-    """
-    rotation = rotation_matrix(rotation_trunk_from_imu, "rotation_trunk_from_imu")
-    force = np.mean([imu.sample(pitch, roll)[1] for _ in range(IMU_SAMPLES)], axis=0)
-    return pitch_roll(-rotation @ force)
+        carried = ((self._carried[0], self._carried[1]),) if len(self._carried) == 2 else ()
+        name, joint_names = self.arm.name, self.arm.limits.joint_names
+        return Recording(name, joint_names, table[:, 0], position, velocity, effort, command, script, carried)

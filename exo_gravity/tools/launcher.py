@@ -22,6 +22,7 @@ from pathlib import Path
 
 from exo_gravity.core.control_params import CAN_BRIDGE
 from exo_gravity.core.errors import ExoGravityError, ParameterError
+from exo_gravity.tools.cli.extras import require_ros
 from exo_gravity.tools.inputs.executables import executable, node_names
 from exo_gravity.tools.inputs.parameter_file import Nodes, load, packaged_config
 
@@ -194,6 +195,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
 def main(args: Sequence[str] | None = None) -> None:
     """Entry point of the executable `launcher`."""
     options = _arguments(args)
+    require_ros("launcher")
     stopping = stop_on_signals()
     try:
         dead = Launcher(options.params or packaged_config("sim.yaml")).run(stopping)

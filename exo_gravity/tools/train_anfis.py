@@ -1,59 +1,82 @@
 """train_anfis: trains an ANFIS for joints 2 to 4 of an upright arm, and saves it in one readable file.
 
-From `gravload` data by default, the paper's 1,053 positions; with --bag from the holds of a recorded rosbag2. The file
-is what `law: anfis` of the compensator reads.
+By default it learns `gravload` torques at the paper's 1,053 positions; with --bag, the torques measured in the holds of
+a rosbag2 recording. The compensator reads the file for `law: anfis`.
+
+Exit code 0: saved. 2: wrong use, wrong file, or too few samples.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from exo_gravity.core.anfis_law import JOINTS
-from exo_gravity.core.errors import ExoGravityError
+from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.core.tilt import SIDES
-from exo_gravity.tools.anfis.data import from_gravload
-from exo_gravity.tools.anfis.recorded import from_bag
-from exo_gravity.tools.anfis.training import RIDGE, train_law
-from exo_gravity.tools.comparison.tables import PAPER_ANFIS
+from exo_gravity.tools.cli.extras import extras
 from exo_gravity.tools.inputs.arms import configured_arm
+from exo_gravity.tools.inputs.paper import PAPER_ANFIS
 
-RECORDED_RIDGE = 0.03  # recorded torques carry noise and stiction, which a law must not follow
+RECORDED_RIDGE = 0.03  # larger, because recorded torques contain noise and stiction that the law must not learn
 
 
-def _arguments(argv: list[str] | None) -> argparse.Namespace:
+def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="train_anfis", description="Train the ANFIS that `law: anfis` runs.")
-    parser.add_argument("--params", metavar="FILE", help="ROS 2 parameter file (default: the packaged exo.yaml)")
-    parser.add_argument("--side", choices=SIDES, default="right", help="which of its arms (default: right)")
-    parser.add_argument("--bag", metavar="BAG", help="learn from the holds of this rosbag2 instead of from gravload")
-    parser.add_argument(
-        "--functions", metavar="N", type=int, choices=range(2, 7), help="per input (default: 4, for a bag 2)"
-    )
-    parser.add_argument("--output", metavar="FILE", default="anfis.json", help="where to save (default: anfis.json)")
-    return parser.parse_args(argv)
+    option = parser.add_argument
+    option("--params", metavar="FILE", help="ROS 2 parameter file (default: the packaged exo.yaml)")
+    option("--side", choices=SIDES, default="right", help="which of its arms (default: right)")
+    option("--bag", metavar="BAG", help="learn from the holds of this rosbag2 recording instead of from gravload")
+    functions = "membership functions per input (default: 4, for a bag 2)"
+    option("--functions", metavar="N", type=int, choices=range(2, 7), help=functions)
+    option("--output", metavar="FILE", default="anfis.json", help="where to save the law (default: anfis.json)")
+    return parser.parse_args(args)
+
+
+def _check_output(path: Path) -> None:
+    """Create the folder of `path`, before the training. Raises ParameterError if the file can't be written."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ParameterError("output", str(path), f"a file in a folder that can be made ({error.strerror})") from None
+    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise ParameterError("output", str(path), "a file that can be written")
 
 
 def _run(options: argparse.Namespace) -> None:
+    """Train, save the law and print its errors."""
+    from exo_gravity.tools.anfis.data import from_gravload
+    from exo_gravity.tools.anfis.training import RIDGE, train_law
+
+    output = Path(options.output)
+    _check_output(output)
     configured = configured_arm(options.params, options.side)
     functions = options.functions or (2 if options.bag else 4)
-    samples = from_bag(options.bag, configured, functions) if options.bag else from_gravload(configured)
-    law, results = train_law(samples, configured.robot, functions, RECORDED_RIDGE if options.bag else RIDGE)
-    output = Path(options.output)
+    if options.bag:
+        from exo_gravity.tools.anfis.recorded import from_bag
+
+        samples, ridge = from_bag(options.bag, configured, functions), RECORDED_RIDGE
+    else:
+        samples, ridge = from_gravload(configured), RIDGE
+    law, results = train_law(samples, configured.robot, functions, ridge)
     output.write_text(law.dump(), encoding="utf-8")
-    print(f"{law.source}; {law.model.rules} rules, {law.model.parameters} parameters a joint")
+    print(f"{law.source}; {law.model.rules} rules, {law.model.parameters} parameters per joint")
     print(f"{'joint':<6}{'training RMSE':>16}{'held-out RMSE':>16}{'the paper':>16}{'steps':>8}{'time':>9}")
     for i, (joint, result) in enumerate(zip(JOINTS, results, strict=True)):
         figures = f"{law.error['training'][i]:>13.2e} Nm{law.error['held_out'][i]:>13.2e} Nm{PAPER_ANFIS[i]:>13.2e} Nm"
         print(f"{joint:<6}{figures}{result.evaluations:>8}{result.seconds:>7.1f} s")
-    print(f"saved {output}; joint 1 needs no torque while the trunk is upright, and gets none")
+    print(f"saved {output}; it gives joint 1 no torque, which needs none while the trunk is upright")
 
 
-def main(argv: list[str] | None = None) -> None:
+def main(args: Sequence[str] | None = None) -> None:
     """Entry point of the executable `train_anfis`."""
-    options = _arguments(argv)
+    options = _arguments(args)
     try:
-        _run(options)
+        with extras("train_anfis", "report,validate"):
+            _run(options)
     except (ExoGravityError, OSError) as error:
         print(f"train_anfis: {error}", file=sys.stderr)
         raise SystemExit(2) from None

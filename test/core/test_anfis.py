@@ -1,4 +1,4 @@
-"""ANFIS inference against Jang's five layers written out, and the law that runs it inside its training box alone."""
+"""ANFIS inference against Jang's five layers written out, and the law that uses it only inside its training box."""
 
 import json
 import math
@@ -48,7 +48,7 @@ def five_layers(model, which, u):
 
 
 @pytest.mark.parametrize(("inputs", "functions"), [(1, 3), (2, 2), (3, 4), (4, 2)])
-def test_the_output_is_that_of_jangs_five_layers(inputs, functions):
+def test_the_output_equals_that_of_jangs_five_layers(inputs, functions):
     model = random_model(2, inputs, functions)
     samples = np.random.default_rng(2).uniform(-1.2, 1.2, (20, inputs))
     expected = [[five_layers(model, which, u) for which in range(2)] for u in samples]
@@ -77,18 +77,18 @@ def test_normalised_memberships_sum_to_1_even_far_from_all_centres():
         ("consequent", "many"),
     ],
 )
-def test_arrays_that_make_no_model_are_refused_by_name(part, value):
+def test_invalid_arrays_are_rejected_by_name(part, value):
     parts = {name: getattr(random_model(), name) for name in ("centre", "sigma", "consequent")}
     with pytest.raises(DataError, match=part):
         Anfis(**{**parts, part: value})
 
 
-def test_more_rules_than_memory_holds_are_refused():
+def test_too_many_rules_are_rejected():
     with pytest.raises(DataError, match="rules"):
         Anfis(np.zeros((1, 10, 5)), np.ones((1, 10, 5)), np.zeros((1, 1, 11)))
 
 
-def test_a_law_comes_back_from_its_file_with_the_same_torques():
+def test_a_law_read_back_from_its_file_gives_the_same_torques():
     before, theta = law(), np.random.default_rng(3).uniform(0, 2, (50, 3))
     after = AnfisLaw.load(before.dump())
     assert np.array_equal(after.torques(theta), before.torques(theta))
@@ -101,7 +101,7 @@ def test_the_file_has_one_line_per_rule():
     assert sum(line.strip().startswith("[") and line.count(",") >= 3 for line in lines) == 3 * 8
 
 
-def test_a_law_loads_from_a_mapping_too():
+def test_a_law_also_loads_from_a_mapping():
     assert AnfisLaw.load(json.loads(law().dump())).gravity == 9.8
 
 
@@ -120,7 +120,7 @@ def test_a_law_loads_from_a_mapping_too():
         (lambda c: c.update(joints=[]), "train_anfis"),
     ],
 )
-def test_a_flawed_file_is_refused_with_the_name_of_the_flaw(flaw, named):
+def test_an_error_in_a_file_is_rejected_and_named(flaw, named):
     content = json.loads(law().dump())
     flaw(content)
     with pytest.raises(DataError, match=named):
@@ -128,7 +128,7 @@ def test_a_flawed_file_is_refused_with_the_name_of_the_flaw(flaw, named):
 
 
 @pytest.mark.parametrize("text", ["", "no JSON", "[1, 2]", "3"])
-def test_text_that_is_no_law_is_refused(text):
+def test_text_that_is_not_a_law_is_rejected(text):
     with pytest.raises(DataError):
         AnfisLaw.load(text)
 
@@ -137,48 +137,46 @@ def test_joint_1_gets_no_torque():
     assert law().torque(ARM, INSIDE, UPRIGHT)[0] == 0.0
 
 
-def test_one_pose_is_what_the_arrays_give_at_the_gravity_and_the_gain_of_the_arm():
+def test_a_single_pose_agrees_with_the_arrays_scaled_by_the_arms_gravity_and_gain():
     arm = ArmModel(ARM.length, ARM.cog, ARM.mass, (1.0, 0.5, 1.5, 2.0), 4.9)
     expected = law().torques(np.array((INSIDE[1:],)))[0] * (0.5, 1.5, 2.0) * 0.5
     assert law().torque(arm, INSIDE, UPRIGHT)[1:] == pytest.approx(tuple(expected))
 
 
-def test_inside_its_box_upright_and_for_its_arm_the_law_has_nothing_to_say():
-    assert not law().outside(ARM, INSIDE, UPRIGHT)
+def test_inside_its_box_upright_and_for_its_arm_the_law_applies():
     assert law().outside(ARM, INSIDE, UPRIGHT) == ""
 
 
-def test_the_encoder_of_joint_1_is_free_to_be_anywhere():
+def test_the_law_applies_at_any_angle_of_joint_1():
     assert not law().outside(ARM, (3.0, *INSIDE[1:]), UPRIGHT)
 
 
 @pytest.mark.parametrize("joint", [1, 2, 3])
 @pytest.mark.parametrize("angle", [-1.0, 3.5, math.nan])
-def test_outside_its_box_it_names_the_joint(joint, angle):
+def test_outside_its_box_the_law_names_the_joint(joint, angle):
     theta = list(INSIDE)
     theta[joint] = angle
-    assert law().outside(ARM, theta, UPRIGHT)
     assert f"theta_{joint + 1}" in law().outside(ARM, theta, UPRIGHT)
 
 
 @pytest.mark.parametrize(("pitch", "roll"), [(0.02, 0.0), (0.0, -0.02), (0.3, 0.3)])
-def test_on_a_tilted_trunk_it_says_so(pitch, roll):
+def test_on_a_tilted_trunk_the_law_names_the_tilt(pitch, roll):
     assert "tilted" in law().outside(ARM, INSIDE, Tilt.of("right", pitch, roll))
 
 
-def test_half_a_degree_of_tilt_is_still_upright():
+def test_a_trunk_tilted_by_less_than_half_a_degree_counts_as_upright():
     assert not law().outside(ARM, INSIDE, Tilt.of("right", math.radians(0.49), 0.0))
 
 
-def test_with_a_wearers_arm_that_it_was_not_trained_for_it_says_so():
+def test_with_another_wearers_arm_the_law_does_not_apply():
     loaded = ARM.with_wearer((0, 0, 1.0, 0.5), (0, 0, 0.1, 0.1))
     assert "another arm" in law().outside(loaded, INSIDE, UPRIGHT)
 
 
-def test_gain_and_gravity_are_no_other_arm():
+def test_another_gain_or_gravity_is_not_another_arm():
     assert not law().outside(ArmModel(ARM.length, ARM.cog, ARM.mass, (0.5,) * 4, 1.6), INSIDE, UPRIGHT)
 
 
-def test_the_sentence_stays_the_same_while_the_reason_does():
+def test_the_sentence_stays_the_same_as_long_as_the_reason_does():
     sentences = {law().outside(ARM, (0, angle, 0.5, 0.5), UPRIGHT) for angle in (-0.2, -0.3, -0.4)}
     assert len(sentences) == 1

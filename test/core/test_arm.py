@@ -1,4 +1,4 @@
-"""ArmModel refuses what no arm is, and says which value."""
+"""ArmModel rejects invalid values by name, and adds a wearer's mass correctly."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ LENGTH, COG, MASS = (0.05, 0.13, 0.30, 0.30), (0.02, 0.05, 0.1, 0.2), (0.5, 0.4,
         ("gravity", None),
     ],
 )
-def test_an_impossible_value_is_refused_by_its_name(field, value):
+def test_an_impossible_value_is_rejected_by_name(field, value):
     good = {"length": LENGTH, "cog": COG, "mass": MASS}
     with pytest.raises(ParameterError) as caught:
         ArmModel(**{**good, field: value})
@@ -40,14 +40,14 @@ def test_a_model_cannot_be_changed():
         arm.gravity = 1.0
 
 
-def test_a_model_does_not_follow_the_array_it_was_made_from():
+def test_a_model_does_not_follow_changes_of_the_array_it_was_made_from():
     mass = np.array(MASS)
     arm = ArmModel(LENGTH, COG, mass)
     mass[0] = 9.0
     assert arm.mass[0] == MASS[0]
 
 
-def test_equal_arms_are_equal_and_hash_alike():
+def test_arms_with_equal_values_are_equal_and_have_the_same_hash():
     assert ArmModel(LENGTH, COG, MASS) == ArmModel(list(LENGTH), list(COG), list(MASS))
     assert hash(ArmModel(LENGTH, COG, MASS)) == hash(ArmModel(LENGTH, COG, MASS))
     assert ArmModel(LENGTH, COG, MASS) != ArmModel(LENGTH, COG, MASS, gravity=9.8)
@@ -60,12 +60,12 @@ def test_a_wearer_adds_mass_and_first_moment_in_proportion_to_the_support():
     np.testing.assert_allclose(worn.mass * worn.cog, arm.mass * arm.cog + [0, 0, 0.16, 0.135])
 
 
-def test_without_support_a_wearer_changes_nothing():
+def test_with_support_0_a_wearer_changes_no_first_moment():
     arm = ArmModel(LENGTH, COG, MASS)
     worn = arm.with_wearer((0, 0, 2.0, 1.5), (0, 0, 0.16, 0.18), support=0.0)
     np.testing.assert_allclose(worn.first_moment, arm.first_moment, rtol=1e-15)
 
 
-def test_a_weightless_link_can_carry_a_wearer():
+def test_a_massless_link_can_carry_a_wearer():
     arm = ArmModel(LENGTH, COG, (0.5, 0.4, 0.0, 0.0)).with_wearer((0, 0, 2.0, 0), (0, 0, 0.16, 0))
     assert arm.cog[2] == pytest.approx(0.16)

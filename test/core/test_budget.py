@@ -41,7 +41,7 @@ def test_joint_1_of_a_tilted_trunk_needs_the_horizontal_part_of_gravity_times_th
     assert needs()[0].torque == pytest.approx(whole, abs=2e-3)
 
 
-def test_no_pose_of_either_arm_needs_more_than_the_budgets_largest_torque():
+def test_no_random_pose_of_either_arm_needs_more_than_the_largest_torque():
     joints = needs()
     rng = np.random.default_rng(11)
     pose, tilts = rng.uniform(LOW, HIGH, (20_000, 4)), np.radians(rng.uniform(-20, 20, (20_000, 2)))
@@ -52,14 +52,14 @@ def test_no_pose_of_either_arm_needs_more_than_the_budgets_largest_torque():
         assert np.all(largest <= [joint.torque + 2e-3 for joint in joints])
 
 
-def test_the_torque_at_a_point_is_that_of_the_left_arm_at_its_tilt():
+def test_the_torque_at_a_point_agrees_with_the_exact_law_for_the_left_arm():
     points = Workspace(LOW, HIGH, 1.5).points(200)
     for point in points:
         direction = Tilt.of("left", pitch=point[4], roll=point[5]).direction
         assert torque_at(ROBOT, point[None])[0] == pytest.approx(gravity_torque(ROBOT, point[:4], direction), abs=1e-12)
 
 
-def test_the_worst_pose_needs_the_budgets_largest_torque():
+def test_the_worst_pose_needs_the_largest_torque():
     for number, joint in enumerate(needs()):
         torque = torque_at(ROBOT.with_wearer(*LOAD), joint.worst[None])[0, number]
         assert abs(torque) == pytest.approx(joint.torque, abs=5e-3)
@@ -119,7 +119,7 @@ def test_every_motors_peak_is_above_its_rated_torque():
 
 
 @pytest.mark.parametrize("arguments", [(HIGH, LOW, 0.1), (LOW, HIGH, -0.1), (LOW, HIGH, 2.0), (LOW, HIGH[:3], 0.1)])
-def test_an_impossible_workspace_is_refused(arguments):
+def test_an_impossible_workspace_is_rejected(arguments):
     with pytest.raises(ParameterError):
         Workspace(*arguments)
 

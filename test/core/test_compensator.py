@@ -1,4 +1,4 @@
-"""The compensator: no torque without fresh and finite input, and no step whatever is changed."""
+"""The compensator gives no torque without fresh and finite input, and no change of settings steps the torque."""
 
 import math
 
@@ -49,7 +49,7 @@ class Run:
         return float(np.abs(np.diff(np.array(self.efforts), axis=0)).max())
 
 
-def test_after_the_ramp_the_torque_is_the_laws():
+def test_after_the_ramp_the_torque_equals_that_of_the_law():
     run = Run()
     assert run.cycle().effort == (0.0, 0.0, 0.0, 0.0)
     run.cycle(0.5)
@@ -68,7 +68,7 @@ def test_a_tilted_trunk_changes_the_torque():
     np.testing.assert_allclose(run.efforts[-1], expected, rtol=1e-12)
 
 
-def test_without_a_fresh_tilt_there_is_no_torque_and_a_reason():
+def test_without_a_fresh_tilt_there_is_a_reason_instead_of_a_torque():
     run = Run(use_imu=True)
     assert run.cycle()[:2] == (None, "no trunk tilt yet")
     run.compensator.set_tilt(run.now, 0.0, 0.0)
@@ -137,7 +137,7 @@ def test_a_stamp_of_another_clock_is_refused_and_the_reason_names_it(age):
     "theta",
     [(0.0, 0.0, 0.0), (0.0, 0.0, math.nan, 0.0), (math.inf, 0.0, 0.0, 0.0), (0.0, 0.0, 1e308, 1e308), (0, -27, 0, 0)],
 )
-def test_impossible_angles_get_no_torque(theta):
+def test_impossible_joint_angles_get_no_torque(theta):
     run = Run()
     run.cycle(2.0)
     answer = run.cycle(theta=theta)
@@ -146,7 +146,7 @@ def test_impossible_angles_get_no_torque(theta):
 
 
 @pytest.mark.parametrize("angle", [math.nan, math.inf, 4.0])
-def test_an_impossible_tilt_is_refused_and_the_last_one_stays(angle):
+def test_an_impossible_tilt_is_rejected_and_the_last_one_stays(angle):
     run = Run(use_imu=True)
     run.compensator.set_tilt(run.now, 0.1, 0.0)
     with pytest.raises(ParameterError):
@@ -154,7 +154,7 @@ def test_an_impossible_tilt_is_refused_and_the_last_one_stays(angle):
     assert run.cycle().effort is not None
 
 
-def test_after_a_break_the_torque_ramps_in_anew():
+def test_after_a_break_the_torque_ramps_in_again():
     run = Run()
     run.cycle(2.0)
     run.now += 0.2
@@ -181,7 +181,7 @@ def test_a_change_of_mode_reaches_the_arm_without_a_step():
     assert run.largest_step <= np.abs(two - one).max() * PERIOD * 1.001
 
 
-def test_the_transition_takes_the_time_that_the_new_settings_say():
+def test_a_transition_takes_the_transition_time_of_the_new_settings():
     run = Run(transition_time=0.3)
     run.cycle(1.5)
     run.compensator.apply(make(mode="zero_g", transition_time=4.0))
@@ -192,7 +192,7 @@ def test_the_transition_takes_the_time_that_the_new_settings_say():
     np.testing.assert_allclose(run.efforts[-1], two, rtol=1e-12)
 
 
-def test_settings_swept_again_and_again_are_followed_without_a_step():
+def test_a_sweep_of_settings_is_followed_without_a_step():
     run = Run(mode="zero_g", support=0.0)
     run.cycle(1.5)
     run.efforts.clear()
@@ -205,7 +205,7 @@ def test_settings_swept_again_and_again_are_followed_without_a_step():
     assert run.largest_step <= np.abs(two - one).max() / 1.0 * PERIOD * 1.1
 
 
-def test_too_much_torque_is_clamped_and_named():
+def test_too_large_a_torque_is_clamped_and_the_joint_named():
     run = Run(max_effort=(3.0, 1.0, 3.0, 3.0))
     answer = run.cycle(2.0)
     assert answer.effort[1] == 1.0
@@ -229,7 +229,7 @@ PERIODS = st.sampled_from([0.001, 0.002, 0.004, 0.009, 0.011, 0.03, 0.045])  # l
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(CHANGES, st.lists(PERIODS, max_size=60), st.tuples(*[st.floats(-1.5, 1.5)] * 4)), max_size=9))
-def test_no_sequence_of_changes_poses_and_late_cycles_steps_the_torque_beyond_its_rate(sequence):
+def test_no_sequence_of_changes_poses_and_late_cycles_exceeds_the_torque_rate(sequence):
     run = Run()
     run.cycle(1.2)
     for change, periods, theta in sequence:
@@ -255,20 +255,20 @@ def test_no_sequence_of_changes_poses_and_late_cycles_steps_the_torque_beyond_it
         ("max_total_mass", math.inf),
     ],
 )
-def test_impossible_settings_are_refused_by_name(field, value):
+def test_impossible_settings_are_rejected_by_name(field, value):
     with pytest.raises(ParameterError) as caught:
         make(**{field: value})
     assert caught.value.name.replace(".", "_") == field
 
 
-def test_more_than_the_largest_total_mass_is_refused_whatever_the_mode():
+def test_too_large_a_total_mass_is_rejected_in_every_mode():
     make(max_total_mass=5.5)  # 1.854 kg of robot, 3.6 kg of wearer
     for mode in ("one_g", "zero_g"):
         with pytest.raises(ParameterError, match=r"total mass in kg = 5.45: must be at most max_total_mass = 5 "):
             make(mode=mode, max_total_mass=5.0)
 
 
-def test_of_the_wearer_the_share_that_is_supported_counts_for_the_total_mass():
+def test_only_the_supported_share_of_the_wearer_counts_towards_the_total_mass():
     assert make(mode="zero_g", support=0.5, max_total_mass=5.0).arm.total_mass == pytest.approx(3.654)
 
 
@@ -280,7 +280,7 @@ def learned(moments=ROBOT.first_moment[1:]):
     return AnfisLaw(model, (0.0,) * 3, (1.0,) * 3, moments, ROBOT.gravity, "made up", {})
 
 
-def test_inside_its_box_the_anfis_answers():
+def test_inside_its_box_the_anfis_gives_the_torque():
     run = Run(law="anfis", anfis=learned())
     answer = run.cycle(1.2)
     assert answer.fallback == ""
@@ -295,7 +295,7 @@ def test_inside_its_box_the_anfis_answers():
         (THETA, 0.0, (0.3, 0.2, 0.1), "another arm"),
     ],
 )
-def test_where_the_anfis_was_not_trained_the_exact_law_answers_and_says_why(theta, pitch, moments, why):
+def test_where_the_anfis_was_not_trained_the_exact_law_replaces_it_and_the_reason_is_given(theta, pitch, moments, why):
     run = Run(law="anfis", anfis=learned(moments))
     run.compensator.set_tilt(run.now, pitch, 0.0)
     answer = run.cycle(1.2, theta)
@@ -365,6 +365,6 @@ def test_calibrated_gains_and_other_planets_are_accepted(gain, gravity):
     assert make(robot=scaled).arm.scale == pytest.approx([gain * gravity] * 4)
 
 
-def test_the_anfis_without_a_file_is_refused():
+def test_the_law_anfis_without_a_file_is_rejected():
     with pytest.raises(ParameterError, match="anfis_file"):
         make(law="anfis")

@@ -1,4 +1,4 @@
-"""The compensator's parameters as settings: every value, possible or not, is taken or refused with a sentence."""
+"""The compensator's parameters as settings: every value is either applied or rejected with a message."""
 
 import math
 import random
@@ -17,7 +17,7 @@ WRONG += ([0.0, 0.0, 0.31, 0.0], [0.1, -1e-9, 0.1, 0.1], [1e308] * 4, ["0.1"] * 
 
 
 def possible(param, rng):
-    """Draw a value that the parameter by itself can have."""
+    """Draw a value within the bounds of the parameter."""
     if param.choices:
         return rng.choice(param.choices)
     if not param.bounds:
@@ -29,7 +29,7 @@ def possible(param, rng):
     return rng.choice([low, rng.uniform(low, high)])
 
 
-def test_a_thousand_changes_possible_and_not_are_taken_or_refused_and_never_step_the_torque():
+def test_a_thousand_valid_and_invalid_changes_are_applied_or_rejected_and_never_step_the_torque():
     rng = random.Random(7)
     values = values_of(COMPENSATOR, {"use_imu": False})
     compensator = Compensator(settings_of(values))
@@ -54,17 +54,17 @@ def test_a_thousand_changes_possible_and_not_are_taken_or_refused_and_never_step
             assert step <= values["max_effort_rate"] * min(period, LONGEST_STEP) * (1 + 1e-9)
             last, moved = effort, moved + step
     assert 300 < refused < 700
-    assert moved > 100.0  # Nm: it did follow
+    assert moved > 100.0  # Nm; the torque followed the changes
 
 
 @pytest.mark.parametrize(
     "name", ["use_sim_time", "start_type_description_service", "qos_overrides./tf.publisher.depth"]
 )
-def test_what_ros_itself_declares_on_every_node_is_left_alone(name):
+def test_parameters_that_ros_declares_on_every_node_are_ignored(name):
     assert name not in values_of(COMPENSATOR, {name: True})
 
 
-def test_the_total_mass_is_bounded_by_its_parameter():
+def test_max_total_mass_bounds_the_total_mass():
     wearer = {"wearer.body_mass": 75.0, "mode": "zero_g"}
     assert settings_of(values_of(COMPENSATOR, wearer)).arm.total_mass == pytest.approx(5.559, abs=1e-3)
     values = values_of(COMPENSATOR, {**wearer, "max_total_mass": 5.0})

@@ -1,4 +1,4 @@
-"""The laws against Pinocchio, the Robotics Toolbox, and the paper's equations copied out by hand."""
+"""The gravity laws against Pinocchio, the Robotics Toolbox, and the paper's equations copied by hand."""
 
 import math
 from math import cos, sin
@@ -30,12 +30,12 @@ def random_directions(rng, count=200):
 
 
 def upright(rng, count=200):
-    """Poses whose theta_1 is what the paper means by it: the angle between joint 1's axis and gravity, here 0."""
+    """Poses with the paper's theta_1, the angle between joint 1's axis and gravity, equal to 0."""
     return random_poses(rng, count) * (0.0, 1.0, 1.0, 1.0)
 
 
 @pytest.mark.parametrize("reference", [pinocchio, gravload])
-def test_the_exact_law_agrees_on_random_arms_and_poses_and_tilts_over_the_whole_sphere_with(reference):
+def test_the_exact_law_agrees_for_random_arms_poses_and_gravity_directions_with(reference):
     rng = np.random.default_rng(1)
     for _ in range(10):
         arm, theta, direction = random_arm(rng), random_poses(rng), random_directions(rng)
@@ -43,7 +43,7 @@ def test_the_exact_law_agrees_on_random_arms_and_poses_and_tilts_over_the_whole_
         assert gravity_torque(arm, theta, direction) == pytest.approx(expected, abs=ROUNDING)
 
 
-def test_eq2_to_eq5_agree_with_gravload_where_each_centre_of_gravity_is_at_its_links_end():
+def test_eq2_to_eq5_agree_with_gravload_if_each_centre_of_gravity_is_at_its_links_end():
     rng = np.random.default_rng(2)
     for _ in range(10):
         arm, theta = random_arm(rng, at_link_ends=True), upright(rng)
@@ -51,7 +51,7 @@ def test_eq2_to_eq5_agree_with_gravload_where_each_centre_of_gravity_is_at_its_l
         assert paper_static_torque(arm, theta) == pytest.approx(expected, abs=ROUNDING)
 
 
-def test_eq2_to_eq5_are_off_by_a_sixth_of_joint_2s_torque_where_they_are_in_mid_link():
+def test_eq2_to_eq5_miss_a_sixth_of_joint_2s_torque_if_centres_of_gravity_are_mid_link():
     arm = ArmModel((0.05, 0.13, 0.30, 0.30), (0.025, 0.065, 0.15, 0.15), (0.8, 0.6, 0.7, 0.5))
     theta = upright(np.random.default_rng(3), 2000)
     exact = gravity_torque(arm, theta)
@@ -63,7 +63,7 @@ def test_eq2_to_eq5_are_off_by_a_sixth_of_joint_2s_torque_where_they_are_in_mid_
 @pytest.mark.parametrize(
     "law", [paper_static_torque, lambda arm, theta: paper_mobile_torque(arm, theta, 0.0, 0.0)], ids=("static", "mobile")
 )
-def test_a_paper_law_is_the_exact_one_at_link_ends_and_upright(law):
+def test_a_paper_law_equals_the_exact_law_at_link_ends_and_upright(law):
     rng = np.random.default_rng(4)
     arm, theta = random_arm(rng, at_link_ends=True), upright(rng)
     assert law(arm, theta) == pytest.approx(gravity_torque(arm, theta), abs=ROUNDING)
@@ -71,7 +71,7 @@ def test_a_paper_law_is_the_exact_one_at_link_ends_and_upright(law):
 
 @pytest.mark.parametrize("side", ["left", "right"])
 @pytest.mark.parametrize("name", list(LAWS))
-def test_one_pose_in_plain_floats_is_what_the_arrays_give(name, side):
+def test_a_single_pose_in_plain_floats_agrees_with_the_arrays(name, side):
     rng = np.random.default_rng(5)
     arm = random_arm(rng)
     for theta, (pitch, roll) in zip(random_poses(rng, 100), rng.uniform(-1.5, 1.5, (100, 2)), strict=True):
@@ -86,7 +86,7 @@ def test_one_pose_in_plain_floats_is_what_the_arrays_give(name, side):
 
 
 @pytest.mark.parametrize("law", ["exact", "static", "mobile"])
-def test_many_poses_at_once_each_with_a_tilt_of_its_own_get_what_each_gets_alone(law):
+def test_a_batch_of_poses_with_different_tilts_agrees_with_single_poses(law):
     rng = np.random.default_rng(6)
     count = 2 * BLOCK + 3
     arm, theta, direction = random_arm(rng), random_poses(rng, count), random_directions(rng, count)

@@ -1,4 +1,4 @@
-"""The bytes on the wire: every code survives, nothing overflows, and no command is a special frame."""
+"""The motors' frames: every code survives a round trip, nothing overflows, and no command is a special frame."""
 
 import math
 
@@ -15,7 +15,7 @@ SPECS = pytest.mark.parametrize("spec", MOTORS.values(), ids=MOTORS)
 
 
 def command_word(**codes) -> bytes:
-    """A command laid out by the manual's table, without the code under test."""
+    """A command built from the manual's table, independent of the code under test."""
     bits = "".join(f"{codes[name]:0{width}b}" for name, width in LAYOUT)
     return int(bits, 2).to_bytes(8, "big")
 
@@ -42,14 +42,14 @@ def test_every_code_of_every_reply_field_survives_unpack_and_pack(spec, offset, 
 
 
 @SPECS
-def test_the_largest_values_stay_the_largest(spec):
+def test_the_largest_values_do_not_overflow(spec):
     command = unpack_command(spec, pack_command(spec, 12.5, -spec.velocity_range, 0.0, 0.0, spec.torque_range))
     assert command.torque == pytest.approx(spec.torque_range)
     assert command.position == pytest.approx(12.5)
     assert command.velocity == pytest.approx(-spec.velocity_range)
 
 
-def test_no_torque_is_packed_to_the_code_nearest_to_none():
+def test_zero_torque_is_packed_to_the_nearest_code():
     for spec in MOTORS.values():
         off = unpack_command(spec, pack_command(spec, 0.0, 0.0, 0.0, 0.0, 0.0))
         assert abs(off.torque) <= spec.torque_range / 4095 * 1.0001
@@ -69,7 +69,7 @@ def test_no_command_is_ever_a_special_frame(spec, position, velocity, kp, kd, to
 
 
 @pytest.mark.parametrize("codes_below_top", [1, 2, 3])
-def test_a_command_that_would_spell_a_special_frame_asks_for_a_little_less(codes_below_top):
+def test_a_command_that_would_spell_a_special_frame_gets_a_slightly_lower_torque(codes_below_top):
     torque = 15.0 - codes_below_top * 30.0 / 4095
     data = pack_command(AK60, 12.5, 45.0, 500.0, 5.0, torque)
     assert data not in SPECIAL_FRAMES
@@ -78,7 +78,7 @@ def test_a_command_that_would_spell_a_special_frame_asks_for_a_little_less(codes
 
 @pytest.mark.parametrize("field", range(5))
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e3, -1e3])
-def test_a_command_out_of_range_or_not_finite_is_refused(field, value):
+def test_a_command_out_of_range_or_not_finite_is_rejected(field, value):
     fields = [0.0] * 5
     fields[field] = value
     with pytest.raises(ParameterError, match="must be from"):
@@ -86,12 +86,12 @@ def test_a_command_out_of_range_or_not_finite_is_refused(field, value):
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 99.0])
-def test_a_reply_out_of_range_or_not_finite_is_refused(value):
+def test_a_reply_out_of_range_or_not_finite_is_rejected(value):
     with pytest.raises(ParameterError):
         pack_reply(AK60, 1, value, 0.0, 0.0)
 
 
-def test_a_reply_of_six_bytes_has_no_temperature_and_one_of_eight_has():
+def test_a_6_byte_reply_has_no_temperature_and_an_8_byte_reply_has_one():
     short = unpack_reply(AK80, pack_reply(AK80, 2, 1.0, -2.0, 3.0))
     long = unpack_reply(AK80, pack_reply(AK80, 2, 1.0, -2.0, 3.0, temperature=-40, error=7))
     assert (short.temperature, short.error) == (None, None)
@@ -102,7 +102,7 @@ def test_a_reply_of_six_bytes_has_no_temperature_and_one_of_eight_has():
 
 
 @given(st.binary(max_size=16))
-def test_any_bytes_are_decoded_within_range_or_refused(data):
+def test_any_bytes_are_decoded_within_range_or_rejected(data):
     try:
         reply = unpack_reply(AK60, data)
     except FrameError as error:
@@ -114,27 +114,27 @@ def test_any_bytes_are_decoded_within_range_or_refused(data):
 
 
 @pytest.mark.parametrize("data", [b"", b"\x00" * 7, *SPECIAL_FRAMES])
-def test_what_is_no_command_is_refused(data):
+def test_bytes_that_are_not_a_command_are_rejected(data):
     with pytest.raises(FrameError):
         unpack_command(AK60, data)
 
 
-def test_a_mirrored_motor_turns_and_pushes_the_other_way():
+def test_a_reversed_motor_has_reversed_angle_and_torque():
     motor = JointMotor(AK60, 1, direction=-1, zero=0.5, torque_scale=0.75)
     assert motor.joint_position(0.2) == pytest.approx(0.3)
     assert motor.motor_position(motor.joint_position(0.2)) == pytest.approx(0.2)
-    asked = unpack_command(AK60, motor.command(1.5, 0.0)).torque
-    assert asked == pytest.approx(-2.0, abs=0.004)
-    assert motor.joint_effort(asked) == pytest.approx(1.5, abs=0.003)
+    commanded = unpack_command(AK60, motor.command(1.5, 0.0)).torque
+    assert commanded == pytest.approx(-2.0, abs=0.004)
+    assert motor.joint_effort(commanded) == pytest.approx(1.5, abs=0.003)
 
 
 @pytest.mark.parametrize("spec", MOTORS.values(), ids=MOTORS)
 def test_damping_alone_does_not_push_an_arm_at_rest(spec):
-    asked = unpack_command(spec, JointMotor(spec, 1).command(0.0, 5.0))
-    assert abs(asked.torque + asked.kd * asked.velocity) < spec.torque_range / 4095 * 1.01
+    command = unpack_command(spec, JointMotor(spec, 1).command(0.0, 5.0))
+    assert abs(command.torque + command.kd * command.velocity) < spec.torque_range / 4095 * 1.01
 
 
-def test_a_command_beyond_the_wire_is_clamped_but_never_made_of_nothing():
+def test_an_effort_beyond_the_wire_range_is_clamped_and_one_that_is_not_finite_is_rejected():
     motor = JointMotor(AK60, 1)
     assert unpack_command(AK60, motor.command(99.0, 0.0)).torque == pytest.approx(15.0)
     for effort in (math.nan, math.inf):
@@ -146,7 +146,7 @@ def test_a_command_beyond_the_wire_is_clamped_but_never_made_of_nothing():
     ("field", "value"),
     [("can_id", 0), ("can_id", 127), ("direction", 0), ("zero", 11.0), ("zero", math.nan), ("torque_scale", 0.0)],
 )
-def test_an_impossible_motor_is_refused(field, value):
+def test_an_impossible_motor_is_rejected_by_name(field, value):
     with pytest.raises(ParameterError) as caught:
         JointMotor(AK60, **{"can_id": 1, field: value})
     assert caught.value.name == field

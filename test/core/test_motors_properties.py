@@ -1,4 +1,4 @@
-"""Whatever bytes and numbers come, the motors' codec gives a value within the wire's range or a clear error."""
+"""For any bytes and numbers the motors' codec returns a value within the wire range or raises a clear error."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.motors import MOTORS, SPECIAL_FRAMES, pack_command, pack_reply, unpack_command, unpack_reply
 
 COMMAND, REPLY = ("position", "velocity", "kp", "kd", "torque"), ("position", "velocity", "torque")
-SPECIAL_NUDGE = 3  # codes less that a command asks for where it would spell a special frame
+SPECIAL_NUDGE = 3  # codes by which the torque is reduced at most if the command would spell a special frame
 LONGEST = 80  # bytes; CAN FD has up to 64
 
 seeded = settings(max_examples=200, derandomize=True, database=None, deadline=None)
@@ -25,13 +25,13 @@ SHARES = st.floats(-1.0, 1.0) | st.sampled_from((-1.0, 0.0, 1.0))
 
 @st.composite
 def specs(draw):
-    """A motor with its default ranges or those of any other firmware."""
+    """A motor with its default ranges or with those of another firmware."""
     spec = draw(st.sampled_from(list(MOTORS.values())))
     return draw(st.just(spec) | st.builds(spec.with_ranges, st.floats(1.0, 100.0), st.floats(1.0, 100.0)))
 
 
 def bounds(spec, field):
-    """Least and greatest value of a field, and how far apart two codes are."""
+    """Lowest and highest value of a field, and the step between two codes."""
     low, high, bits = {
         "position": (-spec.position_range, spec.position_range, 16),
         "velocity": (-spec.velocity_range, spec.velocity_range, 12),
@@ -55,7 +55,7 @@ def scaled(spec, field, share):
 
 @seeded
 @given(specs(), st.tuples(*[NUMBERS] * 5))
-def test_any_numbers_make_a_command_of_8_bytes_within_one_code_or_an_error_that_names_the_field(spec, values):
+def test_any_numbers_give_a_command_of_8_bytes_or_an_error_that_names_the_field(spec, values):
     inside = [bounds(spec, f)[0] <= v <= bounds(spec, f)[1] for f, v in zip(COMMAND, values, strict=True)]
     if all(inside):
         assert len(pack_command(spec, *values)) == 8
@@ -67,31 +67,31 @@ def test_any_numbers_make_a_command_of_8_bytes_within_one_code_or_an_error_that_
 
 @seeded
 @given(specs(), st.tuples(*[SHARES] * 5))
-def test_what_a_command_asks_comes_back_within_half_a_code(spec, shares):
-    asked = [scaled(spec, field, share) for field, share in zip(COMMAND, shares, strict=True)]
-    data = pack_command(spec, *asked)
+def test_a_command_survives_a_round_trip_within_half_a_code(spec, shares):
+    sent = [scaled(spec, field, share) for field, share in zip(COMMAND, shares, strict=True)]
+    data = pack_command(spec, *sent)
     assert data not in SPECIAL_FRAMES
     got = unpack_command(spec, data)
     top = all(g >= bounds(spec, f)[1] - 1e-9 for f, g in zip(COMMAND[:4], got[:4], strict=True))
-    for field, wanted, value in zip(COMMAND, asked, got, strict=True):
+    for field, wanted, value in zip(COMMAND, sent, got, strict=True):
         codes = 0.5 + (SPECIAL_NUDGE if top and field == "torque" else 0)
         assert abs(value - wanted) <= (codes + 1e-6) * bounds(spec, field)[2]
 
 
 @seeded
 @given(specs(), st.tuples(*[SHARES] * 3), st.integers(0, 255), st.integers(-40, 215) | st.none(), st.integers(0, 255))
-def test_what_a_motor_replies_comes_back_within_half_a_code(spec, shares, motor_id, temperature, error):
-    told = [scaled(spec, field, share) for field, share in zip(REPLY, shares, strict=True)]
-    got = unpack_reply(spec, pack_reply(spec, motor_id, *told, temperature, error))
+def test_a_reply_survives_a_round_trip_within_half_a_code(spec, shares, motor_id, temperature, error):
+    sent = [scaled(spec, field, share) for field, share in zip(REPLY, shares, strict=True)]
+    got = unpack_reply(spec, pack_reply(spec, motor_id, *sent, temperature, error))
     assert (got.motor_id, got.temperature) == (motor_id, temperature)
     assert got.error == (None if temperature is None else error)
-    for field, wanted, value in zip(REPLY, told, got[1:4], strict=True):
+    for field, wanted, value in zip(REPLY, sent, got[1:4], strict=True):
         assert abs(value - wanted) <= (0.5 + 1e-6) * bounds(spec, field)[2]
 
 
 @seeded
 @given(specs(), BYTES)
-def test_any_bytes_are_a_reply_within_range_or_an_error_that_shows_them(spec, data):
+def test_any_bytes_decode_to_a_reply_within_range_or_an_error_that_shows_them(spec, data):
     try:
         reply = unpack_reply(spec, data)
     except FrameError as error:
@@ -104,7 +104,7 @@ def test_any_bytes_are_a_reply_within_range_or_an_error_that_shows_them(spec, da
 
 @seeded
 @given(specs(), BYTES | st.sampled_from(SPECIAL_FRAMES))
-def test_any_bytes_are_a_command_within_range_or_an_error_that_shows_them(spec, data):
+def test_any_bytes_decode_to_a_command_within_range_or_an_error_that_shows_them(spec, data):
     try:
         command = unpack_command(spec, data)
     except FrameError as error:
@@ -116,10 +116,10 @@ def test_any_bytes_are_a_command_within_range_or_an_error_that_shows_them(spec, 
 
 @seeded
 @given(specs(), st.binary(min_size=8, max_size=8) | EXTREME_CODES)
-def test_bytes_that_were_understood_are_packed_to_the_same_bytes(spec, data):
+def test_decoded_bytes_are_packed_to_the_same_bytes(spec, data):
     assume(data not in SPECIAL_FRAMES)
     command, reply = unpack_command(spec, data), unpack_reply(spec, data)
-    assume(data[:7] != b"\xff" * 7)  # beside a special frame a command may have been nudged
+    assume(data[:7] != b"\xff" * 7)  # next to a special frame the torque may have been reduced
     assert pack_command(spec, *command) == data
     assert pack_reply(spec, *reply) == data
 
@@ -137,7 +137,7 @@ def joints(draw):
 
 @seeded
 @given(joints(), NUMBERS, NUMBERS)
-def test_a_joint_makes_a_command_of_any_effort_without_stiffness_or_refuses_it(motor, effort, damping):
+def test_a_joint_packs_any_effort_without_stiffness_or_rejects_it(motor, effort, damping):
     try:
         command = unpack_command(motor.spec, motor.command(effort, damping))
     except ParameterError:
@@ -152,7 +152,7 @@ def test_a_joint_makes_a_command_of_any_effort_without_stiffness_or_refuses_it(m
 
 @seeded
 @given(joints(), BYTES)
-def test_a_joint_reads_any_bytes_as_finite_numbers_or_refuses_them(motor, data):
+def test_a_joint_decodes_any_bytes_to_finite_numbers_or_rejects_them(motor, data):
     try:
         reply = motor.joint_reply(data)
     except FrameError:
@@ -164,6 +164,6 @@ def test_a_joint_reads_any_bytes_as_finite_numbers_or_refuses_them(motor, data):
 
 @seeded
 @given(joints(), st.floats(-3.0, 3.0))
-def test_a_joint_angle_comes_back_within_one_code(motor, angle):
+def test_a_joint_angle_survives_a_round_trip_within_one_code(motor, angle):
     data = pack_reply(motor.spec, motor.can_id, motor.motor_position(angle), 0.0, 0.0)
     assert motor.joint_reply(data).position == pytest.approx(angle, abs=bounds(motor.spec, "position")[2])

@@ -1,9 +1,9 @@
-"""How fast something that is counted happens."""
+"""The rate of counted events."""
 
 from exo_gravity.core.rate import Rate
 
 
-def test_a_rate_is_counted_over_a_second_or_more_and_begins_anew_with_its_counter():
+def test_a_rate_is_averaged_over_a_second_or_more_and_restarts_with_its_counter():
     rate = Rate()
     assert [rate.update(now, count) for now, count in ((10.0, 0), (10.5, 250), (11.0, 500), (11.1, 540))] == [
         0.0,

@@ -1,4 +1,4 @@
-"""Trunk tilt, against SciPy's Rotation and against what a bowing and a leaning trunk must feel."""
+"""Trunk tilt against SciPy's Rotation, and the signs of pitch and roll."""
 
 import math
 
@@ -22,20 +22,20 @@ def rotation(pitch, roll, heading=0.0):
     return Rotation.from_euler("xyz", (roll, pitch, heading))  # fixed axes: roll about x first, then pitch about y
 
 
-def test_gravity_in_the_trunk_is_that_of_a_roll_then_a_pitch_about_fixed_axes():
+def test_gravity_in_the_trunk_agrees_with_a_roll_then_a_pitch_about_fixed_axes():
     for pitch, roll in random_tilts():
         assert gravity_in_trunk(pitch, roll) == pytest.approx(rotation(pitch, roll).inv().apply((0, 0, -1)), abs=1e-12)
 
 
-def test_bowing_forward_is_positive_pitch_and_brings_gravity_forward():
+def test_bowing_forward_is_positive_pitch_and_turns_gravity_forward():
     assert gravity_in_trunk(0.3, 0.0)[0] > 0
 
 
-def test_leaning_to_the_right_is_positive_roll_and_brings_gravity_to_the_right():
+def test_leaning_to_the_right_is_positive_roll_and_turns_gravity_to_the_right():
     assert gravity_in_trunk(0.0, 0.3)[1] < 0
 
 
-def test_pitch_and_roll_come_back_from_the_gravity_that_they_make():
+def test_pitch_and_roll_are_recovered_from_gravity():
     for tilt in random_tilts():
         assert pitch_roll(gravity_in_trunk(*tilt)) == pytest.approx(tuple(tilt), abs=1e-6)
 
@@ -45,18 +45,18 @@ def test_gravity_straight_forward_is_a_pitch_of_90_degrees():
 
 
 @pytest.mark.parametrize("gravity", [(0, 0, 0), (math.nan, 0, 1), (math.inf, 0, 1)])
-def test_gravity_without_a_direction_is_refused(gravity):
+def test_gravity_without_a_direction_is_rejected(gravity):
     with pytest.raises(ParameterError, match="gravity_in_trunk"):
         pitch_roll(gravity)
 
 
-def test_the_left_arm_sees_gravity_turned_into_its_base_frame():
+def test_the_left_arms_direction_is_gravity_in_its_base_frame():
     for pitch, roll in random_tilts():
         expected = LEFT_BASE_FROM_TRUNK @ gravity_in_trunk(pitch, roll)
         assert Tilt.of("left", pitch, roll).direction == pytest.approx(expected, abs=1e-12)
 
 
-def test_the_right_arm_sees_what_the_left_sees_at_the_opposite_roll():
+def test_the_right_arms_direction_is_the_left_arms_at_the_opposite_roll():
     for pitch, roll in random_tilts():
         assert Tilt.of("right", pitch, roll).direction == Tilt.of("left", pitch, -roll).direction
 
@@ -68,29 +68,29 @@ def test_the_axis_angle_is_the_angle_between_the_trunks_vertical_and_gravity():
 
 
 @pytest.mark.parametrize(("side", "phi"), [("left", 0.2), ("right", -0.2)])
-def test_the_papers_letters_are_minus_pitch_and_the_roll_outward(side, phi):
+def test_beta_is_minus_the_pitch_and_phi_is_the_outward_roll(side, phi):
     tilt = Tilt.of(side, 0.1, 0.2)
     assert (tilt.beta, tilt.phi) == (-0.1, phi)
 
 
 @pytest.mark.parametrize("arguments", [("middle", 0, 0), ("left", math.nan, 0), ("left", 0, 4.0), ("left", None, 0)])
-def test_an_impossible_tilt_is_refused(arguments):
+def test_an_impossible_tilt_is_rejected(arguments):
     with pytest.raises(ParameterError):
         Tilt.of(*arguments)
 
 
-def test_the_rotation_matrix_is_that_of_scipy():
+def test_the_rotation_matrix_agrees_with_scipy():
     for turn in Rotation.random(200, random_state=4):
         assert rotation_matrix(turn.as_quat()) == pytest.approx(turn.as_matrix(), abs=1e-12)
 
 
-def test_a_quaternion_rounded_by_its_driver_is_made_a_unit_one():
+def test_a_quaternion_rounded_by_a_driver_is_normalised():
     quaternion = Rotation.from_euler("x", 0.4).as_quat()
     assert rotation_matrix(1.005 * quaternion) == pytest.approx(rotation_matrix(quaternion), abs=1e-12)
 
 
 @pytest.mark.parametrize("quaternion", [(0, 0, 0, 0), (0, 0, 0, 1.1), (math.nan, 0, 0, 1), (0, 0, 1), (1, 1, 1, 1)])
-def test_what_is_no_unit_quaternion_is_refused_by_name(quaternion):
+def test_a_quaternion_that_is_not_a_unit_one_is_rejected_by_name(quaternion):
     with pytest.raises(ParameterError, match="rotation_trunk_from_imu"):
         rotation_matrix(quaternion, "rotation_trunk_from_imu")
 

@@ -1,4 +1,4 @@
-"""Recorded arrays -> holds, drift and the answer to pushes, against arrays whose drift is known."""
+"""Holds, drift and the response to pushes, from synthetic recordings with known drift."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ DEG_PER_MIN = math.radians(1.0) / 60.0
 
 
 def smooth(begin, end, seconds):
-    """A movement of least jerk, (n, 4)."""
+    """A minimum-jerk motion, (n, 4)."""
     s = np.arange(round(seconds * RATE))[:, None] / (seconds * RATE)
     return begin + (end - begin) * (10 * s**3 - 15 * s**4 + 6 * s**5)
 
 
 def still(pose, seconds, drift=0.0):
-    """A pose that creeps by `drift` (rad/s) in every joint or in each, (n, 4)."""
+    """A pose that creeps by `drift` (rad/s, one number or one per joint), (n, 4)."""
     return pose + np.arange(round(seconds * RATE))[:, None] / RATE * drift
 
 
 def recording(*pieces, steps=(), noise=0.0, seed=1, effort=None, command=None, carried=None):
-    """What motors would report of these pieces of position, one after the other: quantised, never a velocity of 0."""
+    """Motor readings for these consecutive pieces of position: quantised, and never a velocity of 0."""
     exact = np.concatenate(pieces)
     rng = np.random.default_rng(seed)
     time = np.arange(len(exact)) / RATE
@@ -53,12 +53,12 @@ def two_poses(**options):
     )  # holds 0-10 s and 12-22 s
 
 
-def test_each_stillness_is_a_hold_and_the_movement_between_is_none():
+def test_each_still_span_is_a_hold_and_the_motion_between_them_is_not():
     holds = analyse(two_poses()).holds
     assert [(round(h.start), round(h.end)) for h in holds] == [(0, 10), (12, 22)]
 
 
-def test_a_hold_has_the_pose_it_was_held_in():
+def test_the_pose_of_a_hold_is_its_mean_position():
     holds = analyse(two_poses()).holds
     np.testing.assert_allclose([h.pose for h in holds], [POSE_A, POSE_B], atol=2 * POSITION_CODE)
 
@@ -88,7 +88,7 @@ def test_quantisation_alone_is_within_the_uncertainty_wherever_the_code_changes(
     assert np.all(np.abs(hold.drift_rate - drift) < hold.drift_rate_uncertainty)
 
 
-def test_a_touch_of_a_tenth_of_a_degree_for_five_seconds_hardly_changes_the_drift():
+def test_a_5_s_touch_of_a_tenth_of_a_degree_hardly_changes_the_drift():
     drift = 1.0 * DEG_PER_MIN
     exact = still(POSE_A, 60.0, drift)
     exact[20_000:22_500] += math.radians(0.1)
@@ -109,7 +109,7 @@ def test_a_motor_at_rest_shows_half_a_velocity_code():
     np.testing.assert_allclose(hold.velocity_rms, VELOCITY_CODE / 2)
 
 
-def test_torque_error_is_the_rms_of_commanded_less_measured_where_both_are_known():
+def test_torque_error_is_the_rms_of_commanded_minus_measured_where_both_are_known():
     effort = np.full((5000, 4), 2.0)
     command = effort + np.array([0.0, 0.1, -0.2, 0.3])
     command[:100] = math.nan
@@ -118,12 +118,12 @@ def test_torque_error_is_the_rms_of_commanded_less_measured_where_both_are_known
     np.testing.assert_allclose(hold.torque_rms, 2.0)
 
 
-def test_a_torque_that_nobody_recorded_is_unknown_and_not_zero():
+def test_a_torque_that_was_not_recorded_is_unknown_and_not_zero():
     (hold,) = analyse(recording(still(POSE_A, 10.0), command=np.full((5000, 4), math.nan))).holds
     assert np.all(np.isnan(hold.torque_error))
 
 
-def test_a_push_is_told_with_its_peak_its_residual_and_its_time_until_still():
+def test_a_push_has_a_peak_a_residual_and_a_time_until_still():
     aside = POSE_A + np.array([0.0, 0.2, -0.1, 0.0])
     back = POSE_A + np.array([0.0, 0.05, -0.02, 0.0])
     pieces = (still(POSE_A, 10.0), smooth(POSE_A, aside, 1.0), smooth(aside, back, 2.0), still(back, 10.0))
@@ -134,16 +134,16 @@ def test_a_push_is_told_with_its_peak_its_residual_and_its_time_until_still():
     assert push.until_still == pytest.approx(3.0, abs=0.4)
 
 
-def test_a_motion_to_a_pose_far_off_is_a_move():
+def test_a_motion_to_a_distant_pose_is_a_move():
     assert [motion.kind for motion in analyse(two_poses()).motions] == ["move"]
 
 
-def test_an_arm_that_is_moving_when_the_recording_ends_did_not_become_still():
+def test_an_arm_still_moving_at_the_end_of_the_recording_has_no_time_until_still():
     motion = analyse(recording(still(POSE_A, 10.0), still(POSE_A, 5.0, drift=-0.3))).motions[-1]
     assert math.isnan(motion.until_still) and np.all(np.isnan(motion.residual))
 
 
-def test_nothing_recorded_for_a_second_parts_a_hold():
+def test_a_gap_of_a_second_in_the_recording_splits_a_hold():
     whole = recording(still(POSE_A, 20.0))
     keep = (whole.time < 9.0) | (whole.time > 10.0)
     arrays = (getattr(whole, name)[keep] for name in ("time", "position", "velocity", "effort", "command"))
@@ -151,12 +151,12 @@ def test_nothing_recorded_for_a_second_parts_a_hold():
     assert len(trial.holds) == 2 and [motion.kind for motion in trial.motions] == ["gap"]
 
 
-def test_a_fast_vibration_is_no_hold_though_each_period_ends_where_it_began():
+def test_a_fast_vibration_is_not_a_hold():
     time = np.arange(5000)[:, None] / RATE
     assert not analyse(recording(POSE_A + 0.02 * np.sin(2 * math.pi * 5.0 * time))).holds
 
 
-def test_a_recording_at_20_hz_is_judged_the_same():
+def test_a_recording_at_20_hz_has_the_same_holds():
     whole = two_poses()
     arrays = (getattr(whole, name)[::25] for name in ("time", "position", "velocity", "effort", "command"))
     assert len(analyse(Recording("right", whole.joint_names, *arrays)).holds) == 2
@@ -166,7 +166,7 @@ SCRIPT = (ScriptedStep("move", 0.0, 2.0), ScriptedStep("hold", 2.0, 12.0))
 
 
 def let_go(pose_at_end, seconds=1.0):
-    """Moved to POSE_A, let go at 2 s, and then by itself to another pose."""
+    """Move to POSE_A, release at 2 s, then drift to another pose."""
     return recording(
         smooth(POSE_B, POSE_A, 2.0),
         smooth(POSE_A, pose_at_end, seconds),
@@ -175,18 +175,18 @@ def let_go(pose_at_end, seconds=1.0):
     )
 
 
-def test_an_arm_that_stays_where_it_was_let_go_held():
+def test_an_arm_that_stays_where_it_was_let_go_passes():
     held = let_go(POSE_A)
     assert failures(held, analyse(held), HoldCriteria()) == []
 
 
-def test_an_arm_that_falls_and_hangs_still_did_not_hold():
+def test_an_arm_that_falls_and_then_hangs_still_fails():
     fallen = let_go(np.zeros(4))
     (sentence,) = failures(fallen, analyse(fallen), HoldCriteria())
     assert "from where it was let go" in sentence
 
 
-def test_a_jerk_within_the_limit_is_no_failure():
+def test_a_jerk_within_the_criteria_is_not_a_failure():
     off = POSE_A + math.radians(0.4)
     jerked = recording(
         smooth(POSE_B, POSE_A, 2.0), still(POSE_A, 5.0), smooth(POSE_A, off, 0.1), still(off, 4.9), steps=SCRIPT
@@ -196,7 +196,7 @@ def test_a_jerk_within_the_limit_is_no_failure():
     assert failures(jerked, trial, HoldCriteria()) == []
 
 
-def test_an_arm_that_slips_while_it_is_left_alone_did_not_hold():
+def test_an_arm_that_slips_during_a_hold_fails():
     off = POSE_A + math.radians(1.5)
     slipped = recording(
         smooth(POSE_B, POSE_A, 2.0), still(POSE_A, 5.0), smooth(POSE_A, off, 0.2), still(off, 4.8), steps=SCRIPT
@@ -204,13 +204,13 @@ def test_an_arm_that_slips_while_it_is_left_alone_did_not_hold():
     assert any("slipped by 1.5" in sentence for sentence in failures(slipped, analyse(slipped), HoldCriteria()))
 
 
-def test_what_the_wearer_does_before_letting_go_is_no_drift():
+def test_motion_before_release_does_not_count_as_drift():
     slow = recording(smooth(POSE_A - 0.01, POSE_A, 2.0), still(POSE_A, 10.0), steps=SCRIPT)
     (hold,) = analyse(slow).holds
     assert hold.start >= 2.0 and np.all(hold.stray < 2 * POSITION_CODE)
 
 
-def test_half_a_degree_in_ten_seconds_is_the_limit_of_a_hold_and_two_after_a_push():
+def test_a_hold_may_stray_half_a_degree_in_10_s_and_two_degrees_after_a_push():
     creeping = still(POSE_A, 10.0, drift=math.radians(0.1))
     steps = (*SCRIPT, ScriptedStep("push", 12.0, 12.4), ScriptedStep("hold", 12.4, 22.4))
     pushed = creeping[-1] + np.array([0.0, 0.3, 0.1, 0.0])
@@ -222,24 +222,24 @@ def test_half_a_degree_in_ten_seconds_is_the_limit_of_a_hold_and_two_after_a_pus
     assert len(sentences) == 4 and all(sentence.startswith("right: 2.1-") for sentence in sentences)
 
 
-def test_a_limit_on_the_rate_names_the_joint_that_creeps():
+def test_a_limit_on_the_rate_names_the_joint_that_exceeds_it():
     creeping = recording(still(POSE_A, 60.0, drift=np.array([0.0, 0.0, 0.0, 0.5]) * DEG_PER_MIN))
     (sentence,) = failures(creeping, analyse(creeping), HoldCriteria(max_rate=0.2 * DEG_PER_MIN))
     assert "j4 drifted 0.50 degrees per minute, more than 0.20" in sentence
 
 
-def test_a_hold_too_short_to_tell_a_rate_is_not_judged_by_it():
+def test_a_hold_shorter_than_rated_from_is_not_judged_by_its_rate():
     creeping = recording(still(POSE_A, 20.0, drift=0.5 * DEG_PER_MIN))
     assert failures(creeping, analyse(creeping), HoldCriteria(max_rate=0.2 * DEG_PER_MIN))
     assert not failures(creeping, analyse(creeping), HoldCriteria(max_rate=0.2 * DEG_PER_MIN, rated_from=30.0))
 
 
 HANGING = np.array([0.0, 0.05, 0.0, 0.1])
-SPEED_DOWN = 1.875 * np.abs(POSE_A - HANGING) / 4.0  # of least jerk, in 4 s
+SPEED_DOWN = 1.875 * np.abs(POSE_A - HANGING) / 4.0  # peak speed of a minimum-jerk motion in 4 s
 
 
 def carried_until(end, steps=()):
-    """Hanging for 5 s, lifted to POSE_A in 2 s, held for 10 s, and let down from 17 s on, 4 s long."""
+    """Hang for 5 s, lift to POSE_A in 2 s, hold for 10 s, and let down from 17 s to 21 s."""
     pieces = (
         still(HANGING, 5.0),
         smooth(HANGING, POSE_A, 2.0),
@@ -250,68 +250,68 @@ def carried_until(end, steps=()):
     return recording(*pieces, steps=steps, carried=((4.0, end),))
 
 
-def test_an_arm_that_hangs_without_being_carried_is_not_held():
+def test_an_arm_that_hangs_without_being_carried_has_no_hold():
     assert [(round(h.start), round(h.end)) for h in analyse(carried_until(17.0)).holds] == [(7, 17)]
 
 
 STOPPED_IN_A_HOLD = (ScriptedStep("move", 5.0, 7.0), ScriptedStep("hold", 7.0, 60.0))
 
 
-def test_the_way_down_after_a_stop_in_the_middle_of_a_hold_is_no_slip():
+def test_the_let_down_after_a_stop_during_a_hold_is_not_a_slip():
     stopped = carried_until(17.0, STOPPED_IN_A_HOLD)
     trial = analyse(stopped)
     assert [motion.kind for motion in trial.motions] == ["let down"]
     assert failures(stopped, trial, HoldCriteria()) == []
 
 
-def test_the_same_motion_of_an_arm_that_is_carried_on_is_a_slip():
+def test_the_same_motion_of_an_arm_that_is_still_carried_is_a_slip():
     fallen = carried_until(26.0, STOPPED_IN_A_HOLD)
     assert any("slipped" in sentence for sentence in failures(fallen, analyse(fallen), HoldCriteria()))
 
 
-def test_a_hold_that_was_stopped_is_judged_as_long_as_it_lasted():
+def test_a_hold_cut_short_by_a_stop_is_judged_up_to_the_stop():
     script = (ScriptedStep("hold", 0.0, 60.0),)
     creeping = recording(still(POSE_A, 10.0, math.radians(0.3)), steps=script, carried=((0.0, 9.0),))
     (release,) = analyse(creeping).releases
     assert release.end == 9.0 and release.offset[0] == pytest.approx(math.radians(0.3) * 9.0, abs=math.radians(0.05))
 
 
-def test_a_hold_that_was_stopped_at_once_is_not_judged():
+def test_a_hold_stopped_right_after_its_start_is_not_judged():
     stopped = recording(smooth(POSE_B, POSE_A, 2.0), smooth(POSE_A, HANGING, 4.0), steps=SCRIPT, carried=((0.0, 2.5),))
     assert analyse(stopped).releases == ()
 
 
-def test_the_way_down_is_told_with_its_highest_speed():
+def test_a_let_down_has_the_peak_speed_of_each_joint():
     down = analyse(carried_until(17.0)).motions[-1]
     assert down.kind == "let down" and down.start == 17.0
     np.testing.assert_allclose(down.speed, SPEED_DOWN, atol=2 * VELOCITY_CODE)
 
 
-def test_what_a_wearer_does_to_an_arm_on_its_way_down_is_no_part_of_it():
+def test_a_let_down_ends_when_the_wearer_moves_the_arm():
     steps = (*STOPPED_IN_A_HOLD[:1], ScriptedStep("hold", 7.0, 18.0), ScriptedStep("move", 18.0, 20.0))
     down = analyse(carried_until(17.0, steps)).motions[-1]
     assert (down.kind, down.start, down.end) == ("let down", 17.0, 18.0)
 
 
-def test_an_arm_let_down_between_two_holds_was_not_pushed():
+def test_a_let_down_between_two_holds_is_not_a_push():
     pieces = (still(POSE_A, 5.0), smooth(POSE_A, POSE_A - 0.1, 4.0), smooth(POSE_A - 0.1, POSE_A, 2.0))
     twice = recording(*pieces, still(POSE_A, 5.0), carried=((0.0, 5.0), (10.0, 16.0)))
     trial = analyse(twice)
     assert len(trial.holds) == 2 and [motion.kind for motion in trial.motions] == ["let down"]
 
 
-def test_an_arm_that_was_never_carried_did_not_hold():
+def test_an_arm_that_was_never_carried_fails():
     hanging = recording(still(HANGING, 10.0), carried=())
     assert failures(hanging, analyse(hanging), HoldCriteria()) == ["right: the arm was never carried"]
 
 
-def test_no_hold_at_all_is_said():
+def test_a_recording_without_a_hold_fails():
     moving = recording(smooth(POSE_A, POSE_B, 2.0))
     assert "never still" in failures(moving, analyse(moving), HoldCriteria())[0]
 
 
 @pytest.mark.parametrize("change", ["shape", "order", "nan"])
-def test_arrays_that_do_not_fit_together_are_refused(change):
+def test_inconsistent_arrays_are_rejected(change):
     good = recording(still(POSE_A, 1.0))
     arrays = {name: getattr(good, name).copy() for name in ("time", "position", "velocity", "effort", "command")}
     if change == "shape":

@@ -1,4 +1,4 @@
-"""A trial's script is read whole or refused with the entry that is wrong."""
+"""A trial script is parsed completely, or rejected with the name of the invalid entry."""
 
 import pytest
 
@@ -11,7 +11,7 @@ GOOD = {
 }
 
 
-def test_a_protocol_knows_which_step_is_under_way():
+def test_a_script_returns_the_active_step_and_the_time_since_its_start():
     script = TrialScript.parse(GOOD)
     assert script.duration == 12.5
     assert script.pose_count == 1
@@ -34,7 +34,7 @@ def test_a_protocol_knows_which_step_is_under_way():
         ({"name": "x", "steps": [{"push": [0, 0, 0, 1], "over": -1}]}, "steps[0].over"),
     ],
 )
-def test_a_wrong_entry_is_named(content, name):
+def test_an_invalid_entry_is_named(content, name):
     with pytest.raises(ParameterError) as caught:
         TrialScript.parse(content)
     assert caught.value.name == name

@@ -1,4 +1,4 @@
-"""The wearer's arm, against the worked figures of the two tables and against segments weighed one by one."""
+"""The wearer's arm, against torques worked out from the two tables and against its single segments."""
 
 import math
 
@@ -10,18 +10,18 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.wearer import SEX, TABLES, Wearer
 
 LENGTHS = (0.28, 0.27, 0.086)
-LINKS = (0.05, 0.13, 0.28, 0.30)  # link 3 as long as the upper arm: the robot's elbow is the wearer's
+LINKS = (0.05, 0.13, 0.28, 0.30)  # link 3 is as long as the upper arm, so that the elbows coincide
 
 
 def worn(wearer, links=LINKS):
-    """The wearer's arm on a robot that weighs nothing."""
+    """The wearer's arm on a massless robot."""
     return ArmModel(links, (0, 0, 0, 0), (0, 0, 0, 0)).with_wearer(*wearer.on_links(links))
 
 
 @pytest.mark.parametrize(
     ("table", "shoulder", "elbow", "mass"), [("de_leva", 10.8, 2.99, 3.70), ("winter", 9.8, 2.75, 3.75)]
 )
-def test_a_man_of_75_kg_needs_the_worked_torques_with_his_arm_straight_and_horizontal(table, shoulder, elbow, mass):
+def test_a_75_kg_mans_straight_horizontal_arm_needs_the_torques_worked_out_by_hand(table, shoulder, elbow, mass):
     arm = worn(Wearer(75.0, "male", table, LENGTHS))
     torque = gravity_torque(arm, (0, 0, math.pi / 2, 0))
     assert torque[2] == pytest.approx(shoulder, abs=0.05)
@@ -39,11 +39,11 @@ def test_the_links_carry_the_mass_and_the_first_moment_of_their_segments(table, 
     assert mass * cog == pytest.approx((0, 0, upper * upper_cog, forearm * forearm_cog + hand * (0.27 + hand_cog)))
 
 
-def test_a_womans_arm_is_a_smaller_share_of_her_mass_than_a_mans():
+def test_a_womans_arm_is_lighter_than_a_mans_at_the_same_body_mass():
     assert worn(Wearer(70.0, "female")).total_mass < worn(Wearer(70.0, "male")).total_mass
 
 
-def test_twice_the_body_mass_is_twice_the_torque():
+def test_twice_the_body_mass_needs_twice_the_torque():
     one, two = (gravity_torque(worn(Wearer(mass)), (0.1, 0.2, 0.8, 0.4)) for mass in (40.0, 80.0))
     assert two == pytest.approx(2 * one)
 
@@ -51,7 +51,7 @@ def test_twice_the_body_mass_is_twice_the_torque():
 @pytest.mark.parametrize(
     ("links", "words"), [((0.05, 0.13, 0.15, 0.30), "upper arm"), ((0.05, 0.13, 0.30, 0.15), "forearm and hand")]
 )
-def test_a_centre_of_gravity_beyond_the_robots_link_is_refused_with_the_segments_name(links, words):
+def test_a_centre_of_gravity_beyond_its_link_is_rejected_with_the_segments_name(links, words):
     with pytest.raises(ParameterError, match=rf"link_length.*{words}.*beyond link"):
         Wearer(75.0).on_links(links)
 
@@ -70,11 +70,11 @@ def test_a_centre_of_gravity_beyond_the_robots_link_is_refused_with_the_segments
         ("segment_length", (75, "male", "winter", (0.28, math.nan, 0.086))),
     ],
 )
-def test_an_impossible_wearer_is_refused_by_name(name, arguments):
+def test_an_impossible_wearer_is_rejected_by_name(name, arguments):
     with pytest.raises(ParameterError, match=name):
         Wearer(*arguments)
 
 
-def test_a_whole_arm_weighs_a_twentieth_of_the_body():
+def test_an_arm_weighs_a_twentieth_of_the_body():
     for table in TABLES:
         assert 0.045 < np.sum(Wearer(1e2, "male", table).on_links(LINKS).mass) / 1e2 < 0.055

@@ -1,6 +1,6 @@
-"""The motor bus against simulated motors: order of frames, and what is no reply.
+"""The motor bus with simulated motors: the order of its frames, and which frames count as replies.
 
-On python-can's virtual bus, or on the one that EXO_TEST_CAN_INTERFACE and EXO_TEST_CAN_CHANNEL name.
+Runs on python-can's virtual bus, or on the one that EXO_TEST_CAN_INTERFACE and EXO_TEST_CAN_CHANNEL name.
 """
 
 import os
@@ -23,19 +23,19 @@ AK60 = MOTORS["AK60-6"]
 MOUNTED = (("AK60-6", 1, 0.0), ("AK80-9", -1, 0.4), ("AK60-6", 1, -0.2), ("AK60-6", 1, 0.0))
 MOTORS_OF_ARM = tuple(JointMotor(MOTORS[name], n, *mounted) for n, (name, *mounted) in enumerate(MOUNTED, 1))
 LINKS = ArmConfig().links
-WEIGHTLESS = ArmModel(LINKS.length, LINKS.cog, LINKS.mass, gravity=0.0)  # it stays, however slow the machine is
+WEIGHTLESS = ArmModel(LINKS.length, LINKS.cog, LINKS.mass, gravity=0.0)  # stays in place, however slow the machine is
 INTERFACE = os.environ.get("EXO_TEST_CAN_INTERFACE", "virtual")
 CHANNELS = (os.environ.get("EXO_TEST_CAN_CHANNEL", f"test_motor_bus_{n}") for n in count())
 ON = Drive(NOTHING, NOTHING, True)
 
 
-def soon() -> float:
+def in_1_s() -> float:
     return time.monotonic() + 1.0
 
 
 @pytest.fixture
 def wires():
-    """Two ends of one bus: ours, and one to listen and talk at. Both let FD frames through."""
+    """Two ends of one bus: one for the motor bus, one for the test. Both pass FD frames."""
     channel = next(CHANNELS)
     ours, other = (can.Bus(interface=INTERFACE, channel=channel, fd=True) for _ in range(2))
     yield ours, other
@@ -57,7 +57,7 @@ def device(request, wires):
     thread.join()
 
 
-def sent(bus: can.BusABC) -> list[tuple[int, bytes]]:
+def received(bus: can.BusABC) -> list[tuple[int, bytes]]:
     frames = []
     while (message := bus.recv(0.0)) is not None:
         frames.append((message.arbitration_id, bytes(message.data)))
@@ -66,7 +66,7 @@ def sent(bus: can.BusABC) -> list[tuple[int, bytes]]:
 
 def test_every_motor_is_read_in_joint_coordinates(wires, device):
     bus = MotorBus(wires[0], MOTORS_OF_ARM)
-    assert bus.exchange(OFF, soon())
+    assert bus.exchange(OFF, in_1_s())
     for sample, angle in zip(bus.samples, (0.1, 0.2, 0.3, 0.4), strict=True):
         assert sample.position == pytest.approx(angle, abs=0.01)
 
@@ -76,36 +76,36 @@ def test_an_exchange_moves_the_simulated_arm(wires, device):
     before = device.arm.positions[3]
     end = time.monotonic() + 5.0
     while device.arm.positions[3] < before + 0.2 and time.monotonic() < end:
-        bus.exchange(Drive((0.0, 0.0, 0.0, 2.0), NOTHING, True), soon())
+        bus.exchange(Drive((0.0, 0.0, 0.0, 2.0), NOTHING, True), in_1_s())
     assert device.arm.positions[3] > before + 0.2
 
 
-def test_motors_are_told_to_give_nothing_before_they_are_switched_on_and_before_they_are_switched_off(wires):
+def test_a_zero_torque_command_precedes_switching_on_and_switching_off(wires):
     bus = MotorBus(wires[0], MOTORS_OF_ARM)
     bus.exchange(ON, time.monotonic())
-    frames = [data for can_id, data in sent(wires[1]) if can_id == 1]
+    frames = [data for can_id, data in received(wires[1]) if can_id == 1]
     assert frames.index(ENTER) == 1
     assert unpack_command(AK60, frames[0]).torque == pytest.approx(0.0, abs=0.004)
     bus.exchange(OFF, time.monotonic())
-    frames = [data for can_id, data in sent(wires[1]) if can_id == 1]
+    frames = [data for can_id, data in received(wires[1]) if can_id == 1]
     assert frames[-1] == EXIT
     assert unpack_command(AK60, frames[-2]).torque == pytest.approx(0.0, abs=0.004)
 
 
-def test_the_last_frames_switch_every_motor_off_twice(wires):
+def test_stop_switches_every_motor_off_twice(wires):
     bus = MotorBus(wires[0], MOTORS_OF_ARM)
     bus.exchange(ON, time.monotonic())
-    sent(wires[1])
+    received(wires[1])
     bus.stop()
-    assert [can_id for can_id, data in sent(wires[1]) if data == EXIT] == [1, 2, 3, 4, 1, 2, 3, 4]
+    assert [can_id for can_id, data in received(wires[1]) if data == EXIT] == [1, 2, 3, 4, 1, 2, 3, 4]
 
 
-def test_the_zero_is_refused_while_the_motors_are_on(wires):
+def test_set_zero_is_refused_while_the_motors_are_on(wires):
     bus = MotorBus(wires[0], MOTORS_OF_ARM)
     bus.exchange(ON, time.monotonic())
     with pytest.raises(BusError, match="motors are on"):
         bus.set_zero()
-    assert SET_ZERO not in [data for _, data in sent(wires[1])]
+    assert SET_ZERO not in [data for _, data in received(wires[1])]
 
 
 def frame(can_id: int, data: bytes, **kind) -> can.Message:
@@ -134,7 +134,7 @@ REPLY = pack_reply(AK60, 1, 0.25, 0.0, 0.0, 30, 0)
         (frame(1, REPLY, is_error_frame=True), "error frame"),
     ],
 )
-def test_what_is_no_reply_of_ours_is_counted_and_left(wires, message, kind):
+def test_a_frame_that_is_not_a_reply_is_counted_and_ignored(wires, message, kind):
     bus = MotorBus(wires[0], MOTORS_OF_ARM)
     wires[1].send(message)
     bus.exchange(OFF, time.monotonic())
@@ -144,7 +144,7 @@ def test_what_is_no_reply_of_ours_is_counted_and_left(wires, message, kind):
 
 @pytest.mark.parametrize("can_id", [0, 1])
 @pytest.mark.parametrize("length", [6, 8])
-def test_a_reply_counts_under_the_motors_id_and_the_masters(wires, can_id, length):
+def test_a_reply_may_have_the_motors_id_or_the_masters(wires, can_id, length):
     bus = MotorBus(wires[0], MOTORS_OF_ARM)
     wires[1].send(frame(can_id, REPLY[:length]))
     bus.exchange(OFF, time.monotonic())
@@ -152,18 +152,18 @@ def test_a_reply_counts_under_the_motors_id_and_the_masters(wires, can_id, lengt
     assert not bus.ignored
 
 
-def test_a_late_reply_is_not_taken_for_the_answer_to_the_next_command(wires):
+def test_a_late_reply_does_not_count_for_the_next_cycle(wires):
     bus = MotorBus(wires[0], MOTORS_OF_ARM)
     for can_id in (1, 2, 3, 4):
         wires[1].send(frame(can_id, bytes((can_id,)) + REPLY[1:]))
     assert not bus.exchange(OFF, time.monotonic())
 
 
-def test_two_joints_with_one_id_are_refused(wires):
+def test_two_joints_with_the_same_id_are_refused(wires):
     with pytest.raises(ParameterError, match="4 different IDs"):
         MotorBus(wires[0], [JointMotor(AK60, 1)] * 4)
 
 
-def test_a_bus_that_cannot_be_opened_is_named_with_the_reason():
+def test_the_error_for_a_bus_that_cannot_be_opened_names_it():
     with pytest.raises(BusError, match="CAN bus nonsense can9"):
         open_bus("nonsense", "can9", {})

@@ -1,9 +1,9 @@
-"""A bus full of foreign frames: what the motors say is read, and nothing else.
+"""A bus full of foreign frames: only the motors' replies are read.
 
-Of a motor's reply, 6 or 8 bytes, only the first is known: its ID. A foreign frame of such a length, with such a first
-byte and the arbitration ID of that motor or of the master, can't be told from a reply by its bytes. Of random data
-frames on random IDs that is 2/9 x 4/256 x 2/2048, three in a million; of random frames of 8 bytes with the ID 0 it is
-one in 64. The last test says what the safety limits make of them.
+A reply has 6 or 8 bytes, of which only the first, the motor's ID, is known in advance. A foreign frame of that length,
+with that first byte and the arbitration ID of that motor or of the master, looks like a reply. Of random frames with
+random IDs these are 2/9 x 4/256 x 2/2048, three in a million; of random 8-byte frames with ID 0, one in 64. The last
+test shows how the safety limits treat them.
 """
 
 from __future__ import annotations
@@ -33,12 +33,13 @@ POSITION_CODE = 25.0 / 65535
 LINKS = ArmConfig().links
 WEIGHTLESS = ArmModel(LINKS.length, LINKS.cog, LINKS.mass, gravity=0.0)
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
-FRAMES, BURST = 100_000, 10  # in all, and before each reply
+FRAMES = 100_000  # in total
+BURST = 10  # frames before each reply
 LIMITS = Limits(tuple("1234"), (-1.65, -0.17, -0.78, -0.17), (1.65, 3.14, 2.53, 3.14), (5.0,) * 4, (3.0, 9.0, 3.0, 3.0))
 
 
 def foreign_frame(rng: random.Random) -> can.Message:
-    """Return a frame of any kind, half of them close to what a motor sends or gets."""
+    """Return a frame of any kind; half of them resemble what a motor sends or receives."""
     near = rng.random() < 0.5
     can_id = rng.choice((MASTER, *IDS, 5, 127)) if near else rng.randrange(2048)
     data = rng.randbytes(rng.choice((6, 7, 8)) if near else rng.randrange(9))
@@ -61,8 +62,8 @@ def foreign_frame(rng: random.Random) -> can.Message:
     )
 
 
-def passes_as_reply(message: can.Message) -> bool:
-    """Return whether, by the manual's layout, nothing but the number in it tells this from a motor's reply."""
+def looks_like_reply(message: can.Message) -> bool:
+    """Return whether the frame has the layout of a motor's reply in the manual."""
     if message.is_extended_id or message.is_remote_frame or message.is_error_frame or message.is_fd:
         return False
     data = bytes(message.data)
@@ -70,7 +71,10 @@ def passes_as_reply(message: can.Message) -> bool:
 
 
 class NoisyMotors:
-    """Motors that do not move, behind a bus on which others send `BURST` frames before every reply."""
+    """Motors that do not move, on a bus on which other devices send `BURST` frames before every reply.
+
+    foreign: the number of those frames.
+    """
 
     def __init__(self, bus: can.BusABC, firmware: Firmware, seed: int):
         arm = SimulatedArm(ArmConfig(links=WEIGHTLESS))
@@ -78,7 +82,7 @@ class NoisyMotors:
         self._device = SimulatedDevice(arm, [SimulatedMotor(joint, firmware) for joint in JOINTS])
         self._bus = bus
         self._rng = random.Random(seed)
-        self.foreign, self.forged = 0, 0
+        self.foreign = 0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -98,9 +102,7 @@ class NoisyMotors:
     def _make_noise(self):
         for _ in range(BURST):
             message = foreign_frame(self._rng)
-            if passes_as_reply(message):
-                self.forged += 1  # the tests below have these
-            else:
+            if not looks_like_reply(message):  # the tests below have these
                 self._bus.send(message)
                 self.foreign += 1
 
@@ -120,7 +122,7 @@ def noisy(request, wires):
     motors.close()
 
 
-def test_among_foreign_frames_of_every_kind_each_motor_is_read_and_nothing_else(wires, noisy):
+def test_among_foreign_frames_of_every_kind_only_the_motors_are_read(wires, noisy):
     bus = MotorBus(wires[0], JOINTS)
     while noisy.foreign < FRAMES:
         assert bus.exchange(OFF, time.monotonic() + 10.0)
@@ -128,13 +130,13 @@ def test_among_foreign_frames_of_every_kind_each_motor_is_read_and_nothing_else(
             assert abs(sample.position - angle) <= POSITION_CODE
             assert sample.temperature in (30, None) and sample.error in (0, None)
     noisy.close()
-    bus.exchange(OFF, time.monotonic())  # what came after the last reply
+    bus.exchange(OFF, time.monotonic())  # reads the frames after the last reply
     assert sum(bus.ignored.values()) == noisy.foreign
     assert set(bus.ignored) == {"command", "error frame", "extended, remote or FD frame", "foreign frame"}
 
 
-def test_a_frame_is_taken_for_a_reply_if_and_only_if_its_bytes_are_one(wires):
-    """Against the manual's layout as the independent judge."""
+def test_a_frame_counts_as_a_reply_exactly_if_it_has_the_layout_of_one(wires):
+    """The manual's layout is the independent reference."""
     bus, rng, found = MotorBus(wires[0], JOINTS), random.Random(3), Counter()
     for _ in range(FRAMES // 5):
         message = foreign_frame(rng)
@@ -142,7 +144,7 @@ def test_a_frame_is_taken_for_a_reply_if_and_only_if_its_bytes_are_one(wires):
         wires[1].send(message)
         bus.exchange(OFF, time.monotonic())
         changed = [joint for joint in range(4) if bus.samples[joint] is not before[joint]]
-        if passes_as_reply(message):
+        if looks_like_reply(message):
             assert changed == [message.data[0] - 1]
             found["reply"] += 1
         else:
@@ -152,8 +154,8 @@ def test_a_frame_is_taken_for_a_reply_if_and_only_if_its_bytes_are_one(wires):
 
 
 @pytest.mark.parametrize(("length", "most"), [(8, 0.0001), (6, 0.005)])
-def test_a_forged_reply_with_random_numbers_is_nearly_always_a_fault_that_lets_the_arm_down(length, most):
-    """As of 250 cycles a second, from an arm that stands at POSE."""
+def test_a_forged_reply_with_random_values_is_nearly_always_a_fault(length, most):
+    """At 250 cycles a second, with the arm at rest in `POSE`."""
     rng, count, unseen = random.Random(5), 20_000, 0
     before = [JointSample(angle, 0.0, 0.0, 30, 0, 1.0) for angle in POSE]
     for _ in range(count):

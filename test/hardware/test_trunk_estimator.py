@@ -1,7 +1,6 @@
-"""The trunk's orientation from an IMU: on a recording of a real one, and on trunks whose motion is known exactly."""
+"""The trunk's orientation from an IMU: on a recording of a real IMU, and on simulated motions known exactly."""
 
 import math
-from pathlib import Path
 
 import imufusion
 import numpy as np
@@ -13,7 +12,8 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.tilt import gravity_in_trunk
 from exo_gravity.hardware.trunk_estimator import MAX_GAP, ImuSample, TrunkEstimator
 
-RECORDING = Path(__file__).parents[3] / "shared" / "data" / "imu_handheld.csv"
+from ..support.handheld_imu import read_recording
+
 ALIGNED = (0.0, 0.0, 0.0, 1.0)
 G = 9.80665
 
@@ -31,22 +31,19 @@ def gravity(estimate):
 @pytest.fixture(scope="module")
 def recording():
     """Time (n,) s, gyroscope (n, 3) deg/s and accelerometer (n, 3) g of an IMU moved by hand."""
-    if not RECORDING.exists():
-        pytest.skip(f"the recording is not here: {RECORDING}")
-    columns = np.loadtxt(RECORDING, delimiter=",", skiprows=1)
-    return columns[:, 0], columns[:, 1:4], columns[:, 4:7]
+    return read_recording()
 
 
 @pytest.fixture(scope="module")
 def estimates(recording):
-    """Gravity in the IMU's axes (n, 3) for each sample of the recording; NaN where the estimator gave nothing."""
+    """Gravity in the IMU's axes (n, 3) for each sample of the recording; NaN without an estimate."""
     estimator = TrunkEstimator(ALIGNED)
     time, rate, acceleration = recording
     answers = map(estimator.update, map(ImuSample, time, np.radians(rate), G * acceleration))
     return np.array([(math.nan,) * 3 if answer is None else gravity(answer) for answer in answers])
 
 
-def test_nothing_is_given_for_3_seconds_and_everything_after(recording, estimates):
+def test_the_estimates_start_after_3_seconds_and_have_no_gap(recording, estimates):
     missing = np.isnan(estimates[:, 0])
     assert recording[0][missing].max() == pytest.approx(3.0, abs=0.05) and not np.any(missing[np.argmin(missing) :])
 
@@ -55,7 +52,7 @@ def test_at_rest_the_tilt_agrees_with_the_accelerometer_within_1_degree(recordin
     _, rate, acceleration = recording
     speed, size = np.linalg.norm(rate, axis=1), np.linalg.norm(acceleration, axis=1)
     restless = (speed > 3.0) | (np.abs(size - np.median(size)) > 0.05)
-    at_rest = uniform_filter1d(restless.astype(float), 101) < 1e-9  # nothing stirs for half a second before and after
+    at_rest = uniform_filter1d(restless.astype(float), 101) < 1e-9  # also half a second before and after
     up = uniform_filter1d(acceleration, 101, axis=0)[at_rest]
     error = angle(estimates[at_rest], -up)
     assert np.mean(at_rest) > 0.3
@@ -64,29 +61,31 @@ def test_at_rest_the_tilt_agrees_with_the_accelerometer_within_1_degree(recordin
 
 def test_in_motion_the_tilt_turns_no_faster_than_the_gyroscope_plus_the_feedback(recording, estimates):
     time, rate, _ = recording
-    feedback = math.degrees(0.5)  # deg/s: the gain, at most, whatever the accelerometer says
+    feedback = math.degrees(0.5)  # deg/s: the gain, at most, whatever the accelerometer measures
     steps = angle(estimates[1:], estimates[:-1])
     allowed = (np.linalg.norm(rate[1:], axis=1) + feedback) * np.diff(time)
     assert np.nanmax(steps - allowed) <= 0.0
 
 
-def test_the_recording_agrees_with_imufusion_run_by_itself(recording, estimates):
+def test_on_the_recording_the_estimator_agrees_with_imufusion_alone(recording, estimates):
     ahrs, expected = imufusion.Ahrs(), []
     for dt, rate, acceleration in zip(np.diff(recording[0], prepend=-0.01), *recording[1:], strict=True):
         ahrs.set_sample_period(dt)
         ahrs.update_no_magnetometer(rate, acceleration)
         expected.append(-ahrs.get_gravity().astype(float))
-    # 0.05 degrees is what the gyroscope's bias, which this reference does not learn, makes of it.
+    # The reference does not learn the gyroscope's bias, which makes 0.05 degrees.
     assert np.nanmax(angle(estimates, np.array(expected))) < 0.1
 
 
 def samples_of(orientation, duration=5.0, rate=100.0, start=0.0, report=False, bias=(0.0, 0.0, 0.0)):
     """Samples of an ideal IMU: `orientation(t)` is world from IMU, a Rotation."""
+    before = orientation(0.0)
     for step in range(1, round(duration * rate) + 1):
         t = step / rate
         now = orientation(t)
-        speed = (orientation(t - 1 / rate).inv() * now).as_rotvec() * rate + bias
+        speed = (before.inv() * now).as_rotvec() * rate + bias
         yield ImuSample(start + t, speed, now.inv().apply((0, 0, G)), now.as_quat() if report else None)
+        before = now
 
 
 def last(estimator, samples):
@@ -97,7 +96,7 @@ def last(estimator, samples):
 
 
 @pytest.mark.parametrize("report", [False, True])
-def test_the_tilt_is_the_trunks_however_the_imu_is_mounted(report):
+def test_any_mounting_of_the_imu_gives_the_tilt_of_the_trunk(report):
     world_from_trunk = Rotation.from_euler("xyz", (0.2, -0.5, 1.0))
     for mounting in Rotation.random(20, random_state=1):
         estimator = TrunkEstimator(mounting.as_quat())
@@ -106,7 +105,7 @@ def test_the_tilt_is_the_trunks_however_the_imu_is_mounted(report):
 
 
 @pytest.mark.parametrize("report", [False, True])
-def test_the_orientation_given_has_the_tilt_given(report):
+def test_the_orientation_agrees_with_pitch_and_roll(report):
     mounting = Rotation.from_euler("zyx", (2.0, 0.4, -1.0))
     bow = samples_of(lambda t: Rotation.from_euler("xyz", (0.3, 0.2 * t, 0.1)) * mounting, report=report)
     answer = last(TrunkEstimator(mounting.as_quat()), bow)
@@ -129,7 +128,7 @@ def test_a_bow_through_90_degrees_is_followed_without_a_jump():
     assert down[-1] == pytest.approx((math.sin(2), 0, -math.cos(2)), abs=0.01)  # within one sample
 
 
-def test_the_gyroscopes_bias_is_learnt_at_rest():
+def test_the_gyroscope_bias_is_estimated_at_rest():
     estimator = TrunkEstimator(ALIGNED)
     answer = last(estimator, samples_of(lambda t: Rotation.identity(), duration=60.0, bias=(0.03, 0, 0)))
     assert estimator.gyroscope_bias == pytest.approx((0.03, 0, 0), abs=1e-3)
@@ -144,21 +143,21 @@ def settled(report=False, mounting=ALIGNED):
 
 GOOD = ImuSample(5.01, (0.0, 0.0, 0.0), (0.0, 0.0, G))
 IMPOSSIBLE = {
-    "a stamp that is not a number": GOOD._replace(time=math.nan),
-    "an endless stamp": GOOD._replace(time=math.inf),
+    "a NaN stamp": GOOD._replace(time=math.nan),
+    "an infinite stamp": GOOD._replace(time=math.inf),
     "the last stamp again": GOOD._replace(time=5.0),
     "a stamp before the last": GOOD._replace(time=4.95),
-    "a gyroscope that says NaN": GOOD._replace(angular_velocity=(0, math.nan, 0)),
+    "a NaN angular velocity": GOOD._replace(angular_velocity=(0, math.nan, 0)),
     "a gyroscope in deg/s": GOOD._replace(angular_velocity=(0, 40.0, 0)),
     "no gyroscope": GOOD._replace(angular_velocity=None),
-    "an accelerometer that says infinity": GOOD._replace(acceleration=(0, 0, math.inf)),
+    "an infinite acceleration": GOOD._replace(acceleration=(0, 0, math.inf)),
     "a dead accelerometer": GOOD._replace(acceleration=(0, 0, 0)),
     "an accelerometer in g": GOOD._replace(acceleration=(0, 0, 1.0)),
     "an accelerometer at 20 g": GOOD._replace(acceleration=(0, 0, 20 * G)),
     "no accelerometer": GOOD._replace(acceleration=None),
     "two axes": GOOD._replace(acceleration=(0, G)),
     "an orientation of zeros": GOOD._replace(orientation=(0, 0, 0, 0)),
-    "an orientation that is not a number": GOOD._replace(orientation=(0, 0, math.nan, 1)),
+    "a NaN orientation": GOOD._replace(orientation=(0, 0, math.nan, 1)),
 }
 
 
@@ -172,7 +171,7 @@ def test_an_impossible_sample_is_refused_and_leaves_the_estimate_as_it_was(sampl
 
 @pytest.mark.parametrize("report", [False, True])
 @pytest.mark.parametrize("start", [5.0 + MAX_GAP, 1e9, -1e3])
-def test_after_a_gap_or_another_clock_nothing_is_given_until_it_has_settled_again(report, start):
+def test_after_a_gap_or_a_clock_jump_there_is_no_estimate_until_it_has_settled_again(report, start):
     estimator = settled(report)
     tilted = Rotation.from_euler("y", 1.0)
     answers = [estimator.update(s) for s in samples_of(lambda t: tilted, start=start, report=report)]
@@ -181,34 +180,34 @@ def test_after_a_gap_or_another_clock_nothing_is_given_until_it_has_settled_agai
     assert {round(answer.pitch, 2) for answer in given} == {1.0}
 
 
-def test_a_reported_orientation_that_jumps_is_not_passed_on():
+def test_a_jump_of_the_reported_orientation_is_not_passed_on():
     estimator = settled(report=True)
     jumped = Rotation.from_euler("y", 0.3)
     answers = [estimator.update(s) for s in samples_of(lambda t: jumped, duration=0.9, start=5.0, report=True)]
     assert not any(answers) and "jumped" in estimator.settling
 
 
-def test_a_driver_that_reports_the_identity_without_meaning_it_is_found_out():
+def test_a_driver_that_always_reports_the_identity_is_detected():
     estimator = TrunkEstimator(ALIGNED)
-    lying = (sample._replace(orientation=ALIGNED) for sample in samples_of(lambda t: Rotation.from_euler("x", 0.6)))
+    constant = (sample._replace(orientation=ALIGNED) for sample in samples_of(lambda t: Rotation.from_euler("x", 0.6)))
     with pytest.raises(ParameterError, match="20 degrees of the accelerometer"):
-        last(estimator, lying)
+        last(estimator, constant)
 
 
-def test_a_gyroscope_with_a_reversed_axis_is_found_out():
+def test_a_gyroscope_with_a_reversed_axis_is_detected():
     estimator = settled()
     bow = samples_of(lambda t: Rotation.from_euler("y", 0.5 * t), duration=3.0, start=5.0)
     with pytest.raises(ParameterError, match="20 degrees of the accelerometer"):
         last(estimator, (s._replace(angular_velocity=-np.asarray(s.angular_velocity)) for s in bow))
 
 
-def test_without_imufusion_only_an_imu_that_reports_its_orientation_is_followed(monkeypatch):
+def test_without_imufusion_an_imu_must_report_its_orientation(monkeypatch):
     monkeypatch.setattr("exo_gravity.hardware.trunk_estimator.imufusion", None)
     estimator = settled(report=True)
     with pytest.raises(ParameterError, match="imufusion"):
         estimator.update(GOOD)
 
 
-def test_the_mounting_must_be_given_as_a_unit_quaternion():
+def test_the_mounting_must_be_a_unit_quaternion():
     with pytest.raises(ParameterError, match="rotation_trunk_from_imu"):
         TrunkEstimator((0, 0, 0, 0))

@@ -1,4 +1,4 @@
-"""The watchdog: what a dead process left pushing is let down; what it left in peace is left in peace."""
+"""The watchdog: after the bridge has died, an arm with its motors on is let down; motors that are off stay off."""
 
 import os
 import signal
@@ -25,7 +25,7 @@ QUICKLY = replace(LIMITS, fade_time=0.5, damping=1.5)
 CHANNELS = (f"test_watchdog_{n}" for n in count())
 EFFORT = (0.0, 3.0, 1.0, 0.5)
 PERIOD = 0.004
-# A process that carries an arm on a bus of its own, as far as its watchdog can know.
+# A process that its watchdog takes for a bridge that carries an arm.
 CARRIER = """
 import sys, time
 from exo_gravity.core.drive import OFF, Drive
@@ -56,11 +56,11 @@ def wire():
     bus.shutdown()
 
 
-def test_it_goes_on_from_the_last_torques_and_ends_with_the_motors_off(wire):
+def test_the_let_down_starts_from_the_last_torques_and_ends_with_the_motors_off(wire):
     channel, device, listener = wire
-    told = []
-    let_down(Charge(("virtual", channel, {}), MOTORS_OF_ARM, QUICKLY, PERIOD), EFFORT, (0.0,) * 4, told.append)
-    assert told == ["the arm is down, its motors are off"]
+    log = []
+    let_down(Charge(("virtual", channel, {}), MOTORS_OF_ARM, QUICKLY, PERIOD), EFFORT, (0.0,) * 4, log.append)
+    assert log == ["the arm is down, its motors are off"]
     frames = [(m.arbitration_id, bytes(m.data)) for m in iter(lambda: listener.recv(0.0), None)]
     torques = [unpack_command(MOTORS["AK80-9"], data).torque for to, data in frames if to == 2 and data[0] == 0x80]
     assert torques[0] == pytest.approx(EFFORT[1], abs=0.25)
@@ -71,11 +71,11 @@ def test_it_goes_on_from_the_last_torques_and_ends_with_the_motors_off(wire):
     assert [data for to, data in frames if to == 2 and data[0] == 0xFF][-1] == EXIT
 
 
-def test_a_bus_that_can_not_be_opened_is_told():
-    told = []
-    let_down(Charge(("no_such_interface", "x", {}), MOTORS_OF_ARM, QUICKLY, PERIOD), EFFORT, (0.0,) * 4, told.append)
-    assert len(told) == 1
-    assert "CAN bus no_such_interface x" in told[0]
+def test_a_bus_that_cannot_be_opened_is_logged():
+    log = []
+    let_down(Charge(("no_such_interface", "x", {}), MOTORS_OF_ARM, QUICKLY, PERIOD), EFFORT, (0.0,) * 4, log.append)
+    assert len(log) == 1
+    assert "CAN bus no_such_interface x" in log[0]
 
 
 @pytest.fixture
@@ -96,20 +96,20 @@ def carry():
 
 
 @pytest.mark.parametrize(("powered", "number"), [(True, signal.SIGSTOP), (False, signal.SIGKILL)])
-def test_a_frozen_carrier_is_killed_and_one_with_its_motors_off_is_let_die(carry, powered, number):
+def test_a_frozen_bridge_is_killed_and_nothing_is_let_down_while_the_motors_are_off(carry, powered, number):
     process = carry(powered)
     os.kill(process.pid, number)
     assert process.wait(30) == -signal.SIGKILL
-    for line in process.stdout:  # no charge to let down; it ends when the watchdog, too, has ended
+    for line in process.stdout:  # ends once the watchdog, which shares this output, has ended too
         assert line == "carrying\n"
 
 
-def test_where_the_whole_machine_stood_still_the_carrier_lives_on(carry):
+def test_a_stall_of_the_whole_machine_does_not_kill_the_bridge(carry):
     process = carry(powered=True)
     (children,) = Path(f"/proc/{process.pid}/task").glob(f"{process.pid}/children")
     both = [process.pid, int(children.read_text().split()[0])]
     for number in (signal.SIGSTOP, signal.SIGCONT):
         for pid in both:
             os.kill(pid, number)
-        time.sleep(0.3)  # three times as long as the watchdog is patient, stopped and going on
+        time.sleep(0.3)  # more than three times the watchdog's `FROZEN`, both stopped and running
     assert process.poll() is None

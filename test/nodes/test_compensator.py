@@ -121,15 +121,11 @@ def test_a_load_beyond_the_motors_is_clamped_and_one_warning_states_the_support_
     def budget() -> str:
         return probe.diagnostic("compensator", "budget") or ""
 
-    try:
-        probe.wait_until(lambda: budget() == "within rated torque everywhere")
-        assert probe.set_parameters("compensator", atomically=True, mode="zero_g", wearer__body_mass=75).successful
-        probe.wait_until(lambda: budget().startswith("beyond"))
-    finally:
-        probe.executor.remove_node(bridge)
-        bridge.destroy_node()
+    probe.wait_until(lambda: budget() == "within rated torque everywhere")
+    assert probe.set_parameters("compensator", atomically=True, mode="zero_g", wearer__body_mass=75).successful
     needs = "right_shoulder_abduction needs 19.6 Nm in its worst pose (rated 9, peak 18)"
-    assert needs in budget() and "the largest support that fits is" in budget()
+    probe.wait_until(lambda: needs in budget())
+    assert "the largest support that fits is" in budget()
     probe.wait_until(lambda: probe.status_contains("compensator", ", right_shoulder_flexion"))
     probe.wait_until(lambda: probe.effort_commands[-1].effort[2] == 3.0)
     probe.wait_until(lambda: [line for line in nodes.log if needs in line and "WARN" in line])

@@ -1,4 +1,4 @@
-"""The subscription that its user looks after, in one process with a publisher, over real DDS."""
+"""HotPath, the subscription that bypasses the executor, with a publisher in the same process, over real DDS."""
 
 import threading
 import time
@@ -16,8 +16,11 @@ from exo_gravity.nodes.run import keep_to_this_machine
 keep_to_this_machine()
 
 
-class Pair:
-    """A publisher and a hot path in one node; what came, and on which thread."""
+class PublisherAndHotPath:
+    """A publisher and a hot path in one node.
+
+    received: (text, sequence number, thread) of each message. error: raised by the callback if set.
+    """
 
     def __init__(self):
         self.context = rclpy.Context()
@@ -25,14 +28,14 @@ class Pair:
         self.node = rclpy.create_node("hot_path_test", context=self.context)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
-        self.came = []
+        self.received = []
         self.error = None
         self.hot = HotPath(self.node, String, "hot_path_topic", self._on_message, QoSProfile(depth=8))
         self.publisher = self.node.create_publisher(String, "hot_path_topic", 8)
-        self.until(lambda: self.publisher.get_subscription_count() == 1)
+        self.wait_until(lambda: self.publisher.get_subscription_count() == 1)
 
     def _on_message(self, message, info):
-        self.came.append((message.data, info["publication_sequence_number"], threading.current_thread().name))
+        self.received.append((message.data, info["publication_sequence_number"], threading.current_thread().name))
         if self.error:
             raise self.error
 
@@ -40,15 +43,15 @@ class Pair:
         for text in texts:
             self.publisher.publish(String(data=text))
 
-    def until(self, condition, action=lambda: None):
+    def wait_until(self, condition, action=lambda: None):
         end = time.monotonic() + 20.0
         while not condition():
             action()
-            assert time.monotonic() < end, self.came
+            assert time.monotonic() < end, self.received
             time.sleep(0.005)
 
     def texts(self):
-        return [text for text, _, _ in self.came]
+        return [text for text, _, _ in self.received]
 
     def close(self):
         self.hot.stop()
@@ -62,7 +65,7 @@ def make():
     pairs = []
 
     def make():
-        pairs.append(Pair())
+        pairs.append(PublisherAndHotPath())
         return pairs[-1]
 
     yield make
@@ -70,27 +73,27 @@ def make():
         pair.close()
 
 
-def test_messages_come_in_order_on_a_thread_of_their_own_without_an_executor(make):
+def test_messages_arrive_in_order_on_their_own_thread_without_an_executor(make):
     pair = make()
     pair.hot.start()
     pair.send("a", "b", "c")
-    pair.until(lambda: len(pair.came) == 3)
+    pair.wait_until(lambda: len(pair.received) == 3)
     assert pair.texts() == ["a", "b", "c"]
-    assert {thread for _, _, thread in pair.came} == {"hot_path_topic"}
+    assert {thread for _, _, thread in pair.received} == {"hot_path_topic"}
 
 
-def test_a_poll_takes_everything_that_waits_and_the_publishers_numbers_with_it(make):
+def test_a_poll_takes_all_waiting_messages_and_their_sequence_numbers(make):
     pair = make()
     pair.send("a", "b", "c")
-    pair.until(lambda: len(pair.came) == 3, pair.hot.poll)
-    assert [number for _, number, _ in pair.came] == [1, 2, 3]
-    assert {thread for _, _, thread in pair.came} == {threading.current_thread().name}
+    pair.wait_until(lambda: len(pair.received) == 3, pair.hot.poll)
+    assert [number for _, number, _ in pair.received] == [1, 2, 3]
+    assert {thread for _, _, thread in pair.received} == {threading.current_thread().name}
 
 
-def test_a_poll_waits_for_a_message_but_no_longer_than_it_is_told(make):
+def test_a_poll_waits_for_a_message_until_its_timeout(make):
     pair = make()
     pair.hot.poll(0.01)
-    assert pair.came == []
+    assert pair.received == []
     sender = threading.Timer(0.05, pair.send, "a")
     sender.start()
     begin = time.monotonic()
@@ -100,40 +103,40 @@ def test_a_poll_waits_for_a_message_but_no_longer_than_it_is_told(make):
     sender.join()
 
 
-def test_the_executor_leaves_the_messages_alone(make):
+def test_the_executor_does_not_take_the_messages(make):
     pair = make()
     pair.send("a")
     for _ in range(20):
         pair.executor.spin_once(timeout_sec=0.01)
-    assert pair.came == []
-    pair.until(lambda: pair.came, pair.hot.poll)
+    assert pair.received == []
+    pair.wait_until(lambda: pair.received, pair.hot.poll)
 
 
-def test_after_stop_nothing_is_called_any_more(make):
+def test_after_stop_the_callback_is_not_called(make):
     pair = make()
     pair.hot.start()
     pair.hot.stop()
     pair.send("a")
     for _ in range(20):
         pair.executor.spin_once(timeout_sec=0.01)
-    assert pair.came == []
+    assert pair.received == []
 
 
-def test_what_the_callback_raises_ends_the_thread_and_is_kept(make):
+def test_an_exception_in_the_callback_ends_the_thread_and_is_kept(make):
     pair = make()
     pair.error = ValueError("not like that")
     pair.hot.start()
     pair.send("a", "b")
-    pair.until(lambda: pair.hot.failure)
+    pair.wait_until(lambda: pair.hot.failure)
     assert pair.hot.failure is pair.error
     assert pair.texts() == ["a"]
 
 
-def test_with_another_rclpy_the_executor_calls_back(make, monkeypatch):
+def test_with_an_unknown_rclpy_the_executor_calls_back(make, monkeypatch):
     monkeypatch.setattr(hot_path, "rclpy_implementation", object())
     pair = make()
     pair.hot.start()
     pair.hot.poll()
     pair.send("a")
-    pair.until(lambda: pair.came, lambda: pair.executor.spin_once(timeout_sec=0.1))
+    pair.wait_until(lambda: pair.received, lambda: pair.executor.spin_once(timeout_sec=0.1))
     assert pair.texts() == ["a"]

@@ -1,18 +1,18 @@
-"""The node `imu` in a process of its own, over real DDS, fed with a recording and with what an IMU must not say."""
+"""The node `imu` as a process, over real DDS, with a recording and with impossible samples."""
+
+from __future__ import annotations
 
 import math
-import os
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import imufusion
 import numpy as np
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import Vector3Stamped
+from geometry_msgs.msg import Vector3, Vector3Stamped
 from rclpy.executors import SingleThreadedExecutor
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
@@ -20,31 +20,36 @@ from sensor_msgs.msg import Imu
 from exo_gravity.core.tilt import gravity_in_trunk
 from exo_gravity.nodes.conversions import to_nanoseconds, to_time
 
-RECORDING = Path(__file__).parents[3] / "shared" / "data" / "imu_handheld.csv"
+from ..support.handheld_imu import read_recording
+
 G = 9.80665
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 MOUNTING = Rotation.from_euler("xyz", (math.pi / 2, 0.0, math.pi / 2))  # trunk from IMU: its x points left, its y up
-AHEAD = 25  # samples sent before the node has taken them: fewer than it queues, so that none is lost
+AHEAD = 25  # samples in flight: fewer than the node queues, so that none is lost
 NODE = [sys.executable, "-c", "from exo_gravity.nodes.imu import main; main()", "--ros-args"]
 
 
-class Bench:
-    """One node, a driver that feeds it, and a listener."""
+class ImuNode:
+    """One node as a process, a driver that feeds it, and a listener.
+
+    tilts: vector by stamp in ns. sent, received: the number of samples sent, and of those the node has received.
+    """
 
     def __init__(self, rotation):
         arguments = ("-p", f"rotation_trunk_from_imu:={[float(part) for part in rotation]}")
-        self.process = subprocess.Popen([*NODE, *arguments], stdin=subprocess.PIPE)  # ends with us, should we crash
+        self.process = subprocess.Popen([*NODE, *arguments], stdin=subprocess.PIPE)  # it ends with its stdin
         self.context = rclpy.Context()
         rclpy.init(context=self.context)
-        self.node = rclpy.create_node("bench", context=self.context)
+        self.node = rclpy.create_node("imu_driver", context=self.context)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
         self.publisher = self.node.create_publisher(Imu, "/imu/data_raw", 50)
         self.node.create_subscription(Vector3Stamped, "/imu/pitch_yaw", self._on_tilt, 1000)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
         self.status = DiagnosticStatus()
-        self.tilts = {}  # stamp in ns -> vector
-        self.sent, self.received, self.order = 0, 0, {}
+        self.tilts: dict[int, Vector3] = {}
+        self.sent, self.received = 0, 0
+        self._number: dict[int, int] = {}  # of each sample by stamp in ns
 
     def close(self):
         self.process.terminate()
@@ -56,24 +61,24 @@ class Bench:
     def _on_tilt(self, message):
         stamp = to_nanoseconds(message.header.stamp)
         self.tilts[stamp] = message.vector
-        self.received = max(self.received, self.order[stamp])
+        self.received = max(self.received, self._number[stamp])
 
     def _on_diagnostics(self, message):
         (self.status,) = message.status
         values = {pair.key: pair.value for pair in self.status.values}
         self.received = max(self.received, int(values["received"]))
 
-    def until(self, condition, timeout=20.0):
+    def wait_until(self, condition, timeout=20.0):
         end = time.monotonic() + timeout
         while not condition():
-            assert time.monotonic() < end, f"{self.status.message!r}, {self.received} of {self.sent} samples taken"
+            assert time.monotonic() < end, f"{self.status.message!r}, {self.received} of {self.sent} samples received"
             self.executor.spin_once(timeout_sec=0.05)
 
-    def said(self, text):
+    def reports(self, text):
         return text in self.status.message
 
     def send(self, stamp, rate=(0.0, 0.0, 0.0), acceleration=(0.0, 0.0, G), orientation=None):
-        """Publish the sample of `stamp` s; wait while the node is far behind."""
+        """Publish the sample of `stamp` s; wait while too many are in flight."""
         message = Imu()
         message.header.stamp = to_time(round(stamp * 1e9))
         for vector, values in ((message.angular_velocity, rate), (message.linear_acceleration, acceleration)):
@@ -83,78 +88,73 @@ class Bench:
         message.orientation_covariance[0] = -1.0 if orientation is None else 0.0
         self.publisher.publish(message)
         self.sent += 1
-        self.order[round(stamp * 1e9)] = self.sent
-        self.until(lambda: self.sent - self.received < AHEAD)
+        self._number[round(stamp * 1e9)] = self.sent
+        self.wait_until(lambda: self.sent - self.received < AHEAD)
 
     def settle(self, start, **sample):
-        """Send the same sample every 10 ms of stamps for 4 s, until the node has taken all; return the last stamp."""
+        """Send the same sample for 4 s of stamps, wait until the node has received all, and return the last stamp."""
         for stamp in start + 0.01 * np.arange(400):
             self.send(stamp, **sample)
-        self.until(lambda: self.received == self.sent and round(stamp * 1e9) in self.tilts)
+        self.wait_until(lambda: self.received == self.sent and round(stamp * 1e9) in self.tilts)
         return float(stamp)
 
 
 @pytest.fixture
-def bench(request, monkeypatch):
-    """A node whose IMU is aligned with the trunk, or mounted as the test's parameter says."""
-    monkeypatch.setenv("ROS_DOMAIN_ID", "42")
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+def imu(request, monkeypatch):
+    """A node whose IMU is aligned with the trunk, or mounted as the test's parameter states."""
     monkeypatch.setenv("EXO_GRAVITY_SUPERVISED", "1")
-    bench = Bench(getattr(request, "param", UPRIGHT))
+    imu = ImuNode(getattr(request, "param", UPRIGHT))
     try:
-        bench.until(lambda: bench.publisher.get_subscription_count() and bench.said("waiting"))
-        yield bench
+        imu.wait_until(lambda: imu.publisher.get_subscription_count() and imu.reports("waiting"))
+        yield imu
     finally:
-        bench.close()
+        imu.close()
 
 
-def test_every_sample_of_the_recording_is_answered_with_what_imufusion_says_by_itself(bench):
-    if not RECORDING.exists():
-        pytest.skip(f"the recording is not here: {RECORDING}")
-    columns = np.loadtxt(RECORDING, delimiter=",", skiprows=1)
+def test_every_sample_of_a_recording_gives_the_tilt_that_imufusion_alone_gives(imu):
+    time, gyroscope, accelerometer = read_recording()
     ahrs, expected = imufusion.Ahrs(), {}
-    for row, dt in zip(columns, np.diff(columns[:, 0], prepend=-0.01), strict=True):
-        stamp, rate, acceleration = row[0], row[1:4], row[4:7]
+    for stamp, dt, rate, acceleration in zip(time, np.diff(time, prepend=-0.01), gyroscope, accelerometer, strict=True):
         ahrs.set_sample_period(dt)
         ahrs.update_no_magnetometer(rate, acceleration)
         if not ahrs.get_flags().startup:
             expected[round(stamp * 1e9)] = -ahrs.get_gravity().astype(float)
-        bench.send(stamp, np.radians(rate), G * acceleration)
-    bench.until(lambda: max(expected) in bench.tilts)
-    assert bench.tilts.keys() == expected.keys()
-    given = np.array([gravity_in_trunk(tilt.y, tilt.x) for tilt in bench.tilts.values()])
+        imu.send(stamp, np.radians(rate), G * acceleration)
+    imu.wait_until(lambda: max(expected) in imu.tilts)
+    assert imu.tilts.keys() == expected.keys()
+    given = np.array([gravity_in_trunk(tilt.y, tilt.x) for tilt in imu.tilts.values()])
     error = np.linalg.norm(given - list(expected.values()), axis=1)
     assert np.degrees(error.max()) < 0.1
 
 
-def test_nothing_is_published_for_a_sample_that_is_not_a_number_and_the_reason_is_told(bench):
-    stamp = bench.settle(1000.0)
-    bench.send(stamp + 0.01, acceleration=(0, math.nan, G))
-    bench.until(lambda: bench.said("refused: linear_acceleration must be 3 finite numbers"))
-    bench.send(stamp + 0.02)
-    bench.until(lambda: round((stamp + 0.02) * 1e9) in bench.tilts)
-    assert round((stamp + 0.01) * 1e9) not in bench.tilts
+def test_a_nan_sample_is_refused_with_a_reason_and_gives_no_tilt(imu):
+    stamp = imu.settle(1000.0)
+    imu.send(stamp + 0.01, acceleration=(0, math.nan, G))
+    imu.wait_until(lambda: imu.reports("refused: linear_acceleration must be 3 finite numbers"))
+    imu.send(stamp + 0.02)
+    imu.wait_until(lambda: round((stamp + 0.02) * 1e9) in imu.tilts)
+    assert round((stamp + 0.01) * 1e9) not in imu.tilts
 
 
-def test_silence_is_an_error_and_after_it_nothing_is_published_until_it_has_settled(bench):
-    stamp = bench.settle(2000.0)
-    bench.until(lambda: bench.said("no samples on /imu/data_raw") and bench.status.level == DiagnosticStatus.ERROR)
-    bench.send(stamp + 0.5)
-    bench.until(lambda: bench.received == bench.sent)
-    bench.until(lambda: bench.said("no samples"))
-    assert round((stamp + 0.5) * 1e9) not in bench.tilts
+def test_silence_is_an_error_after_which_no_tilt_is_published_until_the_estimate_has_settled(imu):
+    stamp = imu.settle(2000.0)
+    imu.wait_until(lambda: imu.reports("no samples on /imu/data_raw") and imu.status.level == DiagnosticStatus.ERROR)
+    imu.send(stamp + 0.5)
+    imu.wait_until(lambda: imu.received == imu.sent)
+    imu.wait_until(lambda: imu.reports("no samples"))
+    assert round((stamp + 0.5) * 1e9) not in imu.tilts
 
 
-@pytest.mark.parametrize("bench", [MOUNTING.as_quat()], indirect=True, ids=["turned"])
-def test_a_turned_imu_gives_the_trunks_tilt_rate_and_acceleration(bench):
-    everything = []
-    bench.node.create_subscription(Imu, "/imu/data", everything.append, 50)
+@pytest.mark.parametrize("imu", [MOUNTING.as_quat()], indirect=True, ids=["turned"])
+def test_a_turned_imu_gives_tilt_rate_and_acceleration_in_the_trunks_axes(imu):
+    messages = []
+    imu.node.create_subscription(Imu, "/imu/data", messages.append, 50)
     world_from_trunk = Rotation.from_euler("xyz", (0.2, 0.4, 1.0))
     world_from_imu = world_from_trunk * MOUNTING
     up = world_from_imu.inv().apply((0, 0, G))
-    stamp = bench.settle(0.0, acceleration=up, rate=(0, 0, 1e-3), orientation=world_from_imu.as_quat())
-    bench.until(lambda: everything)
-    tilt, data = bench.tilts[round(stamp * 1e9)], everything[-1]
+    stamp = imu.settle(0.0, acceleration=up, rate=(0, 0, 1e-3), orientation=world_from_imu.as_quat())
+    imu.wait_until(lambda: messages)
+    tilt, data = imu.tilts[round(stamp * 1e9)], messages[-1]
     assert (tilt.x, tilt.y, tilt.z) == pytest.approx((0.2, 0.4, 0.0), abs=1e-9)
     q, w, a = data.orientation, data.angular_velocity, data.linear_acceleration
     assert Rotation.from_quat((q.x, q.y, q.z, q.w)).approx_equal(world_from_trunk, 1e-9)
@@ -174,7 +174,6 @@ def test_a_turned_imu_gives_the_trunks_tilt_rate_and_acceleration(bench):
         (["-p", "timeot:=0.2"], "timeot = 0.2: must be one of"),
     ],
 )
-def test_wrong_parameters_end_the_node_with_one_sentence(arguments, sentence):
-    environment = dict(os.environ, ROS_DOMAIN_ID="42", ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
-    ended = subprocess.run([*NODE, *arguments], env=environment, capture_output=True, text=True, timeout=30)
+def test_an_invalid_parameter_ends_the_node_with_one_sentence(arguments, sentence):
+    ended = subprocess.run([*NODE, *arguments], capture_output=True, text=True, timeout=30)
     assert ended.returncode == 2 and sentence in ended.stderr

@@ -1,4 +1,4 @@
-"""The node `recorder` in a process of its own, over real DDS: what was published is in the recording."""
+"""The node `recorder` as a process, over real DDS: every published message is in the recording."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def start(output, *arguments, **options):
-    given = ("-p", f"output:={output}") if output else ()
+    parameters = ("-p", f"output:={output}") if output else ()
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen([*NODE, *given, *arguments], **pipes, **options)
+    return subprocess.Popen([*NODE, *parameters, *arguments], **pipes, **options)
 
 
-class Arm:
-    """A node in this process that publishes what a bridge and a compensator would."""
+class PublishingArm:
+    """A node in this process that publishes like a bridge and a compensator."""
 
     def __init__(self):
         self.context = rclpy.Context()
@@ -60,15 +60,15 @@ class Arm:
         self.node.destroy_node()
         rclpy.try_shutdown(context=self.context)
 
-    def until(self, condition, timeout=60.0):
+    def wait_until(self, condition, timeout=60.0):
         """Spin until `condition()` holds."""
         deadline = time.monotonic() + timeout
         while not condition():
-            assert time.monotonic() < deadline, "did not happen in time"
+            assert time.monotonic() < deadline, "the condition did not hold in time"
             self.executor.spin_once(timeout_sec=0.01)
 
-    def heard(self):
-        """Whether every topic that is to be recorded has a listener."""
+    def is_recorded(self):
+        """Return whether every topic that is to be recorded has a subscriber."""
         publishers = (self.states, self.efforts, self.imu, self.faults, self.steps)
         return all(publisher.get_subscription_count() for publisher in publishers)
 
@@ -87,20 +87,20 @@ class Arm:
 
 @pytest.fixture
 def arm():
-    arm = Arm()
+    arm = PublishingArm()
     yield arm
     arm.close()
 
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
-    """A recording from beginning to end: its folder, the lines of JSON, the exit code, and what DDS calls the type."""
+    """A complete recording: its folder, the lines of JSON, the exit code, and the type hash that DDS announces."""
     path = tmp_path_factory.mktemp("recorder") / "bag"
-    arm = Arm()
+    arm = PublishingArm()
     arm.steps.publish(String(data=json.dumps({"step": 0, "action": "hold", "duration": 9.0})))
     process = start(path, "-p", "live:=true")
     try:
-        arm.until(arm.heard)
+        arm.wait_until(arm.is_recorded)
         known = arm.node.get_publishers_info_by_topic("/right/joint_states")[0]
         for k in range(COUNT):
             arm.publish(k)
@@ -125,7 +125,7 @@ def recorded(path, topic):
         return [(stamp, reader.deserialize(data, c.msgtype)) for c, stamp, data in reader.messages(chosen)]
 
 
-def test_on_ctrl_c_it_closes_the_recording_and_ends_with_0(session):
+def test_ctrl_c_closes_the_recording_and_ends_the_node_with_0(session):
     path, _, code, _ = session
     assert code == 0 and (path / "metadata.yaml").exists()
 
@@ -136,29 +136,29 @@ def test_every_message_of_an_arm_is_in_the_recording(session, topic):
     assert [round(getattr(message, field)[0]) for _, message in recorded(session[0], topic)] == list(range(COUNT))
 
 
-def test_every_message_has_the_time_of_its_arrival(session):
+def test_every_message_has_its_time_of_arrival(session):
     for stamp, message in recorded(session[0], "/right/joint_states"):
         sent = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         assert 0 < stamp - sent < 10**9
 
 
-def test_a_best_effort_publisher_is_recorded_as_such(session):
+def test_a_best_effort_publisher_is_recorded_as_best_effort(session):
     with AnyReader([session[0]]) as reader:
         (imu,) = (c for c in reader.connections if c.topic == "/imu/data_raw")
     assert imu.ext.offered_qos_profiles[0].reliability.name == "BEST_EFFORT" and imu.msgcount > 0
 
 
-def test_what_was_told_before_the_recorder_came_is_in_it(session):
+def test_a_latched_message_from_before_the_recorder_started_is_recorded(session):
     ((_, message),) = recorded(session[0], "/right/wearer_step")
     assert json.loads(message.data)["action"] == "hold"
 
 
-def test_foreign_topics_are_left_alone(session):
+def test_other_topics_are_not_recorded(session):
     with AnyReader([session[0]]) as reader:
         assert "/right/chatter" not in reader.topics
 
 
-def test_the_type_has_the_hash_that_its_publisher_announces(session):
+def test_a_type_has_the_hash_that_its_publisher_announces(session):
     metadata = yaml.safe_load((session[0] / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     topics = {
         entry["topic_metadata"]["name"]: entry["topic_metadata"] for entry in metadata["topics_with_message_count"]
@@ -166,32 +166,32 @@ def test_the_type_has_the_hash_that_its_publisher_announces(session):
     assert topics["/right/joint_states"]["type_description_hash"] == str(session[3])
 
 
-def test_parameters_at_the_start_are_in_it_in_the_form_that_starts_a_node(session):
+def test_the_initial_parameters_are_recorded_as_a_parameter_file(session):
     parameters = yaml.safe_load(read_bag(session[0]).parameters["/right/bridge"])["/right/bridge"]["ros__parameters"]
     assert parameters["robot.mass"] == [0.5, 0.6, 0.7, 0.8] and parameters["support"] == 0.0
 
 
-def test_a_parameter_that_was_changed_is_an_event(session):
+def test_a_parameter_change_is_recorded_as_an_event(session):
     assert "/right/bridge: support = 0.5" in [event.text for event in read_bag(session[0]).events]
 
 
-def test_the_live_line_tells_joints_step_and_faults(session):
+def test_a_live_line_has_joints_step_and_faults(session):
     line = json.loads(session[1][-1])
     assert line["right"]["names"] == NAMES and line["right"]["position"] == [float(COUNT - 1)] * 4
     assert line["right"]["command"] == [float(COUNT - 1)] * 4 and line["right"]["step"]["action"] == "hold"
     assert line["faults"] == ["right/bridge: motor 2 is silent"]
 
 
-def test_without_an_output_it_says_what_is_missing_and_ends_with_2():
+def test_without_an_output_the_node_names_the_missing_parameter_and_ends_with_2():
     process = start(None)
     _, errors = process.communicate(timeout=30)
     assert process.returncode == 2 and "output" in errors
 
 
-def test_a_full_disk_ends_it_with_the_reason_and_disturbs_nobody(arm, tmp_path):
+def test_a_full_disk_ends_the_recorder_with_the_reason_and_keeps_what_fits(arm, tmp_path):
     small = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))  # noqa: E731
     process = start(tmp_path / "bag", preexec_fn=small)
-    arm.until(arm.heard)
+    arm.wait_until(arm.is_recorded)
     k = 0
     while process.poll() is None and k < 20_000:
         arm.publish(k := k + 1)
@@ -202,7 +202,7 @@ def test_a_full_disk_ends_it_with_the_reason_and_disturbs_nobody(arm, tmp_path):
 
 def test_the_recording_of_a_killed_recorder_can_be_read(arm, tmp_path):
     process = start(tmp_path / "bag")
-    arm.until(arm.heard)
+    arm.wait_until(arm.is_recorded)
     first = time.monotonic()
     k = 0
     while time.monotonic() - first < 1.5:

@@ -1,4 +1,4 @@
-"""What a node does before it is a node: where it may be heard."""
+"""Which hosts a node communicates with, as set before it starts."""
 
 import os
 
@@ -17,14 +17,14 @@ def environment(monkeypatch):
     return monkeypatch.setenv
 
 
-def test_nothing_set_means_this_machine_alone():
+def test_without_settings_a_node_communicates_on_this_machine_only():
     keep_to_this_machine()
     assert os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
     assert os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("fastdds.xml")
     assert open_to_others() == ""
 
 
-def test_what_the_user_set_stays(environment):
+def test_the_users_settings_are_kept(environment):
     environment("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
     keep_to_this_machine()
     assert os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "SUBNET"
@@ -32,7 +32,7 @@ def test_what_the_user_set_stays(environment):
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "named"),
     [
         ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET"),
         ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT"}, "ROS_AUTOMATIC_DISCOVERY_RANGE=SYSTEM_DEFAULT"),
@@ -45,7 +45,7 @@ def test_what_the_user_set_stays(environment):
         ),
     ],
 )
-def test_what_lets_other_hosts_in_is_named(environment, settings, told):
+def test_the_setting_that_admits_other_hosts_is_named(environment, settings, named):
     for name, value in settings.items():
         environment(name, value)
-    assert open_to_others() == told
+    assert open_to_others() == named

@@ -1,7 +1,7 @@
-"""config/sros2/policy.xml against the nodes as they are: who publishes, subscribes, serves and asks what.
+"""config/sros2/policy.xml against the running nodes: what each publishes, subscribes to, serves and calls.
 
-Real nodes of config/sim_both.yaml and a recorder; their bridges are not armed. That DDS then enforces the policy is not
-shown here: it takes a middleware built with security.
+The nodes are those of config/sim_both.yaml and a recorder; their bridges are not enabled. These tests do not show that
+DDS enforces the policy, which takes a middleware built with security.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import os
 import threading
 import time
 import xml.etree.ElementTree as ElementTree
-from pathlib import Path
 
 import pytest
 import rclpy
@@ -22,11 +21,12 @@ from exo_gravity.bag.storage import Storage
 from exo_gravity.core.errors import DataError
 from exo_gravity.tools.launcher import Launcher
 
-CONFIG = Path(__file__).parents[2] / "config"
+from ..support import CONFIG
+
 POLICY = CONFIG / "sros2" / "policy.xml"
 PORT = 40_000 + os.getpid() % 10_000  # apart from those of other tests
 RULES = {"topics": ("topic", {"publish", "subscribe"}), "services": ("service", {"reply", "request"})}
-ASKED = ("get_parameters", "list_parameters")  # of every node by the recorder
+RECORDER_CALLS = ("get_parameters", "list_parameters")  # on every node
 NODES = (
     "/imu", "/recorder",
     *(f"/{arm}/{node}" for arm in ("left", "right") for node in ("can_bridge", "compensator", "simulator")),
@@ -35,7 +35,7 @@ NOTHING = {"publish": set(), "subscribe": set(), "reply": set(), "request": set(
 
 
 def read_policy():
-    """The policy as {enclave: {'publish': names, 'subscribe': ..., 'reply': ..., 'request': ...}}."""
+    """Return the policy as {enclave: {'publish': names, 'subscribe': ..., 'reply': ..., 'request': ...}}."""
     policy = {}
     for enclave in ElementTree.parse(POLICY).getroot().iter("enclave"):
         rules = policy[enclave.get("path")] = {kind: set() for kind in NOTHING}
@@ -46,23 +46,23 @@ def read_policy():
 
 
 def graph_of(node, name):
-    """The same of a running node, as `node` sees it."""
+    """Return the same for the running node `name`, as `node` observes it."""
     namespace, _, leaf = name.rpartition("/")
-    asked = (
+    queries = (
         node.get_publisher_names_and_types_by_node,
         node.get_subscriber_names_and_types_by_node,
         node.get_service_names_and_types_by_node,
         node.get_client_names_and_types_by_node,
     )
     try:
-        found = [{item for item, _ in ask(leaf, namespace or "/")} for ask in asked]
+        found = [{item for item, _ in query(leaf, namespace or "/")} for query in queries]
     except NodeNameNonExistentError:
         return NOTHING
     return dict(zip(NOTHING, found, strict=True))
 
 
 def parameter_file(folder):
-    """config/sim_both.yaml on buses of its own, with a recorder and without arming."""
+    """Write config/sim_both.yaml with unused ports, a recorder, and bridges that do not start by themselves."""
     content = yaml.safe_load((CONFIG / "sim_both.yaml").read_text(encoding="utf-8"))
     for name, entry in content.items():
         values = entry["ros__parameters"]
@@ -76,60 +76,63 @@ def parameter_file(folder):
     return path
 
 
-def lasting(rules_of):
-    """The rules of each node, but for the recorder's requests: it has its clients for a moment only."""
+def lasting_rules(rules_of):
+    """Return the rules of each node, without the recorder's requests: its clients exist for a moment only."""
     return {node: {**rules_of(node), **({"request": set()} if node == "/recorder" else {})} for node in NODES}
 
 
-def asked_for(bag):
-    """The nodes whose parameters a recorder has written into a recording that it may still be writing."""
+def nodes_with_recorded_parameters(bag):
+    """Return the nodes whose parameters are in a recording, which may still grow."""
     types, wanted = get_typestore(Stores.ROS2_JAZZY), lambda topic, msgtype: topic == "/recorder/parameters"
     try:
         batches = Storage(bag).batches(wanted)
-        told = [types.deserialize_cdr(data, batch.msgtype).data for batch in batches for data in batch.data]
-    except DataError:  # there is nothing in it yet
+        texts = [types.deserialize_cdr(data, batch.msgtype).data for batch in batches for data in batch.data]
+    except DataError:  # the recording is still empty
         return set()
-    return {text.partition(":")[0].strip() for text in told}
+    return {text.partition(":")[0].strip() for text in texts}
 
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
-    """The graph of the running nodes, and the nodes whose parameters the recorder wrote down."""
+    """The graph of the running nodes, and the nodes whose parameters the recorder has written."""
     folder, ending, context = tmp_path_factory.mktemp("sros2"), threading.Event(), rclpy.Context()
     rclpy.init(context=context)
-    looker = rclpy.create_node("looker", context=context)
+    observer = rclpy.create_node("observer", context=context)
     launcher = Launcher(parameter_file(folder), on_line=lambda node, line: None)
     thread = threading.Thread(target=launcher.run, args=(ending,))
     thread.start()
-    expected = lasting(read_policy().get), set(NODES) - {"/recorder"}
+    expected = lasting_rules(read_policy().get), set(NODES) - {"/recorder"}
     found, end = None, time.monotonic() + 30.0
-    while found != expected and time.monotonic() < end:  # the tests below say what differs
+    while found != expected and time.monotonic() < end:  # the tests below show the difference
         time.sleep(0.2)
-        found = lasting(lambda node: graph_of(looker, node)), asked_for(folder / "bag") - {"/looker"}
+        found = (
+            lasting_rules(lambda node: graph_of(observer, node)),
+            nodes_with_recorded_parameters(folder / "bag") - {"/observer"},
+        )
     ending.set()
     thread.join()
-    looker.destroy_node()
+    observer.destroy_node()
     rclpy.try_shutdown(context=context)
     return found
 
 
 @pytest.mark.parametrize("node", NODES)
 @pytest.mark.parametrize("kind", ["publish", "subscribe", "reply"])
-def test_a_node_may_do_what_it_does_and_nothing_else(session, node, kind):
+def test_a_node_may_do_exactly_what_it_does(session, node, kind):
     assert read_policy()[node][kind] == session[0][node][kind]
 
 
 @pytest.mark.parametrize("node", [node for node in NODES if node != "/recorder"])
-def test_no_node_but_the_recorder_asks_others(session, node):
+def test_only_the_recorder_calls_services_of_other_nodes(session, node):
     assert session[0][node]["request"] == set() == read_policy()[node]["request"]
 
 
-def test_the_recorder_may_ask_those_nodes_that_it_does_ask(session):
-    requests = {f"{node}/{service}" for node in session[1] for service in ASKED}
+def test_the_recorder_may_call_exactly_the_services_that_it_calls(session):
+    requests = {f"{node}/{service}" for node in session[1] for service in RECORDER_CALLS}
     assert read_policy()["/recorder"]["request"] == requests
 
 
-def test_the_operator_may_call_every_service_and_see_every_topic():
+def test_the_operator_may_call_every_service_and_subscribe_to_every_topic():
     policy = read_policy()
     operator = policy.pop("/operator")
     assert operator["request"] == set().union(*(rules["reply"] for rules in policy.values()))
@@ -137,12 +140,12 @@ def test_the_operator_may_call_every_service_and_see_every_topic():
 
 
 @pytest.mark.parametrize("arm", ["left", "right"])
-def test_nobody_but_an_arms_compensator_may_publish_its_torques(arm):
+def test_only_an_arms_compensator_may_publish_its_efforts(arm):
     publishers = [name for name, rules in read_policy().items() if f"/{arm}/effort_commands" in rules["publish"]]
     assert publishers == [f"/{arm}/compensator"]
 
 
-def test_the_file_has_the_form_of_an_access_control_policy_of_version_0_2_0():
+def test_the_file_has_the_structure_of_an_access_control_policy_of_version_0_2_0():
     root = ElementTree.parse(POLICY).getroot()
     assert (root.tag, root.attrib, [child.tag for child in root]) == ("policy", {"version": "0.2.0"}, ["enclaves"])
     for enclave in root[0]:
@@ -156,6 +159,6 @@ def test_the_file_has_the_form_of_an_access_control_policy_of_version_0_2_0():
             assert len(rule) and {child.tag for child in rule} == {item}
 
 
-def test_every_name_is_spelt_out_in_full():
+def test_every_name_is_absolute_and_without_wildcards():
     names = [name for rules in read_policy().values() for kind in rules.values() for name in kind]
     assert all(name.startswith("/") and not set(name) & set("*?[]~ \n") for name in names)

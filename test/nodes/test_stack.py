@@ -136,5 +136,5 @@ def test_the_anfis_law_runs_from_its_file_and_the_exact_law_replaces_it_outside_
     probe.wait_until(lambda: probe.diagnostic("compensator", "law") == "anfis")
     probe.wait_until(lambda: probe.status_contains("compensator", "compensating"))
     assert probe.set_parameters("compensator", wearer__body_mass=75.0, mode="zero_g", atomically=True).successful
-    message = "exact law in use instead of anfis: the ANFIS was trained for another"
+    message = "the exact law replaces anfis: the ANFIS was trained for another arm"
     probe.wait_until(lambda: probe.status_contains("compensator", message))

@@ -119,7 +119,7 @@ def test_joint_stops_hold_against_the_motors_peak_torque(joint, side):
 
 def test_each_joint_turns_190_degrees_in_all():
     config = ArmConfig()
-    np.testing.assert_allclose(np.degrees(config.position_max - config.position_min), 190.0)
+    np.testing.assert_allclose(np.degrees(np.subtract(config.position_max, config.position_min)), 190.0)
 
 
 def test_the_wearers_arm_sinks_where_the_bare_arm_is_held():

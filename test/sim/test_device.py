@@ -16,7 +16,7 @@ from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.motors import ENTER, MOTORS, SET_ZERO, pack_command, unpack_reply
 from exo_gravity.core.trial_script import TrialScript
-from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
+from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer, can_link
 from exo_gravity.sim import device as device_module
 
 NAMES = ("AK60-6", "AK80-9", "AK60-6", "AK60-6")
@@ -221,7 +221,7 @@ def test_an_echo_that_the_bus_marks_as_such_is_never_taken_for_a_command():
 def test_on_a_bus_that_does_not_echo_a_command_with_the_bytes_of_a_reply_is_carried_out():
     options = {"interface": "virtual", "channel": f"device-{next(channels)}"}
     with running(make_device(), options) as host:
-        for _ in range(device_module._ECHOES_AWAITED + 5):
+        for _ in range(can_link.MAX_PENDING_ECHOES + 5):
             host.send(frame(1, command(0)))
             reply = next_reply(host)
         host.send(frame(1, bytes(reply.data)))

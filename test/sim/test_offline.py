@@ -14,7 +14,8 @@ from exo_gravity.core.motors import ENTER, EXIT, MOTORS, unpack_command
 from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.sim import ArmConfig, ImuConfig, SimulatedArm, SimulatedDevice, SimulatedImu, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
-from exo_gravity.sim.offline import ArmSetup, OfflineTrial, told_tilt
+from exo_gravity.sim.imu import measured_tilt
+from exo_gravity.sim.offline import ArmSetup, OfflineTrial
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")
 POSE = [0.1, 0.6, 0.7, 0.5]
@@ -150,5 +151,5 @@ def test_the_same_trial_twice_is_the_same_recording(make):
 
 def test_a_second_of_imu_samples_tells_the_tilt_of_the_trunk():
     mounted = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
-    tilt = told_tilt(0.1, -0.06, SimulatedImu(ImuConfig(mounted)), mounted)
+    tilt = measured_tilt(0.1, -0.06, SimulatedImu(ImuConfig(mounted)), mounted)
     np.testing.assert_allclose(tilt, (0.1, -0.06), atol=0.01)

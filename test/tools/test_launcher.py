@@ -1,5 +1,6 @@
 """launcher: which keys of a parameter file it accepts, and how it refuses the others. test/nodes starts real nodes."""
 
+import sys
 import time
 from pathlib import Path
 
@@ -68,3 +69,12 @@ def test_two_bridges_with_one_motor_on_the_same_bus_are_refused(refused):
 
 def test_the_packaged_file_is_accepted():
     Launcher(SIM)
+
+
+def test_without_rclpy_one_line_says_how_to_get_it(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    with pytest.raises(SystemExit) as ended:
+        main([])
+    error = capsys.readouterr().err
+    assert ended.value.code == 2 and error.startswith("launcher: the Python package rclpy is not found: ")
+    assert "exo_gravity[ros]" in error and error.count("\n") == 1

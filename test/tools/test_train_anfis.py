@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -11,10 +12,11 @@ from exo_gravity.core import gravity_torque
 from exo_gravity.core.anfis_law import AnfisLaw, scaled
 from exo_gravity.core.errors import DataError
 from exo_gravity.tools.anfis.data import from_gravload
+from exo_gravity.tools.anfis.projection import Projection
 from exo_gravity.tools.anfis.recorded import TILT_TOPIC, TILT_TYPE, from_bag
-from exo_gravity.tools.anfis.training import RIDGE, _Projection, train, train_law
-from exo_gravity.tools.comparison.tables import PAPER_ANFIS
+from exo_gravity.tools.anfis.training import RIDGE, train, train_law
 from exo_gravity.tools.inputs.arms import configured_arm
+from exo_gravity.tools.inputs.paper import PAPER_ANFIS
 from exo_gravity.tools.train_anfis import main
 
 from ..support import made_bags as made
@@ -81,7 +83,7 @@ def test_the_reported_errors_are_those_of_the_saved_law(learned):
 
 def test_the_projected_gradient_is_that_of_finite_differences():
     inputs = RNG.uniform(-1, 1, (60, 2))
-    problem = _Projection(inputs, np.sin(3 * inputs[:, 0]) * inputs[:, 1], 3, RIDGE, lambda step, rmse: None)
+    problem = Projection(inputs, np.sin(3 * inputs[:, 0]) * inputs[:, 1], 3, RIDGE, lambda step, rmse: None)
     premises = np.concatenate((RNG.uniform(-1, 1, 6), RNG.uniform(-0.3, 0.3, 6)))
 
     def cost(at):
@@ -204,8 +206,28 @@ def test_wrong_use_ends_with_2_and_one_sentence(arguments, tmp_path, capsys):
     assert "Traceback" not in capsys.readouterr().err
 
 
-def test_an_output_that_cant_be_written_ends_with_2(bag, tmp_path, capsys):
+def test_the_folder_of_the_output_is_created(bag, tmp_path):
+    saved = tmp_path / "new" / "folder" / "law.json"
+    main(["--params", str(params_file(tmp_path)), "--bag", str(bag), "--output", str(saved)])
+    assert AnfisLaw.load(saved.read_text(encoding="utf-8")).first_moment == made.ARM.first_moment[1:]
+
+
+@pytest.mark.parametrize("output", ["file/law.json", "folder"])
+def test_an_output_that_cannot_be_written_ends_with_2_before_the_training(output, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("exo_gravity.tools.anfis.training.train", lambda *_, **__: pytest.fail("trained"))
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    (tmp_path / "folder").mkdir()
     with pytest.raises(SystemExit) as ended:
-        main(["--params", str(params_file(tmp_path)), "--bag", str(bag), "--output", str(tmp_path / "no" / "law.json")])
+        main(["--params", str(params_file(tmp_path)), "--output", str(tmp_path / output)])
     assert ended.value.code == 2
-    assert "law.json" in capsys.readouterr().err
+    assert f"train_anfis: output = '{tmp_path / output}': must be a file" in capsys.readouterr().err
+
+
+def test_a_missing_package_is_named_with_the_extra_that_installs_it(capsys, monkeypatch):
+    monkeypatch.delitem(sys.modules, "exo_gravity.tools.anfis.training")
+    monkeypatch.setitem(sys.modules, "threadpoolctl", None)
+    with pytest.raises(SystemExit) as ended:
+        main([])
+    assert ended.value.code == 2
+    expected = "threadpoolctl is not installed: apt install python3-threadpoolctl, or pip install 'exo_gravity[report"
+    assert expected in capsys.readouterr().err

@@ -14,7 +14,7 @@ from exo_gravity.core import ArmModel
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.tools import validate
 from exo_gravity.tools.anfis import training
-from exo_gravity.tools.comparison import figures, laws
+from exo_gravity.tools.comparison import figures, laws, validation
 from exo_gravity.tools.comparison.growth import growth, sizes
 from exo_gravity.tools.inputs.arms import configured_arm, with_cog_at_link_ends
 from exo_gravity.tools.inputs.references import REFERENCES, gravload
@@ -26,16 +26,16 @@ DOWN = np.array(((0.0, 0.0, 1.0),))
 def quick(tmp_path_factory):
     """Exit code, printed text, folder and parts of a run with few poses and short training."""
     folder = tmp_path_factory.mktemp("validation")
-    lines, parts, evaluate = [], [], validate.evaluate
+    lines, parts, evaluate = [], [], validation.evaluate
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(validate, "QUICK_COUNT", 60)
         patch.setattr(figures, "GRID", (8, 8, 3))
         patch.setattr(training, "MAX_EVALUATIONS", 12)
-        patch.setattr(validate, "evaluate", lambda *given: parts.append(evaluate(*given)) or parts[-1])
+        patch.setattr(validation, "evaluate", lambda *given: parts.append(evaluate(*given)) or parts[-1])
         patch.setattr("builtins.print", lambda *parts, **_: lines.append(" ".join(map(str, parts))))
         with pytest.raises(SystemExit) as ended:
             validate.main(["--quick", "--output", str(folder)])
-    return ended.value.code, "\n".join(lines), folder, parts
+    return ended.value.code, "\n".join(lines), folder, validation.Validation(*parts)
 
 
 def write_params(folder, arm, bridge=None):
@@ -108,19 +108,19 @@ def test_a_joint_that_needs_no_torque_has_no_share():
     assert math.isnan(laws.compare(case, {"law": np.ones((1053, 4))}, "", np.zeros((1053, 4)))[0].share)
 
 
-def test_the_papers_premise_is_link_ends_gain_1_and_its_own_gravity():
+def test_the_papers_assumptions_are_cog_at_link_ends_gain_1_and_its_own_gravity():
     arm = with_cog_at_link_ends(ArmModel((0.1,) * 4, (0.05,) * 4, (1.0,) * 4, (0.5,) * 4))
     assert np.array_equal(arm.cog, arm.length) and arm.gravity == 9.8 and np.all(arm.gain == 1)
 
 
-def test_the_arm_is_read_from_dotted_and_nested_names_alike(tmp_path):
+def test_the_arm_is_read_from_dotted_and_nested_names(tmp_path):
     mass, cog = [0.1, 0.2, 0.3, 0.4], [0.01, 0.02, 0.03, 0.04]
     nested = configured_arm(write_params(tmp_path, {"robot": {"mass": mass, "cog": cog}, "gravity": 9.8}))
     dotted = configured_arm(write_params(tmp_path, {"robot.mass": mass, "robot.cog": cog, "gravity": 9.8}))
     assert nested.robot == dotted.robot == ArmModel((0.05, 0.13, 0.3, 0.3), cog, mass, gravity=9.8)
 
 
-def test_the_joint_limits_are_those_of_the_bridge_beside_the_compensator(tmp_path):
+def test_the_joint_limits_are_those_of_the_bridge_next_to_the_compensator(tmp_path):
     path = write_params(tmp_path, {}, {"position_min": [-1.0, 0.0, 0.0, 0.0], "position_max": [1.0, 1.5, 1.5, 2.0]})
     assert configured_arm(path).high.tolist() == [1.0, 1.5, 1.5, 2.0]
 
@@ -148,7 +148,7 @@ def test_all_checks_hold_on_the_packaged_arm(quick):
     assert "FAILED" not in printed and printed.count("\nheld") == 4
 
 
-def test_the_papers_figures_stand_beside_ours(quick):
+def test_the_papers_figures_are_printed_next_to_ours(quick):
     for figure in ("6.06e-16", "4.06e-16", "8.03e-17", "1.71e-03", "1.32e-03", "3.15e-04", "380 s"):
         assert figure in quick[1]
 
@@ -172,18 +172,20 @@ def test_the_figures_are_pictures_with_something_in_them(quick, name):
     assert matplotlib.image.imread(quick[2] / name)[..., :3].std() > 0.05
 
 
-def test_an_exact_law_that_is_off_by_a_billionth_somewhere_fails_its_check(quick):
-    paper, configured = quick[3]
-    rows = [replace(row, largest=1e-9) if (row.law, row.joint) == ("exact", 3) else row for row in configured.rows]
-    failed = [sentence for held, sentence in validate.checks(paper, replace(configured, rows=rows)) if not held]
+def test_an_exact_law_that_is_off_by_a_billionth_of_a_newton_metre_fails_its_check(quick):
+    part = quick[3].as_configured
+    rows = [replace(row, largest=1e-9) if (row.law, row.joint) == ("exact", 3) else row for row in part.rows]
+    spoilt = replace(quick[3], as_configured=replace(part, rows=rows))
+    failed = [sentence for held, sentence in spoilt.checks() if not held]
     assert len(failed) == 1 and failed[0].startswith("exact law")
 
 
 @pytest.mark.parametrize("kind", ["training", "held_out"])
 def test_an_anfis_worse_than_the_papers_on_one_joint_fails_its_check(quick, kind):
-    paper, configured = quick[3]
-    law = replace(paper.law, error={**paper.law.error, kind: [1e-6, 1.33e-3, 1e-6]})
-    failed = [sentence for held, sentence in validate.checks(replace(paper, law=law), configured) if not held]
+    part = quick[3].link_ends
+    law = replace(part.law, error={**part.law.error, kind: [1e-6, 1.33e-3, 1e-6]})
+    spoilt = replace(quick[3], link_ends=replace(part, law=law))
+    failed = [sentence for held, sentence in spoilt.checks() if not held]
     assert len(failed) == 1 and failed[0].startswith("ANFIS")
 
 
@@ -219,6 +221,6 @@ def test_the_growth_of_one_model_counts_its_rules_parameters_and_positions():
     assert row.training_time > 0 and row.inference_time > 0 and 0 < row.held_out_rmse < 1
 
 
-def test_gravload_is_told_gravity_in_its_own_sign():
+def test_gravload_gets_gravity_in_its_own_sign():
     abducted = np.array(((0.0, 0.1, 0.0, 0.0),))
     assert gravload(configured_arm().robot)(abducted, DOWN)[0, 1] > 0

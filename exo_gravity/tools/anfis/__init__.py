@@ -1,0 +1,1 @@
+"""Training an ANFIS: its samples, computed or recorded, and the learning itself."""

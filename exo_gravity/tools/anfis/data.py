@@ -1,7 +1,7 @@
-"""What an ANFIS learns from: `gravload` torques of joints 2 to 4 over an upright arm's workspace.
+"""Samples for an ANFIS: `gravload` torques of joints 2 to 4 over an upright arm's workspace.
 
-It trains on the paper's 1,053 positions, 13 x 9 x 9 over joints 2, 3, 4, and is checked on the positions in the middle
-between them. Torques are in Nm at gain 1, not scaled.
+It trains on the paper's 1,053 positions, 13 x 9 x 9 over joints 2, 3, 4, and is checked half-way between them. Torques
+are in Nm at gain 1, not scaled.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ GRID = (13, 9, 9)  # positions of joints 2, 3, 4: 1,053 as in the paper
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Angles (n, 3) rad and torques (n, 3) Nm of joints 2 to 4, to train on and held out, within the box low..high."""
+    """Training and held-out samples of joints 2 to 4: angles (n, 3) rad in the box low..high, torques (n, 3) Nm."""
 
     angle: np.ndarray
     torque: np.ndarray
@@ -31,14 +31,16 @@ class Samples:
 
 
 def from_gravload(configured: ConfiguredArm) -> Samples:
-    """Return the torques of the upright arm by the Robotics Toolbox, on the grid and between its positions."""
+    """Return the upright arm's torques by the Robotics Toolbox, on the grid and half-way between its positions."""
     low, high = configured.low[1:], configured.high[1:]
     axes = [np.linspace(a, b, count) for a, b, count in zip(low, high, GRID, strict=True)]
     reference = gravload(replace(configured.robot, gain=np.ones(4)))
-    sets = []
-    for positions in (axes, [(axis[1:] + axis[:-1]) / 2 for axis in axes]):
-        angle = np.array(list(product(*positions)))
+
+    def torques(angle: np.ndarray) -> np.ndarray:
         theta = np.column_stack((np.zeros(len(angle)), angle))
-        torque = reference(theta, np.tile((0.0, 0.0, 1.0), (len(theta), 1)))
-        sets += [angle, torque[:, 1:]]
-    return Samples(*sets, low, high, f"gravload of the Robotics Toolbox, {len(sets[0])} positions")
+        return reference(theta, np.tile((0.0, 0.0, 1.0), (len(theta), 1)))[:, 1:]
+
+    angle = np.array(list(product(*axes)))
+    between = np.array(list(product(*((axis[1:] + axis[:-1]) / 2 for axis in axes))))
+    source = f"gravload of the Robotics Toolbox, {len(angle)} positions"
+    return Samples(angle, torques(angle), between, torques(between), low, high, source)

@@ -1,44 +1,41 @@
 """Hybrid learning of an ANFIS that converges: variable projection with SciPy's least squares.
 
-Jang's hybrid learning solves the consequents by least squares and moves the premises down the gradient, an epoch each.
-The same split, done to the end: the consequents are a function of the premises (the least-squares solution), so the
-error is one of the premises alone, and a trust-region method takes its steps on that (Golub and Pereyra 1973; Jacobian
-after Kaufman 1975). 100 evaluations reach what thousands of epochs do not.
+In each epoch, Jang's hybrid learning solves the consequents by least squares and moves the premises down the gradient.
+Variable projection completes this split: the consequents are a function of the premises (the least-squares solution),
+so the error depends on the premises alone, and a trust-region method minimises it (Golub and Pereyra 1973; Jacobian
+after Kaufman 1975). 100 evaluations achieve what thousands of epochs do not.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress
-from scipy.linalg import qr, solve_triangular
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
-from exo_gravity.core.anfis import Anfis, grades
+from exo_gravity.core.anfis import Anfis
 from exo_gravity.core.anfis_law import JOINTS, AnfisLaw, scaled
 from exo_gravity.core.arm import ArmModel
 from exo_gravity.core.errors import DataError
 from exo_gravity.tools.anfis.data import Samples
+from exo_gravity.tools.anfis.projection import OnEvaluation, Projection
 
-RIDGE = 1e-6  # holds consequents that the data leave open near 0; on noisy data more of it is wanted
-# In units of half the training box. Narrow functions fit the sampled positions and miss those between: from 0.4 wide on
-# the held-out error is up to tenfold that of 0.8.
+RIDGE = 1e-6  # keeps consequents that the data do not determine near 0; noisy data need more
+# In units of half the training box. Narrow functions overfit the sampled positions: at a width of 0.4 the held-out
+# error is up to ten times that at 0.8.
 NARROWEST, WIDEST = 0.8, 4.0
-FARTHEST = 2.0  # how far from the middle of the box a centre may go
+FARTHEST = 2.0  # largest distance of a centre from the middle of the box, in the same units
 
 MAX_EVALUATIONS = 100
-
-OnEvaluation = Callable[[int, float], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """A model of one output, its RMSE on the training data, evaluations of the premises and seconds that it took."""
+    """A model of one output: its RMSE on the training data, evaluations of the premises, and training time in s."""
 
     model: Anfis
     rmse: float
@@ -57,8 +54,8 @@ def train(
 ) -> Trained:
     """Return an ANFIS of `functions` Gaussians per input, trained on inputs (n, d) in -1..1 and output (n,).
 
-    on_evaluation(evaluation, RMSE) is called after each evaluation of the premises. Raises DataError where there are
-    fewer samples than consequents.
+    on_evaluation(evaluation, RMSE) is called after each evaluation of the premises. Raises DataError if there are fewer
+    samples than consequents.
     """
     dimension = inputs.shape[1]
     consequents = functions**dimension * (dimension + 1)
@@ -70,7 +67,7 @@ def train(
     high = np.repeat((FARTHEST, np.log(WIDEST)), count)
     centre = np.tile(np.linspace(-1.0, 1.0, functions), dimension)
     start = np.concatenate((centre, np.full(count, np.log(1.05 * NARROWEST))))
-    problem = _Projection(inputs, output, functions, ridge, on_evaluation)
+    problem = Projection(inputs, output, functions, ridge, on_evaluation)
     found = least_squares(
         problem.residual, start, problem.jacobian, (low, high), max_nfev=max_evaluations, ftol=1e-4, xtol=1e-8
     )
@@ -82,20 +79,17 @@ def train(
 def train_law(
     samples: Samples, arm: ArmModel, functions: int = 4, ridge: float = RIDGE
 ) -> tuple[AnfisLaw, list[Trained]]:
-    """Return the law for `arm` trained on `samples`, and how the training of joints 2, 3 and 4 went."""
+    """Return the law for `arm` trained on `samples`, and the training results of joints 2, 3 and 4."""
     inputs = scaled(samples.angle, samples.low, samples.high)
     results = []
     for joint, torque in zip(JOINTS, samples.torque.T, strict=True):
         with Progress(console=Console(stderr=True), transient=True) as progress:
-            task = progress.add_task("", total=MAX_EVALUATIONS)
-
-            def show(step: int, rmse: float, task=task, progress=progress, joint=joint) -> None:
-                progress.update(task, completed=step, description=f"training joint {joint}: RMSE {rmse:.2e} Nm")
-
-            options = {"ridge": ridge, "max_evaluations": MAX_EVALUATIONS, "on_evaluation": show}
-            # Matrices this small gain nothing from threads, which on busy cores wait for one another: 73 s, not 2.
+            show = _progress_line(progress, joint)
+            # Threads gain nothing on matrices this small, and wait for each other on busy cores: 73 s instead of 2 s.
             with threadpool_limits(1):
-                results.append(train(inputs, torque, functions, **options))
+                results.append(
+                    train(inputs, torque, functions, ridge=ridge, max_evaluations=MAX_EVALUATIONS, on_evaluation=show)
+                )
     parts = (np.concatenate([getattr(r.model, part) for r in results]) for part in ("centre", "sigma", "consequent"))
     model = Anfis(*parts)
     held_out = model.output(scaled(samples.held_out_angle, samples.low, samples.high)) - samples.held_out_torque
@@ -107,75 +101,10 @@ def train_law(
     return AnfisLaw(model, *box, arm.first_moment[1:], arm.gravity, samples.source, error), results
 
 
-class _Projection:
-    """The residual as a function of the premises alone: all centres, then the logarithms of all widths."""
+def _progress_line(progress: Progress, joint: str) -> OnEvaluation:
+    task = progress.add_task("", total=MAX_EVALUATIONS)
 
-    def __init__(self, inputs, output, functions, ridge, on_evaluation: OnEvaluation):
-        self.inputs, self.functions, self.ridge = inputs, functions, ridge
-        self.extended = np.column_stack((np.ones(len(inputs)), inputs))
-        consequents = functions ** inputs.shape[1] * self.extended.shape[1]
-        self.target = np.concatenate((output, np.zeros(consequents)))
-        self.evaluations = 0
-        self.on_evaluation = on_evaluation
-        self._at: np.ndarray | None = None
+    def show(evaluation: int, rmse: float) -> None:
+        progress.update(task, completed=evaluation, description=f"training joint {joint}: RMSE {rmse:.2e} Nm")
 
-    def residual(self, premises: np.ndarray) -> np.ndarray:
-        self._solve(premises)
-        return self._residual
-
-    def jacobian(self, premises: np.ndarray) -> np.ndarray:
-        """Kaufman: the model's derivative at fixed consequents, less the part that the consequents can make up for."""
-        self._solve(premises)
-        derivative = self._derivative()
-        projected = np.zeros((len(self.target), derivative.shape[1]))
-        projected[: len(derivative)] = derivative
-        projected -= self._basis @ (self._basis[: len(derivative)].T @ derivative)
-        return -projected
-
-    def model(self, premises: np.ndarray) -> Anfis:
-        self._solve(premises)
-        return Anfis(self._centre, self._sigma, self._consequent[None])
-
-    def _solve(self, premises: np.ndarray) -> None:
-        """Find the consequents for these premises, unless they were found last time."""
-        if self._at is not None and np.array_equal(premises, self._at):
-            return
-        centre, width = premises.reshape(2, 1, self.inputs.shape[1], self.functions)
-        self._centre, self._sigma = centre, np.exp(width)
-        self._share = grades(self._centre, self._sigma, self.inputs)[0]  # (n, d, k)
-        strength = self._share[:, 0]
-        for axis in range(1, self.inputs.shape[1]):
-            strength = (strength[:, :, None] * self._share[:, axis, None, :]).reshape(len(strength), -1)
-        design = (strength[:, :, None] * self.extended[:, None, :]).reshape(len(strength), -1)
-        # The ridge as rows of their own keeps the matrix of full rank: no pivoting, no squared condition.
-        self._basis, triangle = qr(
-            np.vstack((design, self.ridge * np.eye(design.shape[1]))), mode="economic", check_finite=False
-        )
-        in_basis = self._basis.T @ self.target
-        self._residual = self.target - self._basis @ in_basis
-        self._consequent = solve_triangular(triangle, in_basis).reshape(-1, self.extended.shape[1])
-        self._at = premises.copy()
-        self.evaluations += 1
-        samples = self._residual[: len(self.inputs)]
-        self.on_evaluation(self.evaluations, float(np.sqrt(np.mean(samples**2))))
-
-    def _derivative(self) -> np.ndarray:
-        """Return d output / d premises (n, 2 d k) at fixed consequents.
-
-        With e = -((u - centre) / sigma)^2 / 2 the grades are a softmax: d output / d e_q = grade_q (G_q - output), G_q
-        being what the rules with function q give by themselves.
-        """
-        count, dimension, functions = self._share.shape
-        rule = (self.extended @ self._consequent.T).reshape(count, *(functions,) * dimension)
-        distance = (self.inputs[:, :, None] - self._centre) / self._sigma
-        by_centre, by_width = np.empty((2, count, dimension, functions))
-        for axis in range(dimension):
-            alone = np.moveaxis(rule, axis + 1, 1)
-            for other in reversed([i for i in range(dimension) if i != axis]):
-                share = self._share[:, other].reshape(count, *(1,) * (alone.ndim - 2), functions)
-                alone = (alone * share).sum(axis=-1)
-            share = self._share[:, axis]
-            by_exponent = share * (alone - (share * alone).sum(axis=1, keepdims=True))
-            by_centre[:, axis] = by_exponent * distance[:, axis] / self._sigma[0, axis]
-            by_width[:, axis] = by_exponent * distance[:, axis] ** 2
-        return np.hstack((by_centre.reshape(count, -1), by_width.reshape(count, -1)))
+    return show

@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 
 # Ubuntu 24.04 has these; all others come from PyPI only.
 APT = {
@@ -36,3 +37,11 @@ def extras(tool: str, extra: str) -> Iterator[None]:
             raise  # not a package that an extra installs
         print(f"{tool}: {missing(error.name, extra)}", file=sys.stderr)
         raise SystemExit(2) from None
+
+
+def require_ros(tool: str) -> None:
+    """End `tool` with exit code 2 and one line if ROS 2's Python library is not found."""
+    if not find_spec("rclpy"):
+        remedy = "source /opt/ros/jazzy/setup.bash, or without ROS: pip install 'exo_gravity[ros]'"
+        print(f"{tool}: the Python package rclpy is not found: {remedy}", file=sys.stderr)
+        raise SystemExit(2)

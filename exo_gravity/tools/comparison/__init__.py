@@ -1,0 +1,1 @@
+"""The paper's comparison of all laws with independent references."""

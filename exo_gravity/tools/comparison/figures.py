@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
 
-matplotlib.use("Agg")  # no window: a machine without a screen draws too
+matplotlib.use("Agg")  # draws without a screen
 from matplotlib import pyplot as plt
 from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 
 from exo_gravity.tools.comparison.laws import Row, rms
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 
-FLOOR, CEILING = 1e-7, 1.0  # Nm, ends of the colour scale; less is drawn as the floor
-GRID = (56, 56, 7)  # positions of joints 2, 3, 4 behind the workspace figure
-# Lines that lie on one another stay visible: the wider ones below are drawn first.
-STYLES = {
+FLOOR, CEILING = 1e-7, 1.0  # Nm, ends of the colour scale
+GRID = (56, 56, 7)  # positions of joints 2, 3, 4 in the workspace figure
+# Overlapping lines stay visible, because the wider ones are drawn first.
+STYLES: dict[str, dict[str, Any]] = {
     "EQ2-EQ5": {"color": "tab:orange", "marker": "s", "linewidth": 4, "markersize": 7},
     "EQ1m-EQ4m": {"color": "tab:red", "marker": "D", "linewidth": 2},
     "ANFIS": {"color": "tab:blue", "marker": "^", "linestyle": "--"},
@@ -29,7 +31,7 @@ STYLES = {
 Error = Callable[[np.ndarray], np.ndarray]  # theta (n, 4) rad -> error (n, 4) Nm
 
 
-def workspace_figure(path: Path, configured: ConfiguredArm, errors: dict[str, Error]) -> None:
+def workspace_figure(path: Path, configured: ConfiguredArm, errors: Mapping[str, Error]) -> None:
     """Draw the RMSE over the elbow of joints 2 to 4 (rows) and each law (columns) over abduction and flexion."""
     box = zip(configured.low[1:], configured.high[1:], GRID, strict=True)
     axes = [np.linspace(low, high, n) for low, high, n in box]
@@ -53,7 +55,7 @@ def workspace_figure(path: Path, configured: ConfiguredArm, errors: dict[str, Er
 
 
 def tilt_figure(path: Path, rows: Sequence[Row]) -> None:
-    """Draw the RMSE of each law over the limit of the tilt: a column per joint, a row per set of centres of gravity."""
+    """Draw the RMSE of each law over the tilt limit: one column per joint, one row per set of centres of gravity."""
     rows = [row for row in rows if row.positions == "random" and row.reference == "gravload"]
     cogs = list(dict.fromkeys(row.cog for row in rows))
     figure, grid = plt.subplots(len(cogs), 4, figsize=(13, 6.4), sharex=True, sharey="col", squeeze=False)
@@ -75,6 +77,6 @@ def tilt_figure(path: Path, rows: Sequence[Row]) -> None:
     _save(figure, path)
 
 
-def _save(figure, path: Path) -> None:
+def _save(figure: Figure, path: Path) -> None:
     figure.savefig(path, dpi=130)
     plt.close(figure)

@@ -1,8 +1,8 @@
-"""The curse of dimensionality, measured: what an ANFIS of joint 3 costs as its inputs grow from 2 to 6.
+"""The curse of dimensionality, measured: the cost of an ANFIS for joint 3 with 2 to 6 inputs.
 
-Inputs are added in the order of `INPUTS`: the elbow and the shoulder's flexion, then abduction, rotation, and the
-trunk's pitch and sideways tilt of up to 30 degrees. The functions per input stay the same, so the rules multiply. Each
-model sees three positions per consequent, and learns from the exact law.
+Inputs are added in the order of `INPUTS`: shoulder flexion and elbow, then abduction, rotation, and the trunk's pitch
+and sideways tilt of up to 30 degrees. The functions per input stay the same, so the rules multiply. Each model learns
+the exact law at three positions per consequent.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ COLUMNS = (2, 3, 1, 0, 4, 5)  # of theta_1..theta_4, pitch, tilt
 TILT = math.radians(30.0)
 SAMPLES = 3  # positions per consequent
 HELD_OUT = 2000  # random positions
-STEPS = 20  # evaluations of the premises
-MANY = 2000  # consequents above which one least-squares solution takes a minute: the premises stay where they start
+EVALUATIONS = 20  # of the premises
+MANY = 2000  # consequents; beyond, one least-squares solution takes a minute, so the premises are not trained
 
 
 @dataclass(frozen=True)
 class Growth:
-    """One model: its size, what it took, and what it came to. Seconds; RMSE in Nm."""
+    """One model: its size, its training and inference time in s, and its RMSE in Nm."""
 
     inputs: int
     functions: int
@@ -48,13 +48,12 @@ class Growth:
 
 
 def growth(configured: ConfiguredArm, functions: int, inputs: int) -> Growth:
-    """Return what a model of joint 3 with `functions` per input and the first `inputs` of `INPUTS` costs and gives."""
+    """Return cost and error of a model of joint 3 with `functions` per input and the first `inputs` of `INPUTS`."""
     consequents = functions**inputs * (inputs + 1)
     count = math.ceil((SAMPLES * consequents) ** (1 / inputs))
     positions = np.array(list(product(np.linspace(-1, 1, count), repeat=inputs)))
-    trained = train(
-        positions, _torque(configured, positions), functions, max_evaluations=STEPS if consequents < MANY else 1
-    )
+    evaluations = EVALUATIONS if consequents < MANY else 1
+    trained = train(positions, _torque(configured, positions), functions, max_evaluations=evaluations)
     between = np.random.default_rng(0).uniform(-1, 1, (HELD_OUT, inputs))
     error = trained.model.output(between)[:, 0] - _torque(configured, between)
     model = trained.model
@@ -73,12 +72,12 @@ def growth(configured: ConfiguredArm, functions: int, inputs: int) -> Growth:
 
 
 def sizes() -> Iterator[tuple[int, int]]:
-    """Yield (functions, inputs) of the table, the cheap ones first."""
+    """Yield (functions, inputs) of the table, for each number of functions the cheap ones first."""
     yield from product((2, 3), range(2, len(INPUTS) + 1))
 
 
 def _torque(configured: ConfiguredArm, scaled: np.ndarray) -> np.ndarray:
-    """Return joint 3's torque (n,) for inputs (n, d) in -1..1 over the workspace; the others are 0."""
+    """Return joint 3's torque (n,) for inputs (n, d) scaled to -1..1 over the workspace; other inputs are 0."""
     low, high = np.append(configured.low, (-TILT, -TILT)), np.append(configured.high, (TILT, TILT))
     state = np.zeros((len(scaled), len(INPUTS)))
     chosen = list(COLUMNS[: scaled.shape[1]])
@@ -88,7 +87,7 @@ def _torque(configured: ConfiguredArm, scaled: np.ndarray) -> np.ndarray:
 
 
 def _inference_time(model: Anfis, inputs: np.ndarray) -> float:
-    """Return the median time in s of one pose."""
+    """Return the median time in s to evaluate one pose."""
     times = []
     for pose in inputs[:500]:
         started = time.perf_counter()

@@ -1,8 +1,8 @@
-"""Which laws are compared, over which poses and tilts, and what they are off by.
+"""The compared laws, the poses and tilts of the comparison, and the errors.
 
-Two arms: centres of gravity at the links' far ends, d_n = l_n, as the paper's equations have it, and as configured.
-Each over the 1,053 positions with an upright trunk, and over random poses with pitch and sideways tilt drawn evenly
-within a limit. The paper's laws get the angle between joint 1's axis and gravity as theta_1, as in the compensator.
+Each arm is compared over the 1,053 positions with an upright trunk, and over random poses whose pitch and sideways tilt
+are uniform within a limit. The paper's laws take the angle between joint 1's axis and gravity as theta_1, as in the
+compensator.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ TILTS = (0, 5, 10, 20, 30)  # degrees
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Poses theta (n, 4) rad of an arm, and as many tilts. cog: 'link ends' or 'configured'; limit: degrees.
+    """Poses theta (n, 4) rad of an arm, each with a trunk tilt.
 
-    direction (n, 3), axis_angle, beta, phi (n,) rad: as in `core.tilt.Tilt`.
+    cog: which centres of gravity. positions: 'workspace' or 'random'. limit: of the tilt, degrees. direction (n, 3);
+    axis_angle, beta, phi (n,) rad: as in `core.tilt.Tilt`.
     """
 
     cog: str
@@ -43,13 +44,13 @@ class Case:
 
     @property
     def axis_first(self) -> np.ndarray:
-        """The poses with theta_1 as the paper means it."""
+        """The poses with the paper's theta_1, the angle of joint 1's axis to gravity."""
         return np.column_stack((self.axis_angle, self.theta[:, 1:]))
 
 
 @dataclass(frozen=True)
 class Row:
-    """How far `law` is from `reference` on one joint (1..4) over the `count` poses of a case: RMSE and largest, Nm."""
+    """The error in Nm of `law` against `reference` on one joint (1..4) over the `count` poses of a case."""
 
     cog: str
     positions: str
@@ -64,7 +65,7 @@ class Row:
 
     @property
     def share(self) -> float:
-        """RMSE as a share of the RMS torque; NaN where gravity asks for none."""
+        """RMSE / RMS torque; NaN for a joint without gravity torque."""
         return self.rmse / self.rms_torque if self.rms_torque > 1e-12 else math.nan
 
 
@@ -72,7 +73,7 @@ Torques = Callable[[Case], np.ndarray]
 
 
 def laws(anfis: AnfisLaw) -> dict[str, Torques]:
-    """Return the laws by name, each a function of a case -> (n, 4) Nm; the ANFIS even where it was not trained."""
+    """Return the laws by name, as functions of a case -> (n, 4) Nm; the ANFIS also outside its training box."""
     return {
         "exact": lambda case: gravity_torque(case.arm, case.theta, case.direction),
         "EQ2-EQ5": lambda case: paper_static_torque(case.arm, case.axis_first),
@@ -82,7 +83,7 @@ def laws(anfis: AnfisLaw) -> dict[str, Torques]:
 
 
 def cases(cog: str, configured: ConfiguredArm, count: int) -> Iterator[Case]:
-    """Yield the case of the 1,053 positions, then one of `count` random poses for each of `TILTS`."""
+    """Yield the 1,053 positions, then `count` random poses for each of `TILTS`."""
     box = zip(configured.low[1:], configured.high[1:], GRID, strict=True)
     axes = [np.linspace(low, high, n) for low, high, n in box]
     yield _case(cog, "workspace", 0, configured, np.array(list(product((0.0,), *axes))))
@@ -91,16 +92,23 @@ def cases(cog: str, configured: ConfiguredArm, count: int) -> Iterator[Case]:
         yield _case(cog, "random", limit, configured, rng.uniform(configured.low, configured.high, (count, 4)), rng)
 
 
-def _case(cog: str, positions: str, limit: int, configured: ConfiguredArm, theta: np.ndarray, rng=None) -> Case:
+def _case(
+    cog: str,
+    positions: str,
+    limit: int,
+    configured: ConfiguredArm,
+    theta: np.ndarray,
+    rng: np.random.Generator | None = None,
+) -> Case:
     bound = math.radians(limit)
-    tilt = rng.uniform(-bound, bound, (len(theta), 2)) if limit else np.zeros((len(theta), 2))
+    tilt = rng.uniform(-bound, bound, (len(theta), 2)) if rng else np.zeros((len(theta), 2))
     tilts = [Tilt.of(configured.side, pitch, roll) for pitch, roll in tilt.tolist()]
     felt = (np.array([getattr(t, name) for t in tilts]) for name in ("direction", "axis_angle", "beta", "phi"))
     return Case(cog, positions, limit, configured.robot, theta, *felt)
 
 
 def compare(case: Case, torque: dict[str, np.ndarray], reference: str, expected: np.ndarray) -> list[Row]:
-    """Return a row per law and joint: the laws' torques (n, 4) against the reference's `expected` (n, 4)."""
+    """Return a row per law and joint; torque: of each law (n, 4) Nm; expected: of the reference (n, 4) Nm."""
     rms_torque = rms(expected)
     rows = []
     for law, given in torque.items():
@@ -114,4 +122,5 @@ def compare(case: Case, torque: dict[str, np.ndarray], reference: str, expected:
 
 def rms(values: np.ndarray) -> np.ndarray:
     """Return the root mean square of each column."""
-    return np.sqrt(np.mean(np.square(values), axis=0))
+    result: np.ndarray = np.sqrt(np.mean(np.square(values), axis=0))
+    return result

@@ -1,4 +1,4 @@
-"""What `validate` prints and writes: the tables on the terminal, and their rows as CSV."""
+"""The tables of `validate` on the terminal, and their rows as CSV."""
 
 from __future__ import annotations
 
@@ -13,15 +13,11 @@ from exo_gravity.core.anfis_law import AnfisLaw
 from exo_gravity.tools.anfis.training import Trained
 from exo_gravity.tools.comparison.growth import Growth
 from exo_gravity.tools.comparison.laws import Row
-
-# RMSE in Nm of joints 2 to 4 over 1,053 positions, section "Results from Simulation" of the paper
-PAPER_ANALYTICAL = (6.06e-16, 4.06e-16, 8.03e-17)
-PAPER_ANFIS = (1.71e-3, 1.32e-3, 3.15e-4)
-PAPER_SECONDS = 380.0  # a joint
+from exo_gravity.tools.inputs.paper import PAPER_ANALYTICAL, PAPER_ANFIS, PAPER_SECONDS
 
 
 def paper_table(rows: Sequence[Row], law: AnfisLaw, trained: Sequence[Trained]) -> Iterator[str]:
-    """Yield the lines of the paper's comparison, its figures beside ours; rows: of its premise d_n = l_n."""
+    """Yield the lines of the paper's comparison, its figures next to ours; rows: with its assumption d_n = l_n."""
     ours = {
         name: [row.rmse for row in rows if (row.positions, row.law, row.reference) == ("workspace", name, "gravload")]
         for name in ("exact", "EQ2-EQ5")
@@ -32,7 +28,7 @@ def paper_table(rows: Sequence[Row], law: AnfisLaw, trained: Sequence[Trained]) 
         ("EQ3-EQ5, the paper", PAPER_ANALYTICAL, ""),
         ("EQ3-EQ5, here", ours["EQ2-EQ5"][1:], ""),
         ("exact law, here", ours["exact"][1:], ""),
-        ("ANFIS, the paper", PAPER_ANFIS, f"{PAPER_SECONDS:.0f} s a joint"),
+        ("ANFIS, the paper", PAPER_ANFIS, f"{PAPER_SECONDS:.0f} s per joint"),
         ("ANFIS, here", law.error["training"], seconds),
         ("ANFIS, here, between the positions", law.error["held_out"], ""),
     ):
@@ -40,7 +36,7 @@ def paper_table(rows: Sequence[Row], law: AnfisLaw, trained: Sequence[Trained]) 
 
 
 def law_table(rows: Iterable[Row]) -> Iterator[str]:
-    """Yield the lines of RMSE, largest error and share of the RMS torque for each case, law and joint."""
+    """Yield the lines of RMSE, largest error and RMSE / RMS torque for each case, law and joint."""
     yield f"{'law - reference; Nm':<22}" + "".join(f"{f'joint {joint}':^24}" for joint in range(1, 5))
     yield f"{'':<22}" + "".join(f"{'RMSE':>9}{'largest':>9}{'share':>6}" for _ in range(4))
     for (cog, positions, limit, count), case in groupby(rows, lambda r: (r.cog, r.positions, r.limit, r.count)):
@@ -57,7 +53,7 @@ def _cell(row: Row) -> str:
 
 
 def growth_line(row: Growth | None = None) -> str:
-    """Return one line of the growth table, or its head."""
+    """Return one line of the growth table; without a row, its heading."""
     if row is None:
         names = ("inputs", "functions", "rules", "parameters", "positions", "steps", "training", "one pose")
         return "".join(f"{name:>11}" for name in names) + f"{'RMSE':>11}{'held out':>11}"
@@ -67,7 +63,7 @@ def growth_line(row: Growth | None = None) -> str:
 
 
 def write_csv(path: Path, rows: Sequence[Row | Growth]) -> None:
-    """Write dataclasses as CSV, a column per field (SI units: Nm, s; `limit` in degrees)."""
+    """Write dataclasses as CSV, one column per field (SI units: Nm, s; `limit` in degrees)."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=list(asdict(rows[0])))
         writer.writeheader()

@@ -1,0 +1,1 @@
+"""What the tools read: parameter files, the arms in them, installed executables, and the references."""

@@ -1,14 +1,15 @@
-"""The two references: gravity torques by other people's code, from the same masses and Table 1 of the paper.
+"""The two references: gravity torques by independent libraries, from the same masses and Table 1 of the paper.
 
-The Robotics Toolbox's `gravload` runs a recursive Newton-Euler over the Denavit-Hartenberg parameters; Pinocchio's
-`computeGeneralizedGravity` runs one over spatial inertias. Neither shares a line with `core.gravity`, nor
-with the other.
+The Robotics Toolbox's `gravload` runs a recursive Newton-Euler algorithm over the Denavit-Hartenberg parameters;
+Pinocchio's `computeGeneralizedGravity` runs one over spatial inertias. They share no code with `core.gravity` or with
+each other.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -25,25 +26,26 @@ Reference = Callable[[np.ndarray, np.ndarray], np.ndarray]  # theta (n, 4), dire
 def gravload(arm: ArmModel) -> Reference:
     """Return the torque by the Robotics Toolbox: theta (n, 4) rad and gravity's direction (n, 3) -> (n, 4) Nm."""
     robot = toolbox_robot(arm)
-    # Releases differ in the sign of `gravity`. Their default tells: in all of them it means weight along -z.
+    # Releases differ in the sign of `gravity`; in all of them the default means weight along -z.
     g = arm.gravity * -math.copysign(1.0, robot.gravity[2])
 
     def torque(theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
         poses = zip(theta, g * direction, strict=True)
-        return arm.gain * np.array([robot.gravload(q, gravity) for q, gravity in poses])
+        unscaled = np.array([robot.gravload(q, gravity) for q, gravity in poses])
+        return np.asarray(arm.gain * unscaled)
 
     return torque
 
 
-def toolbox_robot(arm: ArmModel):
+def toolbox_robot(arm: ArmModel) -> Any:
     """Return the arm as the Robotics Toolbox's DHRobot."""
     try:
         from roboticstoolbox import DHRobot, RevoluteDH
     except ImportError as error:
-        raise _absent("roboticstoolbox", error) from None
+        raise _not_importable("roboticstoolbox", error) from None
     return DHRobot(
         [
-            # The toolbox counts a centre of gravity from the link's far end.
+            # The toolbox measures a centre of gravity from the link's far end.
             RevoluteDH(a=a, alpha=alpha, offset=offset, m=m, r=(d - a, 0, 0), I=np.zeros((3, 3)), Jm=0, B=0, G=1)
             for a, alpha, offset, m, d in zip(arm.length, ALPHA, OFFSET, arm.mass, arm.cog, strict=True)
         ]
@@ -60,31 +62,31 @@ def pinocchio(arm: ArmModel) -> Reference:
         for i, gravity in enumerate(arm.gravity * direction):
             model.gravity.linear = gravity
             result[i] = pin.computeGeneralizedGravity(model, data, theta[i])
-        return arm.gain * result
+        return np.asarray(arm.gain * result)
 
     return torque
 
 
-def pinocchio_model(arm: ArmModel):
+def pinocchio_model(arm: ArmModel) -> tuple[Any, Any]:
     """Return the module `pinocchio` and the arm as its Model."""
     try:
         import pinocchio as pin
     except ImportError as error:
-        raise _absent("pinocchio", error) from None
+        raise _not_importable("pinocchio", error) from None
     model = pin.Model()
     parent, placement = 0, pin.SE3.Identity()
     for joint in range(JOINT_COUNT):
         parent = model.addJoint(parent, pin.JointModelRZ(), placement, f"joint_{joint + 1}")
-        turned = pin.SE3(pin.utils.rotate("z", OFFSET[joint]), np.zeros(3))
-        along = turned * pin.SE3(np.eye(3), np.array((arm.cog[joint], 0.0, 0.0)))
+        rotated = pin.SE3(pin.utils.rotate("z", OFFSET[joint]), np.zeros(3))
+        at_cog = rotated * pin.SE3(np.eye(3), np.array((arm.cog[joint], 0.0, 0.0)))
         inertia = pin.Inertia(float(arm.mass[joint]), np.zeros(3), np.zeros((3, 3)))
-        model.appendBodyToJoint(parent, inertia, along)
-        placement = turned * pin.SE3(pin.utils.rotate("x", ALPHA[joint]), np.array((arm.length[joint], 0.0, 0.0)))
+        model.appendBodyToJoint(parent, inertia, at_cog)
+        placement = rotated * pin.SE3(pin.utils.rotate("x", ALPHA[joint]), np.array((arm.length[joint], 0.0, 0.0)))
     return pin, model
 
 
 REFERENCES = {"gravload": gravload, "Pinocchio": pinocchio}
 
 
-def _absent(module: str, error: ImportError) -> DataError:
-    return DataError(f"{module} can't be imported ({error}): pip install 'exo_gravity[report,validate]'")
+def _not_importable(module: str, error: ImportError) -> DataError:
+    return DataError(f"cannot import {module} ({error}): pip install 'exo_gravity[report,validate]'")

@@ -1,0 +1,1 @@
+"""What the tools show: reports of trials and torque budgets, as tables, figures and pages."""

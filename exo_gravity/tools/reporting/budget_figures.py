@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
+from matplotlib.patheffects import AbstractPathEffect, withStroke
 
 from exo_gravity.core.budget import torque_at
 from exo_gravity.tools.reporting.budget_table import JOINTS, ArmBudget
@@ -68,7 +68,7 @@ def _where(figure: Figure, axis: Axes, arm: ArmBudget, joint: int) -> None:
     for limit, style in ((arm.joints[joint].rated, "-"), (arm.joints[joint].peak, ":")):
         if largest.min() < limit < largest.max():
             lines = axis.contour(np.degrees(across), np.degrees(up), largest, [limit], colors="white", linestyles=style)
-            outline = [withStroke(linewidth=2.5, foreground=INK)]
+            outline: list[AbstractPathEffect] = [withStroke(linewidth=2.5, foreground=INK)]
             lines.set_path_effects(outline)
             for text in axis.clabel(lines, fmt=f"{limit:g} Nm"):
                 text.set_path_effects(outline)

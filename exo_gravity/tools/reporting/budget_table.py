@@ -54,7 +54,7 @@ def arm_budget(configured: ConfiguredArm, wearer: Wearer, support: float, max_ti
     Raises ParameterError if the wearer does not fit the robot.
     """
     motors = tuple(configured.can_bridge["motor"])
-    workspace = Workspace(configured.low, configured.high, max_tilt)
+    workspace = Workspace(configured.limits.position_min, configured.limits.position_max, max_tilt)
     with named(f"{configured.namespace}/compensator"):
         load = wearer.on_links(configured.robot.length)
         torques = motor_torques(motors, configured.can_bridge["torque_scale"])

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -23,7 +24,7 @@ INTERVALS = 2_000  # per curve
 WIDTH = 11.0  # inches
 
 
-def overview(recording: Recording, trial: TrialAnalysis) -> Figure:
+def overview(recording: Recording, analysis: TrialAnalysis) -> Figure:
     """Return positions, velocities and torques over time, with holds and pushes shaded and holds numbered."""
     figure = Figure(figsize=(WIDTH, 8.2), layout="constrained")
     axes = figure.subplots(3, 1, sharex=True, height_ratios=(1.25, 1.0, 1.25))
@@ -31,7 +32,7 @@ def overview(recording: Recording, trial: TrialAnalysis) -> Figure:
     for axis, label, (scale, values) in zip(
         axes, ("Position (deg)", "Velocity (deg/s)", "Torque (Nm)"), panels, strict=True
     ):
-        _shade(axis, trial)
+        _shade(axis, analysis)
         for joint, colour in enumerate(JOINT_COLOURS):
             axis.plot(*_envelope(recording.time, scale * values[:, joint]), color=colour, lw=1.1)
         axis.set_ylabel(label)
@@ -39,7 +40,7 @@ def overview(recording: Recording, trial: TrialAnalysis) -> Figure:
     commanded = bool(np.isfinite(recording.command).any())
     for command in recording.command.T if commanded else ():
         axes[2].plot(*_envelope(recording.time, command), color=INK, lw=0.6, ls=(0, (4, 3)))
-    for number, hold in enumerate(trial.holds, 1):
+    for number, hold in enumerate(analysis.holds, 1):
         middle = (hold.start + hold.end) / 2
         axes[0].annotate(
             str(number), (middle, 1.0), (0, 3), xycoords=("data", "axes fraction"), textcoords="offset points",
@@ -47,18 +48,18 @@ def overview(recording: Recording, trial: TrialAnalysis) -> Figure:
         )  # fmt: skip
     axes[2].set_xlabel("Time (s)")
     axes[2].set_xlim(recording.time[0], recording.time[-1])
-    _legend(figure, recording, trial, commanded)
+    _legend(figure, recording, analysis, commanded)
     return figure
 
 
-def drift(recording: Recording, trial: TrialAnalysis, criteria: HoldCriteria) -> Figure:
+def drift(recording: Recording, analysis: TrialAnalysis, criteria: HoldCriteria) -> Figure:
     """Return the deviation of each joint from the start of each hold, and the drift rate of each hold."""
     figure = Figure(figsize=(WIDTH, 6.6), layout="constrained")
     grid = figure.add_gridspec(2, 4, height_ratios=(1.0, 1.1))
     first = figure.add_subplot(grid[0, 0])
     axes = [first, *(figure.add_subplot(grid[0, joint], sharex=first, sharey=first) for joint in (1, 2, 3))]
     for joint, (axis, name) in enumerate(zip(axes, joint_labels(recording), strict=True)):
-        for hold in trial.holds:
+        for hold in analysis.holds:
             time, away = _from_start(recording, hold, joint)
             axis.plot(time, degrees(away), color=JOINT_COLOURS[joint], lw=0.9, alpha=0.75)
         axis.set_title(name, fontsize=10, color=JOINT_COLOURS[joint], loc="left", weight="bold")
@@ -69,23 +70,23 @@ def drift(recording: Recording, trial: TrialAnalysis, criteria: HoldCriteria) ->
     first.set_ylabel("Deviation from the start (deg)")
     reach = max([0.1, *(abs(value) for axis in axes for value in axis.dataLim.intervaly if math.isfinite(value))])
     first.set_ylim(-1.15 * reach, 1.15 * reach)
-    _rates(figure.add_subplot(grid[1, :]), recording, trial, criteria)
+    _rates(figure.add_subplot(grid[1, :]), recording, analysis, criteria)
     return figure
 
 
-def _rates(axis: Axes, recording: Recording, trial: TrialAnalysis, criteria: HoldCriteria) -> None:
+def _rates(axis: Axes, recording: Recording, analysis: TrialAnalysis, criteria: HoldCriteria) -> None:
     for joint, (name, colour) in enumerate(zip(joint_labels(recording), JOINT_COLOURS, strict=True)):
-        numbers = np.arange(1, len(trial.holds) + 1) + 0.12 * (joint - 1.5)
-        rate = [per_minute(hold.drift_rate[joint]) for hold in trial.holds]
-        error = [per_minute(hold.drift_rate_uncertainty[joint]) for hold in trial.holds]
+        numbers = np.arange(1, len(analysis.holds) + 1) + 0.12 * (joint - 1.5)
+        rate = [per_minute(hold.drift_rate[joint]) for hold in analysis.holds]
+        error = [per_minute(hold.drift_rate_uncertainty[joint]) for hold in analysis.holds]
         axis.errorbar(numbers, rate, error, fmt="o", ms=4.5, lw=1.2, capsize=2, color=colour, label=name)
     axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
     if math.isfinite(criteria.max_rate):
         bound = per_minute(criteria.max_rate)
         axis.axhspan(-bound, bound, color=HOLD_COLOUR, zorder=-1, label=f"allowed: ±{bound:g} deg/min")
         axis.legend(loc="upper left", bbox_to_anchor=(0, 1.14), ncols=5, frameon=False, fontsize=9)
-    axis.set_xticks(range(1, len(trial.holds) + 1))
-    axis.set_xlim(0.4, len(trial.holds) + 0.6)
+    axis.set_xticks(range(1, len(analysis.holds) + 1))
+    axis.set_xlim(0.4, len(analysis.holds) + 0.6)
     axis.set_xlabel("Hold")
     axis.set_ylabel("Drift (deg/min)")
     _plain(axis)
@@ -111,25 +112,25 @@ def _envelope(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndar
     return np.repeat(time[edges], 2), ends.ravel()
 
 
-def _shade(axis: Axes, trial: TrialAnalysis) -> None:
-    for hold in trial.holds:
+def _shade(axis: Axes, analysis: TrialAnalysis) -> None:
+    for hold in analysis.holds:
         axis.axvspan(hold.start, hold.end, color=HOLD_COLOUR, lw=0, zorder=0)
-    for motion in trial.motions:
+    for motion in analysis.motions:
         if motion.kind in ("push", "slip"):
             axis.axvspan(motion.start, motion.end, color=PUSH_COLOUR, lw=0, zorder=0)
 
 
-def _legend(figure: Figure, recording: Recording, trial: TrialAnalysis, commanded: bool) -> None:
-    entries = [
+def _legend(figure: Figure, recording: Recording, analysis: TrialAnalysis, commanded: bool) -> None:
+    entries: list[Artist] = [
         Line2D([], [], color=colour, lw=2.5, label=name)
         for name, colour in zip(joint_labels(recording), JOINT_COLOURS, strict=True)
     ]
     if commanded:
         entries.append(Line2D([], [], color=INK, lw=0.8, ls=(0, (4, 3)), label="commanded"))
     entries.append(Patch(color=HOLD_COLOUR, label="hold"))
-    if any(motion.kind in ("push", "slip") for motion in trial.motions):
+    if any(motion.kind in ("push", "slip") for motion in analysis.motions):
         entries.append(Patch(color=PUSH_COLOUR, label="push"))
-    columns = len(entries) if sum(len(entry.get_label()) for entry in entries) < 90 else 4
+    columns = len(entries) if sum(len(str(entry.get_label())) for entry in entries) < 90 else 4
     figure.legend(handles=entries, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
 
 

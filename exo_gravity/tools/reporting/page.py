@@ -67,18 +67,18 @@ def figure_html(png: bytes, caption: str) -> str:
     )
 
 
-def arm_html(recording: Recording, trial: TrialAnalysis, figures: Iterable[str]) -> str:
+def arm_html(recording: Recording, analysis: TrialAnalysis, figures: Iterable[str]) -> str:
     """Return the section of one arm: its key numbers, figures and tables."""
     labels = joint_labels(recording)
-    holds = _table("hold", labels, hold_rows(recording, trial), HOLD_COLUMNS)
-    motions = _table("motion", labels, motion_rows(recording, trial), MOTION_COLUMNS)
+    holds = _table("hold", labels, hold_rows(recording, analysis), HOLD_COLUMNS)
+    motions = _table("motion", labels, motion_rows(recording, analysis), MOTION_COLUMNS)
     return "\n".join(
         (
             f"<h2>Arm: {escape(recording.name)}</h2>",
-            _key(trial, recording),
+            _key(analysis, recording),
             *figures,
-            f"<h3>Holds</h3>{holds}" if trial.holds else "<p>No hold was found.</p>",
-            f"<h3>Motions between holds</h3>{motions}" if trial.motions else "",
+            f"<h3>Holds</h3>{holds}" if analysis.holds else "<p>No hold was found.</p>",
+            f"<h3>Motions between holds</h3>{motions}" if analysis.motions else "",
         )
     )
 
@@ -110,16 +110,19 @@ def parameters_html(parameters: dict[str, str]) -> str:
     return f"<details><summary>Parameters at the start</summary><pre>{escape(text)}</pre></details>" if text else ""
 
 
-def _key(trial: TrialAnalysis, recording: Recording) -> str:
+def _key(analysis: TrialAnalysis, recording: Recording) -> str:
     """Return the key numbers: holds, their total time, the fastest drift."""
-    numbers = [(str(len(trial.holds)), "holds"), (f"{sum(h.duration for h in trial.holds):.0f} s", "total hold time")]
-    if trial.holds:
+    numbers = [
+        (str(len(analysis.holds)), "holds"),
+        (f"{sum(h.duration for h in analysis.holds):.0f} s", "total hold time"),
+    ]
+    if analysis.holds:
         _, number, joint = max(
             (abs(rate), number, joint)
-            for number, hold in enumerate(trial.holds)
+            for number, hold in enumerate(analysis.holds)
             for joint, rate in enumerate(hold.drift_rate)
         )
-        hold = trial.holds[number]
+        hold = analysis.holds[number]
         rate, error = per_minute(hold.drift_rate[joint]), per_minute(hold.drift_rate_uncertainty[joint])
         label = f"fastest drift: {joint_labels(recording)[joint]}, hold {number + 1}"
         numbers.append((f"{shown(rate, 2)} ± {shown(error, 2)} deg/min", label))
@@ -142,7 +145,7 @@ def _group(rows: Sequence[Row], labels: Sequence[str], columns: Sequence[tuple[s
     span = f'<td rowspan="{len(rows)}">'
     first: dict[str, Any] = rows[0]
     label = str(first["hold"]) if "hold" in first else escape(first["kind"])
-    length = shown(first.get("duration_s", first.get("until_still_s")), 1)
+    length = shown(first["duration_s"] if "hold" in first else first["until_still_s"], 1)
     lines = []
     for row, joint, colour in zip(rows, labels, JOINT_COLOURS, strict=True):
         cells = "".join(f"<td>{shown(row[name], digits)}</td>" for _, name, digits in columns)

@@ -6,7 +6,7 @@ import csv
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from rich import box
@@ -17,18 +17,19 @@ from exo_gravity.core.recording import Recording
 from exo_gravity.core.trial_analysis import Hold, Motion, TrialAnalysis
 
 Row = dict[str, Any]
+Numbers = TypeVar("Numbers", float, np.ndarray)
 # Dropped in this order where the terminal is too narrow
 SPARE_COLUMNS = ("v deg/s", "peak speed deg/s", "error Nm", "torque Nm", "at s", "deg in 10 s")
 
 
-def degrees(values: np.ndarray | float) -> np.ndarray:
+def degrees(values: Numbers) -> Numbers:
     """Return radians in degrees, or rad/s in degrees per second."""
-    return np.degrees(values)
+    return values * math.degrees(1.0)
 
 
-def per_minute(values: np.ndarray | float) -> np.ndarray:
+def per_minute(values: Numbers) -> Numbers:
     """Return rad/s in degrees per minute."""
-    return 60.0 * np.degrees(values)
+    return values * math.degrees(60.0)
 
 
 def joint_labels(recording: Recording) -> list[str]:
@@ -36,9 +37,9 @@ def joint_labels(recording: Recording) -> list[str]:
     return [name.removeprefix(f"{recording.name}_").replace("_", " ") for name in recording.joint_names]
 
 
-def hold_rows(recording: Recording, trial: TrialAnalysis) -> Iterator[Row]:
+def hold_rows(recording: Recording, analysis: TrialAnalysis) -> Iterator[Row]:
     """Yield one row for each hold and joint."""
-    for number, hold in enumerate(trial.holds, 1):
+    for number, hold in enumerate(analysis.holds, 1):
         for joint, name in enumerate(recording.joint_names):
             yield {
                 "arm": recording.name,
@@ -58,9 +59,9 @@ def hold_rows(recording: Recording, trial: TrialAnalysis) -> Iterator[Row]:
             }
 
 
-def motion_rows(recording: Recording, trial: TrialAnalysis) -> Iterator[Row]:
+def motion_rows(recording: Recording, analysis: TrialAnalysis) -> Iterator[Row]:
     """Yield one row for each motion between holds and joint."""
-    for number, motion in enumerate(trial.motions, 1):
+    for number, motion in enumerate(analysis.motions, 1):
         for joint, name in enumerate(recording.joint_names):
             yield {
                 "arm": recording.name,
@@ -96,12 +97,12 @@ def shown(value: float, digits: int) -> str:
     return f"{round(float(value), digits) + 0.0:.{digits}f}" if math.isfinite(value) else "–"
 
 
-def print_tables(console: Console, recording: Recording, trial: TrialAnalysis) -> None:
+def print_tables(console: Console, recording: Recording, analysis: TrialAnalysis) -> None:
     """Print the holds and motions of one arm; a cell holds the four joints in order."""
     console.print(f"\n[bold]{recording.name}[/], joints in order: {', '.join(joint_labels(recording))}")
-    if trial.holds:
-        console.print(_table(_hold_columns(trial.holds), console.width))
-    if pushes := [motion for motion in trial.motions if motion.kind != "move"]:
+    if analysis.holds:
+        console.print(_table(_hold_columns(analysis.holds), console.width))
+    if pushes := [motion for motion in analysis.motions if motion.kind != "move"]:
         console.print(_table(_push_columns(pushes), console.width))
 
 

@@ -17,9 +17,9 @@ from exo_gravity.bag.content import Bag, Event
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.recording import Recording
 from exo_gravity.core.trial_script import TrialScript
-from exo_gravity.sim import SimulatedImu
 from exo_gravity.sim.device_params import SIMULATOR, device_of, imu_of, set_faults
-from exo_gravity.sim.offline import ArmSetup, OfflineTrial, told_tilt
+from exo_gravity.sim.imu import SimulatedImu, measured_tilt
+from exo_gravity.sim.offline import ArmSetup, OfflineTrial
 from exo_gravity.tools.inputs.arms import named, node_values, read_arm
 from exo_gravity.tools.inputs.parameter_file import Nodes, load
 
@@ -93,5 +93,5 @@ def _tilt(nodes: Nodes, spaces: list[str]) -> tuple[float, float] | None:
             with named("/imu"):
                 believed = nodes["/imu"].get("rotation_trunk_from_imu", [])
                 trunk = simulator["trunk.pitch"], simulator["trunk.roll"]
-                return told_tilt(*trunk, SimulatedImu(imu_of(simulator)), believed)
+                return measured_tilt(*trunk, SimulatedImu(imu_of(simulator)), believed)
     return None
