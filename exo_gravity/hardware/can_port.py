@@ -23,13 +23,12 @@ class CanPort:
     """Sends and receives classic CAN frames. Not thread-safe: one thread owns it.
 
     reopen: opens the bus again and raises BusError if it cannot; None if a failed bus must stay failed.
-    generation: how many buses have been opened.
+    name: of the bus.
     """
 
     def __init__(self, bus: can.BusABC, reopen: Callable[[], can.BusABC] | None = None) -> None:
-        self.generation = 1
         self._bus = bus
-        self._name = bus.channel_info
+        self.name = str(bus.channel_info)
         self._reopen = reopen
         self._failing_since: float | None = None
         self._error = ""
@@ -66,11 +65,10 @@ class CanPort:
     def _open_bus(self) -> can.BusABC:
         if not self._is_open:
             if self._reopened is None:
-                raise BusError(f"CAN bus {self._name}: {self._error}; opening it again")
+                raise BusError(f"CAN bus {self.name}: {self._error}; opening it again")
             self._bus, self._reopened = self._reopened, None
             self._is_open = True
             self._failing_since = None
-            self.generation += 1
         return self._bus
 
     def _failure(self, error: Exception) -> BusError:
@@ -81,16 +79,20 @@ class CanPort:
         elif self._reopen is not None and now - self._failing_since > REOPEN_AFTER:
             self._is_open = False
             threading.Thread(target=self._open_again, args=(self._reopen,), name="reopen", daemon=True).start()
-        return BusError(f"CAN bus {self._name}: {self._error}")
+        return BusError(f"CAN bus {self.name}: {self._error}")
 
     def _open_again(self, reopen: Callable[[], can.BusABC]) -> None:
         _close(self._bus)
         while not self._is_closing:
             try:
-                self._reopened = reopen()
-                return
+                bus = reopen()
             except BusError:
                 time.sleep(REOPEN_PERIOD)
+                continue
+            if self._is_closing:
+                _close(bus)
+            self._reopened = bus
+            return
 
 
 def _close(bus: can.BusABC) -> None:

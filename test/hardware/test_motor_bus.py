@@ -118,10 +118,10 @@ REPLY = pack_reply(AK60, 1, 0.25, 0.0, 0.0, 30, 0)
 @pytest.mark.parametrize(
     ("message", "kind"),
     [
-        (frame(1, MOTORS_OF_ARM[0].command(1.0, 0.0)), "command"),
-        (frame(1, ENTER), "command"),
+        (frame(1, MOTORS_OF_ARM[0].command(1.0, 0.0)), "foreign command"),
+        (frame(1, ENTER), "foreign command"),
         (frame(1, b""), "foreign frame"),
-        (frame(2, REPLY), "foreign frame"),
+        (frame(2, REPLY), "foreign command"),
         (frame(9, REPLY), "foreign frame"),
         (frame(1, REPLY[:5]), "foreign frame"),
         (frame(0, b"\x09" + REPLY[1:]), "foreign frame"),
