@@ -143,7 +143,9 @@ class Compensator:
     def _set_tilt(self, now: float, pitch: float, roll: float, age: float) -> None:
         tilt = Tilt.of(self.settings.side, pitch, roll)
         if not -MAX_LEAD <= age <= MAX_LAG:
-            expected = f"from {-MAX_LEAD:g} to {MAX_LAG:g} s: synchronise the clocks of the IMU driver and this computer"
+            expected = (
+                f"from {-MAX_LEAD:g} to {MAX_LAG:g} s: synchronise the clocks of the IMU driver and this computer"
+            )
             raise ParameterError("age of the trunk tilt by its stamp", round(age, 3), expected)
         measured = now - max(0.0, age)
         # The direction is continuous where pitch and roll flip, in a bow through 90 degrees.
