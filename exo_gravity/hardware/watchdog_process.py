@@ -22,10 +22,10 @@ from queue import SimpleQueue
 
 import can
 
+from exo_gravity.core.validation import FROZEN
 from exo_gravity.hardware.drive_notes import DriveNotes
 from exo_gravity.hardware.handover import Charge, let_down
 
-FROZEN = 0.08  # s without a note, while the watchdog itself runs
 POLL = 0.01  # s
 LOG_TIME = 1.0  # s for the last lines of the log
 

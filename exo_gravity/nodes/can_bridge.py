@@ -23,6 +23,7 @@ from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.faults import FaultCode
 from exo_gravity.core.limits import JointSample
 from exo_gravity.core.safety import SafetyMachine
+from exo_gravity.core.validation import check_bridge
 from exo_gravity.core.wire import check_rate
 from exo_gravity.hardware.control_loop import NO_COMMAND, ControlLoop, EffortCommand
 from exo_gravity.hardware.handover import Charge
@@ -59,6 +60,7 @@ class CanBridge(LifecycleNode):
         self._names = values["joint_names"]
         self._motors = motors_of(values)
         self._limits = limits_of(values)
+        check_bridge(values["rate"], self._motors, self._limits)
         self._period = 1.0 / values["rate"]
         self._charge = Charge(bus_of(self, values), self._motors, self._limits, self._period)
         self._owner = f"{self.get_fully_qualified_name()} (PID {os.getpid()})"

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 import rclpy
 import yaml
-from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from geometry_msgs.msg import Vector3Stamped
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.compensator import LONGEST_STEP
 from exo_gravity.core.control_params import CAN_BRIDGE
-from exo_gravity.core.wearer import Wearer
 from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.wearer import Wearer
 from exo_gravity.nodes.conversions import to_nanoseconds, to_time
 
 from ..support.joint_state_feeder import PARTS, POSE, JointStateFeeder
