@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from ..faults.cases import CASES, FaultCase
+from ..faults.cases import CASES
+from ..faults.fault_case import FaultCase
 from ..faults.runner import RigPool
 
 pytestmark = pytest.mark.real_time
