@@ -18,7 +18,7 @@ BAD_PARAMETERS = [
     ("can_bridge", {"can_id": [1, 2, 2, 4]}, "can_id = [1, 2, 2, 4]", "4 different IDs"),
     ("can_bridge", {"motor": ["AK60-6", "AK80-9", "AK60-6", "AK10-9"]}, "AK10-9", "AK60-6, AK80-9"),
     ("can_bridge", {"rate": 1100.0}, "rate = 1100.0", "at most 1033 Hz"),
-    ("can_bridge", {"rate": 20.0}, "rate = 20.0", "at least 40 Hz"),
+    ("can_bridge", {"rate": 20.0}, "rate = 20.0", "must span 2 periods"),
     ("can_bridge", {"max_effort": [18.0] * 4}, "max_effort = [18.0", "peak torque"),
     ("can_bridge", {"home_tolerance": [6.3] * 4}, "home_tolerance = [6.3", "half a turn of each motor's rotor"),
     ("compensator", {"gravity": 25.0}, "gain times gravity = [25.0", "twice the Earth's"),
