@@ -48,6 +48,20 @@ class FaultCode(str, Enum):
     INTERNAL_ERROR = "internal_error", "the control loop raised an unexpected exception"
 
 
+# After these faults zeros and signs are checked again: an encoder may have lost its turn count, or a motor its power.
+DOUBTFUL = frozenset(
+    {
+        FaultCode.MOTOR_SILENT,
+        FaultCode.MOTOR_ERROR,
+        FaultCode.TORQUE_NOT_DELIVERED,
+        FaultCode.OUTSIDE_LIMITS,
+        FaultCode.POSITION_JUMP,
+        FaultCode.IMPLAUSIBLE_ZERO,
+        FaultCode.FOREIGN_COMMAND,
+    }
+)
+
+
 class Fault(NamedTuple):
     """A fault that occurred: its code, and a sentence that names the joint, the value and the limit."""
 

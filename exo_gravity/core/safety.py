@@ -29,25 +29,10 @@ from exo_gravity.core.delivery import DeliveryMonitor
 from exo_gravity.core.descent import DAMPING_RISE, ArmDescent
 from exo_gravity.core.drive import CARRYING, NOTHING, OFF, Drive, State
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.faults import Fault, FaultCode
+from exo_gravity.core.faults import DOUBTFUL, Fault, FaultCode
 from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
+from exo_gravity.core.rest import RestTracker
 from exo_gravity.core.start_gate import Proving, StartGate
-
-# The arm is at rest when no joint turns by more than SETTLED in SETTLING_TIME. Velocity is too coarse for this.
-SETTLED = 0.005  # rad
-SETTLING_TIME = 0.5  # s
-# After these faults an encoder may have lost its turn count, or a motor its power.
-DOUBTFUL = frozenset(
-    {
-        FaultCode.MOTOR_SILENT,
-        FaultCode.MOTOR_ERROR,
-        FaultCode.TORQUE_NOT_DELIVERED,
-        FaultCode.OUTSIDE_LIMITS,
-        FaultCode.POSITION_JUMP,
-        FaultCode.IMPLAUSIBLE_ZERO,
-        FaultCode.FOREIGN_COMMAND,
-    }
-)
 
 
 class SafetyMachine:
@@ -73,8 +58,7 @@ class SafetyMachine:
         self._now = -math.inf
         self._sent = OFF  # last sent to the motors
         self._descent = ArmDescent(0.0, NOTHING, NOTHING, self._peak, limits)
-        self._rest_since = 0.0
-        self._rest: Sequence[JointSample] = (UNKNOWN,) * 4  # where the arm was at that time
+        self._rest = RestTracker()
         self._before: Sequence[JointSample] = (UNKNOWN,) * 4
         self._silent: Sequence[bool] = (True,) * 4
         self._is_trusted = False  # zeros and signs
@@ -124,8 +108,8 @@ class SafetyMachine:
         self._let_down(now)
 
     def settled(self, now: float) -> bool:
-        """Return whether no replying joint has moved for `SETTLING_TIME`."""
-        return now - self._rest_since >= SETTLING_TIME
+        """Return whether no replying joint has moved for a while."""
+        return self._rest.is_settled(now)
 
     def step(
         self, now: float, joints: Sequence[JointSample], effort: Sequence[float] | None, effort_time: float
@@ -154,13 +138,13 @@ class SafetyMachine:
         if self.state is State.PROVING:
             self._prove(now, joints, dt)
         if self.state in (State.RAMPING_IN, State.ACTIVE):
-            self._carry_on(now)
             try:
                 return self._carry(now, joints, effort or NOTHING, dt)
             except ParameterError as error:
                 self.trip(FaultCode.COMMAND_IMPOSSIBLE, str(error), now)
         if self.state is State.PROVING:
-            return Drive(self._proving.effort, (self._risen_damping(now),) * 4, True)
+            damping = self.limits.damping * min(1.0, (now - self._since) / DAMPING_RISE)
+            return Drive(self._proving.effort, (damping,) * 4, True)
         if self.state is State.LETTING_DOWN:
             return self._descend(now, joints, dt)
         return self._stand(now, joints, dt)
@@ -207,28 +191,26 @@ class SafetyMachine:
             self._is_trusted = True
             self._enter(State.RAMPING_IN, now)
 
-    def _carry_on(self, now: float) -> None:
-        if self.state is State.RAMPING_IN and now - self._since >= self.limits.ramp_time:
-            self._enter(State.ACTIVE, now)
-
     def _carry(self, now: float, joints: Sequence[JointSample], effort: Sequence[float], dt: float) -> Drive:
-        ramp = (now - self._since) / self.limits.ramp_time if self.state is State.RAMPING_IN else 1.0
+        ramp = 1.0
+        if self.state is State.RAMPING_IN:
+            ramp = (now - self._since) / self.limits.ramp_time
+            if ramp >= 1.0:
+                ramp = 1.0
+                self._enter(State.ACTIVE, now)
         shaped, acted = self.limits.shape(effort, ramp, joints, self._sent.effort, dt)
         self.acted.update(dict.fromkeys(acted, now))
-        damping = self._approach_damping(self.limits.wall_damping(joints), dt)
-        return Drive(shaped, damping, True)
-
-    def _approach_damping(self, wanted: Sequence[float], dt: float) -> tuple[float, ...]:
-        """Return the damping (4,) on its way from the last one; it rises at once and falls over DAMPING_RISE."""
+        # Damping rises at once, since the soft wall already rises with the position, and falls over DAMPING_RISE.
         fall = self.limits.damping / DAMPING_RISE * dt
-        return tuple(max(want, last - fall) for want, last in zip(wanted, self._sent.damping, strict=True))
+        walls = zip(self.limits.wall_damping(joints), self._sent.damping, strict=True)
+        return Drive(shaped, tuple(max(wall, last - fall) for wall, last in walls), True)
 
     def _descend(self, now: float, joints: Sequence[JointSample], dt: float) -> Drive:
         descent = self._descent
         descent.step(now, dt, joints, self._silent)
         if self.state is not State.LETTING_DOWN:  # a motor that could not be reached replies again
             self._enter(State.LETTING_DOWN, now)
-        if descent.is_down(now, self._rest_since):
+        if descent.is_down(now, self._rest.since):
             self.is_unreached = any(self._silent)
             self._enter(State.FAULT if self.fault else State.DISABLED, now)
             return self._stand(now, joints, dt)
@@ -248,29 +230,14 @@ class SafetyMachine:
         self.is_unreached = False
         return self._descend(now, joints, dt)
 
-    def _risen_damping(self, now: float) -> float:
-        return self.limits.damping * min(1.0, (now - self._since) / DAMPING_RISE)
-
     def _track(self, now: float, joints: Sequence[JointSample]) -> None:
         """Note which motors are silent, which returned, and whether the arm is at rest as far as its motors reply."""
         silent = [self.limits.is_silent(now, joint) for joint in joints]
-        if any(silent) or self._jumped(joints):
+        jumped = (self.limits.is_jump(i, *pair) for i, pair in enumerate(zip(joints, self._before, strict=True)))
+        if any(silent) or any(jumped):
             self._is_trusted = False  # a motor may have lost power, and with it the turn count of its encoder
-        if any(
-            not is_silent and not abs(joint.position - rest.position) <= SETTLED
-            for joint, rest, is_silent in zip(joints, self._rest, silent, strict=True)
-        ):
-            self._rest_since, self._rest = now, joints
-        # A silent joint may have moved by the time it replies again.
-        self._rest = [UNKNOWN if is_silent else rest for rest, is_silent in zip(self._rest, silent, strict=True)]
+        self._rest.step(now, joints, silent)
         self._silent = silent
-
-    def _jumped(self, joints: Sequence[JointSample]) -> bool:
-        """Return whether an angle changed faster than a joint can turn, in any state."""
-        return any(
-            self.limits.is_jump(i, joint, last)
-            for i, (joint, last) in enumerate(zip(joints, self._before, strict=True))
-        )
 
     def _let_down(self, now: float) -> None:
         self._descent = ArmDescent(now, self._sent.effort, self._sent.damping, self._peak, self.limits)
