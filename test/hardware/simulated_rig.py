@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -35,6 +36,7 @@ class SimulatedRig:
     """
 
     def __init__(self, interface: str = "virtual", friction: float = 0.1) -> None:
+        sys.setswitchinterval(2e-4)  # as in nodes/run.py: with Python's 5 ms the threads here would delay each other
         port = next(_PORTS)
         options: dict[str, Any] = {}
         if interface == "udp_multicast":
