@@ -1,9 +1,9 @@
 """report BAG: what a recorded trial showed, as a table, CSV files, figures and one HTML page.
 
-With --repair: a complete copy of a recording that was cut short, for `ros2 bag` and other tools.
+With --repair it instead writes a complete copy of a recording that was cut short, for `ros2 bag` and other tools.
 
-Exit code 0: the arm held, or the recording is complete. 1: it drifted more than allowed, or was never held. 2: wrong use, or part of the recording
-could not be read; the rest is reported first.
+Exit code 0: the arm held, or the recording is complete. 1: it drifted more than allowed, or was never held. 2: wrong
+use, or part of the recording could not be read; the rest is reported first.
 """
 
 from __future__ import annotations
