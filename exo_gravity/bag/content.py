@@ -22,6 +22,7 @@ class Bag:
 
     start: ns since 1970 of time 0. recordings: one per arm. events: faults, warnings and changed parameters.
     parameters: YAML text by node. notes: missing parts that do no harm. problems: unreadable parts, one sentence each.
+    is_partial: whether the recording was cut short, or ends before its arms were down.
     """
 
     path: Path
@@ -31,3 +32,4 @@ class Bag:
     parameters: dict[str, str]
     notes: tuple[str, ...]
     problems: tuple[str, ...]
+    is_partial: bool = False

@@ -11,11 +11,12 @@ from typing import Any
 
 from exo_gravity.bag.content import Event
 from exo_gravity.bag.topics import DIAGNOSTICS, PARAMETER_EVENTS, STEPS, arm_of, leaf
+from exo_gravity.core.drive import State
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.recording import ScriptedStep, Span
-from exo_gravity.core.safety import State
 
 CARRIED = (State.RAMPING_IN.value, State.ACTIVE.value)
+STATE_GAP = 1.0  # s; can_bridge reports its state twice a second, except while it ends
 
 
 class EventLog:
@@ -25,7 +26,7 @@ class EventLog:
         self.parameters: dict[str, str] = {}
         self._events: list[tuple[int, str]] = []
         self._steps: dict[str, list[tuple[int, str, float]]] = {}  # arm -> (stamp, action, duration)
-        self._carried: dict[str, list[tuple[int, bool]]] = {}  # arm -> (stamp, whether it was carried)
+        self._states: dict[str, list[tuple[int, str]]] = {}  # arm -> (stamp, state)
         self._last: dict[str, tuple[int, str]] = {}  # node -> level and text of its last status
 
     def add(self, topic: str, stamp: int, message: Any) -> None:
@@ -60,7 +61,7 @@ class EventLog:
         self._last[status.name] = (level, status.message)
         state = next((entry.value for entry in status.values if entry.key == "state"), "")
         if state:
-            self._carried.setdefault(arm_of(status.name), []).append((stamp, state in CARRIED))
+            self._states.setdefault(arm_of(status.name), []).append((stamp, state))
 
     def events(self, start: int) -> tuple[Event, ...]:
         """Return faults, warnings and changed parameters in order; start: ns of time 0."""
@@ -75,13 +76,37 @@ class EventLog:
             for (begin, action, duration), end in zip(steps, ends, strict=False)
         )
 
-    def carried(self, arm: str, start: int) -> tuple[Span, ...] | None:
-        """Return when the arm was carried, by its reported states; None if no state of it was recorded."""
-        if arm not in self._carried:
+    def carried(self, arm: str, start: int, end: float) -> tuple[Span, ...] | None:
+        """Return when the arm was carried, by its reported states; None if no state of it was recorded.
+
+        end: s, of the arm's recording. An arm that is carried in the last state before it counts as carried until then.
+        """
+        if arm not in self._states:
             return None
-        states = sorted(self._carried[arm])
-        groups = (list(group) for carried, group in groupby(states, lambda state: state[1]) if carried)
-        return tuple(((group[0][0] - start) / 1e9, (group[-1][0] - start) / 1e9) for group in groups)
+        states = self._in_order(arm, start)
+        groups = [list(group) for carried, group in groupby(states, lambda state: state[1] in CARRIED) if carried]
+        spans = [(group[0][0], group[-1][0]) for group in groups]
+        time, last = states[-1]
+        if last in CARRIED and 0.0 < end - time < STATE_GAP:
+            spans[-1] = spans[-1][0], end
+        return tuple(spans)
+
+    def open_end(self, arm: str, start: int, end: float, is_cut: bool) -> str:
+        """Return what the recording does not show of the arm's way down, as a sentence, or ''.
+
+        end: s, of the arm's recording. is_cut: whether its file was cut short.
+        """
+        time, last = self._in_order(arm, start)[-1] if arm in self._states else (0.0, "")
+        if end - time >= STATE_GAP and not is_cut:
+            return ""  # the joint states go on: they show the way down
+        if last in CARRIED:
+            return f"{arm}: the recording ends while the arm is carried: it does not show how the arm was let down"
+        if last == State.LETTING_DOWN.value:
+            return f"{arm}: the recording ends before the arm was down"
+        return ""
+
+    def _in_order(self, arm: str, start: int) -> list[tuple[float, str]]:
+        return sorted(((stamp - start) / 1e9, state) for stamp, state in self._states[arm])
 
 
 def _value(value: Any) -> object:

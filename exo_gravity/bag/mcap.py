@@ -37,10 +37,18 @@ class Batch(NamedTuple):
     data: list[bytes]
 
 
+class Announced(NamedTuple):
+    """What a file states about a topic: its type, the type's definition, and the publishers' quality of service."""
+
+    msgtype: str
+    definition: str
+    offered_qos: str
+
+
 class McapMessages:
     """The messages of one MCAP file, collected by channel.
 
-    After reading, `cut_short` describes where the file ends too early; None for a complete file.
+    After reading, `cut_short` describes where the file ends too early; None for a complete file. announced: by topic.
     """
 
     def __init__(self, stream: BinaryIO, topics: dict[str, str], wanted: Wanted) -> None:
@@ -48,10 +56,11 @@ class McapMessages:
         if stream.read(len(MAGIC)) != MAGIC:
             raise DataError(f"{stream.name}: not an MCAP file, or empty")
         self.cut_short: str | None = None
+        self.announced: dict[str, Announced] = {}
         self._stream = stream
         self._topics = topics
         self._wanted = wanted
-        self._schemas: dict[int, str] = {}
+        self._schemas: dict[int, Schema] = {}
         self._batches: dict[int, Batch] = {}
 
     def batches(self) -> Iterator[Batch]:
@@ -95,11 +104,15 @@ class McapMessages:
     def _describe(self, opcode: int, body: bytes) -> None:
         if opcode == Opcode.SCHEMA:
             schema = Schema.read(ReadDataStream(BytesIO(body)))
-            self._schemas[schema.id] = schema.name
+            self._schemas[schema.id] = schema
         elif opcode == Opcode.CHANNEL:
             channel = Channel.read(ReadDataStream(BytesIO(body)))
-            msgtype = self._schemas.get(channel.schema_id, "")
+            schema = self._schemas.get(channel.schema_id)
+            msgtype = schema.name if schema else ""
             self._topics[channel.topic] = msgtype
+            definition = schema.data.decode(errors="replace") if schema else ""
+            qos = channel.metadata.get("offered_qos_profiles", "")
+            self.announced[channel.topic] = Announced(msgtype, definition, qos)
             if self._wanted(channel.topic, msgtype) and channel.id not in self._batches:
                 self._batches[channel.id] = Batch(channel.topic, msgtype, [], [])
 

@@ -39,6 +39,7 @@ def read_bag(path: str | Path, progress: Progress = lambda done, size: None) -> 
         contents.add(batch)
         progress(storage.done, storage.size)
     if storage.cut_short:
+        contents.is_cut = True
         contents.notes.append(f"the recording was cut short ({storage.cut_short}): what was written before is reported")
     states = sorted(name for name in contents.joints if leaf(name) == STATES)
     if not states and not contents.problems:
@@ -56,6 +57,7 @@ def read_bag(path: str | Path, progress: Progress = lambda done, size: None) -> 
         log.parameters,
         tuple(contents.notes),
         tuple(contents.problems),
+        contents.is_cut or contents.is_open,
     )
 
 
@@ -74,6 +76,8 @@ class _Contents:
         self.log = EventLog()
         self.notes: list[str] = []
         self.problems: list[str] = []
+        self.is_cut = False  # the file was cut short
+        self.is_open = False  # an arm was not down at the end
         self._unreadable: set[str] = set()
         self._types = get_typestore(Stores.ROS2_JAZZY)
 
@@ -106,8 +110,15 @@ class _Contents:
             clock, values = _in_order(stamp if stamped else arrival, values)
             command = self._commands(states, names, clock, stamped)
             position, velocity, effort = (values[:, FIELDS.index(field)] for field in FIELDS)
-            arrays = ((clock - start) / 1e9, position, velocity, effort, command)
-            return Recording(name, names, *arrays, self.log.steps(name, start), self.log.carried(name, start))
+            time = (clock - start) / 1e9
+            end = float(time[-1])
+            if open_end := self.log.open_end(name, start, end, self.is_cut):
+                self.notes.append(open_end)
+                self.is_open = True
+            carried = self.log.carried(name, start, end)
+            return Recording(
+                name, names, time, position, velocity, effort, command, self.log.steps(name, start), carried
+            )
         except DataError as error:
             self.problems.append(str(error))
             return None

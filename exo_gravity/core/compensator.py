@@ -2,7 +2,8 @@
 
 Each call checks that the input is fresh and finite, evaluates the law, blends in the last change of settings, ramps in,
 clamps and limits the rate. A change of law, mode, mass or gain never steps the torque: the difference between the
-torques of the old and the new settings is kept as a remainder that fades over `transition_time`.
+torques before and after the change is kept as a remainder that fades over `transition_time`. Where the chosen law does
+not apply, the exact law replaces it, with the same transition, for at least `FALLBACK_TIME`.
 """
 
 from __future__ import annotations
@@ -18,12 +19,17 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.gravity import LAWS, Law, Torque
 from exo_gravity.core.limits import MAX_COMMAND
 from exo_gravity.core.param_table import check_owned, owned
-from exo_gravity.core.tilt import SIDES, Tilt
+from exo_gravity.core.tilt import SIDES, Tilt, angle_between
 
 MODES = ("one_g", "zero_g")
 LAW_NAMES = (*LAWS, "anfis")
+# Gain times gravity, m/s^2: twice the Earth's, rounded up. Calibrated gains are 0.8 to 1.3.
+MAX_SCALE = 20.0
 TILT_SPEED = 5.0  # rad/s, faster than a trunk can tilt
 TILT_JUMP = 0.1  # rad, by which two tilts may differ however close in time
+MAX_LEAD = 0.05  # s that the stamp of a tilt may be ahead of our clock: /clock comes in steps, hosts differ by ms
+MAX_LAG = 1.0  # s that it may be behind; beyond, the stamp comes from another clock
+FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
 RAMP_TIME = 1.0  # s from zero to full torque, at the start and after a break
 # s without an answer, after which the torque ramps in from zero. This is longer than any command_timeout: the arm is
 # already being let down, so the restart from zero cannot drop it.
@@ -76,6 +82,9 @@ class Settings:
             robot, wearer = self.robot.total_mass, whole.total_mass - self.robot.total_mass
             bound = f"at most max_total_mass = {self.max_total_mass:g} (robot {robot:.2f}, wearer's share {wearer:.2f})"
             raise ParameterError("total mass in kg", round(whole.total_mass, 2), bound)
+        if max(self.robot.scale) > MAX_SCALE:
+            scale = [round(value, 2) for value in self.robot.scale]
+            raise ParameterError("gain times gravity", scale, f"at most {MAX_SCALE:g} m/s^2, twice the Earth's gravity")
         object.__setattr__(self, "arm", whole if self.mode == "zero_g" else self.robot)
         object.__setattr__(self, "active_law", law)
 
@@ -99,15 +108,18 @@ class Compensator:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self._tilt = Tilt.of(settings.side)
-        self._trunk = (0.0, 0.0)  # pitch and roll
-        self._tilt_time = -math.inf
+        self._tilt_time = -math.inf  # when it was measured
+        self._tilt_arrival = -math.inf
+        self._tilt_refusal = ""  # why the newest tilt was refused; contains no measured value
         self._ramp_start = -math.inf
         self._last_answer = -math.inf
         self._effort = NO_TORQUE
+        self._torque = NO_TORQUE  # before ramp and limits
         self._remainder = NO_TORQUE
-        self._change_time: float | None = None  # time of the last change of settings; None if no transition is active
+        self._change_time: float | None = None  # time of the last change of law or settings; None after the transition
         self._pending: Settings | None = None
-        self._fallback = ""
+        self._fallback = ""  # why the exact law replaces the chosen one
+        self._fallback_until = -math.inf
 
     def apply(self, settings: Settings) -> None:
         """Use new settings from the next `step` on; the torque moves to them without a step."""
@@ -115,50 +127,92 @@ class Compensator:
             raise ParameterError("side", settings.side, f"{self.settings.side}, because the side cannot change")
         self._pending = settings
 
-    def set_tilt(self, now: float, pitch: float, roll: float) -> None:
-        """Set the trunk's pitch and roll in rad, measured at `now` (s).
+    def set_tilt(self, now: float, pitch: float, roll: float, age: float = 0.0) -> None:
+        """Set the trunk's pitch and roll in rad, which arrived at `now` (s) and were measured `age` s earlier.
 
-        Raises ParameterError if a trunk cannot have moved that far since the last measurement.
+        Raises ParameterError if a trunk cannot have moved that far since the last measurement, and if `age` is
+        impossible because the clock that stamped the tilt differs from ours.
         """
+        try:
+            self._set_tilt(now, pitch, roll, age)
+        except ParameterError as error:
+            self._tilt_refusal = f"{error.name} must be {error.expected}"
+            raise
+        self._tilt_refusal = ""
+
+    def _set_tilt(self, now: float, pitch: float, roll: float, age: float) -> None:
         tilt = Tilt.of(self.settings.side, pitch, roll)
-        reach = TILT_JUMP + TILT_SPEED * (now - self._tilt_time)
-        if any(abs(new - old) > reach for new, old in zip((pitch, roll), self._trunk, strict=True)):
-            expected = f"within {reach:.2f} rad of the last tilt, [{self._trunk[0]:.2f}, {self._trunk[1]:.2f}]"
+        if not -MAX_LEAD <= age <= MAX_LAG:
+            expected = (
+                f"from {-MAX_LEAD:g} to {MAX_LAG:g} s: synchronise the clocks of the IMU driver and this computer"
+            )
+            raise ParameterError("age of the trunk tilt by its stamp", round(age, 3), expected)
+        measured = now - max(0.0, age)
+        # The direction is continuous where pitch and roll flip, in a bow through 90 degrees.
+        reach = TILT_JUMP + TILT_SPEED * max(0.0, measured - self._tilt_time)
+        if angle_between(tilt.direction, self._tilt.direction) > reach:
+            expected = f"within {TILT_JUMP:g} rad plus {TILT_SPEED:g} rad/s of the last tilt"
             raise ParameterError("trunk tilt", [pitch, roll], expected)
-        self._tilt, self._trunk, self._tilt_time = tilt, (pitch, roll), now
+        self._tilt, self._tilt_time, self._tilt_arrival = tilt, measured, now
 
     def step(self, now: float, theta: Sequence[float]) -> Answer:
         """Return the torque for joint angles `theta` (4,) rad at `now` s on a monotonic clock."""
         if len(theta) != JOINT_COUNT or not all(-MAX_ANGLE <= angle <= MAX_ANGLE for angle in theta):
             return Answer(None, f"joint angles {list(theta)} are not 4 numbers within {MAX_ANGLE:g} rad")
-        timeout = self.settings.tilt_timeout
-        if self.settings.use_imu and not now - self._tilt_time <= timeout:
-            never = self._tilt_time == -math.inf
-            return Answer(None, "no trunk tilt yet" if never else f"trunk tilt older than {timeout * 1000:.0f} ms")
+        if self.settings.use_imu and not now - self._tilt_time <= self.settings.tilt_timeout:
+            return Answer(None, self._why_no_tilt(now))
         torque = self._transition(now, theta)
         if not all(map(math.isfinite, torque)):
             return Answer(None, f"torque {list(torque)} Nm from the law is not finite")
         return self._limited(now, torque)
 
-    def _law(self, theta: Sequence[float]) -> Torque:
+    def _why_no_tilt(self, now: float) -> str:
+        timeout = self.settings.tilt_timeout
+        text = f"trunk tilt older than {timeout * 1000:.0f} ms"
+        if self._tilt_time == -math.inf:
+            text = "no trunk tilt yet"
+        elif now - self._tilt_arrival <= timeout:
+            text += " by its stamp: the IMU driver lags, or its clock differs"
+        return f"{text} (the newest was refused: {self._tilt_refusal})" if self._tilt_refusal else text
+
+    def _law(self, now: float, theta: Sequence[float]) -> Torque:
+        """Return the torque of the chosen law, or of the exact law while the chosen one does not apply."""
         settings, tilt = self.settings, self._tilt
         law = settings.active_law
-        self._fallback = law.outside(settings.arm, theta, tilt)
+        reason = law.outside(settings.arm, theta, tilt)
+        if reason:
+            self._fallback, self._fallback_until = reason, now + FALLBACK_TIME
+        elif now >= self._fallback_until:
+            self._fallback = ""
         if self._fallback:
             law = LAWS["exact"]
         return law.torque(settings.arm, theta, tilt)
 
     def _transition(self, now: float, theta: Sequence[float]) -> Torque:
-        """Return the law's torque plus the remainder of the last change of settings."""
-        before = None
+        """Return the law's torque plus the remainder of the last change of settings or law."""
+        torque = self._current(now, theta)
         if self._pending is not None:
-            before = self._blended(now, self._law(theta))
+            if self._pending.law != self.settings.law:
+                self._fallback, self._fallback_until = "", -math.inf
             self.settings, self._pending = self._pending, None
-        torque = self._law(theta)
-        if before is not None:
-            self._remainder = tuple(b - t for b, t in zip(before, torque, strict=True))
-            self._change_time = now
+            torque = self._bridged(now, torque, self._law(now, theta))
+        self._torque = torque
+        return torque
+
+    def _current(self, now: float, theta: Sequence[float]) -> Torque:
+        """Return the torque by the current settings."""
+        replaced = bool(self._fallback)
+        torque = self._law(now, theta)
+        if bool(self._fallback) != replaced and 0.0 <= now - self._last_answer <= BREAK:
+            # Continue from the last torque: the replaced law may not apply at `theta`.
+            return self._bridged(now, self._torque, torque)
         return self._blended(now, torque)
+
+    def _bridged(self, now: float, before: Torque, after: Torque) -> Torque:
+        """Begin the transition between two torques; return its start, `before`."""
+        self._remainder = tuple(b - a for b, a in zip(before, after, strict=True))
+        self._change_time = now
+        return before
 
     def _blended(self, now: float, torque: Torque) -> Torque:
         """Return `torque` plus what is left at `now` of the remainder."""

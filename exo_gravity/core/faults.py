@@ -28,6 +28,7 @@ class FaultCode(str, Enum):
     MOTOR_SILENT = "motor_silent", "a motor has not replied within `reply_timeout`"
     MOTOR_ERROR = "motor_error", "a motor reports an error"
     OVER_TEMPERATURE = "over_temperature", "a motor is hotter than `max_temperature`"
+    TORQUE_NOT_DELIVERED = "torque_not_delivered", "a motor's reply shows another torque than the commanded one"
     # The motion
     OVER_SPEED = "over_speed", "a joint turns faster than `max_velocity`"
     OUTSIDE_LIMITS = "outside_limits", "a joint is more than 0.1 rad beyond `position_min` or `position_max`"
@@ -41,10 +42,25 @@ class FaultCode(str, Enum):
     COMMAND_WITHDRAWN = "command_withdrawn", "the compensator withdrew its efforts; its diagnostics give the reason"
     COMMAND_IMPOSSIBLE = "command_impossible", "an effort is NaN, beyond 40 Nm, misnamed or missing"
     SECOND_COMMANDER = "second_commander", "two publishers send effort commands"
-    # The computer
+    # The bus and the computer
+    FOREIGN_COMMAND = "foreign_command", "another sender commands a motor of this arm"
     BUS_ERROR = "bus_error", "the CAN bus cannot be opened, or sending or receiving failed"
     WATCHDOG_DEAD = "watchdog_dead", "the watchdog process has died"
     INTERNAL_ERROR = "internal_error", "the control loop raised an unexpected exception"
+
+
+# After these faults zeros and signs are checked again: an encoder may have lost its turn count, or a motor its power.
+DOUBTFUL = frozenset(
+    {
+        FaultCode.MOTOR_SILENT,
+        FaultCode.MOTOR_ERROR,
+        FaultCode.TORQUE_NOT_DELIVERED,
+        FaultCode.OUTSIDE_LIMITS,
+        FaultCode.POSITION_JUMP,
+        FaultCode.IMPLAUSIBLE_ZERO,
+        FaultCode.FOREIGN_COMMAND,
+    }
+)
 
 
 class Fault(NamedTuple):

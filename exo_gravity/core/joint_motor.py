@@ -41,17 +41,23 @@ class JointMotor:
         if not low <= self.torque_scale <= high:
             raise ParameterError("torque_scale", self.torque_scale, f"from {low:g} to {high:g}")
 
+    @property
+    def peak_effort(self) -> float:
+        """The largest torque in Nm at the joint, for seconds."""
+        return min(self.spec.peak_torque, self.spec.torque_range) * self.torque_scale
+
     def command(self, effort: float, damping: float) -> bytes:
-        """Return the frame for a joint `effort` in Nm and a `damping` in Nm s/rad; the torque is clamped to its range.
+        """Return the frame for a joint `effort` in Nm and `damping` in Nm s/rad, clamped to the wire format.
 
         Raises ParameterError on NaN or infinity.
         """
         torque = self.direction * effort / self.torque_scale
-        if damping:  # No code is exactly 0 rad/s. Without this term the nearest one adds damping times its velocity.
-            torque -= damping * standstill(self.spec)
+        kd = min(damping / self.torque_scale, self.spec.kd_max)
+        if kd:  # no code is exactly 0 rad/s: the nearest one would push with kd times its velocity
+            torque -= kd * standstill(self.spec)
         if math.isfinite(torque) and abs(torque) > self.spec.torque_range:
             torque = math.copysign(self.spec.torque_range, torque)
-        return pack_command(self.spec, 0.0, 0.0, 0.0, damping, torque)
+        return pack_command(self.spec, 0.0, 0.0, 0.0, kd, torque)
 
     def joint_reply(self, data: bytes | bytearray) -> MotorReply:
         """Return the content of a reply in the joint's rad, rad/s and Nm. Raises FrameError."""

@@ -20,8 +20,14 @@ from exo_gravity.core.param_table import check_owned, owned
 
 MAX_COMMAND = 40.0  # Nm: no arm needs half of it, so a larger effort command is wrong
 PEAK_TORQUE = max(spec.peak_torque for spec in MOTORS.values())  # Nm
+# The soft wall before a joint limit. These figures make it passive, for inertias of 0.005 to 0.3 kg m^2 and any rate:
+# behind the rate limit a spring alone would throw the arm back. The motor applies the damping without delay.
 WALL_WIDTH = 0.1  # rad before a joint limit, as in crisp_controllers
-WALL_TORQUE = 5.0  # Nm at the joint limit
+WALL_STIFFNESS = 25.0  # Nm/rad
+WALL_TORQUE = 5.0  # Nm, largest
+WALL_DAMPING = 5.0  # Nm s/rad, from WALL_EDGE on
+WALL_EDGE = 0.02  # rad into the wall over which the damping rises
+WALL_RELEASE = 0.03  # rad/s out of the wall, from which on the spring no longer pushes
 OVERSHOOT = 0.1  # rad past a joint limit that is not yet a fault, because mechanical stops are not infinitely stiff
 DERATING = 10.0  # degC below max_temperature over which the permitted torque falls to half
 JUMP = 0.05  # rad that two readings may differ by in addition to what max_velocity allows
@@ -115,11 +121,14 @@ class Limits:
         if not low - overshoot <= joint.position <= high + overshoot:
             reason = f"{name}: {joint.position:.3f} rad, the limits are {low:g} to {high:g}"
             return Fault(FaultCode.OUTSIDE_LIMITS, reason)
-        # This is False while `last` is UNKNOWN.
-        if abs(joint.position - last.position) > JUMP + limit * (joint.time - last.time):
+        if self.is_jump(i, joint, last):
             reason = f"{name}: from {last.position:.3f} to {joint.position:.3f} rad in one step"
             return Fault(FaultCode.POSITION_JUMP, reason)
         return None
+
+    def is_jump(self, i: int, joint: JointSample, last: JointSample) -> bool:
+        """Return whether joint `i` moved farther than it can since its `last` reading; False if that is UNKNOWN."""
+        return abs(joint.position - last.position) > JUMP + self.max_velocity[i] * (joint.time - last.time)
 
     def find_wrong_zero(self, joints: Sequence[JointSample]) -> Fault | None:
         """Return the fault of the first joint that is not near `home`, where the arm must hang, or None."""
@@ -146,13 +155,13 @@ class Limits:
         for i, (name, joint) in enumerate(zip(self.joint_names, joints, strict=True)):
             if not abs(effort[i]) <= MAX_COMMAND:
                 raise ParameterError(f"effort of {name}", effort[i], f"from -{MAX_COMMAND:g} to {MAX_COMMAND:g} Nm")
-            wall = self._wall(i, joint.position)
+            depth = self._depth(i, joint.position)
             permitted = self.max_effort[i] * self._derating(joint.temperature)
-            wanted = share * (effort[i] + wall)
+            wanted = share * (effort[i] + _wall_torque(depth, joint.velocity))
             clamped = max(-permitted, min(permitted, wanted))
             limited = max(before[i] - step, min(before[i] + step, clamped))
             for limit, acts in (
-                ("soft wall", wall != 0.0),
+                ("soft wall", depth != 0.0),
                 ("derating", permitted < self.max_effort[i]),
                 ("max_effort", clamped != wanted),
                 ("max_effort_rate", limited != clamped),
@@ -162,15 +171,25 @@ class Limits:
             shaped.append(limited)
         return tuple(shaped), acted
 
-    def _wall(self, i: int, position: float) -> float:
-        stiffness = WALL_TORQUE / WALL_WIDTH
-        below = self.position_min[i] + WALL_WIDTH - position
+    def wall_damping(self, joints: Sequence[JointSample]) -> tuple[float, ...]:
+        """Return the damping (4,) in Nm s/rad of the soft walls at the joints' positions."""
+        depths = (self._depth(i, joint.position) for i, joint in enumerate(joints))
+        return tuple(WALL_DAMPING * min(1.0, abs(depth) / WALL_EDGE) for depth in depths)
+
+    def _depth(self, i: int, position: float) -> float:
+        """Return how deep joint `i` is in a soft wall, in rad: > 0 beyond the upper edge, < 0 beyond the lower one."""
         above = position - self.position_max[i] + WALL_WIDTH
-        if below > 0.0:
-            return min(WALL_TORQUE, stiffness * below)
-        return -min(WALL_TORQUE, stiffness * above) if above > 0.0 else 0.0
+        below = self.position_min[i] + WALL_WIDTH - position
+        return above if above > 0.0 else -max(0.0, below)
 
     def _derating(self, temperature: int | None) -> float:
         if temperature is None:
             return 1.0
         return max(0.5, min(1.0, 0.5 + 0.5 * (self.max_temperature - temperature) / DERATING))
+
+
+def _wall_torque(depth: float, velocity: float) -> float:
+    """Return the torque in Nm of a soft wall at `depth` (rad), none while the joint leaves it (`velocity`, rad/s)."""
+    if math.copysign(velocity, velocity * depth) < -WALL_RELEASE:
+        return 0.0
+    return -max(-WALL_TORQUE, min(WALL_TORQUE, WALL_STIFFNESS * depth))

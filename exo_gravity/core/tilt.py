@@ -66,6 +66,11 @@ def pitch_roll(gravity_in_trunk: Vector) -> tuple[float, float]:
     return math.asin(max(-1.0, min(1.0, x / norm))), math.atan2(-y, -z)
 
 
+def angle_between(a: Vector, b: Vector) -> float:
+    """Return the angle in rad, 0..pi, between two unit vectors (3,); accurate for small and large angles."""
+    return 2.0 * math.atan2(math.dist(a, b), math.dist(a, [-component for component in b]))
+
+
 def rotation_matrix(quaternion: Vector, name: str = "quaternion") -> np.ndarray:
     """Return the rotation matrix (3, 3) of a unit quaternion (x, y, z, w), ROS order.
 

@@ -2,10 +2,15 @@
 
 Each cycle fetches the newest efforts from `get_efforts`. Other threads use `call` to run a function on the control
 thread between two cycles. The loop is paced by absolute monotonic deadlines, so that the rate does not drift.
+
+An exception anywhere lets the arm down: one in `get_efforts` counts as withdrawn efforts, one of the bus as a silent
+bus, one in the state machine as a fault. If the state machine keeps failing, the watchdog takes over from the last
+noted drive; without a watchdog, this thread lowers the arm (hardware/last_resort.py).
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 import time
@@ -14,17 +19,19 @@ from concurrent.futures import Future
 from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
 
+from exo_gravity.core.drive import CARRYING, OFF, State
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.faults import FaultCode
 from exo_gravity.core.limits import JointSample
-from exo_gravity.core.safety import CARRYING, NOTHING, Drive, SafetyMachine, State
+from exo_gravity.core.safety import SafetyMachine
+from exo_gravity.hardware import last_resort
 from exo_gravity.hardware.motor_bus import MotorBus
 
 EFFORT_WAIT = 0.5  # share of a cycle's idle time for which the loop may wait for late efforts
 SMOOTHING = 0.02  # per cycle, of the measured work time
 REPLY_WAIT = 0.8  # share of a cycle in which replies are awaited; the rest is for publishing them
 MAX_ERRORS = 3  # unexpected exceptions in a row after which the state machine is no longer trusted
-LAST_RESORT = 3.0  # s of damping alone after that
+HAND_OVER_TIME = 0.5  # s in which a watchdog that takes over has ended this process
 
 
 class EffortCommand(NamedTuple):
@@ -41,9 +48,11 @@ class ControlLoop:
     """Owns `bus` and `safety` from `start` until its thread has ended.
 
     get_efforts(latest) is called before every exchange and returns the newest efforts, for which it may wait until
-    `latest` (monotonic s). on_cycle(now, samples) is called after every exchange.
+    `latest` (monotonic s). on_cycle(now, samples) is called after every exchange; its errors do not stop the control.
+    hand_over(reason) requests the watchdog to end this process and let the arm down; it returns whether one is there.
     cycles, late, incomplete: counts of all cycles, of those that began more than a period late, and of those in which
-    not every motor replied in time.
+    not every motor replied in time. failure: the exception that ended the control, if any. cycle_errors: count of
+    exceptions in on_cycle; cycle_error is the last one.
     """
 
     def __init__(
@@ -51,18 +60,24 @@ class ControlLoop:
         bus: MotorBus,
         safety: SafetyMachine,
         period: float,
-        on_cycle: Callable[[float, Sequence[JointSample]], None],
+        on_cycle: Callable[[float, Sequence[JointSample]], None] = lambda now, samples: None,
         get_efforts: Callable[[float], EffortCommand] = lambda latest: NO_COMMAND,
+        hand_over: Callable[[str], bool] = lambda reason: False,
     ) -> None:
-        self.cycles = self.late = self.incomplete = 0
+        self.cycles = self.late = self.incomplete = self.cycle_errors = 0
+        self.cycle_error = ""
+        self.failure: BaseException | None = None
         self.safety = safety
         self._bus = bus
         self._period = period
         self._on_cycle = on_cycle
         self._get_efforts = get_efforts
+        self._hand_over = hand_over
+        self._drive = OFF  # last decided
+        self._foreign_commands = 0  # so far
         self._work = period  # s per cycle, without waiting for efforts; smoothed
         self._calls: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
-        self._stopping = False
+        self._is_stopping = self._is_abandoned = False
         self._thread = threading.Thread(target=self._run, name="control", daemon=True)
 
     def start(self) -> None:
@@ -70,7 +85,10 @@ class ControlLoop:
         self._thread.start()
 
     def call(self, function: Callable[[], Any]) -> Future[Any]:
-        """Run `function` on the control thread between two cycles; the future has its result."""
+        """Run `function` on the control thread between two cycles; the future has its result.
+
+        A future that is cancelled before never runs.
+        """
         future: Future[Any] = Future()
         self._calls.put((function, future))
         return future
@@ -85,6 +103,18 @@ class ControlLoop:
         """Count of frames that were not replies of this arm's motors, by kind."""
         return dict(self._bus.ignored)
 
+    @property
+    def is_alive(self) -> bool:
+        """Whether the control thread runs."""
+        return self._thread.is_alive()
+
+    @property
+    def is_off(self) -> bool:
+        """Whether the arm is down and its motors have confirmed that they are off."""
+        safety = self.safety
+        is_down = safety.state in (State.DISABLED, State.FAULT) and not safety.is_unreached
+        return is_down and not self._bus.may_be_powered
+
     def set_zero(self) -> None:
         """Make the present pose the motors' zero. Use it within a `call`, and only while they are off."""
         self._bus.set_zero()
@@ -98,48 +128,95 @@ class ControlLoop:
         if self.safety.state in CARRYING:
             self.trip(code, reason)
 
-    def stop(self) -> None:
-        """Let the arm down, send the last frames, close the bus; return when that is done."""
-        self._stopping = True
+    def stop(self, timeout: float | None = None) -> bool:
+        """Let the arm down, send the last frames, close the bus; return whether that was done within `timeout` s.
+
+        A motor that cannot be reached may still be on, so the thread tries to reach it without end.
+        """
+        self._is_stopping = True
+        return self._join(timeout)
+
+    def abandon(self) -> None:
+        """End the thread and close the bus without any further frame: the motors keep what they apply."""
+        self._is_abandoned = True
+        self._join()
+
+    def _join(self, timeout: float | None = None) -> bool:
         if self._thread.ident is not None:
-            self._thread.join()
+            self._thread.join(timeout)
+        if self._thread.is_alive():
+            return False
+        with contextlib.suppress(Empty):
+            while True:
+                self._calls.get_nowait()[1].cancel()
+        return True
 
     def _run(self) -> None:
-        deadline = time.monotonic()
-        errors = 0
         try:
-            while errors < MAX_ERRORS and not self._finished():
-                try:
-                    self._cycle(deadline)
-                    errors = 0
-                except Exception as error:  # whatever happened, the arm must come down
-                    errors += 1
-                    self.safety.trip(FaultCode.INTERNAL_ERROR, f"{type(error).__name__}: {error}", time.monotonic())
-                deadline = self._wait(deadline + self._period)
-            if errors:
-                self._damp()
-        finally:
+            self._control()
+        except BaseException as error:  # whatever happened, the arm must come down
+            self.failure = error
+            self._resign(f"{type(error).__name__}: {error}")
+        if self._is_abandoned:
+            self._bus.close()
+        else:
             self._bus.stop()
 
-    def _finished(self) -> bool:
-        return self._stopping and self.safety.state in (State.DISABLED, State.FAULT)
+    def _control(self) -> None:
+        deadline = time.monotonic()
+        errors = 0
+        while not self._is_abandoned and not (self._is_stopping and self.is_off):
+            try:
+                self._cycle(deadline)
+                errors = 0
+            except Exception as error:
+                errors += 1
+                if errors == MAX_ERRORS:
+                    raise
+                self.safety.trip(FaultCode.INTERNAL_ERROR, f"{type(error).__name__}: {error}", time.monotonic())
+            deadline = self._wait(deadline + self._period)
+
+    def _resign(self, reason: str) -> None:
+        """Hand the arm over to the watchdog, which ends this process; without one, lower the arm."""
+        if self._bus.may_be_powered:
+            with contextlib.suppress(Exception):
+                if self._hand_over(f"the control loop failed: {reason}"):
+                    time.sleep(HAND_OVER_TIME)
+            last_resort.lower(self._bus, self._drive, self._period)
 
     def _cycle(self, due: float) -> None:
-        efforts = self._get_efforts(due + EFFORT_WAIT * (self._period - self._work))
+        efforts = self._efforts(due)
         self._run_calls()
         now = time.monotonic()
-        if self._stopping:
+        if self._is_stopping:
             self.safety.disable(now)
-        drive = self.safety.step(now, tuple(self._bus.samples), *efforts)
+        drive = self._drive = self.safety.step(now, tuple(self._bus.samples), *efforts)
         try:
             complete = self._bus.exchange(drive, now + REPLY_WAIT * self._period)
         except BusError as error:
             self.safety.trip(FaultCode.BUS_ERROR, str(error), now)
             complete = False
+        if self._bus.foreign_commands > self._foreign_commands:
+            self._foreign_commands = self._bus.foreign_commands
+            self.safety.trip(FaultCode.FOREIGN_COMMAND, self._bus.foreign_command, time.monotonic())
         self.cycles += 1
         self.incomplete += not complete
-        self._on_cycle(time.monotonic(), self._bus.samples)
+        try:
+            self._on_cycle(time.monotonic(), self._bus.samples)
+        except Exception as error:
+            self.cycle_errors += 1
+            self.cycle_error = f"{type(error).__name__}: {error}"
         self._work += SMOOTHING * (time.monotonic() - now - self._work)
+
+    def _efforts(self, due: float) -> EffortCommand:
+        is_contested = self._bus.is_contested  # then receiving comes first
+        latest = due if is_contested else due + EFFORT_WAIT * (self._period - self._work)
+        try:
+            return self._get_efforts(latest)
+        except Exception as error:
+            reason = f"efforts cannot be received: {type(error).__name__}: {error}"
+            self.safety.trip(FaultCode.INTERNAL_ERROR, reason, time.monotonic())
+            return NO_COMMAND
 
     def _run_calls(self) -> None:
         while True:
@@ -147,13 +224,21 @@ class ControlLoop:
                 function, future = self._calls.get_nowait()
             except Empty:
                 return
+            if not future.set_running_or_notify_cancel():
+                continue
             try:
                 future.set_result(function())
             except Exception as error:
                 future.set_exception(error)
 
     def _wait(self, deadline: float) -> float:
-        """Sleep until `deadline`; return it, or the present time if that is more than a period late."""
+        """Wait until `deadline`; return it, or the present time if that is more than a period late.
+
+        While another sender commands the motors, this receives instead, to answer each foreign command at once.
+        """
+        if self._bus.is_contested:
+            with contextlib.suppress(BusError):
+                self._bus.receive_until(deadline)
         remaining = deadline - time.monotonic()
         if remaining > 0.0:
             time.sleep(remaining)
@@ -161,12 +246,3 @@ class ControlLoop:
             self.late += 1
             return time.monotonic()
         return deadline
-
-    def _damp(self) -> None:
-        """The last resort, without the state machine: damping alone, for as long as an arm takes to come down."""
-        end = time.monotonic() + LAST_RESORT
-        while time.monotonic() < end:
-            try:
-                self._bus.exchange(Drive(NOTHING, self.safety.limits.damping, True), time.monotonic() + self._period)
-            except BusError:
-                time.sleep(self._period)

@@ -1,15 +1,18 @@
 """The AK motors of one arm on one python-can bus, in MIT mode: command all, collect the replies until a deadline.
 
-A motor replies only when commanded, 200-400 us later, with its own ID or the master's (0). Other frames are ignored and
-counted by kind: error and remote frames, extended IDs, frames of other devices, and our own commands where the bus
-echoes them (udp_multicast does). The first byte of a command is 0x7f, 0x80 or 0xff; that of a reply is the motor's ID,
-which `JointMotor` keeps below those. So a command is never taken for a reply.
+A motor replies only when commanded, 200-400 us later, with its own ID or the master's (0). The first byte of our
+commands is 0x7f, 0x80 or 0xff; that of a reply is the motor's ID, which `JointMotor` keeps below those. So a command is
+never taken for a reply. Frames of other devices are ignored and counted by kind.
+
+A motor obeys every sender. A command to one of our motors that we did not send is answered at once with our own.
 
 A zero command precedes ENTER and EXIT: the motor remembers its last command, and ENTER would carry it out.
 """
 
 from __future__ import annotations
 
+import contextlib
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -18,31 +21,40 @@ from typing import Any
 import can
 
 from exo_gravity.core.arm import JOINT_COUNT
+from exo_gravity.core.drive import OFF, Drive
 from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import UNKNOWN, JointSample
 from exo_gravity.core.motors import ENTER, EXIT, SET_ZERO
-from exo_gravity.core.safety import OFF, Drive
+from exo_gravity.hardware.can_port import CanPort
+from exo_gravity.hardware.frame_filter import FOREIGN_COMMAND, REPLY, FrameFilter
 
-MASTER_ID = 0  # the arbitration ID of some firmwares' replies
 MAX_STALE_FRAMES = 256  # frames read before each cycle: the capacity of udp_multicast, more than any cycle produces
-EXIT_PERIOD = 0.5  # s between two EXIT frames to motors that are off, in case one was lost
+EXIT_PERIOD = 0.5  # s between two EXIT frames to motors that are off, in case one was lost,
+UNCONFIRMED_EXIT_PERIOD = 0.02  # s, and to motors that have not replied since the first EXIT
+LAST_REPLIES = 0.02  # s for which replies to the last frames are awaited
+LISTEN_TIME = 0.12  # s before the first frame
+SETTLING_TIME = 0.02  # s of it in which late replies to the previous owner may still arrive
+CORRECTION_PERIOD = 0.001  # s between two corrections of a motor: two correcting hosts must not fill the bus
+CONTEST_TIME = 0.5  # s after a foreign command in which another one is expected
 
 
 def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:
     """Open a python-can bus of any kind. Raises BusError that names the bus and the reason."""
     try:
         return can.Bus(interface=interface, channel=channel, **options)
-    except (can.CanError, OSError, TypeError, ValueError) as error:
+    except Exception as error:  # backends raise errors of every type
         raise BusError(f"CAN bus {interface} {channel} {dict(options)} cannot be opened: {error}") from error
 
 
 class MotorBus:
     """Four motors on one bus. Not thread-safe: one thread owns it.
 
-    powered: whether the motors are already on. note: called with each drive before its frames are sent.
+    powered: whether the motors are already on. note: called with each drive before its frames are sent. reopen: opens
+    the bus again after a failure.
     samples: the newest JointSample of each joint, UNKNOWN before the first reply; times are `time.monotonic`.
     ignored: count of frames that were not replies of these motors, by kind.
+    foreign_commands: count of commands to these motors from another sender; foreign_command describes the last one.
     """
 
     def __init__(
@@ -51,19 +63,49 @@ class MotorBus:
         motors: Sequence[JointMotor],
         powered: bool = False,
         note: Callable[[Drive], None] = lambda drive: None,
+        reopen: Callable[[], can.BusABC] | None = None,
     ) -> None:
         ids = [motor.can_id for motor in motors]
         if len(motors) != JOINT_COUNT or len(set(ids)) != JOINT_COUNT:
             raise ParameterError("can_id", ids, "4 different IDs")
-        self._bus = bus
+        self.samples: list[JointSample] = [UNKNOWN] * JOINT_COUNT
+        self.ignored: Counter[str] = Counter()
+        self.foreign_commands = 0
+        self.foreign_command = ""
+        self._port = CanPort(bus, reopen)
+        self._filter = FrameFilter(ids)
         self._motors = tuple(motors)
         self._joint_of = {motor.can_id: joint for joint, motor in enumerate(motors)}
         self._powered = powered
+        self._unconfirmed = set(range(JOINT_COUNT)) if powered else set()  # not known to be off
+        self._commands: list[bytes | None] = [None] * JOINT_COUNT  # last sent
+        self._corrected = [-math.inf] * JOINT_COUNT  # s
+        self._foreign_time = -math.inf
         self._note = note
-        self._exit_sent = -float("inf")
+        self._exit_sent = -math.inf
+        self._is_confirming = False  # replies now follow an EXIT
         self._answered: set[int] = set()
-        self.samples: list[JointSample] = [UNKNOWN] * JOINT_COUNT
-        self.ignored: Counter[str] = Counter()
+
+    @property
+    def may_be_powered(self) -> bool:
+        """Whether a motor may be on: it was switched on, and has not replied since it was sent EXIT."""
+        return self._powered or bool(self._unconfirmed)
+
+    @property
+    def is_contested(self) -> bool:
+        """Whether another sender commands these motors."""
+        return time.monotonic() - self._foreign_time < CONTEST_TIME
+
+    def listen(self) -> None:
+        """Listen before the first frame. Raises BusError if another host commands these motors."""
+        end = time.monotonic() + LISTEN_TIME
+        self.receive_until(end - LISTEN_TIME + SETTLING_TIME)
+        self._answered.clear()
+        self.foreign_commands = 0
+        self.receive_until(end)
+        if self.foreign_commands or self._answered:
+            heard = self.foreign_command or f"motor {self._motors[min(self._answered)].can_id} replies to another host"
+            raise BusError(f"CAN bus {self._port.name} is in use: {heard}; stop the other commander first")
 
     def exchange(self, drive: Drive, deadline: float) -> bool:
         """Send every motor its part of `drive`, then collect replies until all arrived or `deadline` (monotonic s).
@@ -71,89 +113,134 @@ class MotorBus:
         Switches the motors on or off when `drive.powered` changes. Returns whether all motors replied in time. Raises
         BusError if the bus fails.
         """
-        self._note(drive)
-        try:
-            self._drain()
-            if drive.powered and not self._powered:
-                self._send_commands(OFF)
-                self._send_all(ENTER)
-            self._send_commands(drive)
-            if not drive.powered and (self._powered or time.monotonic() - self._exit_sent > EXIT_PERIOD):
-                self._send_all(EXIT)
-                self._exit_sent = time.monotonic()
-            self._powered = drive.powered
-            self._answered.clear()
-            while len(self._answered) < JOINT_COUNT:
-                remaining = deadline - time.monotonic()
-                message = self._bus.recv(max(0.0, remaining))
-                if message is not None:
-                    self._take(message)
-                if remaining <= 0.0:
-                    break
-        except (can.CanError, OSError) as error:
-            raise BusError(f"CAN bus {self._bus.channel_info}: {error}") from error
+        self._note(drive._replace(powered=drive.powered or self.may_be_powered))
+        self._is_confirming = not self._powered and self._exit_sent > -math.inf
+        self._drain()
+        if drive.powered:
+            self._switch_on()
+        self._send_commands(drive)
+        if not drive.powered:
+            self._switch_off()
+        self._answered.clear()
+        while len(self._answered) < JOINT_COUNT:
+            remaining = deadline - time.monotonic()
+            message = self._port.receive(max(0.0, remaining))
+            if message is not None:
+                self._take(message)
+            if remaining <= 0.0:
+                break
+        self._port.confirm()
         return len(self._answered) == JOINT_COUNT
+
+    def receive_until(self, deadline: float) -> None:
+        """Receive until `deadline` (monotonic s), and answer foreign commands. Raises BusError."""
+        while (remaining := deadline - time.monotonic()) > 0.0:
+            message = self._port.receive(remaining)
+            if message is not None:
+                self._take(message)
 
     def set_zero(self) -> None:
         """Make the present pose every motor's zero; only while they are off. They are silent for up to 1.5 s."""
         if self._powered:
             raise BusError("set_zero: refused while the motors are on")
-        try:
-            self._send_commands(OFF)
-            self._send_all(SET_ZERO)
-        except (can.CanError, OSError) as error:
-            raise BusError(f"CAN bus {self._bus.channel_info}: {error}") from error
+        self._send_commands(OFF)
+        self._send_all(SET_ZERO)
 
-    def stop(self) -> None:
-        """Send the last frames, a zero command and EXIT, twice; then close the bus. Never raises."""
+    def stop(self) -> bool:
+        """Send the last frames, a zero command and EXIT, twice; then close the bus. Never raises.
+
+        Returns whether the motors are off, as far as their replies show. If not, they stay noted as powered.
+        """
         for _ in range(2):
+            self._is_confirming = True
             for motor in self._motors:
                 for data in (motor.command(0.0, 0.0), EXIT):
                     try:
                         self._send(motor.can_id, data)
-                    except (can.CanError, OSError):
+                    except BusError:
                         self.ignored["unsent"] += 1
-        self._note(OFF)
-        self._bus.shutdown()
+            self._powered = False
+            end = time.monotonic() + LAST_REPLIES
+            with contextlib.suppress(BusError):
+                while self._unconfirmed and (remaining := end - time.monotonic()) > 0.0:
+                    message = self._port.receive(remaining)
+                    if message is not None:
+                        self._take(message)
+        if not self._unconfirmed:
+            self._note(OFF)
+        self._port.close()
+        return not self._unconfirmed
+
+    def close(self) -> None:
+        """Close the bus without any frame. Never raises."""
+        self._port.close()
+
+    def _switch_on(self) -> None:
+        if not self._powered:
+            self._powered, self._exit_sent = True, -math.inf
+            self._unconfirmed = set(range(JOINT_COUNT))
+            self._send_commands(OFF)
+            self._send_all(ENTER)
+
+    def _switch_off(self) -> None:
+        period = UNCONFIRMED_EXIT_PERIOD if self._unconfirmed else EXIT_PERIOD
+        if self._powered or time.monotonic() - self._exit_sent > period:
+            self._send_all(EXIT)
+            self._exit_sent = time.monotonic()
+        self._powered = False
 
     def _send_commands(self, drive: Drive) -> None:
-        for motor, effort in zip(self._motors, drive.effort, strict=True):
-            self._send(motor.can_id, motor.command(effort, drive.damping))
+        columns = (self._motors, drive.effort, drive.damping, drive.enter)
+        for joint, (motor, effort, damping, enter) in enumerate(zip(*columns, strict=True)):
+            command = self._commands[joint] = motor.command(effort, damping)
+            if enter:
+                self._send(motor.can_id, command)
+                self._send(motor.can_id, ENTER)
+            self._send(motor.can_id, command)
 
     def _send_all(self, data: bytes) -> None:
         for motor in self._motors:
             self._send(motor.can_id, data)
 
     def _send(self, can_id: int, data: bytes) -> None:
-        self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        self._filter.sent(can_id, data)
+        self._port.send(can_id, data)
 
     def _drain(self) -> None:
         """Read replies that arrived after their cycle, so that they do not count for this one."""
         for _ in range(MAX_STALE_FRAMES):
-            message = self._bus.recv(0.0)
+            message = self._port.receive(0.0)
             if message is None:
                 return
             self._take(message)
 
     def _take(self, message: can.Message) -> None:
-        kind = self._foreign(message)
-        if kind:
+        kind = self._filter.kind(message)
+        if kind != REPLY:
             self.ignored[kind] += 1
+            if kind == FOREIGN_COMMAND:
+                self._oppose(self._joint_of[message.arbitration_id], bytes(message.data))
             return
         joint = self._joint_of[message.data[0]]
-        _, *reading = self._motors[joint].joint_reply(message.data)
+        reply = self._motors[joint].joint_reply(bytes(message.data))
         self._answered.add(joint)
-        self.samples[joint] = JointSample(*reading, time.monotonic())
+        if self._is_confirming:
+            self._unconfirmed.discard(joint)
+        self.samples[joint] = JointSample(*reply[1:], time.monotonic())
 
-    def _foreign(self, message: can.Message) -> str:
-        """Return the kind of a frame that is not a reply of our motors, else ''."""
-        if message.is_error_frame:
-            return "error frame"
-        if message.is_extended_id or message.is_remote_frame or message.is_fd:
-            return "extended, remote or FD frame"
-        data = message.data
-        if message.arbitration_id in self._joint_of and len(data) == 8 and data[0] in (0x7F, 0x80, 0xFF):
-            return "command"
-        if len(data) not in (6, 8) or data[0] not in self._joint_of:
-            return "foreign frame"
-        return "" if message.arbitration_id in (MASTER_ID, data[0]) else "foreign frame"
+    def _oppose(self, joint: int, foreign: bytes) -> None:
+        """Send our last command again after a foreign one, so that the motor obeys it for less than a millisecond."""
+        now = time.monotonic()
+        can_id, command = self._motors[joint].can_id, self._commands[joint]
+        self.foreign_commands += 1
+        self._foreign_time = now
+        self.foreign_command = f"another sender commands motor {can_id} (frame [{foreign.hex(' ')}])"
+        if not self._powered or command is None:
+            return
+        if foreign == EXIT:
+            self._send(can_id, command)
+            self._send(can_id, ENTER)
+        elif now - self._corrected[joint] < CORRECTION_PERIOD:
+            return
+        self._corrected[joint] = now
+        self._send(can_id, command)

@@ -19,6 +19,7 @@ import numpy as np
 from exo_gravity.core.arm import STANDARD_GRAVITY, one_float
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.tilt import gravity_from_orientation, pitch_roll, rotation_matrix
+from exo_gravity.hardware.freeze_check import FreezeCheck
 
 try:
     import imufusion
@@ -82,6 +83,7 @@ class TrunkEstimator:
         self._fused = _Fused(rate) if imufusion else None
         self._reported = _Reported()
         self._source: _Fused | _Reported | None = None
+        self._freeze = FreezeCheck()
         self._time = -math.inf
         self._down: np.ndarray | None = None  # gravity's unit vector in the trunk's axes
         self._contradicted = 0.0  # s
@@ -94,14 +96,15 @@ class TrunkEstimator:
     def update(self, sample: ImuSample) -> TrunkOrientation | None:
         """Process a sample; return the trunk's orientation, or None while settling.
 
-        Raises ParameterError if the sample is impossible or not later than the last one (it is then ignored), or if
-        the orientation has contradicted the accelerometer for CONTRADICTION_TIME.
+        Raises ParameterError if the sample is impossible, frozen or not later than the last one (it is then ignored),
+        or if the orientation has contradicted the accelerometer for CONTRADICTION_TIME.
         """
         source = self._fused if sample.orientation is None else self._reported
         if source is None:
             raise ParameterError("orientation", None, "reported by the IMU, or install imufusion to fuse it")
         acceleration = source.check(sample)
         dt = self._step(sample.time)
+        self._freeze.check(sample.time, sample.angular_velocity, sample.acceleration)
         if source is not self._source or abs(dt) > MAX_GAP:
             self._restart(source, acceleration, f"gap of {dt:.2f} s" if source is self._source else "started")
             dt = 0.0

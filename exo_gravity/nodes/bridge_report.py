@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 from rclpy.node import Node
 
+from exo_gravity.core.drive import State
 from exo_gravity.core.limits import Limits
 from exo_gravity.core.rate import Rate
-from exo_gravity.core.safety import State
 from exo_gravity.core.wire import Load, load
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics
@@ -72,6 +72,7 @@ class BridgeReport:
             "late cycles": loop.late,
             "incomplete cycles": loop.incomplete,
             "frames ignored": ", ".join(f"{kind}: {n}" for kind, n in sorted(loop.ignored.items())) or "none",
+            "publishing errors": f"{loop.cycle_errors}, last: {loop.cycle_error}" if loop.cycle_errors else "none",
             "last refused message": refusal,
         }
         for name, joint in zip(self._names, loop.samples, strict=True):
@@ -81,6 +82,10 @@ class BridgeReport:
 
 def _headline(loop: ControlLoop, acting: str) -> tuple[bytes, str]:
     safety = loop.safety
+    if loop.failure:
+        return ERROR, f"the control thread has ended: {loop.failure}"
+    if safety.is_unreached:
+        return ERROR, f"{safety.state.value}: a motor does not reply and may still be powered: cut the motors' supply"
     if safety.fault:
         return ERROR, f"{safety.state.value}: {safety.fault.code}: {safety.fault.reason}"
     if safety.state is State.CHECKING:

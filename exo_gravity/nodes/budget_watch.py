@@ -8,6 +8,7 @@ computed, newer settings wait; the newest of them comes next.
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -70,6 +71,8 @@ class BudgetWatch:
             self._node.destroy_client(self._client)  # the executor then waits for one entity less
 
     def _sentence(self, robot: ArmModel, mass: Sequence[float], cog: Sequence[float], support: float) -> str:
+        # A thread inherits its creator's policy, and thread_priority sets that of all threads: never SCHED_FIFO here.
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         try:
             values = dict(zip(BRIDGE_PARAMETERS, map(parameter_value_to_python, self._bridge), strict=False))
             bridge = values_of([param for param in CAN_BRIDGE if param.name in BRIDGE_PARAMETERS], values)

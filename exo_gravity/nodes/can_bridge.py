@@ -8,6 +8,7 @@ depend on the wall clock, and an unknown stamp is refused.
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -16,19 +17,22 @@ from typing import Any
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
-from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity.core.control_params import CAN_BRIDGE, OPTIONS, limits_of, motors_of
 from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.faults import FaultCode
 from exo_gravity.core.limits import JointSample
-from exo_gravity.core.safety import SafetyMachine, State
+from exo_gravity.core.safety import SafetyMachine
+from exo_gravity.core.validation import check_bridge
 from exo_gravity.core.wire import check_rate
 from exo_gravity.hardware.control_loop import NO_COMMAND, ControlLoop, EffortCommand
-from exo_gravity.hardware.motor_bus import MotorBus, open_bus
+from exo_gravity.hardware.handover import Charge
+from exo_gravity.hardware.motor_bus import MotorBus
+from exo_gravity.hardware.owned_bus import OwnedBus
 from exo_gravity.hardware.scheduling import request_real_time
-from exo_gravity.hardware.watchdog import Charge, Watchdog
+from exo_gravity.nodes.bridge_recovery import is_requested, run_recovery
 from exo_gravity.nodes.bridge_report import BridgeReport, log_limits
+from exo_gravity.nodes.bridge_services import CALL_TIMEOUT, BridgeServices
 from exo_gravity.nodes.conversions import by_name, to_nanoseconds
 from exo_gravity.nodes.declare import bus_of, declare
 from exo_gravity.nodes.hot_path import HotPath
@@ -40,100 +44,153 @@ from exo_gravity.nodes.sole_publisher import SolePublisher
 EFFORTS = QoSProfile(depth=8, reliability=ReliabilityPolicy.BEST_EFFORT)
 REMEMBERED = 256  # stamps of joint states: more than command_timeout covers at any rate
 REPORT_PERIOD = 0.1  # s
-ZERO_TOLERANCE = 0.02  # rad that a motor may report after set_zero
-ZERO_TIMEOUT = 3.0  # s; motors are silent for up to 1.5 s while they write their memory
-CALL_TIMEOUT = 2.0  # s that a service waits for the control thread
+DESCENT_TIMEOUT = 60.0  # s in which a deactivated arm must be down, with its motors off
+REMINDER_PERIOD = 10.0  # s between two reminders that a motor cannot be reached
 
 
 class CanBridge(LifecycleNode):
-    """The lifecycle node: configure opens the bus, activate starts the loop and arms, deactivate lets the arm down."""
+    """The lifecycle node: configure opens the bus, activate starts the loop and arms, deactivate lets the arm down.
+
+    Raises BusError if `autostart` is set and the node cannot be configured or activated.
+    """
 
     def __init__(self) -> None:
         super().__init__("can_bridge", automatically_declare_parameters_from_overrides=True)
         values = declare(self, CAN_BRIDGE, free_prefix=OPTIONS)
-        self._address = bus_of(self, values)
         self._names = values["joint_names"]
         self._motors = motors_of(values)
         self._limits = limits_of(values)
+        check_bridge(values["rate"], self._motors, self._limits)
         self._period = 1.0 / values["rate"]
+        self._charge = Charge(bus_of(self, values), self._motors, self._limits, self._period)
+        self._owner = f"{self.get_fully_qualified_name()} (PID {os.getpid()})"
         self._real_time = values["thread_priority"], values["lock_memory"]
         self._wire = check_rate(values["rate"], len(self._motors))
         self._command = NO_COMMAND  # the newest from the compensator
         self._measured = -math.inf  # monotonic s, when the last published joint state was measured
-        self._watchdog = Watchdog()
-        self._watchdog.guard(Charge(self._address, self._motors, self._limits, self._period))
-        self._bus: MotorBus | None = None
-        self._loop: ControlLoop | None = None
+        self._owned: OwnedBus | None = None  # while configured
+        self._bus: MotorBus | None = None  # while inactive
+        self._loop: ControlLoop | None = None  # while active
+        self._error = ""  # why the last transition failed
         self._published: OrderedDict[int, float] = OrderedDict()
         self._refusal = "none"
-        self._commander = SolePublisher()
+        self._commander = SolePublisher(self, "effort_commands")
         self._report_writer = BridgeReport(self, self._names, self._wire, self._period)
         self._publisher = self.create_publisher(JointState, "joint_states", 1)
         self._joint_states = JointState(name=self._names)  # one message, reused
         self._efforts = HotPath(self, JointState, "effort_commands", self._on_efforts, EFFORTS)
-        self.create_service(SetBool, "~/enable", self._on_enable)
-        self.create_service(Trigger, "~/clear_fault", self._on_clear_fault)
-        self.create_service(Trigger, "~/set_zero", self._on_set_zero)
+        BridgeServices(self, lambda: self._loop, self._motors, self._limits)
         self.create_timer(REPORT_PERIOD, self._report)
         log_limits(self, self._limits, self._wire, values["rate"])
         if values["autostart"]:
-            self._open()
-            self.trigger_configure()
-            self.trigger_activate()
+            for trigger in (self.trigger_configure, self.trigger_activate):
+                if trigger() is not TransitionCallbackReturn.SUCCESS:
+                    self.close()
+                    raise BusError(self._error)
+
+    @property
+    def failure(self) -> BaseException | None:
+        """The exception that ended the control thread, if any."""
+        return self._loop.failure if self._loop else None
 
     # Lifecycle
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Open the bus."""
-        try:
-            self._open()
-        except BusError as error:
-            self.get_logger().error(str(error))
-            return TransitionCallbackReturn.FAILURE
-        return TransitionCallbackReturn.SUCCESS
+        """Take the bus, open it, and listen."""
+        return self._transition(self._configure, super().on_configure, state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start the control loop, and enable the arm once it passes the start gate."""
-        safety = SafetyMachine(self._limits, self._period)
-        self._loop = ControlLoop(self._bus, safety, self._period, self._publish, get_efforts=self._get_efforts)
-        self._bus = None  # now owned by the loop
-        self._loop.call(lambda: self._loop.safety.enable(time.monotonic()))
-        self._loop.start()
-        for refused in request_real_time(*self._real_time):
-            self.get_logger().warning(refused)
-        return super().on_activate(state)
+        return self._transition(self._activate, super().on_activate, state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Let the arm down and wait until it is down; the bus stays open for the next activation."""
-        self._stop_loop()
-        self._open()
-        return super().on_deactivate(state)
+        """Let the arm down and wait until its motors are off; the bus stays ours for the next activation."""
+        return self._transition(self._deactivate, super().on_deactivate, state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Close the bus."""
-        self.close()
-        return super().on_cleanup(state)
+        """Close the bus and release it."""
+        return self._transition(self.close, super().on_cleanup, state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Let the arm down and close the bus."""
-        self.close()
-        return super().on_shutdown(state)
+        return self._transition(self.close, super().on_shutdown, state)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Let the arm down and close the bus, after an exception in a transition."""
+        return self._transition(self.close, super().on_error, state)
 
     def close(self) -> None:
-        """Let the arm down, send the last frames and close the bus, in any state."""
-        self._stop_loop()
+        """Let the arm down, send the last frames, close the bus and release it, in any state.
+
+        A motor that cannot be reached may still be on, so this waits for it without end.
+        """
+        loop, self._loop = self._loop, None
+        while loop is not None and not loop.stop(REMINDER_PERIOD):
+            if loop.safety.is_unreached:
+                self.get_logger().error("a motor does not reply; it may still be powered; trying again")
         if self._bus is not None:
             self._bus.stop()
             self._bus = None
+        if self._owned is not None:
+            self._owned.close()
+            self._owned = None
 
-    def _open(self) -> None:
-        if self._bus is None:
-            self._bus = MotorBus(open_bus(*self._address), self._motors, note=self._watchdog.note)
+    def _transition(
+        self,
+        function: Callable[[], None],
+        superior: Callable[[LifecycleState], TransitionCallbackReturn],
+        state: LifecycleState,
+    ) -> TransitionCallbackReturn:
+        """Run a transition; if it raises, log why, which rclpy does not."""
+        try:
+            function()
+            return superior(state)
+        except BusError as error:
+            self._error = str(error)
+        except Exception as error:
+            self._error = f"{type(error).__name__}: {error}"
+        self.get_logger().error(self._error)
+        return TransitionCallbackReturn.FAILURE
 
-    def _stop_loop(self) -> None:
-        if self._loop is not None:
-            self._loop.stop()
-            self._loop = None
+    def _configure(self) -> None:
+        self._owned = OwnedBus(self._charge, self._owner, self.get_logger().error)
+        try:
+            self._bus = self._owned.open()
+        except BaseException:
+            self.close()
+            raise
+
+    def _activate(self) -> None:
+        self._command = NO_COMMAND
+        if self._owned is None:
+            raise BusError("the node is not configured")
+        bus, self._bus = self._bus or self._owned.open(), None
+        safety = SafetyMachine(self._limits, self._period, [motor.peak_effort for motor in self._motors])
+        hand_over = self._owned.watchdog.hand_over
+        loop = ControlLoop(bus, safety, self._period, self._publish, self._get_efforts, hand_over)
+        loop.start()
+        try:
+            for refused in request_real_time(*self._real_time):
+                self.get_logger().warning(refused)
+        except BaseException:
+            loop.stop()
+            raise
+        self._loop = loop
+        loop.call(lambda: safety.enable(time.monotonic()))
+
+    def _deactivate(self) -> None:
+        loop, end = self._loop, time.monotonic() + DESCENT_TIMEOUT
+        if loop is None:
+            raise BusError("the node is not active")
+        loop.call(lambda: loop.safety.disable(time.monotonic())).result(CALL_TIMEOUT)
+        while not loop.is_off:
+            if loop.failure:
+                raise BusError(f"the control thread has ended: {loop.failure}")
+            if time.monotonic() > end:
+                raise BusError("a motor does not reply and may still be powered; the node stays active")
+            time.sleep(self._period)
+        self._loop = None
+        loop.stop()
 
     # Control thread
 
@@ -178,74 +235,12 @@ class CanBridge(LifecycleNode):
                 loop.trip(FaultCode.COMMAND_IMPOSSIBLE, f"effort_commands: {error.name} must be {error.expected}")
             self._command = EffortCommand(effort, answered)
 
-    def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        def switch(safety: SafetyMachine) -> str:
-            if not request.data:
-                safety.disable(time.monotonic())
-            elif not safety.enable(time.monotonic()):
-                return f"refused: the arm is {safety.state.value}" + (
-                    f" ({safety.fault.reason})" if safety.fault else ""
-                )
-            return ""
-
-        return self._on_control_thread(switch, response)
-
-    def _on_clear_fault(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        def clear(safety: SafetyMachine) -> str:
-            return "" if safety.clear(time.monotonic()) else f"no fault to clear: the arm is {safety.state.value}"
-
-        return self._on_control_thread(clear, response)
-
-    def _on_set_zero(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        since = time.monotonic()
-        self._on_control_thread(self._set_zero, response)
-        if response.success and not self._zeroed(since):
-            response.success, response.message = False, f"the motors did not set their zero: {self._positions()}"
-        return response
-
-    def _zeroed(self, since: float) -> bool:
-        """Wait until every motor has replied again; return whether all then report 0."""
-        end = since + ZERO_TIMEOUT
-        while time.monotonic() < end:
-            if all(joint.time > since and abs(joint.position) <= ZERO_TOLERANCE for joint in self._loop.samples):
-                return True
-            time.sleep(self._period)
-        return False
-
-    def _positions(self) -> str:
-        return ", ".join(f"{n} at {j.position:.3f} rad" for n, j in zip(self._names, self._loop.samples, strict=True))
-
-    def _set_zero(self, safety: SafetyMachine) -> str:
-        if any(motor.zero for motor in self._motors):
-            return f"zero = {[motor.zero for motor in self._motors]}: must be all 0 when the motors store the zero"
-        if safety.state is not State.DISABLED:
-            return f"refused: the arm is {safety.state.value}, must be disabled"
-        now = time.monotonic()
-        if any(self._limits.is_silent(now, joint) for joint in self._loop.samples):
-            return "refused: a motor does not reply"
-        if not safety.settled(now):
-            return "refused: the arm is not at rest"
-        self._loop.set_zero()
-        return ""
-
-    def _on_control_thread(self, function: Callable[[SafetyMachine], str], response):
-        """Run `function` on the control thread; it returns an error text, or ''."""
-        loop = self._loop
-        try:
-            if loop is None:
-                raise BusError("the node is not active")
-            response.message = loop.call(lambda: function(loop.safety)).result(CALL_TIMEOUT)
-        except (BusError, TimeoutError) as error:
-            response.message = str(error) or "the control thread did not respond"
-        response.success = not response.message
-        return response
-
     def _report(self) -> None:
-        if self._loop is not None and not self._watchdog.alive:
-            self._loop.trip_if_carried(FaultCode.WATCHDOG_DEAD, "the watchdog process has died")
+        if self._loop is not None and self._owned is not None and not self._owned.watchdog.alive:
+            self._loop.trip_if_carried(FaultCode.WATCHDOG_DEAD, "the watchdog process has died or is frozen")
         self._report_writer.send(self._loop, self._refusal, self._command.answered)
 
 
 def main() -> None:
     """Entry point of the executable `can_bridge`."""
-    raise SystemExit(run(CanBridge, priority=20))
+    raise SystemExit(run_recovery() if is_requested() else run(CanBridge, priority=20))

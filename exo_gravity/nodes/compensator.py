@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -28,16 +29,17 @@ from exo_gravity.core.control_params import COMPENSATOR, settings_of
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.hardware.scheduling import request_real_time
 from exo_gravity.nodes.budget_watch import BudgetWatch
-from exo_gravity.nodes.conversions import by_name
+from exo_gravity.nodes.conversions import by_name, to_nanoseconds
 from exo_gravity.nodes.declare import declare, values_after, with_floats
 from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics
 from exo_gravity.nodes.hot_path import HotPath
 from exo_gravity.nodes.run import run
-from exo_gravity.nodes.sole_publisher import SolePublisher
+from exo_gravity.nodes.sole_publisher import DISTRUST, SolePublisher
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-DISTRUST = 0.2  # s without efforts after a second publisher of an input was seen
 SILENCE = 0.5  # s without joint states until diagnostics report it
+REPORT_PERIOD = 0.5  # s
+MAX_CHANGES = 16  # answers whose reason is new, waiting for the report
 
 
 def read_settings(values: dict[str, Any]) -> Settings:
@@ -61,10 +63,11 @@ class CompensatorNode(Node):
         self._diagnostics = Diagnostics(self)
         self._budget = BudgetWatch(self, self._names, math.radians(USUAL_TILT) if values["use_imu"] else 0.0)
         self._answer = Answer(None)
+        self._changes: deque[Answer] = deque(maxlen=MAX_CHANGES)
         self._last_answer = -math.inf
         self._answers = 0
         self._refusal = "none"
-        self._sources = {"joint_states": SolePublisher(), "/imu/pitch_yaw": SolePublisher()}
+        self._sources = {topic: SolePublisher(self, topic) for topic in ("joint_states", "/imu/pitch_yaw")}
         # Which input had a second publisher, as a sentence, and when (monotonic s).
         self._intruder, self._intruded = "", -math.inf
         self._publisher = self.create_publisher(JointState, "effort_commands", 1)
@@ -76,7 +79,9 @@ class CompensatorNode(Node):
         self.add_pre_set_parameters_callback(lambda changes: with_floats(self, COMPENSATOR, changes))
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
-        self.create_timer(0.5, self._report)
+        # Only the executor's thread reports: diagnostics and budget are not for two threads.
+        self._changed = self.create_guard_condition(self._report_changes)
+        self.create_timer(REPORT_PERIOD, self._report_current)
         self._log(self._compensator.settings)
         self._joint_states.start()
         for refused in request_real_time(values["thread_priority"], values["lock_memory"]):
@@ -110,16 +115,21 @@ class CompensatorNode(Node):
         changed = answer.reason != self._answer.reason
         self._answer, self._last_answer = answer, now
         if changed:
-            self._report()
+            self._changes.append(answer)
+            self._changed.trigger()
 
     def _on_pitch_yaw(self, message: Vector3Stamped, info: dict[str, Any]) -> None:
         now = time.monotonic()
         try:
             self._check_publisher("/imu/pitch_yaw", info, now)
             with self._lock:
-                self._compensator.set_tilt(now, pitch=message.vector.y, roll=message.vector.x)
+                self._compensator.set_tilt(now, message.vector.y, message.vector.x, self._age(message))
         except ParameterError as error:  # the last tilt then grows old, and the efforts are withdrawn
             self._refused("/imu/pitch_yaw", error)
+
+    def _age(self, message: Vector3Stamped) -> float:
+        """Return the age of a message in s by its stamp and the node's clock."""
+        return (self.get_clock().now().nanoseconds - to_nanoseconds(message.header.stamp)) * 1e-9
 
     def _check_publisher(self, topic: str, info: dict, now: float) -> None:
         """Withdraw for a while if a second publisher sends on `topic`."""
@@ -173,9 +183,16 @@ class CompensatorNode(Node):
             "last refused message": self._refusal,
         }
 
-    def _report(self) -> None:
-        answer = self._answer
+    def _report_changes(self) -> None:
+        while self._changes:
+            self._report(self._changes.popleft())
+
+    def _report_current(self) -> None:
         self._budget.update(self._compensator.settings)
+        self._report_changes()
+        self._report(self._answer)
+
+    def _report(self, answer: Answer) -> None:
         values = self._values()
         if time.monotonic() - self._last_answer > SILENCE:
             self._diagnostics.report(WARN, "waiting for joint_states", values)

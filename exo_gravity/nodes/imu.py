@@ -1,11 +1,13 @@
 """imu: `sensor_msgs/Imu` from an IMU driver in, the trunk's pitch and roll out, one for each sample.
 
-While samples are missing, impossible or not yet settled, it publishes nothing: the tilt grows old, the compensator
-withdraws, and `can_bridge` latches the fault. The reason is logged once, and stays on /diagnostics while it lasts.
+While samples are missing, impossible, frozen, not yet settled or from two publishers, it publishes nothing: the tilt
+grows old, the compensator withdraws, and `can_bridge` latches the fault. The reason is logged once, and stays on
+/diagnostics while it lasts.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any
 
@@ -23,6 +25,7 @@ from exo_gravity.nodes.declare import declare
 from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics
 from exo_gravity.nodes.hot_path import HotPath
 from exo_gravity.nodes.run import run
+from exo_gravity.nodes.sole_publisher import DISTRUST, SolePublisher
 
 PITCH_YAW, DATA = "/imu/pitch_yaw", "/imu/data"
 # The fusion integrates every sample. A queue of depth 1 would lose samples whenever the node is delayed.
@@ -31,7 +34,7 @@ WATCH_PERIOD = 0.1  # s
 
 
 class ImuNode(Node):
-    """The ROS shell around `hardware.imu.TrunkEstimator`."""
+    """The ROS shell around `hardware.trunk_estimator.TrunkEstimator`."""
 
     def __init__(self) -> None:
         super().__init__("imu", automatically_declare_parameters_from_overrides=True)
@@ -42,6 +45,8 @@ class ImuNode(Node):
         self._estimator = TrunkEstimator(values["rotation_trunk_from_imu"], values["rate"])
         self._timeout = values["timeout"]
         self._arrived = time.monotonic()
+        self._driver = SolePublisher(self, self._topic)
+        self._intruded = -math.inf  # monotonic s, when a second publisher was seen
         self._received = self._published = self._refused = 0
         self._rate = Rate()
         self._refusal: ParameterError | None = None  # since the last report
@@ -64,9 +69,14 @@ class ImuNode(Node):
         """Stop taking samples."""
         self._samples.stop()
 
-    def _on_imu(self, message: Imu, _info: dict[str, Any]) -> None:
+    def _on_imu(self, message: Imu, info: dict[str, Any]) -> None:
         self._arrived = time.monotonic()
         self._received += 1
+        if self._driver.is_another(info):
+            self._intruded = self._arrived
+        if self._is_intruded(self._arrived):  # the estimator starts anew after the gap
+            self._refused += 1
+            return
         try:
             orientation = self._estimator.update(sample_of(message))
         except ParameterError as error:
@@ -76,6 +86,9 @@ class ImuNode(Node):
         if orientation is not None:
             self._published += 1
             self._publish(message, orientation)
+
+    def _is_intruded(self, now: float) -> bool:
+        return now - self._intruded < DISTRUST
 
     def _publish(self, message: Imu, orientation: TrunkOrientation) -> None:
         tilt = Vector3Stamped()
@@ -109,6 +122,8 @@ class ImuNode(Node):
             self._diagnostics.report(WARN, f"waiting for {self._topic}", values)
         elif age > self._timeout:
             self._diagnostics.report(ERROR, f"no samples on {self._topic}", values)
+        elif self._is_intruded(now):
+            self._diagnostics.report(ERROR, f"more than one publisher of {self._topic}", values)
         elif refusal:
             self._diagnostics.report(ERROR, f"refused: {refusal.name} must be {refusal.expected}", values)
         elif self._estimator.settling:

@@ -8,6 +8,7 @@ present state of the arm. A reply is sent 200 to 400 us after its command, as me
 from __future__ import annotations
 
 import heapq
+import math
 import operator
 import random
 import time
@@ -22,6 +23,7 @@ from exo_gravity.sim.arm import STEP, SimulatedArm
 from exo_gravity.sim.can_link import CanLink, Frame
 from exo_gravity.sim.gap_meter import GapMeter
 from exo_gravity.sim.motor import SimulatedMotor
+from exo_gravity.sim.truth import TruthLog
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 REPLY_DELAY = (200e-6, 400e-6)  # s
@@ -35,8 +37,10 @@ class SimulatedDevice:
     motors: shoulder to elbow, with different CAN IDs. side: 'left' or 'right'. seed: of the reply delays.
 
     May be set from any thread: `pitch` and `roll` of the trunk in rad; `bus_silent` (frames pass in neither direction,
-    and the motors keep their last commands); and the faults of each motor. To be read: `time`, s simulated; `slip`, s
-    that `run` has lost against real time; `gaps`, the longest interruptions of `run`.
+    and the motors keep their last commands); `cut_off`, the same for each motor (4,); `encoder_error` (4,) rad, added
+    to the angle that a motor reads; and the faults of each motor. truth: receives every physics step, None for no log.
+    To be read: `time`, s simulated; `slip`, s that `run` has lost against real time; `gaps`, the longest interruptions
+    of `run`.
     """
 
     def __init__(self, arm: SimulatedArm, motors: Sequence[SimulatedMotor], side: str = "right", seed: int = 0) -> None:
@@ -49,6 +53,9 @@ class SimulatedDevice:
         self.pitch = 0.0
         self.roll = 0.0
         self.bus_silent = False
+        self.cut_off: Sequence[bool] = (False,) * JOINT_COUNT
+        self.encoder_error: Sequence[float] = (0.0,) * JOINT_COUNT
+        self.truth: TruthLog | None = None
         self.slip = 0.0
         self.gaps = GapMeter()
         self._joint_of_id = {can_id: joint for joint, can_id in enumerate(ids)}
@@ -57,6 +64,8 @@ class SimulatedDevice:
         self._clock = 0.0  # s elapsed, of which `time` is the part in whole steps
         self._trial: tuple[VirtualWearer, float] | None = None  # the wearer, and the time at which the script starts
         self._gravity_tilt: tuple[float, float] | None = None
+        self._frames = [0] * JOINT_COUNT  # received by each motor
+        self._power_returns = math.inf  # simulated s
 
     @property
     def time(self) -> float:
@@ -77,7 +86,11 @@ class SimulatedDevice:
     @property
     def disconnected(self) -> bool:
         """Whether a simulated fault keeps a motor from replying."""
-        return self.bus_silent or any(motor.unplugged for motor in self.motors)
+        return self.bus_silent or any(self.cut_off) or any(motor.unplugged for motor in self.motors)
+
+    def return_power(self, delay: float) -> None:
+        """Return the power of unplugged motors in `delay` s; they come back switched off."""
+        self._power_returns = self.time + delay
 
     def start(self, wearer: VirtualWearer, delay: float = 0.0) -> None:
         """Let `wearer` start the script in `delay` s; replaces any other wearer."""
@@ -90,19 +103,23 @@ class SimulatedDevice:
         if tilt != self._gravity_tilt:
             self.arm.set_gravity(Tilt.of(self.side, *tilt).direction)
             self._gravity_tilt = tilt
+        if self.truth:
+            self.truth.synchronise(self._clock)
         steps = int((self._clock - self.time) / STEP + 1e-6)
         while steps > 0:
-            count = steps if self._steady(steps * STEP) else 1
+            count = steps if self.truth is None and self._steady(steps * STEP) else 1
             self._step(self.arm.positions, self.arm.velocities, count)
             steps -= count
 
     def exchange(self, can_id: int, data: bytes) -> Frame | None:
         """Pass the frame `data` with arbitration ID `can_id` to the motors; return (ID, data) of the reply, if any."""
         joint = self._joint_of_id.get(can_id)
-        if joint is None or self.bus_silent:
+        if joint is None or self.bus_silent or self.cut_off[joint]:
             return None
         motor, arm = self.motors[joint], self.arm
-        reply = motor.receive(data, arm.positions[joint], arm.velocities[joint], self.time)
+        self._frames[joint] += 1
+        position = arm.positions[joint] + self.encoder_error[joint]
+        reply = motor.receive(data, position, arm.velocities[joint], self.time)
         return None if reply is None else (motor.reply_id, reply)
 
     def run(
@@ -141,7 +158,13 @@ class SimulatedDevice:
         return all(motor.steady for motor in self.motors)
 
     def _step(self, theta: list[float], velocity: list[float], count: int) -> None:
+        if self.time >= self._power_returns:
+            self._power_returns = math.inf
+            for motor in self.motors:
+                motor.unplugged = False
         torque = list(map(SimulatedMotor.torque, self.motors, theta, velocity))
+        if self.truth:
+            self.truth.note(self.time, theta, velocity, torque, self.motors, self._frames)
         if self._trial is not None:
             wearer, start = self._trial
             torque = list(map(operator.add, torque, wearer.torque(self.time - start, theta, velocity)))

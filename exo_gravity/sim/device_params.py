@@ -14,6 +14,7 @@ from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.imu import ImuConfig
 from exo_gravity.sim.motor import Firmware, SimulatedMotor
+from exo_gravity.sim.truth import TruthLog
 
 
 def _param(name: str, owner: type, field: str) -> Param:
@@ -46,11 +47,15 @@ SIMULATOR = (
     Param("imu.topic", "", "topic of the trunk's IMU; empty: this simulator has no IMU", fixed=True),
     _param("imu.rate", ImuConfig, "rate"),
     _param("imu.rotation_trunk_from_imu", ImuConfig, "rotation_trunk_from_imu"),
-    Param("trunk.pitch", 0.0, "forward tilt of the trunk, approached at 0.5 rad/s", (-1.5, 1.5), "rad"),
-    Param("trunk.roll", 0.0, "tilt of the trunk to the right, approached at 0.5 rad/s", (-1.5, 1.5), "rad"),
+    Param("trunk.pitch", 0.0, "forward tilt of the trunk, approached at 0.5 rad/s", (-3.1, 3.1), "rad"),
+    Param("trunk.roll", 0.0, "tilt of the trunk to the right, approached at 0.5 rad/s", (-3.1, 3.1), "rad"),
     Param("trial", "", "script file for the virtual wearer; if set while the node runs, the wearer starts at once"),
     Param("trial_delay", 6.0, "time from the motors being on to the wearer's first step", (0.0, 60.0), "s", fixed=True),
+    Param("truth", "", "file for the arm's true motion at 1 kHz (exo_gravity/sim/truth.py); empty: none", fixed=True),
     Param("fault.unplugged", [False] * 4, "motors without power"),
+    Param("fault.unplugged_time", 0.0, "time until their power returns, motors off; 0: never", (0.0, 60.0), "s"),
+    Param("fault.cut_off", [False] * 4, "motors with power, but without connection to the bus"),
+    Param("fault.encoder_error", [0.0] * 4, "error of the joint angles that the motors read", (-7.0, 7.0), "rad"),
     Param("fault.temperature", [30.0] * 4, "motor temperatures", (-40.0, 215.0), "degC"),
     Param("fault.error", [0] * 4, "motor error codes", (0, 255)),
     Param("fault.bus_silent", False, "the bus passes no frames"),
@@ -66,12 +71,17 @@ def device_of(values: Mapping[str, Any]) -> SimulatedDevice:
     motors = [SimulatedMotor(motor, firmware) for motor in motors_of(values)]
     device = SimulatedDevice(SimulatedArm(arm), motors, values["side"])
     device.pitch, device.roll = values["trunk.pitch"], values["trunk.roll"]
+    if values["truth"]:
+        device.truth = TruthLog(values["truth"])
     return device
 
 
 def set_faults(device: SimulatedDevice, values: Mapping[str, Any]) -> None:
     """Set the faults of `device` that parameter values describe."""
     device.bus_silent = values["fault.bus_silent"]
+    device.cut_off, device.encoder_error = values["fault.cut_off"], values["fault.encoder_error"]
+    if values["fault.unplugged_time"]:
+        device.return_power(values["fault.unplugged_time"])
     faults = (values["fault.unplugged"], values["fault.temperature"], values["fault.error"])
     for motor, unplugged, temperature, error in zip(device.motors, *faults, strict=True):
         motor.unplugged, motor.temperature, motor.error = unplugged, temperature, error

@@ -69,6 +69,11 @@ class SimulatedMotor:
         return self._entered
 
     @property
+    def damping(self) -> float:
+        """Damping in Nm s/rad that the motor applies to the joint."""
+        return self._command.kd * self.joint.torque_scale if self._entered else 0.0
+
+    @property
     def steady(self) -> bool:
         """Whether the torque stays constant until the next frame, however the joint moves."""
         return not (self.unplugged or (self._entered and (self._command.kp or self._command.kd)))

@@ -19,12 +19,13 @@ import numpy as np
 
 from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.compensator import Compensator, Settings
+from exo_gravity.core.drive import Drive, State
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.motors import ENTER, EXIT
 from exo_gravity.core.recording import Recording, ScriptedStep
-from exo_gravity.core.safety import Drive, SafetyMachine, State
+from exo_gravity.core.safety import SafetyMachine
 from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.virtual_wearer import VirtualWearer
@@ -70,7 +71,7 @@ class OfflineTrial:
         self._delay = delay
         self._start = math.inf  # s, of the script
         self._carried: list[float] = []  # s, the first and the last time at which the motors carried the arm
-        self._safety = SafetyMachine(arm.limits, 1.0 / arm.rate)
+        self._safety = SafetyMachine(arm.limits, 1.0 / arm.rate, [motor.peak_effort for motor in arm.motors])
         self._compensator = Compensator(arm.settings)
         # The newest efforts, and when the readings that they answer were taken.
         self._efforts: tuple[Sequence[float] | None, float] = (None, -math.inf)
@@ -134,12 +135,12 @@ class OfflineTrial:
     def _exchange(self, drive: Drive, now: float) -> None:
         """Send `drive` to the motors and read their replies, with the same frames as `MotorBus`."""
         send = self.arm.device.exchange
-        for joint, (motor, effort) in enumerate(zip(self.arm.motors, drive.effort, strict=True)):
+        for joint, motor in enumerate(self.arm.motors):
             command = self._pack[joint]
-            if drive.powered and not self._powered:
+            if drive.powered and (drive.enter[joint] or not self._powered):
                 send(motor.can_id, command(0.0, 0.0))
                 send(motor.can_id, ENTER)
-            reply = send(motor.can_id, command(effort, drive.damping))
+            reply = send(motor.can_id, command(drive.effort[joint], drive.damping[joint]))
             if self._powered and not drive.powered:
                 reply = send(motor.can_id, EXIT)
             if reply:

@@ -5,7 +5,10 @@
 It stops the bridges first and waits for them, because they need the other nodes while they let the arms down. If the
 launcher dies, the nodes stop by themselves: each watches its standard input, whose other end the launcher holds.
 
-Exit code 0: stopped by Ctrl-C or SIGTERM. 1: a node ended. 2: wrong use or wrong file.
+If a bridge dies, its watchdog lets the arm down. If both die, the launcher starts the bridge's executable once more, to
+let the arm down and nothing else.
+
+Exit code 0: stopped by Ctrl-C or SIGTERM. 1: a node ended, or motors may still be powered. 2: wrong use or wrong file.
 """
 
 from __future__ import annotations
@@ -17,18 +20,18 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from exo_gravity.core.control_params import CAN_BRIDGE
 from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.tools.cli.extras import require_ros
 from exo_gravity.tools.inputs.executables import executable, node_names
 from exo_gravity.tools.inputs.parameter_file import Nodes, load, packaged_config
 
-DESCENT_TIMEOUT = 30.0  # s for a bridge to let its arm down, after which it is killed
+DESCENT_TIMEOUT = 40.0  # s for a bridge to let its arm down, after which it is killed
+WATCHDOG_TIMEOUT = 30.0  # s for the watchdog of a dead bridge to let the arm down
+RECOVERY = {"EXO_GRAVITY_RECOVER": "1"}  # starts can_bridge for one purpose: to let down an arm that was left behind
 STOP_TIMEOUT = 5.0  # s for any other node to end
-DEFAULT_CAN_IDS = next(param.default for param in CAN_BRIDGE if param.name == "can_id")
 LOG_FORMAT = "{severity} {message}"
 
 OnLine = Callable[[str, str], None]  # (node, line of its log)
@@ -53,27 +56,31 @@ class Launcher:
         self._processes: dict[str, subprocess.Popen[str]] = {}
         self._readers: dict[str, threading.Thread] = {}
         self._on_line = on_line
+        self.maybe_powered: list[str] = []
 
     def start(self) -> None:
         """Start every node."""
-        environment = dict(os.environ, PYTHONUNBUFFERED="1", EXO_GRAVITY_SUPERVISED="1")
+        for node in self._commands:
+            self._processes[node], self._readers[node] = self._start(node, {"EXO_GRAVITY_SUPERVISED": "1"})
+
+    def _start(self, node: str, variables: Mapping[str, str]) -> tuple[subprocess.Popen[str], threading.Thread]:
+        """Start one node with more environment `variables`; return its process and the reader of its log."""
+        environment = {**os.environ, "PYTHONUNBUFFERED": "1", **variables}
         environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         environment.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", LOG_FORMAT)
-        for node, command in self._commands.items():
-            process = subprocess.Popen(
-                command,
-                env=environment,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-                errors="replace",
-                start_new_session=True,  # Ctrl-C in the terminal reaches only the launcher
-            )
-            self._processes[node] = process
-            reader = threading.Thread(target=self._read, args=(node, process), daemon=True)
-            reader.start()
-            self._readers[node] = reader
+        process = subprocess.Popen(
+            self._commands[node],
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            start_new_session=True,  # Ctrl-C in the terminal reaches only the launcher
+        )
+        reader = threading.Thread(target=self._read, args=(node, process), daemon=True)
+        reader.start()
+        return process, reader
 
     def process(self, node: str) -> subprocess.Popen[str]:
         """Return the process of a node by its full name."""
@@ -91,14 +98,18 @@ class Launcher:
         return None
 
     def stop(self) -> None:
-        """Stop every node: first the bridges, which let the arms down, then the rest."""
+        """Stop every node: first the bridges, which let the arms down, then the rest.
+
+        Sets `maybe_powered` to the bridges whose motors may still be on.
+        """
         bridges = [node for node in self._processes if node.endswith("/can_bridge")]
         others = [node for node in self._processes if node not in bridges]
         self._terminate(bridges, DESCENT_TIMEOUT)
+        self.maybe_powered = [node for node in bridges if not self._is_off(node)]
         self._terminate(others, STOP_TIMEOUT)
 
     def _terminate(self, nodes: list[str], timeout: float) -> None:
-        """Terminate `nodes` and wait for them and their children; kill those that run for more than `timeout` s."""
+        """Terminate `nodes` and wait for them; kill those that run for more than `timeout` s."""
         processes = [self._processes[node] for node in nodes]
         for process in processes:
             if process.poll() is None:
@@ -110,8 +121,29 @@ class Launcher:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-        for node in nodes:  # the watchdog of a dead bridge may still let the arm down, and keeps the output open
-            self._readers[node].join(max(STOP_TIMEOUT, deadline - time.monotonic()))
+        for node in nodes:
+            if _has_ended_well(self._processes[node]):
+                self._readers[node].join(STOP_TIMEOUT)
+
+    def _is_off(self, node: str) -> bool:
+        """Return whether the motors of a bridge that has ended are off; let its arm down if nothing else has.
+
+        The watchdog of a dead bridge keeps the output open until the arm is down. If it has died as well, the bridge's
+        executable lets the arm down.
+        """
+        if _has_ended_well(self._processes[node]):
+            return True
+        self._readers[node].join(WATCHDOG_TIMEOUT)
+        if self._readers[node].is_alive():
+            return False
+        recovery, reader = self._start(node, RECOVERY)
+        try:
+            return recovery.wait(DESCENT_TIMEOUT) == 0
+        except subprocess.TimeoutExpired:
+            recovery.kill()
+            return False
+        finally:
+            reader.join(STOP_TIMEOUT)
 
     def run(self, stopping: Stopping) -> tuple[str, int] | None:
         """Run the nodes until `stopping` is set or one ends; return the name and exit code of the one that ended."""
@@ -135,18 +167,21 @@ class Launcher:
             self._on_line(node, line.rstrip())
 
 
+def _has_ended_well(process: subprocess.Popen[str]) -> bool:
+    """Return whether a node has ended by itself: stopped (0), or with wrong parameters or no bus (2)."""
+    return process.poll() in (0, 2)
+
+
 def _check_buses(nodes: Nodes) -> None:
-    """Raise ParameterError if two bridges would command the same motor."""
-    owner: dict[tuple[object, ...], str] = {}
+    """Raise ParameterError if two bridges would command motors on the same bus, which has one owner."""
+    owner: dict[tuple[tuple[str, str], ...], str] = {}
     for node, parameters in nodes.items():
         if not node.endswith("/can_bridge"):
             continue
         bus = tuple(sorted((k, str(v)) for k, v in parameters.items() if k.startswith("can.")))
-        ids = parameters.get("can_id", DEFAULT_CAN_IDS)
-        for can_id in ids if isinstance(ids, list) else ():
-            other = owner.setdefault((bus, can_id), node)
-            if other != node:
-                raise ParameterError(f"{node} can_id", ids, f"different from the IDs of {other} on the same bus")
+        other = owner.setdefault(bus, node)
+        if other != node:
+            raise ParameterError(f"{node} can", dict(bus), f"different from the bus of {other}: one arm per bus")
 
 
 class StopFlag:
@@ -198,11 +233,15 @@ def main(args: Sequence[str] | None = None) -> None:
     require_ros("launcher")
     stopping = stop_on_signals()
     try:
-        dead = Launcher(options.params or packaged_config("sim.yaml")).run(stopping)
+        launcher = Launcher(options.params or packaged_config("sim.yaml"))
+        dead = launcher.run(stopping)
     except ExoGravityError as error:
         print(f"launcher: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     if dead:
         node, code = dead
         print(f"launcher: {node.lstrip('/')} ended with exit code {code}; all nodes were stopped", file=sys.stderr)
+    for node in launcher.maybe_powered:
+        print(f"launcher: the motors of {node} may still be powered: cut their supply", file=sys.stderr)
+    if dead or launcher.maybe_powered:
         raise SystemExit(1)

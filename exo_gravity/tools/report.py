@@ -1,7 +1,9 @@
 """report BAG: what a recorded trial showed, as a table, CSV files, figures and one HTML page.
 
-Exit code 0: the arm held. 1: it drifted more than allowed, or was never held. 2: wrong use, or part of the recording
-could not be read; the rest is reported first.
+With --repair it instead writes a complete copy of a recording that was cut short, for `ros2 bag` and other tools.
+
+Exit code 0: the arm held, or the recording is complete. 1: it drifted more than allowed, or was never held. 2: wrong
+use, or part of the recording could not be read; the rest is reported first.
 """
 
 from __future__ import annotations
@@ -23,6 +25,9 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="report", description="Report a recorded trial: holds, drift, pushes.")
     option = parser.add_argument
     option("bag", help="rosbag2 folder, or an .mcap or .db3 file, complete or cut short")
+    option(
+        "--repair", action="store_true", help="write a complete copy, BAG_repaired, of a recording cut short; no report"
+    )
     option("--output", metavar="DIR", help="folder for the report (default: BAG_report next to the recording)")
 
     def limit(name: str, default: float, unit: str, description: str) -> None:
@@ -39,7 +44,22 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
     options = _arguments(args)
     with extras("report", "report"):
-        return _run(options)
+        return _repair(Path(options.bag)) if options.repair else _run(options)
+
+
+def _repair(path: Path) -> int:
+    from exo_gravity.bag.repair import is_complete, repair
+
+    try:
+        if is_complete(path):
+            print(f"{path} is complete: nothing to repair")
+            return 0
+        folder, count = repair(path)
+    except DataError as error:
+        print(f"report: {error}", file=sys.stderr)
+        return 2
+    print(f"Written: {folder}, complete, with {count} messages")
+    return 0
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -309,6 +309,40 @@ def test_the_arm_counts_as_carried_from_the_first_to_the_last_carrying_state(con
     np.testing.assert_allclose(only(made.write_bag(tmp_path / "bag", content)).carried, expected, atol=1e-9)
 
 
+def with_states(content, *states):
+    """The content with the bridge's state added every half second from 0.1 s on; None for no report."""
+    for number, state in enumerate(states):
+        if state:
+            topic, kind, data = status(0, state, state=state)
+            content = [*content, (topic, kind, made.START + 10**8 + number * 5 * 10**8, data)]
+    return sorted(content, key=lambda item: item[2])
+
+
+def until(content, seconds):
+    return [item for item in content if item[2] < made.START + round(seconds * 1e9)]
+
+
+def test_an_arm_that_is_carried_when_the_recording_ends_was_not_let_down_in_it(content, tmp_path):
+    read = read_bag(made.write_bag(tmp_path / "bag", until(with_states(content, *["active"] * 20), 4.35)))
+    (arm,) = read.recordings
+    assert arm.carried == ((pytest.approx(0.0998), arm.time[-1]),)
+    assert read.notes == (
+        "right: the recording ends while the arm is carried: it does not show how the arm was let down",
+    )
+
+
+def test_a_recording_that_ends_in_the_descent_does_not_claim_that_the_arm_came_down(content, tmp_path):
+    states = ["active"] * 6 + ["letting down"] * 3
+    read = read_bag(made.write_bag(tmp_path / "bag", until(with_states(content, *states), 4.35)))
+    assert read.notes == ("right: the recording ends before the arm was down",)
+
+
+@pytest.mark.parametrize("last", ["disabled", "fault", None])
+def test_an_arm_that_is_off_at_the_end_or_still_observed_gets_no_note(content, tmp_path, last):
+    states = ["active"] * 4 + [last] * 5
+    assert not read_bag(made.write_bag(tmp_path / "bag", until(with_states(content, *states), 4.35))).notes
+
+
 def test_without_a_reported_state_it_is_unknown_when_the_arm_was_carried(content, bag):
     assert only(bag).carried is None
 

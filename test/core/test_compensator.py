@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exo_gravity.core import gravity_torque
-from exo_gravity.core.compensator import LONGEST_STEP
+from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core.compensator import LONGEST_STEP, MAX_LEAD
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.tilt import Tilt, pitch_roll
 
 from ..support.compensator_run import PERIOD, ROBOT, THETA, CompensatorRun, settings_with
 
@@ -42,6 +42,63 @@ def test_without_a_fresh_tilt_there_is_a_reason_instead_of_a_torque():
     run.compensator.set_tilt(run.now, 0.0, 0.0)
     assert run.cycle().effort is not None
     assert "older than 80 ms" in run.cycle(0.1).reason
+
+
+def gravity_at(bow, lean):
+    """Gravity in the trunk's axes after a bow by any angle of a trunk that leans: true at 90 degrees and beyond."""
+    down = np.array((0.0, math.sin(lean), -math.cos(lean)))
+    turn = np.array(((math.cos(bow), 0, -math.sin(bow)), (0, 1, 0), (math.sin(bow), 0, math.cos(bow))))
+    return turn @ down
+
+
+@pytest.mark.parametrize("lean", [-0.2, -1e-9, 0.0, 1e-3, 0.3])
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_a_bow_through_90_degrees_and_lying_down_stay_compensated(lean, way):
+    run = CompensatorRun(use_imu=True)
+    base_from_trunk = np.array(((0, 1, 0), (1, 0, 0), (0, 0, -1)))  # left arm: x0 left, y0 forward, z0 down
+    for k in range(2400):
+        bow = way * min(math.pi, 2.0 * max(0.0, k * PERIOD - 1.1))  # 2 rad/s, to 180 degrees
+        gravity = gravity_at(bow, lean)
+        run.compensator.set_tilt(run.now, *pitch_roll(gravity))
+        assert run.cycle().reason == ""
+        if k * PERIOD > 1.1:
+            expected = gravity_torque(ROBOT, THETA, base_from_trunk @ gravity)
+            np.testing.assert_allclose(run.efforts[-1], expected, atol=1e-6)
+
+
+def test_a_tilt_that_turns_faster_than_a_trunk_is_refused_whichever_way_it_turns():
+    for pitch, roll in ((0.3, 0.0), (0.0, -0.3), (-math.pi / 2, 0.0)):
+        run = CompensatorRun(use_imu=True)
+        run.compensator.set_tilt(run.now, 0.0, 0.0)
+        with pytest.raises(ParameterError, match=r"trunk tilt = .*: must be within 0.1 rad plus 5 rad/s"):
+            run.compensator.set_tilt(run.now + 0.01, pitch, roll)
+
+
+def test_a_tilt_is_as_old_as_its_stamp():
+    run = CompensatorRun(use_imu=True)
+    for _ in range(100):
+        run.compensator.set_tilt(run.now, 0.1, 0.0, age=0.07)
+        assert run.cycle().effort is not None
+    run.compensator.set_tilt(run.now, 0.1, 0.0, age=0.0799)
+    assert run.cycle().reason == "trunk tilt older than 80 ms by its stamp: the IMU driver lags, or its clock differs"
+
+
+def test_a_stamp_ahead_of_the_clock_makes_a_tilt_no_younger_than_its_arrival():
+    run = CompensatorRun(use_imu=True)
+    run.compensator.set_tilt(run.now, 0.0, 0.0, age=-MAX_LEAD)
+    assert run.cycle(0.078).effort is not None
+    assert run.cycle(0.004).reason == "trunk tilt older than 80 ms"
+
+
+@pytest.mark.parametrize("age", [-3600.0, -0.06, 1.01, 3600.0, math.nan, math.inf])
+def test_a_stamp_of_another_clock_is_refused_and_the_reason_names_it(age):
+    run = CompensatorRun(use_imu=True)
+    with pytest.raises(ParameterError, match="synchronise the clocks"):
+        run.compensator.set_tilt(run.now, 0.0, 0.0, age)
+    reason = run.cycle().reason
+    assert "no trunk tilt yet (the newest was refused: age of the trunk tilt by its stamp must be from" in reason
+    run.compensator.set_tilt(run.now, 0.0, 0.0)
+    assert run.cycle().effort is not None
 
 
 @pytest.mark.parametrize(
@@ -180,4 +237,15 @@ def test_too_large_a_total_mass_is_rejected_in_every_mode():
 
 
 def test_only_the_supported_share_of_the_wearer_counts_towards_the_total_mass():
-    assert settings_with(mode="zero_g", support=0.5, max_total_mass=5.0).arm.total_mass == pytest.approx(3.654)
+
+
+@pytest.mark.parametrize(("gain", "gravity"), [(2.0, 25.0), (2.0, 10.01), (0.9, 25.0), (1.3, 16.0)])
+def test_gain_and_gravity_together_may_not_double_the_earths(gain, gravity):
+    with pytest.raises(ParameterError, match=r"gain times gravity = .*: must be at most 20 m/s\^2"):
+        settings_with(robot=ArmModel(ROBOT.length, ROBOT.cog, ROBOT.mass, (1.0, gain, 1.0, 1.0), gravity))
+
+
+@pytest.mark.parametrize(("gain", "gravity"), [(2.0, 9.83), (1.3, 9.81), (0.8, 25.0), (1.0, 1.62), (0.0, 25.0)])
+def test_calibrated_gains_and_other_planets_are_accepted(gain, gravity):
+    scaled = ArmModel(ROBOT.length, ROBOT.cog, ROBOT.mass, [gain] * 4, gravity)
+    assert settings_with(robot=scaled).arm.scale == pytest.approx([gain * gravity] * 4)

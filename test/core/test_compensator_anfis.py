@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from exo_gravity.core import gravity_torque
 from exo_gravity.core.anfis import Anfis
 from exo_gravity.core.anfis_law import AnfisLaw
+from exo_gravity.core.compensator import FALLBACK_TIME
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.tilt import Tilt
 
-from ..support.compensator_run import ROBOT, THETA, CompensatorRun, settings_with
+from ..support.compensator_run import PERIOD, ROBOT, THETA, CompensatorRun, settings_with
 
 
 def learned(moments=ROBOT.first_moment[1:]):
@@ -43,6 +48,56 @@ def test_where_the_anfis_was_not_trained_the_exact_law_replaces_it_and_the_reaso
     answer = run.cycle(1.2, theta)
     assert why in answer.fallback
     np.testing.assert_allclose(answer.effort, gravity_torque(ROBOT, theta, Tilt.of("left", pitch).direction))
+
+
+def wobble(run, seconds, width=0.02, hertz=3.0):
+    """Swing theta_2 about the edge of the box, 1 rad, by `width` rad; return the laws' replaced state per cycle."""
+    replaced = []
+    for k in range(round(seconds / PERIOD)):
+        theta_2 = 1.0 + width * math.sin(2 * math.pi * hertz * k * PERIOD)
+        replaced.append(bool(run.cycle(theta=(0.2, theta_2, 0.6, 0.5)).fallback))
+    return replaced
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(0.001, 0.2), st.floats(0.1, 10.0))
+def test_along_a_path_across_the_edge_of_the_box_the_torque_neither_steps_nor_chatters(width, hertz):
+    run = CompensatorRun(law="anfis", anfis=learned())
+    run.cycle(2.0)
+    run.efforts.clear()
+    replaced = wobble(run, 4.0, width, hertz)
+    # The laws differ by up to 2 Nm, which fades over 1 s; the exact law changes by up to 3 Nm/rad along the path.
+    remainders = 2.0 * PERIOD / 1.0
+    path = 3.0 * width * 2 * math.pi * hertz * PERIOD
+    assert run.largest_step <= 2 * remainders + path
+    switches = np.flatnonzero(np.diff(replaced))
+    assert all(b - a >= FALLBACK_TIME / PERIOD - 1 for a, b in zip(switches[::2], switches[1::2], strict=False))
+
+
+def test_the_anfis_returns_half_a_second_after_it_applies_again():
+    run = CompensatorRun(law="anfis", anfis=learned())
+    run.cycle(1.5)
+    assert run.cycle(theta=(0.2, 1.01, 0.6, 0.5)).fallback
+    assert "theta_2" in run.cycle(FALLBACK_TIME - 2 * PERIOD).fallback
+    assert run.cycle(2 * PERIOD).fallback == ""
+    run.cycle(1.1)
+    np.testing.assert_allclose(run.efforts[-1], (0.0, 0.5, 1.0, 0.25), rtol=1e-9)
+
+
+def test_a_change_of_settings_in_the_cycle_that_leaves_the_box_is_bridged_too():
+    run = CompensatorRun(law="anfis", anfis=learned())
+    run.cycle(2.0)
+    before = run.efforts[-1]
+    run.compensator.apply(settings_with(law="anfis", anfis=learned(), mode="zero_g"))
+    run.cycle(theta=(0.2, 1.001, 0.6, 0.5))
+    np.testing.assert_allclose(run.efforts[-1], before, atol=0.01)
+
+
+def test_another_law_does_not_wait_for_the_anfis():
+    run = CompensatorRun(law="anfis", anfis=learned())
+    run.cycle(1.5, (0.2, 1.2, 0.6, 0.5))
+    run.compensator.apply(settings_with(law="paper_static"))
+    assert run.cycle(theta=(0.2, 1.2, 0.6, 0.5)).fallback == ""
 
 
 def test_the_law_anfis_without_a_file_is_rejected():

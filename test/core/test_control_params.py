@@ -23,6 +23,7 @@ def possible(param, rng):
     if not param.bounds:
         return param.default
     low, high = param.bounds
+    low, high = (5.0, 10.0) if param.name == "gravity" else (low, high)  # m/s^2, which go with any gain
     high = high * rng.choice([1.0, 0.1]) if low == 0.0 else high
     if isinstance(param.default, list):
         return [rng.uniform(low, high) for _ in param.default]

@@ -31,13 +31,36 @@ def test_a_hot_motor_gets_less_torque():
     assert "derating (b)" in arm.machine.acted
 
 
-def test_a_soft_wall_pushes_the_joint_back_from_its_limit():
+@pytest.mark.parametrize("rate", [20.0, 50.0, 100.0, 250.0, 500.0, 1000.0])
+@pytest.mark.parametrize("inertia", [0.005, 0.008, 0.03, 0.1, 0.3])
+@pytest.mark.parametrize("speed", [0.1, 0.5, 2.0, 5.0])
+def test_the_soft_wall_never_throws_a_joint_back_faster_than_it_came(rate, inertia, speed):
+    """One joint without friction or gravity runs into its wall; the motor applies torque and damping at once."""
+    period, limit = 1.0 / rate, LIMITS.position_max[0]
+    position, velocity, torque = limit - 0.15, speed, 0.0
+    for _ in range(int(4.0 * rate)):
+        joints = [reading(position=position, velocity=round(velocity / 0.022) * 0.022, time=0.0)] * 4
+        (torque, *_), _ = LIMITS.shape((0.0,) * 4, 1.0, joints, (torque,) * 4, period)
+        damping = LIMITS.wall_damping(joints)[0]
+        end = torque / damping if damping else math.inf  # rad/s, where the damping balances the torque
+        if damping:
+            decay = math.exp(-damping / inertia * period)
+            position += end * period + (velocity - end) * (1.0 - decay) * inertia / damping
+            velocity = end + (velocity - end) * decay
+        else:
+            position += (velocity + 0.5 * torque / inertia * period) * period
+            velocity += torque / inertia * period
+        assert velocity >= -speed
+    assert position < limit + 6.0 * max(0.1, speed * period)
+
+
+def test_a_wall_pushes_back_before_a_joint_limit():
     low, high = LIMITS.position_min[3], LIMITS.position_max[3]
     for position, sign in ((low + 0.05, 1), (high - 0.05, -1)):
-        shaped, acted = LIMITS.shape(
-            (0.0,) * 4, 1.0, [reading(position=position, time=0.0)] * 4, (sign * 2.5,) * 4, 1.0
-        )
-        assert shaped[3] == pytest.approx(sign * 2.5)
+        joints = [reading(position=position, time=0.0)] * 4
+        shaped, acted = LIMITS.shape((0.0,) * 4, 1.0, joints, (0.0,) * 4, 1.0)
+        assert shaped[3] == pytest.approx(sign * 1.25)
+        assert LIMITS.wall_damping(joints)[3] == 5.0
         assert "soft wall (d)" in acted
 
 

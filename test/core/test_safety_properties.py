@@ -7,8 +7,8 @@ import math
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from exo_gravity.core.drive import CARRYING, OFF, State
 from exo_gravity.core.faults import Fault, FaultCode
-from exo_gravity.core.safety import CARRYING, OFF, State
 
 from ..support.safety_run import LIMITS, PERIOD, SafetyRun
 
@@ -17,6 +17,7 @@ EVENTS = st.one_of(
     st.tuples(st.just("disable"), st.none()),
     st.tuples(st.just("clear"), st.none()),
     st.tuples(st.just("trip"), st.none()),
+    st.tuples(st.just("off"), st.integers(0, 3)),
     st.tuples(st.just("silent"), st.integers(0, 3)),
     st.tuples(st.just("replies"), st.integers(0, 3)),
     st.tuples(st.just("effort"), st.lists(st.floats(width=32), min_size=4, max_size=4) | st.none()),
@@ -35,6 +36,8 @@ def test_no_sequence_of_events_lets_torque_flow_without_fresh_input_or_step(even
             getattr(arm.machine, event)(arm.now)
         elif event == "trip":
             arm.machine.trip(FaultCode.BUS_ERROR, "test", arm.now)
+        elif event == "off":
+            arm.off.add(value)
         elif event == "silent":
             arm.silent.add(value)
         elif event == "replies":
@@ -61,7 +64,7 @@ def check(arm: SafetyRun, had_fault: Fault | None) -> None:
         assert arm.effort_age <= LIMITS.command_timeout + 1e-9
         assert all(arm.now - joint.time <= LIMITS.reply_timeout + 1e-9 for joint in arm.joints)
         assert machine.fault is None
-    elif machine.state is not State.LETTING_DOWN:
-        assert drive.effort == OFF.effort
+    elif machine.state is not State.LETTING_DOWN and not machine.is_unreached:
+        assert drive == OFF
     if had_fault:
         assert machine.fault == had_fault

@@ -1,187 +1,229 @@
-"""The fault matrix: each fault that is injected while the arm is carried, and how soon the arm must be let down."""
+"""The fault matrix: each fault, when it occurs, and how soon the arm must be let down."""
 
 from __future__ import annotations
 
 import math
-import os
 import signal
-import time
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import Vector3Stamped
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import Imu, JointState
 
-from ..support.load import start_frames, start_spin
-from .rigs import CommandedRig, ExternalClockRig, LauncherRig, Rig, TwoLaunchersRig
+from exo_gravity.core.motors import EXIT, SET_ZERO
 
-REACTION = 0.10  # s from a fault to damping or EXIT on the bus,
-PROCESS_REACTION = 0.15  # or where another process must first notice that one has died or frozen
-STATES, EFFORTS, TILT = "/right/joint_states", "/right/effort_commands", "/imu/pitch_yaw"
-FRAME_RATE = 3000  # random frames per second beside our 2,000: what two cores can receive in five Python processes
+from .actions import (
+    MOTOR_2,
+    deactivate,
+    enable,
+    foreign_frames,
+    in_turn,
+    kill_bridge_beside_frozen_watchdog,
+    overload_processors,
+    pause,
+    publish,
+    random_frames,
+    raw_imu,
+    record_on_a_full_disk,
+    send_signal,
+    set_contradicting_parameters,
+    set_impossible_parameters,
+    signal_bridge_and_watchdog,
+    signal_watchdog,
+    simulator,
+    start_second_bridge,
+    states_at,
+    tilt,
+)
+from .command_cases import CLOCK, EFFORT_COMMANDS
+from .fault_case import ALL_JOINTS, PROCESS_REACTION, FaultCase
+from .rig import Rig
+from .rigs import (
+    BothArmsRig,
+    HighFrictionRig,
+    LauncherRig,
+    LeastFrictionRig,
+    LowFrictionRig,
+    SignCheckRig,
+    SlowFadeRig,
+    TwoLaunchersRig,
+    WallRig,
+    WearerRig,
+)
 
-Action = Callable[[Any], object]  # on a rig of the case's type
-
-
-@dataclass(frozen=True)
-class FaultCase:
-    """One fault. inject(rig) causes it; clear(rig) ends it where the rig is used again.
-
-    limit: s until the arm must be let down, None where it may stay carried, because the fault is refused or ignored.
-    in_tests: whether the tests run it too. ends_rig: whether the rig is spent although its nodes run on.
-    """
-
-    name: str
-    inject: Action
-    rig: type[Rig] = Rig
-    limit: float | None = REACTION
-    clear: Action = lambda rig: None
-    in_tests: bool = False
-    ends_rig: bool = False
-
-
-def send_signal(node: str, number: int) -> Action:
-    return lambda rig: rig.process(node).send_signal(number)
-
-
-def simulator(**values: object) -> Action:
-    """Set parameters of the simulator."""
-    return lambda rig: rig.probe.set_parameters("simulator", **values)
-
-
-def publish(message_type: type, topic: str, make_message: Callable[[Rig], object]) -> Action:
-    """Publish the message for half a second, from a publisher that does not belong to the arm."""
-
-    def inject(rig: Rig) -> None:
-        publisher = rig.probe.node.create_publisher(message_type, topic, 1)
-        rig.probe.wait_until(lambda: publisher.get_subscription_count() > 0)
-        for _ in range(50):  # a single message may be overwritten by the next regular one before it is read
-            publisher.publish(make_message(rig))
-            time.sleep(0.01)
-
-    return inject
-
-
-def states_at(position: list[float]) -> Callable[[Rig], JointState]:
-    """Joint states with this `position` in rad, otherwise like the arm's newest."""
-
-    def make_message(rig: Rig) -> JointState:
-        newest = rig.probe.joint_states[-1]
-        return JointState(header=newest.header, name=newest.name, position=position)
-
-    return make_message
-
-
-def tilt(pitch: float) -> Callable[[Rig], Vector3Stamped]:
-    def make_message(rig: Rig) -> Vector3Stamped:
-        message = Vector3Stamped()
-        message.vector.y = pitch
-        return message
-
-    return make_message
+STATES, EFFORTS, TILT, RAW_IMU = "/right/joint_states", "/right/effort_commands", "/imu/pitch_yaw", "/imu/data_raw"
+MOTOR_TURN = 0.698  # rad of joint 2 for one turn of its rotor
+RECOVERY = 6.0  # s in which the launcher brings down an arm that has lost its bridge and its watchdog
+HELD = ("active",)
+OFF = ("disabled", "stopped", "inactive")
+KILL, STOP, CONTINUE, TERMINATE, INTERRUPT = (
+    signal.SIGKILL,
+    signal.SIGSTOP,
+    signal.SIGCONT,
+    signal.SIGTERM,
+    signal.SIGINT,
+)
+J2 = [False, True, False, False]
+NONE = [False] * 4
+CUT_OFF, CONNECT = simulator(fault__cut_off=J2), simulator(fault__cut_off=NONE)
+# The device counts the time from the moment at which the motor loses its power.
+RESTART = simulator(fault__unplugged_time=0.03, fault__unplugged=J2)
+RESTARTED = simulator(fault__unplugged_time=0.0, fault__unplugged=NONE)
+SILENCE, END_SILENCE = simulator(fault__bus_silent=True), simulator(fault__bus_silent=False)
+ERROR, NO_ERROR = simulator(fault__error=[0, 5, 0, 0]), simulator(fault__error=[0] * 4)
+JUMP, NO_JUMP = (simulator(fault__encoder_error=[0.0, error, 0.0, 0.0]) for error in (MOTOR_TURN, 0.0))
 
 
-def random_frames(count: int, ids: Iterable[int]) -> Action:
-    def inject(rig: Rig) -> None:
-        sender = start_frames(rig.nodes[0].bus, count, FRAME_RATE, ids)
-        rig.probe.wait_until(lambda: sender.poll() is not None, 2 * count / FRAME_RATE + 30.0)
-        assert sender.returncode == 0
-
-    return inject
-
-
-def overload_processors(rig: Rig) -> None:
-    """Start four busy processes for each of two processors, for 3 s."""
-    for process in [start_spin(3.0) for _ in range(8)]:
-        process.wait()
+def refused_on_the_wrong_angle(rig: Rig) -> None:
+    """Clear the fault and enable the arm, whose encoder is still wrong: its motors must stay off."""
+    rig.probe.wait_until(lambda: rig.probe.state == "fault", 10.0)
+    start = rig.truth.count
+    assert rig.probe.trigger("clear_fault").success
+    rig.probe.wait_until(lambda: rig.probe.state == "disabled", 10.0)
+    assert rig.probe.enable(True).success
+    rig.probe.wait_until(lambda: rig.probe.state == "fault", 10.0)
+    assert rig.probe.fault == "implausible_zero", rig.probe.fault
+    assert not rig.truth.since(0.0, start)["on"].any(), "the motors were switched on"
+    NO_JUMP(rig)
 
 
-def set_impossible_parameters(rig: Rig) -> None:
-    bad = ({"robot__mass": [-1.0] * 4}, {"robot__mass": [math.nan] * 4}, {"gain": [1.0] * 3}, {"mode": 7}, {"law": ""})
-    for values in bad:
-        assert not rig.probe.set_parameters("compensator", **values).successful
+def left_arm_is_carried(rig: BothArmsRig) -> None:
+    assert rig.left.state == "active", f"the left arm is {rig.left.state}"
 
 
-def kill_watchdog(rig: Rig) -> None:
-    bridge = rig.process("can_bridge").pid
-    children = Path(f"/proc/{bridge}/task/{bridge}/children").read_text()
-    os.kill(int(children.split()[0]), signal.SIGKILL)
+def not_thrown_back(records: np.ndarray) -> str:
+    """Return what is wrong if the elbow leaves the wall faster than half its speed into the wall."""
+    velocity = records["velocity"][:, 3]
+    inward = velocity.argmax()
+    into, back = float(velocity[inward]), float(-velocity[inward:].min())
+    if into < 1.0:
+        return f"the push reached only {into:.1f} rad/s"
+    return f"thrown back at {back:.1f} after {into:.1f} rad/s" if back > 0.5 * into else ""
 
 
-def change_message(change: Callable[[JointState], object]) -> Action:
-    return lambda rig: setattr(rig, "change_message", change)
+def push_elbow(rig: Rig) -> None:
+    script = rig.write_script("push", [{"push": [0.0, 0.0, 0.0, 1.2], "over": 0.5}, {"hold": 600.0}])
+    assert rig.probe.set_parameters("simulator", trial=str(script)).successful
 
 
-def shift_clock(seconds: float) -> Action:
-    return lambda rig: setattr(rig, "clock_offset", seconds)
-
-
-def shift_stamp(seconds: int) -> Action:
-    def change(message: JointState) -> None:
-        message.header.stamp.sec += seconds
-
-    return change_message(change)
-
-
-def second_effort(value: float) -> Action:
-    return change_message(lambda message: message.effort.__setitem__(1, value))
-
-
-HOUR, DAY = 3600, 86400  # s
-PROCESSES = (
-    FaultCase("compensator killed", send_signal("compensator", signal.SIGKILL), limit=PROCESS_REACTION),
-    FaultCase("second publisher of efforts", publish(JointState, EFFORTS, lambda rig: rig.probe.effort_commands[-1]),
-        TwoLaunchersRig, in_tests=True),
-    FaultCase("compensator frozen, the rest runs on", send_signal("compensator", signal.SIGSTOP), TwoLaunchersRig,
-        clear=send_signal("compensator", signal.SIGCONT), in_tests=True),
-    FaultCase("compensator killed, the rest runs on", send_signal("compensator", signal.SIGKILL), TwoLaunchersRig,
-        ends_rig=True),
-    FaultCase("can_bridge killed", send_signal("can_bridge", signal.SIGKILL), limit=PROCESS_REACTION, in_tests=True),
-    FaultCase("can_bridge frozen", send_signal("can_bridge", signal.SIGSTOP), limit=PROCESS_REACTION),
-    FaultCase("can_bridge terminated", send_signal("can_bridge", signal.SIGTERM), limit=PROCESS_REACTION),
-    FaultCase("watchdog killed", kill_watchdog, limit=PROCESS_REACTION),
-    FaultCase("launcher killed", lambda rig: rig.launcher.kill(), LauncherRig, PROCESS_REACTION),
-    FaultCase("launcher interrupted", lambda rig: rig.launcher.send_signal(signal.SIGINT), LauncherRig,
-        PROCESS_REACTION),
-    FaultCase("imu killed", send_signal("imu", signal.SIGKILL), limit=PROCESS_REACTION),
-    FaultCase("imu frozen", send_signal("imu", signal.SIGSTOP), limit=PROCESS_REACTION,
-        clear=send_signal("imu", signal.SIGCONT)),
-)  # fmt: skip
-MOTORS = (
-    FaultCase("one motor silent", simulator(fault__unplugged=[False, False, True, False]),
-        clear=simulator(fault__unplugged=[False] * 4)),
-    FaultCase("whole bus silent", simulator(fault__bus_silent=True), clear=simulator(fault__bus_silent=False)),
-    FaultCase("motor reports an error", simulator(fault__error=[0, 0, 5, 0]), clear=simulator(fault__error=[0] * 4)),
-    FaultCase("motor at 95 degC", simulator(fault__temperature=[30.0, 95.0, 30.0, 30.0]),
-        clear=simulator(fault__temperature=[30.0] * 4)),
-)  # fmt: skip
-INPUTS = (
-    FaultCase("second publisher of joint states", publish(JointState, STATES, states_at([1.0] * 4))),
+# fmt: off
+HELD_ROWS = (
     FaultCase("NaN joint states", publish(JointState, STATES, states_at([math.nan] * 4)), limit=None),
-    FaultCase("second publisher of the tilt", publish(Vector3Stamped, TILT, tilt(1.0))),
     FaultCase("NaN tilt", publish(Vector3Stamped, TILT, tilt(math.nan)), limit=None),
-    FaultCase("impossible parameters", set_impossible_parameters, limit=None),
+    FaultCase("impossible parameters", set_impossible_parameters, limit=None, outcomes=HELD),
+    FaultCase("parameters that contradict each other", set_contradicting_parameters, limit=None, outcomes=HELD),
+    FaultCase("second can_bridge on the bus", start_second_bridge("/second"), limit=None, outcomes=HELD, in_tests=True),
+    FaultCase("disk full for the recorder", record_on_a_full_disk, limit=None, outcomes=HELD),
+    FaultCase("trunk bows past 90 degrees", in_turn(simulator(trunk__pitch=1.9), pause(4.5)), limit=None, outcomes=HELD,
+        clear=in_turn(simulator(trunk__pitch=0.1), pause(4.0))),
     FaultCase("100,000 random frames", random_frames(100_000, (0, *range(5, 2048))), limit=None),  # 1-4: the motors
     FaultCase("foreign frames, 3,000 a second", random_frames(15_000, range(0x100, 0x200)), limit=None),
     FaultCase("processors overloaded", overload_processors, limit=None),
 )
-EFFORT_COMMANDS = (
-    FaultCase("effort NaN", second_effort(math.nan), CommandedRig, in_tests=True),
-    FaultCase("effort infinite", second_effort(math.inf), CommandedRig),
-    FaultCase("effort of 1e308 Nm", second_effort(1e308), CommandedRig),
-    FaultCase("three efforts", change_message(lambda message: message.effort.pop()), CommandedRig),
-    FaultCase("a wrong name", change_message(lambda message: message.name.__setitem__(3, "left_knee")), CommandedRig),
-    FaultCase("a name twice", change_message(lambda message: message.name.__setitem__(3, message.name[2])),
-        CommandedRig),
-    FaultCase("no names", change_message(lambda message: setattr(message, "name", [])), CommandedRig),
-    FaultCase("no efforts", change_message(lambda message: setattr(message, "effort", [])), CommandedRig),
-    FaultCase("stamps an hour old", shift_stamp(-HOUR), CommandedRig),
-    FaultCase("stamps a day ahead", shift_stamp(DAY), CommandedRig),
-)  # fmt: skip
-CLOCK = (
-    FaultCase("clock set back an hour", shift_clock(-HOUR), ExternalClockRig, None),
-    FaultCase("clock set ahead an hour", shift_clock(HOUR), ExternalClockRig, None),
+MOTORS = (
+    FaultCase("arm disabled", enable(False), outcomes=OFF),
+    FaultCase("motor 2 cut off from the bus", CUT_OFF, clear=CONNECT, unreached=(1,), outcomes=("motor_silent",)),
+    FaultCase("motor 2 without power", simulator(fault__unplugged=J2), clear=RESTARTED, unpowered=(1,), steps_from=0.05,
+        outcomes=("motor_silent",)),
+    FaultCase("motor 2 restarts in 30 ms", RESTART, clear=RESTARTED, steps_from=0.3,
+        outcomes=("torque_not_delivered", "motor_silent")),
+    FaultCase("bus silent until the arm is given up", SILENCE, clear=END_SILENCE, unreached=ALL_JOINTS,
+        outcomes=("motor_silent",)),
+    FaultCase("bus silent for 3 s", in_turn(SILENCE, pause(3.0), END_SILENCE), unreached=ALL_JOINTS,
+        outcomes=("motor_silent",)),
+    FaultCase("motor 2 reports an error", ERROR, clear=NO_ERROR, outcomes=("motor_error",), in_tests=True),
+    FaultCase("motor 2 at 95 degC", simulator(fault__temperature=[30.0, 95.0, 30.0, 30.0]),
+        clear=simulator(fault__temperature=[30.0] * 4), outcomes=("over_temperature",)),
+    FaultCase("joint 2 jumps by a motor turn, then clear and enable", JUMP, afterwards=refused_on_the_wrong_angle,
+        clear=lambda rig: None, outcomes=("position_jump", "over_speed")),
+    FaultCase("foreign EXIT to motor 2, once", foreign_frames(EXIT), steps_from=0.05,
+        outcomes=("foreign_command", "torque_not_delivered"), in_tests=True),
+    FaultCase("foreign SET_ZERO to motor 2, once", foreign_frames(SET_ZERO), unreached=(1,), steps_from=0.05,
+        ends_rig=True),
+    FaultCase("foreign 6 Nm to motor 2, 500 a second for 2 s", foreign_frames(MOTOR_2.command(-6.0, 0.0), 500.0, 2.0),
+        steps_from=2.1, outcomes=("foreign_command",)),
+    FaultCase("foreign zero commands to motor 2, 500 a second for 2 s",
+        foreign_frames(MOTOR_2.command(0.0, 0.0), 500.0, 2.0), steps_from=2.1, outcomes=("foreign_command",)),
+    FaultCase("second publisher of joint states", publish(JointState, STATES, states_at([1.0] * 4))),
+    FaultCase("second publisher of the tilt", publish(Vector3Stamped, TILT, tilt(1.0))),
+    FaultCase("second publisher of the raw IMU", publish(Imu, RAW_IMU, raw_imu), limit=0.3),
 )
-CASES = (*PROCESSES, *MOTORS, *INPUTS, *EFFORT_COMMANDS, *CLOCK)
+DESCENT = (
+    FaultCase("enabled again while let down", enable(True), stage="letting down", outcomes=OFF),
+    FaultCase("motor 2 cut off for 2 s while let down", in_turn(CUT_OFF, pause(2.0), CONNECT), stage="letting down"),
+    FaultCase("motor 2 restarts while let down", RESTART, stage="letting down", clear=RESTARTED, steps_from=0.3),
+    FaultCase("foreign EXIT to motor 2 while let down", foreign_frames(EXIT), stage="letting down", steps_from=0.05),
+    FaultCase("watchdog killed while let down", signal_watchdog(KILL), stage="letting down", ends_rig=True),
+    FaultCase("can_bridge killed while let down", send_signal("can_bridge", KILL), limit=PROCESS_REACTION,
+        stage="letting down"),
+)
+START = (
+    FaultCase("motor 2 reports an error while checking", ERROR, SignCheckRig, stage="checking", clear=NO_ERROR,
+        outcomes=("motor_error",)),
+    FaultCase("motor 2 cut off while checking", CUT_OFF, SignCheckRig, stage="checking", clear=CONNECT,
+        outcomes=("checking",)),
+    FaultCase("motor 2 cut off while proving", CUT_OFF, SignCheckRig, stage="proving signs", clear=CONNECT,
+        unreached=(1,), outcomes=("motor_silent",)),
+    FaultCase("joint 2 jumps by a motor turn while proving", JUMP, SignCheckRig, stage="proving signs", clear=NO_JUMP,
+        outcomes=("position_jump", "over_speed")),
+    FaultCase("foreign EXIT to motor 2 while proving", foreign_frames(EXIT), SignCheckRig, stage="proving signs",
+        steps_from=0.05),
+    FaultCase("motor 2 restarts while ramping in", RESTART, SignCheckRig, stage="ramping in", clear=RESTARTED,
+        steps_from=0.3),
+    FaultCase("imu frozen while ramping in", send_signal("imu", STOP), SignCheckRig, PROCESS_REACTION, "ramping in",
+        clear=send_signal("imu", CONTINUE)),
+    FaultCase("can_bridge killed while proving", send_signal("can_bridge", KILL), SignCheckRig, PROCESS_REACTION,
+        "proving signs"),
+    FaultCase("can_bridge killed while ramping in", send_signal("can_bridge", KILL), SignCheckRig, PROCESS_REACTION,
+        "ramping in"),
+)
+PROCESSES = (
+    FaultCase("imu frozen", send_signal("imu", STOP), limit=PROCESS_REACTION, clear=send_signal("imu", CONTINUE)),
+    FaultCase("can_bridge deactivated", deactivate, outcomes=OFF, ends_rig=True),
+    FaultCase("watchdog frozen", signal_watchdog(STOP), limit=0.6, clear=signal_watchdog(CONTINUE),
+        outcomes=("watchdog_dead",), ends_rig=True),
+    FaultCase("watchdog killed", signal_watchdog(KILL), limit=PROCESS_REACTION, outcomes=("watchdog_dead",),
+        ends_rig=True),
+    FaultCase("can_bridge and watchdog frozen for 1 s",
+        in_turn(signal_bridge_and_watchdog(STOP), pause(1.0), signal_bridge_and_watchdog(CONTINUE)),
+        limit=1.0 + PROCESS_REACTION, ends_rig=True),
+    FaultCase("compensator killed", send_signal("compensator", KILL), limit=PROCESS_REACTION),
+    FaultCase("imu killed", send_signal("imu", KILL), limit=PROCESS_REACTION),
+    FaultCase("can_bridge killed", send_signal("can_bridge", KILL), limit=PROCESS_REACTION, in_tests=True),
+    FaultCase("can_bridge killed and started again at once",
+        in_turn(send_signal("can_bridge", KILL), start_second_bridge("/right")), limit=PROCESS_REACTION),
+    FaultCase("can_bridge frozen", send_signal("can_bridge", STOP), limit=PROCESS_REACTION),
+    FaultCase("can_bridge terminated", send_signal("can_bridge", TERMINATE), limit=PROCESS_REACTION),
+    FaultCase("can_bridge killed beside a watchdog frozen for 1 s", kill_bridge_beside_frozen_watchdog(1.0),
+        limit=1.0 + PROCESS_REACTION),
+    FaultCase("can_bridge and watchdog killed", signal_bridge_and_watchdog(KILL), limit=RECOVERY),
+    FaultCase("second publisher of efforts", publish(JointState, EFFORTS, lambda rig: rig.probe.effort_commands[-1]),
+        TwoLaunchersRig, in_tests=True, outcomes=("second_commander",)),
+    FaultCase("compensator frozen, the rest runs on", send_signal("compensator", STOP), TwoLaunchersRig,
+        clear=send_signal("compensator", CONTINUE), in_tests=True, outcomes=("command_stale",)),
+    FaultCase("compensator killed, the rest runs on", send_signal("compensator", KILL), TwoLaunchersRig,
+        ends_rig=True, outcomes=("command_stale",)),
+    FaultCase("launcher killed", lambda rig: rig.launcher.kill(), LauncherRig, PROCESS_REACTION),
+    FaultCase("launcher interrupted", lambda rig: rig.launcher.send_signal(INTERRUPT), LauncherRig, PROCESS_REACTION),
+    FaultCase("launcher terminated", lambda rig: rig.launcher.send_signal(TERMINATE), LauncherRig, PROCESS_REACTION),
+    FaultCase("can_bridge killed beside a frozen launcher",
+        in_turn(lambda rig: rig.launcher.send_signal(STOP), send_signal("can_bridge", KILL)), LauncherRig,
+        PROCESS_REACTION, clear=lambda rig: rig.launcher.send_signal(CONTINUE)),
+)
+ARMS = (
+    FaultCase("arm disabled, friction 0.01 Nm", enable(False), LeastFrictionRig, outcomes=OFF),
+    FaultCase("can_bridge killed, friction 0.01 Nm", send_signal("can_bridge", KILL), LeastFrictionRig,
+        PROCESS_REACTION),
+    FaultCase("arm disabled, friction 0.05 Nm", enable(False), LowFrictionRig, outcomes=OFF, ends_rig=True),
+    FaultCase("arm disabled, friction 0.5 Nm", enable(False), HighFrictionRig, outcomes=OFF, ends_rig=True),
+    FaultCase("arm disabled, fade_time 30 s", enable(False), SlowFadeRig, outcomes=OFF, ends_rig=True),
+    FaultCase("elbow pushed into the soft wall", push_elbow, WallRig, None, speed_limit=5.0, check=not_thrown_back),
+    FaultCase("arm disabled, Zero-G, 75 kg", enable(False), WearerRig, outcomes=OFF),
+    FaultCase("motor 2 reports an error, Zero-G, 75 kg", ERROR, WearerRig, clear=NO_ERROR, outcomes=("motor_error",)),
+    FaultCase("can_bridge killed, Zero-G, 75 kg", send_signal("can_bridge", KILL), WearerRig, PROCESS_REACTION),
+    FaultCase("motor 2 of the right of two arms reports an error", ERROR, BothArmsRig, clear=NO_ERROR,
+        afterwards=left_arm_is_carried, outcomes=("motor_error",)),
+    FaultCase("can_bridge of the right of two arms killed", send_signal("can_bridge", KILL), BothArmsRig,
+        PROCESS_REACTION),
+)
+# fmt: on
+CASES = (*HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *CLOCK, *ARMS)

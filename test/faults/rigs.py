@@ -1,118 +1,55 @@
-"""The rigs on which faults are tried: which nodes run, in which processes, and which node commands the arm."""
+"""The kinds of rig: which nodes run, in which processes, which node commands the arm, and what the arm is like."""
 
 from __future__ import annotations
 
 import math
 import subprocess
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
-import yaml
 from builtin_interfaces.msg import Time
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core.wearer import Wearer
 from exo_gravity.tools.inputs.parameter_file import load
 
 from ..support import CONFIG
-from ..support.bus_listener import BusListener
-from ..support.launched_nodes import GENTLE, NO_IMU, REAL, LaunchedNodes, LauncherProcess, Parameters, full_name
+from ..support.launched_nodes import GENTLE, NO_IMU, LaunchedNodes, LauncherProcess, Parameters
 from ..support.ros_probe import RosProbe
+from ..support.truth import Truth
+from .rig import CARRY_LIMIT, NEAR, SIMULATOR, Rig
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-HORIZONTAL = {"name": "horizontal", "steps": [{"move": [0.0, 1.5, 0.0, 0.3], "over": 2.0}, {"hold": 600.0}]}
 UPRIGHT: Parameters = {"trunk": {"pitch": 0.0, "roll": 0.0}}
-CARRY_LIMIT = 90.0  # s for the nodes to start and carry the arm
 
 ChangeMessage = Callable[[JointState], object]
-
-
-class Rig:
-    """Nodes that carry the arm in a horizontal pose, with a probe and a bus listener. End it with `close`.
-
-    timing: rate and time-outs of the nodes, `REAL` or, for a busy machine, `SIMULATED`.
-    """
-
-    def __init__(self, folder: Path, timing: Mapping[str, Parameters] = REAL) -> None:
-        self.folder, self.timing = folder, timing
-        self.script = folder / "horizontal.yaml"
-        self.script.write_text(yaml.safe_dump(HORIZONTAL))
-        self.nodes = self._make_nodes()
-        self.probe = RosProbe()
-        self.listener = BusListener(self.nodes[0].bus)
-        for nodes in self.nodes:
-            nodes.start()
-
-    def _make_nodes(self) -> list[LaunchedNodes]:
-        """Return the nodes of each launcher; the first one has the bridge."""
-        return [self._nodes(can_bridge=GENTLE)]
-
-    def _nodes(self, without: tuple[str, ...] = (), port: int | None = None, **changes: Any) -> LaunchedNodes:
-        return LaunchedNodes(self.folder, without=without, port=port, timing=self.timing, **changes)
-
-    @property
-    def rate(self) -> float:
-        """The rate of the control loop in Hz."""
-        return float(self.timing["can_bridge"]["rate"])
-
-    def carry(self) -> None:
-        """Clear what the last fault left and bring the arm to the pose, in several attempts on a busy machine.
-
-        Raises Timeout unless it is carried within `CARRY_LIMIT`.
-        """
-        probe = self.probe
-        with probe.time_limit(CARRY_LIMIT):
-            probe.wait_until(lambda: self.have_ended or (probe.joint_states and probe.effort_commands))
-            assert not self.have_ended, f"the nodes ended: {self.log[-5:]}"
-            while not self._bring_to_pose():
-                probe.wait_until(lambda: probe.state == "fault")
-
-    def _bring_to_pose(self) -> bool:
-        probe = self.probe
-        probe.bring_to(self.script)
-        self.listener.frames.clear()
-        seen = len(probe.joint_states)
-        probe.wait_until(lambda: len(probe.joint_states) > seen + self.rate / 4)
-        return probe.state == "active"
-
-    def process(self, node: str) -> subprocess.Popen[str]:
-        """Return the process of a node by the last part of its name."""
-        return next(nodes.process(node) for nodes in self.nodes if full_name(node) in load(nodes.path))
-
-    @property
-    def have_ended(self) -> bool:
-        """Whether the nodes have ended."""
-        return self.nodes[0].have_ended
-
-    @property
-    def log(self) -> list[str]:
-        return [line for nodes in self.nodes for line in nodes.log]
-
-    def close(self) -> None:
-        for nodes in self.nodes:
-            nodes.stop()
-        self.listener.close()
-        self.probe.close()
 
 
 class TwoLaunchersRig(Rig):
     """The compensator has its own launcher: when it dies, the other nodes run on."""
 
-    def _make_nodes(self) -> list[LaunchedNodes]:
-        others = self._nodes(without=("compensator", "imu"), can_bridge=GENTLE, simulator=UPRIGHT)
-        without = ("can_bridge", "simulator", "imu")
-        return [others, self._nodes(without=without, port=others.bus["port"], compensator=NO_IMU)]
+    simulator: ClassVar[Parameters] = UPRIGHT
+
+    def _make_nodes(self, port: int) -> list[LaunchedNodes]:
+        bridge = {**GENTLE, "rate": self.rate}
+        others = self._nodes(without=("compensator", "imu", "simulator"), port=port, can_bridge=bridge)
+        compensator = self._nodes(without=("can_bridge", "simulator", "imu"), port=port, compensator=NO_IMU)
+        return [others, compensator]
 
 
 class CommandedRig(Rig):
     """This process commands the arm, at 100 Hz; `change_message` may spoil each message before it leaves."""
 
-    def __init__(self, folder: Path, timing: Mapping[str, Parameters] = REAL) -> None:
-        super().__init__(folder, timing)
+    rate = 100.0
+    simulator: ClassVar[Parameters] = UPRIGHT
+
+    def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
+        super().__init__(folder, shipped_timeouts)
         self.change_message: ChangeMessage = lambda message: None
         parameters = load(CONFIG / "sim.yaml")["/right/compensator"]
         self._arm = ArmModel(*(parameters[name] for name in ("link_length", "robot.cog", "robot.mass")))
@@ -120,14 +57,9 @@ class CommandedRig(Rig):
         self.probe.node.create_subscription(JointState, "/right/joint_states", self._on_joint_states, NEWEST)
         self.probe.executor.wake()
 
-    def _make_nodes(self) -> list[LaunchedNodes]:
+    def _make_nodes(self, port: int) -> list[LaunchedNodes]:
         bridge = {**GENTLE, "rate": self.rate}
-        return [self._nodes(without=("compensator", "imu"), can_bridge=bridge, simulator=UPRIGHT)]
-
-    @property
-    def rate(self) -> float:
-        """100 Hz, at which this process can command the arm."""
-        return 100.0
+        return [self._nodes(without=("compensator", "imu", "simulator"), port=port, can_bridge=bridge)]
 
     def _on_joint_states(self, state: JointState) -> None:
         message = JointState(header=state.header, name=state.name)
@@ -135,25 +67,27 @@ class CommandedRig(Rig):
         self.change_message(message)
         self._publisher.publish(message)
 
-    def carry(self) -> None:
+    def bring_to(self, stage: str) -> None:
         self.change_message = lambda message: None
-        super().carry()
+        super().bring_to(stage)
 
 
 class ExternalClockRig(Rig):
     """Bridge and compensator use /clock, which this process publishes, `clock_offset` s off the system's clock."""
 
-    def __init__(self, folder: Path, timing: Mapping[str, Parameters] = REAL) -> None:
-        super().__init__(folder, timing)
+    simulator: ClassVar[Parameters] = UPRIGHT
+
+    def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
+        super().__init__(folder, shipped_timeouts)
         self.clock_offset = 0.0
         self._publisher = self.probe.node.create_publisher(Clock, "/clock", 10)
         self.probe.node.create_timer(0.002, self._publish_clock)
         self.probe.executor.wake()
 
-    def _make_nodes(self) -> list[LaunchedNodes]:
+    def _make_nodes(self, port: int) -> list[LaunchedNodes]:
         clock = {"use_sim_time": True}
         compensator, bridge = {**clock, **NO_IMU}, {**clock, **GENTLE}
-        return [self._nodes(without=("imu",), compensator=compensator, can_bridge=bridge, simulator=UPRIGHT)]
+        return [self._nodes(without=("imu", "simulator"), port=port, compensator=compensator, can_bridge=bridge)]
 
     def _publish_clock(self) -> None:
         fraction, seconds = math.modf(time.time() + self.clock_offset)
@@ -163,10 +97,86 @@ class ExternalClockRig(Rig):
 class LauncherRig(Rig):
     """The launcher is a process, as for users; `launcher` is that process."""
 
-    def _make_nodes(self) -> list[LaunchedNodes]:
-        self._launcher = LauncherProcess(self.folder, timing=self.timing, can_bridge=GENTLE)
+    def _make_nodes(self, port: int) -> list[LaunchedNodes]:
+        self._launcher = LauncherProcess(
+            self.folder, without=SIMULATOR, port=port, timing=self.timing, can_bridge=GENTLE
+        )
         return [self._launcher]
 
     @property
     def launcher(self) -> subprocess.Popen[str]:
         return self._launcher.launcher_process
+
+
+class BothArmsRig(Rig):
+    """Both arms at 100 Hz; faults strike the right one. `left` probes the left arm, `left_truth` is its motion."""
+
+    base = "sim_both.yaml"
+    rate = 100.0
+
+    def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
+        super().__init__(folder, shipped_timeouts)
+        self.left = RosProbe("/left")
+        self.left_truth = Truth(self.nodes[-1].truth_path("/left/simulator"))
+
+    def bring_to(self, stage: str) -> None:
+        with self.left.time_limit(CARRY_LIMIT):
+            newest = self.left_truth.newest()
+            if self.left.state != "active" or newest is None or abs(newest["position"][1] - self.pose[1]) > NEAR:
+                self.left.bring_to(self.script)
+        super().bring_to(stage)
+
+    def close(self) -> None:
+        super().close()
+        self.left.close()
+
+
+class LowFrictionRig(Rig):
+    """Joints with 0.05 Nm of friction."""
+
+    simulator: ClassVar[Parameters] = {"friction": {"coulomb": [0.05] * 4, "viscous": [0.0] * 4}}
+
+
+class LeastFrictionRig(Rig):
+    """Joints with 0.01 Nm of friction."""
+
+    simulator: ClassVar[Parameters] = {"friction": {"coulomb": [0.01] * 4, "viscous": [0.0] * 4}}
+
+
+class HighFrictionRig(Rig):
+    """Joints with 0.5 Nm of friction."""
+
+    simulator: ClassVar[Parameters] = {"friction": {"coulomb": [0.5] * 4}}
+
+
+class SlowFadeRig(Rig):
+    """The torque fades over 30 s."""
+
+    bridge: ClassVar[Parameters] = {"fade_time": 30.0}
+
+
+class SignCheckRig(Rig):
+    """The signs are checked at the start, and the torque ramps in over 3 s."""
+
+    bridge: ClassVar[Parameters] = {"sign_check_torque": 1.5, "ramp_time": 3.0}
+
+
+class WallRig(Rig):
+    """The elbow's upper limit is within reach of a push, and far from the mechanical stop."""
+
+    pose = (0.0, 0.3, 0.3, 0.6)
+    bridge: ClassVar[Parameters] = {"position_max": [1.65, 3.14, 2.53, 1.2]}
+
+
+_MASS, _COG = Wearer(75.0).on_links((0.05, 0.13, 0.3, 0.3))
+
+
+class WearerRig(Rig):
+    """Zero-G for a wearer of 75 kg, who is passive. In this pose the rated torques carry the wearer's arm."""
+
+    pose = (0.0, 0.4, 0.2, 0.5)
+    compensator: ClassVar[Parameters] = {"mode": "zero_g", "wearer": {"body_mass": 75.0}}
+    simulator: ClassVar[Parameters] = {
+        "wearer": {"mass": _MASS.tolist(), "cog": _COG.tolist()},
+        "friction": {"coulomb": [0.1] * 4},
+    }

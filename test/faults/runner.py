@@ -1,48 +1,73 @@
-"""Runs one fault case on a rig and judges what the bus showed."""
+"""Runs one row of the fault matrix on a rig, and decides whether it was safe."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from ..support.launched_nodes import REAL, Parameters
-from .cases import FaultCase
-from .response import Response, measure_response
-from .rigs import Rig
+import numpy as np
 
-OBSERVATION = 3.0  # s for which an arm that may stay carried is observed
-REST = 1.0  # s for which an arm that was let down must stay down after the fault has cleared
-DESCENT = 40.0  # s until the arm must be down
-MAX_SPEED = 1.0  # rad/s
+from .fault_case import FaultCase
+from .judge import MAX_GAP, MAX_WORK, Response, measure
+from .rig import CARRYING, Rig
+from .rigs import BothArmsRig
+
+OBSERVATION = 3.0  # s for which an arm that may stay carried, or must stay off, is observed
+AFTER_EXIT = 3.0  # s after the last motor was switched off in which the arm must not fall
+DESCENT = 30.0  # s until the arm must be down
+BEFORE = 0.1  # s before the fault, from which on the torque is known
 LOG_LINES = 20
 
 Result = dict[str, Any]  # a row of the table; `unsafe` is empty, or says why the case failed
 
 
 def run_case(case: FaultCase, rig: Rig) -> Result:
-    """Inject the fault into the carried arm and return the result.
+    """Inject the fault at its stage and return the result.
 
-    Too late a reaction is unsafe only with the time-outs of a real device.
+    Too late a reaction is unsafe only with the shipped time-outs.
     """
-    rig.carry()
-    probe, first_line, fault_time = rig.probe, len(rig.log), time.time()
-    case.inject(rig)
-    if case.limit is None:
-        end = time.monotonic() + OBSERVATION
-        probe.wait_until(lambda: time.monotonic() > end or probe.state == "fault")
-    if case.limit is not None or probe.state in ("letting down", "fault"):
-        probe.wait_until(lambda: probe.state == "fault" or (rig.have_ended and rig.listener.motors_are_off()), DESCENT)
+    rig.bring_to(case.stage)
+    first_line, start = len(rig.log), max(0, rig.truth.count - 1000)
+    fault_time = time.time()
+    injected = case.inject(rig)
+    fault_time = injected if isinstance(injected, float) else fault_time
+    _observe(case, rig)
     outcome = _outcome(rig)
     case.clear(rig)
-    if outcome != "active":  # a motor that was unreachable is switched off as soon as it answers again
-        probe.wait_until(rig.listener.motors_are_off, DESCENT)
-    end = time.monotonic() + REST
-    probe.wait_until(lambda: time.monotonic() > end)
-    response = measure_response(list(rig.listener.frames), fault_time, 1.0 / rig.rate)
-    return _result(case, rig, outcome, response, rig.log[first_line:])
+    if outcome not in CARRYING and not case.must_stay_off:
+        _wait_until_down(rig)
+    records = rig.truth.since(fault_time - BEFORE, start)
+    failures = _failures(case, rig, outcome, records, fault_time)
+    if any("Traceback" in line for line in rig.log[first_line:]):
+        failures.append("exception")
+    if not rig.nodes[0].log:
+        failures.append("empty log")
+    if not failures:
+        try:
+            case.afterwards(rig)
+        except AssertionError as error:
+            failures.append(f"afterwards: {str(error).splitlines()[0]}")
+    return _result(case, outcome, _response(case, rig, records, fault_time), failures)
+
+
+def _observe(case: FaultCase, rig: Rig) -> None:
+    """Wait until the arm is let down, or for OBSERVATION if it may stay as it is."""
+    probe, end = rig.probe, time.monotonic() + OBSERVATION
+    if case.limit is None or case.must_stay_off:
+        probe.wait_until(lambda: time.monotonic() > end or probe.state == "fault")
+        if probe.state not in ("letting down", "fault"):
+            return
+    # A bridge that has given up a motor that it cannot reach is in `fault`, and that motor still on.
+    probe.wait_until(lambda: probe.state == "fault" or rig.truth.motors_are_off(), DESCENT)
+
+
+def _wait_until_down(rig: Rig) -> None:
+    arms = [rig.truth, rig.left_truth] if isinstance(rig, BothArmsRig) and rig.have_ended else [rig.truth]
+    rig.probe.wait_until(lambda: all(arm.motors_are_off() for arm in arms), DESCENT)
+    end = time.monotonic() + AFTER_EXIT
+    rig.probe.wait_until(lambda: time.monotonic() > end)
 
 
 def _outcome(rig: Rig) -> str:
@@ -50,44 +75,75 @@ def _outcome(rig: Rig) -> str:
     if rig.have_ended:
         return "stopped"
     probe = rig.probe
-    return str(probe.fault if probe.state == "fault" else probe.state)
+    return str(probe.fault if probe.state == "fault" else probe.state or "inactive")
 
 
-def _result(case: FaultCase, rig: Rig, outcome: str, response: Response, log: list[str]) -> Result:
-    carried = outcome == "active"
+def _response(case: FaultCase, rig: Rig, records: np.ndarray, fault_time: float) -> Response:
+    if not len(records):
+        return Response()
+    return measure(records, fault_time, 1.0 / rig.rate, case.unreached, case.unpowered, case.steps_from)
+
+
+def _failures(case: FaultCase, rig: Rig, outcome: str, records: np.ndarray, fault_time: float) -> list[str]:
+    """Return what was unsafe."""
+    response, carried = _response(case, rig, records, fault_time), outcome in CARRYING
+    late = response.reaction is None or (case.limit is not None and response.reaction > case.limit)
+    must_react = case.limit is not None and not case.must_stay_off and len(case.unreached) < 4
     failures = {
-        "not let down": not carried and response.reaction is None,
+        "empty truth": not len(records),
+        "switched on": case.must_stay_off and bool(len(records)) and bool(records["on"].any()),
+        "not let down": not carried and response.off is None,
         "stayed carried": carried and case.limit is not None,
-        "too late": rig.timing is REAL and case.limit is not None and (response.reaction or 0.0) > case.limit,
-        "too fast": response.top_speed > MAX_SPEED,
+        f"{outcome} instead of {' or '.join(case.outcomes)}": bool(case.outcomes) and outcome not in case.outcomes,
+        "too late": rig.shipped_timeouts and must_react and late,
+        "too fast": response.top_speed > case.speed_limit,
         "torque step": response.excess > 0.0,
-        "enabled again": response.re_enabled,
-        "exception": any("Traceback" in line for line in log),
+        "driven by a motor": not carried and response.work > MAX_WORK,
+        "switched on again": response.re_enabled,
+        f"truth stops for {response.gap:.1f} s": response.gap > MAX_GAP,
     }
+    wrong = [failure for failure, failed in failures.items() if failed]
+    if len(records) and case.check(records[records["time"] >= fault_time]):
+        wrong.append(case.check(records[records["time"] >= fault_time]))
+    if isinstance(rig, BothArmsRig):
+        left = rig.left_truth.since(fault_time - BEFORE)
+        if not len(left) or measure(left, fault_time, 1.0 / rig.rate).top_speed > case.speed_limit:
+            wrong.append("left arm too fast")
+        if len(left) and measure(left, fault_time, 1.0 / rig.rate).excess > 0.0:
+            wrong.append("torque step of the left arm")
+    return wrong
+
+
+def _result(case: FaultCase, outcome: str, response: Response, failures: list[str]) -> Result:
+    carried = outcome in CARRYING
     return {
         "fault": case.name,
+        "stage": case.stage,
         "result": outcome,
-        "reaction_ms": None if carried else round((response.reaction or 0.0) * 1000),
+        "reaction_ms": None if carried or response.reaction is None else round(response.reaction * 1000),
         "limit_ms": case.limit and round(case.limit * 1000),
         "top_speed_rad_s": round(response.top_speed, 2),
+        "fastest_joint": response.fastest,
         "torque_step_nm": round(response.largest_step, 3),
-        "latched": "held" if carried else "NO" if response.re_enabled else "yes",
-        "unsafe": ", ".join(failure for failure, failed in failures.items() if failed),
+        "work_j": round(response.work, 3),
+        "off_s": None if carried or response.off is None else round(response.off, 1),
+        "unsafe": ", ".join(failures),
     }
 
 
 def not_run(case: FaultCase, error: BaseException) -> Result:
     """Return the result of a case that could not be run to its end."""
-    figures = dict.fromkeys(("reaction_ms", "limit_ms", "top_speed_rad_s", "torque_step_nm", "latched"))
+    figures = ("reaction_ms", "limit_ms", "top_speed_rad_s", "fastest_joint", "torque_step_nm", "work_j", "off_s")
     reason = (str(error) or type(error).__name__).splitlines()[0]
-    return {"fault": case.name, "result": "not run", **figures, "unsafe": f"not run: {reason}"}
+    unsafe = f"not run: {reason}"
+    return {"fault": case.name, "stage": case.stage, "result": "not run", **dict.fromkeys(figures), "unsafe": unsafe}
 
 
 class RigPool:
     """Keeps a rig for the next case of its type. A context manager: the rig ends with it."""
 
-    def __init__(self, folder: Path, timing: Mapping[str, Parameters] = REAL) -> None:
-        self._folder, self._timing = folder, timing
+    def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
+        self._folder, self._shipped_timeouts = folder, shipped_timeouts
         self._rig: Rig | None = None
         self._count = 0
 
@@ -120,7 +176,7 @@ class RigPool:
             self._count += 1
             folder = self._folder / str(self._count)
             folder.mkdir()
-            self._rig = case.rig(folder, self._timing)
+            self._rig = case.rig(folder, self._shipped_timeouts)
         return self._rig
 
     def _close(self) -> None:

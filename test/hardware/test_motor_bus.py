@@ -15,7 +15,7 @@ from exo_gravity.core.arm import ArmModel
 from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.motors import ENTER, EXIT, MOTORS, SET_ZERO, pack_reply, unpack_command
-from exo_gravity.core.safety import OFF, Drive
+from exo_gravity.core.drive import NOTHING, OFF, Drive
 from exo_gravity.hardware.motor_bus import MotorBus, open_bus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 
@@ -26,7 +26,7 @@ LINKS = ArmConfig().links
 WEIGHTLESS = ArmModel(LINKS.length, LINKS.cog, LINKS.mass, gravity=0.0)  # stays in place, however slow the machine is
 INTERFACE = os.environ.get("EXO_TEST_CAN_INTERFACE", "virtual")
 CHANNELS = (os.environ.get("EXO_TEST_CAN_CHANNEL", f"test_motor_bus_{n}") for n in count())
-ON = Drive((0.0, 0.0, 0.0, 0.0), 0.0, True)
+ON = Drive(NOTHING, NOTHING, True)
 
 
 def in_1_s() -> float:
@@ -76,7 +76,7 @@ def test_an_exchange_moves_the_simulated_arm(wires, device):
     before = device.arm.positions[3]
     end = time.monotonic() + 5.0
     while device.arm.positions[3] < before + 0.2 and time.monotonic() < end:
-        bus.exchange(Drive((0.0, 0.0, 0.0, 2.0), 0.0, True), in_1_s())
+        bus.exchange(Drive((0.0, 0.0, 0.0, 2.0), NOTHING, True), in_1_s())
     assert device.arm.positions[3] > before + 0.2
 
 
@@ -118,10 +118,10 @@ REPLY = pack_reply(AK60, 1, 0.25, 0.0, 0.0, 30, 0)
 @pytest.mark.parametrize(
     ("message", "kind"),
     [
-        (frame(1, MOTORS_OF_ARM[0].command(1.0, 0.0)), "command"),
-        (frame(1, ENTER), "command"),
+        (frame(1, MOTORS_OF_ARM[0].command(1.0, 0.0)), "foreign command"),
+        (frame(1, ENTER), "foreign command"),
         (frame(1, b""), "foreign frame"),
-        (frame(2, REPLY), "foreign frame"),
+        (frame(2, REPLY), "foreign command"),
         (frame(9, REPLY), "foreign frame"),
         (frame(1, REPLY[:5]), "foreign frame"),
         (frame(0, b"\x09" + REPLY[1:]), "foreign frame"),

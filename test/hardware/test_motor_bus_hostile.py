@@ -20,7 +20,8 @@ from exo_gravity.core.arm import ArmModel
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import JointSample, Limits
 from exo_gravity.core.motors import ENTER, EXIT, MOTORS, SET_ZERO
-from exo_gravity.core.safety import OFF
+from exo_gravity.core.drive import OFF
+from exo_gravity.hardware.frame_filter import TRIAL
 from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 
@@ -132,7 +133,9 @@ def test_among_foreign_frames_of_every_kind_only_the_motors_are_read(wires, nois
     noisy.close()
     bus.exchange(OFF, time.monotonic())  # reads the frames after the last reply
     assert sum(bus.ignored.values()) == noisy.foreign
-    assert set(bus.ignored) == {"command", "error frame", "extended, remote or FD frame", "foreign frame"}
+    # Until enough frames were sent to show that the bus does not echo, a frame like our own counts as an echo.
+    assert bus.ignored.pop("echo", 0) <= TRIAL
+    assert set(bus.ignored) == {"foreign command", "error frame", "extended, remote or FD frame", "foreign frame"}
 
 
 def test_a_frame_counts_as_a_reply_exactly_if_it_has_the_layout_of_one(wires):

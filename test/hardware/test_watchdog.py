@@ -1,115 +1,177 @@
-"""The watchdog: after the bridge has died, an arm with its motors on is let down; motors that are off stay off."""
+"""The watchdog: after the bridge has died, its arm is let down, whatever else died or froze."""
 
+from __future__ import annotations
+
+import fcntl
 import os
+import pickle
 import signal
 import subprocess
 import sys
-import threading
 import time
-from dataclasses import replace
-from itertools import count, pairwise
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import can
 import pytest
 
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.limits import Limits
-from exo_gravity.core.motors import ENTER, EXIT, MOTORS, unpack_command
-from exo_gravity.hardware.watchdog import Charge, let_down
-from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
-
-MOTORS_OF_ARM = tuple(JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1))
-LIMITS = Limits(("a", "b", "c", "d"), (-1.6,) * 4, (3.1,) * 4, (6.0,) * 4, (3.0, 9.0, 3.0, 3.0))
-QUICKLY = replace(LIMITS, fade_time=0.5, damping=1.5)
-CHANNELS = (f"test_watchdog_{n}" for n in count())
-EFFORT = (0.0, 3.0, 1.0, 0.5)
-PERIOD = 0.004
-# A process that its watchdog takes for a bridge that carries an arm.
-CARRIER = """
-import sys, time
-from exo_gravity.core.safety import OFF, Drive
+from exo_gravity.core.errors import BusError
+from exo_gravity.hardware.bus_lock import BusLock
+from exo_gravity.hardware.owned_bus import OwnedBus
 from exo_gravity.hardware.watchdog import Watchdog
-watchdog = Watchdog()
-while True:
-    print("carrying", flush=True)
-    watchdog.note(Drive((0.0,) * 4, 0.0, {powered}))
-    time.sleep(0.01)
-"""
+
+from .simulated_rig import SimulatedRig, wait_until
+
+pytestmark = pytest.mark.real_time
+REPO = Path(__file__).parents[2]
+
+
+class Carrier:
+    """A process that carries the arm of `rig` with a constant torque, and its watchdog."""
+
+    def __init__(self, rig: SimulatedRig, folder: Path, stderr: int = subprocess.PIPE) -> None:
+        path = folder / "charge.pickle"
+        path.write_bytes(pickle.dumps((rig.charge, rig.carrying)))
+        command = [sys.executable, "-m", "test.hardware.carrier", str(path)]
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen(command, cwd=REPO, stdin=pipe, stdout=pipe, stderr=stderr, text=True)
+        self.watchdog = int(self.process.stdout.readline() or 0)
+
+    def order(self, text: str) -> None:
+        self.process.stdin.write(f"{text}\n")
+        self.process.stdin.flush()
+
+    def kill(self, number: int = signal.SIGKILL) -> None:
+        self.process.send_signal(number)
+
+    def log(self) -> str:
+        """Return the log once carrier and watchdog have ended."""
+        return self.process.stderr.read()
+
+    def close(self) -> None:
+        self.process.kill()
+        if self.watchdog and is_running(self.watchdog):
+            os.kill(self.watchdog, signal.SIGKILL)
+        self.process.communicate()
+
+
+def is_running(pid: int) -> bool:
+    """Return whether the process runs; a zombie has ended."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
 
 
 @pytest.fixture
-def wire():
-    channel = next(CHANNELS)
-    device = SimulatedDevice(SimulatedArm(), [SimulatedMotor(joint) for joint in MOTORS_OF_ARM])
-    device.arm.reset((0.0, 0.9, 0.3, 0.3))
-    for joint, effort in zip(MOTORS_OF_ARM, EFFORT, strict=True):
-        device.exchange(joint.can_id, ENTER)
-        device.exchange(joint.can_id, joint.command(effort, 0.0))
-    bus, stop = can.Bus(interface="virtual", channel=channel), threading.Event()
-    thread = threading.Thread(target=device.run, args=(bus, stop.is_set))
-    thread.start()
-    with can.Bus(interface="virtual", channel=channel) as listener:
-        yield channel, device, listener
-        stop.set()
-        thread.join()
-    bus.shutdown()
-
-
-def test_the_let_down_starts_from_the_last_torques_and_ends_with_the_motors_off(wire):
-    channel, device, listener = wire
-    log = []
-    let_down(Charge(("virtual", channel, {}), MOTORS_OF_ARM, QUICKLY, PERIOD), EFFORT, log.append)
-    assert log == ["the arm is down, its motors are off"]
-    frames = [(m.arbitration_id, bytes(m.data)) for m in iter(lambda: listener.recv(0.0), None)]
-    torques = [unpack_command(MOTORS["AK80-9"], data).torque for to, data in frames if to == 2 and data[0] == 0x80]
-    assert torques[0] == pytest.approx(EFFORT[1], abs=0.25)
-    steps = [abs(after - before) for before, after in pairwise(torques)]
-    assert max(steps) <= LIMITS.max_effort_rate * PERIOD + 2 * 36.0 / 4095
-    assert ENTER not in [data for _, data in frames]
-    assert not any(motor.entered for motor in device.motors)
-    assert [data for to, data in frames if to == 2 and data[0] == 0xFF][-1] == EXIT
-
-
-def test_a_bus_that_cannot_be_opened_is_logged():
-    log = []
-    let_down(Charge(("no_such_interface", "x", {}), MOTORS_OF_ARM, QUICKLY, PERIOD), EFFORT, log.append)
-    assert len(log) == 1
-    assert "CAN bus no_such_interface x" in log[0]
+def rig(make_rig: Callable[..., SimulatedRig]) -> SimulatedRig:
+    return make_rig(interface="udp_multicast")
 
 
 @pytest.fixture
-def carry():
-    processes = []
+def carry(rig: SimulatedRig, tmp_path: Path) -> Iterator[Callable[..., Carrier]]:
+    carriers: list[Carrier] = []
 
-    def carry(powered):
-        command = [sys.executable, "-c", CARRIER.format(powered=powered)]
-        processes.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
-        assert processes[-1].stdout.readline() == "carrying\n"
-        return processes[-1]
+    def carry(**options: int) -> Carrier:
+        rig.switch_on(rig.carrying)  # or the arm would fall until the process has started
+        carriers.append(Carrier(rig, tmp_path, **options))
+        assert carriers[-1].watchdog, carriers[-1].log()
+        assert rig.motors_on == [True] * 4
+        return carriers[-1]
 
     yield carry
-    for process in processes:
-        process.kill()
-        process.wait()
-        process.stdout.close()
+    for carrier in carriers:
+        carrier.close()
 
 
-@pytest.mark.parametrize(("powered", "number"), [(True, signal.SIGSTOP), (False, signal.SIGKILL)])
-def test_a_frozen_bridge_is_killed_and_nothing_is_let_down_while_the_motors_are_off(carry, powered, number):
-    process = carry(powered)
-    os.kill(process.pid, number)
-    assert process.wait(30) == -signal.SIGKILL
-    for line in process.stdout:  # ends once the watchdog, which shares this output, has ended too
-        assert line == "carrying\n"
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_the_arm_of_a_killed_or_frozen_bridge_is_let_down(rig, carry, number):
+    carrier = carry()
+    carrier.kill(number)
+    assert carrier.process.wait(5) == -signal.SIGKILL
+    assert carrier.log().endswith("letting the arm down\nERROR the arm is down, its motors are off\n")
+    rig.assert_let_down()
 
 
-def test_a_stall_of_the_whole_machine_does_not_kill_the_bridge(carry):
-    process = carry(powered=True)
-    (children,) = Path(f"/proc/{process.pid}/task").glob(f"{process.pid}/children")
-    both = [process.pid, int(children.read_text().split()[0])]
+def test_a_bridge_can_hand_its_arm_over(rig, carry):
+    carrier = carry()
+    carrier.order("hand over")
+    assert carrier.process.wait(5) == -signal.SIGKILL
+    assert "handed the arm over and has been killed (a test)" in carrier.log()
+    rig.assert_let_down()
+
+
+def test_the_watchdog_of_a_killed_bridge_with_its_motors_off_ends_and_sends_nothing(rig, carry):
+    carrier = carry()
+    carrier.order("off")
+    wait_until(lambda: not any(rig.motors_on))
+    time.sleep(0.1)  # until the motors have confirmed it
+    carrier.kill()
+    assert carrier.log() == ""
+    wait_until(lambda: not is_running(carrier.watchdog))
+
+
+def test_a_full_pipe_of_the_log_does_not_delay_the_watchdog(rig, carry):
+    reader, writer = os.pipe()
+    carrier = carry(stderr=writer)
+    fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
+    os.write(writer, b"x" * 4096)
+    carrier.kill()
+    wait_until(lambda: not any(rig.motors_on))
+    wait_until(lambda: not is_running(carrier.watchdog))
+    os.close(reader)
+    os.close(writer)
+    rig.assert_let_down()
+
+
+def test_a_bus_whose_arm_is_being_let_down_is_held_by_the_watchdog(rig, carry):
+    carrier = carry()
+    carrier.kill()
+    with pytest.raises(BusError, match=rf"held by the watchdog \(PID {carrier.watchdog}\) of /right/can_bridge"):
+        BusLock(rig.charge.address, "another")
+    wait_until(lambda: not is_running(carrier.watchdog))
+    rig.assert_let_down()
+
+
+def test_after_bridge_and_watchdog_were_killed_the_next_owner_lets_the_arm_down_first(rig, carry):
+    carrier = carry()
+    os.kill(carrier.watchdog, signal.SIGSTOP)
+    carrier.kill()
+    os.kill(carrier.watchdog, signal.SIGKILL)
+    carrier.process.wait(5)
+    wait_until(lambda: not is_running(carrier.watchdog))
+    assert rig.motors_on == [True] * 4
+    log: list[str] = []
+    owned = OwnedBus(rig.charge, "the next owner", log.append)
+    owned.close()
+    assert log[-1] == "the arm is down, its motors are off"
+    rig.assert_let_down()
+
+
+def test_a_bridge_lives_on_after_the_whole_machine_has_stalled(carry):
+    carrier = carry()
     for number in (signal.SIGSTOP, signal.SIGCONT):
-        for pid in both:
+        for pid in (carrier.process.pid, carrier.watchdog):
             os.kill(pid, number)
-        time.sleep(0.3)  # more than three times the watchdog's `FROZEN`, both stopped and running
-    assert process.poll() is None
+        time.sleep(0.3)  # several times FROZEN, both stopped and running
+    assert carrier.process.poll() is None
+
+
+def test_a_frozen_watchdog_is_noticed_and_recovers(rig):
+    lock = BusLock(rig.charge.address, "a test")
+    watchdog = Watchdog(lock, rig.charge)
+
+    def is_alive_after(seconds: float) -> bool:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end and watchdog.alive:
+            time.sleep(0.05)
+        return watchdog.alive
+
+    wait_until(lambda: lock.notes.heartbeat)
+    assert is_alive_after(0.5)
+    os.kill(watchdog.pid, signal.SIGSTOP)
+    assert not is_alive_after(0.5)
+    os.kill(watchdog.pid, signal.SIGCONT)
+    wait_until(lambda: watchdog.alive)
+    watchdog.close()
+    assert not watchdog.alive
+    lock.release()

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,14 +13,16 @@ import numpy as np
 import pytest
 import rclpy
 import yaml
+from geometry_msgs.msg import Vector3Stamped
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.compensator import LONGEST_STEP
 from exo_gravity.core.control_params import CAN_BRIDGE
+from exo_gravity.core.tilt import Tilt
 from exo_gravity.core.wearer import Wearer
-from exo_gravity.nodes.conversions import to_nanoseconds
+from exo_gravity.nodes.conversions import to_nanoseconds, to_time
 
 from ..support.joint_state_feeder import PARTS, POSE, JointStateFeeder
 from ..support.launched_nodes import NO_IMU
@@ -83,6 +88,74 @@ def test_a_thousand_valid_and_invalid_changes_neither_step_the_torque_nor_stop_t
     excess, step_count = largest_excess(commands, rate=50.0)
     assert excess <= 1e-9 and step_count > 300
     assert np.ptp([command.effort for command in commands], axis=0).max() > 2.0  # the torque did change
+
+
+class TiltFeeder:
+    """Publishes every 10 ms, from a thread, the tilt of a trunk that bows by `bow` rad.
+
+    lag: age of the stamps in s. speed: rad/s at which the bow grows, up to 180 degrees.
+    """
+
+    def __init__(self, node: Any, bow: float) -> None:
+        self.bow = bow
+        self.lag = self.speed = 0.0
+        self._publisher = node.create_publisher(Vector3Stamped, "/imu/pitch_yaw", 1)
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._publish)
+        self._thread.start()
+
+    def _publish(self) -> None:
+        message = Vector3Stamped()
+        last = time.monotonic()
+        while not self._stopping.wait(0.01):
+            now = time.monotonic()
+            self.bow, last = min(math.pi, self.bow + self.speed * (now - last)), now
+            message.header.stamp = to_time(time.time_ns() - round(self.lag * 1e9))
+            flipped = self.bow > math.pi / 2
+            message.vector.y = math.pi - self.bow if flipped else self.bow
+            message.vector.x = math.pi if flipped else 0.0
+            self._publisher.publish(message)
+
+    def close(self) -> None:
+        self._stopping.set()
+        self._thread.join()
+
+
+@pytest.fixture
+def tilt(probe: RosProbe) -> Iterator[TiltFeeder]:
+    """A feeder of the tilt of a trunk that bows by 0.3 rad."""
+    feeder = TiltFeeder(probe.node, 0.3)
+    yield feeder
+    feeder.close()
+
+
+def test_a_tilt_is_believed_by_its_stamp_and_not_by_its_arrival(launch, probe, feed, tilt):
+    launch(without=OTHER_NODES)
+    feed()
+    expected = gravity_torque(ROBOT, POSE, Tilt.of("right", 0.3).direction)
+    commands = probe.effort_commands
+    probe.wait_until(lambda: commands and commands[-1].effort and np.allclose(commands[-1].effort, expected, atol=1e-9))
+    for lag, reason in (
+        (0.7, "older than 500 ms by its stamp: the IMU driver lags"),
+        (3600.0, "age of the trunk tilt by its stamp must be from -0.05 to 1 s: synchronise the clocks"),
+        (-3600.0, "synchronise the clocks"),
+    ):
+        tilt.lag = lag
+        probe.wait_until(lambda reason=reason: probe.status_contains("compensator", reason))
+        assert not commands[-1].effort
+        tilt.lag = 0.0
+        probe.wait_until(lambda: probe.status_contains("compensator", "compensating"))
+
+
+def test_a_trunk_that_bows_past_90_degrees_stays_compensated(launch, probe, feed, tilt):
+    launch(without=OTHER_NODES)
+    feed()
+    probe.wait_until(lambda: probe.status_contains("compensator", "compensating"))
+    begin = len(probe.effort_commands)
+    tilt.speed = 1.0
+    lying = gravity_torque(ROBOT, POSE, (0.0, 0.0, -1.0))
+    probe.wait_until(lambda: np.allclose(probe.effort_commands[-1].effort or math.nan, lying, atol=1e-6))
+    assert all(command.effort for command in probe.effort_commands[begin:])
 
 
 def write_two_compensators(path: Path, supports: Mapping[str, float]) -> Path:

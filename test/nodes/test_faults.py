@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from ..faults.cases import CASES, FaultCase
+from ..faults.cases import CASES
+from ..faults.fault_case import FaultCase
 from ..faults.runner import RigPool
-from ..support.launched_nodes import SIMULATED
 
 pytestmark = pytest.mark.real_time
 
@@ -17,7 +17,7 @@ CHOSEN = [case for case in CASES if case.in_tests]
 
 @pytest.fixture(scope="module")
 def pool(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RigPool]:
-    with RigPool(tmp_path_factory.mktemp("faults"), SIMULATED) as pool:
+    with RigPool(tmp_path_factory.mktemp("faults"), shipped_timeouts=False) as pool:
         yield pool
 
 

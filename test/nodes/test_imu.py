@@ -77,7 +77,7 @@ class ImuNode:
     def reports(self, text):
         return text in self.status.message
 
-    def send(self, stamp, rate=(0.0, 0.0, 0.0), acceleration=(0.0, 0.0, G), orientation=None):
+    def send(self, stamp, rate=(0.0, 0.0, 0.0), acceleration=(0.0, 0.0, G), orientation=None, noise=1e-9):
         """Publish the sample of `stamp` s; wait while too many are in flight."""
         message = Imu()
         message.header.stamp = to_time(round(stamp * 1e9))
@@ -86,8 +86,9 @@ class ImuNode:
         q = message.orientation
         q.x, q.y, q.z, q.w = map(float, UPRIGHT if orientation is None else orientation)
         message.orientation_covariance[0] = -1.0 if orientation is None else 0.0
-        self.publisher.publish(message)
         self.sent += 1
+        message.linear_acceleration.x += noise * (-1) ** self.sent
+        self.publisher.publish(message)
         self._number[round(stamp * 1e9)] = self.sent
         self.wait_until(lambda: self.sent - self.received < AHEAD)
 
@@ -143,6 +144,28 @@ def test_silence_is_an_error_after_which_no_tilt_is_published_until_the_estimate
     imu.wait_until(lambda: imu.received == imu.sent)
     imu.wait_until(lambda: imu.reports("no samples"))
     assert round((stamp + 0.5) * 1e9) not in imu.tilts
+
+
+def test_a_frozen_imu_with_new_stamps_gives_no_tilt_and_is_reported(imu):
+    stamp = imu.settle(3000.0)
+    for k in range(30):
+        imu.send(stamp + 0.01 * (k + 1), noise=0.0)
+    imu.wait_until(lambda: imu.reports("the IMU or its driver is frozen") and imu.received == imu.sent)
+    late = [number for number in imu.tilts if number > round((stamp + 0.11) * 1e9)]
+    assert not late and round((stamp + 0.09) * 1e9) in imu.tilts
+
+
+def test_samples_of_a_second_driver_are_an_error_and_give_no_tilt(imu):
+    stamp = imu.settle(4000.0)
+    first, imu.publisher = imu.publisher, imu.node.create_publisher(Imu, "/imu/data_raw", 50)
+    imu.wait_until(lambda: imu.publisher.get_subscription_count())
+    imu.send(stamp + 0.01, acceleration=(0.0, 1.0, 9.7))
+    imu.wait_until(lambda: imu.reports("more than one publisher of /imu/data_raw"))
+    assert imu.status.level == DiagnosticStatus.ERROR
+    imu.publisher = first
+    imu.send(stamp + 0.02)
+    imu.wait_until(lambda: imu.received == imu.sent)
+    assert max(imu.tilts) == round(stamp * 1e9)
 
 
 @pytest.mark.parametrize("imu", [MOUNTING.as_quat()], indirect=True, ids=["turned"])

@@ -19,7 +19,7 @@ from . import CONFIG
 
 Parameters = Mapping[str, Any]
 
-PORTS = itertools.count(20_000 + os.getpid() % 10_000)  # a bus for each, apart from those of other test runs
+PORTS = itertools.count(20_000 + 2 * (os.getpid() % 5_000), 2)  # two buses for each, apart from other test runs
 NO_IMU: Parameters = {"use_imu": False}  # for the compensator, which then starts without waiting for a tilt
 FAST: Parameters = {"sign_check_torque": 0.0, "ramp_time": 0.5, "fade_time": 0.5, "damping": 1.5}
 GENTLE: Parameters = {**FAST, "ramp_time": 1.0, "fade_time": 2.0, "damping": 5.0}
@@ -38,8 +38,9 @@ class LaunchedNodes:
     """The nodes of a parameter file, on a CAN bus of their own.
 
     base: the file in config/. without: nodes to leave out, by the last part of their names. port: of the bus, a new one
-    by default. timing: rate and time-outs by node, `SIMULATED` or `REAL`. changes: of the parameters, by node; they
-    come last, after `FAST` for the bridge. The attribute `ended_node` is what `Launcher.run` returned.
+    by default; the left arm's bus has the next one. timing: rate and time-outs by node, `SIMULATED` or `REAL`. changes:
+    of the parameters, by node, for both arms; they come last, after `FAST` for the bridge. truth: whether simulators log
+    the arm's true motion, at `truth_path`. The attribute `ended_node` is what `Launcher.run` returned.
     """
 
     def __init__(
@@ -49,19 +50,24 @@ class LaunchedNodes:
         without: Iterable[str] = (),
         port: int | None = None,
         timing: Mapping[str, Parameters] = SIMULATED,
+        truth: bool = False,
         **changes: Parameters,
     ) -> None:
         port = port or next(PORTS)
+        self.folder = folder
         content = yaml.safe_load((CONFIG / base).read_text())
         content = {name: entry for name, entry in content.items() if name.split("/")[-1] not in without}
         for name, entry in content.items():
             node, parameters = name.split("/")[-1], entry["ros__parameters"]
             if "can" in parameters:
-                parameters["can"]["options"]["port"] = port
+                parameters["can"]["options"]["port"] = port + name.startswith("/left")
+            if truth and node == "simulator":
+                parameters["truth"] = str(self.truth_path(name))
             parameters.update(FAST if node == "can_bridge" else {})
             parameters.update(timing.get(node, {}))
-        for node, values in changes.items():
-            content[full_name(node)]["ros__parameters"].update(values)
+            parameters.update(changes.get(node, {}))
+        unknown = set(changes) - {name.split("/")[-1] for name in content}
+        assert not unknown, f"changes of nodes that are left out: {unknown}"
         self.bus: dict[str, Any] = {
             "interface": "udp_multicast",
             "channel": "239.74.163.2",
@@ -89,8 +95,16 @@ class LaunchedNodes:
         return not self._thread.is_alive()
 
     def process(self, node: str) -> subprocess.Popen[str]:
-        """Return the process of a node by the last part of its name."""
+        """Return the process of a node by the last part of its name, or by its full name."""
         return self.launcher.process(full_name(node))
+
+    def pid(self, node: str) -> int:
+        """Return the ID of a node's process."""
+        return self.process(node).pid
+
+    def truth_path(self, node: str = "/right/simulator") -> Path:
+        """Return the path of a simulator's truth log."""
+        return self.folder / f"truth{node.replace('/', '_')}.bin"
 
     def stop(self) -> None:
         self.stopping.set()
@@ -107,15 +121,33 @@ class LauncherProcess(LaunchedNodes):
             stderr=subprocess.STDOUT,
             text=True,
         )
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
         return self
+
+    def _read(self) -> None:
+        for line in self.launcher_process.stdout or ():
+            self.log.append(line.rstrip())
 
     @property
     def have_ended(self) -> bool:
         return self.launcher_process.poll() is not None
 
+    def pid(self, node: str) -> int:
+        """Return the ID of a node's process, which must run."""
+        for child in children(self.launcher_process.pid):
+            if f"__node:={node}".encode() in Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0"):
+                return child
+        raise LookupError(f"{node} does not run")
+
     def stop(self) -> None:
         self.launcher_process.terminate()
-        self.log += self.launcher_process.communicate(timeout=60)[0].splitlines()
+        try:
+            self.launcher_process.wait(60)
+        except subprocess.TimeoutExpired:
+            self.launcher_process.kill()
+            raise
+        self._thread.join(60)
 
 
 def executable(name: str) -> str:
@@ -125,4 +157,13 @@ def executable(name: str) -> str:
 
 def full_name(node: str) -> str:
     """Return the full name of a node of the right arm, or of the IMU that serves both arms."""
+    if node.startswith("/"):
+        return node
     return "/imu" if node == "imu" else f"/right/{node}"
+
+
+def children(pid: int) -> list[int]:
+    """Return the IDs of the child processes of `pid`."""
+    return [
+        int(child) for task in Path(f"/proc/{pid}/task").iterdir() for child in (task / "children").read_text().split()
+    ]

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from exo_gravity.core.drive import OFF, State
 from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
-from exo_gravity.core.safety import OFF, SafetyMachine, State
+from exo_gravity.core.safety import SafetyMachine
 
 PERIOD = 0.004  # s
 LIMITS = Limits(
@@ -28,10 +29,11 @@ def reading(**changes: Any) -> JointSample:
 
 
 class SafetyRun:
-    """A machine and its inputs.
+    """A machine, its inputs, and the motors that it drives.
 
-    changes: of each joint's reading. silent: the joints whose motors do not reply. effort: Nm, with `effort_age` in s.
-    drive: the machine's last output. steps: the largest torque step in Nm of each cycle.
+    changes: of each joint's reading. silent: the joints whose motors do not reply. off: those whose motors have been
+    switched off behind the machine's back. effort: Nm, with `effort_age` in s. drive: the machine's last output.
+    applied: (4,) Nm, what the motors truly apply; a silent motor keeps its torque. steps: its largest step per cycle.
     """
 
     def __init__(self, **limits: Any) -> None:
@@ -42,7 +44,9 @@ class SafetyRun:
         self.effort: Sequence[float] | None = EFFORT
         self.effort_age = 0.002
         self.joints = [UNKNOWN] * 4
+        self.off: set[int] = set()
         self.drive = OFF
+        self.applied = [0.0] * 4
         self.steps: list[float] = []
 
     def cycle(self, seconds: float = PERIOD) -> SafetyRun:
@@ -51,10 +55,17 @@ class SafetyRun:
             self.now += PERIOD
             for i, change in enumerate(self.changes):
                 if i not in self.silent:
-                    self.joints[i] = reading(time=self.now - 0.001, **change)
-            before = self.drive
+                    damped = self.applied[i] - self.drive.damping[i] * change.get("velocity", 0.0)
+                    torque = 0.0 if i in self.off else damped
+                    self.joints[i] = reading(**{"time": self.now - 0.001, "effort": torque, **change})
+            before = list(self.applied)
             self.drive = self.machine.step(self.now, tuple(self.joints), self.effort, self.now - self.effort_age)
-            self.steps.append(max(abs(a - b) for a, b in zip(self.drive.effort, before.effort, strict=True)))
+            for i in range(4):
+                if i not in self.silent:
+                    self.applied[i] = self.drive.effort[i]
+                if self.drive.enter[i]:
+                    self.off.discard(i)
+            self.steps.append(max(abs(a - b) for a, b in zip(self.applied, before, strict=True)))
         return self
 
     def enable(self) -> SafetyRun:

@@ -61,10 +61,11 @@ def test_a_list_of_200_000_numbers_is_refused_at_once_and_named(refused):
     assert "/left/compensator gain = [1.0, 1.0" in error and "at most 100 entries; it has 200,000" in error
 
 
-def test_two_bridges_with_one_motor_on_the_same_bus_are_refused(refused):
+def test_two_bridges_on_the_same_bus_are_refused(refused):
     bus = yaml.safe_load(SIM.read_text())["/right/can_bridge"]["ros__parameters"]["can"]
-    error = refused({"/left/can_bridge": {"can": bus, "can_id": [9, 8, 7, 1]}})
-    assert "/right/can_bridge can_id = [1, 2, 3, 4]: must be different from the IDs of /left/can_bridge" in error
+    error = refused({"/left/can_bridge": {"can": bus, "can_id": [9, 8, 7, 5]}})
+    assert "/right/can_bridge can = {'can.channel': '239.74.163.2'" in error
+    assert "must be different from the bus of /left/can_bridge: one arm per bus" in error
 
 
 def test_the_packaged_file_is_accepted():

@@ -212,6 +212,27 @@ def test_an_unfinished_trial_is_judged_up_to_its_end_and_gets_a_note(held):
     assert "let down at 15.0 s, before the script ended" in " ".join(printed(report).split())
 
 
+def test_a_killed_trial_is_not_said_to_have_been_let_down(tmp_path, capsys):
+    """The bag of a trial that is killed while the arm is carried, in its second hold."""
+    recording = made.trial(POSES, hold=6.0, rate=100.0)
+    types = made.STORE.types
+    zero = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
+    pair = types["diagnostic_msgs/msg/KeyValue"](key="state", value="active")
+    kind = "diagnostic_msgs/msg/DiagnosticArray"
+    entry = types["diagnostic_msgs/msg/DiagnosticStatus"](0, "right/can_bridge", "active", "", [pair])
+    data = bytes(made.STORE.serialize_cdr(types[kind](types["std_msgs/msg/Header"](zero, ""), [entry]), kind))
+    states = [("/diagnostics", kind, made.START + n * 5 * 10**8, data) for n in range(24)]
+    content = sorted([*made.messages(recording), *states], key=lambda item: item[2])
+    bag = made.write_bag(tmp_path / "killed", [item for item in content if item[2] < made.START + 12 * 10**9])
+    assert main([str(bag), "--output", str(tmp_path / "out")]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "let down at" not in text and " let down " not in text.replace("how the arm was let down", "")
+    assert "right: the recording ends at 12.0 s, before the script ended" in text
+    assert "It held, as far as it was recorded." in text
+    assert "as far as it was recorded" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "let down" not in (tmp_path / "out" / "motions.csv").read_text(encoding="utf-8")
+
+
 def test_a_finished_trial_gets_no_note(held):
     (whole,) = held.bag.recordings
     assert not analyse(bag_of(dataclasses.replace(whole, carried=((0.0, whole.time[-1]),)))).notes

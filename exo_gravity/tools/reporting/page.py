@@ -83,13 +83,13 @@ def arm_html(recording: Recording, analysis: TrialAnalysis, figures: Iterable[st
     )
 
 
-def page_html(title: str, when: str, verdict: Sequence[str], sections: Iterable[str], ending: str) -> str:
-    """Return the page. when: the line below the title. verdict: the failures, empty if the arm held."""
-    reasons = "".join(f"<li>{escape(sentence)}</li>" for sentence in verdict)
+def page_html(title: str, when: str, failures: Sequence[str], held: str, sections: Iterable[str], ending: str) -> str:
+    """Return the page. when: the line below the title. held: the verdict if there are no `failures`."""
+    reasons = "".join(f"<li>{escape(sentence)}</li>" for sentence in failures)
     banner = (
         f'<div class="verdict not"><b>It did not hold.</b><ul>{reasons}</ul></div>'
-        if verdict
-        else '<div class="verdict"><b>It held.</b></div>'
+        if failures
+        else f'<div class="verdict"><b>{escape(held)}</b></div>'
     )
     return (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'

@@ -55,6 +55,13 @@ class Report:
         return 2 if self.bag.problems else int(bool(self.failures))
 
     @property
+    def held(self) -> str:
+        """The verdict on arms that held, which covers no more than was recorded."""
+        if self.bag.problems:
+            return "It held, as far as the recording could be read."
+        return "It held, as far as it was recorded." if self.bag.is_partial else "It held."
+
+    @property
     def title(self) -> str:
         """Name of the trial, arms and date: 'demo, right arm, 2026-03-14'."""
         path = self.bag.path.resolve()
@@ -91,8 +98,9 @@ def _reservations(bag: Bag) -> Iterator[str]:
         yield f"{names}: the recording does not show when the arm was carried: letting it down may count as a slip"
     for recording in bag.recordings:
         if recording.steps and recording.carried and recording.steps[-1].end > recording.carried[-1][1] + EARLY:
-            end = f"{recording.carried[-1][1]:.1f} s"
-            yield f"{recording.name}: let down at {end}, before the script ended: only the time until then counts"
+            end = recording.carried[-1][1]
+            what = "the recording ends" if end >= float(recording.time[-1]) else "let down"
+            yield f"{recording.name}: {what} at {end:.1f} s, before the script ended: only the time until then counts"
 
 
 def write(report: Report, folder: str | Path) -> list[Path]:
@@ -130,8 +138,7 @@ def print_report(report: Report, console: Console | None = None) -> None:
         console.print(f"[red]Not reported:[/] {escape(problem)}.")
     for sentence in report.failures:
         console.print(f"[red]{escape(sentence)}.[/]")
-    held = "It held, as far as the recording could be read." if report.bag.problems else "It held."
-    console.print("[red bold]It did not hold.[/]" if report.failures else f"[green bold]{held}[/]")
+    console.print("[red bold]It did not hold.[/]" if report.failures else f"[green bold]{report.held}[/]")
 
 
 def report_console() -> Console:
@@ -168,4 +175,4 @@ def _page(report: Report, sections: Sequence[str]) -> str:
         + page.parameters_html(bag.parameters)
     )
     when = f"{report.start:%Y-%m-%d %H:%M:%S}, {length:.0f} s, {bag.path}"
-    return page.page_html(report.title, when, report.failures, sections, ending)
+    return page.page_html(report.title, when, report.failures, report.held, sections, ending)

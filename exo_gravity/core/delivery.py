@@ -1,0 +1,114 @@
+"""Checks that motors apply the torque they were commanded, from the torque in their replies.
+
+A motor that has been switched off, has restarted, missed its ENTER, or obeys another commander still replies, but with
+another torque. The expected torque is effort - damping * velocity. Single readings are noisy, so the difference is
+smoothed over a few of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from exo_gravity.core.faults import Fault, FaultCode
+from exo_gravity.core.limits import JointSample, Limits
+
+ABSOLUTE = 0.2  # Nm: 27 torque codes of an AK60-6, above the noise of its current sensor
+RELATIVE = 0.25  # of the expected torque
+SMOOTHING = 0.02  # s, time constant
+PERSISTENCE = 0.01  # s for which the smoothed difference must stay too large
+
+TEST_TORQUE = 0.4  # Nm, each way, that shows that a motor is on
+TEST_TIME = 0.06  # s, each way
+TEST_SHARE = 0.5  # of the test torque that must appear in the replies
+
+
+class DeliveryMonitor:
+    """Compares commanded with replied torque, joint by joint. missing: (4,) whether a joint does not deliver."""
+
+    def __init__(self, limits: Limits, peak_effort: Sequence[float]) -> None:
+        self._limits = limits
+        self._peak = tuple(peak_effort)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past, for example while the motors are off."""
+        count = len(self._peak)
+        self._difference = [0.0] * count
+        self._expected = [0.0] * count
+        self._bad_time = [0.0] * count
+        self._last_time = [0.0] * count
+
+    @property
+    def missing(self) -> tuple[bool, ...]:
+        """Whether each joint (4,) does not deliver its torque."""
+        return tuple(time >= PERSISTENCE for time in self._bad_time)
+
+    def step(
+        self, dt: float, joints: Sequence[JointSample], effort: Sequence[float], damping: Sequence[float]
+    ) -> Fault | None:
+        """Take the replies `joints` to the last commands, `effort` (4,) Nm and `damping` (4,) Nm s/rad.
+
+        Returns a fault if a joint does not deliver its torque. A joint without a new reply keeps its state.
+        """
+        share = min(1.0, dt / SMOOTHING)
+        for i, joint in enumerate(joints):
+            if not joint.time > self._last_time[i]:
+                continue
+            self._last_time[i] = joint.time
+            expected = effort[i] - damping[i] * joint.velocity
+            expected = max(-self._peak[i], min(self._peak[i], expected))
+            self._difference[i] += share * (joint.effort - expected - self._difference[i])
+            self._expected[i] += share * (expected - self._expected[i])
+            tolerance = ABSOLUTE + RELATIVE * abs(self._expected[i])
+            self._bad_time[i] = self._bad_time[i] + dt if abs(self._difference[i]) > tolerance else 0.0
+        for i, is_missing in enumerate(self.missing):
+            if is_missing:
+                reply = self._expected[i] + self._difference[i]
+                reason = f"{self._limits.joint_names[i]}: {self._expected[i]:.2f} Nm commanded, {reply:.2f} Nm replied"
+                return Fault(FaultCode.TORQUE_NOT_DELIVERED, reason)
+        return None
+
+
+class SwitchOnCheck:
+    """Checks that all four motors are on: a short push each way, under damping, must appear in their replies.
+
+    effort: (4,) Nm to apply now. done: whether the check has ended. Joints with `torque` 0 are skipped.
+    """
+
+    def __init__(self, limits: Limits) -> None:
+        self.done = False
+        self._names = limits.joint_names
+        self._torque = [min(TEST_TORQUE, most) for most in limits.max_effort]
+        self._rate = limits.max_effort_rate
+        self.effort = [0.0] * len(self._torque)
+        self._elapsed = 0.0
+        self._sums = [[0.0, 0.0] for _ in self._torque]
+        self._counts = [0, 0]
+
+    def step(self, dt: float, joints: Sequence[JointSample]) -> Fault | None:
+        """Advance by `dt` s with the replies to the last commands; return the fault that they show, if any."""
+        self._elapsed += dt
+        phase, into = divmod(self._elapsed, TEST_TIME)
+        if phase >= 2:
+            return self._finish(dt)
+        if into > 0.4 * TEST_TIME:
+            self._counts[int(phase)] += 1
+            for sums, joint in zip(self._sums, joints, strict=True):
+                sums[int(phase)] += joint.effort
+        for i, torque in enumerate(self._torque):
+            self._approach(i, torque if phase == 0 else -torque, dt)
+        return None
+
+    def _finish(self, dt: float) -> Fault | None:
+        for i, (name, torque, sums) in enumerate(zip(self._names, self._torque, self._sums, strict=True)):
+            forward, backward = (total / max(1, count) for total, count in zip(sums, self._counts, strict=True))
+            if forward - backward < TEST_SHARE * 2.0 * torque:
+                reason = f"{name}: the motor did not switch on: {torque:g} Nm commanded, {forward:.2f} Nm replied"
+                return Fault(FaultCode.TORQUE_NOT_DELIVERED, reason)
+            self._approach(i, 0.0, dt)
+        self.done = not any(self.effort)
+        return None
+
+    def _approach(self, i: int, target: float, dt: float) -> None:
+        step = self._rate * dt
+        self.effort[i] += max(-step, min(step, target - self.effort[i]))

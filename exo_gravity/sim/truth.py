@@ -1,0 +1,71 @@
+"""The true motion of the simulated arm, written to a file at every physics step, for a judge in another process.
+
+The file is a sequence of `RECORD`, the only description of the format. Records leave the process every `FLUSH_PERIOD`;
+what was written stays when the process is frozen or killed.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from exo_gravity.core.arm import JOINT_COUNT
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.sim.motor import SimulatedMotor
+
+# time: wall clock in s. position, velocity: of the joints, rad and rad/s. torque: of the motors on the joints, Nm.
+# damping: Nm s/rad, the part of that torque that is proportional to the velocity. frames: received by each motor so
+# far. on: whether each motor is on.
+RECORD = np.dtype(
+    [
+        ("time", "<f8"),
+        ("position", "<f4", JOINT_COUNT),
+        ("velocity", "<f4", JOINT_COUNT),
+        ("torque", "<f4", JOINT_COUNT),
+        ("damping", "<f4", JOINT_COUNT),
+        ("frames", "<u4", JOINT_COUNT),
+        ("on", "?", JOINT_COUNT),
+    ]
+)
+_ROW = struct.Struct(f"<d{4 * JOINT_COUNT}f{JOINT_COUNT}I{JOINT_COUNT}?")
+FLUSH_PERIOD = 0.02  # s
+
+
+class TruthLog:
+    """Writes the file at `path`. Raises ParameterError if it cannot be created."""
+
+    def __init__(self, path: str | Path) -> None:
+        try:
+            self._file = open(path, "wb", buffering=0)  # noqa: SIM115, open as long as the process runs
+        except OSError as error:
+            raise ParameterError("truth", str(path), f"a file that can be written ({error.strerror})") from None
+        self._rows = bytearray()
+        self._offset = 0.0  # wall clock minus simulated time, s
+        self._flushed = 0.0
+
+    def synchronise(self, now: float) -> None:
+        """Note that the simulated time `now` (s) is the present time."""
+        self._offset = time.time() - now
+
+    def note(
+        self,
+        now: float,
+        position: Sequence[float],
+        velocity: Sequence[float],
+        torque: Sequence[float],
+        motors: Sequence[SimulatedMotor],
+        frames: Sequence[int],
+    ) -> None:
+        """Append the state of the arm at the simulated time `now` (s); sequences are (4,)."""
+        stamp = now + self._offset
+        damping = [motor.damping for motor in motors]
+        entered = [motor.entered for motor in motors]
+        self._rows += _ROW.pack(stamp, *position, *velocity, *torque, *damping, *frames, *entered)
+        if abs(stamp - self._flushed) >= FLUSH_PERIOD:
+            self._flushed = stamp
+            self._file.write(self._rows)
+            self._rows.clear()

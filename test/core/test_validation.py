@@ -1,0 +1,56 @@
+"""Parameters of a bridge that are possible alone, but not together."""
+
+from __future__ import annotations
+
+import pytest
+
+from exo_gravity.core.control_params import CAN_BRIDGE, limits_of, motors_of
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.param_table import values_of
+from exo_gravity.core.validation import check_bridge
+
+
+def check(**given):
+    values = values_of(CAN_BRIDGE, {"can.interface": "virtual", "can.channel": "arm", **given})
+    check_bridge(values["rate"], motors_of(values), limits_of(values))
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {},
+        {"max_effort": [9.0, 18.0, 9.0, 9.0]},  # peak torque
+        {"max_effort": [6.75, 18.0, 9.0, 9.0], "torque_scale": [0.75, 1.0, 1.0, 1.0]},
+        {"home_tolerance": [0.523, 0.349, 0.523, 0.523]},
+        {"rate": 40.0},
+        {"rate": 25.0, "command_timeout": 0.08, "reply_timeout": 0.1},
+        {"rate": 200.0, "command_timeout": 0.01},
+    ],
+)
+def test_consistent_parameters_are_accepted(given):
+    check(**given)
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        (
+            {"max_effort": [18.0] * 4},
+            "max_effort = [18.0, 18.0, 18.0, 18.0]: must be at most the motors' peak torque, [9.0,",
+        ),
+        ({"max_effort": [3.0, 18.0, 3.0, 3.0], "torque_scale": [1.0, 0.9, 1.0, 1.0]}, "peak torque, [9.0, 16.2, 9.0"),
+        ({"max_effort": [6.0, 9.0, 3.0, 3.0], "torque_range": [5.0, 18.0, 15.0, 15.0]}, "peak torque, [5.0, 18.0, 9.0"),
+        ({"home_tolerance": [6.3] * 4}, "at most half a turn of each motor's rotor, [0.523, 0.349, 0.523, 0.523] rad"),
+        ({"home_tolerance": [0.5, 0.36, 0.5, 0.5]}, "home_tolerance = [0.5, 0.36, 0.5, 0.5]: must be"),
+        ({"rate": 39.0}, "rate = 39.0: must be at least 40 Hz: command_timeout = 0.05 s must span 2 periods"),
+        ({"rate": 30.0, "command_timeout": 0.1}, "at least 40 Hz: reply_timeout = 0.05 s must span 2 periods"),
+        (
+            {"rate": 20.0, "command_timeout": 0.1, "reply_timeout": 0.1},
+            "at least 25 Hz: the watchdog's time-out = 0.08 s must span 2 periods",
+        ),
+    ],
+)
+def test_contradicting_parameters_are_refused_with_both_values(given, sentence):
+    with pytest.raises(ParameterError) as caught:
+        check(**given)
+    assert sentence in str(caught.value)

@@ -1,0 +1,228 @@
+"""How faults are caused: signals to processes, faults of the simulated device, foreign messages and frames."""
+
+from __future__ import annotations
+
+import math
+import os
+import resource
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import can
+import yaml
+from geometry_msgs.msg import Vector3Stamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from sensor_msgs.msg import Imu, JointState
+
+from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.motors import MOTORS
+
+from ..support.launched_nodes import executable
+from ..support.load import start_frames, start_spin
+from .fault_case import Action
+from .rig import Rig
+
+FRAME_RATE = 3000  # random frames per second beside our 2,000: what two cores can receive in five Python processes
+MOTOR_2 = JointMotor(MOTORS["AK80-9"], 2, direction=-1)  # as in sim.yaml
+START_LIMIT = 15.0  # s for a process that must refuse its parameters
+FILE_SIZE_LIMIT = 50_000  # bytes
+
+
+def in_turn(*actions: Action) -> Action:
+    """Do one action after the other."""
+    return lambda rig: [action(rig) for action in actions] and None
+
+
+def pause(seconds: float) -> Action:
+    return lambda rig: time.sleep(seconds)
+
+
+def send_signal(node: str, number: int) -> Action:
+    return lambda rig: os.kill(rig.pid(node), number)
+
+
+def signal_watchdog(number: int) -> Action:
+    return lambda rig: os.kill(rig.watchdog, number)
+
+
+def signal_bridge_and_watchdog(number: int) -> Action:
+    def inject(rig: Rig) -> None:
+        for pid in (rig.watchdog, rig.pid("can_bridge")):
+            os.kill(pid, number)
+
+    return inject
+
+
+def kill_bridge_beside_frozen_watchdog(seconds: float) -> Action:
+    """Freeze the watchdog for `seconds` s, and kill the bridge meanwhile."""
+
+    def inject(rig: Rig) -> None:
+        watchdog = rig.watchdog
+        os.kill(watchdog, signal.SIGSTOP)
+        os.kill(rig.pid("can_bridge"), signal.SIGKILL)
+        time.sleep(seconds)
+        os.kill(watchdog, signal.SIGCONT)
+
+    return inject
+
+
+def simulator(**values: object) -> Action:
+    """Set parameters of the simulator."""
+
+    def inject(rig: Rig) -> None:
+        for name, value in values.items():
+            result = rig.probe.set_parameters("simulator", **{name: value})
+            assert result.successful, result.reason
+
+    return inject
+
+
+def enable(on: bool) -> Action:
+    return lambda rig: rig.probe.enable(on)
+
+
+def deactivate(rig: Rig) -> None:
+    request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
+    rig.probe.call(ChangeState, "/right/can_bridge/change_state", request)
+
+
+def publish(message_type: type, topic: str, make_message: Callable[[Rig], object]) -> Action:
+    """Publish the message for half a second, from a publisher that does not belong to the arm."""
+
+    def inject(rig: Rig) -> float:
+        publisher = rig.probe.node.create_publisher(message_type, topic, 1)
+        rig.probe.wait_until(lambda: publisher.get_subscription_count() > 0)
+        start = time.time()
+        for _ in range(50):  # a single message may be overwritten by the next regular one before it is read
+            publisher.publish(make_message(rig))
+            time.sleep(0.01)
+        rig.probe.node.destroy_publisher(publisher)
+        return start
+
+    return inject
+
+
+def states_at(position: list[float]) -> Callable[[Rig], JointState]:
+    """Joint states with this `position` in rad, otherwise like the arm's newest."""
+
+    def make_message(rig: Rig) -> JointState:
+        newest = rig.probe.joint_states[-1]
+        return JointState(header=newest.header, name=newest.name, position=position)
+
+    return make_message
+
+
+def tilt(pitch: float) -> Callable[[Rig], Vector3Stamped]:
+    def make_message(rig: Rig) -> Vector3Stamped:
+        message = Vector3Stamped()
+        message.header.stamp = rig.probe.node.get_clock().now().to_msg()
+        message.vector.y = pitch
+        return message
+
+    return make_message
+
+
+def raw_imu(rig: Rig) -> Imu:
+    """Return a sample of an IMU that lies on its side."""
+    message = Imu()
+    message.header.stamp = rig.probe.node.get_clock().now().to_msg()
+    message.orientation_covariance[0] = -1.0
+    message.linear_acceleration.x = 9.8
+    return message
+
+
+def random_frames(count: int, ids: Iterable[int]) -> Action:
+    def inject(rig: Rig) -> None:
+        sender = start_frames(rig.nodes[0].bus, count, FRAME_RATE, ids)
+        rig.probe.wait_until(lambda: sender.poll() is not None, 2 * count / FRAME_RATE + 30.0)
+        assert sender.returncode == 0
+
+    return inject
+
+
+def foreign_frames(data: bytes, rate: float = 1.0, seconds: float = 0.0) -> Action:
+    """Send `data` to motor 2 as another host would: once, or `rate` a second for `seconds` s."""
+
+    def inject(rig: Rig) -> float:
+        message = can.Message(arbitration_id=MOTOR_2.can_id, data=data, is_extended_id=False)
+        with can.Bus(**rig.nodes[0].bus) as bus:
+            wall, start = time.time(), time.monotonic()
+            for number in range(1 + int(rate * seconds)):
+                time.sleep(max(0.0, start + number / rate - time.monotonic()))
+                bus.send(message)
+        return wall
+
+    return inject
+
+
+def overload_processors(rig: Rig) -> None:
+    """Start four busy processes for each of two processors, for 3 s."""
+    for process in [start_spin(3.0) for _ in range(8)]:
+        process.wait()
+
+
+def set_impossible_parameters(rig: Rig) -> None:
+    bad: tuple[dict[str, Any], ...] = (
+        {"robot__mass": [-1.0] * 4},
+        {"robot__mass": [math.nan] * 4},
+        {"gain": [1.0] * 3},
+        {"mode": 7},
+        {"law": ""},
+    )
+    for values in bad:
+        assert not rig.probe.set_parameters("compensator", **values).successful
+
+
+def set_contradicting_parameters(rig: Rig) -> None:
+    """Set values that are each within their range but ask for too much together, live and at the start."""
+    live = rig.probe.set_parameters("compensator", atomically=True, gain=[2.0] * 4, gravity=25.0)
+    assert not live.successful, "gain 2 with gravity 25 was accepted"
+    for values in ({"max_effort": [18.0] * 4}, {"home_tolerance": [6.3] * 4}, {"rate": 20.0}):
+        code, log = run_bridge(rig, "/another", port_offset=1, **values)
+        assert code == 2, f"can_bridge started with {values}: {log[-1:]}"
+
+
+def start_second_bridge(namespace: str) -> Action:
+    """Start another bridge on the same bus: it must refuse to run."""
+
+    def inject(rig: Rig) -> None:
+        code, log = run_bridge(rig, namespace)
+        assert code not in (0, None), f"a second can_bridge ran on the same bus: {log[-1:]}"
+
+    return inject
+
+
+def run_bridge(rig: Rig, namespace: str, port_offset: int = 0, **changes: object) -> tuple[int | None, list[str]]:
+    """Run a second bridge on the rig's bus; return its exit code, None if it had to be ended, and its log."""
+    content = yaml.safe_load(rig.nodes[0].path.read_text())["/right/can_bridge"]
+    content["ros__parameters"].update(changes)
+    content["ros__parameters"]["can"]["options"]["port"] += port_offset
+    path = rig.folder / f"second_bridge_{time.monotonic_ns()}.yaml"
+    path.write_text(yaml.safe_dump({f"{namespace}/can_bridge": content}))
+    command = [executable("can_bridge"), "--ros-args", "-r", f"__ns:={namespace}", "--params-file", str(path)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        output, code = process.communicate(timeout=START_LIMIT)[0], process.returncode
+    except subprocess.TimeoutExpired:
+        process.terminate()
+        try:
+            output, code = process.communicate(timeout=START_LIMIT)[0], None
+        except subprocess.TimeoutExpired:
+            process.kill()
+            output, code = process.communicate()[0], None
+    return code, output.splitlines()
+
+
+def record_on_a_full_disk(rig: Rig) -> None:
+    """Record the arm for 2 s with a recorder that may write only a small file."""
+    folder: Path = rig.folder / f"recording_{time.monotonic_ns()}"
+    recorder = subprocess.Popen([executable("recorder"), "--ros-args", "-p", f"output:={folder}"])
+    resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (FILE_SIZE_LIMIT, FILE_SIZE_LIMIT))
+    time.sleep(4.0)
+    recorder.terminate()
+    recorder.wait(30.0)

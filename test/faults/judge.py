@@ -1,0 +1,103 @@
+"""Judges how an arm came down after a fault, by the simulated arm's true motion, not by the frames on its bus."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from exo_gravity.core.motors import MOTORS
+
+MAX_SPEED = 1.0  # rad/s, of every joint
+MAX_EFFORT_RATE = 50.0  # Nm/s
+MAX_WORK = 0.3  # J that one motor may put into the arm after a fault
+RESOLUTION = 2 * MOTORS["AK80-9"].torque_range * 2 / 0xFFF  # Nm, two codes of a command
+MAX_GAP = 0.2  # s between two records: a longer gap means that the simulated device did not run
+
+
+@dataclass
+class Response:
+    """What the arm did since the fault.
+
+    reaction: s until every motor that can be reached is off or applies damping, None if one never does. top_speed:
+    rad/s of `fastest` (joint 1..4). largest_step: Nm of a motor's torque within 1 ms, apart from damping times speed;
+    switching off counts. excess: Nm by which the worst step exceeds what `MAX_EFFORT_RATE` allows for the frames that
+    the motor received in that time. work: J that the busiest motor put into the arm. off: s until the last motor was
+    off, None if one is on at the end. re_enabled: whether a motor was switched on after all had been off. gap: s, the
+    longest time without a record.
+    """
+
+    reaction: float | None = None
+    top_speed: float = 0.0
+    fastest: int = 0
+    largest_step: float = 0.0
+    excess: float = 0.0
+    work: float = 0.0
+    off: float | None = None
+    re_enabled: bool = False
+    gap: float = 0.0
+
+
+def measure(
+    records: np.ndarray,
+    fault_time: float,
+    period: float,
+    unreached: Collection[int] = (),
+    unpowered: Collection[int] = (),
+    steps_from: float = 0.0,
+) -> Response:
+    """Return the response to a fault at `fault_time` (wall clock, s) of a control loop with `period` s.
+
+    records: of sim/truth.py, from shortly before the fault on; at least one. unreached: joints (0..3) whose motors no
+    frame can reach. unpowered: joints that fall because their motors have no power; their speed does not count.
+    steps_from: s after the fault from which on torque steps count, where the fault itself is a step.
+    """
+    since = records["time"] - fault_time
+    after = since >= 0.0
+    on = records["on"] & after[:, None]
+    speed = np.abs(records["velocity"]) * after[:, None]
+    speed[:, list(unpowered)] = 0.0
+    step, excess = _steps(records, period)
+    step, excess = step[since[1:] >= steps_from], excess[since[1:] >= steps_from]
+    powered = np.flatnonzero(on.any(axis=1))
+    off_at = powered[-1] + 1 if len(powered) else 0
+    dark = np.flatnonzero(after & ~records["on"].any(axis=1))
+    return Response(
+        reaction=_reaction(records, since, unreached),
+        top_speed=float(speed.max(initial=0.0)),
+        fastest=int(speed.max(axis=0, initial=0.0).argmax()) + 1,
+        largest_step=float(step.max(initial=0.0)),
+        excess=float(excess.max(initial=0.0)),
+        work=float(_work(records, after).max(initial=0.0)),
+        off=None if off_at >= len(records) else max(0.0, float(since[off_at])),
+        re_enabled=bool(len(dark) and len(powered) and powered[-1] > dark[0]),
+        gap=float(np.diff(records["time"]).max(initial=0.0)),
+    )
+
+
+def _reaction(records: np.ndarray, since: np.ndarray, unreached: Collection[int]) -> float | None:
+    """Return the time in s until the last of the reached motors is off or applies damping."""
+    reached = [joint for joint in range(4) if joint not in unreached]
+    if not reached:
+        return None
+    safe = (~records["on"] | (records["damping"] > 0.0))[:, reached].all(axis=1) & (since >= 0.0)
+    return float(since[safe.argmax()]) if safe.any() else None
+
+
+def _steps(records: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the torque steps (n - 1, 4) between records in Nm, and by how much each exceeds what is allowed."""
+    effort = records["torque"] + records["damping"] * records["velocity"]  # the part that damping does not explain
+    step = np.abs(np.diff(effort, axis=0))
+    on = records["on"]
+    switched_off = on[:-1] & ~on[1:]
+    step[switched_off] = np.abs(records["torque"][:-1])[switched_off]
+    frames = np.maximum(1, np.diff(records["frames"].astype(int), axis=0))
+    return step, step - (MAX_EFFORT_RATE * period * frames + RESOLUTION)
+
+
+def _work(records: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Return the work (4,) in J that each motor put into the arm; braking does not offset it."""
+    power = np.maximum(0.0, records["torque"] * records["velocity"])[after]
+    dt = np.minimum(MAX_GAP, np.diff(records["time"], append=records["time"][-1:]))[after]
+    return np.asarray(power.T @ dt)

@@ -1,0 +1,172 @@
+"""The rig on which faults are tried: nodes as processes that carry a simulated arm, and the arm's true motion.
+
+The simulated device always has its own launcher: it outlives the other nodes, so that the judge sees the arm after its
+motors were switched off.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import yaml
+
+from exo_gravity.tools.inputs.parameter_file import load
+
+from ..support.launched_nodes import GENTLE, REAL, SIMULATED, LaunchedNodes, Parameters, children, full_name
+from ..support.ros_probe import RosProbe
+from ..support.truth import Truth
+
+HORIZONTAL = (0.0, 1.5, 0.0, 0.3)  # rad; joint 2 carries 3.8 Nm, joint 3 0.2 Nm
+NEAR = 0.15  # rad from the pose, in which the arm need not be moved again
+CARRY_LIMIT = 60.0  # s for the nodes to start and bring the arm to a stage
+SIMULATOR = ("simulator",)
+CARRYING = ("active", "ramping in", "proving signs")
+
+
+class Rig:
+    """Nodes that carry the arm in `pose`, with a probe and the arm's true motion. End it with `close`.
+
+    shipped_timeouts: whether the nodes have their default time-outs, or longer ones for a busy machine.
+    bridge, compensator, simulator: the nodes' parameters, apart from those of the configuration `base`.
+    """
+
+    base = "sim.yaml"
+    rate = 250.0  # Hz
+    pose: Sequence[float] = HORIZONTAL
+    bridge: ClassVar[Parameters] = {}
+    compensator: ClassVar[Parameters] = {}
+    simulator: ClassVar[Parameters] = {}
+
+    def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
+        self.folder, self.shipped_timeouts = folder, shipped_timeouts
+        self.script = self.write_script("pose", [{"move": list(self.pose), "over": 2.0}, {"hold": 600.0}])
+        self.probe = RosProbe()
+        device = self._device_nodes()
+        self.nodes = [*self._make_nodes(device.bus["port"]), device]
+        self.truth = Truth(device.truth_path())
+        self._watchdogs: set[int] = set()
+        for nodes in reversed(self.nodes):
+            nodes.start()
+
+    @property
+    def timing(self) -> Mapping[str, Parameters]:
+        """Rate and time-outs of the nodes."""
+        return REAL if self.shipped_timeouts else SIMULATED
+
+    def write_script(self, name: str, steps: list[dict[str, Any]]) -> Path:
+        """Write a trial script and return its path."""
+        path = self.folder / f"{name}.yaml"
+        path.write_text(yaml.safe_dump({"name": name, "steps": steps}))
+        return path
+
+    def _device_nodes(self) -> LaunchedNodes:
+        without = ("can_bridge", "compensator", "imu")
+        return self._nodes(without=without, truth=True, simulator=self.simulator)
+
+    def _make_nodes(self, port: int) -> list[LaunchedNodes]:
+        """Return the nodes of each launcher apart from the simulator; the first one has the bridge."""
+        bridge = {**GENTLE, "rate": self.rate, **self.bridge}
+        return [self._nodes(without=SIMULATOR, port=port, can_bridge=bridge, compensator=self.compensator)]
+
+    def _nodes(self, **options: Any) -> LaunchedNodes:
+        return LaunchedNodes(self.folder, base=self.base, timing=self.timing, **options)
+
+    def bring_to(self, stage: str) -> None:
+        """Clear what the last fault left and bring the arm to `stage`, a state of the bridge, in several attempts.
+
+        Raises Timeout after `CARRY_LIMIT`.
+        """
+        with self.probe.time_limit(CARRY_LIMIT):
+            self._wait_for_nodes()
+            if stage in ("checking", "proving signs", "ramping in"):
+                self._start_over(stage)
+                return
+            while not self._is_at_pose():
+                self.probe.bring_to(self.script)
+                self._wait_for_states(self.rate / 4)
+            if stage == "letting down":
+                assert self.probe.enable(False).success
+                self.probe.wait_until(lambda: abs(self.true_velocity(1)) > 0.2)
+            self._note_watchdogs()
+
+    def _wait_for_states(self, count: float) -> None:
+        seen = len(self.probe.joint_states)
+        self.probe.wait_until(lambda: len(self.probe.joint_states) > seen + count)
+
+    def _wait_for_nodes(self) -> None:
+        probe = self.probe
+        probe.wait_until(lambda: self.have_ended or (probe.joint_states and probe.effort_commands))
+        assert not self.have_ended, f"the nodes ended: {self.log[-5:]}"
+
+    def _is_at_pose(self) -> bool:
+        newest = self.truth.newest()
+        is_near = newest is not None and np.abs(newest["position"] - self.pose).max() < NEAR
+        return self.probe.state == "active" and bool(is_near)
+
+    def _start_over(self, stage: str) -> None:
+        """Let the arm hang with its motors off, make its signs unproven, and enable it up to `stage`."""
+        probe = self.probe
+        probe.wait_until(lambda: probe.state not in (None, "checking"))
+        if probe.state in CARRYING:
+            assert probe.enable(False).success
+        probe.wait_until(lambda: self.truth.motors_are_off() and probe.state in ("disabled", "fault"))
+        for silent in (True, False):
+            probe.set_parameters("simulator", fault__bus_silent=silent)
+            time.sleep(0.2)
+        if probe.state == "fault":
+            assert probe.trigger("clear_fault").success
+        assert probe.enable(True).success
+        probe.wait_until(lambda: probe.state == stage)
+        self._note_watchdogs()
+
+    def true_velocity(self, joint: int) -> float:
+        """Return the newest velocity in rad/s of `joint` (0..3)."""
+        newest = self.truth.newest()
+        return 0.0 if newest is None else float(newest["velocity"][joint])
+
+    def process(self, node: str) -> subprocess.Popen[str]:
+        """Return the process of a node by the last part of its name."""
+        return self._nodes_of(node).process(node)
+
+    def pid(self, node: str) -> int:
+        """Return the ID of a node's process."""
+        return self._nodes_of(node).pid(node)
+
+    @property
+    def watchdog(self) -> int:
+        """The ID of the process of the bridge's watchdog."""
+        return children(self.pid("can_bridge"))[0]
+
+    def _nodes_of(self, node: str) -> LaunchedNodes:
+        return next(nodes for nodes in self.nodes if full_name(node) in load(nodes.path))
+
+    def _note_watchdogs(self) -> None:
+        self._watchdogs.update(children(self.pid("can_bridge")))
+
+    @property
+    def have_ended(self) -> bool:
+        """Whether the nodes have ended."""
+        return self.nodes[0].have_ended
+
+    @property
+    def log(self) -> list[str]:
+        return [line for nodes in self.nodes for line in nodes.log]
+
+    def close(self) -> None:
+        try:
+            for nodes in self.nodes:
+                nodes.stop()
+        finally:
+            for pid in self._watchdogs:  # one that is left waits for a device that no longer runs
+                with contextlib.suppress(ProcessLookupError):
+                    if b"watchdog" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                        os.kill(pid, signal.SIGKILL)
+            self.probe.close()

@@ -1,0 +1,50 @@
+"""A process that carries an arm as a bridge does; `python -m test.hardware.carrier FILE`, FILE a pickled charge.
+
+It prints the PID of its watchdog once the motors are on and the watchdog runs. A line on its standard input is an order:
+"hand over" requests the watchdog to take over, "off" switches the motors off.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import sys
+import threading
+import time
+from pathlib import Path
+
+from exo_gravity.core.drive import NOTHING, OFF, Drive
+from exo_gravity.core.errors import BusError
+from exo_gravity.hardware.handover import Charge
+from exo_gravity.hardware.owned_bus import OwnedBus
+
+
+def log(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def main(charge: Charge, drive: Drive) -> None:
+    try:
+        owned = OwnedBus(charge, f"/right/can_bridge (PID {os.getpid()})", log)
+        bus = owned.open()
+    except BusError as error:
+        log(str(error))
+        raise SystemExit(1) from None
+    orders: list[str] = []
+    threading.Thread(target=lambda: [orders.append(line) for line in sys.stdin], daemon=True).start()
+    is_announced = False
+    while True:
+        end = time.monotonic() + charge.period
+        bus.exchange(OFF if "off\n" in orders else drive, end)
+        if "hand over\n" in orders:
+            owned.watchdog.hand_over("a test")
+            orders.clear()
+        if not is_announced and owned._lock.notes.heartbeat and all(joint.time > 0.0 for joint in bus.samples):
+            print(owned.watchdog.pid, flush=True)
+            is_announced = True
+        time.sleep(max(0.0, end - time.monotonic()))
+
+
+if __name__ == "__main__":
+    charge, effort = pickle.loads(Path(sys.argv[1]).read_bytes())
+    main(charge, Drive(effort, NOTHING, True))

@@ -1,0 +1,93 @@
+"""A simulated arm on a CAN bus, and the truth about it: how fast its joints really turn, and which motors are on."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import can
+
+from exo_gravity.core.gravity import gravity_torque
+from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.limits import Limits
+from exo_gravity.core.motors import ENTER, MOTORS
+from exo_gravity.hardware.handover import Charge
+from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
+
+MOTORS_OF_ARM = tuple(JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1))
+LIMITS = Limits(("a", "b", "c", "d"), (-1.6,) * 4, (3.1,) * 4, (6.0,) * 4, (3.0, 9.0, 3.0, 3.0))
+PERIOD = 0.004
+POSE = (0.0, 0.9, 0.3, 0.3)
+SAFE_SPEED = 1.0  # rad/s
+AFTER_EXIT = 1.0  # s for which a joint that was dropped would turn
+
+_PORTS = itertools.count(30_000 + os.getpid() % 10_000)
+
+
+class SimulatedRig:
+    """An arm in `POSE` on a bus of its own. interface: 'virtual', or 'udp_multicast' to share it with processes.
+
+    top_speed: rad/s, the largest true speed of a joint so far.
+    """
+
+    def __init__(self, interface: str = "virtual", friction: float = 0.1) -> None:
+        sys.setswitchinterval(2e-4)  # as in nodes/run.py: with Python's 5 ms the threads here would delay each other
+        port = next(_PORTS)
+        options: dict[str, Any] = {}
+        if interface == "udp_multicast":
+            channel, options = "239.74.163.2", {"port": port, "hop_limit": 0}
+        else:
+            channel = f"simulated_rig_{port}"
+        config = ArmConfig(coulomb_friction=(friction,) * 4)
+        self.charge = Charge((interface, channel, options), MOTORS_OF_ARM, LIMITS, PERIOD)
+        self.device = SimulatedDevice(SimulatedArm(config), [SimulatedMotor(joint) for joint in MOTORS_OF_ARM])
+        self.device.arm.reset(POSE)
+        self.carrying = tuple(gravity_torque(config.links, POSE))  # Nm that hold the arm
+        self.top_speed = 0.0
+        self._stop = threading.Event()
+        self._bus = self.charge.open()
+        self._thread = threading.Thread(target=self.device.run, args=(self._bus, self._stop.is_set, self._look))
+        self._thread.start()
+
+    def _look(self, _now: float) -> None:
+        self.top_speed = max(self.top_speed, *map(abs, self.device.arm.velocities))
+
+    def open(self) -> can.BusABC:
+        """Open another end of the bus."""
+        return self.charge.open()
+
+    def switch_on(self, effort: Sequence[float]) -> None:
+        """Switch the motors on without a frame on the bus, as if a dead process had left them."""
+        for joint, torque in zip(MOTORS_OF_ARM, effort, strict=True):
+            self.device.exchange(joint.can_id, joint.command(torque, 0.0))
+            self.device.exchange(joint.can_id, ENTER)
+
+    @property
+    def motors_on(self) -> list[bool]:
+        """Whether each motor is on."""
+        return [motor.entered for motor in self.device.motors]
+
+    def assert_let_down(self) -> None:
+        """The motors are off, and no joint turned fast, not even once nothing held it."""
+        assert self.motors_on == [False] * 4
+        time.sleep(AFTER_EXIT)
+        assert self.top_speed < SAFE_SPEED
+        assert abs(self.device.arm.positions[1]) < 0.5  # from 0.9
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._bus.shutdown()
+
+
+def wait_until(condition: Callable[[], object], timeout: float = 40.0) -> None:
+    """Wait until `condition()` holds."""
+    end = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < end, "the condition did not hold in time"
+        time.sleep(0.005)

@@ -1,0 +1,117 @@
+"""The way down, judged by the simulated arm's true motion: slow, to the ground in time, and no drop at the end."""
+
+import math
+
+import numpy as np
+import pytest
+
+from exo_gravity.core import Tilt, gravity_torque
+from exo_gravity.core.drive import OFF, State
+from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
+from exo_gravity.core.motors import ENTER, EXIT, MOTORS
+from exo_gravity.core.safety import SafetyMachine
+from exo_gravity.core.wearer import Wearer
+from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
+
+MOTORS_OF_ARM = [JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1)]
+LIMITS = Limits(("rotation", "abduction", "flexion", "elbow"))
+RATE = 250.0
+TOP_SPEED = 1.0  # rad/s
+HORIZONTAL = (0.0, 1.5, 0.0, 0.3)
+POSES = [HORIZONTAL, (0.0, 0.8, 0.6, 0.5), (0.0, 0.6, 0.9, 1.5), (1.5, 1.5, -0.7, 2.5), (0.0, 0.1, 2.3, 0.1)]
+
+
+class Lowered:
+    """An arm that its motors hold at `theta` until a fault lets it down. The speed is the arm's own, at 1 kHz.
+
+    grounded: s until the joints that gravity moves stayed within 0.2 rad of where they ended. switched_off: s.
+    top_speed, speed_after_exit: rad/s, the latter over the 3 s after EXIT.
+    """
+
+    def __init__(self, theta, friction, body_mass=0.0, pitch=0.0, roll=0.0):
+        mass, cog = Wearer(body_mass).on_links((0.05, 0.13, 0.3, 0.3)) if body_mass else ((0.0,) * 4, (0.0,) * 4)
+        config = ArmConfig(
+            wearer_mass=mass, wearer_cog=cog, coulomb_friction=(friction,) * 4, viscous_friction=(0.0,) * 4
+        )
+        self.arm = SimulatedArm(config)
+        self.device = SimulatedDevice(self.arm, [SimulatedMotor(motor) for motor in MOTORS_OF_ARM])
+        self.device.pitch, self.device.roll = pitch, roll
+        self.device.advance(0.001)
+        self.arm.reset(theta)
+        links = config.links.with_wearer(mass, cog)
+        self.holding = gravity_torque(links, theta, Tilt.of("right", pitch, roll).direction)
+        self.machine = SafetyMachine(LIMITS, 1.0 / RATE, [motor.peak_effort for motor in MOTORS_OF_ARM])
+        self.top_speed = self.speed_after_exit = 0.0
+        self._samples = [UNKNOWN] * 4
+        self._track = []
+        self._now = 0.0
+        self._lower()
+
+    def _lower(self):
+        for motor, effort in zip(MOTORS_OF_ARM, self.holding, strict=True):
+            self.device.exchange(motor.can_id, motor.command(effort, 0.0))
+            self._take(motor, self.device.exchange(motor.can_id, ENTER))
+        self.machine.take_over(self.holding.tolist(), (0.0,) * 4, 0.0)
+        while self._now < 60.0:
+            drive = self.machine.step(self._now, tuple(self._samples), None, -math.inf)
+            if drive == OFF:
+                break
+            for motor, effort, damping in zip(MOTORS_OF_ARM, drive.effort, drive.damping, strict=True):
+                self._take(motor, self.device.exchange(motor.can_id, motor.command(effort, damping)))
+            self.top_speed = max(self.top_speed, self._advance(1.0 / RATE))
+            self._track.append((self._now, *self.arm.positions))
+        for motor in MOTORS_OF_ARM:
+            self.device.exchange(motor.can_id, EXIT)
+        self.switched_off = self._now
+        track = np.array(self._track)[:, 2:]  # joint 1 turns about the vertical: it has no ground
+        far = np.flatnonzero(np.abs(track - np.array(self.arm.positions[1:])).max(axis=1) > 0.2)
+        self.grounded = self._track[far[-1]][0] if len(far) else 0.0
+        self.speed_after_exit = self._advance(3.0)
+
+    def _take(self, motor, reply):
+        _, *reading = motor.joint_reply(reply[1])
+        self._samples[motor.can_id - 1] = JointSample(*reading, self._now)
+
+    def _advance(self, duration):
+        fastest = 0.0
+        for _ in range(round(duration / 0.001)):
+            self.device.advance(0.001)
+            fastest = max(fastest, float(np.abs(self.arm.velocities).max()))
+        self._now += duration
+        return fastest
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.01, 0.05, 0.2, 0.5])
+@pytest.mark.parametrize("body_mass", [0.0, 75.0])
+def test_a_horizontal_arm_comes_down_slowly_in_15_s_and_does_not_drop_when_its_motors_are_switched_off(
+    friction, body_mass
+):
+    lowered = Lowered(HORIZONTAL, friction, body_mass)
+    assert lowered.top_speed < TOP_SPEED
+    assert lowered.speed_after_exit < TOP_SPEED / 4
+    assert lowered.grounded < 15.0
+    assert lowered.machine.state is State.DISABLED
+
+
+@pytest.mark.parametrize("theta", POSES[1:])
+@pytest.mark.parametrize(("pitch", "roll", "friction"), [(0.0, 0.0, 0.2), (0.4, -0.3, 0.01)])
+def test_from_other_poses_and_on_a_tilted_trunk_it_comes_down_as_slowly(theta, pitch, roll, friction):
+    lowered = Lowered(theta, friction, pitch=pitch, roll=roll)
+    assert lowered.top_speed < TOP_SPEED
+    assert lowered.speed_after_exit < TOP_SPEED / 4
+
+
+@pytest.mark.parametrize("theta", POSES[1:4])
+def test_a_passive_arm_of_75_kg_comes_down_as_slowly_wherever_the_motors_can_hold_it(theta):
+    lowered = Lowered(theta, 0.05, 75.0)
+    assert np.all(np.abs(lowered.holding) <= [motor.peak_effort for motor in MOTORS_OF_ARM])
+    assert lowered.top_speed < TOP_SPEED
+    assert lowered.speed_after_exit < TOP_SPEED / 4
+
+
+def test_an_arm_upright_overhead_is_not_left_to_fall():
+    lowered = Lowered((0.0, 3.0, 0.0, 0.0), 0.0)
+    assert lowered.top_speed < TOP_SPEED
+    assert lowered.speed_after_exit < TOP_SPEED / 4
+    assert abs(lowered.arm.positions[1]) < 0.2

@@ -1,0 +1,110 @@
+"""The truth log: what a judge in another process reads of the simulated arm's motion."""
+
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.motors import ENTER, EXIT, MOTORS
+from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
+from exo_gravity.sim.truth import RECORD, TruthLog
+
+from ..support.truth import Truth
+
+JOINTS = [JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1)]
+ADVANCE = """
+import sys, time
+from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.motors import MOTORS
+from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
+from exo_gravity.sim.truth import TruthLog
+device = SimulatedDevice(SimulatedArm(), [SimulatedMotor(JointMotor(MOTORS["AK60-6"], n)) for n in (1, 2, 3, 4)])
+device.truth = TruthLog(sys.argv[1])
+device.advance(1.0)
+print(flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.fixture
+def device(tmp_path):
+    device = SimulatedDevice(SimulatedArm(), [SimulatedMotor(joint) for joint in JOINTS])
+    device.truth = TruthLog(tmp_path / "truth.bin")
+    return device
+
+
+def test_every_physics_step_is_logged_with_wall_time_motion_torque_damping_and_motor_state(device, tmp_path):
+    device.arm.reset((0.0, 1.0, 0.0, 0.0))
+    device.exchange(2, JOINTS[1].command(2.0, 1.5))
+    device.exchange(2, ENTER)
+    before = time.time()
+    device.advance(0.5)
+    records = Truth(tmp_path / "truth.bin").since(0.0)
+    assert len(records) >= 450
+    np.testing.assert_allclose(np.diff(records["time"]), 0.001, atol=1e-5)
+    assert abs(records["time"][-1] - before) < 0.1
+    assert records["on"][-1].tolist() == [False, True, False, False]
+    assert records["frames"][-1].tolist() == [0, 2, 0, 0]
+    assert records["damping"][-1, 1] == pytest.approx(1.5, abs=0.01)
+    effort = records["torque"][:, 1] + records["damping"][:, 1] * records["velocity"][:, 1]
+    np.testing.assert_allclose(effort, 2.0, atol=0.02)
+    np.testing.assert_allclose(np.gradient(records["position"][:, 1], 0.001), records["velocity"][:, 1], atol=0.05)
+
+
+def test_a_reader_sees_the_newest_state_while_the_file_grows(device, tmp_path):
+    truth = Truth(tmp_path / "truth.bin")
+    assert truth.newest() is None
+    device.exchange(3, ENTER)
+    device.advance(0.1)
+    assert not truth.motors_are_off()
+    device.exchange(3, EXIT)
+    device.advance(0.1)
+    assert truth.motors_are_off()
+    start = truth.count
+    device.advance(0.1)
+    assert 80 <= len(truth.since(0.0, start)) <= 120
+
+
+def test_what_was_written_survives_a_kill(tmp_path):
+    path = tmp_path / "truth.bin"
+    process = subprocess.Popen([sys.executable, "-c", ADVANCE, str(path)], stdout=subprocess.PIPE)
+    process.stdout.readline()
+    process.kill()
+    process.wait()
+    process.stdout.close()
+    assert path.stat().st_size >= 950 * RECORD.itemsize
+
+
+def test_a_motor_that_loses_power_for_30_ms_comes_back_switched_off(device):
+    device.exchange(2, ENTER)
+    device.motors[1].unplugged = True
+    device.return_power(0.03)
+    device.advance(0.02)
+    assert device.exchange(2, JOINTS[1].command(0.0, 0.0)) is None
+    device.advance(0.02)
+    assert device.exchange(2, JOINTS[1].command(0.0, 0.0)) is not None
+    assert not device.motors[1].entered
+
+
+def test_a_motor_that_is_cut_off_keeps_its_torque_and_does_not_reply(device):
+    device.exchange(2, JOINTS[1].command(2.0, 0.0))
+    device.exchange(2, ENTER)
+    device.cut_off = (False, True, False, False)
+    assert device.exchange(2, EXIT) is None
+    assert device.motors[1].torque(0.0, 0.0) == pytest.approx(2.0, abs=0.01)
+    assert device.exchange(3, ENTER) is not None
+
+
+def test_an_encoder_error_shifts_the_angle_that_a_motor_replies(device):
+    device.encoder_error = (0.0, 0.698, 0.0, 0.0)
+    _, data = device.exchange(2, JOINTS[1].command(0.0, 0.0))
+    assert JOINTS[1].joint_reply(data).position == pytest.approx(0.698, abs=0.001)
+
+
+def test_a_file_that_cannot_be_created_is_refused(tmp_path):
+    with pytest.raises(ParameterError, match="truth"):
+        TruthLog(tmp_path / "missing" / "truth.bin")

@@ -1,0 +1,41 @@
+"""Reads the truth log of a simulated device while it grows; exo_gravity/sim/truth.py describes the format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from exo_gravity.sim.truth import RECORD
+
+
+class Truth:
+    """The truth log at `path`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @property
+    def count(self) -> int:
+        """How many records there are; 0 without a file."""
+        return self.path.stat().st_size // RECORD.itemsize if self.path.exists() else 0
+
+    def newest(self) -> np.ndarray | None:
+        """Return the newest record, None if there is none."""
+        count = self.count
+        return self._read(count - 1, count)[0] if count else None
+
+    def since(self, time: float, start: int = 0) -> np.ndarray:
+        """Return the records from `time` (wall clock, s) on; those before index `start` are not read."""
+        records = self._read(start, self.count)
+        return records[records["time"] >= time]
+
+    def motors_are_off(self) -> bool:
+        """Return whether no motor is on."""
+        newest = self.newest()
+        return newest is not None and not newest["on"].any()
+
+    def _read(self, start: int, end: int) -> np.ndarray:
+        if end <= start:
+            return np.empty(0, RECORD)
+        return np.fromfile(self.path, RECORD, end - start, offset=start * RECORD.itemsize)
