@@ -11,8 +11,8 @@ import signal
 import sys
 import time
 
-from exo_gravity.core.limits import UNKNOWN
 from exo_gravity.core.drive import NOTHING, Drive
+from exo_gravity.core.limits import UNKNOWN
 from exo_gravity.hardware.control_loop import REPLY_WAIT
 from exo_gravity.hardware.scheduling import favour
 
@@ -33,7 +33,7 @@ def main() -> None:
         now = time.monotonic()
         all_replied = UNKNOWN not in bus.samples  # an ENTER sent earlier might be lost
         effort = arm.law([joint.position for joint in bus.samples]) if all_replied else NOTHING
-        bus.exchange(Drive(effort, 0.0, powered=all_replied), now + REPLY_WAIT * period)
+        bus.exchange(Drive(effort, NOTHING, powered=all_replied), now + REPLY_WAIT * period)
 
     try:
         run_paced(period, cycle, stopping)

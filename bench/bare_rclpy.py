@@ -21,8 +21,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
-from exo_gravity.core.limits import UNKNOWN
 from exo_gravity.core.drive import NOTHING, Drive
+from exo_gravity.core.limits import UNKNOWN
 from exo_gravity.hardware.control_loop import REPLY_WAIT
 from exo_gravity.hardware.scheduling import favour
 from exo_gravity.nodes.run import keep_to_this_machine
@@ -44,7 +44,7 @@ def bridge_thread(node: Node, arm: DirectArm, period: float, stopping: list[bool
 
     def cycle() -> None:
         all_replied = UNKNOWN not in bus.samples  # an ENTER sent earlier might be lost
-        drive = Drive(newest["effort"], 0.0, powered=all_replied)
+        drive = Drive(newest["effort"], NOTHING, powered=all_replied)
         bus.exchange(drive, time.monotonic() + REPLY_WAIT * period)
         if all_replied:
             position, velocity, effort, *_ = zip(*bus.samples, strict=True)

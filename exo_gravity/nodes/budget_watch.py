@@ -74,7 +74,7 @@ class BudgetWatch:
         # A thread inherits its creator's policy, and thread_priority sets that of all threads: never SCHED_FIFO here.
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         try:
-            values = dict(zip(BRIDGE_PARAMETERS, map(parameter_value_to_python, self._bridge), strict=False))
+            values = dict(zip(BRIDGE_PARAMETERS, map(parameter_value_to_python, self._bridge or ()), strict=False))
             bridge = values_of([param for param in CAN_BRIDGE if param.name in BRIDGE_PARAMETERS], values)
             workspace = Workspace(bridge["position_min"], bridge["position_max"], self._max_tilt)
             torques = motor_torques(bridge["motor"], bridge["torque_scale"])

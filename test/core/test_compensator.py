@@ -237,6 +237,7 @@ def test_too_large_a_total_mass_is_rejected_in_every_mode():
 
 
 def test_only_the_supported_share_of_the_wearer_counts_towards_the_total_mass():
+    assert settings_with(mode="zero_g", support=0.5, max_total_mass=5.0).arm.total_mass == pytest.approx(3.654)
 
 
 @pytest.mark.parametrize(("gain", "gravity"), [(2.0, 25.0), (2.0, 10.01), (0.9, 25.0), (1.3, 16.0)])

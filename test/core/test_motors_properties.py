@@ -144,9 +144,10 @@ def test_a_joint_packs_any_effort_without_stiffness_or_rejects_it(motor, effort,
         assert not (math.isfinite(effort) and abs(effort) < 1e100 and 0.0 <= damping <= motor.spec.kd_max)
         return
     assert_within(motor.spec, COMMAND, command)
-    assert command.kp == 0.0 and abs(command.kd - damping) <= bounds(motor.spec, "kd")[2]
+    kd = min(damping / motor.torque_scale, motor.spec.kd_max)
+    assert command.kp == 0.0 and abs(command.kd - kd) <= bounds(motor.spec, "kd")[2]
     torque = motor.direction * effort / motor.torque_scale
-    slack = (1.5 + damping) * max(bounds(motor.spec, field)[2] for field in ("torque", "velocity"))
+    slack = (1.5 + kd) * max(bounds(motor.spec, field)[2] for field in ("torque", "velocity"))
     assert abs(command.torque - max(-motor.spec.torque_range, min(motor.spec.torque_range, torque))) <= slack
 
 

@@ -71,7 +71,7 @@ def kill_bridge_beside_frozen_watchdog(seconds: float) -> Action:
     return inject
 
 
-def simulator(**values: object) -> Action:
+def simulator(**values: Any) -> Action:
     """Set parameters of the simulator."""
 
     def inject(rig: Rig) -> None:
