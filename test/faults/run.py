@@ -38,7 +38,8 @@ def main() -> int:
     arguments = parser.parse_args()
     cases = [case for case in CASES if arguments.only in case.name][arguments.start - 1 :]
     console = Console(width=max(120, Console().width))
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
     results: list[Result] = []
     interrupted = False
     try:

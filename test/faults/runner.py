@@ -79,8 +79,8 @@ def _result(case: FaultCase, rig: Rig, outcome: str, response: Response, log: li
 def not_run(case: FaultCase, error: BaseException) -> Result:
     """Return the result of a case that could not be run to its end."""
     figures = dict.fromkeys(("reaction_ms", "limit_ms", "top_speed_rad_s", "torque_step_nm", "latched"))
-    reason = (str(error) or type(error).__name__).splitlines()[0]
-    return {"fault": case.name, "result": "not run", **figures, "unsafe": f"not run: {reason}"}
+    reason = str(error) or type(error).__name__
+    return {"fault": case.name, "result": "not run", **figures, "unsafe": "not run", "log": reason.splitlines()}
 
 
 class RigPool:
