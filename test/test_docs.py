@@ -34,12 +34,12 @@ def anchors(path: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-def test_the_tables_in_docs_equal_the_declarations():
+def test_the_tables_in_docs_equal_the_declarations() -> None:
     checked = run_tables("--check")
     assert checked.returncode == 0, checked.stdout + checked.stderr
 
 
-def test_every_table_has_its_place_in_a_document():
+def test_every_table_has_its_place_in_a_document() -> None:
     places = {n for path in DOCUMENTS for n in re.findall(r"<!-- table: (\w+) -->", path.read_text(encoding="utf-8"))}
     assert places == {*NODES, "faults"}
 
@@ -52,8 +52,8 @@ def test_every_table_has_its_place_in_a_document():
     ],
 )
 def test_a_document_that_differs_from_the_code_is_reported_with_the_command_that_renews_it(
-    tmp_path, document, table, declared, changed
-):
+    tmp_path: Path, document: str, table: str, declared: str, changed: str
+) -> None:
     copy = Path(shutil.copy(TABLES.with_name(document), tmp_path))
     text = copy.read_text(encoding="utf-8")
     assert declared in text
@@ -66,7 +66,7 @@ def test_a_document_that_differs_from_the_code_is_reported_with_the_command_that
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=name)
-def test_every_link_leads_to_a_file_and_a_heading(path):
+def test_every_link_leads_to_a_file_and_a_heading(path: Path) -> None:
     for link in re.findall(r"\]\((?!https?:)([^)]+)\)", path.read_text(encoding="utf-8")):
         file, _, anchor = link.partition("#")
         target = path.parent / file if file else path
@@ -75,15 +75,15 @@ def test_every_link_leads_to_a_file_and_a_heading(path):
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=name)
-def test_every_path_in_backticks_exists(path):
+def test_every_path_in_backticks_exists(path: Path) -> None:
     for text in re.findall(rf"`((?:{FOLDERS})/[\w./]*)`", path.read_text(encoding="utf-8")):
         assert (ROOT / text).exists() or (ROOT / "exo_gravity" / text).exists(), text
 
 
-def test_the_readmes_library_example_prints_what_the_readme_shows():
-    code, shown = re.search(
-        r"```python\n(.*?)```\s*```text\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL
-    ).groups()
+def test_the_readmes_library_example_prints_what_the_readme_shows() -> None:
+    example = re.search(r"```python\n(.*?)```\s*```text\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL)
+    assert example
+    code, shown = example.groups()
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
         exec(code, {})

@@ -42,7 +42,8 @@ def main() -> int:
     arguments = parser.parse_args()
     cases = [case for case in CASES if any(text in case.name for text in arguments.only)][arguments.start - 1 :]
     console = Console(width=max(120, Console().width))
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
     results: list[Result] = []
     interrupted = False
     try:
