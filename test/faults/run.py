@@ -67,7 +67,7 @@ def run_all(cases: Sequence[FaultCase], console: Console, shipped_timeouts: bool
             start = time.monotonic()
             try:
                 result = pool.run(case)
-            except Exception as error:  # the other cases may still show something
+            except Exception as error:  # the rig cannot be started or ended
                 result = not_run(case, error)
             result["seconds"] = round(time.monotonic() - start, 1)
             console.print(result["result"], result["unsafe"] or "safe", f"{result['seconds']:.0f} s", markup=False)

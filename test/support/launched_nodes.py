@@ -70,6 +70,11 @@ class LaunchedNodes:
         self.log: list[str] = []
         self.stopping = threading.Event()
         self.ended_node: tuple[str, int] | None = None
+        self._thread: threading.Thread | None = None
+
+    def has_started(self) -> bool:
+        """Return whether `start` was called."""
+        return self._thread is not None
 
     def start(self) -> LaunchedNodes:
         self.launcher = Launcher(self.path, on_line=lambda node, line: self.log.append(f"{node}: {line}"))
@@ -83,7 +88,7 @@ class LaunchedNodes:
     @property
     def have_ended(self) -> bool:
         """Whether every process has ended."""
-        return not self._thread.is_alive()
+        return self._thread is not None and not self._thread.is_alive()
 
     def process(self, node: str) -> subprocess.Popen[str]:
         """Return the process of a node by the last part of its name, or by its full name."""
@@ -99,7 +104,8 @@ class LaunchedNodes:
 
     def stop(self) -> None:
         self.stopping.set()
-        self._thread.join(60)
+        if self._thread is not None:
+            self._thread.join(60)
 
 
 class LauncherProcess(LaunchedNodes):
@@ -138,7 +144,8 @@ class LauncherProcess(LaunchedNodes):
         except subprocess.TimeoutExpired:
             self.launcher_process.kill()
             raise
-        self._thread.join(60)
+        if self._thread is not None:
+            self._thread.join(60)
 
 
 def executable(name: str) -> str:
