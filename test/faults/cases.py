@@ -93,7 +93,7 @@ def left_arm_is_carried(rig: BothArmsRig) -> None:
 def not_thrown_back(records: np.ndarray) -> str:
     """Return what is wrong if the elbow leaves the wall faster than half its speed into the wall."""
     velocity = records["velocity"][:, 3]
-    inward = velocity.argmax()
+    inward = int(np.argmax(velocity))
     into, back = float(velocity[inward]), float(-velocity[inward:].min())
     if into < 1.0:
         return f"the push reached only {into:.1f} rad/s"

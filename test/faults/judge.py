@@ -66,7 +66,7 @@ def measure(
     return Response(
         reaction=_reaction(records, since, unreached),
         top_speed=float(speed.max(initial=0.0)),
-        fastest=int(speed.max(axis=0, initial=0.0).argmax()) + 1,
+        fastest=int(np.argmax(speed.max(axis=0, initial=0.0))) + 1,
         largest_step=float(step.max(initial=0.0)),
         excess=float(excess.max(initial=0.0)),
         work=float(_work(records, after).max(initial=0.0)),
@@ -82,7 +82,7 @@ def _reaction(records: np.ndarray, since: np.ndarray, unreached: Collection[int]
     if not reached:
         return None
     safe = (~records["on"] | (records["damping"] > 0.0))[:, reached].all(axis=1) & (since >= 0.0)
-    return float(since[safe.argmax()]) if safe.any() else None
+    return float(since[np.argmax(safe)]) if safe.any() else None
 
 
 def _steps(records: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:

@@ -94,7 +94,7 @@ class Rig:
                 self._start_over(stage)
                 return
             while not self._is_at_pose():
-                self._arm()
+                self._get_carried()
                 self.probe.bring_to(self.script)
                 self._wait_for_states(self.rate / 4)
             if stage == "letting down":
@@ -102,7 +102,7 @@ class Rig:
                 self.probe.wait_until(lambda: abs(self.true_velocity(1)) > 0.2)
             self._note_watchdogs()
 
-    def _arm(self) -> None:
+    def _get_carried(self) -> None:
         """Wait until the arm is carried; the wearer moves an arm that hangs outside its limits."""
         probe = self.probe
         helped = -math.inf

@@ -20,6 +20,7 @@ from . import CONFIG
 Parameters = Mapping[str, Any]
 
 PORTS = itertools.count(20_000 + 2 * (os.getpid() % 5_000), 2)  # two buses for each, apart from other test runs
+GROUP = "239.74.163.2"
 NO_IMU: Parameters = {"use_imu": False}  # for the compensator, which then starts without waiting for a tilt
 FAST: Parameters = {"sign_check_torque": 0.0, "ramp_time": 0.5, "fade_time": 0.5, "damping": 1.5}
 GENTLE: Parameters = {**FAST, "ramp_time": 1.0, "fade_time": 2.0, "damping": 5.0}
@@ -64,7 +65,12 @@ class LaunchedNodes:
             parameters.update(changes.get(node, {}))
         unknown = set(changes) - {name.split("/")[-1] for name in content}
         assert not unknown, f"changes of nodes that are left out: {unknown}"
-        self.bus = {"interface": "udp_multicast", "channel": "239.74.163.2", "port": port, "hop_limit": 0}
+        self.bus: dict[str, Any] = {
+            "interface": "udp_multicast",
+            "channel": "239.74.163.2",
+            "port": port,
+            "hop_limit": 0,
+        }
         self.path = folder / f"params_{port}_{'_'.join(without)}.yaml"
         self.path.write_text(yaml.safe_dump(content))
         self.log: list[str] = []
