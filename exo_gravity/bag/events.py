@@ -10,7 +10,7 @@ from itertools import groupby
 from typing import Any
 
 from exo_gravity.bag.content import Event
-from exo_gravity.bag.topics import DIAGNOSTICS, PARAMETER_EVENTS, STEPS, arm_of, leaf
+from exo_gravity.bag.topics import DIAGNOSTICS, LOSSES, PARAMETER_EVENTS, STEPS, arm_of, leaf
 from exo_gravity.core.drive import State
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.recording import ScriptedStep, Span
@@ -20,10 +20,11 @@ STATE_GAP = 1.0  # s; can_bridge reports its state twice a second, except while 
 
 
 class EventLog:
-    """Collects script steps, faults, changed parameters, and the parameters at the start."""
+    """Collects script steps, faults, changed parameters, the parameters at the start, and what the recorder lost."""
 
     def __init__(self) -> None:
         self.parameters: dict[str, str] = {}
+        self.losses = ""
         self._events: list[tuple[int, str]] = []
         self._steps: dict[str, list[tuple[int, str, float]]] = {}  # arm -> (stamp, action, duration)
         self._states: dict[str, list[tuple[int, str]]] = {}  # arm -> (stamp, state)
@@ -39,6 +40,8 @@ class EventLog:
         elif topic == PARAMETER_EVENTS:
             for parameter in message.changed_parameters:
                 self._events.append((stamp, f"{message.node}: {parameter.name} = {_value(parameter.value)}"))
+        elif topic == LOSSES:
+            self.losses = message.data
         else:
             node, _, text = message.data.partition(":")
             self.parameters[node.strip()] = f"{node}:{text}"

@@ -49,6 +49,8 @@ def read_bag(path: str | Path, progress: Progress = lambda done, size: None) -> 
     if not recordings:
         raise DataError(f"{path}: {'; '.join(contents.problems)}")
     log = contents.log
+    if log.losses:
+        contents.notes.append(f"the recorder lost messages: {log.losses}")
     return Bag(
         Path(path),
         start,

@@ -8,10 +8,13 @@ STRING = "std_msgs/msg/String"
 STATES, COMMANDS, STEPS = "joint_states", "effort_commands", "wearer_step"
 # Of all
 DIAGNOSTICS, PARAMETER_EVENTS = "/diagnostics", "/parameter_events"
+# Of the recorder, in the recording alone
+PARAMETERS, LOSSES = "/recorder/parameters", "/recorder/losses"
 OTHERS = {
     DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
     PARAMETER_EVENTS: "rcl_interfaces/msg/ParameterEvent",
-    "/recorder/parameters": STRING,
+    PARAMETERS: STRING,
+    LOSSES: STRING,
 }
 
 

@@ -2,8 +2,8 @@
 
 rosbags collects messages in a chunk of up to 1 MiB before it writes them. This writer closes the chunk and hands it to
 the kernel every 0.5 s, so a killed process loses no more than that. The index at the end of the file and metadata.yaml
-are then missing, and `report` reads the chunks without them. A slow disk delays this thread only; a full disk ends the
-recording.
+are then missing; `report` reads the chunks without them, and `report --repair` makes a complete copy. A slow disk
+delays this thread only: messages that find the queue full are lost and counted. A full disk ends the recording.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ MAX_WAITING = 2_000  # batches: 100 s at 20 Hz, about 100 MB of two arms at 500 
 FOREVER = QosTime(9_223_372_036, 854_775_807)  # 2^63 - 1 ns, infinite in rmw
 
 Message = tuple[str, int, bytes]  # topic, time of arrival in ns since 1970, serialised message
-Item = tuple[str, str, Qos] | list[Message]  # a new topic with its type, or messages
 
 
 def offered_qos(reliable: bool, transient_local: bool, depth: int) -> Qos:
@@ -50,22 +49,23 @@ class BagWriter:
     """A recording in the new folder `path`; usable as a context manager.
 
     Call `add_topic`, `write` and `close` from one thread; only `close` waits for the disk. `error` is what ended the
-    recording early, None if nothing did; later messages are dropped.
+    recording early, None if nothing did. `count` messages were written, `lost` were not.
     """
 
     def __init__(self, path: str | Path) -> None:
         """Create the folder and its MCAP file. Raises DataError if the folder exists or can't be written."""
         self.path = Path(path)
         self.error: DataError | None = None
-        self.count = 0
+        self.count = self.lost = 0
         self._types = get_typestore(Stores.ROS2_JAZZY)
         try:
             self._writer = Writer(self.path, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
             self._writer.open()
         except (WriterError, OSError) as error:
             raise DataError(f"{self.path}: cannot record there ({error})") from None
+        self._topics: dict[str, tuple[str, Qos]] = {}
         self._connections: dict[str, Connection] = {}
-        self._waiting: queue.Queue[Item] = queue.Queue(MAX_WAITING)
+        self._waiting: queue.Queue[list[Message]] = queue.Queue(MAX_WAITING)
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="bag writer", daemon=True)
         self._thread.start()
@@ -77,12 +77,17 @@ class BagWriter:
         """
         if msgtype not in self._types.fielddefs:
             raise DataError(f"{topic} has type {msgtype}: must be one of ROS 2 Jazzy's common interfaces")
-        self._put((topic, msgtype, qos))
+        self._topics[topic] = msgtype, qos
 
     def write(self, messages: Sequence[Message]) -> None:
         """Queue messages, in the order of their times."""
-        if messages:
-            self._put(list(messages))
+        try:
+            if messages and not self.error:
+                self._waiting.put_nowait(list(messages))
+                return
+        except queue.Full:
+            pass
+        self.lost += len(messages)
 
     def close(self) -> None:
         """Write the queued messages, the index and metadata.yaml. A failure is in `error`."""
@@ -95,19 +100,11 @@ class BagWriter:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _put(self, item: Item) -> None:
-        if self.error:
-            return
-        try:
-            self._waiting.put_nowait(item)
-        except queue.Full:
-            self.error = DataError(f"{self.path}: recording ended: the disk is too slow")
-
     def _run(self) -> None:
         try:
             self._write_until_end()
             self._writer.close()
-        except (OSError, WriterError) as error:
+        except Exception as error:  # of any kind: this thread must not end without a reason
             reason = getattr(error, "strerror", None) or str(error)
             self.error = DataError(f"{self.path}: recording ended after {self.count} messages: {reason}")
             # Closing the file retries the failed write, whose error is already known.
@@ -118,22 +115,31 @@ class BagWriter:
     def _write_until_end(self) -> None:
         flush_at = time.monotonic() + FLUSH_PERIOD
         while not (self._ending.is_set() and self._waiting.empty()):
+            self._announce()
             with contextlib.suppress(queue.Empty):
                 self._take(self._waiting.get(timeout=0.05))
             if time.monotonic() >= flush_at:
                 self._flush()
                 flush_at = time.monotonic() + FLUSH_PERIOD
+        self._announce()
 
-    def _take(self, item: Item) -> None:
-        if isinstance(item, tuple):
-            topic, msgtype, qos = item
+    def _announce(self) -> None:
+        """Add the topics that are new."""
+        for topic in [topic for topic in tuple(self._topics) if topic not in self._connections]:
+            msgtype, qos = self._topics[topic]
             self._connections[topic] = self._writer.add_connection(
                 topic, msgtype, typestore=self._types, offered_qos_profiles=[qos]
             )
-            return
-        for topic, stamp, data in item:
-            self._writer.write(self._connections[topic], stamp, data)
-        self.count += len(item)
+
+    def _take(self, messages: list[Message]) -> None:
+        self._announce()
+        for topic, stamp, data in messages:
+            connection = self._connections.get(topic)
+            if connection is None or stamp < 0:  # a bad message must not end the recording
+                self.lost += 1
+                continue
+            self._writer.write(connection, stamp, data)
+            self.count += 1
 
     def _flush(self) -> None:
         storage = cast(McapWriter, self._writer.storage)

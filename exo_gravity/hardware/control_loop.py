@@ -50,7 +50,7 @@ class ControlLoop:
     get_efforts(latest) is called before every exchange and returns the newest efforts, for which it may wait until
     `latest` (monotonic s). on_cycle(now, samples) is called after every exchange; its errors do not stop the control.
     hand_over(reason) requests the watchdog to end this process and let the arm down; it returns whether one is there.
-    cycles, late, incomplete: counts of all cycles, of those that began more than a period late, and of those in which
+    period: s of a cycle; it may change. cycles, late, incomplete: counts of all cycles, of those that began more than a period late, and of those in which
     not every motor replied in time. failure: the exception that ended the control, if any. cycle_errors: count of
     exceptions in on_cycle; cycle_error is the last one.
     """
@@ -69,7 +69,7 @@ class ControlLoop:
         self.failure: BaseException | None = None
         self.safety = safety
         self._bus = bus
-        self._period = period
+        self.period = period
         self._on_cycle = on_cycle
         self._get_efforts = get_efforts
         self._hand_over = hand_over
@@ -174,7 +174,7 @@ class ControlLoop:
                 if errors == MAX_ERRORS:
                     raise
                 self.safety.trip(FaultCode.INTERNAL_ERROR, f"{type(error).__name__}: {error}", time.monotonic())
-            deadline = self._wait(deadline + self._period)
+            deadline = self._wait(deadline + self.period)
 
     def _resign(self, reason: str) -> None:
         """Hand the arm over to the watchdog, which ends this process; without one, lower the arm."""
@@ -182,7 +182,7 @@ class ControlLoop:
             with contextlib.suppress(Exception):
                 if self._hand_over(f"the control loop failed: {reason}"):
                     time.sleep(HAND_OVER_TIME)
-            last_resort.lower(self._bus, self._drive, self._period)
+            last_resort.lower(self._bus, self._drive, self.period)
 
     def _cycle(self, due: float) -> None:
         efforts = self._efforts(due)
@@ -192,7 +192,7 @@ class ControlLoop:
             self.safety.disable(now)
         drive = self._drive = self.safety.step(now, tuple(self._bus.samples), *efforts)
         try:
-            complete = self._bus.exchange(drive, now + REPLY_WAIT * self._period)
+            complete = self._bus.exchange(drive, now + REPLY_WAIT * self.period)
         except BusError as error:
             self.safety.trip(FaultCode.BUS_ERROR, str(error), now)
             complete = False
@@ -210,7 +210,7 @@ class ControlLoop:
 
     def _efforts(self, due: float) -> EffortCommand:
         is_contested = self._bus.is_contested  # then receiving comes first
-        latest = due if is_contested else due + EFFORT_WAIT * (self._period - self._work)
+        latest = due if is_contested else due + EFFORT_WAIT * (self.period - self._work)
         try:
             return self._get_efforts(latest)
         except Exception as error:
@@ -242,7 +242,7 @@ class ControlLoop:
         remaining = deadline - time.monotonic()
         if remaining > 0.0:
             time.sleep(remaining)
-        elif remaining < -self._period:
+        elif remaining < -self.period:
             self.late += 1
             return time.monotonic()
         return deadline

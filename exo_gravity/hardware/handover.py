@@ -23,6 +23,7 @@ from exo_gravity.hardware.motor_bus import MotorBus, open_bus
 OPEN_PERIOD = 0.05  # s between two attempts to open the bus
 FIRST_REPLIES = 0.05  # s in which the motors must reply to the first commands
 CHECK_PERIOD = 0.05  # s
+RETRY_PERIOD = 0.25  # s between two attempts to reach a motor that does not reply, however long it takes
 
 
 class Charge(NamedTuple):
@@ -68,6 +69,7 @@ def let_down(
         if was_unreached and not is_endless:
             loop.abandon()
             return False
+        loop.period = RETRY_PERIOD if was_unreached else charge.period
         time.sleep(CHECK_PERIOD)
     loop.stop()
     return not motors.may_be_powered

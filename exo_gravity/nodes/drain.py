@@ -15,10 +15,16 @@ from exo_gravity.nodes.hot_path import Unexecuted
 
 
 class Drain:
-    """A subscription to `topic` that queues up to `qos.depth` messages until `take` is called."""
+    """A subscription to `topic` that queues up to `qos.depth` messages until `take` is called.
 
-    def __init__(self, node: Node, msgtype: type, topic: str, qos: QoSProfile) -> None:
+    lost: messages that did not arrive, by the numbers that their only publisher gives them, if `counts_lost`.
+    """
+
+    def __init__(self, node: Node, msgtype: type, topic: str, qos: QoSProfile, counts_lost: bool = False) -> None:
         self.topic = topic
+        self.lost = 0
+        self._counts_lost = counts_lost
+        self._number = 0  # of the last message
         self._subscription = node.create_subscription(
             msgtype, topic, lambda message: None, qos, raw=True, callback_group=Unexecuted()
         )
@@ -31,4 +37,10 @@ class Drain:
             while (item := subscription.handle.take_message(subscription.msg_type, subscription.raw)) is not None:
                 data, about = item
                 taken.append((about["received_timestamp"], bytes(data)))
+                self._count(about.get("publication_sequence_number") or 0)
         return taken
+
+    def _count(self, number: int) -> None:
+        if self._counts_lost and 0 < self._number < number:  # a new publisher begins again at 1
+            self.lost += number - self._number - 1
+        self._number = number

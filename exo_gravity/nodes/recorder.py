@@ -1,14 +1,16 @@
 """recorder: writes a trial to a standard rosbag2 recording (MCAP), with the parameters of every node.
 
 Twice a second it looks for new topics, and records those of all arms, the IMU, diagnostics and parameter changes, each
-with the quality of service that its publisher offers and its time of arrival. The parameters at the start go to the
-topic `/recorder/parameters`, which exists in the recording only: one std_msgs/String of ROS 2 parameter YAML per node.
+with the quality of service that its publisher offers and its time of arrival. Two topics exist in the recording only,
+both std_msgs/String: `/recorder/parameters`, ROS 2 parameter YAML of each node at the start, and `/recorder/losses`,
+how many messages were lost, if any were. A topic that fails is reported, and the others are recorded.
 """
 
 from __future__ import annotations
 
-import json
-import sys
+import math
+import time
+from collections.abc import Callable
 from typing import Any
 
 import yaml
@@ -16,21 +18,23 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from rcl_interfaces.msg import ParameterEvent
 from rcl_interfaces.srv import GetParameters, ListParameters
+from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.serialization import serialize_message
 from rclpy.task import Future
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
+from exo_gravity.bag.topics import LOSSES, PARAMETERS, STATES, leaf
 from exo_gravity.bag.writer import BagWriter, offered_qos
 from exo_gravity.core.control_params import RECORDER
 from exo_gravity.nodes.declare import declare
 from exo_gravity.nodes.drain import Drain
+from exo_gravity.nodes.live_line import ARM_TOPICS, LiveLine
 from exo_gravity.nodes.run import run
 
-ARM_TOPICS = {"joint_states": JointState, "effort_commands": JointState, "wearer_step": String}
 SHARED_TOPICS = {
     "/imu/pitch_yaw": Vector3Stamped,
     "/imu/data": Imu,
@@ -38,11 +42,14 @@ SHARED_TOPICS = {
     "/diagnostics": DiagnosticArray,
     "/parameter_events": ParameterEvent,
 }
-PARAMETERS_TOPIC = "/recorder/parameters"
 DRAIN_PERIOD = 0.05  # s between two writes of what has arrived
 DISCOVERY_PERIOD = 0.5  # s between two searches for new topics and nodes
 LIVE_PERIOD = 0.1  # s between two lines of live state
 DEPTH = 1000  # queued messages per topic: two seconds at 500 Hz
+LOSS_REPORT_PERIOD = 5.0  # s between two warnings of lost messages
+# After the launcher's death a bridge lets its arm down: this is recorded while joint states arrive.
+SILENCE = 0.5  # s without joint states, after which the arms are down
+DESCENT_TIMEOUT = 40.0  # s
 
 
 class Recorder(Node):
@@ -53,21 +60,37 @@ class Recorder(Node):
         values = declare(self, RECORDER)
         self.failure: Exception | None = None  # ends the node, see run()
         self._writer = BagWriter(values["output"])
-        self._writer.add_topic(PARAMETERS_TOPIC, "std_msgs/msg/String", offered_qos(True, True, 1))
+        self._writer.add_topic(PARAMETERS, "std_msgs/msg/String", offered_qos(True, True, 1))
+        self._failed: set[str] = set()  # topics and nodes whose failure was reported
+        self._last_states, self._orphaned = -math.inf, math.inf  # monotonic s
+        self._reported = (0, 0)  # lost messages
         self._drains: list[Drain] = []
         self._snapshots: set[str] = set()
-        self._live = Live() if values["live"] else None
+        self._live = LiveLine() if values["live"] else None
         self.create_timer(DRAIN_PERIOD, self._drain)
         self.create_timer(DISCOVERY_PERIOD, self._discover)
         if self._live:
-            self.create_timer(LIVE_PERIOD, self._live.write)
+            self.create_timer(LIVE_PERIOD, self._print_live_line)
+        self.create_timer(LOSS_REPORT_PERIOD, self._report_losses)
         self._discover()
         self.get_logger().info(f"recording to {self._writer.path}")
+
+    @property
+    def needed(self) -> bool:
+        """Whether an arm may still be on its way down. The node's owner asks only once its launcher has died."""
+        now = time.monotonic()
+        self._orphaned = min(self._orphaned, now)
+        return now - self._last_states < SILENCE and now - self._orphaned < DESCENT_TIMEOUT
 
     def close(self) -> None:
         """Write what has arrived, and close the recording."""
         try:
             self._drain()
+            self._report_losses()
+            if any(self._losses()):
+                missed, unwritten = self._losses()
+                self._writer.add_topic(LOSSES, "std_msgs/msg/String", offered_qos(True, True, 1))
+                self._write_text(LOSSES, f"{missed} did not arrive, {unwritten} were not written")
         finally:
             self._writer.close()
         if self._writer.error:
@@ -78,10 +101,14 @@ class Recorder(Node):
     def _drain(self) -> None:
         messages = []
         for drain in self._drains:
-            taken = drain.take()
+            taken = self._guarded(drain.topic, drain.take) or []
             messages += [(drain.topic, stamp, data) for stamp, data in taken]
-            if taken and self._live:
-                self._live.note(drain.topic, [data for _, data in taken])
+            if not taken:
+                continue
+            if leaf(drain.topic) == STATES:
+                self._last_states = time.monotonic()
+            if self._live:
+                self._guarded(drain.topic, self._live.note, drain.topic, [data for _, data in taken])
         messages.sort(key=lambda message: message[1])
         self._writer.write(messages)
         self.failure = self._writer.error
@@ -90,14 +117,39 @@ class Recorder(Node):
         """Subscribe to new topics, and request the parameters of new nodes."""
         known = {drain.topic for drain in self._drains}
         for topic, types in self.get_topic_names_and_types():
-            msgtype = SHARED_TOPICS.get(topic) or ARM_TOPICS.get(topic.rpartition("/")[2])
+            msgtype = SHARED_TOPICS.get(topic) or ARM_TOPICS.get(leaf(topic))
             if msgtype and topic not in known and type_name(msgtype) in types:
-                self._subscribe(topic, msgtype)
+                self._guarded(topic, self._subscribe, topic, msgtype)
         for name, namespace in self.get_node_names_and_namespaces():
             node = f"{namespace.rstrip('/')}/{name}"
             if node not in self._snapshots and node != self.get_fully_qualified_name() and not name.startswith("_"):
-                Snapshot(self, node)
                 self._snapshots.add(node)
+                self._guarded(node, Snapshot, self, node)
+
+    def _guarded(self, name: str, function: Callable[..., Any], *args: Any) -> Any:
+        """Return the function's result; None after an exception, which is logged once for each `name`."""
+        try:
+            return function(*args)
+        except Exception as error:
+            if name not in self._failed:
+                self._failed.add(name)
+                self.get_logger().error(f"{name}: {type(error).__name__}: {error}; the rest is recorded")
+            return None
+
+    def _losses(self) -> tuple[int, int]:
+        """Return how many messages of joints and IMU did not arrive, and how many were not written."""
+        return sum(drain.lost for drain in self._drains), self._writer.lost
+
+    def _report_losses(self) -> None:
+        lost = self._losses()
+        if lost != self._reported:
+            self._reported = lost
+            self.get_logger().warning(f"messages lost so far: {lost[0]} did not arrive, {lost[1]} were not written")
+
+    def _print_live_line(self) -> None:
+        counts = {"messages": self._writer.count, "lost": sum(self._losses())}
+        if self._live:
+            self._guarded("live state", self._live.write, counts)
 
     def _subscribe(self, topic: str, msgtype: type) -> None:
         offered = [publisher.qos_profile for publisher in self.get_publishers_info_by_topic(topic)]
@@ -113,13 +165,21 @@ class Recorder(Node):
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
         self._writer.add_topic(topic, type_name(msgtype), offered_qos(reliable, latched, offered[0].depth or 1))
-        self._drains.append(Drain(self, msgtype, topic, qos))
+        # Other topics have several publishers, each with its own numbers.
+        self._drains.append(Drain(self, msgtype, topic, qos, counts_lost=msgtype in (JointState, Imu, Vector3Stamped)))
 
     def write_parameters(self, node: str, values: dict[str, Any]) -> None:
         """Write the parameters of a node."""
         text = yaml.safe_dump({node: {"ros__parameters": values}}, default_flow_style=None, width=120)
+        self._write_text(PARAMETERS, text)
+
+    def _write_text(self, topic: str, text: str) -> None:
         now = self.get_clock().now().nanoseconds
-        self._writer.write([(PARAMETERS_TOPIC, now, serialize_message(String(data=text)))])
+        self._writer.write([(topic, now, serialize_message(String(data=text)))])
+
+    def on_snapshot(self, node: str, future: Future, function: Callable[[Any], None]) -> None:
+        """Pass the response of a node's parameter service to `function`."""
+        self._guarded(f"parameters of {node}", lambda: function(future.result()))
 
 
 class Snapshot:
@@ -136,14 +196,18 @@ class Snapshot:
     def _request(self) -> None:
         if self._list.service_is_ready() and self._get.service_is_ready():
             self._recorder.destroy_timer(self._timer)
-            self._list.call_async(ListParameters.Request()).add_done_callback(self._on_names)
+            self._call(self._list, ListParameters.Request(), self._on_names)
 
-    def _on_names(self, future: Future) -> None:
-        self._names = list(future.result().result.names)
-        self._get.call_async(GetParameters.Request(names=self._names)).add_done_callback(self._on_values)
+    def _call(self, client: Client, request: Any, on_response: Callable[[Any], None]) -> None:
+        future = client.call_async(request)
+        future.add_done_callback(lambda done: self._recorder.on_snapshot(self._node, done, on_response))
 
-    def _on_values(self, future: Future) -> None:
-        values = (_plain(parameter_value_to_python(value)) for value in future.result().values)
+    def _on_names(self, response: ListParameters.Response) -> None:
+        self._names = list(response.result.names)
+        self._call(self._get, GetParameters.Request(names=self._names), self._on_values)
+
+    def _on_values(self, response: GetParameters.Response) -> None:
+        values = (_plain(parameter_value_to_python(value)) for value in response.values)
         # ROS's parameter files have neither empty lists nor unset values.
         given = {name: value for name, value in zip(self._names, values, strict=True) if value not in (None, [])}
         self._recorder.write_parameters(self._node, given)
@@ -151,58 +215,10 @@ class Snapshot:
             self._recorder.destroy_client(client)
 
 
-class Live:
-    """The latest state as one line of JSON, for the program that started the recorder: `trial`.
-
-    {"right": {"position": [4 rad], "velocity": [...], "effort": [...], "command": [...], "names": [...],
-    "step": {...}}, "status": {"right/can_bridge": {"level": 2, "message": "...", "state": "fault", ...}},
-    "faults": ["right/can_bridge: ..."]}
-
-    status: the newest of each node on /diagnostics, its values included. faults: those whose level is not OK, as text.
-    """
-
-    def __init__(self) -> None:
-        self._latest: dict[str, bytes] = {}
-        self._status: dict[str, dict[str, Any]] = {}
-
-    def note(self, topic: str, messages: list[bytes]) -> None:
-        """Keep the newest message of a topic, and the newest status of each node."""
-        if topic != "/diagnostics":
-            self._latest[topic] = messages[-1]
-            return
-        for data in messages:
-            for status in deserialize_message(data, DiagnosticArray).status:
-                values = {pair.key: pair.value for pair in status.values}
-                level = int.from_bytes(status.level, "big")
-                self._status[status.name] = values | {"level": level, "message": status.message}
-
-    def write(self) -> None:
-        """Write the line to standard output."""
-        line: dict[str, Any] = {}
-        for topic, data in self._latest.items():
-            namespace, _, leaf = topic.rpartition("/")
-            if leaf in ARM_TOPICS:
-                arm = line.setdefault(namespace.strip("/") or "arm", {})
-                arm.update(_summary(leaf, deserialize_message(data, ARM_TOPICS[leaf])))
-        line["status"] = self._status
-        line["faults"] = [f"{name}: {status['message']}" for name, status in self._status.items() if status["level"]]
-        sys.stdout.write(json.dumps(line) + "\n")
-        sys.stdout.flush()
-
-
 def type_name(msgtype: type) -> str:
     """Return 'sensor_msgs/msg/JointState' for that class."""
     package, kind, *_ = msgtype.__module__.split(".")
     return f"{package}/{kind}/{msgtype.__name__}"
-
-
-def _summary(leaf: str, message: JointState | String) -> dict[str, Any]:
-    if leaf == "wearer_step":
-        return {"step": json.loads(message.data)}
-    if leaf == "effort_commands":
-        return {"command": list(message.effort)}
-    fields = {field: list(getattr(message, field)) for field in ("position", "velocity", "effort")}
-    return {"names": list(message.name), **fields}
 
 
 def _plain(value: Any) -> Any:

@@ -98,15 +98,17 @@ class Launcher:
         return None
 
     def stop(self) -> None:
-        """Stop every node: first the bridges, which let the arms down, then the rest.
+        """Stop every node: first the bridges, which let the arms down, then the rest, and the recorder last.
 
         Sets `maybe_powered` to the bridges whose motors may still be on.
         """
         bridges = [node for node in self._processes if node.endswith("/can_bridge")]
-        others = [node for node in self._processes if node not in bridges]
+        recorders = [node for node in self._processes if node.endswith("/recorder")]
+        others = [node for node in self._processes if node not in (*bridges, *recorders)]
         self._terminate(bridges, DESCENT_TIMEOUT)
         self.maybe_powered = [node for node in bridges if not self._is_off(node)]
         self._terminate(others, STOP_TIMEOUT)
+        self._terminate(recorders, STOP_TIMEOUT)
 
     def _terminate(self, nodes: list[str], timeout: float) -> None:
         """Terminate `nodes` and wait for them; kill those that run for more than `timeout` s."""

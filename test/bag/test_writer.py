@@ -102,16 +102,27 @@ def test_queued_messages_are_written_before_the_end(tmp_path):
     assert writer.count == len(read_bag(tmp_path / "bag").recordings[0].time) == 1500
 
 
-def test_a_disk_that_never_answers_ends_the_recording_without_blocking_the_caller(tmp_path, monkeypatch):
-    answer = threading.Event()
+def test_messages_that_a_slow_disk_cannot_take_are_counted_and_the_recording_goes_on(tmp_path, monkeypatch):
+    ready = threading.Event()
     monkeypatch.setattr("exo_gravity.bag.writer.MAX_WAITING", 10)
-    monkeypatch.setattr(BagWriter, "_take", lambda self, item: answer.wait())
-    writer = BagWriter(tmp_path / "bag")
-    for k in range(20):
-        writer.write([("/right/joint_states", START + k, b"")])
-    assert "too slow" in str(writer.error)
-    answer.set()
-    writer.close()
+    write = BagWriter._take
+    monkeypatch.setattr(BagWriter, "_take", lambda self, messages: ready.wait() and write(self, messages))
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("/right/joint_states", JOINT_STATE, RELIABLE)
+        for k in range(20):
+            writer.write([("/right/joint_states", START + k, joint_state(k))])
+        assert writer.lost in (9, 10)  # the writer holds ten or eleven
+        ready.set()
+    assert writer.error is None and writer.count == 20 - writer.lost
+    assert len(read_bag(tmp_path / "bag").recordings[0].time) == writer.count
+
+
+def test_a_message_that_cannot_be_written_is_counted_and_the_others_are_written(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("/right/joint_states", JOINT_STATE, RELIABLE)
+        good = [("/right/joint_states", START + k, joint_state(k)) for k in range(4)]
+        writer.write([*good[:2], ("/nowhere", START, b""), ("/right/joint_states", -1, b""), *good[2:]])
+    assert (writer.count, writer.lost, writer.error) == (4, 2, None)
 
 
 def process_command(name, path):

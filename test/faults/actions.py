@@ -205,7 +205,9 @@ def run_bridge(rig: Rig, namespace: str, port_offset: int = 0, **changes: object
     path = rig.folder / f"second_bridge_{time.monotonic_ns()}.yaml"
     path.write_text(yaml.safe_dump({f"{namespace}/can_bridge": content}))
     command = [executable("can_bridge"), "--ros-args", "-r", f"__ns:={namespace}", "--params-file", str(path)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
     try:
         output, code = process.communicate(timeout=START_LIMIT)[0], process.returncode
     except subprocess.TimeoutExpired:
@@ -221,7 +223,9 @@ def run_bridge(rig: Rig, namespace: str, port_offset: int = 0, **changes: object
 def record_on_a_full_disk(rig: Rig) -> None:
     """Record the arm for 2 s with a recorder that may write only a small file."""
     folder: Path = rig.folder / f"recording_{time.monotonic_ns()}"
-    recorder = subprocess.Popen([executable("recorder"), "--ros-args", "-p", f"output:={folder}"])
+    command = [executable("recorder"), "--ros-args", "-p", f"output:={folder}"]
+    silent = subprocess.DEVNULL
+    recorder = subprocess.Popen(command, stdout=silent, stderr=silent, start_new_session=True)
     resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (FILE_SIZE_LIMIT, FILE_SIZE_LIMIT))
     time.sleep(4.0)
     recorder.terminate()

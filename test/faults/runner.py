@@ -34,10 +34,10 @@ def run_case(case: FaultCase, rig: Rig) -> Result:
     injected = case.inject(rig)
     fault_time = injected if isinstance(injected, float) else fault_time
     _observe(case, rig)
-    outcome = _outcome(rig)
     case.clear(rig)
-    if outcome not in CARRYING and not case.must_stay_off:
+    if _outcome(rig) not in CARRYING and not case.must_stay_off:
         _wait_until_down(rig)
+    outcome = _outcome(rig)
     records = rig.truth.since(fault_time - BEFORE, start)
     failures = _failures(case, rig, outcome, records, fault_time)
     if any("Traceback" in line for line in rig.log[first_line:]):
@@ -160,6 +160,8 @@ class RigPool:
         rig = self._rig_for(case)
         try:
             result = run_case(case, rig)
+        except Exception as error:  # the other cases may still show something
+            result = not_run(case, error)
         except BaseException:
             self._close()
             raise
@@ -177,6 +179,7 @@ class RigPool:
             folder = self._folder / str(self._count)
             folder.mkdir()
             self._rig = case.rig(folder, self._shipped_timeouts)
+            self._rig.start()
         return self._rig
 
     def _close(self) -> None:

@@ -1,7 +1,7 @@
 """A process that carries an arm as a bridge does; `python -m test.hardware.carrier FILE`, FILE a pickled charge.
 
-It prints the PID of its watchdog once the motors are on and the watchdog runs. A line on its standard input is a
-command: "hand over" requests the watchdog to take over, "off" switches the motors off.
+It prints the PID of its watchdog once the motors are on and the watchdog runs. Orders, on its standard input:
+"hand over" requests the watchdog to take over, "off" switches the motors off.
 """
 
 from __future__ import annotations

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import resource
 import signal
 import subprocess
@@ -198,6 +200,63 @@ def test_a_full_disk_ends_the_recorder_with_the_reason_and_keeps_what_fits(arm, 
     _, errors = process.communicate(timeout=30)
     assert process.returncode == 1 and "recording ended after" in errors and "File too large" in errors
     assert len(read_bag(tmp_path / "bag").recordings[0].time) > 50
+
+
+def test_messages_that_a_stopped_recorder_misses_are_counted_and_noted_in_the_recording(arm, tmp_path):
+    process = start(tmp_path / "bag")
+    arm.wait_until(arm.is_recorded)
+    for k in range(20):
+        arm.publish(k)
+    time.sleep(0.2)  # so that all arrive before the recorder stops
+    process.send_signal(signal.SIGSTOP)
+    for k in range(20, 3000):
+        arm.publish(k)
+    process.send_signal(signal.SIGCONT)
+    for k in range(3000, 3050):
+        arm.publish(k)
+    arm.wait_until(lambda: arm.publish(3050) or True)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 0
+    missed, unwritten = map(int, re.findall(r"messages lost so far: (\d+) did not arrive, (\d+) were not", errors)[-1])
+    found = [
+        [round(getattr(m, field)[0]) for _, m in recorded(tmp_path / "bag", topic)]
+        for topic, field in (("/right/joint_states", "position"), ("/right/effort_commands", "effort"))
+    ]
+    assert unwritten == 0 and missed >= sum(3050 - len(numbers) for numbers in found) > 100
+    assert any(
+        f"the recorder lost messages: {missed} did not arrive" in note for note in read_bag(tmp_path / "bag").notes
+    )
+
+
+def test_a_step_that_is_no_json_ends_neither_the_recording_nor_the_live_lines(arm, tmp_path):
+    arm.steps.publish(String(data="no JSON"))
+    process = start(tmp_path / "bag", "-p", "live:=true")
+    arm.wait_until(arm.is_recorded)
+    for k in range(100):
+        arm.publish(k)
+    line = json.loads(process.stdout.readline())
+    while line.get("right", {}).get("position") != [99.0] * 4 or line["recorder"]["messages"] < 200:
+        line = json.loads(process.stdout.readline())
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=30)
+    assert process.returncode == 0
+    assert len(recorded(tmp_path / "bag", "/right/joint_states")) == 100
+
+
+def test_a_recorder_whose_launcher_died_records_until_the_arm_is_down(arm, tmp_path):
+    process = start(tmp_path / "bag", env=dict(os.environ, EXO_GRAVITY_SUPERVISED="1"))
+    arm.wait_until(arm.is_recorded)
+    k, now = 0, time.monotonic()
+    death, end = now + 0.5, now + 2.5
+    while (now := time.monotonic()) < end:  # the bridge lets the arm down
+        arm.publish(k := k + 1)
+        if now > death:
+            process.stdin.close()  # the launcher has died
+    assert process.poll() is None
+    assert process.wait(20) == 0
+    assert round(recorded(tmp_path / "bag", "/right/joint_states")[-1][1].position[0]) == k
+    assert (tmp_path / "bag" / "metadata.yaml").exists()
 
 
 def test_the_recording_of_a_killed_recorder_can_be_read(arm, tmp_path):

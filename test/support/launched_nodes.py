@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -20,6 +22,7 @@ from . import CONFIG
 Parameters = Mapping[str, Any]
 
 PORTS = itertools.count(20_000 + 2 * (os.getpid() % 5_000), 2)  # two buses for each, apart from other test runs
+GROUP = "239.74.163.2"
 NO_IMU: Parameters = {"use_imu": False}  # for the compensator, which then starts without waiting for a tilt
 FAST: Parameters = {"sign_check_torque": 0.0, "ramp_time": 0.5, "fade_time": 0.5, "damping": 1.5}
 GENTLE: Parameters = {**FAST, "ramp_time": 1.0, "fade_time": 2.0, "damping": 5.0}
@@ -79,6 +82,11 @@ class LaunchedNodes:
         self.log: list[str] = []
         self.stopping = threading.Event()
         self.ended_node: tuple[str, int] | None = None
+        self._thread: threading.Thread | None = None
+
+    def has_started(self) -> bool:
+        """Return whether `start` was called."""
+        return self._thread is not None
 
     def start(self) -> LaunchedNodes:
         self.launcher = Launcher(self.path, on_line=lambda node, line: self.log.append(f"{node}: {line}"))
@@ -92,7 +100,7 @@ class LaunchedNodes:
     @property
     def have_ended(self) -> bool:
         """Whether every process has ended."""
-        return not self._thread.is_alive()
+        return self._thread is not None and not self._thread.is_alive()
 
     def process(self, node: str) -> subprocess.Popen[str]:
         """Return the process of a node by the last part of its name, or by its full name."""
@@ -108,7 +116,19 @@ class LaunchedNodes:
 
     def stop(self) -> None:
         self.stopping.set()
-        self._thread.join(60)
+        if self._thread is not None:
+            self._thread.join(60)
+        self._end_watchdogs()
+
+    def _end_watchdogs(self) -> None:
+        """End watchdogs that retry without end, because their simulated motors are gone: they hold the lock file."""
+        bus = f"{self.bus['channel']}_{self.bus['port']}.bus"
+        for process in Path("/proc").glob("[0-9]*"):
+            with contextlib.suppress(OSError):
+                if b"watchdog_process" in (process / "cmdline").read_bytes() and any(
+                    bus in os.readlink(descriptor) for descriptor in (process / "fd").iterdir()
+                ):
+                    os.kill(int(process.name), signal.SIGKILL)
 
 
 class LauncherProcess(LaunchedNodes):
@@ -147,7 +167,9 @@ class LauncherProcess(LaunchedNodes):
         except subprocess.TimeoutExpired:
             self.launcher_process.kill()
             raise
-        self._thread.join(60)
+        if self._thread is not None:
+            self._thread.join(60)
+        self._end_watchdogs()
 
 
 def executable(name: str) -> str:

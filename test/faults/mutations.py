@@ -1,0 +1,192 @@
+"""`make mutations`: does the fault matrix see a defect? Each of these defects must turn a row unsafe.
+
+    python -m test.faults.mutations [--only TEXT ...]
+
+Each defect is applied to a copy of the package, with which the rows that are meant to see it are played. The exit code
+is 1 if a defect is not seen, or its text is no longer in the source.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+from ..support import ROOT
+
+COPIED = ("exo_gravity", "test", "config")
+ROW_LIMIT = 240.0  # s for each row, with the start of its nodes
+SAFETY, DESCENT, LIMITS = (f"exo_gravity/core/{name}.py" for name in ("safety", "descent", "limits"))
+BUS_LOCK, WATCHDOG = "exo_gravity/hardware/bus_lock.py", "exo_gravity/hardware/watchdog_process.py"
+
+
+class Edit(NamedTuple):
+    """One change: in `file`, the text `old`, which occurs once, becomes `new`."""
+
+    file: str
+    old: str
+    new: str
+
+
+class Mutation(NamedTuple):
+    """A deliberate defect, and the names of the rows of which at least one must see it."""
+
+    name: str
+    rows: tuple[str, ...]
+    edits: tuple[Edit, ...]
+
+
+MUTATIONS = (
+    Mutation(
+        "damping on one motor only",
+        ("motor 2 reports an error",),
+        (
+            Edit(
+                DESCENT,
+                "return tuple(joint.damping for joint in self._joints)",
+                "return (self._joints[0].damping, 0.0, 0.0, 0.0)",
+            ),
+        ),
+    ),
+    Mutation(
+        "EXIT at once on a fault",
+        ("motor 2 reports an error",),
+        (
+            Edit(
+                SAFETY,
+                "        elif self.state is not State.LETTING_DOWN:\n            self._let_down(now)",
+                "        elif self.state is not State.LETTING_DOWN:\n            self._enter(State.FAULT, now)",
+            ),
+        ),
+    ),
+    Mutation(
+        "the torque does not fade",
+        ("motor 2 reports an error",),
+        (
+            Edit(
+                DESCENT,
+                "self.effort = max(-brake, min(brake, effort))",
+                "self.effort = 0.0",
+            ),
+        ),
+    ),
+    Mutation(
+        "the watchdog never acts",
+        ("can_bridge killed",),
+        (Edit(WATCHDOG, "    if not drive.powered:\n", "    if True:\n"),),
+    ),
+    Mutation(
+        "a motor that was switched off is not switched on again",
+        ("foreign EXIT to motor 2 while let down", "motor 2 restarts in 30 ms"),
+        (Edit(SAFETY, "missing and not is_silent for missing", "False for missing"),),
+    ),
+    Mutation(
+        "a second bridge takes the bus",
+        ("second can_bridge on the bus",),
+        (
+            Edit(BUS_LOCK, "if not self._is_acquired():", "if False:"),
+            Edit("exo_gravity/hardware/owned_bus.py", "bus.listen()", "pass"),
+        ),
+    ),
+    Mutation(
+        "a soft wall without damping",
+        ("elbow pushed into the soft wall",),
+        (Edit(LIMITS, "return tuple(WALL_DAMPING * min(", "return tuple(0.0 * min("),),
+    ),
+    Mutation(
+        "torque delivery is not checked",
+        ("motor 2 restarts in 30 ms",),
+        (Edit(SAFETY, "if fault and self.state in CARRYING and is_proven:", "if False:"),),
+    ),
+    Mutation(
+        "a second commander is ignored",
+        ("second publisher of efforts",),
+        (Edit("exo_gravity/nodes/can_bridge.py", "if self._commander.is_another(info):", "if False:"),),
+    ),
+    Mutation(
+        "stale efforts are accepted",
+        ("compensator frozen, the rest runs on",),
+        (Edit(SAFETY, "elif fault is None and not now - effort_time <= self.limits.command_timeout:", "elif False:"),),
+    ),
+    Mutation(
+        "zeros once checked are trusted for ever",
+        ("joint 2 jumps by a motor turn, then clear and enable",),
+        (Edit(SAFETY, "zip(joints, self._before, strict=True)))\n        if any(silent) or any(jumped):",
+              "zip(joints, self._before, strict=True)))\n        if False:"),
+         Edit(SAFETY, "        if code in DOUBTFUL:\n", "        if False:\n")),
+    ),
+    Mutation(
+        "motors are switched off while damping still holds the arm",
+        ("arm disabled",),
+        (
+            Edit(
+                DESCENT,
+                "return self.effort == 0.0 and self.damping == 0.0",
+                "return self.effort == 0.0",
+            ),
+            Edit(DESCENT, "free >= REST_TIME and now - rest_since >= REST_TIME", "free >= 0.0"),
+        ),
+    ),
+)  # fmt: skip
+
+
+def apply(mutation: Mutation, root: Path) -> None:
+    """Change the copy of the checkout in `root`. Raises ValueError if a text does not occur exactly once."""
+    for edit in mutation.edits:
+        path = root / edit.file
+        source = path.read_text()
+        if source.count(edit.old) != 1:
+            raise ValueError(f"{edit.file}: the text to change occurs {source.count(edit.old)} times: {edit.old!r}")
+        path.write_text(source.replace(edit.old, edit.new))
+
+
+def unsafe_rows(mutation: Mutation, folder: Path) -> dict[str, str]:
+    """Play the rows of `mutation` in `folder`; return what was unsafe by row. A row that cannot run does not count."""
+    for name in COPIED:
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "data"))
+    apply(mutation, folder)
+    output = folder / "faults.json"
+    names = ("--exactly", "--only", *mutation.rows, "--output", str(output))
+    subprocess.run(
+        [sys.executable, "-m", "test.faults.run", *names],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(folder)},
+        stdout=subprocess.DEVNULL,
+        timeout=ROW_LIMIT * len(mutation.rows),
+        check=False,
+    )
+    results = json.loads(output.read_text())
+    return {row["fault"]: row["unsafe"] for row in results if row["unsafe"] and row["result"] != "not run"}
+
+
+def main() -> int:
+    """Try each mutation; return the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m test.faults.mutations", description="Try deliberate defects.")
+    parser.add_argument("--only", default=[""], nargs="+", metavar="TEXT", help="only defects whose name contains TEXT")
+    arguments = parser.parse_args()
+    unseen = 0
+    for mutation in MUTATIONS:
+        if not any(text in mutation.name for text in arguments.only):
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                unsafe = unsafe_rows(mutation, Path(folder))
+            except (ValueError, FileNotFoundError, subprocess.TimeoutExpired) as error:
+                unsafe, reason = {}, str(error)
+            else:
+                reason = f"not seen by: {', '.join(mutation.rows)}"
+        seen = "; ".join(f"{row}: {failure}" for row, failure in unsafe.items())
+        print(f"{mutation.name}: {seen or f'NOT SEEN ({reason})'}", flush=True)
+        unseen += not seen
+    print(f"{unseen} defects not seen" if unseen else "every defect was seen")
+    return int(bool(unseen))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
