@@ -19,7 +19,7 @@ from exo_gravity.core.errors import DataError
 from exo_gravity.tools.report import main
 
 from ..support import ROOT
-from ..support import made_bags as made
+from ..support import synthetic_bags as made
 
 
 @pytest.fixture
