@@ -79,13 +79,12 @@ def test_on_the_recording_the_estimator_agrees_with_imufusion_alone(recording, e
 
 def samples_of(orientation, duration=5.0, rate=100.0, start=0.0, report=False, bias=(0.0, 0.0, 0.0)):
     """Samples of an ideal IMU: `orientation(t)` is world from IMU, a Rotation."""
-    before = orientation(0.0)
-    for step in range(1, round(duration * rate) + 1):
-        t = step / rate
-        now = orientation(t)
-        speed = (before.inv() * now).as_rotvec() * rate + bias
-        yield ImuSample(start + t, speed, now.inv().apply((0, 0, G)), now.as_quat() if report else None)
-        before = now
+    times = np.arange(round(duration * rate) + 1) / rate
+    world_from_imu = Rotation.concatenate([orientation(t) for t in times])
+    speeds = (world_from_imu[:-1].inv() * world_from_imu[1:]).as_rotvec() * rate + bias
+    accelerations = world_from_imu[1:].inv().apply((0, 0, G))
+    for t, speed, acceleration, now in zip(times[1:], speeds, accelerations, world_from_imu[1:], strict=True):
+        yield ImuSample(start + t, speed, acceleration, now.as_quat() if report else None)
 
 
 def last(estimator, samples):
@@ -100,7 +99,7 @@ def test_any_mounting_of_the_imu_gives_the_tilt_of_the_trunk(report):
     world_from_trunk = Rotation.from_euler("xyz", (0.2, -0.5, 1.0))
     for mounting in Rotation.random(20, random_state=1):
         estimator = TrunkEstimator(mounting.as_quat())
-        answer = last(estimator, samples_of(lambda t, m=mounting: world_from_trunk * m, report=report))
+        answer = last(estimator, samples_of(lambda t, fixed=world_from_trunk * mounting: fixed, report=report))
         assert (answer.pitch, answer.roll) == pytest.approx((-0.5, 0.2), abs=1e-4)
 
 
