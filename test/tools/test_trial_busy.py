@@ -1,4 +1,4 @@
-"""A trial on a computer that is too busy for the simulated device: it is repeated, and in the end it says so."""
+"""A trial on a computer that is too busy for the simulated device: repeated, then reported in the last line."""
 
 from __future__ import annotations
 

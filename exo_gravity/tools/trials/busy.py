@@ -12,7 +12,7 @@ from typing import Any
 from exo_gravity.core.faults import FaultCode
 
 LONG_GAP = 50.0  # ms; a simulated device loses time after such a stall
-# Faults that a busy computer can cause; '' stands for a trial that failed without a fault.
+# Faults that a busy computer can cause; '' stands for a trial that ended early without a fault.
 POSSIBLE = (
     "",
     FaultCode.MOTOR_SILENT.value,
@@ -41,7 +41,7 @@ def fault_of(status: Status) -> tuple[str, str]:
 def too_busy(status: Status) -> str:
     """Return what was late and, if it is known, by how much; '' if the simulated device ran in time.
 
-    status: of all nodes, at the end of a trial that failed. A simulated fault explains a failure by itself.
+    status: of all nodes, after a trial that ended early. A simulated fault is a reason by itself.
     """
     simulators = {name: values for name, values in status.items() if "longest stall (ms)" in values}
     code, _ = fault_of(status)

@@ -59,12 +59,12 @@ def run_nodes(params: Path, script: TrialScript, folder: Path, console: Console,
         nodes = threading.Thread(target=lambda: dead.append(launcher.run(ending)))
         nodes.start()
         trouble = follow(progress, script, stopped, lambda: _exit_code(launcher, RECORDER), nodes)
-        interrupted = stopped.is_set() or _exit_code(launcher, RECORDER) is not None
+        recorder_failed = _exit_code(launcher, RECORDER) is not None and launcher.dead() is None
         if nodes.is_alive():
             progress.end("letting the arm down and closing the recording")
         ending.set()
         nodes.join()
-    busy = "" if interrupted else too_busy(progress.status)
+    busy = "" if stopped.is_set() or recorder_failed else too_busy(progress.status)
     if dead and dead[0]:
         node, code = dead[0]
         why = last_errors.get(node, f"see {folder / 'log.txt'}")

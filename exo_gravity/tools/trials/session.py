@@ -60,7 +60,7 @@ def run(session: Session, console: Console) -> int:
         code = code or report.exit_code
     contents = "Report and parameters" if session.offline else "Report, recording, log and parameters"
     console.print(f"{contents}: {folder}", markup=False, soft_wrap=True)
-    if code and code != 2 and outcome.busy:
+    if outcome.trouble and outcome.busy and code != 2:
         trouble, code = f"this computer was too busy: {outcome.busy}. {ADVICE}", BUSY_CODE
     if trouble:
         console.print(f"trial: {trouble}", markup=False, soft_wrap=True)
