@@ -162,6 +162,12 @@ class SignCheckRig(Rig):
     bridge: ClassVar[Parameters] = {"sign_check_torque": 1.5, "ramp_time": 3.0}
 
 
+class BowRig(Rig):
+    """In this pose the motors can hold the arm on a trunk that is bowed to any angle up to 110 degrees."""
+
+    pose = (0.0, 0.4, 1.0, 1.8)
+
+
 class WallRig(Rig):
     """The elbow's upper limit is within reach of a push, and far from the mechanical stop."""
 
