@@ -51,7 +51,7 @@ class Rig:
 
     def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
         self.folder, self.shipped_timeouts = folder, shipped_timeouts
-        self.script = self.write_script("pose", [{"move": list(self.pose), "over": 2.0}, {"hold": 600.0}])
+        self.script = self.write_script("pose", [{"move": list(self.pose), "over": 1.5}, {"hold": 600.0}])
         # The hand stays: a joint with little friction would swing out of its limits again.
         self._home = self.write_script("home", [{"move": HOME, "over": 1.0}, {"move": HOME, "over": HELP_TIME}])
         self.probe = RosProbe()
@@ -77,7 +77,7 @@ class Rig:
 
     def _make_nodes(self, port: int) -> list[LaunchedNodes]:
         """Return the nodes of each launcher apart from the simulator; the first one has the bridge."""
-        bridge = {**GENTLE, "rate": self.rate, **self.bridge}
+        bridge = {**GENTLE, "ramp_time": 0.5, "rate": self.rate, **self.bridge}
         return [self._nodes(without=SIMULATOR, port=port, can_bridge=bridge, compensator=self.compensator)]
 
     def _nodes(self, **options: Any) -> LaunchedNodes:

@@ -46,6 +46,7 @@ class CommandedRig(Rig):
     """This process commands the arm, at 100 Hz; `change_message` may spoil each message before it leaves."""
 
     rate = 100.0
+    pose = (0.0, 0.6, 0.0, 0.3)  # soon down: these rows are about what is refused
     simulator: ClassVar[Parameters] = UPRIGHT
 
     def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
