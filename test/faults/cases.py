@@ -39,6 +39,7 @@ from .fault_case import ALL_JOINTS, PROCESS_REACTION, FaultCase
 from .rig import Rig
 from .rigs import (
     BothArmsRig,
+    BowRig,
     HighFrictionRig,
     LauncherRig,
     LeastFrictionRig,
@@ -113,8 +114,6 @@ HELD_ROWS = (
     FaultCase("parameters that contradict each other", set_contradicting_parameters, limit=None, outcomes=HELD),
     FaultCase("second can_bridge on the bus", start_second_bridge("/second"), limit=None, outcomes=HELD, in_tests=True),
     FaultCase("disk full for the recorder", record_on_a_full_disk, limit=None, outcomes=HELD),
-    FaultCase("trunk bows past 90 degrees", in_turn(simulator(trunk__pitch=1.9), pause(4.5)), limit=None, outcomes=HELD,
-        clear=in_turn(simulator(trunk__pitch=0.1), pause(4.0))),
     FaultCase("100,000 random frames", random_frames(100_000, (0, *range(5, 2048))), limit=None),  # 1-4: the motors
     FaultCase("foreign frames, 3,000 a second", random_frames(15_000, range(0x100, 0x200)), limit=None),
     FaultCase("processors overloaded", overload_processors, limit=None),
@@ -216,6 +215,8 @@ ARMS = (
     FaultCase("arm disabled, friction 0.05 Nm", enable(False), LowFrictionRig, outcomes=OFF),
     FaultCase("arm disabled, friction 0.5 Nm", enable(False), HighFrictionRig, outcomes=OFF),
     FaultCase("arm disabled, fade_time 30 s", enable(False), SlowFadeRig, outcomes=OFF),
+    FaultCase("trunk bows past 90 degrees", in_turn(simulator(trunk__pitch=1.9), pause(4.5)), BowRig, None,
+        outcomes=HELD, clear=in_turn(simulator(trunk__pitch=0.1), pause(4.0))),
     FaultCase("elbow pushed into the soft wall", push_elbow, WallRig, None, speed_limit=5.0, check=not_thrown_back),
     FaultCase("arm disabled, Zero-G, 75 kg", enable(False), WearerRig, outcomes=OFF),
     FaultCase("motor 2 reports an error, Zero-G, 75 kg", ERROR, WearerRig, clear=NO_ERROR, outcomes=("motor_error",)),

@@ -12,7 +12,7 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -51,14 +51,14 @@ class Rig:
 
     def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
         self.folder, self.shipped_timeouts = folder, shipped_timeouts
-        self.script = self.write_script("pose", [{"move": list(self.pose), "over": 2.0}, {"hold": 600.0}])
+        self.script = self.write_script("pose", [{"move": list(self.pose), "over": 1.5}, {"hold": 600.0}])
         # The hand stays: a joint with little friction would swing out of its limits again.
         self._home = self.write_script("home", [{"move": HOME, "over": 1.0}, {"move": HOME, "over": HELP_TIME}])
         self.probe = RosProbe()
         device = self._device_nodes()
         self.nodes = [*self._make_nodes(device.bus["port"]), device]
         self.truth = Truth(device.truth_path())
-        self._watchdogs: set[int] = set()
+        self._bridges: set[int] = set()  # IDs of their processes
 
     def start(self) -> None:
         """Start the nodes, the simulated device first."""
@@ -82,7 +82,7 @@ class Rig:
 
     def _make_nodes(self, port: int) -> list[LaunchedNodes]:
         """Return the nodes of each launcher apart from the simulator; the first one has the bridge."""
-        bridge = {**GENTLE, "rate": self.rate, **self.bridge}
+        bridge = {**GENTLE, "ramp_time": 0.5, "rate": self.rate, **self.bridge}
         return [self._nodes(without=SIMULATOR, port=port, can_bridge=bridge, compensator=self.compensator)]
 
     def _nodes(self, **options: Any) -> LaunchedNodes:
@@ -105,7 +105,6 @@ class Rig:
             if stage == "letting down":
                 assert self.probe.enable(False).success
                 self.probe.wait_until(lambda: abs(self.true_velocity(1)) > 0.2)
-            self._note_watchdogs()
 
     def _get_carried(self) -> None:
         """Wait until the arm is carried; the wearer moves an arm that hangs outside its limits."""
@@ -136,6 +135,7 @@ class Rig:
         prefer(os.getpid())
         probe.wait_until(lambda: self._any_ended or (probe.joint_states and probe.effort_commands))
         assert not self._any_ended, "nodes ended at the start"
+        self._bridges.add(self.pid("can_bridge"))
         prefer(os.getpid())
 
     def _is_at_pose(self) -> bool:
@@ -157,7 +157,6 @@ class Rig:
             assert probe.trigger("clear_fault").success
         assert probe.enable(True).success
         probe.wait_until(lambda: probe.state == stage)
-        self._note_watchdogs()
 
     def true_velocity(self, joint: int) -> float:
         """Return the newest velocity in rad/s of `joint` (0..3)."""
@@ -180,9 +179,6 @@ class Rig:
     def _nodes_of(self, node: str) -> LaunchedNodes:
         return next(nodes for nodes in self.nodes if full_name(node) in load(nodes.path))
 
-    def _note_watchdogs(self) -> None:
-        self._watchdogs.update(children(self.pid("can_bridge")))
-
     @property
     def have_ended(self) -> bool:
         """Whether the nodes have ended."""
@@ -201,11 +197,18 @@ class Rig:
             for nodes in filter(LaunchedNodes.has_started, self.nodes):
                 nodes.stop()
         finally:
-            for pid in self._watchdogs:  # one that is left waits for a device that no longer runs
-                with contextlib.suppress(FileNotFoundError, ProcessLookupError):
-                    if b"watchdog" in Path(f"/proc/{pid}/cmdline").read_bytes():
-                        os.kill(pid, signal.SIGKILL)
+            kill_watchdogs(self._bridges)
             self.probe.close()
+
+
+def kill_watchdogs(bridges: Collection[int]) -> None:
+    """Kill the watchdogs of these bridges: one that is left waits without end for a device that no longer runs."""
+    arguments = {str(bridge).encode() for bridge in bridges}
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):
+            command = path.read_bytes().split(b"\0")
+            if any(b".watchdog" in part for part in command) and arguments.intersection(command):
+                os.kill(int(path.parent.name), signal.SIGKILL)
 
 
 def prefer(pid: int) -> None:

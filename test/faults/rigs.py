@@ -46,6 +46,7 @@ class CommandedRig(Rig):
     """This process commands the arm, at 100 Hz; `change_message` may spoil each message before it leaves."""
 
     rate = 100.0
+    pose = (0.0, 0.6, 0.0, 0.3)  # soon down: these rows are about what is refused
     simulator: ClassVar[Parameters] = UPRIGHT
 
     def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
@@ -159,6 +160,12 @@ class SignCheckRig(Rig):
     """The signs are checked at the start, and the torque ramps in over 3 s."""
 
     bridge: ClassVar[Parameters] = {"sign_check_torque": 1.5, "ramp_time": 3.0}
+
+
+class BowRig(Rig):
+    """In this pose the motors can hold the arm on a trunk that is bowed to any angle up to 110 degrees."""
+
+    pose = (0.0, 0.4, 1.0, 1.8)
 
 
 class WallRig(Rig):

@@ -8,13 +8,16 @@ from typing import Any
 
 import pytest
 
-from .simulated_rig import SimulatedRig
+from exo_gravity.hardware import owned_bus
+
+from .simulated_rig import NoWatchdog, SimulatedRig
 
 
 @pytest.fixture
 def lock_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of the lock files of buses, for this test and the processes that it starts."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(owned_bus, "Watchdog", NoWatchdog)
     return tmp_path
 
 

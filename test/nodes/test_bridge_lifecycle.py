@@ -14,13 +14,13 @@ from rclpy.lifecycle import TransitionCallbackReturn
 
 from exo_gravity.core.drive import NOTHING, State
 from exo_gravity.core.errors import BusError
-from exo_gravity.hardware import bus_lock
+from exo_gravity.hardware import bus_lock, owned_bus
 from exo_gravity.hardware.bus_lock import BusLock
 from exo_gravity.hardware.control_loop import EffortCommand
 from exo_gravity.nodes import bridge_services, can_bridge
 from exo_gravity.nodes.can_bridge import CanBridge
 
-from ..hardware.simulated_rig import SimulatedRig, wait_until
+from ..hardware.simulated_rig import NoWatchdog, SimulatedRig, wait_until
 
 pytestmark = pytest.mark.real_time
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
@@ -30,6 +30,7 @@ SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FA
 def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedRig]:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setattr(bus_lock, "ATTEMPT_TIME", 0.1)
+    monkeypatch.setattr(owned_bus, "Watchdog", NoWatchdog)
     rig = SimulatedRig(friction=0.5)  # more than the pushes of the switch-on check
     rig.device.arm.reset((0.0,) * 4)
     yield rig

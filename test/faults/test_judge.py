@@ -1,0 +1,109 @@
+"""The judge sees each way in which an arm can be let down badly, in made truth records."""
+
+import numpy as np
+import pytest
+
+from exo_gravity.sim.truth import RECORD
+
+from .judge import MAX_SPEED, measure
+
+FAULT = 10.0  # s
+PERIOD = 0.004  # s
+
+
+@pytest.fixture
+def records():
+    """A second of an arm that is carried, lowered under damping after a fault, and switched off after 4 s."""
+    records = np.zeros(8000, RECORD)
+    since = records["time"] = FAULT - 0.1 + 0.001 * np.arange(8000)
+    since = since - FAULT
+    records["on"] = (since < 4.0)[:, None]
+    records["frames"] = (np.arange(8000) // 4)[:, None]
+    fade = np.clip(1.0 - np.maximum(since, 0.0) / 2.0, 0.0, 1.0)
+    records["damping"][:, :] = np.where((since >= 0.02) & (since < 4.0), 5.0, 0.0)[:, None]
+    records["velocity"][:, 1] = np.where((since > 0.0) & (since < 3.0), -0.3, 0.0)
+    effort = np.zeros((8000, 4))
+    effort[:, 1] = 3.3 * fade
+    records["torque"] = effort - records["damping"] * records["velocity"]
+    return records
+
+
+def test_an_arm_that_is_let_down_well_is_found_safe(records):
+    response = measure(records, FAULT, PERIOD)
+    assert response.reaction == pytest.approx(0.02, abs=0.002)
+    assert response.top_speed == pytest.approx(0.3)
+    assert response.excess == 0.0
+    assert response.off == pytest.approx(4.0, abs=0.002)
+    assert response.work < 0.001
+    assert not response.re_enabled
+    assert response.gap < 0.002
+
+
+def test_damping_on_one_motor_of_four_is_no_reaction(records):
+    records["damping"][:, [0, 2, 3]] = 0.0
+    assert measure(records, FAULT, PERIOD).reaction == pytest.approx(4.0, abs=0.002)  # when they were switched off
+
+
+def test_a_motor_that_no_frame_reaches_need_not_react(records):
+    records["damping"][:, 1] = 0.0
+    assert measure(records, FAULT, PERIOD, unreached=(1,)).reaction == pytest.approx(0.02, abs=0.002)
+    assert measure(records, FAULT, PERIOD, unreached=(0, 1, 2, 3)).reaction is None
+
+
+def test_switching_off_a_motor_that_applies_torque_is_a_torque_step(records):
+    off = records["time"] >= FAULT + 0.5
+    records["on"][off] = False
+    for field in ("torque", "damping"):
+        records[field][off] = 0.0
+    response = measure(records, FAULT, PERIOD)
+    assert response.largest_step > 2.0
+    assert response.excess > 2.0
+
+
+def test_several_frames_within_a_millisecond_may_change_the_torque_as_often(records):
+    late = records["time"] >= FAULT + 1.0
+    records["torque"][~late, 1] += 0.4
+    assert measure(records, FAULT, PERIOD).excess > 0.0
+    records["frames"][late] += 2
+    assert measure(records, FAULT, PERIOD).excess == 0.0
+
+
+def test_a_torque_step_that_the_fault_itself_causes_does_not_count(records):
+    records["torque"][records["time"] < FAULT + 0.1, 1] += 1.0
+    assert measure(records, FAULT, PERIOD).excess > 0.5
+    assert measure(records, FAULT, PERIOD, steps_from=0.2).excess == 0.0
+
+
+def test_a_fall_after_the_motors_were_switched_off_counts_on_every_joint(records):
+    falls = records["time"] >= FAULT + 6.0
+    records["velocity"][falls, 3] = 2.5
+    response = measure(records, FAULT, PERIOD)
+    assert response.top_speed > MAX_SPEED
+    assert response.fastest == 4
+    assert measure(records, FAULT, PERIOD, unpowered=(3,)).top_speed < MAX_SPEED
+
+
+def test_speed_before_the_fault_does_not_count(records):
+    records["velocity"][records["time"] < FAULT - 0.05, 2] = 3.0
+    assert measure(records, FAULT, PERIOD).top_speed < MAX_SPEED
+
+
+def test_a_motor_that_drives_the_arm_does_work_and_one_that_brakes_does_not(records):
+    driven = (records["time"] >= FAULT + 1.0) & (records["time"] < FAULT + 2.0)
+    records["velocity"][driven, 2] = 0.5
+    records["torque"][driven, 2] = 2.0
+    assert measure(records, FAULT, PERIOD).work == pytest.approx(1.0, abs=0.01)
+    records["torque"][driven, 2] = -2.0
+    assert measure(records, FAULT, PERIOD).work < 0.001
+
+
+def test_a_motor_that_is_on_at_the_end_or_on_again_is_seen(records):
+    records["on"][-1, 2] = True
+    response = measure(records, FAULT, PERIOD)
+    assert response.off is None
+    assert response.re_enabled
+
+
+def test_time_in_which_the_device_did_not_run_is_seen(records):
+    kept = (records["time"] < FAULT + 1.0) | (records["time"] > FAULT + 1.5)
+    assert measure(records[kept], FAULT, PERIOD).gap == pytest.approx(0.5, abs=0.01)
