@@ -11,8 +11,8 @@ import signal
 import sys
 import time
 
+from exo_gravity.core.drive import NOTHING, Drive
 from exo_gravity.core.limits import UNKNOWN
-from exo_gravity.core.safety import NOTHING, Drive
 from exo_gravity.hardware.control_loop import REPLY_WAIT
 from exo_gravity.hardware.scheduling import favour
 

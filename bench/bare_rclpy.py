@@ -21,8 +21,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
+from exo_gravity.core.drive import NOTHING, Drive
 from exo_gravity.core.limits import UNKNOWN
-from exo_gravity.core.safety import NOTHING, Drive
 from exo_gravity.hardware.control_loop import REPLY_WAIT
 from exo_gravity.hardware.scheduling import favour
 from exo_gravity.nodes.run import keep_to_this_machine

@@ -11,9 +11,9 @@ from typing import Any
 
 from exo_gravity.bag.content import Event
 from exo_gravity.bag.topics import DIAGNOSTICS, PARAMETER_EVENTS, STEPS, arm_of, leaf
+from exo_gravity.core.drive import State
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.recording import ScriptedStep, Span
-from exo_gravity.core.safety import State
 
 CARRIED = (State.RAMPING_IN.value, State.ACTIVE.value)
 

@@ -22,9 +22,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from enum import Enum
-from typing import NamedTuple
 
+from exo_gravity.core.drive import CARRYING, NOTHING, OFF, Drive, State
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.faults import Fault, FaultCode
 from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
@@ -39,33 +38,6 @@ LONGEST_SILENCE = 5.0  # s for which the way down waits for a silent motor
 LONGEST_DESCENT = 20.0  # s after which the motors are switched off even if the arm is kept moving
 CALM = 1.0  # s without a fault before the motors are switched on: middleware and machine stutter while nodes start
 DAMPING_RISE = 0.2  # s; damping that starts at once would be a torque step
-NOTHING = (0.0, 0.0, 0.0, 0.0)
-
-
-class State(str, Enum):
-    """The state of the arm between off and carried."""
-
-    DISABLED = "disabled"
-    CHECKING = "checking"
-    PROVING = "proving signs"
-    RAMPING_IN = "ramping in"
-    ACTIVE = "active"
-    LETTING_DOWN = "letting down"
-    FAULT = "fault"
-
-
-class Drive(NamedTuple):
-    """What the motors receive: effort (4,) Nm, one damping in Nm s/rad, and whether they are switched on."""
-
-    effort: tuple[float, ...]
-    damping: float
-    powered: bool
-
-
-# The states in which torque is applied on request.
-CARRYING = (State.PROVING, State.RAMPING_IN, State.ACTIVE)
-
-OFF = Drive(NOTHING, 0.0, False)
 
 
 class SafetyMachine:
@@ -93,7 +65,7 @@ class SafetyMachine:
         self._before: Sequence[JointSample] = (UNKNOWN,) * 4
         self._unreached = False  # whether a motor was silent when the way down ended
         self._known = False  # whether zeros and signs have been checked since the motors began to reply
-        self._sign_check: SignCheck | None = None  # while PROVING
+        self._sign_check = self._new_sign_check()
 
     def enable(self, now: float) -> bool:
         """Start the checks, after which torque ramps in. Return False, and do nothing, unless DISABLED."""
@@ -160,7 +132,7 @@ class SafetyMachine:
         if self.state is State.PROVING:
             drive = Drive(tuple(self._sign_check.effort), self._damping(now), True)
         elif self.state in (State.RAMPING_IN, State.ACTIVE):
-            drive = self._carry(now, joints, effort, dt)
+            drive = self._carry(now, joints, effort or NOTHING, dt)
         elif self.state is State.LETTING_DOWN:
             drive = self._descend(now, silent, dt)
         else:
@@ -168,7 +140,9 @@ class SafetyMachine:
         self._effort = drive.effort
         return drive
 
-    def _check(self, now, joints, effort, effort_time) -> None:
+    def _check(
+        self, now: float, joints: Sequence[JointSample], effort: Sequence[float] | None, effort_time: float
+    ) -> None:
         """Start gate: continue to RAMPING_IN, or note what is missing, or trip on what must not be waited out."""
         fault = self.limits.find_fault(now, joints, self._before, overshoot=0.0)
         if not fault and not self._known:
@@ -192,7 +166,9 @@ class SafetyMachine:
         self._since = now
         return None
 
-    def _watch(self, now, joints, effort, effort_time) -> None:
+    def _watch(
+        self, now: float, joints: Sequence[JointSample], effort: Sequence[float] | None, effort_time: float
+    ) -> None:
         fault = self.limits.find_fault(now, joints, self._before)
         if fault is None and effort is None:
             fault = Fault(FaultCode.COMMAND_WITHDRAWN, "the compensator withdrew its efforts; see its diagnostics")
@@ -215,7 +191,7 @@ class SafetyMachine:
         push = [min(limits.sign_check_torque, most) for most in limits.max_effort]
         return SignCheck(limits.joint_names, push, limits.max_effort_rate)
 
-    def _carry(self, now, joints, effort, dt) -> Drive:
+    def _carry(self, now: float, joints: Sequence[JointSample], effort: Sequence[float], dt: float) -> Drive:
         ramp = (now - self._since) / self.limits.ramp_time if self.state is State.RAMPING_IN else 1.0
         if ramp >= 1.0:
             ramp = 1.0
@@ -229,7 +205,7 @@ class SafetyMachine:
         self.acted.update(dict.fromkeys(acted, now))
         return Drive(shaped, 0.0, True)
 
-    def _descend(self, now, silent, dt) -> Drive:
+    def _descend(self, now: float, silent: bool, dt: float) -> Drive:
         elapsed = now - self._since
         fade = max(0.0, 1.0 - elapsed / self.limits.fade_time)
         faded = elapsed >= self.limits.fade_time + SETTLING_TIME
@@ -242,7 +218,7 @@ class SafetyMachine:
         effort = (max(e - step, min(e + step, fade * f)) for e, f in zip(self._effort, self._from, strict=True))
         return Drive(tuple(effort), self._damping(now), True)
 
-    def _stand(self, now, silent) -> Drive:
+    def _stand(self, now: float, silent: bool) -> Drive:
         if self._unreached and not silent and self.settled(now):
             self._unreached = False
         return Drive(NOTHING, self.limits.damping, True) if self._unreached else OFF

@@ -34,6 +34,9 @@ class SignCheck:
         self._names = names
         self._torque = torque
         self._rise, self._fall = min(RISE, rate), min(FALL, rate)
+        self._joint, self._start, self._passed = 0, float("inf"), False
+        self._still = self._waited = 0.0
+        self.done = False
         self._start_joint(0)
 
     def step(self, dt: float, joints: Sequence[JointSample]) -> Fault | None:

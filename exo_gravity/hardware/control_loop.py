@@ -14,10 +14,11 @@ from concurrent.futures import Future
 from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
 
+from exo_gravity.core.drive import CARRYING, NOTHING, Drive, State
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.faults import FaultCode
 from exo_gravity.core.limits import JointSample
-from exo_gravity.core.safety import CARRYING, NOTHING, Drive, SafetyMachine, State
+from exo_gravity.core.safety import SafetyMachine
 from exo_gravity.hardware.motor_bus import MotorBus
 
 EFFORT_WAIT = 0.5  # share of a cycle's idle time for which the loop may wait for late efforts
@@ -163,7 +164,7 @@ class ControlLoop:
         return deadline
 
     def _damp(self) -> None:
-        """The last resort, without the state machine: damping alone, for as long as an arm takes to come down."""
+        """Apply damping alone, without the state machine, for as long as an arm takes to come down: the last resort."""
         end = time.monotonic() + LAST_RESORT
         while time.monotonic() < end:
             try:

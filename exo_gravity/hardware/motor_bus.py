@@ -18,11 +18,11 @@ from typing import Any
 import can
 
 from exo_gravity.core.arm import JOINT_COUNT
+from exo_gravity.core.drive import OFF, Drive
 from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import UNKNOWN, JointSample
 from exo_gravity.core.motors import ENTER, EXIT, SET_ZERO
-from exo_gravity.core.safety import OFF, Drive
 
 MASTER_ID = 0  # the arbitration ID of some firmwares' replies
 MAX_STALE_FRAMES = 256  # frames read before each cycle: the capacity of udp_multicast, more than any cycle produces
@@ -141,9 +141,9 @@ class MotorBus:
             self.ignored[kind] += 1
             return
         joint = self._joint_of[message.data[0]]
-        _, *reading = self._motors[joint].joint_reply(message.data)
+        reply = self._motors[joint].joint_reply(message.data)
         self._answered.add(joint)
-        self.samples[joint] = JointSample(*reading, time.monotonic())
+        self.samples[joint] = JointSample(*reply[1:], time.monotonic())
 
     def _foreign(self, message: can.Message) -> str:
         """Return the kind of a frame that is not a reply of our motors, else ''."""

@@ -16,14 +16,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm import STANDARD_GRAVITY, one_float
+from exo_gravity.core.arm import STANDARD_GRAVITY, Vector, one_float
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.tilt import gravity_from_orientation, pitch_roll, rotation_matrix
 
 try:
     import imufusion
 except ImportError:  # needed only for an IMU that reports no orientation
-    imufusion = None
+    imufusion = None  # type: ignore[assignment]  # the module's absence
 
 MAX_GAP = 0.1  # s between two samples: at 6 rad/s the trunk turns by 34 degrees in it
 SETTLE_TIME = 1.0  # s of continuous samples before a reported orientation is used
@@ -168,7 +168,9 @@ class _Fused:
             raise ParameterError("linear_acceleration", acceleration, f"from {low:g} to {high:g} m/s^2 in magnitude")
         return acceleration
 
-    def restart(self, acceleration: np.ndarray) -> None:
+    def restart(self, acceleration: np.ndarray | None) -> None:
+        if acceleration is None:
+            raise ParameterError("linear_acceleration", None, "reported by an IMU without an orientation")
         self._ahrs.restart()
         # Start from the accelerometer's tilt, not from level: an IMU mounted upside down is 180 degrees from level, has
         # no direction to turn in, and would stay there.
@@ -195,7 +197,7 @@ class _Reported:
         return self._since_restart >= SETTLE_TIME
 
     def check(self, sample: ImuSample) -> np.ndarray | None:
-        rotation_matrix(sample.orientation, "orientation")
+        rotation_matrix(() if sample.orientation is None else sample.orientation, "orientation")
         return None if sample.acceleration is None else _vector("linear_acceleration", sample.acceleration)
 
     def restart(self, acceleration: np.ndarray | None) -> None:
@@ -218,7 +220,7 @@ def _angle(a: np.ndarray, b: np.ndarray) -> float:
     return 2.0 * math.atan2(math.hypot(*(a - b)), math.hypot(*(a + b)))  # accurate for small angles, too
 
 
-def _product(p: Sequence[float], q: Sequence[float]) -> np.ndarray:
+def _product(p: Vector, q: Vector) -> np.ndarray:
     """Hamilton product of two quaternions (x, y, z, w), made a unit one."""
     (px, py, pz, pw), (qx, qy, qz, qw) = p, q
     product = np.array(

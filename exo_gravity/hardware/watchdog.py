@@ -25,10 +25,11 @@ from typing import Any, NamedTuple
 
 import can
 
+from exo_gravity.core.drive import Drive
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import Limits
-from exo_gravity.core.safety import Drive, SafetyMachine
+from exo_gravity.core.safety import SafetyMachine
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.motor_bus import MotorBus, open_bus
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 from rclpy.node import Node
 
+from exo_gravity.core.drive import State
 from exo_gravity.core.limits import Limits
 from exo_gravity.core.rate import Rate
-from exo_gravity.core.safety import State
 from exo_gravity.core.wire import Load, load
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics

@@ -71,7 +71,7 @@ class BudgetWatch:
 
     def _sentence(self, robot: ArmModel, mass: Sequence[float], cog: Sequence[float], support: float) -> str:
         try:
-            values = dict(zip(BRIDGE_PARAMETERS, map(parameter_value_to_python, self._bridge), strict=False))
+            values = dict(zip(BRIDGE_PARAMETERS, map(parameter_value_to_python, self._bridge or ()), strict=False))
             bridge = values_of([param for param in CAN_BRIDGE if param.name in BRIDGE_PARAMETERS], values)
             workspace = Workspace(bridge["position_min"], bridge["position_max"], self._max_tilt)
             torques = motor_torques(bridge["motor"], bridge["torque_scale"])

@@ -11,7 +11,7 @@ import math
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -19,10 +19,11 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity.core.control_params import CAN_BRIDGE, OPTIONS, limits_of, motors_of
+from exo_gravity.core.drive import State
 from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.faults import FaultCode
 from exo_gravity.core.limits import JointSample
-from exo_gravity.core.safety import SafetyMachine, State
+from exo_gravity.core.safety import SafetyMachine
 from exo_gravity.core.wire import check_rate
 from exo_gravity.hardware.control_loop import NO_COMMAND, ControlLoop, EffortCommand
 from exo_gravity.hardware.motor_bus import MotorBus, open_bus
@@ -42,6 +43,7 @@ REMEMBERED = 256  # stamps of joint states: more than command_timeout covers at 
 REPORT_PERIOD = 0.1  # s
 ZERO_TOLERANCE = 0.02  # rad that a motor may report after set_zero
 ZERO_TIMEOUT = 3.0  # s; motors are silent for up to 1.5 s while they write their memory
+Response = TypeVar("Response", SetBool.Response, Trigger.Response)
 CALL_TIMEOUT = 2.0  # s that a service waits for the control thread
 
 
@@ -81,8 +83,6 @@ class CanBridge(LifecycleNode):
             self.trigger_configure()
             self.trigger_activate()
 
-    # Lifecycle
-
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Open the bus."""
         try:
@@ -95,10 +95,10 @@ class CanBridge(LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start the control loop, and enable the arm once it passes the start gate."""
         safety = SafetyMachine(self._limits, self._period)
-        self._loop = ControlLoop(self._bus, safety, self._period, self._publish, get_efforts=self._get_efforts)
-        self._bus = None  # now owned by the loop
-        self._loop.call(lambda: self._loop.safety.enable(time.monotonic()))
-        self._loop.start()
+        loop = ControlLoop(self._open(), safety, self._period, self._publish, get_efforts=self._get_efforts)
+        self._bus, self._loop = None, loop  # the bus is now owned by the loop
+        loop.call(lambda: safety.enable(time.monotonic()))
+        loop.start()
         for refused in request_real_time(*self._real_time):
             self.get_logger().warning(refused)
         return super().on_activate(state)
@@ -126,16 +126,15 @@ class CanBridge(LifecycleNode):
             self._bus.stop()
             self._bus = None
 
-    def _open(self) -> None:
+    def _open(self) -> MotorBus:
         if self._bus is None:
             self._bus = MotorBus(open_bus(*self._address), self._motors, note=self._watchdog.note)
+        return self._bus
 
     def _stop_loop(self) -> None:
         if self._loop is not None:
             self._loop.stop()
             self._loop = None
-
-    # Control thread
 
     def _get_efforts(self, latest: float) -> EffortCommand:
         """Return the newest efforts; wait until `latest` (monotonic s) for the answer to the last joint state."""
@@ -156,8 +155,6 @@ class CanBridge(LifecycleNode):
         if len(self._published) > REMEMBERED:
             self._published.popitem(last=False)
         self._publisher.publish(message)
-
-    # ROS callbacks
 
     def _on_efforts(self, message: JointState, info: dict[str, Any]) -> None:
         loop = self._loop
@@ -198,37 +195,39 @@ class CanBridge(LifecycleNode):
 
     def _on_set_zero(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         since = time.monotonic()
-        self._on_control_thread(self._set_zero, response)
-        if response.success and not self._zeroed(since):
-            response.success, response.message = False, f"the motors did not set their zero: {self._positions()}"
+        loop = self._loop
+        self._on_control_thread(lambda safety: self._set_zero(safety, loop), response)
+        if response.success and loop is not None and not self._zeroed(loop, since):
+            response.success = False
+            response.message = f"the motors did not set their zero: {self._positions(loop)}"
         return response
 
-    def _zeroed(self, since: float) -> bool:
+    def _zeroed(self, loop: ControlLoop, since: float) -> bool:
         """Wait until every motor has replied again; return whether all then report 0."""
         end = since + ZERO_TIMEOUT
         while time.monotonic() < end:
-            if all(joint.time > since and abs(joint.position) <= ZERO_TOLERANCE for joint in self._loop.samples):
+            if all(joint.time > since and abs(joint.position) <= ZERO_TOLERANCE for joint in loop.samples):
                 return True
             time.sleep(self._period)
         return False
 
-    def _positions(self) -> str:
-        return ", ".join(f"{n} at {j.position:.3f} rad" for n, j in zip(self._names, self._loop.samples, strict=True))
+    def _positions(self, loop: ControlLoop) -> str:
+        return ", ".join(f"{n} at {j.position:.3f} rad" for n, j in zip(self._names, loop.samples, strict=True))
 
-    def _set_zero(self, safety: SafetyMachine) -> str:
+    def _set_zero(self, safety: SafetyMachine, loop: ControlLoop | None) -> str:
         if any(motor.zero for motor in self._motors):
             return f"zero = {[motor.zero for motor in self._motors]}: must be all 0 when the motors store the zero"
         if safety.state is not State.DISABLED:
             return f"refused: the arm is {safety.state.value}, must be disabled"
         now = time.monotonic()
-        if any(self._limits.is_silent(now, joint) for joint in self._loop.samples):
+        if loop is None or any(self._limits.is_silent(now, joint) for joint in loop.samples):
             return "refused: a motor does not reply"
         if not safety.settled(now):
             return "refused: the arm is not at rest"
-        self._loop.set_zero()
+        loop.set_zero()
         return ""
 
-    def _on_control_thread(self, function: Callable[[SafetyMachine], str], response):
+    def _on_control_thread(self, function: Callable[[SafetyMachine], str], response: Response) -> Response:
         """Run `function` on the control thread; it returns an error text, or ''."""
         loop = self._loop
         try:

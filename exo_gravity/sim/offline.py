@@ -19,12 +19,13 @@ import numpy as np
 
 from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.compensator import Compensator, Settings
+from exo_gravity.core.drive import Drive, State
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.motors import ENTER, EXIT
 from exo_gravity.core.recording import Recording, ScriptedStep
-from exo_gravity.core.safety import Drive, SafetyMachine, State
+from exo_gravity.core.safety import SafetyMachine
 from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.virtual_wearer import VirtualWearer

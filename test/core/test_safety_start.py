@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from exo_gravity.core.safety import OFF, State
+from exo_gravity.core.drive import OFF, State
 
 from ..support.safety_run import EFFORT, LIMITS, PERIOD, SafetyRun
 

@@ -17,10 +17,10 @@ import can
 import pytest
 
 from exo_gravity.core.arm import ArmModel
+from exo_gravity.core.drive import OFF
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import JointSample, Limits
 from exo_gravity.core.motors import ENTER, EXIT, MOTORS, SET_ZERO
-from exo_gravity.core.safety import OFF
 from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 

@@ -28,7 +28,7 @@ PERIOD = 0.004
 # A process that its watchdog takes for a bridge that carries an arm.
 CARRIER = """
 import sys, time
-from exo_gravity.core.safety import OFF, Drive
+from exo_gravity.core.drive import OFF, Drive
 from exo_gravity.hardware.watchdog import Watchdog
 watchdog = Watchdog()
 while True:

@@ -7,10 +7,10 @@ import time
 
 import pytest
 
+from exo_gravity.core.drive import OFF, Drive
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.motors import EXIT, MOTORS
-from exo_gravity.core.safety import OFF, Drive
 from exo_gravity.hardware.motor_bus import MotorBus, open_bus
 
 VCAN = ("socketcan", "vcan0")

@@ -16,7 +16,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
-from exo_gravity.core.safety import State
+from exo_gravity.core.drive import State
 from exo_gravity.core.trial_script import Step, TrialScript
 
 SETTLING = 0.5  # s between letting go and the position from which drift is measured
