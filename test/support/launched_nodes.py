@@ -19,7 +19,7 @@ from . import CONFIG
 
 Parameters = Mapping[str, Any]
 
-PORTS = itertools.count(20_000 + os.getpid() % 10_000)  # a bus for each, apart from those of other test runs
+PORTS = itertools.count(20_000 + os.getpid() % 100 * 100)  # of test buses; 100 for each process
 NO_IMU: Parameters = {"use_imu": False}  # for the compensator, which then starts without waiting for a tilt
 FAST: Parameters = {"sign_check_torque": 0.0, "ramp_time": 0.5, "fade_time": 0.5, "damping": 1.5}
 GENTLE: Parameters = {**FAST, "ramp_time": 1.0, "fade_time": 2.0, "damping": 5.0}
