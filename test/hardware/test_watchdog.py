@@ -32,8 +32,8 @@ from exo_gravity.core.drive import OFF, Drive
 from exo_gravity.hardware.watchdog import Watchdog
 watchdog = Watchdog()
 while True:
-    print("carrying", flush=True)
     watchdog.note(Drive((0.0,) * 4, 0.0, {powered}))
+    print("carrying", flush=True)
     time.sleep(0.01)
 """
 
