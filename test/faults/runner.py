@@ -19,7 +19,7 @@ DESCENT = 40.0  # s until the arm must be down
 MAX_SPEED = 1.0  # rad/s
 LOG_LINES = 20
 
-Result = dict[str, Any]  # a row of the table; `unsafe` is empty, or says why the case failed
+Result = dict[str, Any]  # a row of the table; `unsafe` is empty, or states why the case failed
 
 
 def run_case(case: FaultCase, rig: Rig) -> Result:

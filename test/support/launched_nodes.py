@@ -35,7 +35,7 @@ REAL: dict[str, Parameters] = {
 
 
 class LaunchedNodes:
-    """The nodes of a parameter file, on a CAN bus of their own.
+    """The nodes of a parameter file on their own CAN bus.
 
     base: the file in config/. without: nodes to leave out, by the last part of their names. port: of the bus, a new one
     by default. timing: rate and time-outs by node, `SIMULATED` or `REAL`. changes: of the parameters, by node; they
