@@ -173,7 +173,7 @@ class RosProbe:
             self.wait_until(lambda: self.state in ("active", "fault"))
 
     def bring_to(self, script: object) -> None:
-        """Let the virtual wearer move the carried arm as the trial script at the path `script` states, and release it."""
+        """Let the virtual wearer move the carried arm by the trial script at the path `script`, and release it."""
         self.wait_until_carried()
         self.wearer_steps.clear()
         assert self.set_parameters("simulator", trial="").successful
