@@ -20,7 +20,7 @@ DESCENT = 30.0  # s until the arm must be down
 BEFORE = 0.1  # s before the fault, from which on the torque is known
 LOG_LINES = 20
 
-Result = dict[str, Any]  # a row of the table; `unsafe` is empty, or says why the case failed
+Result = dict[str, Any]  # a row of the table; `unsafe` is empty, or states why the case failed
 
 
 def run_case(case: FaultCase, rig: Rig) -> Result:

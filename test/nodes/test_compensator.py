@@ -29,8 +29,6 @@ from ..support.launched_nodes import NO_IMU
 from ..support.random_parameters import parameter_message, random_changes
 from ..support.ros_probe import RosProbe
 
-pytestmark = pytest.mark.real_time
-
 OTHER_NODES = ("can_bridge", "simulator", "imu")
 ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
 WEARER = Wearer(75.0).on_links(ROBOT.length)

@@ -15,8 +15,6 @@ from ..support.launched_nodes import NO_IMU, LaunchedNodes
 from ..support.random_parameters import parameter_message
 from ..support.ros_probe import RosProbe
 
-pytestmark = pytest.mark.real_time
-
 NODE = "/right/compensator"
 OTHER_NODES = ("can_bridge", "simulator", "imu")
 SCRIPT = TrialScript.parse({"name": "hold", "steps": [{"hold": 1.0}]})

@@ -6,7 +6,6 @@ DDS enforces the policy, which takes a middleware built with security.
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 import xml.etree.ElementTree as ElementTree
@@ -22,9 +21,9 @@ from exo_gravity.core.errors import DataError
 from exo_gravity.tools.launcher import Launcher
 
 from ..support import CONFIG
+from ..support.launched_nodes import PORTS
 
 POLICY = CONFIG / "sros2" / "policy.xml"
-PORT = 40_000 + os.getpid() % 10_000  # apart from those of other tests
 RULES = {"topics": ("topic", {"publish", "subscribe"}), "services": ("service", {"reply", "request"})}
 RECORDER_CALLS = ("get_parameters", "list_parameters")  # on every node
 NODES = (
@@ -63,11 +62,12 @@ def graph_of(node, name):
 
 def parameter_file(folder):
     """Write config/sim_both.yaml with unused ports, a recorder, and bridges that do not start by themselves."""
+    ports = {"left": next(PORTS), "right": next(PORTS)}
     content = yaml.safe_load((CONFIG / "sim_both.yaml").read_text(encoding="utf-8"))
     for name, entry in content.items():
         values = entry["ros__parameters"]
         if "can" in values:
-            values["can"]["options"]["port"] = PORT + ("left" in name)
+            values["can"]["options"]["port"] = ports[name.split("/")[1]]
         if name.endswith("/can_bridge"):
             values["autostart"] = False
     content["/recorder"] = {"ros__parameters": {"output": str(folder / "bag")}}
@@ -102,7 +102,7 @@ def session(tmp_path_factory):
     thread = threading.Thread(target=launcher.run, args=(ending,))
     thread.start()
     expected = lasting_rules(read_policy().get), set(NODES) - {"/recorder"}
-    found, end = None, time.monotonic() + 30.0
+    found, end = None, time.monotonic() + 90.0
     while found != expected and time.monotonic() < end:  # the tests below show the difference
         time.sleep(0.2)
         found = (

@@ -16,8 +16,6 @@ from exo_gravity.tools.trials.offline import simulated_trials
 
 from ..support.launched_nodes import NO_IMU, executable
 
-pytestmark = pytest.mark.real_time
-
 OTHER_NODES = ("can_bridge", "simulator", "imu")
 SCRIPT = TrialScript.parse({"name": "hold", "steps": [{"hold": 1.0}]})
 

@@ -52,7 +52,7 @@ def running(device, options, **own):
 
 
 def next_reply(host, timeout=5.0):
-    """Return the next frame from a motor, or None. The first byte tells it from echoes of the host's commands."""
+    """Return the next frame from a motor, or None; the first byte of the host's own commands is 0x7f or more."""
     deadline = time.monotonic() + timeout
     while (remaining := deadline - time.monotonic()) > 0:
         message = host.recv(remaining)

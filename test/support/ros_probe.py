@@ -29,7 +29,7 @@ class Timeout(AssertionError):
 
 
 class RosProbe:
-    """Listens to the arm in the namespace `arm`, on a thread of its own.
+    """Listens to the arm in the namespace `arm`, on its own thread.
 
     joint_states, effort_commands, wearer_steps: the messages so far. statuses: the newest DiagnosticStatus by node.
     """
@@ -173,7 +173,7 @@ class RosProbe:
             self.wait_until(lambda: self.state in ("active", "fault"))
 
     def bring_to(self, script: object) -> None:
-        """Let the virtual wearer move the carried arm as the trial script at the path `script` says, and let go."""
+        """Let the virtual wearer move the carried arm by the trial script at the path `script`, and release it."""
         self.wait_until_carried()
         self.wearer_steps.clear()
         assert self.set_parameters("simulator", trial="").successful

@@ -40,10 +40,10 @@ def main() -> None:
     """Run the clock."""
     longest, before = 0.0, time.monotonic()
     while True:
-        asked, _, _ = select.select([sys.stdin], [], [], TICK)
+        request, _, _ = select.select([sys.stdin], [], [], TICK)
         now = time.monotonic()
         longest, before = max(longest, now - before), now
-        if asked:
+        if request:
             if not sys.stdin.readline():
                 return
             print(longest, flush=True)
