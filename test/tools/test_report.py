@@ -18,6 +18,7 @@ from rich.console import Console
 
 from exo_gravity.bag.content import Bag, Event
 from exo_gravity.core.verdict import HoldCriteria
+from exo_gravity.tools.report import main
 from exo_gravity.tools.reporting.trial_report import analyse, print_report, write
 
 from ..support import synthetic_bags as made
