@@ -26,10 +26,10 @@ class FaultCase:
     clear(rig) ends the fault where the rig is used again. afterwards(rig) checks, once the arm is down, what happens
     next: it raises AssertionError. stage: the bridge's state in which the fault occurs. limit: s until the arm must be
     let down, None where it may stay carried, because the fault is refused or ignored. outcomes: the allowed results,
-    fault codes or states; () for any. unreached: joints (0..3) whose motors no frame can reach. unpowered: joints whose
-    motors have no power, so that nothing can brake their fall. steps_from: s after the fault from which on torque steps
-    count, where the fault itself is a step. speed_limit: rad/s of any joint. check: of the arm's true motion. in_tests:
-    whether the tests run it too. ends_rig: whether the rig is spent although its nodes run on.
+    fault codes or states; () for any. unreached: joints (0..3) whose motors no frame can reach. unpowered: joints that
+    fall, because a motor has no power, so that nothing can brake them. steps_from: s after the fault from which on
+    torque steps count, where the fault itself is a step. speed_limit: rad/s of any joint. check: of the arm's true
+    motion. in_tests: whether the tests run it too. ends_rig: whether the rig is spent although its nodes run on.
     """
 
     name: str

@@ -13,6 +13,7 @@ MAX_SPEED = 1.0  # rad/s, of every joint
 MAX_EFFORT_RATE = 50.0  # Nm/s
 MAX_WORK = 0.3  # J that one motor may put into the arm after a fault
 RESOLUTION = 2 * MOTORS["AK80-9"].torque_range * 2 / 0xFFF  # Nm, two codes of a command
+PEAK_TORQUE = np.array([MOTORS[name].peak_torque for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6")])
 MAX_GAP = 0.2  # s between two records: a longer gap means that the simulated device did not run
 
 
@@ -87,8 +88,11 @@ def _reaction(records: np.ndarray, since: np.ndarray, unreached: Collection[int]
 
 def _steps(records: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the torque steps (n - 1, 4) between records in Nm, and by how much each exceeds what is allowed."""
-    effort = records["torque"] + records["damping"] * records["velocity"]  # the part that damping does not explain
+    torque = records["torque"]
+    effort = torque + records["damping"] * records["velocity"]  # the part that damping does not explain
     step = np.abs(np.diff(effort, axis=0))
+    at_peak = np.abs(torque) > PEAK_TORQUE - RESOLUTION  # there, damping explains less than its share
+    step[at_peak[1:] | at_peak[:-1]] = 0.0
     on = records["on"]
     switched_off = on[:-1] & ~on[1:]
     step[switched_off] = np.abs(records["torque"][:-1])[switched_off]

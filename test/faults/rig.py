@@ -107,17 +107,18 @@ class Rig:
                 self.probe.wait_until(lambda: abs(self.true_velocity(1)) > 0.2)
 
     def _get_carried(self) -> None:
-        """Wait until the arm is carried; the wearer moves an arm that hangs outside its limits."""
+        """Wait until the arm is carried; the wearer moves an arm that hangs outside its limits or away from home."""
         probe = self.probe
         helped = -math.inf
         while probe.state != "active":
+            misplaced = probe.fault == "implausible_zero" or probe.status_contains("can_bridge", "to be moved")
+            if misplaced and time.monotonic() > helped + HELP_TIME:
+                helped = time.monotonic()
+                probe.set_parameters("simulator", trial=str(self._home))
             if probe.state == "fault":
                 probe.trigger("clear_fault")
             elif probe.state == "disabled":
                 probe.enable(True)
-            elif probe.status_contains("can_bridge", "to be moved") and time.monotonic() > helped + HELP_TIME:
-                helped = time.monotonic()
-                probe.set_parameters("simulator", trial=str(self._home))
             self._wait_for_report()
 
     def _wait_for_report(self) -> None:

@@ -60,6 +60,13 @@ def test_switching_off_a_motor_that_applies_torque_is_a_torque_step(records):
     assert response.excess > 2.0
 
 
+def test_damping_that_reaches_the_peak_torque_of_a_motor_is_no_torque_step(records):
+    fast = (records["time"] >= FAULT + 1.0) & (records["time"] < FAULT + 1.2)
+    records["velocity"][fast, 0] = 3.0
+    records["torque"][fast, 0] = -9.0
+    assert measure(records, FAULT, PERIOD).excess == 0.0
+
+
 def test_several_frames_within_a_millisecond_may_change_the_torque_as_often(records):
     late = records["time"] >= FAULT + 1.0
     records["torque"][~late, 1] += 0.4
