@@ -27,7 +27,7 @@ def cut(tmp_path):
     """The folder of a recording whose file ends within a chunk, without metadata.yaml."""
     recording = made.trial([[0.1, 0.4, 0.5, 0.6], [-0.2, 0.8, 0.3, 0.9]], hold=3.0, rate=200.0)
     with BagWriter(tmp_path / "bag") as writer:
-        for topic, msgtype in dict((item[0], item[1]) for item in made.messages(recording)).items():
+        for topic, msgtype in {item[0]: item[1] for item in made.messages(recording)}.items():
             writer.add_topic(topic, msgtype, offered_qos("step" not in topic, "step" in topic, 1))
         writer.write([(topic, stamp, data) for topic, _, stamp, data in made.messages(recording)])
     file = tmp_path / "bag" / "bag.mcap"

@@ -61,6 +61,8 @@ def _observe(case: FaultCase, rig: Rig) -> None:
             return
     # A bridge that has given up a motor that it cannot reach is in `fault`, and that motor still on.
     probe.wait_until(lambda: probe.state == "fault" or rig.truth.motors_are_off(), DESCENT)
+    if rig.truth.motors_are_off():  # the last state of a killed bridge stands until the launcher has ended
+        probe.wait_until(lambda: _outcome(rig) not in CARRYING, DESCENT)
 
 
 def _wait_until_down(rig: Rig) -> None:

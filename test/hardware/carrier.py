@@ -16,6 +16,7 @@ from pathlib import Path
 from exo_gravity.core.drive import NOTHING, OFF, Drive
 from exo_gravity.core.errors import BusError
 from exo_gravity.hardware.handover import Charge
+from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.hardware.owned_bus import OwnedBus
 
 
@@ -26,10 +27,11 @@ def log(text: str) -> None:
 def main(charge: Charge, drive: Drive) -> None:
     try:
         owned = OwnedBus(charge, f"/right/can_bridge (PID {os.getpid()})", log)
-        bus = owned.open()
     except BusError as error:
         log(str(error))
         raise SystemExit(1) from None
+    notes = owned._lock.notes
+    bus = MotorBus(charge.open(), charge.motors, powered=True, note=notes.note)  # the rig has switched the motors on
     orders: list[str] = []
     threading.Thread(target=lambda: [orders.append(line) for line in sys.stdin], daemon=True).start()
     is_announced = False
@@ -39,7 +41,7 @@ def main(charge: Charge, drive: Drive) -> None:
         if "hand over\n" in orders:
             owned.watchdog.hand_over("a test")
             orders.clear()
-        if not is_announced and owned._lock.notes.heartbeat and all(joint.time > 0.0 for joint in bus.samples):
+        if not is_announced and notes.heartbeat and all(joint.time > 0.0 for joint in bus.samples):
             print(owned.watchdog.pid, flush=True)
             is_announced = True
         time.sleep(max(0.0, end - time.monotonic()))

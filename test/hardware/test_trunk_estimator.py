@@ -78,11 +78,12 @@ def test_on_the_recording_the_estimator_agrees_with_imufusion_alone(recording, e
 
 
 def samples_of(orientation, duration=5.0, rate=100.0, start=0.0, report=False, bias=(0.0, 0.0, 0.0)):
-    """Samples of an ideal IMU: `orientation(t)` is world from IMU, a Rotation."""
+    """Samples of an IMU with hardly any noise: `orientation(t)` is world from IMU, a Rotation."""
     times = np.arange(round(duration * rate) + 1) / rate
     world_from_imu = Rotation.concatenate([orientation(t) for t in times])
     speeds = (world_from_imu[:-1].inv() * world_from_imu[1:]).as_rotvec() * rate + bias
-    accelerations = world_from_imu[1:].inv().apply((0, 0, G))
+    noise = 1e-9 * (-1.0) ** np.arange(len(speeds))
+    accelerations = world_from_imu[1:].inv().apply((0, 0, G)) + noise[:, None]
     for t, speed, acceleration, now in zip(times[1:], speeds, accelerations, world_from_imu[1:], strict=True):
         yield ImuSample(start + t, speed, acceleration, now.as_quat() if report else None)
 
@@ -198,6 +199,45 @@ def test_a_gyroscope_with_a_reversed_axis_is_detected():
     bow = samples_of(lambda t: Rotation.from_euler("y", 0.5 * t), duration=3.0, start=5.0)
     with pytest.raises(ParameterError, match="20 degrees of the accelerometer"):
         last(estimator, (s._replace(angular_velocity=-np.asarray(s.angular_velocity)) for s in bow))
+
+
+def frozen(count, rate=100.0, **values):
+    """Samples that repeat one measurement with new stamps, after those of `settled`."""
+    return (GOOD._replace(time=5.0 + (k + 1) / rate, **values) for k in range(count))
+
+
+@pytest.mark.parametrize("orientation", [None, ALIGNED])
+def test_a_frozen_imu_is_refused_after_a_tenth_of_a_second_and_followed_again_once_it_measures(orientation):
+    estimator = settled(report=orientation is not None)
+    accepted = [estimator.update(sample) for sample in frozen(10, orientation=orientation)]
+    assert all(accepted)
+    for sample in list(frozen(40, orientation=orientation))[10:]:
+        with pytest.raises(ParameterError, match="the IMU or its driver is frozen"):
+            estimator.update(sample)
+    report = orientation is not None
+    tilted = [
+        estimator.update(s) for s in samples_of(lambda t: Rotation.from_euler("y", 0.3), start=5.4, report=report)
+    ]
+    assert tilted[0] is None and tilted[-1].pitch == pytest.approx(0.3, abs=1e-3)
+
+
+def test_a_slow_or_fast_imu_counts_as_frozen_by_samples_and_by_time():
+    slow, fast = settled(), settled()
+    assert all(slow.update(sample) is not None for sample in frozen(9, rate=20.0))
+    assert all(fast.update(sample) is not None for sample in frozen(100, rate=1000.0))
+
+
+def test_an_imu_frozen_from_the_start_is_refused_too():
+    estimator = TrunkEstimator(ALIGNED)
+    with pytest.raises(ParameterError, match="frozen"):
+        last(estimator, frozen(20))
+
+
+def test_a_driver_that_reports_its_orientation_alone_is_not_frozen():
+    for zeros in (None, (0.0, 0.0, 0.0)):
+        estimator = TrunkEstimator(ALIGNED)
+        samples = frozen(300, orientation=ALIGNED, angular_velocity=zeros, acceleration=zeros)
+        assert last(estimator, samples) is not None
 
 
 def test_without_imufusion_an_imu_must_report_its_orientation(monkeypatch):

@@ -120,14 +120,14 @@ def test_a_stop_lets_the_arm_down_and_keeps_the_recording(make):
     trial = make()
     recording = trial.run(lambda now: now >= 4.0)
     assert trial.trouble == "right: stopped by the operator"
-    assert 4.0 < recording.time[-1] < 15.0
+    assert 6.0 < recording.time[-1] < 30.0  # of letting down
     assert not any(motor.entered for motor in trial.arm.device.motors)
 
 
 def test_the_recording_has_the_time_in_which_the_arm_was_carried(make):
     recording = make().run(lambda now: now >= 10.0)
     ((start, end),) = recording.carried
-    assert 2.0 < start < 6.0  # the checks take a second without trouble, then the sign check of four joints
+    assert 2.0 < start < 8.0  # the checks take a second without trouble, then the sign check of four joints
     assert end == pytest.approx(10.0, abs=0.01) and recording.time[-1] > end + 2.0  # of letting down
 
 
