@@ -16,6 +16,7 @@ ABSOLUTE = 0.2  # Nm: 27 torque codes of an AK60-6, above the noise of its curre
 RELATIVE = 0.25  # of the expected torque
 SMOOTHING = 0.02  # s, time constant
 PERSISTENCE = 0.01  # s for which the smoothed difference must stay too large
+GAP = 0.015  # s without a reply, after which a motor may have restarted: its next replies count at once
 
 TEST_TORQUE = 0.4  # Nm, each way, that shows that a motor is on
 TEST_TIME = 0.06  # s, each way
@@ -54,13 +55,16 @@ class DeliveryMonitor:
         for i, joint in enumerate(joints):
             if not joint.time > self._last_time[i]:
                 continue
+            has_returned = 0.0 < self._last_time[i] < joint.time - GAP
             self._last_time[i] = joint.time
             expected = effort[i] - damping[i] * joint.velocity
             expected = max(-self._peak[i], min(self._peak[i], expected))
-            self._difference[i] += share * (joint.effort - expected - self._difference[i])
-            self._expected[i] += share * (expected - self._expected[i])
+            weight = 1.0 if has_returned else share
+            self._difference[i] += weight * (joint.effort - expected - self._difference[i])
+            self._expected[i] += weight * (expected - self._expected[i])
             tolerance = ABSOLUTE + RELATIVE * abs(self._expected[i])
-            self._bad_time[i] = self._bad_time[i] + dt if abs(self._difference[i]) > tolerance else 0.0
+            before = max(self._bad_time[i], PERSISTENCE / 2) if has_returned else self._bad_time[i]
+            self._bad_time[i] = before + dt if abs(self._difference[i]) > tolerance else 0.0
         for i, is_missing in enumerate(self.missing):
             if is_missing:
                 reply = self._expected[i] + self._difference[i]

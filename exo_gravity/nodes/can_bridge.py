@@ -1,31 +1,25 @@
 """can_bridge: CAN motors -> `joint_states`, `effort_commands` -> CAN, through the safety machine.
 
-A control thread runs the bus (hardware/control_loop.py). Efforts carry the stamp of the joint state that they answer.
-The bridge remembers when, on the monotonic clock, each stamped state was measured: so the age of an answer does not
-depend on the wall clock, and an unknown stamp is refused.
+A control thread runs the bus (hardware/control_loop.py). In each cycle it publishes the joint states and reads the
+efforts that answer them (nodes/effort_exchange.py).
 """
 
 from __future__ import annotations
 
-import math
+import contextlib
 import os
 import time
-from collections import OrderedDict
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable
 
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import JointState
 
 from exo_gravity.core.control_params import CAN_BRIDGE, OPTIONS, limits_of, motors_of
-from exo_gravity.core.errors import BusError, ParameterError
+from exo_gravity.core.errors import BusError
 from exo_gravity.core.faults import FaultCode
-from exo_gravity.core.limits import JointSample
 from exo_gravity.core.safety import SafetyMachine
 from exo_gravity.core.validation import check_bridge
 from exo_gravity.core.wire import check_rate
-from exo_gravity.hardware.control_loop import NO_COMMAND, ControlLoop, EffortCommand
+from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.handover import Charge
 from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.hardware.owned_bus import OwnedBus
@@ -33,16 +27,10 @@ from exo_gravity.hardware.scheduling import request_real_time
 from exo_gravity.nodes.bridge_recovery import is_requested, run_recovery
 from exo_gravity.nodes.bridge_report import BridgeReport, log_limits
 from exo_gravity.nodes.bridge_services import CALL_TIMEOUT, BridgeServices
-from exo_gravity.nodes.conversions import by_name, to_nanoseconds
 from exo_gravity.nodes.declare import bus_of, declare
-from exo_gravity.nodes.hot_path import HotPath
+from exo_gravity.nodes.effort_exchange import EffortExchange
 from exo_gravity.nodes.run import run
-from exo_gravity.nodes.sole_publisher import SolePublisher
 
-# The control thread reads them once a cycle; the depth lets it notice a second commander. Not reliable: an old effort
-# sent again is useless, and acknowledging each one wakes a thread in both nodes (measured: 2 % of a core).
-EFFORTS = QoSProfile(depth=8, reliability=ReliabilityPolicy.BEST_EFFORT)
-REMEMBERED = 256  # stamps of joint states: more than command_timeout covers at any rate
 REPORT_PERIOD = 0.1  # s
 DESCENT_TIMEOUT = 60.0  # s in which a deactivated arm must be down, with its motors off
 AUTOSTART_PATIENCE = 30.0  # s for the watchdog of a dead bridge to let the arm down
@@ -58,7 +46,6 @@ class CanBridge(LifecycleNode):
     def __init__(self) -> None:
         super().__init__("can_bridge", automatically_declare_parameters_from_overrides=True)
         values = declare(self, CAN_BRIDGE, free_prefix=OPTIONS)
-        self._names = values["joint_names"]
         self._motors = motors_of(values)
         self._limits = limits_of(values)
         check_bridge(values["rate"], self._motors, self._limits)
@@ -66,24 +53,17 @@ class CanBridge(LifecycleNode):
         self._charge = Charge(bus_of(self, values), self._motors, self._limits, self._period)
         self._owner = f"{self.get_fully_qualified_name()} (PID {os.getpid()})"
         self._real_time = values["thread_priority"], values["lock_memory"]
-        self._wire = check_rate(values["rate"], len(self._motors))
-        self._command = NO_COMMAND  # the newest from the compensator
-        self._measured = -math.inf  # monotonic s, when the last published joint state was measured
+        wire = check_rate(values["rate"], len(self._motors))
         self._owned: OwnedBus | None = None  # while configured
         self._bus: MotorBus | None = None  # while inactive
         self._loop: ControlLoop | None = None  # while active
         self._patience = AUTOSTART_PATIENCE if values["autostart"] else 0.0
         self._error = ""  # why the last transition failed
-        self._published: OrderedDict[int, float] = OrderedDict()
-        self._refusal = "none"
-        self._commander = SolePublisher(self, "effort_commands")
-        self._report_writer = BridgeReport(self, self._names, self._wire, self._period)
-        self._publisher = self.create_publisher(JointState, "joint_states", 1)
-        self._joint_states = JointState(name=self._names)  # one message, reused
-        self._efforts = HotPath(self, JointState, "effort_commands", self._on_efforts, EFFORTS)
+        self._exchange = EffortExchange(self, values["joint_names"], self._limits, lambda: self._loop)
+        self._report_writer = BridgeReport(self, values["joint_names"], wire, self._period)
         BridgeServices(self, lambda: self._loop, self._motors, self._limits)
         self.create_timer(REPORT_PERIOD, self._report)
-        log_limits(self, self._limits, self._wire, values["rate"])
+        log_limits(self, self._limits, wire, values["rate"])
         if values["autostart"]:
             for trigger in (self.trigger_configure, self.trigger_activate):
                 if trigger() is not TransitionCallbackReturn.SUCCESS:
@@ -126,16 +106,29 @@ class CanBridge(LifecycleNode):
 
         A motor that cannot be reached may still be on, so this waits for it without end.
         """
-        loop, self._loop = self._loop, None
-        while loop is not None and not loop.stop(REMINDER_PERIOD):
-            if loop.safety.is_unreached:
-                self.get_logger().error("a motor does not reply; it may still be powered; trying again")
+        loop = self._loop
+        if loop is not None:
+            self._stop(loop)
+            self._loop = None
         if self._bus is not None:
             self._bus.stop()
             self._bus = None
         if self._owned is not None:
             self._owned.close()
             self._owned = None
+
+    def _stop(self, loop: ControlLoop) -> None:
+        reminder = time.monotonic() + REMINDER_PERIOD
+        while not loop.stop(REPORT_PERIOD):
+            self._report_descent()
+            if loop.safety.is_unreached and time.monotonic() > reminder:
+                self.get_logger().error("a motor does not reply; it may still be powered; trying again")
+                reminder += REMINDER_PERIOD
+        self._report_descent()
+
+    def _report_descent(self) -> None:
+        with contextlib.suppress(Exception):  # whatever the middleware does, the arm comes down
+            self._report_writer.send(self._loop, self._exchange.refusal, self._exchange.answered)
 
     def _transition(
         self,
@@ -163,13 +156,13 @@ class CanBridge(LifecycleNode):
             raise
 
     def _activate(self) -> None:
-        self._command = NO_COMMAND
+        self._exchange.forget()
         if self._owned is None:
             raise BusError("the node is not configured")
         bus, self._bus = self._bus or self._owned.open(), None
         safety = SafetyMachine(self._limits, self._period, [motor.peak_effort for motor in self._motors])
         hand_over = self._owned.watchdog.hand_over
-        loop = ControlLoop(bus, safety, self._period, self._publish, self._get_efforts, hand_over)
+        loop = ControlLoop(bus, safety, self._period, self._exchange.publish, self._exchange.get_efforts, hand_over)
         loop.start()
         try:
             for refused in request_real_time(*self._real_time):
@@ -190,57 +183,15 @@ class CanBridge(LifecycleNode):
                 raise BusError(f"the control thread has ended: {loop.failure}")
             if time.monotonic() > end:
                 raise BusError("a motor does not reply and may still be powered; the node stays active")
-            time.sleep(self._period)
+            self._report_descent()
+            time.sleep(REPORT_PERIOD)
+        self._stop(loop)
         self._loop = None
-        loop.stop()
-
-    # Control thread
-
-    def _get_efforts(self, latest: float) -> EffortCommand:
-        """Return the newest efforts; wait until `latest` (monotonic s) for the answer to the last joint state."""
-        self._efforts.poll()
-        if self._command.answered < self._measured:
-            self._efforts.poll(latest - time.monotonic())
-        return self._command
-
-    def _publish(self, now: float, joints: Sequence[JointSample]) -> None:
-        """Publish a joint state if every motor has replied recently: an unknown angle is never sent as a number."""
-        if any(self._limits.is_silent(now, joint) for joint in joints):
-            return
-        message = self._joint_states
-        message.position, message.velocity, message.effort, *_ = zip(*joints, strict=True)
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._measured = min(joint.time for joint in joints)
-        self._published[to_nanoseconds(message.header.stamp)] = self._measured
-        if len(self._published) > REMEMBERED:
-            self._published.popitem(last=False)
-        self._publisher.publish(message)
-
-    # ROS callbacks
-
-    def _on_efforts(self, message: JointState, info: dict[str, Any]) -> None:
-        loop = self._loop
-        if loop is None:
-            return
-        answered = self._published.get(to_nanoseconds(message.header.stamp))
-        if self._commander.is_another(info):
-            self._refusal = "a second publisher of effort_commands"
-            self._command = EffortCommand(None, time.monotonic())  # fails the start gate
-            loop.trip_if_carried(FaultCode.SECOND_COMMANDER, "more than one publisher of effort_commands")
-        elif answered is None:
-            self._refusal = f"stamp {to_nanoseconds(message.header.stamp)} ns answers no joint state of this bridge"
-        else:
-            try:
-                effort = by_name(message, "effort", self._names) if message.effort else None
-            except ParameterError as error:
-                effort, self._refusal = None, str(error)
-                loop.trip(FaultCode.COMMAND_IMPOSSIBLE, f"effort_commands: {error.name} must be {error.expected}")
-            self._command = EffortCommand(effort, answered)
 
     def _report(self) -> None:
         if self._loop is not None and self._owned is not None and not self._owned.watchdog.alive:
             self._loop.trip_if_carried(FaultCode.WATCHDOG_DEAD, "the watchdog process has died or is frozen")
-        self._report_writer.send(self._loop, self._refusal, self._command.answered)
+        self._report_writer.send(self._loop, self._exchange.refusal, self._exchange.answered)
 
 
 def main() -> None:

@@ -22,7 +22,7 @@ from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedM
 MOTORS_OF_ARM = tuple(JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1))
 LIMITS = Limits(("a", "b", "c", "d"), (-1.6,) * 4, (3.1,) * 4, (6.0,) * 4, (3.0, 9.0, 3.0, 3.0))
 PERIOD = 0.004
-POSE = (0.0, 0.9, 0.3, 0.3)
+POSE = (0.0, 0.6, 0.3, 0.3)
 SAFE_SPEED = 1.0  # rad/s
 AFTER_EXIT = 1.0  # s for which a joint that was dropped would turn
 
@@ -77,7 +77,7 @@ class SimulatedRig:
         assert self.motors_on == [False] * 4
         time.sleep(AFTER_EXIT)
         assert self.top_speed < SAFE_SPEED
-        assert abs(self.device.arm.positions[1]) < 0.5  # from 0.9
+        assert abs(self.device.arm.positions[1]) < 0.4  # from 0.6
 
     def close(self) -> None:
         self._stop.set()

@@ -18,7 +18,9 @@ from exo_gravity.hardware import bus_lock, owned_bus
 from exo_gravity.hardware.bus_lock import BusLock
 from exo_gravity.hardware.control_loop import EffortCommand
 from exo_gravity.nodes import bridge_services, can_bridge
+from exo_gravity.nodes.bridge_report import BridgeReport
 from exo_gravity.nodes.can_bridge import CanBridge
+from exo_gravity.nodes.effort_exchange import EffortExchange
 
 from ..hardware.simulated_rig import NoWatchdog, SimulatedRig, wait_until
 
@@ -42,7 +44,9 @@ def make_bridge(rig: SimulatedRig, monkeypatch: pytest.MonkeyPatch) -> Iterator[
     """A function that makes a bridge of the simulated arm, which needs no efforts from outside."""
     bridges: list[CanBridge] = []
     command = EffortCommand(NOTHING, 0.0)
-    monkeypatch.setattr(CanBridge, "_get_efforts", lambda self, latest: command._replace(answered=time.monotonic()))
+    monkeypatch.setattr(
+        EffortExchange, "get_efforts", lambda self, latest: command._replace(answered=time.monotonic())
+    )
 
     def make_bridge(autostart: bool = False) -> CanBridge:
         parameters = {
@@ -101,10 +105,14 @@ def test_configured_activated_deactivated_activated_again_and_cleaned_up(rig, ma
     assert_bus_is_free(rig)
 
 
-def test_a_shutdown_lets_the_arm_down_and_releases_the_bus(rig, make_bridge):
+def test_a_shutdown_lets_the_arm_down_reports_it_and_releases_the_bus(rig, make_bridge, monkeypatch):
+    reported: list[str] = []
+    monkeypatch.setattr(BridgeReport, "send", lambda self, loop, *_: reported.append(loop.safety.state.value))
     bridge = make_bridge()
     carry(bridge, rig)
     assert bridge.trigger_shutdown() is SUCCESS
+    assert "letting down" in reported
+    assert reported[-1] == "disabled"
     assert_nothing_runs(bridge, rig)
     assert_bus_is_free(rig)
 

@@ -1,0 +1,64 @@
+"""Torque asked against torque replied: a motor that does not deliver is noticed, a noisy current sensor is not."""
+
+import numpy as np
+import pytest
+
+from exo_gravity.core.delivery import DeliveryMonitor
+from exo_gravity.core.limits import JointSample
+
+from ..support.safety_run import LIMITS, PERIOD
+
+PEAK = (9.0, 18.0, 9.0, 9.0)
+EFFORT = (0.5, -3.8, 2.0, 1.0)  # Nm
+
+
+class Replies:
+    """Replies of four motors to `EFFORT`, in Nm. now: s."""
+
+    def __init__(self):
+        self.monitor = DeliveryMonitor(LIMITS, PEAK)
+        self.now = 10.0
+
+    def take(self, torques):
+        """One cycle with these replied torques; return the fault."""
+        self.now += PERIOD
+        joints = [JointSample(0.5, 0.0, torque, 30, 0, self.now) for torque in torques]
+        return self.monitor.step(PERIOD, joints, EFFORT, (0.0,) * 4)
+
+    def cycles_until_fault(self, torques):
+        """Count the cycles with these torques until a fault."""
+        return next(count for count in range(1, 100) if self.take(torques))
+
+
+def replaced(joint, torque):
+    """`EFFORT`, with another torque of one joint."""
+    return tuple(torque if i == joint else asked for i, asked in enumerate(EFFORT))
+
+
+@pytest.mark.parametrize("joint", [1, 2, 3])
+def test_a_motor_that_applies_nothing_is_noticed_within_60_ms(joint):
+    replies = Replies()
+    assert not any(replies.take(EFFORT) for _ in range(100))
+    assert replies.cycles_until_fault(replaced(joint, 0.0)) * PERIOD <= 0.06
+    assert replies.monitor.missing == tuple(i == joint for i in range(4))
+
+
+@pytest.mark.parametrize("silence", [0.02, 0.03, 0.04])
+def test_a_motor_that_comes_back_from_a_restart_is_noticed_by_its_second_reply(silence):
+    replies = Replies()
+    assert not any(replies.take(EFFORT) for _ in range(100))
+    replies.now += silence
+    assert replies.cycles_until_fault(replaced(1, 0.0)) <= 2
+
+
+def test_a_motor_that_comes_back_with_its_torque_is_no_fault():
+    replies = Replies()
+    for _ in range(50):
+        assert not replies.take(EFFORT)
+        replies.now += 0.03
+
+
+def test_a_current_sensor_with_5_percent_noise_raises_no_false_alarm():
+    replies, random = Replies(), np.random.default_rng(1)
+    noise = 0.05 * np.maximum(2.0, np.abs(EFFORT))
+    assert not any(replies.take(EFFORT + noise * random.standard_normal(4)) for _ in range(50_000))
