@@ -1,12 +1,12 @@
 """The gravity laws: joint angles -> the torque that each motor must give to hold the arm against gravity.
 
-`exact` is the closed form of Newton-Euler for gravity alone, valid for any centre of gravity and any trunk tilt.
-`paper_static` is EQ2-EQ5 and `paper_mobile` is EQ1m-EQ4m of the paper, word for word. They agree with `exact` only
-if every centre of gravity is at the far end of its link (d_n = l_n) and the trunk is upright.
+`exact` is the closed form of Newton-Euler for gravity alone, valid for any centre of gravity, on its link or beside it,
+and any trunk tilt. `paper_static` is EQ2-EQ5 and `paper_mobile` is EQ1m-EQ4m of the paper, word for word. They agree
+with `exact` only if every centre of gravity is at the far end of its link (d_n = l_n) and the trunk is upright.
 
 Each formula is written once, for a module `xp`: `math` for one pose in plain floats (control loop), `numpy` for whole
-arrays (analysis). Symbols: t1..t4 joint angles in rad, M1..M4 first moments in kg m, g gravity in m/s^2; l, d and
-m1..m4 as in the paper.
+arrays (analysis). Symbols: t1..t4 joint angles in rad, M1..M4 first moments along the links and W, Z, Y3, Y4 across
+them in kg m (`core.moments`), g gravity in m/s^2; l, d and m1..m4 as in the paper.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ def _exact(xp: ModuleType, arm: ArmModel, theta: Values, direction: Values) -> t
     """Return the closed form of Newton-Euler; `direction` is gravity's unit vector in the arm's base frame."""
     t1, t2, t3, t4 = theta
     gx, gy, gz = direction
-    M1, M2, M3, M4 = arm.first_moment
-    s1, c1, s2, c2 = xp.sin(t1), xp.cos(t1), xp.sin(t2), xp.cos(t2)
+    (M1, M2, M3, M4), (W, Z, Y3, Y4) = arm.first_moment, arm.off_axis
+    s1, c1, s2, c2, s3, c3 = xp.sin(t1), xp.cos(t1), xp.sin(t2), xp.cos(t2), xp.sin(t3), xp.cos(t3)
     s34, c34 = xp.sin(t3 + t4), xp.cos(t3 + t4)
     # Gravity along the axes that rotate with joint 1: A across the shoulder, B forward.
     A = gx * c1 + gy * s1
     B = gy * c1 - gx * s1
-    # First moment of the planar part (links 3 and 4) along link 2 and across it.
-    along = M3 * xp.cos(t3) + M4 * c34
-    across = M3 * xp.sin(t3) + M4 * s34
     R = A * s2 + gz * c2
+    # First moments of link 4 and of links 3 and 4 together, along link 2 and across it.
+    along4, across4 = M4 * c34 - Y4 * s34, M4 * s34 + Y4 * c34
+    along, across = M3 * c3 - Y3 * s3 + along4, M3 * s3 + Y3 * c3 + across4
     return (
-        across * A - (M1 + (M2 + along) * s2) * B,
-        (M2 + along) * (gz * s2 - A * c2),
+        (W + across) * A - (M1 + (M2 + along) * s2 - Z * c2) * B,
+        (M2 + along) * (gz * s2 - A * c2) - Z * R,
         across * R - along * B,
-        M4 * (s34 * R - c34 * B),
+        across4 * R - along4 * B,
     )
 
 
@@ -95,8 +95,10 @@ def paper_static_torque(arm: ArmModel, theta: ArrayLike) -> np.ndarray:
     """Return the torque of EQ2-EQ5 in Nm, in the shape of `theta`.
 
     theta: (4,) or (n, 4) rad. Here theta_1 is the angle between joint 1's axis and gravity (0 for an upright wearer),
-    not joint 1's encoder angle. Raises ParameterError if the shape is wrong or a number is not finite.
+    not joint 1's encoder angle. Raises ParameterError if the shape is wrong, a number is not finite, or the arm is
+    given by its moments or has moments across its links.
     """
+    arm.check_masses("paper_static")
     return _in_blocks(_paper_static, arm, _poses(theta))
 
 
@@ -106,6 +108,7 @@ def paper_mobile_torque(arm: ArmModel, theta: ArrayLike, pitch: ArrayLike, yaw: 
     theta: (4,) or (n, 4) rad, with theta_1 as in `paper_static_torque`. pitch, yaw: the paper's beta and phi in rad, a
     number or (n,) each. `Tilt` computes beta, phi and theta_1 for a trunk. Raises ParameterError as above.
     """
+    arm.check_masses("paper_mobile")
     poses = _poses(theta)
     beta, phi = (np.asarray(angle, dtype=float) for angle in (pitch, yaw))
     for name, angle in (("pitch", beta), ("yaw", phi)):
