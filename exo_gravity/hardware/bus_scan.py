@@ -1,0 +1,172 @@
+"""Finds the AK motors on a bus without moving any: MIT mode of V1 and V2 boards.
+
+A motor that is off still answers a command frame. The scan sends each ID a command with zero gains and zero torque,
+whose bytes are the same for every motor type: all ranges but those of the gains are symmetric. ENTER is never sent, so
+torque never flows. IDs above `MAX_CAN_ID` are not scanned: there, an echoed command could be taken for a reply.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Container, Iterable
+from typing import NamedTuple
+
+from exo_gravity.core.errors import BusError
+from exo_gravity.core.joint_motor import MAX_CAN_ID
+from exo_gravity.core.motors import MOTORS, pack_command, unpack_reply
+from exo_gravity.hardware.bus_lock import Address, BusLock
+from exo_gravity.hardware.can_port import CanPort
+from exo_gravity.hardware.motor_bus import open_bus
+
+SPEC = next(iter(MOTORS.values()))  # the position range is the same for all
+NOTHING = pack_command(SPEC, 0.0, 0.0, 0.0, 0.0, 0.0)
+ALL_IDS = range(1, MAX_CAN_ID + 1)
+LISTEN_TIME = 0.12  # s before the first frame, as in hardware/motor_bus.py
+REPLY_TIME = 0.005  # s: a motor replies within 0.4 ms, a USB adapter adds 1 to 2 ms
+ATTEMPTS = 2  # for each ID, in case a frame is lost
+MAX_STALE_FRAMES = 256  # read before each command; two motors with one ID may never stop answering each other
+MASTER_ID = 0  # the arbitration ID of some firmwares' replies
+STATUS_FRAME = 0x29  # (STATUS_FRAME << 8) | motor ID, 29 bits: what V3 boards send on their own timer
+
+
+class Answer(NamedTuple):
+    """What a motor replied.
+
+    reply_id: arbitration ID, the motor's own or 0. reply_length: 6 or 8 bytes. position: motor angle in rad.
+    temperature: degC; error: code of MOTOR_ERRORS; both None from 6-byte firmware.
+    """
+
+    can_id: int
+    reply_id: int
+    reply_length: int
+    position: float
+    temperature: int | None
+    error: int | None
+
+
+class Scan(NamedTuple):
+    """answers: one per motor, by ID. problems: sentences on what is wrong with the bus or an ID."""
+
+    answers: tuple[Answer, ...]
+    problems: tuple[str, ...]
+
+
+class BusScan:
+    """Owns the bus at `address` until `close`, so that no bridge can start meanwhile.
+
+    Raises BusError if a bridge holds the bus, with its name; if another host commands the motors; if a dead bridge left
+    them on; or if the bus cannot be opened.
+    """
+
+    def __init__(self, address: Address) -> None:
+        self._lock = BusLock(address, f"calibrate motors (PID {os.getpid()})")
+        self.name = address[1]
+        self._v3_ids: set[int] = set()
+        try:
+            if self._lock.notes.drive.powered:
+                raise BusError(
+                    f"CAN bus {self.name}: the last can_bridge died and may have left the motors on: start can_bridge, "
+                    "which lets the arm down, and stop it"
+                )
+            self._port = CanPort(open_bus(*address))
+            try:
+                self._listen()
+            except BusError:
+                self._port.close()
+                raise
+        except BaseException:
+            self._lock.release()
+            raise
+
+    def close(self) -> None:
+        """Release the bus."""
+        self._port.close()
+        self._lock.release()
+
+    def __enter__(self) -> BusScan:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def scan(self, can_ids: Iterable[int] = ALL_IDS) -> Scan:
+        """Ask every ID; return who answers, and what is wrong. Raises BusError if the bus fails."""
+        found: dict[int, Answer] = {}
+        problems: dict[str, None] = {}
+        for can_id in can_ids:
+            for _ in range(ATTEMPTS):
+                replies, odd = self._ask(can_id, found)
+                problems |= dict.fromkeys(odd)
+                if len(replies) > 1:
+                    problems[f"ID {can_id}: several replies to one command: {_shared(replies)}"] = None
+                if replies:
+                    found[can_id] = replies[0]
+                    break
+        for can_id in sorted(self._v3_ids):
+            problems[f"ID {can_id}: sends the status frames of a V3 board, whose wire format is not supported"] = None
+        return Scan(tuple(found[can_id] for can_id in sorted(found)), tuple(problems))
+
+    def poll(self, can_ids: Iterable[int]) -> dict[int, Answer]:
+        """Return the newest answer of each of these motors; a silent one is missing. Raises BusError."""
+        answers = {}
+        for can_id in can_ids:
+            replies, _ = self._ask(can_id)
+            if replies:
+                answers[can_id] = replies[-1]
+        return answers
+
+    def _listen(self) -> None:
+        end = time.monotonic() + LISTEN_TIME
+        while (remaining := end - time.monotonic()) > 0.0:
+            message = self._port.receive(remaining)
+            if message is None or message.is_error_frame or message.is_remote_frame:
+                continue
+            if message.is_extended_id:
+                if message.arbitration_id >> 8 == STATUS_FRAME:
+                    self._v3_ids.add(message.arbitration_id & 0xFF)
+            elif message.arbitration_id <= MAX_CAN_ID:
+                raise BusError(
+                    f"CAN bus {self.name} is in use: a frame with ID {message.arbitration_id} was heard; stop the "
+                    "other host; if there is none, two motors with one ID answer each other: switch their power off"
+                )
+
+    def _ask(self, can_id: int, known: Container[int] = ()) -> tuple[list[Answer], list[str]]:
+        """Send one command; return the replies of this motor, and sentences on frames that fit no motor.
+
+        known: other motors, whose late replies do not matter.
+        """
+        for _ in range(MAX_STALE_FRAMES):
+            if self._port.receive(0.0) is None:
+                break
+        self._port.send(can_id, NOTHING)
+        replies: list[Answer] = []
+        odd: list[str] = []
+        end = time.monotonic() + REPLY_TIME
+        while (remaining := end - time.monotonic()) > 0.0:
+            message = self._port.receive(remaining)
+            if message is None or message.is_extended_id or message.is_error_frame or message.is_remote_frame:
+                continue
+            data = bytes(message.data)
+            if data == NOTHING or (data and data[0] in known and data[0] != can_id):
+                continue  # our own command, echoed by the bus, or a late reply
+            if len(data) not in (6, 8):
+                odd.append(f"ID {can_id}: a reply of {len(data)} bytes, must be 6 or 8")
+            elif data[0] != can_id:
+                odd.append(f"ID {can_id}: the reply says that it is from motor {data[0]}")
+            elif message.arbitration_id not in (MASTER_ID, can_id):
+                odd.append(f"ID {can_id}: a reply with ID {message.arbitration_id}, must be {can_id} or {MASTER_ID}")
+            else:
+                replies.append(_answer(message.arbitration_id, data))
+        self._port.confirm()
+        return replies, odd
+
+
+def _answer(reply_id: int, data: bytes) -> Answer:
+    reply = unpack_reply(SPEC, data)
+    return Answer(reply.motor_id, reply_id, len(data), reply.position, reply.temperature, reply.error)
+
+
+def _shared(replies: list[Answer]) -> str:
+    angles = " and ".join(sorted({f"{reply.position:.2f} rad" for reply in replies}))
+    return f"two motors share it ({angles}); give one of them another ID with the vendor's tool, alone on the bus"
