@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Container, Iterable
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from exo_gravity.core.errors import BusError
@@ -23,11 +23,13 @@ SPEC = next(iter(MOTORS.values()))  # the position range is the same for all
 NOTHING = pack_command(SPEC, 0.0, 0.0, 0.0, 0.0, 0.0)
 ALL_IDS = range(1, MAX_CAN_ID + 1)
 LISTEN_TIME = 0.12  # s before the first frame, as in hardware/motor_bus.py
-REPLY_TIME = 0.005  # s: a motor replies within 0.4 ms, a USB adapter adds 1 to 2 ms
+REPLY_TIME = 0.01  # s: a motor replies within 0.4 ms; a USB adapter and a busy computer add some
 ATTEMPTS = 2  # for each ID, in case a frame is lost
 MAX_STALE_FRAMES = 256  # read before each command; two motors with one ID may never stop answering each other
 MASTER_ID = 0  # the arbitration ID of some firmwares' replies
 STATUS_FRAME = 0x29  # (STATUS_FRAME << 8) | motor ID, 29 bits: what V3 boards send on their own timer
+
+Frame = tuple[int, bytes]  # arbitration ID and data
 
 
 class Answer(NamedTuple):
@@ -96,8 +98,12 @@ class BusScan:
         problems: dict[str, None] = {}
         for can_id in can_ids:
             for _ in range(ATTEMPTS):
-                replies, odd = self._ask(can_id, found)
-                problems |= dict.fromkeys(odd)
+                replies, others = self._ask(can_id)
+                for reply_id, data in others:
+                    if problem := _problem(can_id, reply_id, data):
+                        problems[problem] = None
+                    elif data[0] < can_id:
+                        found.setdefault(data[0], _answer(reply_id, data))  # a late reply
                 if len(replies) > 1:
                     problems[f"ID {can_id}: several replies to one command: {_shared(replies)}"] = None
                 if replies:
@@ -111,7 +117,7 @@ class BusScan:
         """Return the newest answer of each of these motors; a silent one is missing. Raises BusError."""
         answers = {}
         for can_id in can_ids:
-            replies, _ = self._ask(can_id)
+            replies, _ = self._ask(can_id, is_alone=False)
             if replies:
                 answers[can_id] = replies[-1]
         return answers
@@ -131,35 +137,42 @@ class BusScan:
                     "other host; if there is none, two motors with one ID answer each other: switch their power off"
                 )
 
-    def _ask(self, can_id: int, known: Container[int] = ()) -> tuple[list[Answer], list[str]]:
-        """Send one command; return the replies of this motor, and sentences on frames that fit no motor.
+    def _ask(self, can_id: int, is_alone: bool = True) -> tuple[list[Answer], list[Frame]]:
+        """Send one command; return the replies of this motor, and other short frames.
 
-        known: other motors, whose late replies do not matter.
+        is_alone: whether to wait for further replies after the first.
         """
         for _ in range(MAX_STALE_FRAMES):
             if self._port.receive(0.0) is None:
                 break
         self._port.send(can_id, NOTHING)
         replies: list[Answer] = []
-        odd: list[str] = []
+        others: list[Frame] = []
         end = time.monotonic() + REPLY_TIME
-        while (remaining := end - time.monotonic()) > 0.0:
+        while (remaining := end - time.monotonic()) > 0.0 and (is_alone or not replies):
             message = self._port.receive(remaining)
             if message is None or message.is_extended_id or message.is_error_frame or message.is_remote_frame:
                 continue
-            data = bytes(message.data)
-            if data == NOTHING or (data and data[0] in known and data[0] != can_id):
-                continue  # our own command, echoed by the bus, or a late reply
-            if len(data) not in (6, 8):
-                odd.append(f"ID {can_id}: a reply of {len(data)} bytes, must be 6 or 8")
-            elif data[0] != can_id:
-                odd.append(f"ID {can_id}: the reply says that it is from motor {data[0]}")
-            elif message.arbitration_id not in (MASTER_ID, can_id):
-                odd.append(f"ID {can_id}: a reply with ID {message.arbitration_id}, must be {can_id} or {MASTER_ID}")
+            frame = message.arbitration_id, bytes(message.data)
+            if frame[1] == NOTHING:
+                continue  # our own command, echoed by the bus
+            if frame[1][:1] == bytes((can_id,)) and not _problem(can_id, *frame):
+                replies.append(_answer(*frame))
             else:
-                replies.append(_answer(message.arbitration_id, data))
+                others.append(frame)
         self._port.confirm()
-        return replies, odd
+        return replies, others
+
+
+def _problem(can_id: int, reply_id: int, data: bytes) -> str:
+    """Return what is wrong with a frame that came after a command to `can_id`; '' for a motor's reply."""
+    if len(data) not in (6, 8):
+        return f"ID {can_id}: a reply of {len(data)} bytes, must be 6 or 8"
+    if data[0] > can_id or (reply_id == can_id and data[0] != can_id):
+        return f"ID {can_id}: the reply says that it is from motor {data[0]}"
+    if reply_id not in (MASTER_ID, data[0]):
+        return f"ID {can_id}: a reply with ID {reply_id}, must be {can_id} or {MASTER_ID}"
+    return ""
 
 
 def _answer(reply_id: int, data: bytes) -> Answer:

@@ -70,7 +70,7 @@ def test_every_motor_is_found_with_its_reply_length_and_angle(address: Address, 
     device = make_device(firmware, ids=(1, 126, 7, 40))
     device.encoder_error = (0.5, -0.2, 1.0, 0.0)
     with device_on(address, device), BusScan(address) as bus:
-        answers, problems = bus.scan()
+        answers, problems = bus.scan((1, 2, 7, 39, 40, 41, 126))
     assert problems == ()
     assert [answer.can_id for answer in answers] == [1, 7, 40, 126]
     assert {answer.reply_length for answer in answers} == {firmware.reply_length}
