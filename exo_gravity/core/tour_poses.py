@@ -1,0 +1,113 @@
+"""Which poses the calibration visits: given ones, or the most informative that the motors can hold and reach in time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from exo_gravity.core.arm import JOINT_COUNT
+from exo_gravity.core.errors import DataError
+from exo_gravity.core.identification import next_pose
+from exo_gravity.core.limits import WALL_WIDTH, Limits
+from exo_gravity.core.tour_guess import TorqueGuess
+from exo_gravity.core.tour_motion import Line, Station
+
+CANDIDATES = 500
+SHARE = 0.85  # of max_effort that a pose may need
+DEVIATIONS = 2.0  # of the expected torque, that a pose must leave room for
+USUAL_FRICTION = 0.5  # Nm, until it is measured
+WAYPOINTS = 8  # of the way to a pose, at which the motors must hold the arm too
+EDGE = 0.02  # rad between a sweep's end and the soft wall
+TIME_SHARE = 1.5  # of the time left for each pose, that the next one may take
+
+
+class Itinerary(Protocol):
+    """Chooses the poses of a tour, one after the other."""
+
+    count: int  # of all poses
+
+    def next(self, taken: np.ndarray, guess: TorqueGuess, friction: Sequence[float], elapsed: float) -> Station | None:
+        """Return the next station, None after the last. Raises DataError if no pose can be held.
+
+        taken: (n, 4) rad, the poses measured so far. friction: (4,) Nm, 0 if unknown. elapsed: s since the start.
+        """
+        ...
+
+
+class FixedStations:
+    """Visits given stations in order."""
+
+    def __init__(self, stations: Sequence[Station]) -> None:
+        self.count = len(stations)
+        self._left: Iterator[Station] = iter(stations)
+
+    def next(self, taken: np.ndarray, guess: TorqueGuess, friction: Sequence[float], elapsed: float) -> Station | None:
+        """Return the next of the given stations."""
+        return next(self._left, None)
+
+
+@dataclass
+class BestPoses:
+    """Visits `count` poses, each the one with the most information that is still missing.
+
+    duration: s, of the whole tour, which the choice keeps within. seed: of the candidates.
+    """
+
+    limits: Limits
+    count: int
+    duration: float
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        low, high = measurable(self.limits, Station((0.0,) * JOINT_COUNT).amplitude)
+        self._home = np.clip(self.limits.home, low, high)
+        self._candidates = np.random.default_rng(self.seed).uniform(low, high, (CANDIDATES, JOINT_COUNT))
+
+    def next(self, taken: np.ndarray, guess: TorqueGuess, friction: Sequence[float], elapsed: float) -> Station | None:
+        """Return the best of the candidates that can be held and reached; the first is the hanging arm."""
+        if len(taken) >= self.count:
+            return None
+        if not len(taken):
+            return Station(tuple(self._home.tolist()))
+        possible = self._candidates[self._is_in_time(taken, elapsed)]
+        possible = possible[self._is_holdable(possible, taken[-1], guess, friction)]
+        if not len(possible):
+            raise DataError("no further pose can be held within max_effort: is it too small for the arm?")
+        index = next_pose(list(taken), possible, guess.tilt.direction, guess.common_moments, guess.gravity)
+        return Station(tuple(possible[index].tolist()))
+
+    def _is_in_time(self, taken: np.ndarray, elapsed: float) -> np.ndarray:
+        """Return which candidates (n,) leave enough time for the others and for the way home."""
+        sweeps = Station(tuple(self._home.tolist())).duration
+        home = [Line(pose, self._home).duration for pose in self._candidates]
+        way = [Line(taken[-1], pose).duration for pose in self._candidates]
+        left = self.count - len(taken)
+        budget = (self.duration - elapsed - np.array(home)) / left
+        fits = np.add(way, sweeps) <= budget * (TIME_SHARE if left > 1 else 1.0)
+        return fits if fits.any() else np.add(way, home) <= np.min(np.add(way, home)) + 1.0
+
+    def _is_holdable(
+        self, poses: np.ndarray, start: np.ndarray, guess: TorqueGuess, friction: Sequence[float]
+    ) -> np.ndarray:
+        """Return which poses (n,) the motors can hold, and reach from `start`."""
+        shares = np.linspace(0.0, 1.0, WAYPOINTS + 1)[1:, None, None]
+        ways = start + shares * (poses - start)
+        return holdable(ways.reshape(-1, JOINT_COUNT), self.limits, guess, friction).reshape(WAYPOINTS, -1).all(axis=0)
+
+
+def measurable(limits: Limits, amplitude: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and highest pose (4,) rad around which a sweep of `amplitude` rad stays off the soft walls."""
+    margin = WALL_WIDTH + amplitude + EDGE
+    return np.array(limits.position_min) + margin, np.array(limits.position_max) - margin
+
+
+def holdable(poses: np.ndarray, limits: Limits, guess: TorqueGuess, friction: Sequence[float]) -> np.ndarray:
+    """Return at which of `poses` (n, 4) rad the motors can hold the arm, and move it against `friction` (4,) Nm."""
+    mean, deviation = guess.torques(poses)
+    slide = [own or USUAL_FRICTION for own in friction]
+    return np.asarray(
+        np.all(np.abs(mean) + DEVIATIONS * deviation + slide <= SHARE * np.array(limits.max_effort), axis=1)
+    )
