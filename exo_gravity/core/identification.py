@@ -1,21 +1,45 @@
 """Held poses -> the arm's moments, the torque scale of each motor, and what the poses do not tell.
 
-The commanded effort that holds the arm in pose i, with weight i on link 4, is for joint n
+The commanded effort that holds the arm in a pose is, without friction, which averages out over both directions,
 
     effort = torque(moments + load) / scale + offset          torque: `core.moments.regressor` times the moments
 
-without friction, which averages out over both directions of motion.
+A pose that does not fit the others (a hand on the arm, a slipping joint) is left out. A result that no arm can have is
+refused, with the pose that is missing. Held poses do not tell a common factor of all scales and moments, unless a known
+weight hung in some of them; nor a moment across link 3 or 4 from an error of that joint's zero.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from exo_gravity.core.arm import STANDARD_GRAVITY, Vector
+from exo_gravity.core.identification_check import check_motors, check_physical, check_told, checked, untold
+from exo_gravity.core.moments import load_moments, regressor
+from exo_gravity.core.pose_choice import TYPICAL_MOMENTS, next_pose
+from exo_gravity.core.pose_fit import (
+    COUNT,
+    FACTOR,
+    MOMENT,
+    OFFSET,
+    SCALE,
+    Rows,
+    Solution,
+    final,
+    without_each_pose,
+    without_outliers,
+)
+
+__all__ = ["Identified", "Observation", "identify", "next_pose"]
+
+LEAST_SPREAD = 0.003  # Nm; about half a code of an AK motor's 12-bit torque
+EXACT = 1e-6  # error of a value that is held
+HIDDEN = 0.1  # share of an unknown, in combinations that are not known, from which it is not known itself
 
 
 class Observation(NamedTuple):
@@ -39,13 +63,15 @@ class Observation(NamedTuple):
 class Identified:
     """The result of `identify`; n is the number of observations.
 
-    moments: (8,) kg m in the order of `MOMENTS`. covariance: (8, 8), infinite for what the data do not tell, in which
-    case the moment is that of `known`, or 0. scale: (4,), true torque per commanded torque; if no load was hung, the
-    product of the four is 1 and the moments are in commanded torque, not in kilograms (`relative`). scale_error: (4,),
-    standard error. offset, friction: (4,) Nm as commanded. residual: (n, 4) Nm, effort minus prediction; held_out: the
-    same, predicted without that pose. singular_values: of the information about all unknowns, the largest first; those
-    below 1 belong to `unknown`. unknown: sentences, each of which names what the data do not tell and what would.
-    rejected: index and reason of each observation that the result does not use.
+    moments: (8,) kg m in the order of `MOMENTS`. covariance: (8, 8), infinite on the diagonal for a moment that the
+    poses do not tell, which is then that of `known`, or 0. scale: (4,), true torque per commanded torque. relative: no
+    weight was hung, so the product of the scales of joints 2 to 4 is taken as 1, and the moments are in commanded
+    torque, not in kilograms. scale_error: (4,), standard error, infinite if not known; 0 if the scale was not solved.
+    Two standard errors cover 95 %, also for few poses. offset, friction: (4,) Nm as commanded. residual: (n, 4) Nm,
+    effort minus prediction. held_out: (n, 4) Nm, the same predicted without that pose, NaN where the others do not
+    suffice. singular_values: of the information in the poses, the largest first; those below 1 are the combinations
+    that are not known. unknown: sentences, each of which names what the poses do not tell and what would. rejected:
+    index and reason of each observation that the result does not use.
     """
 
     moments: np.ndarray
@@ -58,8 +84,8 @@ class Identified:
     held_out: np.ndarray
     singular_values: np.ndarray
     unknown: tuple[str, ...]
-    rejected: tuple[tuple[int, str], ...]
-    relative: bool
+    rejected: tuple[tuple[int, str], ...] = ()
+    relative: bool = False
 
     @property
     def error(self) -> np.ndarray:
@@ -76,22 +102,116 @@ def identify(
 ) -> Identified:
     """Return what the observations tell about an arm with links of `length` (4,) m.
 
-    known: an earlier result of the same arm. solve_scale: False holds scale and offset at those of `known` (without it
-    at 1 and 0). Raises DataError that names the missing pose if the result would be unphysical, and the observation if
-    a value is impossible.
+    known: an earlier result of the same arm. With `solve_scale`, its moments and scales count according to their
+    errors. Without, scale and offset are held at those of `known` (at 1 and 0 if there is none), and the moments are
+    found anew: those of the arm with its wearer. Raises DataError if the result would be unphysical, naming the missing
+    pose, and if an observation is impossible.
     """
-    raise NotImplementedError
+    rows = _rows(observations, length, gravity)
+    direction = np.asarray(observations[-1].direction, dtype=float)
+    start = _start(known, solve_scale)
+    rows = _with_conditions(rows, start, known if solve_scale else None, solve_scale)
+    check_motors(rows.effort, rows.regressor @ np.array(TYPICAL_MOMENTS))
+    keep, rejected = without_outliers(rows, start)
+    used, solution = final(rows.only(keep), start)
+    if solution.unknowns[0] < 0.0:  # M1 is the least certain, and no arm's is negative
+        others = np.arange(COUNT) != 0
+        used, solution = final(replace(used, free=used.free & others), start * others)
+    hidden = solution.hidden > HIDDEN
+    check_told(hidden, len(observations), direction, gravity)
+    loaded = bool(np.any(rows.load[keep]))
+    unknowns, covariance = _in_kilograms(solution, known if solve_scale else None, loaded)
+    error = np.where(hidden, np.inf, np.sqrt(np.diag(covariance)))
+    check_physical(unknowns[MOMENT], error[MOMENT], np.exp(unknowns[SCALE]), direction, gravity)
+    relative = (solve_scale and not loaded) if known is None else (known.relative and not (solve_scale and loaded))
+    return Identified(
+        unknowns[MOMENT],
+        np.where(np.diag(hidden[MOMENT]), np.inf, covariance[MOMENT, MOMENT]),
+        np.exp(unknowns[SCALE]),
+        np.exp(unknowns[SCALE]) * error[SCALE],
+        unknowns[OFFSET],
+        np.median([observation.friction for observation in observations], axis=0),
+        *_residuals(rows, keep, used, solution),
+        solution.singular_values,
+        untold(unknowns[MOMENT], hidden, relative),
+        rejected,
+        relative,
+    )
 
 
-def next_pose(
-    taken: Sequence[Vector],
-    candidates: np.ndarray,
-    direction: Vector = (0.0, 0.0, 1.0),
-    moments: Vector | None = None,
-    gravity: float = STANDARD_GRAVITY,
-) -> int:
-    """Return the index of the candidate (n, 4) in rad that adds the most information to the poses `taken`.
+def _rows(observations: Sequence[Observation], length: Vector, gravity: float) -> Rows:
+    """Return the observations as arrays, with every unknown free."""
+    theta, direction, effort, spread, weights = checked(observations)
+    # A pose whose efforts happen to agree is no better known than others.
+    spread = np.maximum(spread, np.median(spread, axis=0) / 2.0)
+    return Rows(
+        regressor(theta, direction, gravity),
+        np.array([load_moments(length, mass, lever) for mass, lever in weights]),
+        effort,
+        np.hypot(spread, LEAST_SPREAD),
+        np.ones(COUNT, dtype=bool),
+        np.zeros((0, COUNT)),
+        np.zeros(0),
+    )
 
-    direction: (3,). moments: (8,) kg m, a guess; without it those of a light arm.
-    """
-    raise NotImplementedError
+
+def _common(known: Identified) -> float:
+    """Return the logarithm of the factor that moments and scales have in common."""
+    return float(np.log(known.scale[1:]).mean())
+
+
+def _start(known: Identified | None, solve_scale: bool) -> np.ndarray:
+    """Return the unknowns (17,) at which the search starts; if scales are solved, with the common factor removed."""
+    start = np.zeros(COUNT)
+    start[FACTOR] = 1.0
+    start[1:4] = TYPICAL_MOMENTS[1:4]
+    if known is not None:
+        common = _common(known) if solve_scale else 0.0
+        start[MOMENT] = known.moments * math.exp(-common)
+        start[SCALE] = np.log(known.scale) - common
+        start[OFFSET] = known.offset
+    return start
+
+
+def _with_conditions(rows: Rows, start: np.ndarray, known: Identified | None, solve_scale: bool) -> Rows:
+    """Return `rows` with what is held, and with `known` as linear conditions."""
+    free = np.ones(COUNT, dtype=bool)
+    free[SCALE] = free[OFFSET] = solve_scale
+    free[FACTOR] = solve_scale and bool(np.any(rows.load))
+    if not solve_scale:
+        return replace(rows, free=free)
+    anchor = np.zeros((1, COUNT))
+    anchor[0, SCALE] = np.array((0.0, 1.0, 1.0, 1.0)) / EXACT  # the common factor is the weight's
+    if known is not None:
+        relative_error = np.maximum(known.scale_error / known.scale, EXACT)
+        error = np.append(known.error * math.exp(-_common(known)), relative_error)
+        anchor = np.vstack((anchor, np.eye(SCALE.stop, COUNT) / np.maximum(error, EXACT)[:, None]))
+    return replace(rows, free=free, anchor=anchor, anchor_value=anchor @ (start * (np.arange(COUNT) < SCALE.stop)))
+
+
+def _in_kilograms(solution: Solution, known: Identified | None, loaded: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return the unknowns (17,) and their covariance (17, 17) without the factor by which a weight seems too heavy."""
+    unknowns, covariance = solution.unknowns.copy(), solution.covariance.copy()
+    if known is not None and not known.relative and not loaded:
+        unknowns[FACTOR] = math.exp(-_common(known))
+        share = np.min(known.scale_error[1:] / known.scale[1:])
+        covariance[FACTOR, FACTOR] = (share * unknowns[FACTOR]) ** 2
+    factor = unknowns[FACTOR]
+    change = np.eye(COUNT)
+    change[MOMENT, MOMENT] /= factor
+    change[MOMENT, FACTOR] = -unknowns[MOMENT] / factor**2
+    change[SCALE, FACTOR] = -1.0 / factor
+    unknowns[MOMENT] /= factor
+    unknowns[SCALE] -= math.log(factor)
+    freedom = solution.freedom.min() + 6.0
+    # Student's distribution: for few poses two standard errors would cover less than 95 %.
+    few = 1.0 + 1.25 / freedom
+    return unknowns, few**2 * change @ covariance @ change.T
+
+
+def _residuals(rows: Rows, keep: np.ndarray, used: Rows, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
+    """Return residual and held-out residual (n, 4) in Nm of all observations, also of those that were left out."""
+    residual = rows.effort - rows.predicted(solution.unknowns)
+    held_out = residual.copy()
+    held_out[keep], _ = without_each_pose(solution, used.sigma)
+    return residual, held_out

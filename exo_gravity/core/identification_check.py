@@ -1,0 +1,112 @@
+"""What an identification refuses, with the pose that is missing, and what it cannot tell."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from exo_gravity.core.arm import JOINT_COUNT
+from exo_gravity.core.errors import DataError
+from exo_gravity.core.moments import MOMENTS
+from exo_gravity.core.pose_choice import TYPICAL_MOMENTS, missing_pose
+from exo_gravity.core.pose_fit import COUNT, FACTOR, OFFSET, SCALE
+
+if TYPE_CHECKING:
+    from exo_gravity.core.identification import Observation
+
+SCALES = (0.3, 3.0)  # true torque per commanded torque; users report 0.75
+SILENT = 0.01  # Nm by which the effort must differ between poses where gravity's torque differs by `EXPECTED`
+EXPECTED = 0.3  # Nm
+# Unknowns of joint 1, which carries nothing while its axis is vertical.
+FIRST_JOINT = (0, MOMENTS.index("W"), SCALE.start, OFFSET.start)
+NAMES = (*MOMENTS, *(f"{what} {n + 1}" for what in ("torque scale", "offset") for n in range(JOINT_COUNT)))
+TILT = "tilt the stand by 20 degrees or more"
+
+
+def checked(
+    observations: Sequence[Observation],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, list[tuple[float, float]]]:
+    """Return theta (n, 4), direction (n, 3), effort (n, 4), spread (n, 4), and mass and lever of each weight.
+
+    Raises DataError that names the observation.
+    """
+    if not observations:
+        raise DataError("no pose was observed")
+    for index, observation in enumerate(observations):
+        for name, count in (("theta", 4), ("direction", 3), ("effort", 4), ("friction", 4), ("spread", 4)):
+            values = np.asarray(getattr(observation, name), dtype=float)
+            if values.shape != (count,) or not np.all(np.isfinite(values)):
+                raise DataError(f"pose {index + 1}: {name} = {values.tolist()}: must be {count} finite numbers")
+        if np.min(observation.spread) < 0.0:
+            raise DataError(f"pose {index + 1}: spread = {list(observation.spread)}: must be at least 0 Nm")
+    theta, direction, effort, spread = (
+        np.array([getattr(observation, name) for observation in observations], dtype=float)
+        for name in ("theta", "direction", "effort", "spread")
+    )
+    return theta, direction, effort, spread, [(o.load_mass, o.load_lever) for o in observations]
+
+
+def check_motors(effort: np.ndarray, typical: np.ndarray) -> None:
+    """Raise DataError if a motor's effort (n, 4) in Nm stays the same where gravity's `typical` torque does not."""
+    for joint in range(JOINT_COUNT):
+        if np.ptp(typical[:, joint]) > EXPECTED and np.ptp(effort[:, joint]) < SILENT:
+            raise DataError(f"joint {joint + 1}: the effort is {effort[0, joint]:.2f} Nm in every pose: a silent motor")
+
+
+def check_told(hidden: np.ndarray, count: int, direction: np.ndarray, gravity: float) -> None:
+    """Raise DataError that names the missing pose if `count` poses do not tell `hidden` (17,) of joints 2 to 4."""
+    missing = hidden.copy()
+    missing[list(FIRST_JOINT)] = False
+    if missing[FACTOR]:
+        raise DataError("the weight tells no common factor: hang a heavier one, or hold it with a horizontal forearm")
+    if np.any(missing):
+        names = ", ".join(NAMES[index] for index in np.flatnonzero(missing))
+        pose = missing_pose(missing, direction, np.array(TYPICAL_MOMENTS), gravity)
+        raise DataError(f"{count} poses do not tell {names}: add the pose {pose}")
+
+
+def check_physical(
+    moments: np.ndarray, error: np.ndarray, scale: np.ndarray, direction: np.ndarray, gravity: float
+) -> None:
+    """Raise DataError unless an arm can have the moments (8,) kg m and scales (4,), and their `error` (8,) is small."""
+    low, high = SCALES
+    for joint in np.flatnonzero((scale < low) | (scale > high)):
+        expected = f"from {low:g} to {high:g}: is joint {joint + 1}'s direction or motor type wrong, or did it slip?"
+        raise DataError(f"torque scale {joint + 1} = {scale[joint]:.3g}: must be {expected}")
+    for index in (1, 2, 3):
+        name, value, uncertain = MOMENTS[index], moments[index], error[index]
+        if uncertain > abs(value):
+            lone = np.arange(COUNT) == index
+            pose = missing_pose(lone, direction, np.array(TYPICAL_MOMENTS), gravity)
+            raise DataError(f"{name} = {value:.3f} kg m is not known better than {uncertain:.3f}: add the pose {pose}")
+        if value <= 0.0:
+            raise DataError(
+                f"{name} = {value:.3f} kg m: must be positive: check direction and zero of joint {index + 1}"
+            )
+    for across, along in ((6, 2), (7, 3)):
+        if abs(moments[across]) > moments[along]:
+            angle = math.degrees(math.atan2(moments[across], moments[along]))
+            raise DataError(
+                f"{MOMENTS[across]} = {moments[across]:.3f} kg m exceeds {MOMENTS[along]}: "
+                f"the zero of joint {along + 1} seems {angle:.0f} degrees off"
+            )
+
+
+def untold(moments: np.ndarray, hidden: np.ndarray, relative: bool) -> tuple[str, ...]:
+    """Return what the poses do not tell, and what would, in sentences. moments: (8,) kg m; hidden: (17,)."""
+    said = []
+    if relative:
+        said.append("A common factor of all torque scales and moments: hang a known weight on link 4.")
+    if np.any(hidden):
+        names = ", ".join(NAMES[index] for index in np.flatnonzero(hidden))
+        said.append(f"{names}: joint 1 carries nothing while its axis is vertical: {TILT}.")
+    for joint, along, across in ((4, 3, 7), (3, 2, 6)):
+        angle = math.degrees(math.atan2(moments[across], moments[along]))
+        said.append(
+            f"{MOMENTS[across]} of link {joint} from an error of joint {joint}'s zero: it looks like one of "
+            f"{angle:+.1f} degrees; check the zero with a level or at a stop."
+        )
+    return tuple(said)

@@ -1,0 +1,206 @@
+"""Weighted least squares for the unknowns of an arm in held poses.
+
+The unknowns are the eight moments in kg m, the logarithm of the four torque scales, the four offsets in Nm, and the
+factor by which moments and scales are too large in common, by which a known weight seems too heavy. The commanded
+effort is `torque(moments + factor * load) / scale + offset`: bilinear, so a few Gauss-Newton steps solve it. Each step
+leaves alone what the poses do not tell: the combinations whose standard error exceeds `NATURAL`.
+
+Errors are larger in some joints than the observations state (gear friction is not the same in every pose), so each
+joint gets a factor of its own, estimated from its residuals and pooled with the others where poses are few.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from exo_gravity.core.arm import JOINT_COUNT
+from exo_gravity.core.errors import DataError
+from exo_gravity.core.moments import MOMENTS
+
+MOMENT = slice(0, 8)
+SCALE = slice(8, 12)
+OFFSET = slice(12, 16)
+FACTOR = 16
+COUNT = 17
+# kg m, logarithm, Nm, 1: a combination of unknowns that may be wrong by this much is not known.
+NATURAL = np.repeat((0.1, 0.3, 0.3, 0.3), (len(MOMENTS), JOINT_COUNT, JOINT_COUNT, 1))
+NOTHING_KNOWN = np.repeat((0.0, 1.0), (FACTOR, 1))
+HUBER = 2.0  # standard errors beyond which a residual counts linearly
+POOLING = 6.0  # degrees of freedom with which all joints together inform the error of each
+STEPS = 40
+MEDIAN_SQUARE = 0.455  # of a standard normal variable
+MEDIAN_CAUSED = 3.36  # of the sum of four such squares
+OUTLIER = 32.0  # such a sum from which a pose is left out: of good poses, one in 500,000
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """What is fitted, for n poses: `regressor` (n, 4, 8), `load` (n, 8) kg m, `effort` and its error `sigma` (n, 4) Nm.
+
+    free: (17,), the unknowns to be solved. anchor: (k, 17) and anchor_value: (k,), linear conditions on the unknowns,
+    already divided by their standard errors.
+    """
+
+    regressor: np.ndarray
+    load: np.ndarray
+    effort: np.ndarray
+    sigma: np.ndarray
+    free: np.ndarray
+    anchor: np.ndarray
+    anchor_value: np.ndarray
+
+    def only(self, keep: np.ndarray) -> Rows:
+        """Return the poses that `keep` (n,) selects."""
+        names = ("regressor", "load", "effort", "sigma")
+        return replace(self, **{name: getattr(self, name)[keep] for name in names})
+
+    def predicted(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return the commanded effort (n, 4) in Nm."""
+        torque = np.einsum("njk,nk->nj", self.regressor, unknowns[MOMENT] + unknowns[FACTOR] * self.load)
+        return np.asarray(torque * np.exp(-unknowns[SCALE]) + unknowns[OFFSET])
+
+    def jacobian(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return the derivative of `predicted` by the unknowns, (n, 4, 17)."""
+        result = np.zeros((*self.effort.shape, COUNT))
+        result[..., MOMENT] = self.regressor * np.exp(-unknowns[SCALE])[:, None]
+        joints = np.arange(JOINT_COUNT)
+        result[:, joints, SCALE.start + joints] = unknowns[OFFSET] - self.predicted(unknowns)
+        result[:, joints, OFFSET.start + joints] = 1.0
+        result[..., FACTOR] = np.einsum("njk,nk->nj", result[..., MOMENT], self.load)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """unknowns: (17,). covariance: (17, 17) of what is known. hidden: (17,), share 0..1 of each that is not known.
+
+    singular_values: of the poses alone, in units of `NATURAL`, the largest first. residual: (n, 4) Nm. hat: (n, 4, n,
+    4), derivative of the predicted by the measured effort, both divided by sigma.
+    """
+
+    unknowns: np.ndarray
+    covariance: np.ndarray
+    hidden: np.ndarray
+    singular_values: np.ndarray
+    residual: np.ndarray
+    hat: np.ndarray
+
+    @property
+    def freedom(self) -> np.ndarray:
+        """Degrees of freedom of each joint's residuals, (4,)."""
+        return np.asarray(1.0 - np.einsum("njnj->nj", self.hat)).sum(axis=0)
+
+
+def solve(rows: Rows, start: np.ndarray, weight: np.ndarray | None = None) -> Solution:
+    """Return the least-squares solution from `start` (17,); weight: (n, 4) of the squared residuals, 1 by default."""
+    root = np.sqrt(np.ones_like(rows.effort) if weight is None else weight) / rows.sigma
+    unknowns, step = start.copy(), np.full(COUNT, np.inf)
+    for _ in range(STEPS):
+        jacobian = (rows.jacobian(unknowns) * root[..., None]).reshape(-1, COUNT)
+        residual = np.append(
+            (root * (rows.effort - rows.predicted(unknowns))).ravel(), rows.anchor_value - rows.anchor @ unknowns
+        )
+        inverse = _inverse(np.vstack((jacobian, rows.anchor)), rows.free)
+        step = inverse @ residual
+        # A scale that jumps by more than a factor of 1.6 in one step has left the range of the linear model.
+        unknowns = unknowns + step / max(1.0, 2.0 * float(np.abs(step[SCALE]).max()))
+        if np.all(np.abs(step) < 1e-9 * NATURAL):
+            break
+    return _solution(rows, unknowns, root)
+
+
+def _inverse(whitened: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Return the pseudo-inverse (17, m) of `whitened` (m, 17), without what is not known."""
+    natural = NATURAL * free
+    left, size, right = np.linalg.svd(whitened * natural, full_matrices=False)
+    told = size > 1.0
+    return np.asarray(natural[:, None] * (right[told].T / size[told]) @ left[:, told].T)
+
+
+def _solution(rows: Rows, unknowns: np.ndarray, root: np.ndarray) -> Solution:
+    jacobian = (rows.jacobian(unknowns) * root[..., None]).reshape(-1, COUNT)
+    inverse = _inverse(np.vstack((jacobian, rows.anchor)), rows.free)
+    covariance = inverse @ inverse.T
+    known = inverse @ np.vstack((jacobian, rows.anchor))  # a projection, up to the units
+    hidden = np.where(rows.free, 1.0 - np.diag(known), 0.0)
+    free = rows.free & (np.arange(COUNT) != FACTOR)  # a weight that hangs is known, and so is the common factor
+    size = np.linalg.svd((jacobian * NATURAL)[:, free], compute_uv=False)
+    singular_values = np.append(size, np.zeros(int(free.sum()) - len(size)))
+    count = len(rows.effort)
+    hat = (jacobian @ inverse[:, : 4 * count]).reshape(count, 4, count, 4)
+    residual = rows.effort - rows.predicted(unknowns)
+    return Solution(unknowns, covariance, hidden, singular_values, residual, hat)
+
+
+def robust(rows: Rows, start: np.ndarray) -> tuple[Rows, Solution]:
+    """Return a solution in which large residuals count little, and the rows with the error that it shows."""
+    solution = solve(rows, start)
+    for _ in range(4):
+        squares = (solution.residual / rows.sigma) ** 2
+        share = np.maximum(0.2, 1.0 - np.einsum("njnj->nj", solution.hat))
+        typical = np.median(squares / share, axis=0) / MEDIAN_SQUARE
+        factor = _pooled(typical, np.maximum(solution.freedom, 0.0))
+        size = np.sqrt(squares / share / factor)
+        solution = solve(rows, solution.unknowns, np.minimum(1.0, HUBER / np.maximum(size, 1e-9)))
+    return replace(rows, sigma=rows.sigma * np.sqrt(factor)), solution
+
+
+def final(rows: Rows, start: np.ndarray) -> tuple[Rows, Solution]:
+    """Return the plain least-squares solution, and the rows with the error that its residuals show."""
+    scaled, solution = rows, solve(rows, start)
+    for _ in range(3):
+        freedom = np.maximum(solution.freedom, 0.0)
+        squares = ((solution.residual / rows.sigma) ** 2).sum(axis=0)
+        factor = _pooled(squares / np.maximum(freedom, 1e-9), freedom)
+        scaled = replace(rows, sigma=rows.sigma * np.sqrt(factor))
+        solution = solve(scaled, solution.unknowns)
+    return scaled, solution
+
+
+def _pooled(factor: np.ndarray, freedom: np.ndarray) -> np.ndarray:
+    """Return each joint's factor (4,) of the variance, moved towards that of all joints where its data are few."""
+    total = freedom.sum()
+    common = float(factor @ freedom) / total if total > 1.0 else 1.0
+    pooled = (factor * freedom + POOLING * common) / (freedom + POOLING)
+    return np.asarray(np.maximum(pooled, 1e-4))
+
+
+def without_each_pose(solution: Solution, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return, for each pose, what leaving it out shows.
+
+    The residual (n, 4) in Nm of a prediction from the other poses, NaN where they do not suffice; and the part (n,) of
+    the sum of squares that this pose causes, about 4 for a pose with usual errors.
+    """
+    whitened = solution.residual / sigma
+    held_out, caused = np.full_like(whitened, np.nan), np.zeros(len(whitened))
+    for i, residual in enumerate(whitened):
+        left = np.eye(JOINT_COUNT) - solution.hat[i, :, i, :]
+        if np.linalg.eigvalsh((left + left.T) / 2.0)[0] > 1e-6:
+            held_out[i] = np.linalg.solve(left, residual)
+            caused[i] = residual @ held_out[i]
+    return held_out * sigma, caused
+
+
+def without_outliers(rows: Rows, start: np.ndarray) -> tuple[np.ndarray, tuple[tuple[int, str], ...]]:
+    """Return which poses (n,) fit one arm, and index and reason of each that does not.
+
+    Raises DataError if more than a third does not fit.
+    """
+    keep = np.ones(len(rows.effort), dtype=bool)
+    rejected: list[tuple[int, str]] = []
+    while True:
+        used, solution = robust(rows.only(keep), start)
+        held_out, caused = without_each_pose(solution, used.sigma)
+        worst = int(np.argmax(caused))
+        if caused[worst] < OUTLIER * max(1.0, float(np.median(caused)) / MEDIAN_CAUSED):
+            return keep, tuple(rejected)
+        joint = int(np.argmax(np.abs(held_out[worst] / used.sigma[worst])))
+        index = int(np.flatnonzero(keep)[worst])
+        off = f"effort of joint {joint + 1} is {held_out[worst, joint]:+.2f} Nm off what the other poses predict"
+        rejected.append((index, off))
+        keep[index] = False
+        if len(rejected) > len(keep) // 3:
+            said = "; ".join(f"pose {index + 1}: {why}" for index, why in rejected)
+            raise DataError(f"the poses do not fit one arm: {said}. Was it touched, does a joint slip or touch a stop?")
