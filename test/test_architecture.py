@@ -17,8 +17,13 @@ MAY_IMPORT = {
     "bag": {"core", "bag"},
     "tools": {"core", "bag", "tools"},
 }
-# `trial --offline` runs without ROS, so it starts no nodes and uses the simulated device directly.
-EXCEPTIONS = {"exo_gravity/tools/trials/offline.py": {"sim"}}
+# `trial --offline` runs without ROS, so it starts no nodes and uses the simulated device directly. `calibrate motors`
+# asks the motors before there is anything that a node could be started with.
+EXCEPTIONS = {
+    "exo_gravity/tools/trials/offline.py": {"sim"},
+    "exo_gravity/tools/calibration/motors.py": {"hardware"},
+    "exo_gravity/tools/calibration/motor_watch.py": {"hardware"},
+}
 
 
 def imported(path: Path) -> set[str]:
