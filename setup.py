@@ -4,8 +4,8 @@ from setuptools import find_packages, setup
 
 package_name = "exo_gravity"
 # The one list of executables, each named after its module. The launcher reads the nodes from the entry points.
-nodes = ("can_bridge", "imu", "compensator", "simulator", "recorder")
-tools = ("launcher", "trial", "report", "budget", "validate", "train_anfis")
+nodes = ("can_bridge", "imu", "compensator", "simulator", "recorder", "calibrator")
+tools = ("launcher", "trial", "report", "budget", "validate", "train_anfis", "calibrate")
 
 extras = {
     # Jazzy as wheels, for a machine without ROS. Where ROS 2 is installed, leave this extra out.
@@ -13,6 +13,7 @@ extras = {
     "imu": ["imufusion>=1.3"],
     "sim": ["mujoco>=3.2"],
     "report": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11", "scipy>=1.11"],
+    "calibrate": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11"],
     "validate": ["pin>=2.7", "roboticstoolbox-python>=1.1.1", "threadpoolctl>=3.0"],
     "test": [
         "hypothesis>=6.100",
