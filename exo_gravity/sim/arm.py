@@ -2,8 +2,8 @@
 
 Standard Denavit-Hartenberg, Table 1 of the paper: a = link lengths, alpha = (-pi/2, +pi/2, 0, 0), d = 0, joint offsets
 (0, -pi/2, 0, 0), z0 along gravity when the trunk is upright. Joint n turns about z_{n-1}; the centre of gravity of
-link n lies at d_n along x_n. The model is built from these and not from the laws of `core.gravity`, so that it can
-contradict them.
+link n lies at d_n along x_n, and beside the link at `cog_y` along y_n and `cog_z` along z_n. The model is built from
+these and not from the laws of `core.gravity`, so that it can contradict them.
 
 MuJoCo models dry friction as a soft constraint, which creeps. Measured on a 0.3 m link with 0.15 Nm of friction and
 0.05 Nm of imbalance: 18 degrees per minute with MuJoCo's defaults, 0.002 with the stiffness below.
@@ -22,6 +22,7 @@ import numpy as np
 
 from exo_gravity.core.arm import JOINT_COUNT, MAX_LENGTH, MAX_MASS, ArmModel, four_floats
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.moments import MAX_OFFSET
 from exo_gravity.core.param_table import check_owned, owned
 
 STEP = 0.001  # s
@@ -31,6 +32,7 @@ _OFFSET = (0.0, -math.pi / 2, 0.0, 0.0)
 _TUBE_RADIUS = 0.03  # m; each link has the inertia of a thin carbon tube
 _MIN_MASS = 0.001  # kg; MuJoCo cannot simulate a massless link
 _STOPS = (-math.pi, math.pi)  # rad
+_BESIDE = (-MAX_OFFSET, MAX_OFFSET)  # m
 _ZERO = (0.0,) * JOINT_COUNT
 
 # The paper's lengths. Each link carries the motor of the next joint at its far end (AK80-9 0.485 kg, AK60-6 0.368 kg,
@@ -52,8 +54,9 @@ class ArmConfig:
     links: lengths, masses, centres of gravity and gravity of the robot's links. wearer_mass, wearer_cog: the passive
     arm of a wearer, upper arm on link 3, forearm and hand on link 4. rotor_inertia: 243.5 and 607 g cm^2 (published
     motor tables) times the gear ratio squared. coulomb_friction, viscous_friction: estimates for backdrivable planetary
-    gears. position_min, position_max: the paper's motor mounts turn 190 degrees. Raises ParameterError that names the
-    offending value.
+    gears. stribeck_friction comes on top at standstill and fades with speed v as exp(-(v / stribeck_speed)^2). cog_y,
+    cog_z: of the centre of gravity beside the link, along y_n and z_n of Table 1. position_min, position_max: the
+    paper's motor mounts turn 190 degrees. Raises ParameterError that names the offending value.
     """
 
     links: ArmModel = DEFAULT_LINKS
@@ -64,11 +67,16 @@ class ArmConfig:
     )
     coulomb_friction: Sequence[float] = owned((0.2, 0.4, 0.2, 0.2), "Coulomb friction", (0.0, 10.0), "Nm")
     viscous_friction: Sequence[float] = owned((0.02, 0.05, 0.02, 0.02), "viscous friction", (0.0, 10.0), "Nm s/rad")
+    stribeck_friction: Sequence[float] = owned(_ZERO, "friction at standstill beyond Coulomb's", (0.0, 10.0), "Nm")
+    stribeck_speed: Sequence[float] = owned((0.05,) * 4, "speed at which it fades", (0.001, 10.0), "rad/s")
+    cog_y: Sequence[float] = owned(_ZERO, "true centre of gravity beside link n, along y_n", _BESIDE, "m")
+    cog_z: Sequence[float] = owned(_ZERO, "true centre of gravity beside link n, along z_n", _BESIDE, "m")
     position_min: Sequence[float] = owned(_radians(-95.0, -10.0, -45.0, -10.0), "lower joint stops", _STOPS, "rad")
     position_max: Sequence[float] = owned(_radians(95.0, 180.0, 145.0, 180.0), "upper joint stops", _STOPS, "rad")
 
     def __post_init__(self) -> None:
         check_owned(self)
+        self.links.check_masses("the simulated arm")
         if np.any(self.links.mass < _MIN_MASS):
             raise ParameterError("links.mass", self.links.mass, f"at least {_MIN_MASS:g} kg each")
         if np.any(np.greater(self.wearer_cog, self.links.length)):
@@ -91,6 +99,9 @@ class SimulatedArm:
         self.data = mujoco.MjData(self.model)
         # Views of `data`, whose arrays stay in place: each lookup of an attribute costs as much as its use.
         self._theta, self._velocity, self._torque = self.data.qpos, self.data.qvel, self.data.qfrc_applied
+        self._coulomb, self._stribeck, self._speed = map(
+            np.array, (self.config.coulomb_friction, self.config.stribeck_friction, self.config.stribeck_speed)
+        )
         self.set_gravity((0.0, 0.0, 1.0))
         self.reset((0.0,) * JOINT_COUNT)
 
@@ -122,7 +133,13 @@ class SimulatedArm:
     def step(self, torque: Sequence[float], count: int = 1) -> None:
         """Apply `torque`, (4,) Nm of motors and wearer together, for `count` times STEP."""
         self._torque[:] = torque
-        mujoco.mj_step(self.model, self.data, count)
+        if not self._stribeck.any():
+            mujoco.mj_step(self.model, self.data, count)
+            return
+        for _ in range(count):
+            fading = np.exp(-np.square(self._velocity / self._speed))
+            self.model.dof_frictionloss[:] = self._coulomb + self._stribeck * fading
+            mujoco.mj_step(self.model, self.data)
 
 
 def _mjcf(config: ArmConfig) -> str:
@@ -133,13 +150,14 @@ def _mjcf(config: ArmConfig) -> str:
         position, alpha = (links.length[n - 1], _ALPHA[n - 1]) if n else (0.0, 0.0)
         worn = ""
         if config.wearer_mass[n] > 0:
-            worn = f"<body>{_tube(links.length[n], config.wearer_cog[n], config.wearer_mass[n])}</body>"
+            at = f"{config.wearer_cog[n]} 0 0"
+            worn = f"<body>{_tube(links.length[n], at, config.wearer_mass[n])}</body>"
         body = f"""
             <body pos="{position} 0 0" euler="{alpha} 0 {_OFFSET[n]}">
               <joint axis="0 0 1" armature="{config.rotor_inertia[n]}" damping="{config.viscous_friction[n]}"
-                frictionloss="{config.coulomb_friction[n]}" {_FRICTION_STIFFNESS}
+                frictionloss="{config.coulomb_friction[n] + config.stribeck_friction[n]}" {_FRICTION_STIFFNESS}
                 range="{config.position_min[n]} {config.position_max[n]}" {_STOP_STIFFNESS}/>
-              {_tube(links.length[n], links.cog[n], links.mass[n])}{worn}{body}
+              {_tube(links.length[n], _centre(config, n), links.mass[n])}{worn}{body}
             </body>"""
     return f"""
         <mujoco>
@@ -149,8 +167,14 @@ def _mjcf(config: ArmConfig) -> str:
         </mujoco>"""
 
 
-def _tube(length: float, cog: float, mass: float) -> str:
-    """Return the inertial element of a thin tube along x with its centre of gravity at `cog`."""
+def _centre(config: ArmConfig, n: int) -> str:
+    """Return the centre of gravity of link n + 1 in the axes of its joint: x_n, and z_{n-1} as z."""
+    cosine, sine, y, z = math.cos(_ALPHA[n]), math.sin(_ALPHA[n]), config.cog_y[n], config.cog_z[n]
+    return f"{config.links.cog[n]} {cosine * y - sine * z} {sine * y + cosine * z}"
+
+
+def _tube(length: float, centre: str, mass: float) -> str:
+    """Return the inertial element of a thin tube along x with its centre of gravity at `centre`, 'x y z' in m."""
     along = mass * _TUBE_RADIUS**2
     across = along / 2 + mass * length**2 / 12
-    return f'<inertial pos="{cog} 0 0" mass="{mass}" diaginertia="{along} {across} {across}"/>'
+    return f'<inertial pos="{centre}" mass="{mass}" diaginertia="{along} {across} {across}"/>'

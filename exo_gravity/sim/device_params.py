@@ -24,11 +24,15 @@ def _param(name: str, owner: type, field: str) -> Param:
 
 # Parameters of the arm by the field of ArmConfig that owns each of them.
 ARM_FIELDS = {
+    "cog_y": "robot.cog_y",
+    "cog_z": "robot.cog_z",
     "wearer_mass": "wearer.mass",
     "wearer_cog": "wearer.cog",
     "rotor_inertia": "rotor_inertia",
     "coulomb_friction": "friction.coulomb",
     "viscous_friction": "friction.viscous",
+    "stribeck_friction": "friction.stribeck",
+    "stribeck_speed": "friction.stribeck_speed",
     "position_min": "stop.min",
     "position_max": "stop.max",
 }
@@ -39,6 +43,7 @@ SIMULATOR = (
     *MOTOR_PARAMETERS,
     param_of(Firmware, "reply_to_master", fixed=True),
     param_of(Firmware, "reply_length", fixed=True),
+    param_of(Firmware, "current_noise", fixed=True),
     Param("gravity", STANDARD_GRAVITY, "acceleration of gravity", (0.0, MAX_GRAVITY), "m/s^2", fixed=True),
     Param("link_length", _LENGTH, "true link lengths", (0.0, MAX_LENGTH), "m", fixed=True),
     Param("robot.mass", _MASS, "true link masses", (0.0, MAX_MASS), "kg", fixed=True),
@@ -67,7 +72,7 @@ def device_of(values: Mapping[str, Any]) -> SimulatedDevice:
     """Return the device that parameter values describe, with its trunk tilted. Raises ParameterError."""
     links = ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"], gravity=values["gravity"])
     arm = ArmConfig(links, **{field: values[name] for field, name in ARM_FIELDS.items()})
-    firmware = Firmware(values["reply_to_master"], values["reply_length"])
+    firmware = Firmware(values["reply_to_master"], values["reply_length"], current_noise=values["current_noise"])
     motors = [SimulatedMotor(motor, firmware) for motor in motors_of(values)]
     device = SimulatedDevice(SimulatedArm(arm), motors, values["side"])
     device.pitch, device.roll = values["trunk.pitch"], values["trunk.roll"]

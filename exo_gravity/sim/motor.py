@@ -10,6 +10,7 @@ What the firmware does (CubeMars driver manual V1.0.15; Ben Katz's drive, from w
 from __future__ import annotations
 
 import math
+import random
 from dataclasses import dataclass, replace
 
 from exo_gravity.core.arm import one_float
@@ -27,17 +28,19 @@ class Firmware:
     """Differences between firmwares, except the wire ranges (`MotorSpec.with_ranges`).
 
     reply_length: 8 bytes, or 6 without temperature and error. zero_silence: s for which the motor ignores frames after
-    SET_ZERO; users report 0.5 to 1.5.
+    SET_ZERO; users report 0.5 to 1.5. current_noise: standard deviation of one reply.
     """
 
     reply_to_master: bool = owned(False, "replies carry ID 0 instead of the motor's own")
     reply_length: int = owned(8, "bytes of a reply, 6 or 8", (6, 8))
     zero_silence: float = 1.0
+    current_noise: float = owned(0.0, "noise of the torque in replies, as a share of it", (0.0, 0.5))
 
     def __post_init__(self) -> None:
         if self.reply_length not in (6, 8):
             raise ParameterError("reply_length", self.reply_length, "6 or 8 bytes")
         one_float("zero_silence", self.zero_silence, 0.0, 10.0, "s")
+        one_float("current_noise", self.current_noise, 0.0, 0.5)
 
 
 class SimulatedMotor:
@@ -57,6 +60,7 @@ class SimulatedMotor:
         self._entered = False
         self._command, self._data = _NO_COMMAND, b""
         self._silent_until = -math.inf  # s, after SET_ZERO
+        self._random = random.Random(joint.can_id)
 
     @property
     def reply_id(self) -> int:
@@ -115,10 +119,13 @@ class SimulatedMotor:
 
     def _reply(self, position: float, velocity: float) -> bytes:
         joint, spec = self.joint, self.joint.spec
+        torque = joint.direction * self.torque(position, velocity) / joint.torque_scale
+        if self.firmware.current_noise:
+            torque *= self._random.gauss(1.0, self.firmware.current_noise)
         values = (
             _clamp(joint.motor_position(position), spec.position_range),
             _clamp(joint.direction * velocity, spec.velocity_range),
-            _clamp(joint.direction * self.torque(position, velocity) / joint.torque_scale, spec.torque_range),
+            _clamp(torque, spec.torque_range),
         )
         if self.firmware.reply_length == 6:
             return pack_reply(spec, joint.can_id, *values)

@@ -8,6 +8,7 @@ import pytest
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.moments import off_axis_of
 from exo_gravity.sim import STEP, ArmConfig, SimulatedArm
 
 UPRIGHT = (0.0, 0.0, 1.0)
@@ -45,6 +46,32 @@ def test_the_static_torque_of_a_worn_arm_includes_the_wearers_arm():
     arm.reset(RAISED)
     expected = gravity_torque(arm.config.links.with_wearer(mass, cog), RAISED)
     np.testing.assert_allclose(arm.data.qfrc_bias, expected, atol=1e-12)
+
+
+def test_centres_of_gravity_beside_the_links_add_the_torques_of_their_moments():
+    rng = np.random.default_rng(2)
+    links = SimulatedArm().config.links
+    for _ in range(20):
+        cog_y, cog_z = rng.uniform(-0.015, 0.015, (2, 4))
+        arm = SimulatedArm(ArmConfig(links, cog_y=cog_y, cog_z=cog_z))
+        theta, direction = rng.uniform(-3.0, 3.0, 4), Tilt.of("right", *rng.uniform(-1.0, 1.0, 2)).direction
+        arm.set_gravity(direction)
+        arm.reset(theta)
+        expected = ArmModel(links.length, links.cog, links.mass, off_axis=off_axis_of(links.mass, cog_y, cog_z))
+        np.testing.assert_allclose(arm.data.qfrc_bias, gravity_torque(expected, theta, direction), atol=1e-12)
+
+
+def test_stribeck_friction_holds_at_standstill_and_is_gone_in_motion():
+    config = {"coulomb_friction": (0.1,) * 4, "viscous_friction": (0.0,) * 4, "stribeck_friction": (0.2,) * 4}
+    push = np.array((0.0, 0.0, 0.0, 0.2))
+    arms = SimulatedArm(ArmConfig(**config)), SimulatedArm(ArmConfig(**config))
+    for arm, speed in zip(arms, (0.0, 0.5), strict=True):
+        arm.reset(RAISED)
+        arm.set_gravity((0.0, 0.0, 0.0))
+        arm.data.qvel[3] = speed
+        simulate(arm, push, 0.2)
+    assert moved(arms[0], RAISED) < 0.01
+    assert arms[1].velocities[3] > 0.6
 
 
 def test_the_arm_falls_without_torque():
@@ -159,6 +186,9 @@ def test_reset_puts_the_arm_at_rest_in_a_pose():
         ({"wearer_mass": (0, 0, 2000, 0)}, "wearer_mass"),
         ({"wearer_cog": (0, 0, 0.31, 0)}, "wearer_cog"),
         ({"position_min": (2.0, 0, 0, 0)}, "position_min"),
+        ({"cog_y": (0, 0, 0.2, 0)}, "cog_y"),
+        ({"stribeck_friction": (0, 0, -0.1, 0)}, "stribeck_friction"),
+        ({"links": ArmModel.from_moments((0.05, 0.13, 0.3, 0.3), (0.1,) * 4)}, "first_moment"),
         ({"links": ArmModel((0.05, 0.13, 0.3, 0.3), (0,) * 4, (0.5, 0.5, 0.0, 0.2))}, "links.mass"),
     ],
 )

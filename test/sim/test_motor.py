@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from exo_gravity.core.errors import ParameterError
@@ -32,6 +33,13 @@ def test_no_torque_before_enter():
     motor = SimulatedMotor(JointMotor(SPEC, 5))
     assert reply_to(motor, command(torque=2.0)).torque == pytest.approx(0.0, abs=TORQUE_CODE)
     assert motor.torque(0.0, 0.0) == 0.0
+
+
+def test_current_noise_spoils_the_replied_torque_and_not_the_torque():
+    motor = entered(Firmware(current_noise=0.02))
+    replied = [reply_to(motor, command(torque=5.0)).torque for _ in range(500)]
+    assert np.std(replied) == pytest.approx(0.1, rel=0.2) and np.mean(replied) == pytest.approx(5.0, abs=0.02)
+    assert motor.torque(0.0, 0.0) == pytest.approx(5.0, abs=TORQUE_CODE / 2)
 
 
 def test_torque_flows_between_enter_and_exit():
