@@ -165,9 +165,9 @@ class ArmModel:
     def check_masses(self, what: str) -> None:
         """Raise ParameterError unless masses are known and all centres of gravity lie on the links, as `what` needs."""
         if self.by_moments:
-            raise ParameterError("first_moment", self.first_moment, f"0 for {what}, which needs mass and cog")
+            raise ParameterError("robot.first_moment", self.first_moment, f"0 for {what}, which needs mass and cog")
         if any(self.off_axis):
-            raise ParameterError("off_axis", self.off_axis, f"0 for {what}, which knows no moments across the links")
+            raise ParameterError("robot.off_axis", self.off_axis, f"0 for {what}, which knows no moments across links")
 
     def with_wearer(self, mass: Vector, cog: Vector, support: float = 1.0) -> ArmModel:
         """Return this arm plus a share `support` (0..1) of the wearer's arm: 0 is One-G, 1 is full Zero-G.

@@ -76,6 +76,8 @@ class Settings:
         law = self.anfis if self.law == "anfis" else LAWS[self.law]
         if law is None:
             raise ParameterError("law", self.law, "used with anfis_file, a model from train_anfis")
+        if self.law != "exact":
+            self.robot.check_masses(f"law {self.law}")
         # Computed in every mode, so that an impossible wearer is refused now and not when the mode becomes zero_g.
         whole = self.robot.with_wearer(self.wearer_mass, self.wearer_cog, self.support)
         if whole.total_mass > self.max_total_mass:

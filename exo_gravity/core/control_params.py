@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from exo_gravity.core.anfis_law import AnfisLaw
-from exo_gravity.core.arm import MAX_GAIN, MAX_GRAVITY, MAX_LENGTH, MAX_MASS, STANDARD_GRAVITY, ArmModel
+from exo_gravity.core.arm import MAX_GAIN, MAX_GRAVITY, MAX_LENGTH, MAX_MASS, MAX_MOMENT, STANDARD_GRAVITY, ArmModel
 from exo_gravity.core.compensator import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.joint_motor import MAX_CAN_ID, TORQUE_SCALE_BOUNDS, JointMotor
@@ -65,6 +65,10 @@ COMPENSATOR = (
     Param("gravity", STANDARD_GRAVITY, "g, acceleration of gravity", (0.0, MAX_GRAVITY), "m/s^2"),
     Param("robot.mass", [0.585, 0.468, 0.598, 0.203], "m_n, link masses", (0.0, MAX_MASS), "kg"),
     Param("robot.cog", [0.046, 0.113, 0.237, 0.128], "d_n, centre of gravity from joint n", (0.0, MAX_LENGTH), "m"),
+    Param("robot.first_moment", [0.0] * 4, "M1 to M4 by `calibrate`, in place of mass and cog; zeros: not given",
+          (0.0, MAX_MOMENT), "kg m"),
+    Param("robot.off_axis", [0.0] * 4, "W, Z, Y3, Y4 by `calibrate`: moments across the links, for the law exact",
+          (-MAX_MOMENT, MAX_MOMENT), "kg m"),
     Param("wearer.mass", [0.0, 0.0, 0.0, 0.0], "mass of the wearer's arm on each link", (0.0, MAX_MASS), "kg"),
     Param("wearer.cog", [0.0, 0.0, 0.0, 0.0], "centre of gravity of that mass from joint n", (0.0, MAX_LENGTH), "m"),
     Param("wearer.body_mass", 0.0, "body mass; computes wearer.mass and wearer.cog if these are 0", (0.0, 300.0), "kg"),
@@ -118,14 +122,7 @@ def settings_of(values: Mapping[str, Any], anfis: AnfisLaw | None = None) -> Set
 
     anfis: the model in `anfis_file`, or None if no file is given.
     """
-    try:
-        robot = ArmModel(
-            values["link_length"], values["robot.cog"], values["robot.mass"], values["gain"], values["gravity"]
-        )
-    except ParameterError as error:
-        if error.name in ("mass", "cog"):
-            raise ParameterError(f"robot.{error.name}", error.value, error.expected) from None
-        raise
+    robot = robot_of(values)
     mass, cog = wearer_of(values)
     return Settings(
         side=values["side"],
@@ -136,6 +133,19 @@ def settings_of(values: Mapping[str, Any], anfis: AnfisLaw | None = None) -> Set
         anfis=anfis,
         **{param.name: values[param.name] for param in params_of(Settings)},
     )
+
+
+def robot_of(values: Mapping[str, Any]) -> ArmModel:
+    """Return the robot's arm, by its moments if robot.first_moment is given, or raise ParameterError."""
+    length, off_axis, rest = values["link_length"], values["robot.off_axis"], (values["gain"], values["gravity"])
+    try:
+        if any(values["robot.first_moment"]):
+            return ArmModel.from_moments(length, values["robot.first_moment"], off_axis, *rest)
+        return ArmModel(length, values["robot.cog"], values["robot.mass"], *rest, off_axis)
+    except ParameterError as error:
+        if error.name in ("mass", "cog", "first_moment", "off_axis"):
+            raise ParameterError(f"robot.{error.name}", error.value, error.expected) from None
+        raise
 
 
 def wearer_of(values: Mapping[str, Any]) -> tuple[Sequence[float], Sequence[float]]:

@@ -23,6 +23,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core.anfis_law import AnfisLaw
+from exo_gravity.core.arm import ArmModel
 from exo_gravity.core.budget import USUAL_TILT
 from exo_gravity.core.compensator import Answer, Compensator, Settings
 from exo_gravity.core.control_params import COMPENSATOR, settings_of
@@ -162,7 +163,7 @@ class CompensatorNode(Node):
         of_wearer = f", wearer {_row(s.wearer_mass)} kg at {_row(s.wearer_cog)} m" if any(s.wearer_mass) else ""
         self.get_logger().info(
             f"{s.side} arm, law {s.law}, mode {s.mode}, support {s.support:g}: compensates {s.arm.total_mass:.2f} kg, "
-            f"at most {_row(s.max_effort)} Nm; robot {_row(s.robot.mass)} kg at {_row(s.robot.cog)} m{of_wearer}"
+            f"at most {_row(s.max_effort)} Nm; robot {_of_robot(s.robot)}{of_wearer}"
         )
 
     def _values(self) -> dict[str, object]:
@@ -173,8 +174,9 @@ class CompensatorNode(Node):
             "mode": s.mode,
             "support": s.support,
             "answers": self._answers,
-            "robot mass (kg)": _row(s.robot.mass),
-            "robot cog (m)": _row(s.robot.cog),
+            "robot mass (kg)": "not known" if s.robot.by_moments else _row(s.robot.mass),
+            "robot cog (m)": "not known" if s.robot.by_moments else _row(s.robot.cog),
+            "robot moments (kg m)": _row((*s.robot.first_moment, *s.robot.off_axis)),
             "wearer mass (kg)": _row(s.wearer_mass),
             "wearer cog (m)": _row(s.wearer_cog),
             "mass carried (kg)": f"{s.arm.total_mass:.3f}",
@@ -207,6 +209,13 @@ class CompensatorNode(Node):
             self._diagnostics.report(WARN, f"gravity exceeds max_effort: {joints}", values)
         else:
             self._diagnostics.report(OK, "compensating", values)
+
+
+def _of_robot(robot: ArmModel) -> str:
+    along = f"{_row(robot.mass)} kg at {_row(robot.cog)} m"
+    if robot.by_moments:
+        along = f"moments {_row(robot.first_moment)} kg m"
+    return f"{along}, across the links {_row(robot.off_axis)} kg m" if any(robot.off_axis) else along
 
 
 def _row(values: Iterable[float]) -> str:

@@ -72,3 +72,26 @@ def test_max_total_mass_bounds_the_total_mass():
     with pytest.raises(ParameterError, match=r"total mass in kg = 5.56: must be at most max_total_mass = 5 \("):
         settings_of(values)
     assert settings_of({**values, "support": 0.5}).arm.total_mass == pytest.approx(3.707, abs=1e-3)
+
+
+def test_first_moments_replace_masses_and_centres_of_gravity():
+    plain = settings_of(values_of(COMPENSATOR, {"robot.off_axis": [0.0, 0.01, 0.0, 0.0]})).robot
+    given = {"robot.first_moment": list(plain.first_moment), "robot.off_axis": [0.0, 0.01, 0.0, 0.0]}
+    moments = settings_of(values_of(COMPENSATOR, {**given, "robot.mass": [9.0] * 4})).robot
+    assert moments.by_moments and not plain.by_moments
+    assert (moments.first_moment, moments.off_axis) == (plain.first_moment, plain.off_axis)
+    assert moments.off_axis == (0.0, 0.01, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("law", ["paper_static", "paper_mobile"])
+@pytest.mark.parametrize("name", ["robot.first_moment", "robot.off_axis"])
+def test_a_law_that_needs_masses_refuses_moments(law, name):
+    values = values_of(COMPENSATOR, {name: [0.1, 0.2, 0.2, 0.03], "law": law})
+    with pytest.raises(ParameterError, match=rf"{name} = .*must be 0 for law {law}"):
+        settings_of(values)
+
+
+def test_max_total_mass_refuses_moments_that_only_a_heavier_arm_can_have():
+    values = values_of(COMPENSATOR, {"robot.first_moment": [0.1, 0.2, 6.0, 0.03]})
+    with pytest.raises(ParameterError, match=r"total mass in kg = 20.0: must be at most max_total_mass = 10"):
+        settings_of(values)

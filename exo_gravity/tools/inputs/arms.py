@@ -104,7 +104,8 @@ def configured_arm(params: str | Path | None = None, side: str = "right") -> Con
 
 
 def with_cog_at_link_ends(arm: ArmModel) -> ArmModel:
-    """Return the arm under the paper's assumptions: d_n = l_n, c_n = 1 and g = 9.8 m/s^2."""
+    """Return the arm under the paper's assumptions: d_n = l_n, c_n = 1 and g = 9.8 m/s^2. Raises ParameterError."""
+    arm.check_masses("the paper's assumptions")
     return ArmModel(arm.length, arm.length, arm.mass, gravity=9.8)
 
 

@@ -25,6 +25,7 @@ Reference = Callable[[np.ndarray, np.ndarray], np.ndarray]  # theta (n, 4), dire
 
 def gravload(arm: ArmModel) -> Reference:
     """Return the torque by the Robotics Toolbox: theta (n, 4) rad and gravity's direction (n, 3) -> (n, 4) Nm."""
+    arm.check_masses("gravload")
     robot = toolbox_robot(arm)
     # Releases differ in the sign of `gravity`; in all of them the default means weight along -z.
     g = arm.gravity * -math.copysign(1.0, robot.gravity[2])
@@ -54,6 +55,7 @@ def toolbox_robot(arm: ArmModel) -> Any:
 
 def pinocchio(arm: ArmModel) -> Reference:
     """Return the torque by Pinocchio: theta (n, 4) rad and gravity's direction (n, 3) -> (n, 4) Nm."""
+    arm.check_masses("Pinocchio")
     pin, model = pinocchio_model(arm)
     data = model.createData()
 
