@@ -54,7 +54,7 @@ def write_changes(
     text = params.read_text(encoding="utf-8")
     origin = f"{today or datetime.date.today()} {command}"
     for change in changes:
-        change = change._replace(value=_plain(change.value))
+        change = change._replace(value=plain(change.value))
         text = _changed(text, change, origin)
         if change.name:
             wanted[change.node][change.name] = change.value
@@ -66,10 +66,10 @@ def write_changes(
         raise ParameterError("params", str(params), f"without anchors and repeated keys, to set {names} alone")
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Return a value in Python's own types, floats rounded to DIGITS."""
     if isinstance(value, (list, tuple, np.ndarray)):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, (bool, str)):
         return value
     return float(f"{value:.{DIGITS}g}") if isinstance(value, (float, np.floating)) else int(value)

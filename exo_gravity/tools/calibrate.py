@@ -1,0 +1,114 @@
+"""calibrate COMMAND --params FILE --output NEW.yaml: finds what differs between an arm and its parameter file.
+
+    motors     each joint's motor, direction and zero: the person moves the joints by hand, nothing is switched on
+    gravity    the robot's first moments: the arm, on a stand and without a wearer, moves slowly through chosen poses
+    friction   Coulomb, viscous and Stribeck friction of each joint, from slow sweeps
+    scale      real torque per commanded torque of each motor, from a known weight on the last link
+    wearer     the moments of the wearer's relaxed arm
+    imu        how the IMU is mounted on the trunk, from standing upright and bowing once
+
+The new file is the old one with new values, their uncertainty and the date. Beside it are a page (NEW.html) and
+what was measured (NEW.jsonl). No existing file is ever overwritten.
+
+Exit code 0: calibrated. 1: not calibrated, and why. 2: wrong use or wrong file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from exo_gravity.core.errors import ExoGravityError, ParameterError
+from exo_gravity.core.tilt import SIDES
+from exo_gravity.tools.cli.extras import extras, require_ros
+from exo_gravity.tools.inputs.arms import configured_arm
+
+if TYPE_CHECKING:
+    from exo_gravity.tools.calibration.outcome import Outcome
+
+COMMANDS = {
+    "motors": "each joint's motor, direction and zero, found by moving the joints by hand",
+    "gravity": "the robot's first moments, from a slow tour of poses",
+    "friction": "friction of each joint, from slow sweeps",
+    "scale": "torque scale of each motor, from a known weight on the last link",
+    "wearer": "the moments of the wearer's relaxed arm",
+    "imu": "the mounting of the IMU, from standing upright and bowing once",
+}
+MAX_POSES = 12
+
+
+def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="calibrate", description="Find what differs between an arm and its file.")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, description in COMMANDS.items():
+        command = commands.add_parser(name, help=description, description=f"calibrate {name}: {description}.")
+        option = command.add_argument
+        option("--params", required=True, type=Path, metavar="FILE", help="ROS 2 parameter file of the device")
+        option("--output", required=True, type=Path, metavar="NEW.yaml", help="new parameter file to write")
+        if name != "imu":
+            option("--side", choices=SIDES, default="right", help="which arm (default: %(default)s)")
+        if name == "motors":
+            option(
+                "--pose", type=float, nargs=4, default=(0.0,) * 4, metavar="DEG",
+                help="joint angles at which zero is measured, if the arm is in a jig (default: 0 0 0 0, it hangs)",
+            )  # fmt: skip
+        else:
+            option("--bag", type=Path, metavar="FOLDER", help="use this recording instead of the device")
+        if name == "gravity":
+            option("--poses", type=int, default=MAX_POSES, metavar="N", help="largest number of poses (%(default)s)")
+        if name == "scale":
+            option("--mass", type=float, required=True, metavar="KG", help="of the weight")
+            option("--lever", type=float, required=True, metavar="M", help="from the elbow to the weight")
+    return parser.parse_args(args)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit code."""
+    options = _arguments(args)
+    try:
+        with extras("calibrate", "calibrate"):
+            return _run(options)
+    except KeyboardInterrupt:
+        print("calibrate: stopped; nothing was written", file=sys.stderr)
+        return 1
+    except ParameterError as error:
+        print(f"calibrate: {error}", file=sys.stderr)
+        return 2
+    except (ExoGravityError, OSError) as error:
+        print(f"calibrate: not calibrated: {error}", file=sys.stderr)
+        return 1
+
+
+def _run(options: argparse.Namespace) -> int:
+    from exo_gravity.tools.calibration.page import page_of
+    from exo_gravity.tools.calibration.person import Person
+    from exo_gravity.tools.calibration.yaml_file import check_output, write_changes
+
+    options.record, page = options.output.with_suffix(".jsonl"), options.output.with_suffix(".html")
+    for path in (options.output, options.record, page):
+        check_output(path)
+    bag = getattr(options, "bag", None)
+    if bag is not None and not bag.exists():
+        raise ParameterError("bag", str(bag), "a recording: a rosbag2 folder, or an .mcap or .db3 file")
+    person = Person()
+    options.wait, options.ask = person.wait, person.ask
+    arm = None if options.command == "imu" else configured_arm(options.params, options.side)
+    if bag is None and options.command != "motors":
+        require_ros("calibrate")
+    run: Callable[..., Outcome] = import_module(f"exo_gravity.tools.calibration.{options.command}").run
+    outcome = run(options, arm, person.say)
+    for line in outcome.lines:
+        person.say(line)
+    if outcome.changes and not outcome.refusals:
+        write_changes(options.params, options.output, outcome.changes, f"calibrate {options.command}")
+        person.say(f"Written: {options.output}")
+    if not outcome.refusals or outcome.observations:
+        page.write_text(page_of(outcome, options.command, str(options.params)), encoding="utf-8")
+        person.say(f"Written: {page}")
+    for refusal in outcome.refusals:
+        print(f"calibrate: not calibrated: {refusal}", file=sys.stderr)
+    return 1 if outcome.refusals else 0

@@ -1,0 +1,137 @@
+"""The page of a calibration: what it says, and what its numbers are."""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from html import escape
+
+import numpy as np
+import pytest
+
+from exo_gravity.core.arm import ArmModel
+from exo_gravity.core.gravity import gravity_torque
+from exo_gravity.core.identification import Observation, identify
+from exo_gravity.core.moments import load_moments, regressor
+from exo_gravity.core.tilt import Tilt
+from exo_gravity.tools.calibration.outcome import Change, Curve, Outcome
+from exo_gravity.tools.calibration.page import page_of
+from exo_gravity.tools.calibration.torque_table import torque_table
+from exo_gravity.tools.inputs.arms import configured_arm
+
+DAY = datetime.date(2026, 11, 22)
+DOWN = Tilt.of("right", 0.3, -0.2).direction
+LOAD = (1.0, 0.25)  # kg, m from the elbow
+FRICTION = np.array((0.12, 0.2, 0.12, 0.1))
+POSES = np.radians(
+    [
+        (0, 10, 0, 20), (30, 60, 20, 30), (-40, 40, 60, 90), (20, 90, 0, 0), (0, 30, 90, 60), (-20, 70, 45, 110),
+        (45, 100, 30, 45), (0, 50, 110, 20), (-60, 80, 10, 70), (10, 20, 40, 120), (30, 80, 60, 10), (-30, 60, 90, 30),
+    ]
+)  # fmt: skip
+
+
+def true_arm() -> ArmModel:
+    """An arm with the links of the configured one, a fifth heavier, and with centres of gravity beside the links."""
+    robot = configured_arm().robot
+    return ArmModel.from_moments(robot.length, 1.2 * np.array(robot.first_moment), (0.004, -0.006, 0.003, 0.002))
+
+
+def observations(poses: np.ndarray = POSES, outlier: int | None = None) -> tuple[Observation, ...]:
+    """Observations of `true_arm`, every second pose with a weight on link 4."""
+    rng, arm = np.random.default_rng(1), true_arm()
+    taken = []
+    for number, theta in enumerate(poses):
+        load = LOAD if number % 2 else (0.0, 0.0)
+        weight = regressor(theta, DOWN)[0] @ load_moments(arm.length, *load)
+        effort = gravity_torque(arm, theta, DOWN) + weight + 0.005 * rng.standard_normal(4)
+        if number == outlier:
+            effort = effort + 1.0
+        taken.append(Observation(theta, DOWN, effort, FRICTION, np.full(4, 0.005), *load))
+    return tuple(taken)
+
+
+def outcome(outlier: int | None = None, **changes: object) -> Outcome:
+    taken, arm = observations(outlier=outlier), configured_arm()
+    result = identify(taken, arm.robot.length)
+    found = Outcome(
+        (Change("/right/compensator", "robot.first_moment", result.moments[:4].tolist(), "kg m, <±0.001>"),),
+        ("M4 is 20 % larger than in the file.",),
+        (),
+        arm,
+        taken,
+        result,
+        (0.0, math.radians(40.0), 0.5, 1.0),
+    )
+    return replace(found, **changes)  # type: ignore[arg-type]
+
+
+def test_the_table_compares_the_old_and_the_new_file_with_what_was_measured() -> None:
+    found = outcome()
+    table = torque_table(found)
+    assert table is not None
+    assert table.measured == pytest.approx(np.array([o.effort for o in found.observations]))
+    unloaded = slice(0, None, 2)
+    expected = gravity_torque(configured_arm().robot, POSES[unloaded], DOWN)
+    assert table.before[unloaded] == pytest.approx(expected)
+    assert np.abs(table.measured - table.after).max() < 0.03
+    assert np.abs(table.measured - table.before).max() > 0.3
+    loads = regressor(POSES[1::2], DOWN) @ load_moments(configured_arm().robot.length, *LOAD)
+    assert table.before[1::2] == pytest.approx(gravity_torque(configured_arm().robot, POSES[1::2], DOWN) + loads)
+
+
+def test_the_arm_creeps_where_the_remainder_exceeds_friction() -> None:
+    table = torque_table(outcome())
+    assert table is not None
+    wrong = np.abs(table.measured - table.before) > 0.2 * FRICTION
+    assert table.creeping(0.2) == (int(wrong.any(axis=1).sum()), 0)
+    assert table.creeping(100.0) == (0, 0)
+    assert (table.margin > 1.0).all()
+
+
+def test_the_page_says_what_was_found_and_what_was_not_told() -> None:
+    found = outcome()
+    page = page_of(found, "gravity", "old.yaml", DAY)
+    assert "<h1>calibrate gravity, right arm</h1><p class='when'>2026-11-22, from old.yaml</p>" in page
+    assert "<b>Calibrated.</b>" in page
+    assert "robot.first_moment" in page and "kg m, &lt;±0.001&gt;" in page
+    assert "M4 is 20 % larger than in the file." in page
+    assert page.count("data:image/png;base64,") == 2
+    assert found.identified is not None
+    for sentence in found.identified.unknown:
+        assert escape(sentence) in page
+    assert "Singular values" in page
+    assert "Next best pose</b>, if more is wanted: 0 40 29 57 degrees" in page
+    assert page.count("<tbody><tr><td rowspan=") == len(POSES)
+    assert "in 0 with the new" in page
+
+
+def test_a_pose_that_was_left_out_is_marked_with_its_reason() -> None:
+    found = outcome(outlier=5)
+    page = page_of(found, "gravity", "old.yaml", DAY)
+    table = torque_table(found)
+    assert table is not None and found.identified is not None
+    ((index, reason),) = found.identified.rejected
+    assert index == 5 and not table.used[5]
+    assert f"pose 6: {reason}" in page and "<br>left out" in page
+
+
+def test_a_refusal_is_on_the_page_without_new_values() -> None:
+    page = page_of(outcome(refusals=("pose 3 slipped",), identified=None), "gravity", "old.yaml", DAY)
+    assert "Not calibrated; no file was written.</b><ul><li>pose 3 slipped</li>" in page
+    assert "robot.first_moment" not in page and "<img" not in page
+
+
+def test_friction_is_drawn_over_speed() -> None:
+    speed = np.array((0.3, 0.05, 0.1))
+    curves = [Curve(speed, 0.1 + 0.02 * speed, 0.1 + 0.02 * speed) for _ in range(4)]
+    page = page_of(Outcome((), ("friction found",), curves=tuple(curves)), "friction", "old.yaml", DAY)
+    assert page.count("<img") == 1 and "Friction over speed" in page
+
+
+def test_without_poses_the_page_holds_the_values_alone() -> None:
+    changes: Sequence[Change] = (Change("/imu", "rotation_trunk_from_imu", [0.0, 0.0, 0.0, 1.0]),)
+    page = page_of(Outcome(tuple(changes), ()), "imu", "old.yaml", DAY)
+    assert "[0.0, 0.0, 0.0, 1.0]" in page and "<img" not in page
