@@ -14,12 +14,16 @@ import numpy as np
 from exo_gravity.core.arm import JOINT_COUNT, Vector
 from exo_gravity.core.gravity import Torque
 
-ROTOR = 0.002  # kg m^2, between the rotors of an AK60-6 and an AK80-9 at the output
+ROTOR = 0.0015  # kg m^2, between the rotors of an AK60-6 and an AK80-9 at the output
 REACH = (0.8, 0.8, 0.8, 0.6)  # of a link's length, at which its mass is assumed
 FREQUENCY_PER_RATE = 0.12  # natural frequency in rad/s per control cycle per s; two cycles of delay cost 27 degrees
 MAX_FREQUENCY = 20.0  # rad/s
 INTEGRAL_SHARE = 0.4  # of the frequency, at which the integral part acts; unstable from 2 on
 USUAL_FRICTION = 0.15  # Nm, until it is measured
+# Of the friction, per s, by which its compensation changes: a joint that rests anywhere within its friction would jump.
+FRICTION_RATE = 6.0
+# rad ahead of the reference, and rad/s faster, from which on no more friction is compensated
+AHEAD, FASTER = 0.003, 0.03
 FULL_FRICTION_SPEED = 0.03  # rad/s of the reference, from which on friction is compensated fully
 
 
@@ -72,6 +76,7 @@ class Tracker:
         self._frequency = min(MAX_FREQUENCY, FREQUENCY_PER_RATE * rate)
         self._max_effort = np.array(max_effort)
         self._integral = np.zeros(JOINT_COUNT)
+        self._slide = np.zeros(JOINT_COUNT)  # Nm that compensate friction
 
     def shift(self, change: np.ndarray) -> None:
         """Take over a `change` (4,) Nm of the expected torque, so that the effort does not step."""
@@ -89,17 +94,25 @@ class Tracker:
         """Return the effort (4,) in Nm.
 
         error (4,) rad, speed_error (4,) rad/s: reference minus measurement. heading: (4,) rad/s, where the reference
-        goes, also while it waits for the arm. expected: (4,) Nm, gravity's torque. matrix: (4, 4) kg m^2, the mass matrix.
+        goes, also while it waits for the arm. expected: (4,) Nm, gravity's torque. matrix: (4, 4) kg m^2.
         """
         frequency = self._frequency
         stiff = matrix @ error * frequency**2
         push = stiff + matrix @ speed_error * 2.0 * frequency
         integral = self._integral + INTEGRAL_SHARE * frequency * dt * stiff
-        slide = self.friction * np.clip(heading / FULL_FRICTION_SPEED, -1.0, 1.0)
-        torque = np.add(expected, slide) + push + integral
+        self._compensate_friction(dt, error, speed_error, heading)
+        torque = expected + self._slide + push + integral
         is_saturated = np.abs(torque) > self._max_effort
         self.saturated = np.where(is_saturated, self.saturated + dt, 0.0)
         # Without this the integral would wind up.
         self._integral = np.where(is_saturated & (torque * error > 0.0), self._integral, integral)
         self.correction = push + self._integral
         return tuple(np.clip(torque, -self._max_effort, self._max_effort).tolist())
+
+    def _compensate_friction(self, dt: float, error: np.ndarray, speed_error: np.ndarray, heading: np.ndarray) -> None:
+        step = FRICTION_RATE * self.friction * dt
+        wanted = self.friction * np.clip(heading / FULL_FRICTION_SPEED, -1.0, 1.0)
+        change = np.clip(wanted - self._slide, -step, step)
+        way = np.sign(heading)
+        is_ahead = (error * way < -AHEAD) | (speed_error * way < -FASTER)
+        self._slide += np.where(is_ahead & (change * way > 0.0), 0.0, change)

@@ -1,4 +1,4 @@
-"""Which poses the calibration visits: given ones, or the most informative that the motors can hold and reach in time."""
+"""Which poses the calibration visits: given ones, or the most informative ones that the motors can hold."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ SHARE = 0.85  # of max_effort that a pose may need
 DEVIATIONS = 2.0  # of the expected torque, that a pose must leave room for
 USUAL_FRICTION = 0.5  # Nm, until it is measured
 WAYPOINTS = 8  # of the way to a pose, at which the motors must hold the arm too
+FIRST_EDGE = 0.1  # rad in addition, at the first pose
 EDGE = 0.02  # rad between a sweep's end and the soft wall
 TIME_SHARE = 1.5  # of the time left for each pose, that the next one may take
 
@@ -63,7 +64,8 @@ class BestPoses:
 
     def __post_init__(self) -> None:
         low, high = measurable(self.limits, Station((0.0,) * JOINT_COUNT).amplitude)
-        self._home = np.clip(self.limits.home, low, high)
+        # Friction is not known at first: the first pose keeps a distance from the soft walls.
+        self._home = np.clip(self.limits.home, low + FIRST_EDGE, high - FIRST_EDGE)
         self._candidates = np.random.default_rng(self.seed).uniform(low, high, (CANDIDATES, JOINT_COUNT))
 
     def next(self, taken: np.ndarray, guess: TorqueGuess, friction: Sequence[float], elapsed: float) -> Station | None:

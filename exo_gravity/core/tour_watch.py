@@ -8,7 +8,7 @@ from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.tilt import Tilt, angle_between
 
 MAX_ERROR = 0.12  # rad between a joint and the slow reference
-FASTEST = 0.7  # rad/s of a joint, more than twice the fastest reference
+FASTEST = 1.0  # rad/s of a joint; a light joint that leaves its friction reaches 0.5
 MAX_CORRECTION = 0.5  # Nm, of the controllers, in addition to what is unknown of weight and friction
 DEVIATIONS = 3.0  # of the expected torque
 UNKNOWN_FRICTION = 1.0  # Nm, until it is measured

@@ -1,0 +1,74 @@
+"""One pose of a tour: the sweeps through it, there and back, until enough of them were good."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from exo_gravity.core.gravity import Torque
+from exo_gravity.core.tour_average import Average, Sweep, average
+from exo_gravity.core.tour_motion import WINDOW, Line, Station
+
+FOLLOWED = 0.7  # of the way of the reference, that each joint must follow in a sweep that counts
+MAX_FAILURES = 4  # pairs of sweeps in which a joint may stick: each shows the controller more of its friction
+
+
+class Visit:
+    """Collects the samples of the sweeps through `station`.
+
+    slope: (4, 4) Nm/rad, change of the expected torque with the angles. failures: pairs of sweeps that did not count.
+    """
+
+    def __init__(self, station: Station, slope: np.ndarray) -> None:
+        self.station = station
+        self.failures = 0
+        self._slope = slope
+        self._sweeps: list[Sweep] = []
+        self._samples: list[tuple[Sequence[float], Torque]] = []
+        self._directions: list[tuple[float, float, float]] = []
+
+    @property
+    def line(self) -> Line:
+        """The next sweep."""
+        ends = (self.station.low, self.station.high)
+        return Line(*(ends if len(self._sweeps) % 2 == 0 else ends[::-1]), self.station.speed)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether enough sweeps were good."""
+        return len(self._sweeps) == 2 * self.station.cycles
+
+    @property
+    def direction(self) -> np.ndarray:
+        """Mean direction of gravity (3,) during the sweeps."""
+        mean = np.mean(self._directions, axis=0)
+        return np.asarray(mean / np.linalg.norm(mean))
+
+    def note(self, position: Sequence[float], effort: Torque, direction: tuple[float, float, float]) -> None:
+        """Take a sample: the `effort` (4,) Nm that brought the arm to `position` (4,) rad."""
+        self._samples.append((tuple(position), effort))
+        self._directions.append(direction)
+
+    def end_sweep(self) -> np.ndarray | None:
+        """End a sweep. Return the friction (4,) in Nm that it and the one before show, None after a way there."""
+        position, effort = (np.array(column) for column in zip(*self._samples, strict=True))
+        self._sweeps.append(Sweep(len(self._sweeps) % 2 == 0, position, effort))
+        self._samples = []
+        return None if len(self._sweeps) % 2 else average(self._sweeps[-2:], self._slope).friction
+
+    def stuck(self) -> dict[int, float]:
+        """Return the joints that did not follow one of the last two sweeps, with the part of the way that they did."""
+        way = 2.0 * WINDOW * self.station.amplitude
+        followed = np.min([sweep.position[-1] - sweep.position[0] for sweep in self._sweeps[-2::2]], axis=0)
+        returned = np.min([sweep.position[0] - sweep.position[-1] for sweep in self._sweeps[-1::2]], axis=0)
+        shares = np.minimum(followed, returned) / way
+        return {joint: float(share) for joint, share in enumerate(shares) if share < FOLLOWED}
+
+    def start_again(self) -> None:
+        """Discard the sweeps so far."""
+        self._sweeps, self._directions = [], []
+
+    def result(self) -> Average:
+        """Return the average of the sweeps."""
+        return average(self._sweeps, self._slope)
