@@ -105,7 +105,7 @@ def test_the_page_says_what_was_found_and_what_was_not_told() -> None:
     assert "Singular values" in page
     assert "Next best pose</b>, if more is wanted: 0 40 29 57 degrees" in page
     assert page.count("<tbody><tr><td rowspan=") == len(POSES)
-    assert "in 0 with the new" in page
+    assert ", in 0 with the new" in page
 
 
 def test_a_pose_that_was_left_out_is_marked_with_its_reason() -> None:

@@ -86,3 +86,4 @@ def _plain(axis: Axes) -> None:
     axis.tick_params(color=FAINT, labelcolor=INK, labelsize=9)
     axis.grid(axis="y", color=GRID_LINE, lw=0.5)
     axis.set_axisbelow(True)
+    axis.margins(y=0.12)

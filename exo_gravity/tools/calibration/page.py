@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from exo_gravity.core.identification import Identified
 from exo_gravity.core.moments import MOMENTS
 from exo_gravity.tools.calibration.figures import friction_figure, prediction_figure, remainder_figure
-from exo_gravity.tools.calibration.outcome import Outcome
+from exo_gravity.tools.calibration.outcome import Change, Outcome
 from exo_gravity.tools.calibration.torque_table import SMALL_FRICTION, TorqueTable, torque_table
 from exo_gravity.tools.calibration.yaml_file import plain, value_text
 from exo_gravity.tools.reporting.colours import JOINT_COLOURS
@@ -72,14 +72,21 @@ def _sections(outcome: Outcome) -> Iterator[str]:
         yield _embedded(friction_figure(outcome.curves, labels), FRICTION_CAPTION)
 
 
+def _row(change: Change) -> list[str]:
+    value = value_text(plain(change.value)) if change.name else ""
+    return [change.node, change.name or "(comment)", value, change.note]
+
+
 def _creep(table: TorqueTable) -> str:
     count = int(table.used.sum())
     sentences = []
-    for share, friction in ((1.0, "the friction measured"), (SMALL_FRICTION, f"{SMALL_FRICTION:g} of it")):
+    for share, friction in (
+        (1.0, "the friction measured"),
+        (SMALL_FRICTION, f"{SMALL_FRICTION:g} times that friction"),
+    ):
         before, after = table.creeping(share)
-        sentences.append(
-            f"With {friction}, the arm creeps in {before} of {count} poses with the old file, {after} with the new."
-        )
+        creeps = f"creeps in {before} of {count} poses with the old file, in {after} with the new"
+        sentences.append(f"With {friction} the arm {creeps}.")
     error = np.sqrt(np.mean(table.held_out[table.used] ** 2, axis=0)) / np.maximum(table.peak, 1e-9)
     sentences.append(f"Held-out error, RMS, of each joint's peak torque: {' '.join(f'{e:.1%}' for e in error)}.")
     return list_html("Drift to expect", sentences)
