@@ -58,6 +58,8 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
             )  # fmt: skip
         else:
             option("--bag", type=Path, metavar="FOLDER", help="use this recording instead of the device")
+        if name == "imu":
+            option("--rests", type=Path, metavar="FOLDER", help="recording of the IMU resting on each of its six sides")
         if name == "gravity":
             option("--poses", type=int, default=MAX_POSES, metavar="N", help="largest number of poses (%(default)s)")
         if name == "scale":
@@ -92,8 +94,9 @@ def _run(options: argparse.Namespace) -> int:
     for path in (options.output, options.record, page):
         check_output(path)
     bag = getattr(options, "bag", None)
-    if bag is not None and not bag.exists():
-        raise ParameterError("bag", str(bag), "a recording: a rosbag2 folder, or an .mcap or .db3 file")
+    for path in (bag, getattr(options, "rests", None)):
+        if path is not None and not path.exists():
+            raise ParameterError("bag", str(path), "a recording that exists")
     person = Person()
     options.wait, options.ask = person.wait, person.ask
     arm = None if options.command == "imu" else configured_arm(options.params, options.side)

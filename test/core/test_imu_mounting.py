@@ -1,0 +1,141 @@
+"""The mounting of an IMU, from simulated records of a person who stands, bows and stands."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from exo_gravity.core.arm import STANDARD_GRAVITY
+from exo_gravity.core.errors import DataError
+from exo_gravity.core.imu_mounting import ImuRecord, mounting, six_rests
+from exo_gravity.core.tilt import rotation_matrix
+from exo_gravity.sim.imu import ImuConfig, SimulatedImu
+
+RATE = 100.0
+
+
+def random_quaternion(rng: np.random.Generator) -> np.ndarray:
+    quaternion = rng.standard_normal(4)
+    return quaternion / np.linalg.norm(quaternion)
+
+
+def angle_of(error: np.ndarray) -> float:
+    """Return the angle in rad of a rotation matrix."""
+    return math.acos(max(-1.0, min(1.0, (np.trace(error) - 1.0) / 2.0)))
+
+
+def record(
+    quaternion: np.ndarray,
+    bow: float = 0.7,
+    lean: float = 0.0,
+    seed: int = 0,
+    upright: float = 2.0,
+    posture: tuple[float, float] = (0.0, 0.0),
+) -> ImuRecord:
+    """Return 2 s upright, a bow in 1.5 s that leans sideways by `lean` rad, 2 s bowed, back, and 2 s upright."""
+    time = np.arange(0.0, upright + 7.0, 1.0 / RATE)
+    s = np.interp(time, np.cumsum((0.0, upright, 1.5, 2.0, 1.5, 2.0)), (0.0, 0.0, 1.0, 1.0, 0.0, 0.0))
+    share = s * s * (3.0 - 2.0 * s)
+    pitch, roll = posture[0] + bow * share, posture[1] + lean * share
+    imu = SimulatedImu(ImuConfig(tuple(quaternion), RATE, seed=seed))
+    rates = np.gradient(pitch, time), np.gradient(roll, time)
+    samples = [imu.sample(*row) for row in zip(pitch, roll, *rates, strict=True)]
+    gyroscope, accelerometer = (np.array(column) for column in zip(*samples, strict=True))
+    return ImuRecord(time, gyroscope, accelerometer)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_any_mounting_is_found_within_its_stated_error(seed: int) -> None:
+    quaternion = random_quaternion(np.random.default_rng(seed))
+    found = mounting(record(quaternion, seed=seed))
+    error = rotation_matrix(found.quaternion) @ rotation_matrix(quaternion).T
+    assert angle_of(error) < math.radians(1.5)
+    assert angle_of(error) < 2.0 * np.linalg.norm(found.error)
+    assert found.bow == pytest.approx(0.7, abs=0.03)
+    assert found.quaternion[3] >= 0.0 and np.linalg.norm(found.quaternion) == pytest.approx(1.0)
+
+
+def test_the_gyroscope_bias_is_found() -> None:
+    quaternion = np.array((0.0, 0.0, 0.0, 1.0))
+    still = record(quaternion)
+    shifted = still._replace(angular_velocity=still.angular_velocity + np.array((0.03, -0.02, 0.01)))
+    away = mounting(shifted).gyroscope_bias - mounting(still).gyroscope_bias
+    assert away == pytest.approx((0.03, -0.02, 0.01), abs=1e-3)
+
+
+def test_a_crooked_posture_is_part_of_the_result_and_a_lean_counts_into_its_error() -> None:
+    quaternion = np.array((0.0, 0.0, 0.0, 1.0))
+    straight, leaning = (mounting(record(quaternion, lean=lean)) for lean in (0.0, 0.09))
+    assert leaning.error[2] > straight.error[2]
+    crooked = mounting(record(quaternion, posture=(0.05, 0.0)))
+    assert angle_of(rotation_matrix(crooked.quaternion)) == pytest.approx(0.05, abs=0.015)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"bow": 0.2}, "the bow was 1[12] degrees, must be 20 or more"),
+        ({"lean": 0.5, "posture": (0.0, -0.3)}, "not about one axis"),
+        ({"upright": 0.0}, "must begin and end upright"),
+    ],
+)
+def test_a_bow_that_tells_nothing_is_refused(changes: dict[str, object], sentence: str) -> None:
+    if "lean" in changes:  # leans first, then bows: no single axis
+        time = np.arange(0.0, 9.0, 1.0 / RATE)
+        first = np.clip((time - 2.0) / 0.7, 0.0, 1.0) - np.clip((time - 5.5) / 0.7, 0.0, 1.0)
+        then = np.clip((time - 2.7) / 0.8, 0.0, 1.0) - np.clip((time - 6.2) / 0.8, 0.0, 1.0)
+        imu = SimulatedImu(ImuConfig(rate=RATE))
+        pitch, roll = 0.5 * then, 0.5 * first
+        rates = np.gradient(pitch, time), np.gradient(roll, time)
+        samples = [imu.sample(*row) for row in zip(pitch, roll, *rates, strict=True)]
+        taken = ImuRecord(time, *(np.array(column) for column in zip(*samples, strict=True)))
+    else:
+        taken = record(np.array((0.0, 0.0, 0.0, 1.0)), **changes)  # type: ignore[arg-type]
+    with pytest.raises(DataError, match=sentence):
+        mounting(taken)
+
+
+@pytest.mark.parametrize(
+    ("factor", "sentence"),
+    [((1.0, -1.0), "check units and signs"), ((1.0, 57.3), "."), ((0.102, 1.0), "shows 0.10 g, must be 1")],
+)
+def test_wrong_units_and_signs_are_refused(factor: tuple[float, float], sentence: str) -> None:
+    taken = record(np.array((0.0, 0.0, 0.0, 1.0)))
+    wrong = ImuRecord(taken.time, factor[1] * taken.angular_velocity, factor[0] * taken.acceleration)
+    with pytest.raises(DataError, match=sentence):
+        mounting(wrong)
+
+
+def test_an_imu_that_is_never_still_or_silent_is_refused() -> None:
+    time = np.arange(0.0, 5.0, 0.01)
+    shaken = np.stack([np.sin(40.0 * time + phase) for phase in (0, 1, 2)], axis=1)
+    with pytest.raises(DataError, match="never still"):
+        mounting(ImuRecord(time, shaken, 9.81 * shaken))
+    with pytest.raises(DataError, match="3 IMU samples"):
+        mounting(ImuRecord(time[:3], shaken[:3], shaken[:3]))
+
+
+def rests(count: int, scale: np.ndarray, bias: np.ndarray) -> ImuRecord:
+    """Return an IMU that lies on `count` of its sides for 2 s each, turned in 1 s."""
+    sides = np.array([(0, 0, 1), (0, 1, 0), (1, 0, 0), (0, -1, 0), (-1, 0, 0), (0, 0, -1)], float)[:count]
+    rng = np.random.default_rng(3)
+    force = np.repeat(sides * STANDARD_GRAVITY, 300, axis=0) / scale + bias
+    rate = 1e-3 * rng.standard_normal(force.shape)
+    for side in range(count):
+        rate[300 * side : 300 * side + 100] += (1.5, 0.3, 0.0)
+    return ImuRecord(np.arange(len(force)) / RATE, rate, force + 0.01 * rng.standard_normal(force.shape))
+
+
+def test_six_rests_show_scale_and_bias_of_the_accelerometer() -> None:
+    scale, bias = np.array((1.02, 0.97, 1.01)), np.array((0.2, -0.3, 0.1))
+    found = six_rests(rests(6, scale, bias))
+    assert found.scale == pytest.approx(scale, abs=1e-3)
+    assert found.bias == pytest.approx(bias, abs=5e-3)
+    assert found.residual < 0.01
+
+
+def test_five_rests_are_too_few() -> None:
+    with pytest.raises(DataError, match="on 5 different sides, must be 6"):
+        six_rests(rests(5, np.ones(3), np.zeros(3)))

@@ -1,0 +1,102 @@
+"""calibrate imu from recordings, through the command line."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from exo_gravity.core.imu_mounting import ImuRecord
+from exo_gravity.core.tilt import angle_between, rotation_matrix
+from exo_gravity.tools.calibrate import main
+from exo_gravity.tools.calibration.imu import read_imu
+from exo_gravity.tools.inputs.parameter_file import load, packaged_config
+
+from ..core.test_imu_mounting import record, rests
+from ..support.synthetic_bags import START, STORE, Entry, write_bag
+
+IMU = "sensor_msgs/msg/Imu"
+MOUNTED = np.array((0.1, -0.2, 0.6, 0.768))
+MOUNTED /= np.linalg.norm(MOUNTED)
+
+
+def imu_entry(time: float, rate: np.ndarray, force: np.ndarray) -> Entry:
+    types = STORE.types
+    stamp = START + round(time * 1e9)
+    header = types["std_msgs/msg/Header"](
+        stamp=types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9), frame_id="imu"
+    )
+    vector, no_covariance = types["geometry_msgs/msg/Vector3"], np.zeros(9)
+    message = types[IMU](
+        header, types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0), np.full(9, -1.0),
+        vector(*map(float, rate)), no_covariance, vector(*map(float, force)), no_covariance,
+    )  # fmt: skip
+    return "/imu/data_raw", IMU, stamp, bytes(STORE.serialize_cdr(message, IMU))
+
+
+def bag_of(folder: Path, samples: ImuRecord) -> Path:
+    return write_bag(folder, (imu_entry(*row) for row in zip(*samples, strict=True)))
+
+
+def calibrate(tmp_path: Path, *arguments: str) -> int:
+    params = str(packaged_config("exo.yaml"))
+    return main(["imu", "--params", params, "--output", str(tmp_path / "new.yaml"), *arguments])
+
+
+def test_the_mounting_goes_into_the_new_file_and_onto_the_page(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = bag_of(tmp_path / "bag", record(MOUNTED))
+    assert calibrate(tmp_path, "--bag", str(bag)) == 0
+    found = load(tmp_path / "new.yaml")["/imu"]["rotation_trunk_from_imu"]
+    error = rotation_matrix(found) @ rotation_matrix(MOUNTED).T
+    assert all(angle_between(axis, column) < math.radians(1.5) for axis, column in zip(np.eye(3), error, strict=True))
+    text = (tmp_path / "new.yaml").read_text(encoding="utf-8")
+    assert "calibrate imu: ±1.0 1.0" in text and "# x, y, z, w, from a calibration" in text
+    assert "Calibrated." in (tmp_path / "new.html").read_text(encoding="utf-8")
+    assert "rotation_trunk_from_imu" in capsys.readouterr().out
+
+
+def test_six_rests_are_told_and_noted_in_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bow = bag_of(tmp_path / "bow", record(MOUNTED))
+    sides = bag_of(tmp_path / "rests", rests(6, np.array((1.02, 0.97, 1.01)), np.array((0.2, -0.3, 0.1))))
+    assert calibrate(tmp_path, "--bag", str(bow), "--rests", str(sides)) == 0
+    assert "scale 1.02" in capsys.readouterr().out
+    assert "accelerometer: true = scale (shown - bias), scale 1.02" in (tmp_path / "new.yaml").read_text("utf-8")
+
+
+def test_a_small_bow_is_refused_and_nothing_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = bag_of(tmp_path / "bag", record(MOUNTED, bow=0.2))
+    assert calibrate(tmp_path, "--bag", str(bag)) == 1
+    assert "not calibrated: the bow was 11 degrees" in capsys.readouterr().err
+    assert list(tmp_path.glob("new.*")) == []
+
+
+def test_a_recording_without_imu_samples_is_refused_with_its_topics(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    entry = imu_entry(0.0, np.zeros(3), np.zeros(3))
+    bag = write_bag(tmp_path / "bag", [("/other", *entry[1:])])
+    assert calibrate(tmp_path, "--bag", str(bag)) == 1
+    assert "no samples of /imu/data_raw (sensor_msgs/msg/Imu); its topics: /other" in capsys.readouterr().err
+
+
+def test_the_samples_of_a_recording_are_read_in_order(tmp_path: Path) -> None:
+    samples = record(MOUNTED)
+    read = read_imu(bag_of(tmp_path / "bag", samples), "/imu/data_raw")
+    assert read.time == pytest.approx(samples.time, abs=1e-6)
+    assert read.acceleration == pytest.approx(samples.acceleration)
+    assert read.angular_velocity == pytest.approx(samples.angular_velocity)
+
+
+def test_wrong_use_is_told_with_exit_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert calibrate(tmp_path, "--bag", str(tmp_path / "none")) == 2
+    assert "must be a recording that exists" in capsys.readouterr().err
+    (tmp_path / "new.html").touch()
+    assert calibrate(tmp_path, "--bag", str(tmp_path)) == 2
+    assert "new.html': must be a new file" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as stop:
+        main(["motor"])
+    assert stop.value.code == 2
