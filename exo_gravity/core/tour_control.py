@@ -14,7 +14,7 @@ import numpy as np
 from exo_gravity.core.arm import JOINT_COUNT, Vector
 from exo_gravity.core.gravity import Torque
 
-ROTOR = 0.0015  # kg m^2, between the rotors of an AK60-6 and an AK80-9 at the output
+ROTOR = (0.0015, 0.005, 0.0015, 0.0015)  # kg m^2 at the output: an AK80-9 at joint 2, else a little more than an AK60-6
 REACH = (0.8, 0.8, 0.8, 0.6)  # of a link's length, at which its mass is assumed
 FREQUENCY_PER_RATE = 0.12  # natural frequency in rad/s per control cycle per s; two cycles of delay cost 27 degrees
 MAX_FREQUENCY = 20.0  # rad/s
@@ -53,7 +53,7 @@ class MassMatrix:
         along = np.array((x1, x2, x3, x4))
         origins = np.zeros((JOINT_COUNT, 3))
         origins[1:] = np.cumsum(along[:-1] * self._length[:-1, None], axis=0)
-        matrix = np.diag((ROTOR,) * JOINT_COUNT)
+        matrix = np.diag(ROTOR)
         for link, mass in enumerate(self._mass):
             point = origins[link] + self._reach[link] * along[link]
             jacobian = np.cross(axes[: link + 1], point - origins[: link + 1])

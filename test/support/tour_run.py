@@ -22,6 +22,7 @@ from exo_gravity.core.tour_guess import TorqueGuess
 from exo_gravity.core.tour_poses import BestPoses, Itinerary
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
+from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")
 MOTORS_AS_MOUNTED = tuple(
@@ -32,7 +33,7 @@ START_TIMEOUT, LONGEST = 30.0, 400.0  # s
 Disturb = Callable[[float, SimulatedDevice], Sequence[float] | None]
 
 
-class Hand:
+class Hand(VirtualWearer):
     """A wearer who applies the torque that `disturb(time, device)` returns, (4,) Nm."""
 
     def __init__(self, disturb: Disturb, device: SimulatedDevice) -> None:
@@ -86,7 +87,7 @@ class TourRun:
             drive = safety.step(now, tuple(samples), effort, answered)
             powered = self._exchange(device, drive, powered, samples, now)
             if not any(self.limits.is_silent(now, joint) for joint in samples):
-                position, velocity = ([row[i] for row in samples] for i in (0, 1))
+                position, velocity = [row.position for row in samples], [row.velocity for row in samples]
                 began = began or safety.state is State.ACTIVE
                 if began and safety.state is State.ACTIVE:
                     if not self.log and self.disturb:

@@ -1,0 +1,160 @@
+"""calibrator: moves the arm through the poses of a calibration, in the compensator's place.
+
+It answers joint states with efforts as `compensator` does. While the bridge starts, it answers with the expected weight
+of the hanging arm; once the bridge reports `active`, `core.tour` begins. After trouble it withdraws, so that the bridge
+lets the arm down. It prints one line of JSON for each event:
+
+    {"progress": "pose 3 of 12: ..."}   {"observation": {"theta": [4 rad], ..., "speed": 0.1}}
+    {"trouble": "elbow: ..."}           {"done": true}
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import threading
+import time
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Vector3Stamped
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+
+from exo_gravity.core.drive import State
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.gravity import Torque
+from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.tour import Measured
+from exo_gravity.core.tour_params import CALIBRATOR, tour_of
+from exo_gravity.nodes.compensator import NEWEST
+from exo_gravity.nodes.conversions import by_name
+from exo_gravity.nodes.declare import declare
+from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics
+from exo_gravity.nodes.hot_path import HotPath
+from exo_gravity.nodes.run import run
+from exo_gravity.nodes.sole_publisher import SolePublisher
+
+REPORT_PERIOD = 0.1  # s
+
+
+class CalibratorNode(Node):
+    """The ROS shell around `core.tour.Tour`."""
+
+    def __init__(self) -> None:
+        super().__init__("calibrator", automatically_declare_parameters_from_overrides=True)
+        values = declare(self, CALIBRATOR)
+        self._names = values["joint_names"]
+        self._side = values["side"]
+        self._tour = tour_of(values)
+        self._tilt_timeout = values["tilt_timeout"] if values["use_imu"] else math.inf
+        self._tilt = Tilt.of(self._side)
+        self._tilt_time = -math.inf if values["use_imu"] else math.inf  # monotonic s
+        self._bridge = f"{self.get_namespace().strip('/')}/can_bridge".lstrip("/")
+        self._bridge_state, self._bridge_message = "", ""
+        self._began = False
+        self._reported: dict[str, Any] = {"progress": "", "trouble": "", "done": False}
+        self._printed = 0  # observations
+        self._trouble = ""  # outside the tour
+        self._diagnostics = Diagnostics(self)
+        self._source = SolePublisher(self, "joint_states")
+        self._publisher = self.create_publisher(JointState, "effort_commands", 1)
+        self._command = JointState(name=self._names)  # one message, reused
+        self._lock = threading.Lock()  # guards tilt and state: joint states arrive on another thread
+        self._joint_states = HotPath(self, JointState, "joint_states", self._on_joint_states, NEWEST)
+        if values["use_imu"]:
+            self.create_subscription(Vector3Stamped, "/imu/pitch_yaw", self._on_pitch_yaw, NEWEST)
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+        self.create_timer(REPORT_PERIOD, self._report)
+        self._joint_states.start()
+
+    @property
+    def failure(self) -> Exception | None:
+        """The exception that ended the thread of the joint states."""
+        return self._joint_states.failure
+
+    def close(self) -> None:
+        """Stop answering joint states, and report what is still unreported."""
+        self._joint_states.stop()
+        self._report()
+
+    def _on_joint_states(self, message: JointState, info: dict[str, Any]) -> None:
+        self._command.header.stamp = message.header.stamp
+        try:
+            if self._source.is_another(info):
+                self._trouble = "more than one publisher of joint_states"
+            effort = self._effort(by_name(message, "position", self._names), by_name(message, "velocity", self._names))
+        except ParameterError as error:
+            self._trouble, effort = f"joint_states: {error}", None
+        self._command.effort = effort or ()
+        self._publisher.publish(self._command)
+
+    def _effort(self, position: tuple[float, ...], velocity: tuple[float, ...]) -> Torque | None:
+        """Return the effort (4,) in Nm, None to withdraw."""
+        now = time.monotonic()
+        with self._lock:
+            tilt, age, state = self._tilt, now - self._tilt_time, self._bridge_state
+        if self._trouble:
+            return None
+        if age > self._tilt_timeout:
+            if self._began:
+                self._trouble = f"trunk tilt older than {self._tilt_timeout * 1000:.0f} ms"
+            return None
+        if not self._began and state != State.ACTIVE.value:
+            return self._tour.wait(position, tilt)
+        self._began = True
+        return self._tour.step(now, position, velocity, tilt)
+
+    def _on_pitch_yaw(self, message: Vector3Stamped) -> None:
+        try:
+            tilt = Tilt.of(self._side, message.vector.y, message.vector.x)
+        except ParameterError as error:
+            self.get_logger().error(f"/imu/pitch_yaw: {error}")
+            return
+        with self._lock:
+            self._tilt, self._tilt_time = tilt, time.monotonic()
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name == self._bridge:
+                state = next((pair.value for pair in status.values if pair.key == "state"), "")
+                with self._lock:
+                    self._bridge_state, self._bridge_message = state, status.message
+                has_fault = any(pair.key == "fault" and pair.value != "none" for pair in status.values)
+                if has_fault and not self._trouble and not self._tour.trouble:
+                    self._trouble = status.message
+
+    def _report(self) -> None:
+        tour = self._tour
+        while self._printed < len(tour.measured):
+            _print({"observation": as_json(tour.measured[self._printed])})
+            self._printed += 1
+        trouble = tour.trouble or self._trouble
+        progress = tour.progress if self._began else f"waiting for the arm to be carried: {self._bridge_message}"
+        for key, value in (("progress", progress), ("trouble", trouble), ("done", tour.done)):
+            if value != self._reported[key]:
+                self._reported[key] = value
+                _print({key: value})
+        if trouble:
+            self._diagnostics.report(ERROR, f"withdrawn: {trouble}")
+        else:
+            self._diagnostics.report(OK if self._began else WARN, progress)
+
+
+def as_json(measured: Measured) -> dict[str, Any]:
+    """Return what was measured at a pose as values for JSON."""
+    fields = measured.observation._asdict()
+    plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in fields.items()}
+    return {**plain, "speed": measured.speed}
+
+
+def _print(event: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(event) + "\n")
+    sys.stdout.flush()
+
+
+def main() -> None:
+    """Entry point of the executable `calibrator`."""
+    raise SystemExit(run(CalibratorNode, priority=15))

@@ -1,0 +1,1 @@
+"""The subcommands of `calibrate`: one module each, with what they share."""
