@@ -19,10 +19,11 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.arm import STANDARD_GRAVITY, Vector
-from exo_gravity.core.identification_check import check_motors, check_physical, check_told, checked, untold
+from exo_gravity.core.identification_check import check_fit, check_motors, check_physical, check_told, checked, untold
 from exo_gravity.core.moments import load_moments, regressor
 from exo_gravity.core.pose_choice import TYPICAL_MOMENTS, next_pose
 from exo_gravity.core.pose_fit import (
+    ANGLE,
     COUNT,
     FACTOR,
     MOMENT,
@@ -38,6 +39,9 @@ from exo_gravity.core.pose_fit import (
 __all__ = ["Identified", "Observation", "identify", "next_pose"]
 
 LEAST_SPREAD = 0.003  # Nm; about half a code of an AK motor's 12-bit torque
+# Moments across and along the links between which an angle turns a weight: Y3 and M3, Y4 and M4, Z and M4.
+BESIDE = ((6, 2), (7, 3), (5, 3))
+BESIDE_ERROR = 0.05  # rad, of a weight's place; 3 degrees
 EXACT = 1e-6  # error of a value that is held
 HIDDEN = 0.1  # share of an unknown, in combinations that are not known, from which it is not known itself
 
@@ -118,6 +122,7 @@ def identify(
         others = np.arange(COUNT) != 0
         used, solution = final(replace(used, free=used.free & others), start * others)
     hidden = solution.hidden > HIDDEN
+    check_fit(solution.residual, used.effort)
     check_told(hidden, len(observations), direction, gravity)
     loaded = bool(np.any(rows.load[keep]))
     unknowns, covariance = _in_kilograms(solution, known if solve_scale else None, loaded)
@@ -133,7 +138,7 @@ def identify(
         np.median([observation.friction for observation in observations], axis=0),
         *_residuals(rows, keep, used, solution),
         solution.singular_values,
-        untold(unknowns[MOMENT], hidden, relative),
+        untold(unknowns, error, hidden, relative),
         rejected,
         relative,
     )
@@ -142,11 +147,16 @@ def identify(
 def _rows(observations: Sequence[Observation], length: Vector, gravity: float) -> Rows:
     """Return the observations as arrays, with every unknown free."""
     theta, direction, effort, spread, weights = checked(observations)
+    load = np.array([load_moments(length, mass, lever) for mass, lever in weights])
+    beside = np.zeros((*load.shape, 3))
+    for angle, (across, along) in enumerate(BESIDE):
+        beside[:, across, angle] = load[:, along]
     # A pose whose efforts happen to agree is no better known than others.
     spread = np.maximum(spread, np.median(spread, axis=0) / 2.0)
     return Rows(
         regressor(theta, direction, gravity),
-        np.array([load_moments(length, mass, lever) for mass, lever in weights]),
+        load,
+        beside,
         effort,
         np.hypot(spread, LEAST_SPREAD),
         np.ones(COUNT, dtype=bool),
@@ -161,7 +171,7 @@ def _common(known: Identified) -> float:
 
 
 def _start(known: Identified | None, solve_scale: bool) -> np.ndarray:
-    """Return the unknowns (17,) at which the search starts; if scales are solved, with the common factor removed."""
+    """Return the unknowns (20,) at which the search starts; if scales are solved, with the common factor removed."""
     start = np.zeros(COUNT)
     start[FACTOR] = 1.0
     start[1:4] = TYPICAL_MOMENTS[1:4]
@@ -177,11 +187,13 @@ def _with_conditions(rows: Rows, start: np.ndarray, known: Identified | None, so
     """Return `rows` with what is held, and with `known` as linear conditions."""
     free = np.ones(COUNT, dtype=bool)
     free[SCALE] = free[OFFSET] = solve_scale
-    free[FACTOR] = solve_scale and bool(np.any(rows.load))
-    if not solve_scale:
-        return replace(rows, free=free)
-    anchor = np.zeros((1, COUNT))
-    anchor[0, SCALE] = np.array((0.0, 1.0, 1.0, 1.0)) / EXACT  # the common factor is the weight's
+    free[ANGLE] = bool(np.any(rows.load))
+    free[FACTOR] = solve_scale and free[ANGLE.start]
+    anchor = np.eye(COUNT)[ANGLE] / BESIDE_ERROR
+    if solve_scale:
+        common = np.zeros((1, COUNT))
+        common[0, SCALE] = np.array((0.0, 1.0, 1.0, 1.0)) / EXACT  # the common factor is the weight's
+        anchor = np.vstack((anchor, common))
     if known is not None:
         relative_error = np.maximum(known.scale_error / known.scale, EXACT)
         error = np.append(known.error * math.exp(-_common(known)), relative_error)
@@ -190,7 +202,7 @@ def _with_conditions(rows: Rows, start: np.ndarray, known: Identified | None, so
 
 
 def _in_kilograms(solution: Solution, known: Identified | None, loaded: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return the unknowns (17,) and their covariance (17, 17) without the factor by which a weight seems too heavy."""
+    """Return the unknowns (20,) and their covariance (20, 20) without the factor by which a weight seems too heavy."""
     unknowns, covariance = solution.unknowns.copy(), solution.covariance.copy()
     if known is not None and not known.relative and not loaded:
         unknowns[FACTOR] = math.exp(-_common(known))

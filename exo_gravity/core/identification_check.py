@@ -12,7 +12,7 @@ from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.moments import MOMENTS
 from exo_gravity.core.pose_choice import TYPICAL_MOMENTS, missing_pose
-from exo_gravity.core.pose_fit import COUNT, FACTOR, OFFSET, SCALE
+from exo_gravity.core.pose_fit import ANGLE, COUNT, DISTURBED, FACTOR, OFFSET, SCALE
 
 if TYPE_CHECKING:
     from exo_gravity.core.identification import Observation
@@ -20,9 +20,12 @@ if TYPE_CHECKING:
 SCALES = (0.3, 3.0)  # true torque per commanded torque; users report 0.75
 SILENT = 0.01  # Nm by which the effort must differ between poses where gravity's torque differs by `EXPECTED`
 EXPECTED = 0.3  # Nm
+MISFIT = 0.1  # of the peak effort
+LEAST_MISFIT = 0.1  # Nm
 # Unknowns of joint 1, which carries nothing while its axis is vertical.
 FIRST_JOINT = (0, MOMENTS.index("W"), SCALE.start, OFFSET.start)
-NAMES = (*MOMENTS, *(f"{what} {n + 1}" for what in ("torque scale", "offset") for n in range(JOINT_COUNT)))
+PER_JOINT = tuple(f"{what} {n + 1}" for what in ("torque scale", "offset") for n in range(JOINT_COUNT))
+NAMES = (*MOMENTS, *PER_JOINT)
 TILT = "tilt the stand by 20 degrees or more"
 
 
@@ -53,11 +56,21 @@ def check_motors(effort: np.ndarray, typical: np.ndarray) -> None:
     """Raise DataError if a motor's effort (n, 4) in Nm stays the same where gravity's `typical` torque does not."""
     for joint in range(JOINT_COUNT):
         if np.ptp(typical[:, joint]) > EXPECTED and np.ptp(effort[:, joint]) < SILENT:
-            raise DataError(f"joint {joint + 1}: the effort is {effort[0, joint]:.2f} Nm in every pose: a silent motor")
+            raise DataError(
+                f"joint {joint + 1}: the effort is {effort[0, joint] + 0.0:.2f} Nm in every pose: a silent motor"
+            )
+
+
+def check_fit(residual: np.ndarray, effort: np.ndarray) -> None:
+    """Raise DataError if half of the residuals (n, 4) in Nm of a joint are large compared with its efforts (n, 4)."""
+    typical, peak = np.median(np.abs(residual), axis=0), np.abs(effort).max(axis=0)
+    for joint in np.flatnonzero(typical > np.maximum(MISFIT * peak, LEAST_MISFIT)):
+        said = f"joint {joint + 1} is {typical[joint]:.2f} Nm off in half of the poses"
+        raise DataError(f"the poses do not fit one arm: {said}. {DISTURBED}")
 
 
 def check_told(hidden: np.ndarray, count: int, direction: np.ndarray, gravity: float) -> None:
-    """Raise DataError that names the missing pose if `count` poses do not tell `hidden` (17,) of joints 2 to 4."""
+    """Raise DataError that names the missing pose if `count` poses do not tell `hidden` (20,) of joints 2 to 4."""
     missing = hidden.copy()
     missing[list(FIRST_JOINT)] = False
     if missing[FACTOR]:
@@ -95,18 +108,23 @@ def check_physical(
             )
 
 
-def untold(moments: np.ndarray, hidden: np.ndarray, relative: bool) -> tuple[str, ...]:
-    """Return what the poses do not tell, and what would, in sentences. moments: (8,) kg m; hidden: (17,)."""
+def untold(unknowns: np.ndarray, error: np.ndarray, hidden: np.ndarray, relative: bool) -> tuple[str, ...]:
+    """Return what the poses do not tell, and what would, in sentences; unknowns, their errors, and `hidden`: (20,)."""
     said = []
     if relative:
         said.append("A common factor of all torque scales and moments: hang a known weight on link 4.")
-    if np.any(hidden):
-        names = ", ".join(NAMES[index] for index in np.flatnonzero(hidden))
+    if np.any(hidden[:FACTOR]):
+        names = ", ".join(NAMES[index] for index in np.flatnonzero(hidden[:FACTOR]))
         said.append(f"{names}: joint 1 carries nothing while its axis is vertical: {TILT}.")
     for joint, along, across in ((4, 3, 7), (3, 2, 6)):
-        angle = math.degrees(math.atan2(moments[across], moments[along]))
+        angle = math.degrees(math.atan2(unknowns[across], unknowns[along]))
         said.append(
             f"{MOMENTS[across]} of link {joint} from an error of joint {joint}'s zero: it looks like one of "
             f"{angle:+.1f} degrees; check the zero with a level or at a stop."
+        )
+    elbow, elbow_error = math.degrees(unknowns[ANGLE][0]), math.degrees(error[ANGLE][0])
+    if elbow and abs(elbow) > 2.0 * elbow_error:
+        said.append(
+            f"The weight at the elbow speaks for joint 3's zero being {elbow:+.1f} +- {elbow_error:.1f} degrees off."
         )
     return tuple(said)

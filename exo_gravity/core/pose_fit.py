@@ -1,9 +1,11 @@
 """Weighted least squares for the unknowns of an arm in held poses.
 
-The unknowns are the eight moments in kg m, the logarithm of the four torque scales, the four offsets in Nm, and the
-factor by which moments and scales are too large in common, by which a known weight seems too heavy. The commanded
-effort is `torque(moments + factor * load) / scale + offset`: bilinear, so a few Gauss-Newton steps solve it. Each step
-leaves alone what the poses do not tell: the combinations whose standard error exceeds `NATURAL`.
+The unknowns are the eight moments in kg m, the logarithm of the four torque scales, the four offsets in Nm, the factor
+by which moments and scales are too large in common, by which a known weight seems too heavy, and three angles by which
+the weight seems to lie beside the links: a zero of joint 3 or 4 that is off by a degree moves a weight by more than a
+light forearm's own moment. The commanded effort is `torque(moments + factor * load) / scale + offset`: nearly linear,
+so a few Gauss-Newton steps solve it. Each step leaves alone what the poses do not tell: the combinations whose standard
+error exceeds `NATURAL`.
 
 Errors are larger in some joints than the observations state (gear friction is not the same in every pose), so each
 joint gets a factor of its own, estimated from its residuals and pooled with the others where poses are few.
@@ -23,15 +25,19 @@ MOMENT = slice(0, 8)
 SCALE = slice(8, 12)
 OFFSET = slice(12, 16)
 FACTOR = 16
-COUNT = 17
-# kg m, logarithm, Nm, 1: a combination of unknowns that may be wrong by this much is not known.
-NATURAL = np.repeat((0.1, 0.3, 0.3, 0.3), (len(MOMENTS), JOINT_COUNT, JOINT_COUNT, 1))
-NOTHING_KNOWN = np.repeat((0.0, 1.0), (FACTOR, 1))
+ANGLE = slice(17, 20)  # of the load along Y3, Y4 and Z
+COUNT = 20
+# kg m, logarithm, Nm, 1, rad: a combination of unknowns that may be wrong by this much is not known.
+NATURAL = np.repeat((0.1, 0.3, 0.3, 0.3, 0.3), (len(MOMENTS), JOINT_COUNT, JOINT_COUNT, 1, 3))
+NOTHING_KNOWN = np.repeat((0.0, 1.0, 0.0), (FACTOR, 1, 3))
 HUBER = 2.0  # standard errors beyond which a residual counts linearly
 POOLING = 6.0  # degrees of freedom with which all joints together inform the error of each
 STEPS = 40
 MEDIAN_SQUARE = 0.455  # of a standard normal variable
 MEDIAN_CAUSED = 3.36  # of the sum of four such squares
+LEAST_OUTLIER = 0.03  # Nm, and this share of the peak effort: a smaller error does no harm, nor does a hand cause it
+SHARE_OF_PEAK = 0.01
+DISTURBED = "Was it touched, does a joint slip or touch a stop?"
 OUTLIER = 32.0  # such a sum from which a pose is left out: of good poses, one in 500,000
 
 
@@ -39,12 +45,13 @@ OUTLIER = 32.0  # such a sum from which a pose is left out: of good poses, one i
 class Rows:
     """What is fitted, for n poses: `regressor` (n, 4, 8), `load` (n, 8) kg m, `effort` and its error `sigma` (n, 4) Nm.
 
-    free: (17,), the unknowns to be solved. anchor: (k, 17) and anchor_value: (k,), linear conditions on the unknowns,
-    already divided by their standard errors.
+    beside: (n, 8, 3), change of `load` with each angle. free: (20,), the unknowns to be solved. anchor: (k, 20) and
+    anchor_value: (k,), linear conditions on the unknowns, already divided by their standard errors.
     """
 
     regressor: np.ndarray
     load: np.ndarray
+    beside: np.ndarray
     effort: np.ndarray
     sigma: np.ndarray
     free: np.ndarray
@@ -53,28 +60,31 @@ class Rows:
 
     def only(self, keep: np.ndarray) -> Rows:
         """Return the poses that `keep` (n,) selects."""
-        names = ("regressor", "load", "effort", "sigma")
+        names = ("regressor", "load", "beside", "effort", "sigma")
         return replace(self, **{name: getattr(self, name)[keep] for name in names})
 
     def predicted(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the commanded effort (n, 4) in Nm."""
-        torque = np.einsum("njk,nk->nj", self.regressor, unknowns[MOMENT] + unknowns[FACTOR] * self.load)
+        moments = unknowns[MOMENT] + unknowns[FACTOR] * (self.load + self.beside @ unknowns[ANGLE])
+        torque = np.einsum("njk,nk->nj", self.regressor, moments)
         return np.asarray(torque * np.exp(-unknowns[SCALE]) + unknowns[OFFSET])
 
     def jacobian(self, unknowns: np.ndarray) -> np.ndarray:
-        """Return the derivative of `predicted` by the unknowns, (n, 4, 17)."""
+        """Return the derivative of `predicted` by the unknowns, (n, 4, 20)."""
         result = np.zeros((*self.effort.shape, COUNT))
         result[..., MOMENT] = self.regressor * np.exp(-unknowns[SCALE])[:, None]
         joints = np.arange(JOINT_COUNT)
         result[:, joints, SCALE.start + joints] = unknowns[OFFSET] - self.predicted(unknowns)
         result[:, joints, OFFSET.start + joints] = 1.0
-        result[..., FACTOR] = np.einsum("njk,nk->nj", result[..., MOMENT], self.load)
+        load = self.load + self.beside @ unknowns[ANGLE]
+        result[..., FACTOR] = np.einsum("njk,nk->nj", result[..., MOMENT], load)
+        result[..., ANGLE] = unknowns[FACTOR] * (result[..., MOMENT] @ self.beside)
         return result
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """unknowns: (17,). covariance: (17, 17) of what is known. hidden: (17,), share 0..1 of each that is not known.
+    """unknowns: (20,). covariance: (20, 20) of what is known. hidden: (20,), share 0..1 of each that is not known.
 
     singular_values: of the poses alone, in units of `NATURAL`, the largest first. residual: (n, 4) Nm. hat: (n, 4, n,
     4), derivative of the predicted by the measured effort, both divided by sigma.
@@ -94,7 +104,7 @@ class Solution:
 
 
 def solve(rows: Rows, start: np.ndarray, weight: np.ndarray | None = None) -> Solution:
-    """Return the least-squares solution from `start` (17,); weight: (n, 4) of the squared residuals, 1 by default."""
+    """Return the least-squares solution from `start` (20,); weight: (n, 4) of the squared residuals, 1 by default."""
     root = np.sqrt(np.ones_like(rows.effort) if weight is None else weight) / rows.sigma
     unknowns, step = start.copy(), np.full(COUNT, np.inf)
     for _ in range(STEPS):
@@ -112,7 +122,7 @@ def solve(rows: Rows, start: np.ndarray, weight: np.ndarray | None = None) -> So
 
 
 def _inverse(whitened: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Return the pseudo-inverse (17, m) of `whitened` (m, 17), without what is not known."""
+    """Return the pseudo-inverse (20, m) of `whitened` (m, 20), without what is not known."""
     natural = NATURAL * free
     left, size, right = np.linalg.svd(whitened * natural, full_matrices=False)
     told = size > 1.0
@@ -125,7 +135,7 @@ def _solution(rows: Rows, unknowns: np.ndarray, root: np.ndarray) -> Solution:
     covariance = inverse @ inverse.T
     known = inverse @ np.vstack((jacobian, rows.anchor))  # a projection, up to the units
     hidden = np.where(rows.free, 1.0 - np.diag(known), 0.0)
-    free = rows.free & (np.arange(COUNT) != FACTOR)  # a weight that hangs is known, and so is the common factor
+    free = rows.free & (np.arange(COUNT) < FACTOR)  # a weight that hangs is known, and so is the common factor
     size = np.linalg.svd((jacobian * NATURAL)[:, free], compute_uv=False)
     singular_values = np.append(size, np.zeros(int(free.sum()) - len(size)))
     count = len(rows.effort)
@@ -135,13 +145,13 @@ def _solution(rows: Rows, unknowns: np.ndarray, root: np.ndarray) -> Solution:
 
 
 def robust(rows: Rows, start: np.ndarray) -> tuple[Rows, Solution]:
-    """Return a solution in which large residuals count little, and the rows with the error that it shows."""
+    """Return a solution in which large residuals count little, and the rows with at least the error that they state."""
     solution = solve(rows, start)
     for _ in range(4):
         squares = (solution.residual / rows.sigma) ** 2
         share = np.maximum(0.2, 1.0 - np.einsum("njnj->nj", solution.hat))
         typical = np.median(squares / share, axis=0) / MEDIAN_SQUARE
-        factor = _pooled(typical, np.maximum(solution.freedom, 0.0))
+        factor = np.maximum(1.0, _pooled(typical, np.maximum(solution.freedom, 0.0)))
         size = np.sqrt(squares / share / factor)
         solution = solve(rows, solution.unknowns, np.minimum(1.0, HUBER / np.maximum(size, 1e-9)))
     return replace(rows, sigma=rows.sigma * np.sqrt(factor)), solution
@@ -190,11 +200,13 @@ def without_outliers(rows: Rows, start: np.ndarray) -> tuple[np.ndarray, tuple[t
     """
     keep = np.ones(len(rows.effort), dtype=bool)
     rejected: list[tuple[int, str]] = []
+    least = np.maximum(LEAST_OUTLIER, SHARE_OF_PEAK * np.abs(rows.effort).max(axis=0))
     while True:
         used, solution = robust(rows.only(keep), start)
         held_out, caused = without_each_pose(solution, used.sigma)
-        worst = int(np.argmax(caused))
-        if caused[worst] < OUTLIER * max(1.0, float(np.median(caused)) / MEDIAN_CAUSED):
+        matters = np.nanmax(np.abs(held_out) / least, axis=1, initial=0.0) > 1.0
+        worst = int(np.argmax(caused * matters))
+        if not matters[worst] or caused[worst] < OUTLIER * max(1.0, float(np.median(caused)) / MEDIAN_CAUSED):
             return keep, tuple(rejected)
         joint = int(np.argmax(np.abs(held_out[worst] / used.sigma[worst])))
         index = int(np.flatnonzero(keep)[worst])
@@ -203,4 +215,4 @@ def without_outliers(rows: Rows, start: np.ndarray) -> tuple[np.ndarray, tuple[t
         keep[index] = False
         if len(rejected) > len(keep) // 3:
             said = "; ".join(f"pose {index + 1}: {why}" for index, why in rejected)
-            raise DataError(f"the poses do not fit one arm: {said}. Was it touched, does a joint slip or touch a stop?")
+            raise DataError(f"the poses do not fit one arm: {said}. {DISTURBED}")

@@ -1,0 +1,333 @@
+"""Identification from held poses: right on random devices, honest about its errors and about what it cannot tell."""
+
+from __future__ import annotations
+
+import itertools
+from functools import cache
+
+import numpy as np
+import pytest
+
+from exo_gravity.core import ArmModel, Tilt
+from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.identification import Observation, identify, next_pose
+from exo_gravity.core.moments import MOMENTS, load_moments, moments_of, off_axis_of, regressor
+from exo_gravity.core.pose_choice import TYPICAL_MOMENTS
+from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
+
+LENGTH = (0.05, 0.13, 0.30, 0.30)
+LEANING = Tilt.of("right", 0.30, 0.25).direction  # the stand, so that joint 1 carries something
+UPRIGHT = (0.0, 0.0, 1.0)
+WEIGHT = (1.0, 0.25)  # kg, m from the elbow
+CODE = 30.0 / 4095.0  # Nm, one step of an AK60-6's 12-bit torque
+SAMPLES = 50  # of the effort in each direction
+CANDIDATES = np.radians(
+    list(itertools.product((-60, -30, 0, 30, 60), (10, 40, 70, 100, 130), (-30, 0, 30, 60, 90), (0, 30, 60, 90, 120)))
+)
+
+
+class Device:
+    """An arm whose masses, centres of gravity, torque scales, friction and offsets are drawn at random."""
+
+    def __init__(self, seed):
+        self.rng = rng = np.random.default_rng(seed)
+        mass = np.array((0.60, 0.46, 0.61, 0.20)) * rng.uniform(0.7, 1.3, 4)
+        cog = np.minimum(np.array((0.045, 0.115, 0.235, 0.13)) * rng.uniform(0.7, 1.3, 4), LENGTH)
+        off_axis = off_axis_of(mass, *rng.uniform(-0.015, 0.015, (2, 4)))
+        self.moments = moments_of(ArmModel(LENGTH, cog, mass, off_axis=off_axis))
+        self.scale = rng.uniform(0.7, 1.3, 4)
+        self.friction = rng.uniform(0.1, 0.4, 4)
+        self.offset = rng.normal(0.0, 0.02, 4)
+
+    def effort(self, theta, direction, added=0.0):
+        """The commanded effort (n, 4) that holds the arm without friction."""
+        return regressor(theta, direction) @ (self.moments + added) / self.scale + self.offset
+
+    def observe(self, theta, direction=LEANING, weight=(0.0, 0.0), added=0.0, error=0.0):
+        """Pass the pose in both directions: current noise of 2 %, 12 bits. error: (4,) Nm that spoils the pose."""
+        effort = self.effort(theta, direction, load_moments(LENGTH, *weight) + added)[0]
+        mean, spread = [], []
+        for way in (1.0, -1.0):
+            one_way = effort + way * self.friction / self.scale
+            noise = self.rng.normal(size=(SAMPLES, 4)) * (0.02 * np.abs(one_way) + 0.01)
+            codes = np.round((one_way + noise) / CODE) * CODE
+            mean.append(codes.mean(axis=0))
+            spread.append(codes.std(axis=0, ddof=1) / np.sqrt(SAMPLES))
+        half = (mean[0] - mean[1]) / 2.0
+        return Observation(theta, direction, sum(mean) / 2.0 + error, half, np.hypot(*spread) / 2.0, *weight)
+
+    def tour(self, direction=LEANING, bare=8, weighed=4, **how):
+        """Observe the best `bare` poses without, and the best `weighed` with the weight."""
+        return [
+            *(self.observe(theta, direction, **how) for theta in best(direction, bare)),
+            *(self.observe(theta, direction, WEIGHT, **how) for theta in best(direction, weighed, WEIGHT)),
+        ]
+
+
+@cache
+def best(direction, count, weight=(0.0, 0.0)):
+    moments = np.array(TYPICAL_MOMENTS) + load_moments(LENGTH, *weight)
+    taken = []
+    while len(taken) < count:
+        taken.append(tuple(CANDIDATES[next_pose(taken, CANDIDATES, direction, moments)]))
+    return tuple(taken)
+
+
+@cache
+def twenty():
+    """Twenty devices, and the result of a tour of each."""
+    return [(device, identify(device.tour(), LENGTH)) for device in map(Device, range(100, 120))]
+
+
+def test_the_moments_of_20_random_devices_are_right_to_2_percent_or_twice_the_standard_error():
+    for device, found in twenty():
+        wrong = np.abs(found.moments - device.moments)
+        assert np.all((wrong < 2.0 * found.error) | (wrong < 0.02 * device.moments.max()))
+
+
+def test_most_moments_lie_within_2_percent():
+    wrong = np.abs([(found.moments - device.moments)[1:4] / device.moments[1:4] for device, found in twenty()])
+    assert np.median(wrong) < 0.01 and wrong.max() < 0.04
+
+
+def test_two_standard_errors_cover_90_to_99_percent_of_the_moments_and_the_scales():
+    size = np.array([(found.moments - device.moments) / found.error for device, found in twenty()])
+    scale = np.array([(found.scale - device.scale) / found.scale_error for device, found in twenty()])
+    covered = np.abs(np.hstack((size, scale))) < 2.0
+    assert 0.90 <= covered.mean() <= 0.99
+
+
+def test_the_torque_in_other_poses_is_right_to_2_percent_of_the_peak():
+    rng = np.random.default_rng(7)
+    theta = rng.uniform((-1.0, 0.0, -0.5, 0.0), (1.0, 2.8, 2.0, 2.6), (500, 4))
+    for device, found in twenty():
+        true = device.effort(theta, LEANING)
+        wrong = regressor(theta, LEANING) @ found.moments / found.scale + found.offset - true
+        assert np.all(np.sqrt(np.mean(wrong**2, axis=0)) < 0.02 * np.abs(true).max(axis=0))
+
+
+def test_the_prediction_of_a_pose_from_the_others_is_nearly_as_good_as_its_measurement():
+    for _, found in twenty():
+        assert np.nanmax(np.abs(found.held_out)) < 0.15
+        assert np.linalg.norm(found.residual) < np.linalg.norm(found.held_out) < 3.0 * np.linalg.norm(found.residual)
+
+
+def test_the_held_out_prediction_is_that_of_a_fit_without_the_pose():
+    observations = Device(1).tour()
+    found, without = identify(observations, LENGTH), identify(observations[1:], LENGTH)
+    predicted = regressor(observations[0].theta, LEANING)[0] @ without.moments / without.scale + without.offset
+    np.testing.assert_allclose(found.held_out[0], observations[0].effort - predicted, atol=2e-3)
+
+
+def test_friction_is_half_the_difference_of_both_directions():
+    device = Device(2)
+    found = identify(device.tour(), LENGTH)
+    np.testing.assert_allclose(found.friction, device.friction / device.scale, atol=0.01)
+
+
+def test_without_a_weight_moments_and_scales_are_relative_but_the_commanded_torque_is_right():
+    device = Device(3)
+    found = identify(device.tour(bare=12, weighed=0), LENGTH)
+    assert found.relative and "common factor" in found.unknown[0] and found.singular_values[-1] < 1e-3
+    assert np.prod(found.scale[1:]) == pytest.approx(1.0, abs=1e-5)
+    factor = found.moments[1] / device.moments[1]
+    assert factor == pytest.approx(np.prod(device.scale[1:]) ** (-1.0 / 3.0), rel=0.01)
+    np.testing.assert_allclose(found.moments / factor, device.moments, atol=0.004)
+    np.testing.assert_allclose(found.scale / factor, device.scale, rtol=0.03)
+
+
+def test_with_a_weight_no_singular_value_is_small():
+    found = identify(Device(3).tour(), LENGTH)
+    assert not found.relative and found.singular_values[-1] > 1.0
+    assert not any("common factor" in sentence for sentence in found.unknown)
+
+
+def test_with_an_upright_stand_joint_1_is_not_known_and_said_to_be():
+    device = Device(4)
+    found = identify(device.tour(UPRIGHT), LENGTH)
+    assert "M1, W, torque scale 1: joint 1 carries nothing" in found.unknown[0]
+    unseen = [MOMENTS.index("M1"), MOMENTS.index("W")]
+    assert np.all(np.isinf(found.error[unseen])) and np.isinf(found.scale_error[0])
+    seen = [k for k in range(8) if k not in unseen]
+    assert np.all(np.abs(found.moments - device.moments)[seen] < 4.0 * found.error[seen])
+
+
+def test_a_zero_that_is_off_looks_like_a_moment_across_the_link_and_the_torque_is_right_all_the_same():
+    device, off = Device(5), np.array((0.0, 0.0, 0.0, np.radians(5.0)))
+    observations = [o._replace(theta=np.subtract(o.theta, off)) for o in device.tour()]
+    found = identify(observations, LENGTH)
+    turned = np.arctan2(*(device.moments[[7, 3]])) + off[3]
+    assert np.arctan2(found.moments[7], found.moments[3]) == pytest.approx(turned, abs=0.02)
+    assert any("Y4 of link 4 from an error of joint 4's zero" in sentence for sentence in found.unknown)
+
+
+SLIPS = {
+    "one pose": {2: (0, 0, 0.3, 0)},
+    "two poses": {2: (0, 0, 0.3, 0), 5: (0, -0.5, 0, 0)},
+    "weighed": {9: (0, 0, 0, 0.2)},
+}
+
+
+@pytest.mark.parametrize("slips", SLIPS.values(), ids=SLIPS)
+def test_a_pose_with_a_slip_or_a_hand_is_left_out_and_named(slips):
+    device = Device(6)
+    observations = device.tour(bare=10)
+    for index, error in slips.items():
+        observations[index] = observations[index]._replace(effort=np.add(observations[index].effort, error))
+    found = identify(observations, LENGTH)
+    assert {index for index, _ in found.rejected} == set(slips)
+    for index, reason in found.rejected:
+        assert f"joint {int(np.argmax(np.abs(slips[index]))) + 1}" in reason
+    assert np.all(np.abs(found.moments - device.moments) < 4.0 * found.error)
+
+
+@pytest.mark.parametrize(
+    ("bare", "spoilt", "words"), [(26, 11, r"pose 15: effort of joint 4 is"), (8, 6, "off in half of the poses")]
+)
+def test_poses_that_do_not_fit_one_arm_are_refused_together(bare, spoilt, words):
+    observations = Device(7).tour(bare=bare)
+    for k in range(spoilt):
+        error = np.eye(4)[k % 4] * (-1) ** k  # Nm
+        observations[2 * k] = observations[2 * k]._replace(effort=observations[2 * k].effort + error)
+    with pytest.raises(DataError, match=rf"the poses do not fit one arm: .*{words}.*touched"):
+        identify(observations, LENGTH)
+
+
+def test_too_few_poses_are_refused_with_the_pose_that_is_missing_and_accepted_with_it():
+    device = Device(8)
+    observations = [device.observe(theta) for theta in best(LEANING, 2)]
+    for _ in range(6):
+        try:
+            found = identify(observations, LENGTH)
+            break
+        except DataError as error:
+            assert "poses do not tell" in str(error) or "is not known better than" in str(error)
+            degrees = str(error).split("add the pose [")[1].split("]")[0].split(",")
+            observations.append(device.observe(np.radians([float(angle) for angle in degrees])))
+    assert np.all(np.abs(found.moments[1:4]) > found.error[1:4])
+
+
+def test_a_silent_motor_is_told_and_not_fitted():
+    observations = [o._replace(effort=np.multiply(o.effort, (1, 1, 0, 1))) for o in Device(9).tour()]
+    with pytest.raises(DataError, match=r"joint 3: the effort is 0\.00 Nm in every pose: a silent motor"):
+        identify(observations, LENGTH)
+
+
+@pytest.mark.parametrize("factor", [-1.0, 0.2, 5.0])
+def test_a_reversed_joint_and_an_impossible_torque_scale_are_refused(factor):
+    observations = [o._replace(effort=np.multiply(o.effort, (1, 1, factor, 1))) for o in Device(10).tour()]
+    with pytest.raises(DataError, match=r"torque scale 3|do not fit one arm|not known better|must be positive"):
+        identify(observations, LENGTH)
+
+
+def test_a_weight_that_is_too_light_to_tell_the_scale_is_refused():
+    device = Device(11)
+    observations = device.tour(weighed=0) + [device.observe(t, weight=(0.002, 0.1)) for t in best(LEANING, 4)]
+    with pytest.raises(DataError, match="hang a heavier one"):
+        identify(observations, LENGTH)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"effort": (0.0, np.nan, 0.0, 0.0)}, "pose 2: effort"),
+        ({"theta": (0.0, 0.0, 0.0)}, "pose 2: theta"),
+        ({"spread": (0.0, 0.1, -0.1, 0.0)}, "pose 2: spread"),
+    ],
+)
+def test_an_impossible_observation_is_refused_by_number_and_name(change, words):
+    observations = Device(12).tour()
+    observations[1] = observations[1]._replace(**change)
+    with pytest.raises(DataError, match=words):
+        identify(observations, LENGTH)
+    with pytest.raises(DataError, match="no pose"):
+        identify([], LENGTH)
+
+
+def test_a_wearer_is_found_with_the_scales_of_the_bare_arm():
+    device = Device(13)
+    bare = identify(device.tour(), LENGTH)
+    worn = load_moments(LENGTH, 1.6, 0.18) + np.array((0.0, 0.0, 2.0 * 0.16, 0.0, 0.0, 0.0, 0.0, 0.0))
+    observations = [device.observe(theta, UPRIGHT, added=worn) for theta in best(UPRIGHT, 3)]
+    found = identify(observations, LENGTH, known=bare, solve_scale=False)
+    np.testing.assert_array_equal(found.scale, bare.scale)
+    np.testing.assert_allclose((found.moments - bare.moments)[2:4], worn[2:4], rtol=0.03)
+    assert not found.relative and found.moments[0] == bare.moments[0]  # M1 does not show upright
+
+
+def test_a_weight_hung_later_turns_a_relative_result_into_kilograms():
+    device = Device(14)
+    relative = identify(device.tour(bare=12, weighed=0), LENGTH)
+    observations = [device.observe(theta, weight=WEIGHT) for theta in best(LEANING, 4, WEIGHT)]
+    found = identify(observations, LENGTH, known=relative)
+    assert relative.relative and not found.relative
+    assert np.all(np.abs(found.moments - device.moments) < 4.0 * found.error)
+    assert np.all(np.abs(found.scale - device.scale) < 4.0 * found.scale_error)
+    np.testing.assert_allclose(found.scale, device.scale, rtol=0.03)
+
+
+def test_more_poses_of_an_arm_known_in_kilograms_keep_the_kilograms():
+    device = Device(15)
+    known = identify(device.tour(), LENGTH)
+    found = identify([device.observe(theta) for theta in best(LEANING, 6)], LENGTH, known=known)
+    assert not found.relative
+    np.testing.assert_allclose(found.scale, known.scale, rtol=0.02)
+    assert np.all(np.abs(found.moments - device.moments) < 4.0 * found.error)
+
+
+def test_the_next_pose_tells_more_than_a_repeated_or_a_random_one():
+    rng = np.random.default_rng(16)
+    device = Device(16)
+
+    def uncertain(poses):
+        return np.log(identify([device.observe(theta) for theta in poses], LENGTH).error).sum()
+
+    chosen = uncertain(best(LEANING, 10))
+    drawn = [uncertain(rng.permutation(CANDIDATES)[:10]) for _ in range(5)]
+    assert chosen < min(drawn)
+
+
+def held(arm, theta, moments, weight=(0.0, 0.0)):
+    """Move the simulated arm slowly through the pose in both directions; return what holds it, as commanded."""
+    passes = []
+    arm.set_gravity(LEANING)
+    for way in (1.0, -1.0):
+        arm.reset(theta - way * 0.1)
+        guess, summed, efforts = regressor([theta], LEANING)[0] @ moments, np.zeros(4), []
+        for step in range(1300):
+            target = theta + way * (0.1e-3 * step - 0.1)  # rad; 0.1 rad/s
+            error = target - arm.positions
+            summed += 1e-3 * error
+            effort = guess + 80.0 * error + 400.0 * summed + 2.0 * (way * 0.1 - np.array(arm.velocities))
+            effort = np.round(np.clip(effort, -9.0, 9.0) / CODE) * CODE
+            arm.step(effort)
+            if np.all(np.abs(arm.positions - theta) < 0.02):
+                efforts.append(effort)
+        passes.append((np.mean(efforts, axis=0), np.std(efforts, axis=0) / np.sqrt(len(efforts) / 20.0)))
+    (up, up_spread), (down, down_spread) = passes
+    return Observation(theta, LEANING, (up + down) / 2, (up - down) / 2, np.hypot(up_spread, down_spread) / 2, *weight)
+
+
+def test_an_arm_simulated_by_mujoco_is_found_from_slow_passes_in_both_directions():
+    links, beside = DEFAULT_LINKS, np.array(((0.0, 0.01, -0.012, 0.008), (0.012, -0.01, 0.005, 0.01)))
+    friction = {"coulomb_friction": (0.2, 0.3, 0.15, 0.1), "stribeck_friction": (0.05,) * 4}
+    weight = {"wearer_mass": (0.0, 0.0, 0.0, WEIGHT[0]), "wearer_cog": (0.0, 0.0, 0.0, WEIGHT[1])}
+    bare, weighed = (
+        SimulatedArm(ArmConfig(links, cog_y=beside[0], cog_z=beside[1], **friction, **load)) for load in ({}, weight)
+    )
+    guess = np.array(TYPICAL_MOMENTS)
+    observations = [held(bare, np.array(theta), guess) for theta in best(LEANING, 8)]
+    guess = guess + load_moments(LENGTH, *WEIGHT)
+    observations += [held(weighed, np.array(theta), guess, WEIGHT) for theta in best(LEANING, 4, WEIGHT)]
+    found = identify(observations, LENGTH)
+    true = moments_of(ArmModel(links.length, links.cog, links.mass, off_axis=off_axis_of(links.mass, *beside)))
+    wrong = np.abs(found.moments - true)
+    assert np.all((wrong < 0.02 * true.max()) | (wrong < 2.0 * found.error))
+    np.testing.assert_allclose(found.scale, 1.0, atol=0.02)
+    np.testing.assert_allclose(found.friction, friction["coulomb_friction"], atol=0.08)
+    assert found.rejected == ()
+
+
+def test_without_a_candidate_there_is_no_next_pose():
+    with pytest.raises(ParameterError, match="at least one pose"):
+        next_pose([], np.zeros((0, 4)))
