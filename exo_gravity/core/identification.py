@@ -111,36 +111,33 @@ def identify(
     found anew: those of the arm with its wearer. Raises DataError if the result would be unphysical, naming the missing
     pose, and if an observation is impossible.
     """
-    rows = _rows(observations, length, gravity)
-    direction = np.asarray(observations[-1].direction, dtype=float)
     start = _start(known, solve_scale)
-    rows = _with_conditions(rows, start, known if solve_scale else None, solve_scale)
+    rows = _with_conditions(_rows(observations, length, gravity), start, known if solve_scale else None, solve_scale)
     check_motors(rows.effort, rows.regressor @ np.array(TYPICAL_MOMENTS))
     keep, rejected = without_outliers(rows, start)
-    used, solution = final(rows.only(keep), start)
-    if solution.unknowns[0] < 0.0:  # M1 is the least certain, and no arm's is negative
-        others = np.arange(COUNT) != 0
-        used, solution = final(replace(used, free=used.free & others), start * others)
-    hidden = solution.hidden > HIDDEN
+    used, solution = _bounded(rows.only(keep), start)
     check_fit(solution.residual, used.effort)
+    direction, hidden = np.asarray(observations[-1].direction, dtype=float), solution.hidden > HIDDEN
     check_told(hidden, len(observations), direction, gravity)
-    loaded = bool(np.any(rows.load[keep]))
-    unknowns, covariance = _in_kilograms(solution, known if solve_scale else None, loaded)
+    is_loaded = solve_scale and bool(np.any(used.load))
+    told = replace(solution, unknowns=np.where(hidden, start, solution.unknowns))
+    unknowns, covariance = _in_kilograms(told, known if solve_scale else None, is_loaded)
     error = np.where(hidden, np.inf, np.sqrt(np.diag(covariance)))
-    check_physical(unknowns[MOMENT], error[MOMENT], np.exp(unknowns[SCALE]), direction, gravity)
-    relative = (solve_scale and not loaded) if known is None else (known.relative and not (solve_scale and loaded))
+    moments, scale = unknowns[MOMENT], np.exp(unknowns[SCALE])
+    check_physical(moments, error[MOMENT], scale, direction, gravity)
+    is_relative = not is_loaded and (solve_scale if known is None else known.relative)
     return Identified(
-        unknowns[MOMENT],
+        moments,
         np.where(np.diag(hidden[MOMENT]), np.inf, covariance[MOMENT, MOMENT]),
-        np.exp(unknowns[SCALE]),
-        np.exp(unknowns[SCALE]) * error[SCALE],
+        scale,
+        scale * error[SCALE],
         unknowns[OFFSET],
         np.median([observation.friction for observation in observations], axis=0),
         *_residuals(rows, keep, used, solution),
         solution.singular_values,
-        untold(unknowns, error, hidden, relative),
+        untold(unknowns, error, hidden, is_relative),
         rejected,
-        relative,
+        is_relative,
     )
 
 
@@ -201,10 +198,22 @@ def _with_conditions(rows: Rows, start: np.ndarray, known: Identified | None, so
     return replace(rows, free=free, anchor=anchor, anchor_value=anchor @ (start * (np.arange(COUNT) < SCALE.stop)))
 
 
-def _in_kilograms(solution: Solution, known: Identified | None, loaded: bool) -> tuple[np.ndarray, np.ndarray]:
+def _bounded(rows: Rows, start: np.ndarray) -> tuple[Rows, Solution]:
+    """Return the solution with M1, the least certain moment, at least 0, and the rows with their estimated errors."""
+    used, solution = final(rows, start)
+    if solution.unknowns[0] >= 0.0:
+        return used, solution
+    others = np.arange(COUNT) != 0
+    used, bounded = final(replace(rows, free=rows.free & others), start * others)
+    covariance = bounded.covariance.copy()
+    covariance[0, 0] = solution.covariance[0, 0]
+    return used, replace(bounded, covariance=covariance)
+
+
+def _in_kilograms(solution: Solution, known: Identified | None, is_loaded: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return the unknowns (20,) and their covariance (20, 20) without the factor by which a weight seems too heavy."""
     unknowns, covariance = solution.unknowns.copy(), solution.covariance.copy()
-    if known is not None and not known.relative and not loaded:
+    if known is not None and not known.relative and not is_loaded:
         unknowns[FACTOR] = math.exp(-_common(known))
         share = np.min(known.scale_error[1:] / known.scale[1:])
         covariance[FACTOR, FACTOR] = (share * unknowns[FACTOR]) ** 2

@@ -152,6 +152,18 @@ def test_with_an_upright_stand_joint_1_is_not_known_and_said_to_be():
     assert np.all(np.abs(found.moments - device.moments)[seen] < 4.0 * found.error[seen])
 
 
+def test_the_first_moment_is_never_negative_and_its_error_stays_honest():
+    device = Device(30)
+    device.moments[0] = -0.003
+    found = identify(device.tour(Tilt.of("right", 0.05, 0.05).direction), LENGTH)
+    assert found.moments[0] == 0.0 and found.error[0] > 0.002
+
+
+def test_a_moment_of_which_next_to_nothing_is_known_stays_0():
+    found = identify(Device(31).tour(Tilt.of("right", 0.003, 0.002).direction), LENGTH)
+    assert np.isinf(found.error[0]) and found.moments[0] == 0.0
+
+
 def test_a_zero_that_is_off_looks_like_a_moment_across_the_link_and_the_torque_is_right_all_the_same():
     device, off = Device(5), np.array((0.0, 0.0, 0.0, np.radians(5.0)))
     observations = [o._replace(theta=np.subtract(o.theta, off)) for o in device.tour()]
