@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exo_gravity.core import gravity_torque
+from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.anfis import Anfis
 from exo_gravity.core.anfis_law import AnfisLaw
 from exo_gravity.core.compensator import FALLBACK_TIME
@@ -48,6 +48,12 @@ def test_where_the_anfis_was_not_trained_the_exact_law_replaces_it_and_the_reaso
     answer = run.cycle(1.2, theta)
     assert why in answer.fallback
     np.testing.assert_allclose(answer.effort, gravity_torque(ROBOT, theta, Tilt.of("left", pitch).direction))
+
+
+def test_the_anfis_refuses_an_arm_given_by_its_moments():
+    arm = ArmModel.from_moments(ROBOT.length, ROBOT.first_moment)
+    with pytest.raises(ParameterError, match=r"robot.first_moment = .*must be 0 for law anfis"):
+        settings_with(law="anfis", anfis=learned(), robot=arm)
 
 
 def wobble(run, seconds, width=0.02, hertz=3.0):

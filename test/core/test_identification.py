@@ -2,75 +2,18 @@
 
 from __future__ import annotations
 
-import itertools
 from functools import cache
 
 import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, Tilt
-from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.identification import Observation, identify, next_pose
+from exo_gravity.core.identification import Observation, identify
 from exo_gravity.core.moments import MOMENTS, load_moments, moments_of, off_axis_of, regressor
 from exo_gravity.core.pose_choice import TYPICAL_MOMENTS
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
 
-LENGTH = (0.05, 0.13, 0.30, 0.30)
-LEANING = Tilt.of("right", 0.30, 0.25).direction  # the stand, so that joint 1 carries something
-UPRIGHT = (0.0, 0.0, 1.0)
-WEIGHT = (1.0, 0.25)  # kg, m from the elbow
-CODE = 30.0 / 4095.0  # Nm, one step of an AK60-6's 12-bit torque
-SAMPLES = 50  # of the effort in each direction
-CANDIDATES = np.radians(
-    list(itertools.product((-60, -30, 0, 30, 60), (10, 40, 70, 100, 130), (-30, 0, 30, 60, 90), (0, 30, 60, 90, 120)))
-)
-
-
-class Device:
-    """An arm whose masses, centres of gravity, torque scales, friction and offsets are drawn at random."""
-
-    def __init__(self, seed):
-        self.rng = rng = np.random.default_rng(seed)
-        mass = np.array((0.60, 0.46, 0.61, 0.20)) * rng.uniform(0.7, 1.3, 4)
-        cog = np.minimum(np.array((0.045, 0.115, 0.235, 0.13)) * rng.uniform(0.7, 1.3, 4), LENGTH)
-        off_axis = off_axis_of(mass, *rng.uniform(-0.015, 0.015, (2, 4)))
-        self.moments = moments_of(ArmModel(LENGTH, cog, mass, off_axis=off_axis))
-        self.scale = rng.uniform(0.7, 1.3, 4)
-        self.friction = rng.uniform(0.1, 0.4, 4)
-        self.offset = rng.normal(0.0, 0.02, 4)
-
-    def effort(self, theta, direction, added=0.0):
-        """The commanded effort (n, 4) that holds the arm without friction."""
-        return regressor(theta, direction) @ (self.moments + added) / self.scale + self.offset
-
-    def observe(self, theta, direction=LEANING, weight=(0.0, 0.0), added=0.0, error=0.0):
-        """Pass the pose in both directions: current noise of 2 %, 12 bits. error: (4,) Nm that spoils the pose."""
-        effort = self.effort(theta, direction, load_moments(LENGTH, *weight) + added)[0]
-        mean, spread = [], []
-        for way in (1.0, -1.0):
-            one_way = effort + way * self.friction / self.scale
-            noise = self.rng.normal(size=(SAMPLES, 4)) * (0.02 * np.abs(one_way) + 0.01)
-            codes = np.round((one_way + noise) / CODE) * CODE
-            mean.append(codes.mean(axis=0))
-            spread.append(codes.std(axis=0, ddof=1) / np.sqrt(SAMPLES))
-        half = (mean[0] - mean[1]) / 2.0
-        return Observation(theta, direction, sum(mean) / 2.0 + error, half, np.hypot(*spread) / 2.0, *weight)
-
-    def tour(self, direction=LEANING, bare=8, weighed=4, **how):
-        """Observe the best `bare` poses without, and the best `weighed` with the weight."""
-        return [
-            *(self.observe(theta, direction, **how) for theta in best(direction, bare)),
-            *(self.observe(theta, direction, WEIGHT, **how) for theta in best(direction, weighed, WEIGHT)),
-        ]
-
-
-@cache
-def best(direction, count, weight=(0.0, 0.0)):
-    moments = np.array(TYPICAL_MOMENTS) + load_moments(LENGTH, *weight)
-    taken = []
-    while len(taken) < count:
-        taken.append(tuple(CANDIDATES[next_pose(taken, CANDIDATES, direction, moments)]))
-    return tuple(taken)
+from ..support.random_device import CANDIDATES, CODE, LEANING, LENGTH, UPRIGHT, WEIGHT, Device, best
 
 
 @cache
@@ -173,89 +116,6 @@ def test_a_zero_that_is_off_looks_like_a_moment_across_the_link_and_the_torque_i
     assert any("Y4 of link 4 from an error of joint 4's zero" in sentence for sentence in found.unknown)
 
 
-SLIPS = {
-    "one pose": {2: (0, 0, 0.3, 0)},
-    "two poses": {2: (0, 0, 0.3, 0), 5: (0, -0.5, 0, 0)},
-    "weighed": {9: (0, 0, 0, 0.2)},
-}
-
-
-@pytest.mark.parametrize("slips", SLIPS.values(), ids=SLIPS)
-def test_a_pose_with_a_slip_or_a_hand_is_left_out_and_named(slips):
-    device = Device(6)
-    observations = device.tour(bare=10)
-    for index, error in slips.items():
-        observations[index] = observations[index]._replace(effort=np.add(observations[index].effort, error))
-    found = identify(observations, LENGTH)
-    assert {index for index, _ in found.rejected} == set(slips)
-    for index, reason in found.rejected:
-        assert f"joint {int(np.argmax(np.abs(slips[index]))) + 1}" in reason
-    assert np.all(np.abs(found.moments - device.moments) < 4.0 * found.error)
-
-
-@pytest.mark.parametrize(
-    ("bare", "spoilt", "words"), [(26, 11, r"pose 15: effort of joint 4 is"), (8, 6, "off in half of the poses")]
-)
-def test_poses_that_do_not_fit_one_arm_are_refused_together(bare, spoilt, words):
-    observations = Device(7).tour(bare=bare)
-    for k in range(spoilt):
-        error = np.eye(4)[k % 4] * (-1) ** k  # Nm
-        observations[2 * k] = observations[2 * k]._replace(effort=observations[2 * k].effort + error)
-    with pytest.raises(DataError, match=rf"the poses do not fit one arm: .*{words}.*touched"):
-        identify(observations, LENGTH)
-
-
-def test_too_few_poses_are_refused_with_the_pose_that_is_missing_and_accepted_with_it():
-    device = Device(8)
-    observations = [device.observe(theta) for theta in best(LEANING, 2)]
-    for _ in range(6):
-        try:
-            found = identify(observations, LENGTH)
-            break
-        except DataError as error:
-            assert "poses do not tell" in str(error) or "is not known better than" in str(error)
-            degrees = str(error).split("add the pose [")[1].split("]")[0].split(",")
-            observations.append(device.observe(np.radians([float(angle) for angle in degrees])))
-    assert np.all(np.abs(found.moments[1:4]) > found.error[1:4])
-
-
-def test_a_silent_motor_is_told_and_not_fitted():
-    observations = [o._replace(effort=np.multiply(o.effort, (1, 1, 0, 1))) for o in Device(9).tour()]
-    with pytest.raises(DataError, match=r"joint 3: the effort is 0\.00 Nm in every pose: a silent motor"):
-        identify(observations, LENGTH)
-
-
-@pytest.mark.parametrize("factor", [-1.0, 0.2, 5.0])
-def test_a_reversed_joint_and_an_impossible_torque_scale_are_refused(factor):
-    observations = [o._replace(effort=np.multiply(o.effort, (1, 1, factor, 1))) for o in Device(10).tour()]
-    with pytest.raises(DataError, match=r"torque scale 3|do not fit one arm|not known better|must be positive"):
-        identify(observations, LENGTH)
-
-
-def test_a_weight_that_is_too_light_to_tell_the_scale_is_refused():
-    device = Device(11)
-    observations = device.tour(weighed=0) + [device.observe(t, weight=(0.002, 0.1)) for t in best(LEANING, 4)]
-    with pytest.raises(DataError, match="hang a heavier one"):
-        identify(observations, LENGTH)
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"effort": (0.0, np.nan, 0.0, 0.0)}, "pose 2: effort"),
-        ({"theta": (0.0, 0.0, 0.0)}, "pose 2: theta"),
-        ({"spread": (0.0, 0.1, -0.1, 0.0)}, "pose 2: spread"),
-    ],
-)
-def test_an_impossible_observation_is_refused_by_number_and_name(change, words):
-    observations = Device(12).tour()
-    observations[1] = observations[1]._replace(**change)
-    with pytest.raises(DataError, match=words):
-        identify(observations, LENGTH)
-    with pytest.raises(DataError, match="no pose"):
-        identify([], LENGTH)
-
-
 def test_a_wearer_is_found_with_the_scales_of_the_bare_arm():
     device = Device(13)
     bare = identify(device.tour(), LENGTH)
@@ -338,8 +198,3 @@ def test_an_arm_simulated_by_mujoco_is_found_from_slow_passes_in_both_directions
     np.testing.assert_allclose(found.scale, 1.0, atol=0.02)
     np.testing.assert_allclose(found.friction, friction["coulomb_friction"], atol=0.08)
     assert found.rejected == ()
-
-
-def test_without_a_candidate_there_is_no_next_pose():
-    with pytest.raises(ParameterError, match="at least one pose"):
-        next_pose([], np.zeros((0, 4)))

@@ -1,0 +1,98 @@
+"""What an identification leaves out, and what it refuses with the reason and the pose that is missing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.identification import identify, next_pose
+
+from ..support.random_device import LEANING, LENGTH, Device, best
+
+SLIPS = {
+    "one pose": {2: (0, 0, 0.3, 0)},
+    "two poses": {2: (0, 0, 0.3, 0), 5: (0, -0.5, 0, 0)},
+    "weighed": {9: (0, 0, 0, 0.2)},
+}
+
+
+@pytest.mark.parametrize("slips", SLIPS.values(), ids=SLIPS)
+def test_a_pose_with_a_slip_or_a_hand_is_left_out_and_named(slips):
+    device = Device(6)
+    observations = device.tour(bare=10)
+    for index, error in slips.items():
+        observations[index] = observations[index]._replace(effort=np.add(observations[index].effort, error))
+    found = identify(observations, LENGTH)
+    assert {index for index, _ in found.rejected} == set(slips)
+    for index, reason in found.rejected:
+        assert f"joint {int(np.argmax(np.abs(slips[index]))) + 1}" in reason
+    assert np.all(np.abs(found.moments - device.moments) < 4.0 * found.error)
+
+
+@pytest.mark.parametrize(
+    ("bare", "spoilt", "words"), [(26, 11, r"pose 15: effort of joint 4 is"), (8, 6, "off in half of the poses")]
+)
+def test_poses_that_do_not_fit_one_arm_are_refused_together(bare, spoilt, words):
+    observations = Device(7).tour(bare=bare)
+    for k in range(spoilt):
+        error = np.eye(4)[k % 4] * (-1) ** k  # Nm
+        observations[2 * k] = observations[2 * k]._replace(effort=observations[2 * k].effort + error)
+    with pytest.raises(DataError, match=rf"the poses do not fit one arm: .*{words}.*touched"):
+        identify(observations, LENGTH)
+
+
+def test_too_few_poses_are_refused_with_the_pose_that_is_missing_and_accepted_with_it():
+    device = Device(8)
+    observations = [device.observe(theta) for theta in best(LEANING, 2)]
+    for _ in range(6):
+        try:
+            found = identify(observations, LENGTH)
+            break
+        except DataError as error:
+            assert "poses do not tell" in str(error) or "is not known better than" in str(error)
+            degrees = str(error).split("add the pose [")[1].split("]")[0].split(",")
+            observations.append(device.observe(np.radians([float(angle) for angle in degrees])))
+    assert np.all(np.abs(found.moments[1:4]) > found.error[1:4])
+
+
+def test_a_silent_motor_is_told_and_not_fitted():
+    observations = [o._replace(effort=np.multiply(o.effort, (1, 1, 0, 1))) for o in Device(9).tour()]
+    with pytest.raises(DataError, match=r"joint 3: the effort is 0\.00 Nm in every pose: a silent motor"):
+        identify(observations, LENGTH)
+
+
+@pytest.mark.parametrize("factor", [-1.0, 0.2, 5.0])
+def test_a_reversed_joint_and_an_impossible_torque_scale_are_refused(factor):
+    observations = [o._replace(effort=np.multiply(o.effort, (1, 1, factor, 1))) for o in Device(10).tour()]
+    with pytest.raises(DataError, match=r"torque scale 3|do not fit one arm|not known better|must be positive"):
+        identify(observations, LENGTH)
+
+
+def test_a_weight_that_is_too_light_to_tell_the_scale_is_refused():
+    device = Device(11)
+    observations = device.tour(weighed=0) + [device.observe(t, weight=(0.002, 0.1)) for t in best(LEANING, 4)]
+    with pytest.raises(DataError, match="hang a heavier one"):
+        identify(observations, LENGTH)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"effort": (0.0, np.nan, 0.0, 0.0)}, "pose 2: effort"),
+        ({"theta": (0.0, 0.0, 0.0)}, "pose 2: theta"),
+        ({"spread": (0.0, 0.1, -0.1, 0.0)}, "pose 2: spread"),
+    ],
+)
+def test_an_impossible_observation_is_refused_by_number_and_name(change, words):
+    observations = Device(12).tour()
+    observations[1] = observations[1]._replace(**change)
+    with pytest.raises(DataError, match=words):
+        identify(observations, LENGTH)
+    with pytest.raises(DataError, match="no pose"):
+        identify([], LENGTH)
+
+
+def test_without_a_candidate_there_is_no_next_pose():
+    with pytest.raises(ParameterError, match="at least one pose"):
+        next_pose([], np.zeros((0, 4)))
