@@ -21,8 +21,8 @@ class TorqueTable(NamedTuple):
     """One row per pose, n in all, one column per joint, in Nm as commanded.
 
     theta: (n, 4) rad. measured: the effort that holds the arm, (n, 4). spread: its standard error. before, after: as
-    predicted by the old and by the new file. held_out: measured minus predicted without that pose. friction: (4,).
-    used: (n,), false for poses that the result leaves out.
+    predicted by the old and by the new file, which cannot hold the motors' constant offset. held_out: measured minus
+    predicted by a result that was found without that pose. friction: (4,). used: (n,), false for poses left out.
     """
 
     theta: np.ndarray
@@ -67,5 +67,6 @@ def torque_table(outcome: Outcome) -> TorqueTable | None:
     used = np.ones(len(poses), dtype=bool)
     used[[index for index, _ in identified.rejected]] = False
     before = gravity_torque(arm.robot, theta, direction) + weight
-    after = measured - identified.residual
-    return TorqueTable(theta, measured, spread, before, after, identified.held_out, identified.friction, used)
+    after = measured - identified.residual - identified.offset
+    held_out = identified.held_out + identified.offset
+    return TorqueTable(theta, measured, spread, before, after, held_out, identified.friction, used)
