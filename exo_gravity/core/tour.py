@@ -22,13 +22,14 @@ from exo_gravity.core.tilt import Tilt
 from exo_gravity.core.tour_control import MassMatrix, Tracker
 from exo_gravity.core.tour_guess import TorqueGuess
 from exo_gravity.core.tour_motion import Line, Station
-from exo_gravity.core.tour_poses import Itinerary
-from exo_gravity.core.tour_visit import FOLLOWED, MAX_FAILURES, Visit
+from exo_gravity.core.tour_poses import Itinerary, Progress
+from exo_gravity.core.tour_visit import FOLLOWED, Visit
 from exo_gravity.core.tour_watch import Watch
 
 SETTLING = 0.4  # s at rest before the first sweep of a pose
 # rad behind the reference, from which on it slows down, and at which it stops and waits for the arm.
 SLOW_ERROR, STOP_ERROR = 0.04, 0.08
+MAX_SKIPPED = 2  # poses in which a joint may stick
 STEADY_SPEED = 0.05  # rad/s of a sweep, from which on its friction is that of the motion between poses
 REFRESH_PERIOD = 0.1  # s between two estimates of the mass matrix, and of how uncertain the expected torque is
 ANGLE_STEP = 0.01  # rad, for the slope of the expected torque
@@ -68,6 +69,7 @@ class Tour:
         self._line = Line(np.zeros(JOINT_COUNT), np.zeros(JOINT_COUNT))
         self._line_time = 0.0  # s
         self._pause = 0.0  # s after the line
+        self._skipped = 0  # poses
         self._is_sweeping = False
         self._visit: Visit | None = None
         self._friction = [0.0] * JOINT_COUNT  # Nm, 0 until it is measured
@@ -131,30 +133,36 @@ class Tour:
             return
         if self._is_sweeping:
             self._end_sweep(self._visit)
+            if self._visit.has_failed:
+                self._skip(self._visit)
         if self._visit.is_complete and not self.trouble:
             self._finish(self._visit)
-            if not self.trouble:
-                self._go_on(end)
-        elif not self.trouble:
+        if self.trouble:
+            return
+        if self._visit.is_complete or self._visit.has_failed:
+            self._go_on(end)
+        else:
             self._start(self._visit.line, 0.0, is_sweeping=True)
+
+    def _skip(self, visit: Visit) -> None:
+        """Leave out a pose in which a joint sticks; the tour ends if that happens often."""
+        self._skipped += 1
+        if self._skipped > MAX_SKIPPED:
+            joint, share = min(visit.stuck_joints.items(), key=lambda item: item[1])
+            name = self._limits.joint_names[joint]
+            self.trouble = f"{name}: it sticks: it follows {share:.0%} of a slow motion, must be {FOLLOWED:.0%}"
 
     def _end_sweep(self, visit: Visit) -> None:
         """Improve what is known of friction; sweeps without it, and those that a joint did not follow, do not count."""
         friction = visit.end_sweep()
         if friction is None:
             return
-        was_known, stuck = any(self._friction), visit.stuck()
+        was_known, stuck = any(self._friction), visit.stuck_joints
         if visit.station.speed >= STEADY_SPEED:
             self._friction = np.maximum(np.maximum(0.0, friction), self._friction if stuck else 0.0).tolist()
             self._tracker.friction = np.array(self._friction)
-        if stuck:
-            visit.failures += 1
-            joint, share = next(iter(stuck.items()))
-            if visit.failures > MAX_FAILURES:
-                name = self._limits.joint_names[joint]
-                self.trouble = f"{name}: it sticks: it follows {share:.0%} of a slow motion, must be {FOLLOWED:.0%}"
         if stuck or not was_known:
-            visit.start_again()
+            visit.start_again(failed=bool(stuck))
 
     def _finish(self, visit: Visit) -> None:
         """Keep what was measured, and improve the expected torque with it."""
@@ -183,7 +191,7 @@ class Tour:
         """Begin the way from `position` to the next pose, or home after the last."""
         taken = np.array([measured.observation.theta for measured in self.measured])
         try:
-            station = self._itinerary.next(taken, self._guess, self._friction, self.elapsed)
+            station = self._itinerary.next(taken, Progress(position, self.elapsed), self._guess, self._friction)
         except DataError as error:
             self.trouble = str(error)
             return

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -15,7 +15,8 @@ from exo_gravity.core.limits import WALL_WIDTH, Limits
 from exo_gravity.core.tour_guess import TorqueGuess
 from exo_gravity.core.tour_motion import Line, Station
 
-CANDIDATES = 500
+CANDIDATES = 800
+MOST_UPWARDS = 0.3  # sine of the largest angle above the horizontal, of links 3 and 4
 SHARE = 0.85  # of max_effort that a pose may need
 DEVIATIONS = 2.0  # of the expected torque, that a pose must leave room for
 USUAL_FRICTION = 0.5  # Nm, until it is measured
@@ -25,15 +26,24 @@ EDGE = 0.02  # rad between a sweep's end and the soft wall
 TIME_SHARE = 1.5  # of the time left for each pose, that the next one may take
 
 
+class Progress(NamedTuple):
+    """Where the arm is: position (4,) rad, and the time since the start of the tour in s."""
+
+    position: np.ndarray
+    elapsed: float
+
+
 class Itinerary(Protocol):
     """Chooses the poses of a tour, one after the other."""
 
     count: int  # of all poses
 
-    def next(self, taken: np.ndarray, guess: TorqueGuess, friction: Sequence[float], elapsed: float) -> Station | None:
+    def next(
+        self, taken: np.ndarray, progress: Progress, guess: TorqueGuess, friction: Sequence[float]
+    ) -> Station | None:
         """Return the next station, None after the last. Raises DataError if no pose can be held.
 
-        taken: (n, 4) rad, the poses measured so far. friction: (4,) Nm, 0 if unknown. elapsed: s since the start.
+        taken: (n, 4) rad, the poses measured so far. friction: (4,) Nm, 0 if unknown.
         """
         ...
 
@@ -45,7 +55,9 @@ class FixedStations:
         self.count = len(stations)
         self._left: Iterator[Station] = iter(stations)
 
-    def next(self, taken: np.ndarray, guess: TorqueGuess, friction: Sequence[float], elapsed: float) -> Station | None:
+    def next(
+        self, taken: np.ndarray, progress: Progress, guess: TorqueGuess, friction: Sequence[float]
+    ) -> Station | None:
         """Return the next of the given stations."""
         return next(self._left, None)
 
@@ -66,28 +78,36 @@ class BestPoses:
         low, high = measurable(self.limits, Station((0.0,) * JOINT_COUNT).amplitude)
         # Friction is not known at first: the first pose keeps a distance from the soft walls.
         self._home = np.clip(self.limits.home, low + FIRST_EDGE, high - FIRST_EDGE)
-        self._candidates = np.random.default_rng(self.seed).uniform(low, high, (CANDIDATES, JOINT_COUNT))
+        self._candidates = candidates(self.limits, self.seed)
+        self._is_started = False
 
-    def next(self, taken: np.ndarray, guess: TorqueGuess, friction: Sequence[float], elapsed: float) -> Station | None:
+    def next(
+        self, taken: np.ndarray, progress: Progress, guess: TorqueGuess, friction: Sequence[float]
+    ) -> Station | None:
         """Return the best of the candidates that can be held and reached; the first is the hanging arm."""
         if len(taken) >= self.count:
             return None
-        if not len(taken):
+        if not len(taken) and not self._is_started:
+            self._is_started = True
             return Station(tuple(self._home.tolist()))
-        possible = self._candidates[self._is_in_time(taken, elapsed)]
-        possible = possible[self._is_holdable(possible, taken[-1], guess, friction)]
+        possible = np.flatnonzero(self._is_in_time(len(taken), progress))
+        possible = possible[self._is_holdable(self._candidates[possible], progress.position, guess, friction)]
         if not len(possible):
             raise DataError("no further pose can be held within max_effort: is it too small for the arm?")
-        index = next_pose(list(taken), possible, guess.tilt.direction, guess.common_moments, guess.gravity)
-        return Station(tuple(possible[index].tolist()))
+        seen = list(taken) or [self._home]
+        poses = self._candidates[possible]
+        index = possible[next_pose(seen, poses, guess.tilt.direction, guess.common_moments, guess.gravity)]
+        pose = self._candidates[index]
+        self._candidates = np.delete(self._candidates, index, axis=0)  # chosen once, even if a joint sticks there
+        return Station(tuple(pose.tolist()))
 
-    def _is_in_time(self, taken: np.ndarray, elapsed: float) -> np.ndarray:
+    def _is_in_time(self, count: int, progress: Progress) -> np.ndarray:
         """Return which candidates (n,) leave enough time for the others and for the way home."""
         sweeps = Station(tuple(self._home.tolist())).duration
         home = [Line(pose, self._home).duration for pose in self._candidates]
-        way = [Line(taken[-1], pose).duration for pose in self._candidates]
-        left = self.count - len(taken)
-        budget = (self.duration - elapsed - np.array(home)) / left
+        way = [Line(progress.position, pose).duration for pose in self._candidates]
+        left = self.count - count
+        budget = (self.duration - progress.elapsed - np.array(home)) / left
         fits = np.add(way, sweeps) <= budget * (TIME_SHARE if left > 1 else 1.0)
         return fits if fits.any() else np.add(way, home) <= np.min(np.add(way, home)) + 1.0
 
@@ -98,6 +118,17 @@ class BestPoses:
         shares = np.linspace(0.0, 1.0, WAYPOINTS + 1)[1:, None, None]
         ways = start + shares * (poses - start)
         return holdable(ways.reshape(-1, JOINT_COUNT), self.limits, guess, friction).reshape(WAYPOINTS, -1).all(axis=0)
+
+
+def candidates(limits: Limits, seed: int = 1) -> np.ndarray:
+    """Return random poses (n, 4) in rad within `limits` in which no link points far upwards.
+
+    Above the shoulder gravity tips the arm over: what is wrong with the expected torque grows with each movement.
+    """
+    low, high = measurable(limits, Station((0.0,) * JOINT_COUNT).amplitude)
+    poses = np.random.default_rng(seed).uniform(low, high, (CANDIDATES, JOINT_COUNT))
+    down = np.cos(poses[:, 1:2]) * np.cos(np.stack((poses[:, 2], poses[:, 2] + poses[:, 3]), axis=1))
+    return np.asarray(poses[down.min(axis=1) >= -MOST_UPWARDS])
 
 
 def measurable(limits: Limits, amplitude: float) -> tuple[np.ndarray, np.ndarray]:

@@ -11,18 +11,20 @@ from exo_gravity.core.tour_average import Average, Sweep, average
 from exo_gravity.core.tour_motion import WINDOW, Line, Station
 
 FOLLOWED = 0.7  # of the way of the reference, that each joint must follow in a sweep that counts
-MAX_FAILURES = 4  # pairs of sweeps in which a joint may stick: each shows the controller more of its friction
+MAX_FAILURES = 3  # pairs of sweeps in which a joint may stick: each shows the controller more of its friction
 
 
 class Visit:
     """Collects the samples of the sweeps through `station`.
 
-    slope: (4, 4) Nm/rad, change of the expected torque with the angles. failures: pairs of sweeps that did not count.
+    slope: (4, 4) Nm/rad, change of the expected torque with the angles. stuck_joints: those that did not follow one of
+    the last two sweeps, with the part of the way that they did.
     """
 
     def __init__(self, station: Station, slope: np.ndarray) -> None:
         self.station = station
-        self.failures = 0
+        self.stuck_joints: dict[int, float] = {}
+        self._failures = 0
         self._slope = slope
         self._sweeps: list[Sweep] = []
         self._samples: list[tuple[Sequence[float], Torque]] = []
@@ -40,6 +42,11 @@ class Visit:
         return len(self._sweeps) == 2 * self.station.cycles
 
     @property
+    def has_failed(self) -> bool:
+        """Whether joints stuck too often here."""
+        return self._failures > MAX_FAILURES
+
+    @property
     def direction(self) -> np.ndarray:
         """Mean direction of gravity (3,) during the sweeps."""
         mean = np.mean(self._directions, axis=0)
@@ -55,18 +62,16 @@ class Visit:
         position, effort = (np.array(column) for column in zip(*self._samples, strict=True))
         self._sweeps.append(Sweep(len(self._sweeps) % 2 == 0, position, effort))
         self._samples = []
-        return None if len(self._sweeps) % 2 else average(self._sweeps[-2:], self._slope).friction
+        if len(self._sweeps) % 2:
+            return None
+        ways = [np.abs(sweep.position[-1] - sweep.position[0]) for sweep in self._sweeps[-2:]]
+        shares = np.min(ways, axis=0) / (2.0 * WINDOW * self.station.amplitude)
+        self.stuck_joints = {joint: float(share) for joint, share in enumerate(shares) if share < FOLLOWED}
+        return average(self._sweeps[-2:], self._slope).friction
 
-    def stuck(self) -> dict[int, float]:
-        """Return the joints that did not follow one of the last two sweeps, with the part of the way that they did."""
-        way = 2.0 * WINDOW * self.station.amplitude
-        followed = np.min([sweep.position[-1] - sweep.position[0] for sweep in self._sweeps[-2::2]], axis=0)
-        returned = np.min([sweep.position[0] - sweep.position[-1] for sweep in self._sweeps[-1::2]], axis=0)
-        shares = np.minimum(followed, returned) / way
-        return {joint: float(share) for joint, share in enumerate(shares) if share < FOLLOWED}
-
-    def start_again(self) -> None:
-        """Discard the sweeps so far."""
+    def start_again(self, failed: bool) -> None:
+        """Discard the sweeps so far; failed: because a joint did not follow."""
+        self._failures += failed
         self._sweeps, self._directions = [], []
 
     def result(self) -> Average:

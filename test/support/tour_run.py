@@ -43,9 +43,9 @@ class Hand(VirtualWearer):
         """Return that the torque may change at any time."""
         return False
 
-    def torque(self, time: float, theta: Sequence[float], velocity: Sequence[float]) -> Sequence[float]:
+    def torque(self, time: float, theta: Sequence[float], velocity: Sequence[float]) -> tuple[float, ...]:
         """Return the torque on the joints (4,) in Nm."""
-        return self._disturb(time, self._device) or (0.0,) * 4
+        return tuple(self._disturb(time, self._device) or (0.0,) * 4)
 
 
 @dataclass

@@ -12,8 +12,7 @@ from exo_gravity.core.identification import Identified, Observation, identify, n
 from exo_gravity.core.joint_motor import TORQUE_SCALE_BOUNDS
 from exo_gravity.core.limits import Limits
 from exo_gravity.core.moments import MOMENTS, moments_of
-from exo_gravity.core.tour_motion import Station
-from exo_gravity.core.tour_poses import CANDIDATES, measurable
+from exo_gravity.core.tour_poses import candidates
 from exo_gravity.tools.calibration.live import Say, refusals_of, run_tour, tour_parameters
 from exo_gravity.tools.calibration.outcome import Change, Outcome
 from exo_gravity.tools.inputs.arms import ConfiguredArm
@@ -92,11 +91,9 @@ def lines_of(arm: ConfiguredArm, identified: Identified) -> tuple[str, ...]:
 
 def _suggestion(limits: Limits, observations: Sequence[Observation], moments: np.ndarray) -> tuple[float, ...]:
     """Return the pose (4,) in rad that would add the most to `observations`."""
-    low, high = measurable(limits, Station((0.0,) * 4).amplitude)
-    candidates = np.random.default_rng(1).uniform(low, high, (CANDIDATES, 4))
+    poses = candidates(limits)
     taken = [observation.theta for observation in observations]
-    index = next_pose(taken, candidates, observations[-1].direction, moments)
-    return tuple(float(angle) for angle in candidates[index])
+    return tuple(poses[next_pose(taken, poses, observations[-1].direction, moments)].tolist())
 
 
 def _row(values: np.ndarray) -> str:

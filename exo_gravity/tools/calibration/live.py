@@ -105,7 +105,8 @@ def _run(launcher: Launcher, tour: LiveTour, stopping: Stopping, last_errors: Ma
         node, code = dead[0]
         tour.trouble = f"{node.lstrip('/')} ended with exit code {code}: {last_errors.get(node, 'see the log')}"
     if launcher.maybe_powered:
-        tour.trouble = f"the motors of {', '.join(launcher.maybe_powered)} may still be powered: cut their supply"
+        powered = f"the motors of {', '.join(launcher.maybe_powered)} may still be powered: cut their supply"
+        tour.trouble = f"{tour.trouble}; {powered}" if tour.trouble else powered
 
 
 def follow(tour: LiveTour, line: str, record: Path, say: Say) -> None:
