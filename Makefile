@@ -1,4 +1,5 @@
 # make demo         four nodes as processes on the simulated device, about 75 s; a table and figures in trials/
+# make calibrate-demo  a simulated arm with a wrong parameter file, calibrated, 5 minutes; a picture before and after
 # make test         all tests
 # make lint         ruff, mypy, ament's flake8 and pep257, shellcheck
 # make faults       the whole fault matrix on the simulated device, 11 minutes; a table and build/faults.json
@@ -17,11 +18,15 @@ DEMO := imu sim report
 TEST := $(DEMO) validate test
 SETUP := VENV=$(VENV) .ci/setup
 
-.PHONY: demo test lint faults bench socketcan pythons constraints clean
+.PHONY: demo calibrate-demo test lint faults bench socketcan pythons constraints clean
 
 demo:
 	@$(SETUP) $(DEMO)
 	$(BIN)/trial demo
+
+calibrate-demo:
+	@$(SETUP) $(DEMO) calibrate
+	$(BIN)/python -m exo_gravity.tools.calibration.demo
 
 # The nodes' tests need a quiet machine; the others share its cores.
 test:

@@ -98,8 +98,13 @@ def test_a_note_alone_becomes_a_comment(tmp_path: Path) -> None:
     new = written(tmp_path, Change("/right/can_bridge", "", 0, note))
     added, removed = added_and_removed(new)
     assert removed == [] and len(added) == 3
-    assert all(line.startswith("    # ") and len(line) <= 120 for line in added)
-    assert new.splitlines()[2:4] == ["  ros__parameters:", added[0]]
+    assert all(line.startswith("  # ") and len(line) <= 120 for line in added)
+    assert new.splitlines()[1:6] == ["/right/can_bridge:", *added, "  ros__parameters:"]
+
+
+def test_several_notes_keep_their_order(tmp_path: Path) -> None:
+    new = written(tmp_path, *(Change("/right/can_bridge", "", 0, note) for note in ("first", "second")))
+    assert new.index("first") < new.index("second")
 
 
 @pytest.mark.parametrize("name", ["exo.yaml", "sim.yaml", "sim_both.yaml"])

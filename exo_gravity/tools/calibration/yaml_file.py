@@ -87,10 +87,9 @@ def value_text(value: Value) -> str:
 
 
 def _changed(text: str, change: Change, origin: str) -> str:
-    parameters = _parameters(text, change.node)
+    heading, parameters = _parameters(text, change.node)
     if not change.name:
-        at, column = _before(text, parameters.value[0][0])
-        return _edited(text, [Edit(at, at, _comment(column, f"{origin}: {change.note}"))])
+        return _edited(text, [_above(text, heading, f"{origin}: {change.note}")])
     note = f"{origin}: {change.note}" if change.note else origin
     mapping, path = parameters, change.name.split(".")
     while path:
@@ -115,15 +114,15 @@ def _entry(mapping: yaml.MappingNode, path: list[str]) -> tuple[yaml.Node, yaml.
     return None
 
 
-def _parameters(text: str, node: str) -> yaml.MappingNode:
-    """Return the parsed parameters of `node`, whose marks are positions in `text`."""
+def _parameters(text: str, node: str) -> tuple[yaml.Node, yaml.MappingNode]:
+    """Return the key `ros__parameters` of `node` and its value as parsed: their marks are positions in `text`."""
     root = yaml.compose(text, yaml.SafeLoader)
     for key, entry in root.value if isinstance(root, yaml.MappingNode) else ():
         if key.value != node or not isinstance(entry, yaml.MappingNode):
             continue
         for name, parameters in entry.value:
             if name.value == PARAMETERS and isinstance(parameters, yaml.MappingNode) and parameters.value:
-                return parameters
+                return name, parameters
     raise ParameterError("params", node, "a node of the file that has parameters")
 
 
