@@ -21,8 +21,10 @@ from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.hardware.bus_lock import BusLock
 from exo_gravity.hardware.bus_scan import BusScan
 from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
+from exo_gravity.tools.calibrate import main
 from exo_gravity.tools.calibration.motors import run
 from exo_gravity.tools.calibration.outcome import Outcome
+from exo_gravity.tools.calibration.person import Person
 from exo_gravity.tools.inputs.arms import configured_arm
 
 from ..support.simulated_device import SPECS, frame
@@ -238,3 +240,39 @@ def test_two_motors_with_one_id_are_refused(make_bench: Callable[..., Bench]) ->
         outcome = bench.calibrate()
         notifier.stop()
     assert any(refusal.startswith(f"ID {shared}: several replies") for refusal in outcome.refusals)
+
+
+def command_line(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> tuple[int, Path]:
+    """Run `calibrate motors`, the person being the bench's; return the exit code and the path of the new file."""
+    monkeypatch.setattr(Person, "wait", lambda person, request, watch: bench.wait(request, watch))
+    output = bench.params.with_name("new.yaml")
+    return main(["motors", "--params", str(bench.params), "--output", str(output)]), output
+
+
+def test_the_command_line_writes_a_file_that_describes_the_device(
+    make_bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench = make_bench(13)
+    code, output = command_line(bench, monkeypatch)
+    assert code == 0
+    motors = configured_arm(output, "right").motors
+    assert [motor.can_id for motor in motors] == bench.ids
+    assert [motor.direction for motor in motors] == bench.directions
+    assert [motor.zero for motor in motors] == pytest.approx(bench.zeros, abs=0.002)
+    assert "measured hanging" in output.read_text(encoding="utf-8")
+    assert "Calibrated." in output.with_suffix(".html").read_text(encoding="utf-8")
+    assert f"elbow: motor {bench.ids[3]}, direction" in capsys.readouterr().out
+
+
+def test_the_command_line_says_why_it_did_not_calibrate(
+    make_bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench = make_bench(14)
+    bench.device.bus_silent = True
+    code, output = command_line(bench, monkeypatch)
+    assert (code, output.exists(), output.with_suffix(".html").exists()) == (1, False, False)
+    assert "calibrate: not calibrated: IDs that answer: none." in capsys.readouterr().err
+    lock = BusLock(("virtual", bench.channel, {}), "/right/can_bridge (PID 4711)")
+    assert command_line(bench, monkeypatch)[0] == 1
+    assert "held by /right/can_bridge (PID 4711)" in capsys.readouterr().err
+    lock.release()

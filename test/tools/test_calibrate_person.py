@@ -1,0 +1,52 @@
+"""What the person at the terminal is shown, and how the program waits for them."""
+
+from __future__ import annotations
+
+import io
+import os
+import threading
+from collections.abc import Iterator
+from typing import IO
+
+import pytest
+from rich.console import Console
+
+from exo_gravity.core.errors import DataError
+from exo_gravity.tools.calibration.person import Person
+
+
+@pytest.fixture
+def keys() -> Iterator[tuple[IO[str], IO[str]]]:
+    """The program's end of a pipe, and the person's."""
+    reading, writing = os.pipe()
+    with os.fdopen(reading) as program, os.fdopen(writing, "w") as person:
+        yield program, person
+
+
+def test_the_motors_are_watched_until_enter_is_pressed(keys: tuple[IO[str], IO[str]]) -> None:
+    shown, watched = io.StringIO(), threading.Event()
+    person = Person(Console(file=shown), keys[0])
+
+    def watch() -> str:
+        if not watched.is_set():
+            watched.set()
+            keys[1].write("\n")
+            keys[1].flush()
+        return "a table"
+
+    person.wait("bend the elbow", watch)
+    assert watched.is_set()
+    assert "bend the elbow; then press Enter" in shown.getvalue()
+
+
+def test_a_program_without_a_person_ends_with_the_reason(keys: tuple[IO[str], IO[str]]) -> None:
+    keys[1].close()
+    with pytest.raises(DataError, match="nobody is there to press Enter"):
+        Person(Console(file=io.StringIO()), keys[0]).ask("bow")
+
+
+def test_lines_are_printed_as_they_are(keys: tuple[IO[str], IO[str]]) -> None:
+    shown = io.StringIO()
+    line = "pose [3] of 12: " + 20 * "long "
+    Person(Console(file=shown, width=40), keys[0]).say(line)
+    assert shown.getvalue() == f"{line}\n"
