@@ -63,6 +63,7 @@ class TourRun:
     rate: float = 100.0
     load: tuple[float, float] = (0.0, 0.0)
     disturb: Disturb | None = None
+    late: int = 0  # cycles by which efforts reach the bridge late
 
     def __post_init__(self) -> None:
         self.fastest = 0.0  # rad/s, of any joint while carried
@@ -81,10 +82,12 @@ class TourRun:
         safety.enable(0.0)
         samples: list[JointSample] = [UNKNOWN] * 4
         effort: Torque | None = None
+        queue: list[Torque | None] = []
         answered, powered, began = -math.inf, False, False
         for cycle in range(round(LONGEST * self.rate)):
             now = cycle / self.rate
-            drive = safety.step(now, tuple(samples), effort, answered)
+            queue = [*queue, effort][-1 - self.late :]
+            drive = safety.step(now, tuple(samples), queue[0], answered)
             powered = self._exchange(device, drive, powered, samples, now)
             if not any(self.limits.is_silent(now, joint) for joint in samples):
                 position, velocity = [row.position for row in samples], [row.velocity for row in samples]

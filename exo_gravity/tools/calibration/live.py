@@ -29,17 +29,24 @@ from exo_gravity.tools.launcher import Launcher, Stopping, stop_on_signals
 KEPT = ("can_bridge", "simulator")  # the arm's nodes that run during a calibration, with the shared /imu
 POLL_PERIOD = 0.05  # s
 STOPPED = "stopped by Ctrl-C"
+ATTEMPTS = 3  # of a tour on the simulated device
+# Parts of log lines of a busy computer: the simulated device itself is never late.
+LATE = ("command_stale", "motor_silent", "no joint states for", "trunk tilt older", "was frozen for", "stalled for")
 
 Say = Callable[[str], None]
 
 
 @dataclass
 class LiveTour:
-    """What a tour measured so far. trouble: why it ended early, or ''. done: whether it is complete."""
+    """What a tour measured so far. trouble: why it ended early, or ''. done: whether it is complete.
+
+    was_late: whether this computer did not run the nodes in time.
+    """
 
     measured: list[Measured] = field(default_factory=list)
     trouble: str = ""
     done: bool = False
+    was_late: bool = False
 
 
 def tour_parameters(params: Path, arm: ConfiguredArm, changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -69,10 +76,21 @@ def run_tour(
 ) -> LiveTour:
     """Run `nodes`, the content of a parameter file, until the tour is done or has failed; the arm is then down.
 
-    options: output (the log is beside it) and record. Raises ParameterError for a wrong file.
+    options: output (the log is beside it) and record. A tour of the simulated device that this computer was too busy
+    for is repeated. Raises ParameterError for a wrong file.
     """
-    tour, stopping = LiveTour(), stopping or stop_on_signals()
-    last_errors: dict[str, str] = {}
+    stopping = stopping or stop_on_signals()
+    is_simulated = any(node.endswith("/simulator") for node in nodes)
+    for attempt in range(1, ATTEMPTS + 1):
+        tour = _run_once(options, nodes, say, stopping)
+        if not (is_simulated and tour.trouble and tour.was_late) or stopping.is_set() or attempt == ATTEMPTS:
+            break
+        say(f"this computer was too busy ({tour.trouble}): attempt {attempt + 1} of {ATTEMPTS}")
+    return tour
+
+
+def _run_once(options: argparse.Namespace, nodes: Mapping[str, Any], say: Say, stopping: Stopping) -> LiveTour:
+    tour, last_errors = LiveTour(), dict[str, str]()
     with tempfile.TemporaryDirectory() as folder, options.output.with_suffix(".log").open("a", 1) as log:
         path = Path(folder, "params.yaml")
         path.write_text(yaml.safe_dump(dict(nodes), sort_keys=False), encoding="utf-8")
@@ -82,6 +100,7 @@ def run_tour(
                 follow(tour, line, options.record, say)
                 return
             log.write(f"{datetime.now():%H:%M:%S.%f} {node.lstrip('/')} {line}\n")
+            tour.was_late = tour.was_late or any(sign in line for sign in LATE)
             if line.startswith(("FATAL ", "ERROR ")):
                 last_errors[node] = line.partition(" ")[2]
 

@@ -1,0 +1,218 @@
+"""A tour on the simulated device: what it measures, within which limits it moves, and what stops it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core.drive import State
+from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.faults import FaultCode
+from exo_gravity.core.limits import Limits
+from exo_gravity.core.moments import moments_of
+from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.tour_average import Sweep, average
+from exo_gravity.core.tour_control import MassMatrix
+from exo_gravity.core.tour_friction import fit_friction, friction_stations
+from exo_gravity.core.tour_guess import TorqueGuess
+from exo_gravity.core.tour_motion import ACCELERATION, MAX_SPEED, Line, Station
+from exo_gravity.core.tour_params import as_text, stations_of
+from exo_gravity.core.tour_poses import BestPoses, FixedStations, Progress, candidates, measurable
+from exo_gravity.sim import ArmConfig, SimulatedArm
+from exo_gravity.sim.arm import DEFAULT_LINKS
+
+from ..support.tour_run import MOTORS_AS_MOUNTED, NAMES, TourRun
+
+LIMITS = Limits(NAMES)
+POSE = Station((0.1, 0.5, 0.6, 0.7))
+SCALES = (0.8, 1.2, 0.9, 1.1)
+
+
+def expected(tour, links, scales=(1.0,) * 4):
+    """The commanded torque (n, 4) in Nm that holds the true arm in each measured pose."""
+    return np.array([gravity_torque(links, o.theta, o.direction) / scales for o, _ in tour.measured])
+
+
+def efforts(tour):
+    return np.array([o.effort for o, _ in tour.measured])
+
+
+@pytest.fixture(scope="module")
+def wrong_file():
+    """A tour of twelve poses of an arm whose masses, centres of gravity and torque scales differ from the file's."""
+    links = DEFAULT_LINKS
+    truth = ArmModel(links.length, links.cog * 0.9, links.mass * (1.2, 0.8, 1.15, 0.8))
+    motors = [replace(motor, torque_scale=scale) for motor, scale in zip(MOTORS_AS_MOUNTED, SCALES, strict=True)]
+    run = TourRun(truth=ArmConfig(truth), motors=motors)
+    return run, run.run(), truth
+
+
+def test_a_tour_of_twelve_poses_ends_hanging_within_four_minutes(wrong_file):
+    run, tour, _ = wrong_file
+    assert tour.trouble == "" and tour.done and len(tour.measured) == 12
+    assert tour.elapsed < 240.0
+    assert run.safety.fault is None and run.safety.state is State.DISABLED
+    np.testing.assert_allclose(run.log[-1][1:5], LIMITS.home, atol=0.1)
+
+
+def test_the_mean_of_both_directions_is_gravity_and_half_the_difference_is_friction(wrong_file):
+    _, tour, truth = wrong_file
+    error = efforts(tour) - expected(tour, truth, SCALES)
+    assert np.abs(error).max() < 0.02  # of up to 5 Nm
+    friction = np.median([o.friction for o, _ in tour.measured], axis=0)
+    np.testing.assert_allclose(friction * SCALES, (0.2, 0.4, 0.2, 0.2), atol=0.02)
+
+
+def test_errors_are_within_a_few_of_the_stated_standard_errors(wrong_file):
+    _, tour, truth = wrong_file
+    spread = np.array([o.spread for o, _ in tour.measured])
+    ratio = np.abs(efforts(tour) - expected(tour, truth, SCALES)) / spread
+    assert np.mean(ratio < 2.0) > 0.9 and ratio.max() < 6.0
+
+
+def test_a_tour_is_slow_and_no_limit_of_the_bridge_acts(wrong_file):
+    run, _, _ = wrong_file
+    positions = np.array(run.log)[:, 1:5]
+    assert run.fastest < 0.9  # for moments, where a light joint leaves its friction
+    assert np.abs(np.diff(positions[::50], axis=0)).max() / 0.5 < 1.3 * MAX_SPEED
+    assert not run.acted
+
+
+def test_a_hand_that_holds_the_arm_stops_the_tour_and_is_named():
+    run = TourRun(disturb=lambda time, device: (0.0, 0.0, -4.0, 0.0) if time > 18.0 else None)
+    tour = run.run()
+    assert tour.trouble.startswith("flexion: ") and "a hand" in tour.trouble and "the limit is" in tour.trouble
+    assert run.safety.fault.code is FaultCode.COMMAND_WITHDRAWN
+    assert np.abs(run.device.arm.positions[2]) < 0.3 and not run.device.powered
+    assert len(tour.measured) >= 1  # what was measured is kept
+
+
+def test_a_saturated_joint_is_told_with_its_limit():
+    limits = replace(LIMITS, max_effort=(3.0, 9.0, 1.0, 3.0))
+    tour = TourRun(limits=limits).run(FixedStations([Station((0.0, 0.3, 1.2, 0.2))]))
+    assert tour.trouble.startswith("flexion: saturated") and "max_effort = 1 Nm" in tour.trouble
+
+
+def test_a_silent_motor_ends_the_tour_by_the_bridges_fault_and_keeps_what_was_measured():
+    def unplug(time, device):
+        device.motors[1].unplugged = time > 25.0
+
+    run = TourRun(disturb=unplug)
+    tour = run.run()
+    assert run.safety.fault.code is FaultCode.MOTOR_SILENT and "abduction" in run.safety.fault.reason
+    assert tour.measured and not tour.done
+
+
+def test_a_joint_that_slips_between_two_passes_is_told():
+    """A slip shows as a torque that differs between two passes of the same angle."""
+
+    def slip(time, device):
+        return (0.0, 0.0, 1.0, 0.0) if time > 13.6 else None
+
+    tour = TourRun(disturb=slip).run(FixedStations([Station((0.0, 0.3, 0.5, 0.4), cycles=4)]))
+    assert tour.trouble.startswith("flexion: ") and "limit is" in tour.trouble
+    assert not tour.measured
+
+
+def test_joint_states_that_stop_and_a_stand_that_moves_are_told():
+    run = TourRun()
+    guess = TorqueGuess(DEFAULT_LINKS.length, moments_of(DEFAULT_LINKS), Tilt.of("right"), 9.81)
+    from exo_gravity.core.tour import Tour
+
+    for now, tilt, words in ((1.5, (0.0, 0.0), "no joint states for 500 ms"), (1.01, (0.2, 0.0), "tilted by 0.20 rad")):
+        tour = Tour(run.limits, guess, FixedStations([POSE]), 100.0)
+        assert tour.step(1.0, (0.0,) * 4, (0.0,) * 4, Tilt.of("right")) is not None
+        assert tour.step(now, (0.0,) * 4, (0.0,) * 4, Tilt.of("right", *tilt)) is None
+        assert words in tour.trouble
+
+
+def test_a_line_keeps_speed_and_acceleration_and_arrives():
+    line = Line(np.zeros(4), np.array((1.0, -0.5, 0.0, 0.2)))
+    times = np.arange(0.0, line.duration, 0.001)
+    positions, speeds = (np.array(column) for column in zip(*map(line.at, times), strict=True))
+    assert np.abs(speeds).max() <= MAX_SPEED + 1e-9
+    assert np.abs(np.diff(speeds, axis=0)).max() <= ACCELERATION * 0.001 + 1e-9
+    np.testing.assert_allclose(np.diff(positions, axis=0)[500:-500], 0.001 * speeds[500:-501], atol=1e-5)
+    np.testing.assert_allclose(line.at(math.inf)[0], (1.0, -0.5, 0.0, 0.2))
+
+
+def test_the_average_of_sweeps_separates_gravity_and_friction_at_different_angles():
+    slope, friction, sweeps = np.diag((1.0, 2.0, 3.0, 0.5)), np.array((0.2, 0.4, 0.1, 0.3)), []
+    for forward in (True, False, True, False):
+        sign = 1.0 if forward else -1.0
+        offset = sign * np.linspace(-0.03, 0.03, 60)[:, None] - sign * 0.01  # behind the reference
+        position = np.array((0.1, 0.2, 0.3, 0.4)) + offset
+        sweeps.append(Sweep(forward, position, 1.0 + position @ slope.T + sign * friction))
+    result = average(sweeps, slope)
+    np.testing.assert_allclose(result.friction, friction, atol=1e-9)
+    np.testing.assert_allclose(result.effort, 1.0 + slope @ result.theta, atol=1e-9)
+
+
+def test_the_expected_torque_learns_scale_and_moments_of_each_joint():
+    links = DEFAULT_LINKS
+    truth = ArmModel(links.length, links.cog * 0.9, links.mass * 1.2)
+    guess = TorqueGuess(links.length, moments_of(links), Tilt.of("right", 0.1), links.gravity)
+    poses = candidates(LIMITS)[:60]
+    torque = gravity_torque(truth, poses, guess.tilt.direction) / SCALES
+    before = guess.torques(poses)
+    for theta, effort in zip(poses[:10], torque[:10], strict=True):
+        guess.learn(theta, effort, (0.003,) * 4)
+    mean, deviation = guess.torques(poses)
+    assert np.abs(before[0] - torque).max() > 0.5 and np.abs(mean - torque).max() < 0.1
+    assert np.all(deviation <= before[1] + 1e-9)
+    np.testing.assert_allclose(guess.torque(poses[0].tolist()), mean[0], atol=1e-9)
+
+
+def test_the_mass_matrix_is_close_to_that_of_the_device():
+    import mujoco
+
+    arm, matrix = SimulatedArm(), MassMatrix(DEFAULT_LINKS.length, DEFAULT_LINKS.first_moment)
+    for theta in ((0.0,) * 4, (0.3, 0.8, 0.7, 0.5), (-0.5, 1.5, 1.2, 1.0)):
+        arm.reset(theta)
+        true = np.zeros((4, 4))
+        mujoco.mj_fullM(arm.model, arm.data, true)
+        np.testing.assert_allclose(matrix.at(theta), true, atol=0.012)
+
+
+def test_chosen_poses_are_within_the_limits_and_can_be_held():
+    guess = TorqueGuess(DEFAULT_LINKS.length, moments_of(DEFAULT_LINKS), Tilt.of("right"), 9.81)
+    itinerary = BestPoses(LIMITS, 4, 120.0)
+    low, high = measurable(LIMITS, POSE.amplitude)
+    taken = np.empty((0, 4))
+    while station := itinerary.next(taken, Progress(np.array(LIMITS.home), 10.0 * len(taken)), guess, (0.2,) * 4):
+        theta = np.array(station.theta)
+        assert np.all(theta >= low) and np.all(theta <= high)
+        assert np.all(np.abs(guess.torque(station.theta)) < 0.85 * np.array(LIMITS.max_effort))
+        taken = np.vstack((taken, theta))
+    assert len(taken) == 4
+
+
+def test_without_a_pose_that_the_motors_can_hold_the_tour_says_so():
+    weak = replace(LIMITS, max_effort=(0.1,) * 4)
+    guess = TorqueGuess(DEFAULT_LINKS.length, moments_of(DEFAULT_LINKS), Tilt.of("right"), 9.81)
+    with pytest.raises(DataError, match="max_effort"):
+        BestPoses(weak, 4, 120.0).next(np.zeros((1, 4)), Progress(np.zeros(4), 0.0), guess, (0.0,) * 4)
+
+
+def test_friction_over_speed_is_fitted_with_and_without_stribeck():
+    speed = np.array((0.02, 0.05, 0.1, 0.18, 0.3))
+    plain = fit_friction(speed, 0.2 + 0.05 * speed)
+    assert plain.stribeck == 0.0
+    np.testing.assert_allclose((plain.coulomb, plain.viscous), (0.2, 0.05), atol=1e-9)
+    fit = fit_friction(speed, 0.2 + 0.05 * speed + 0.1 * np.exp(-((speed / 0.05) ** 2)))
+    np.testing.assert_allclose(fit.at(speed), 0.2 + 0.05 * speed + 0.1 * np.exp(-((speed / 0.05) ** 2)), atol=0.005)
+    assert fit.coulomb == pytest.approx(0.2, abs=0.01)
+    with pytest.raises(DataError, match="at 1 speeds"):
+        fit_friction(speed[:1], speed[:1])
+
+
+def test_stations_survive_the_parameter_and_are_checked():
+    stations = friction_stations(LIMITS)
+    assert stations_of(as_text(stations), LIMITS) == stations
+    for text in ("[", "[[1]]", as_text([Station((0.0, 0.0, 0.0, 3.1))]), as_text([Station(POSE.theta, speed=0.5)])):
+        with pytest.raises(ParameterError, match=r"tour\.stations"):
+            stations_of(text, LIMITS)
