@@ -148,8 +148,6 @@ def _rows(observations: Sequence[Observation], length: Vector, gravity: float) -
     beside = np.zeros((*load.shape, 3))
     for angle, (across, along) in enumerate(BESIDE):
         beside[:, across, angle] = load[:, along]
-    # A pose whose efforts happen to agree is no better known than others.
-    spread = np.maximum(spread, np.median(spread, axis=0) / 2.0)
     return Rows(
         regressor(theta, direction, gravity),
         load,

@@ -22,6 +22,7 @@ SILENT = 0.01  # Nm by which the effort must differ between poses where gravity'
 EXPECTED = 0.3  # Nm
 MISFIT = 0.1  # of the peak effort
 LEAST_MISFIT = 0.1  # Nm
+LEAST_ZERO_ERROR = 0.5  # deg worth a sentence
 # Unknowns of joint 1, which carries nothing while its axis is vertical.
 FIRST_JOINT = (0, MOMENTS.index("W"), SCALE.start, OFFSET.start)
 PER_JOINT = tuple(f"{what} {n + 1}" for what in ("torque scale", "offset") for n in range(JOINT_COUNT))
@@ -123,7 +124,7 @@ def untold(unknowns: np.ndarray, error: np.ndarray, hidden: np.ndarray, relative
             f"{angle:+.1f} degrees; check the zero with a level or at a stop."
         )
     elbow, elbow_error = math.degrees(unknowns[ANGLE][0]), math.degrees(error[ANGLE][0])
-    if elbow and abs(elbow) > 2.0 * elbow_error:
+    if elbow and abs(elbow) > max(3.0 * elbow_error, LEAST_ZERO_ERROR):
         said.append(
             f"The weight at the elbow speaks for joint 3's zero being {elbow:+.1f} +- {elbow_error:.1f} degrees off."
         )

@@ -155,7 +155,7 @@ def _mjcf(config: ArmConfig) -> str:
         body = f"""
             <body pos="{position} 0 0" euler="{alpha} 0 {_OFFSET[n]}">
               <joint axis="0 0 1" armature="{config.rotor_inertia[n]}" damping="{config.viscous_friction[n]}"
-                frictionloss="{config.coulomb_friction[n] + config.stribeck_friction[n]}" {_FRICTION_STIFFNESS}
+                frictionloss="{config.coulomb_friction[n]}" {_FRICTION_STIFFNESS}
                 range="{config.position_min[n]} {config.position_max[n]}" {_STOP_STIFFNESS}/>
               {_tube(links.length[n], _centre(config, n), links.mass[n])}{worn}{body}
             </body>"""

@@ -85,6 +85,14 @@ def test_with_a_weight_no_singular_value_is_small():
     assert not any("common factor" in sentence for sentence in found.unknown)
 
 
+def test_a_light_weight_leaves_moments_and_scales_as_uncertain_as_each_other():
+    device = Device(3)
+    light = [device.observe(theta, weight=(0.05, 0.25)) for theta in best(LEANING, 4, WEIGHT)]
+    found = identify(device.tour(weighed=0) + light, LENGTH)
+    assert found.scale_error[1] > 0.01 * found.scale[1]
+    assert found.error[2] / found.moments[2] == pytest.approx(found.scale_error[2] / found.scale[2], rel=0.2)
+
+
 def test_with_an_upright_stand_joint_1_is_not_known_and_said_to_be():
     device = Device(4)
     found = identify(device.tour(UPRIGHT), LENGTH)
@@ -116,8 +124,17 @@ def test_a_zero_that_is_off_looks_like_a_moment_across_the_link_and_the_torque_i
     assert any("Y4 of link 4 from an error of joint 4's zero" in sentence for sentence in found.unknown)
 
 
+def test_a_weight_shows_an_error_of_joint_3s_zero():
+    observations = [o._replace(theta=np.subtract(o.theta, (0.0, 0.0, 0.05, 0.0))) for o in Device(17).tour()]
+    found = identify(observations, LENGTH)
+    said = next(sentence for sentence in found.unknown if "zero being" in sentence)
+    assert float(said.split("being ")[1].split()[0]) == pytest.approx(np.degrees(0.05), abs=1.0)
+    assert not any("zero being" in sentence for sentence in identify(Device(17).tour(), LENGTH).unknown)
+
+
 def test_a_wearer_is_found_with_the_scales_of_the_bare_arm():
     device = Device(13)
+    device.offset[:] = 0.1, 0.3, 0.3, 0.1
     bare = identify(device.tour(), LENGTH)
     worn = load_moments(LENGTH, 1.6, 0.18) + np.array((0.0, 0.0, 2.0 * 0.16, 0.0, 0.0, 0.0, 0.0, 0.0))
     observations = [device.observe(theta, UPRIGHT, added=worn) for theta in best(UPRIGHT, 3)]

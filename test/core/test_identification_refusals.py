@@ -7,6 +7,7 @@ import pytest
 
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.identification import identify, next_pose
+from exo_gravity.core.identification_check import check_physical
 
 from ..support.random_device import LEANING, LENGTH, Device, best
 
@@ -45,7 +46,9 @@ def test_poses_that_do_not_fit_one_arm_are_refused_together(bare, spoilt, words)
 def test_too_few_poses_are_refused_with_the_pose_that_is_missing_and_accepted_with_it():
     device = Device(8)
     observations = [device.observe(theta) for theta in best(LEANING, 2)]
-    for _ in range(6):
+    with pytest.raises(DataError, match="2 poses do not tell"):
+        identify(observations, LENGTH)
+    for _ in range(4):
         try:
             found = identify(observations, LENGTH)
             break
@@ -60,6 +63,24 @@ def test_a_silent_motor_is_told_and_not_fitted():
     observations = [o._replace(effort=np.multiply(o.effort, (1, 1, 0, 1))) for o in Device(9).tour()]
     with pytest.raises(DataError, match=r"joint 3: the effort is 0\.00 Nm in every pose: a silent motor"):
         identify(observations, LENGTH)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({2: (0.2, 0.3)}, r"M3 = 0.200 kg m is not known better than 0.300: add the pose \["),
+        ({3: (-0.03, 0.001)}, "M4 = -0.030 kg m: must be positive: check direction and zero of joint 4"),
+        ({7: (0.06, 0.001)}, "Y4 = 0.060 kg m exceeds M4: the zero of joint 4 seems 63 degrees off"),
+        ({6: (-0.3, 0.001)}, "Y3 = -0.300 kg m exceeds M3: the zero of joint 3 seems -56 degrees off"),
+    ],
+)
+def test_moments_that_no_arm_has_are_refused_with_what_to_check(changes, words):
+    moments, error = np.array((0.1, 0.2, 0.2, 0.03, 0.0, 0.0, 0.0, 0.0)), np.full(8, 0.001)
+    check_physical(moments, error, np.ones(4), np.array(LEANING), 9.8)
+    for index, (value, uncertain) in changes.items():
+        moments[index], error[index] = value, uncertain
+    with pytest.raises(DataError, match=words):
+        check_physical(moments, error, np.ones(4), np.array(LEANING), 9.8)
 
 
 @pytest.mark.parametrize("factor", [-1.0, 0.2, 5.0])
