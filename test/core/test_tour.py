@@ -29,7 +29,7 @@ from ..support.tour_run import MOTORS_AS_MOUNTED, NAMES, TourRun
 
 LIMITS = Limits(NAMES)
 POSE = Station((0.1, 0.5, 0.6, 0.7))
-SCALES = (0.8, 1.2, 0.9, 1.1)
+SCALES = (0.8, 1.2, 0.9, 1.0)
 
 
 def expected(tour, links, scales=(1.0,) * 4):
@@ -82,12 +82,24 @@ def test_a_tour_is_slow_and_no_limit_of_the_bridge_acts(wrong_file):
     assert not run.acted
 
 
+class Grip:
+    """A hand that holds joint 3 where it was at `start` s, with a spring of 60 Nm/rad and the damping of an arm."""
+
+    def __init__(self, start):
+        self.start, self.held = start, None
+
+    def __call__(self, time, device):
+        if time < self.start:
+            return None
+        self.held = device.arm.positions[2] if self.held is None else self.held
+        return 0.0, 0.0, 60.0 * (self.held - device.arm.positions[2]) - 3.0 * device.arm.velocities[2], 0.0
+
+
 def test_a_hand_that_holds_the_arm_stops_the_tour_and_is_named():
-    run = TourRun(disturb=lambda time, device: (0.0, 0.0, -4.0, 0.0) if time > 18.0 else None)
+    run = TourRun(disturb=Grip(18.0))
     tour = run.run()
     assert tour.trouble.startswith("flexion: ") and "a hand" in tour.trouble and "the limit is" in tour.trouble
-    assert run.safety.fault.code is FaultCode.COMMAND_WITHDRAWN
-    assert np.abs(run.device.arm.positions[2]) < 0.3 and not run.device.powered
+    assert run.safety.fault.code is FaultCode.COMMAND_WITHDRAWN and not run.device.powered
     assert len(tour.measured) >= 1  # what was measured is kept
 
 
@@ -111,10 +123,10 @@ def test_a_joint_that_slips_between_two_passes_is_told():
     """A slip shows as a torque that differs between two passes of the same angle."""
 
     def slip(time, device):
-        return (0.0, 0.0, 1.0, 0.0) if time > 13.6 else None
+        return 0.0, 0.0, min(0.5, 0.2 * max(0.0, time - 10.0)), 0.0
 
     tour = TourRun(disturb=slip).run(FixedStations([Station((0.0, 0.3, 0.5, 0.4), cycles=4)]))
-    assert tour.trouble.startswith("flexion: ") and "limit is" in tour.trouble
+    assert tour.trouble.startswith("flexion: ") and "between two passes" in tour.trouble
     assert not tour.measured
 
 
@@ -162,7 +174,7 @@ def test_the_expected_torque_learns_scale_and_moments_of_each_joint():
     for theta, effort in zip(poses[:10], torque[:10], strict=True):
         guess.learn(theta, effort, (0.003,) * 4)
     mean, deviation = guess.torques(poses)
-    assert np.abs(before[0] - torque).max() > 0.5 and np.abs(mean - torque).max() < 0.1
+    assert np.abs(before[0] - torque).max() > 0.4 and np.abs(mean - torque).max() < 0.1
     assert np.all(deviation <= before[1] + 1e-9)
     np.testing.assert_allclose(guess.torque(poses[0].tolist()), mean[0], atol=1e-9)
 
