@@ -8,6 +8,9 @@ import pytest
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.identification import identify, next_pose
 from exo_gravity.core.identification_check import check_physical
+from exo_gravity.core.moments import regressor
+from exo_gravity.core.pose_choice import TYPICAL_MOMENTS, missing_pose
+from exo_gravity.core.pose_fit import COUNT
 
 from ..support.random_device import LEANING, LENGTH, Device, best
 
@@ -57,6 +60,14 @@ def test_too_few_poses_are_refused_with_the_pose_that_is_missing_and_accepted_wi
             degrees = str(error).split("add the pose [")[1].split("]")[0].split(",")
             observations.append(device.observe(np.radians([float(angle) for angle in degrees])))
     assert np.all(np.abs(found.moments[1:4]) > found.error[1:4])
+
+
+@pytest.mark.parametrize(("moment", "joint"), [(1, 1), (2, 2), (3, 3)])
+def test_the_missing_pose_shows_the_moment_that_is_missing(moment, joint):
+    hidden = np.arange(COUNT) == moment
+    pose = missing_pose(hidden, LEANING, np.array(TYPICAL_MOMENTS), 9.8)
+    theta = np.radians([float(angle) for angle in pose.split("[")[1].split("]")[0].split(",")])
+    assert np.abs(regressor(theta, LEANING, 9.8)[0, joint, moment]) > 0.8 * 9.8
 
 
 def test_a_silent_motor_is_told_and_not_fitted():
