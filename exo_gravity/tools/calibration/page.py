@@ -95,7 +95,7 @@ def _creep(table: TorqueTable) -> str:
 def _moments(result: Identified) -> str:
     unit = "kg m, of commanded torque" if result.relative else "kg m"
     rows = (
-        [name, f"{value:.4f}", f"±{error:.4f}" if math.isfinite(error) else "not told"]
+        [name, f"{value:.4f}", f"±{error:.5f}" if math.isfinite(error) else "not told"]
         for name, value, error in zip(MOMENTS, result.moments, result.error, strict=True)
     )
     scales = " ".join(f"{s:.3f} ±{e:.3f}" for s, e in zip(result.scale, result.scale_error, strict=True))
@@ -113,15 +113,13 @@ def _untold(outcome: Outcome) -> Iterator[str]:
     yield list_html("What these poses do not tell", [*result.unknown, f"Singular values of the information: {values}"])
     yield list_html("Poses left out", [f"pose {index + 1}: {reason}" for index, reason in result.rejected])
     if outcome.suggestion is not None:
-        pose = " ".join(f"{math.degrees(angle):.0f}" for angle in outcome.suggestion)
-        yield f"<p><b>Next best pose</b>, if more is wanted: {pose} degrees.</p>"
+        yield f"<p><b>Next best pose</b>, if more is wanted: {_degrees(outcome.suggestion)} degrees.</p>"
 
 
 def _poses(table: TorqueTable, labels: Sequence[str]) -> str:
     heads = "".join(f"<th>{head}</th>" for head in POSE_COLUMNS)
     bodies = []
     for number, theta in enumerate(table.theta):
-        pose = " ".join(f"{math.degrees(angle):.0f}" for angle in theta)
         lines = []
         for joint, (label, colour) in enumerate(zip(labels, JOINT_COLOURS, strict=True)):
             columns = (table.measured, table.before, table.after, table.held_out)
@@ -136,12 +134,18 @@ def _poses(table: TorqueTable, labels: Sequence[str]) -> str:
             numbers = "".join(f"<td>{cell}</td>" for cell in cells)
             lines.append(f'<td class="joint" style="--c:{colour}">{escape(label)}</td>{numbers}')
         left_out = "" if table.used[number] else "<br>left out"
-        head = f'<td rowspan="{len(lines)}">{number + 1}</td><td rowspan="{len(lines)}">{pose}{left_out}</td>'
+        head = (
+            f'<td rowspan="{len(lines)}">{number + 1}</td><td rowspan="{len(lines)}">{_degrees(theta)}{left_out}</td>'
+        )
         bodies.append(f"<tbody><tr>{head}{'</tr><tr>'.join(lines)}</tr></tbody>")
     return (
         f'<div class="scroll"><table><thead><tr><th>Pose</th><th>deg</th><th></th>{heads}</tr></thead>'
         f"{''.join(bodies)}</table></div>"
     )
+
+
+def _degrees(theta: Iterable[float]) -> str:
+    return " ".join(str(round(math.degrees(angle))) for angle in theta)
 
 
 def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
