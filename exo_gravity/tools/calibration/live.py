@@ -30,7 +30,7 @@ KEPT = ("can_bridge", "simulator")  # the arm's nodes that run during a calibrat
 POLL_PERIOD = 0.05  # s
 STOPPED = "stopped by Ctrl-C"
 ATTEMPTS = 3  # of a tour on the simulated device
-# Parts of log lines of a busy computer: the simulated device itself is never late.
+# Parts of the lines of nodes on a busy computer: the simulated device itself is never late.
 LATE = ("command_stale", "motor_silent", "no joint states for", "trunk tilt older", "was frozen for", "stalled for")
 
 Say = Callable[[str], None]
@@ -140,6 +140,7 @@ def follow(tour: LiveTour, line: str, record: Path, say: Say) -> None:
             say(event["progress"])
         elif event.get("trouble"):
             tour.trouble = tour.trouble or event["trouble"]
+            tour.was_late = tour.was_late or any(sign in line for sign in LATE)
         elif event.get("done"):
             tour.done = True
 
@@ -155,5 +156,5 @@ def refusals_of(tour: LiveTour, record: Path) -> tuple[str, ...]:
     """Return why the tour did not complete, and where its observations are; () if it did."""
     if not tour.trouble:
         return ()
-    kept = f" {len(tour.measured)} observations are kept in {record}." if tour.measured else ""
-    return (f"{tour.trouble}.{kept}",)
+    kept = f"; {len(tour.measured)} observations are kept in {record}" if tour.measured else ""
+    return (f"{tour.trouble}{kept}",)

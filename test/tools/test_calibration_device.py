@@ -1,0 +1,85 @@
+"""Simulated devices with a wrong parameter file: a tour, the identification and the new values, from start to end."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core.recording import Recording
+from exo_gravity.core.tour_friction import friction_stations
+from exo_gravity.core.tour_poses import BestPoses, FixedStations
+from exo_gravity.sim import ArmConfig
+from exo_gravity.sim.arm import DEFAULT_LINKS
+from exo_gravity.tools.calibration import friction, gravity, recorded
+from exo_gravity.tools.inputs.arms import configured_arm
+from exo_gravity.tools.inputs.parameter_file import packaged_config
+
+from ..support.tour_run import MOTORS_AS_MOUNTED, TourRun
+
+ARM = configured_arm(packaged_config("sim.yaml"))
+MASS = DEFAULT_LINKS.mass * (1.2, 0.8, 1.15, 0.85)
+TRUTH = ArmModel(DEFAULT_LINKS.length, DEFAULT_LINKS.cog * 0.9, MASS)
+SCALES = (0.85, 1.15, 0.9, 1.0)
+FRICTION = np.array((0.2, 0.4, 0.2, 0.2))
+
+
+def device(**changes):
+    """A device of the true arm and scales, whose controller assumes the file's."""
+    motors = [replace(motor, torque_scale=scale) for motor, scale in zip(MOTORS_AS_MOUNTED, SCALES, strict=True)]
+    return TourRun(truth=changes.pop("truth", ArmConfig(TRUTH)), motors=motors, **changes)
+
+
+@pytest.fixture(scope="module")
+def tours():
+    """A tour of eight poses without a weight, and one with 0.5 kg at 0.25 m."""
+    weight = (0.5, 0.25)
+    loaded = ArmConfig(TRUTH, wearer_mass=(0.0, 0.0, 0.0, weight[0]), wearer_cog=(0.0, 0.0, 0.0, weight[1]))
+    runs = device(), device(truth=loaded, load=weight)
+    return [(run, run.run(BestPoses(run.limits, 8, 160.0))) for run in runs]
+
+
+def test_two_tours_with_and_without_a_weight_give_kilograms_and_true_scales(tours):
+    assert [tour.trouble for _, tour in tours] == ["", ""]
+    outcome = gravity.solve(ARM, [one.observation for _, tour in tours for one in tour.measured])
+    assert outcome.refusals == ()
+    found = outcome.identified
+    error = np.abs(found.moments[1:4] - TRUTH.first_moment[1:])
+    assert np.all(error < np.maximum(0.02 * np.array(TRUTH.first_moment[1:]), 2.0 * found.error[1:4]))
+    np.testing.assert_allclose(found.scale[1:], SCALES[1:], rtol=0.02)
+    # The remainder is a small part of friction: an arm with these values stays where it is let go.
+    poses = np.random.default_rng(2).uniform((-1.0, 0.1, -0.3, 0.1), (1.0, 1.4, 1.4, 1.6), (50, 4))
+    direction = tours[0][1].measured[0].observation.direction
+    new = ArmModel.from_moments(ARM.robot.length, found.moments[:4], found.moments[4:])
+    remainder = gravity_torque(TRUTH, poses, direction) - gravity_torque(new, poses, direction)
+    assert np.abs(remainder).max() < 0.2 * FRICTION.min()
+
+
+def test_the_recording_of_a_tour_gives_the_same_torques(tours):
+    run, tour = tours[0]
+    table = np.array(run.log)
+    nothing = np.full((len(table), 4), np.nan)
+    recording = Recording("right", ARM.joint_names, table[:, 0], table[:, 1:5], nothing, nothing, table[:, 5:9])
+    found = list(recorded._sweeps(recording, replace(ARM, compensator={**ARM.compensator, "use_imu": False}), None))
+    assert len(found) >= 10  # up to two for each pose; none where a joint sticks for a moment
+    for one in found:
+        poses = [measured.observation for measured in tour.measured]
+        same = min(poses, key=lambda o: np.abs(np.subtract(o.theta, one.theta)).max())
+        np.testing.assert_allclose(one.theta, same.theta, atol=0.02)
+        np.testing.assert_allclose(one.effort, same.effort, atol=0.06)
+        np.testing.assert_allclose(one.friction, same.friction, atol=0.06)
+
+
+def test_sweeps_at_five_speeds_give_the_friction_of_each_joint():
+    truth = ArmConfig(TRUTH, coulomb_friction=(0.25, 0.35, 0.18, 0.22), viscous_friction=(0.1, 0.2, 0.1, 0.1))
+    run = TourRun(truth=truth)
+    tour = run.run(FixedStations(friction_stations(run.limits)))
+    assert tour.trouble == ""
+    outcome = friction.solve(ARM, tour.measured)
+    assert outcome.refusals == ()
+    speed = outcome.curves[0].speed
+    for joint, curve in enumerate(outcome.curves):
+        true = truth.coulomb_friction[joint] + truth.viscous_friction[joint] * speed
+        np.testing.assert_allclose(curve.fit[speed >= 0.05], true[speed >= 0.05], atol=0.02)
