@@ -99,9 +99,11 @@ def _moments(result: Identified) -> str:
         for name, value, error in zip(MOMENTS, result.moments, result.error, strict=True)
     )
     scales = " ".join(f"{s:.3f} ±{e:.3f}" for s, e in zip(result.scale, result.scale_error, strict=True))
+    offsets = " ".join(f"{offset:+.3f}" for offset in result.offset)
     return (
         f"<h3>First moments</h3>{_table(('', unit, 'standard error'), rows)}"
         f"<p>True torque per commanded torque{', relative' if result.relative else ''}: {scales}</p>"
+        f"<p>Constant offset of the motors, for which there is no parameter: {offsets} Nm</p>"
     )
 
 
