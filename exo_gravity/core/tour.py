@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.arm import JOINT_COUNT
-from exo_gravity.core.errors import DataError
+from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.gravity import Torque
 from exo_gravity.core.identification import Observation
 from exo_gravity.core.limits import Limits
@@ -43,7 +43,7 @@ class Measured(NamedTuple):
 
 
 class Tour:
-    """One tour. Call `wait` for each joint state until the arm is carried, then `step`.
+    """One tour. Call `wait` for each joint state until the arm is carried, then `step`; and `plan` again and again.
 
     measured: so far. trouble: why it ended early, or ''. done: whether the arm hangs again after the last pose.
     progress: what it does, as a sentence. elapsed: s since the first step.
@@ -70,6 +70,8 @@ class Tour:
         self._line_time = 0.0  # s
         self._pause = 0.0  # s after the line
         self._skipped = 0  # poses
+        self._awaits_plan = False
+        self._plan: tuple[Station | None, str] | None = None  # the next pose, None for home, or why there is none
         self._is_sweeping = False
         self._visit: Visit | None = None
         self._friction = [0.0] * JOINT_COUNT  # Nm, 0 until it is measured
@@ -93,7 +95,7 @@ class Tour:
             self._watch = Watch(self._limits.joint_names, self._limits.max_effort, tilt)
             self._now = now
             self._guess.tilt = tilt
-            self._go_on(np.array(position))
+            self._await_plan(np.array(position))
         dt, self._now = now - self._now, now
         self.elapsed += dt
         self._guess.tilt = tilt
@@ -127,6 +129,10 @@ class Tour:
     def _next_line(self) -> None:
         """Begin the next sweep, or after the last one the way to the next pose."""
         end = self._line.at(math.inf)[0]
+        if self._awaits_plan:
+            if self._plan:
+                self._go_on(end, *self._plan)
+            return
         if self._visit is None:
             if not self.done:
                 self.done, self.progress = True, "done"
@@ -140,7 +146,7 @@ class Tour:
         if self.trouble:
             return
         if self._visit.is_complete or self._visit.has_failed:
-            self._go_on(end)
+            self._await_plan(end)
         else:
             self._start(self._visit.line, 0.0, is_sweeping=True)
 
@@ -187,14 +193,28 @@ class Tour:
         after, before = (self._guess.torques(np.array(station.theta) + sign * steps)[0] for sign in (1.0, -1.0))
         return np.asarray((after - before).T / (2.0 * ANGLE_STEP))
 
-    def _go_on(self, position: np.ndarray) -> None:
-        """Begin the way from `position` to the next pose, or home after the last."""
-        taken = np.array([measured.observation.theta for measured in self.measured])
-        try:
-            station = self._itinerary.next(taken, Progress(position, self.elapsed), self._guess, self._friction)
-        except DataError as error:
-            self.trouble = str(error)
+    def plan(self) -> None:
+        """Choose the next pose if one is due. It takes 0.1 s and more: not on the thread of `step`."""
+        if not self._awaits_plan or self._plan:
             return
+        taken = np.array([measured.observation.theta for measured in self.measured]).reshape(-1, JOINT_COUNT)
+        progress = Progress(self._line.at(math.inf)[0], self.elapsed)
+        try:
+            self._plan = (self._itinerary.next(taken, progress, self._guess, self._friction), "")
+        except ExoGravityError as error:
+            self._plan = (None, str(error))
+
+    def _await_plan(self, position: np.ndarray) -> None:
+        """Hold the arm at `position` until the next pose is chosen."""
+        self._visit = None
+        self._start(Line(position, position), 0.0)
+        self._plan = None
+        self._awaits_plan = True
+
+    def _go_on(self, position: np.ndarray, station: Station | None, trouble: str) -> None:
+        """Begin the way from `position` to the next pose, or home after the last."""
+        self._awaits_plan = False
+        self.trouble = trouble
         if station:
             angles = " ".join(f"{math.degrees(angle):.0f}" for angle in station.theta)
             self.progress = f"pose {len(self.measured) + 1} of {self._itinerary.count}: {angles} deg"

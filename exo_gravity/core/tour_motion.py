@@ -39,6 +39,14 @@ class Station(NamedTuple):
         return 2 * self.cycles * Line(self.low, self.high, self.speed).duration
 
 
+def durations(ways: np.ndarray) -> np.ndarray:
+    """Return the time (n,) in s of motions by `ways` (n, 4) rad."""
+    length = np.abs(ways).max(axis=1)
+    speed = np.minimum(MAX_SPEED, np.sqrt(length * ACCELERATION))
+    steady = np.divide(length, speed, out=np.zeros_like(length), where=length > 0.0)
+    return np.asarray(steady + speed / ACCELERATION)
+
+
 class Line:
     """The motion from `start` to `end`, (4,) rad; the joint with the longest way turns at `speed` rad/s at most.
 

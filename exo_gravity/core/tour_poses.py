@@ -13,7 +13,7 @@ from exo_gravity.core.errors import DataError
 from exo_gravity.core.identification import next_pose
 from exo_gravity.core.limits import WALL_WIDTH, Limits
 from exo_gravity.core.tour_guess import TorqueGuess
-from exo_gravity.core.tour_motion import Line, Station
+from exo_gravity.core.tour_motion import Station, durations
 
 CANDIDATES = 800
 MOST_UPWARDS = 0.3  # sine of the largest angle above the horizontal, of links 3 and 4
@@ -104,12 +104,11 @@ class BestPoses:
     def _is_in_time(self, count: int, progress: Progress) -> np.ndarray:
         """Return which candidates (n,) leave enough time for the others and for the way home."""
         sweeps = Station(tuple(self._home.tolist())).duration
-        home = [Line(pose, self._home).duration for pose in self._candidates]
-        way = [Line(progress.position, pose).duration for pose in self._candidates]
+        home, way = (durations(self._candidates - pose) for pose in (self._home, progress.position))
         left = self.count - count
-        budget = (self.duration - progress.elapsed - np.array(home)) / left
-        fits = np.add(way, sweeps) <= budget * (TIME_SHARE if left > 1 else 1.0)
-        return fits if fits.any() else np.add(way, home) <= np.min(np.add(way, home)) + 1.0
+        budget = (self.duration - progress.elapsed - home) / left
+        fits = way + sweeps <= budget * (TIME_SHARE if left > 1 else 1.0)
+        return np.asarray(fits if fits.any() else way + home <= (way + home).min() + 1.0)
 
     def _is_holdable(
         self, poses: np.ndarray, start: np.ndarray, guess: TorqueGuess, friction: Sequence[float]

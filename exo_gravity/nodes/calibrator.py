@@ -38,6 +38,7 @@ from exo_gravity.nodes.run import run
 from exo_gravity.nodes.sole_publisher import SolePublisher
 
 REPORT_PERIOD = 0.1  # s
+PLAN_PERIOD = 0.05  # s
 
 
 class CalibratorNode(Node):
@@ -69,6 +70,8 @@ class CalibratorNode(Node):
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self.create_timer(REPORT_PERIOD, self._report)
         self._joint_states.start()
+        self._stopping = threading.Event()
+        threading.Thread(target=self._plan, daemon=True).start()
 
     @property
     def failure(self) -> Exception | None:
@@ -77,8 +80,14 @@ class CalibratorNode(Node):
 
     def close(self) -> None:
         """Stop answering joint states, and report what is still unreported."""
+        self._stopping.set()
         self._joint_states.stop()
         self._report()
+
+    def _plan(self) -> None:
+        """Choose poses on a thread of its own: neither joint states nor tilts may wait for it."""
+        while not self._stopping.wait(PLAN_PERIOD):
+            self._tour.plan()
 
     def _on_joint_states(self, message: JointState, info: dict[str, Any]) -> None:
         self._command.header.stamp = message.header.stamp

@@ -97,6 +97,7 @@ class TourRun:
                         device.start(Hand(self.disturb, device))
                     self.fastest = max(self.fastest, *map(abs, device.arm.velocities))
                     effort = tour.step(now, position, velocity, tilt)
+                    tour.plan()
                     self.log.append((now, *device.arm.positions, *(effort or (0.0,) * 4)))
                 elif not began:
                     effort = tour.wait(position, tilt)
