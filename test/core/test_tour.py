@@ -15,6 +15,7 @@ from exo_gravity.core.faults import FaultCode
 from exo_gravity.core.limits import Limits
 from exo_gravity.core.moments import moments_of
 from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.tour import Tour
 from exo_gravity.core.tour_average import Sweep, average
 from exo_gravity.core.tour_control import MassMatrix
 from exo_gravity.core.tour_friction import fit_friction, friction_stations
@@ -133,13 +134,21 @@ def test_a_joint_that_slips_between_two_passes_is_told():
 def test_joint_states_that_stop_and_a_stand_that_moves_are_told():
     run = TourRun()
     guess = TorqueGuess(DEFAULT_LINKS.length, moments_of(DEFAULT_LINKS), Tilt.of("right"), 9.81)
-    from exo_gravity.core.tour import Tour
-
     for now, tilt, words in ((1.5, (0.0, 0.0), "no joint states for 500 ms"), (1.01, (0.2, 0.0), "tilted by 0.20 rad")):
         tour = Tour(run.limits, guess, FixedStations([POSE]), 100.0)
         assert tour.step(1.0, (0.0,) * 4, (0.0,) * 4, Tilt.of("right")) is not None
         assert tour.step(now, (0.0,) * 4, (0.0,) * 4, Tilt.of("right", *tilt)) is None
         assert words in tour.trouble
+
+
+def test_the_arm_is_held_until_the_next_pose_is_chosen():
+    guess = TorqueGuess(DEFAULT_LINKS.length, moments_of(DEFAULT_LINKS), Tilt.of("right"), 9.81)
+    tour = Tour(LIMITS, guess, FixedStations([POSE]), 100.0)
+    for cycle in range(200):
+        assert tour.step(0.01 * cycle, (0.0,) * 4, (0.0,) * 4, Tilt.of("right")) == pytest.approx((0.0,) * 4, abs=0.01)
+    tour.plan()
+    efforts = [tour.step(2.0 + 0.01 * i, (0.0,) * 4, (0.0,) * 4, Tilt.of("right")) for i in range(30)]
+    assert efforts[-1][3] > 0.05 and "pose 1 of 1" in tour.progress
 
 
 def test_a_line_keeps_speed_and_acceleration_and_arrives():
