@@ -97,14 +97,14 @@ class BusScan:
         found: dict[int, Answer] = {}
         problems: dict[str, None] = {}
         for can_id in can_ids:
-            for _ in range(ATTEMPTS):
+            for sent in range(1, ATTEMPTS + 1):
                 replies, others = self._ask(can_id)
                 for reply_id, data in others:
                     if problem := _problem(can_id, reply_id, data):
                         problems[problem] = None
                     elif data[0] < can_id:
                         found.setdefault(data[0], _answer(reply_id, data))  # a late reply
-                if len(replies) > 1:
+                if len(replies) > sent:  # a late reply to the first command may arrive after the second
                     problems[f"ID {can_id}: several replies to one command: {_shared(replies)}"] = None
                 if replies:
                     found[can_id] = replies[0]

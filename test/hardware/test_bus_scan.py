@@ -173,3 +173,19 @@ def test_a_v3_board_is_told_by_its_status_frames(address: Address) -> None:
         assert bus.scan(range(1, 4)).problems == (
             "ID 5: sends the status frames of a V3 board, whose wire format is not supported",
         )
+
+
+def test_a_late_reply_is_not_taken_for_a_second_motor(address: Address) -> None:
+    reply = frame(3, bytes((3, 0x80, 0, 0x80, 8, 0)))
+    asked: list[can.Message] = []
+
+    def late(message: can.Message) -> list[can.Message]:
+        if message.arbitration_id != 3:
+            return []
+        asked.append(message)
+        return [reply, reply] if len(asked) == 2 else []
+
+    with responder(address, late), BusScan(address) as bus:
+        answers, problems = bus.scan(range(1, 6))
+    assert [answer.can_id for answer in answers] == [3]
+    assert problems == ()
