@@ -44,9 +44,7 @@ def make_bridge(rig: SimulatedRig, monkeypatch: pytest.MonkeyPatch) -> Iterator[
     """A function that makes a bridge of the simulated arm, which needs no efforts from outside."""
     bridges: list[CanBridge] = []
     command = EffortCommand(NOTHING, 0.0)
-    monkeypatch.setattr(
-        EffortExchange, "get_efforts", lambda self, latest: command._replace(answered=time.monotonic())
-    )
+    monkeypatch.setattr(EffortExchange, "get_efforts", lambda self, latest: command._replace(answered=time.monotonic()))
 
     def make_bridge(autostart: bool = False) -> CanBridge:
         parameters = {
