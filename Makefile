@@ -2,6 +2,7 @@
 # make test         all tests
 # make lint         ruff, mypy, ament's flake8 and pep257, shellcheck
 # make faults       the whole fault matrix on the simulated device, 11 minutes; a table and build/faults.json
+# make mutations    deliberate defects, each of which must turn a row of the fault matrix unsafe; RUNTIME minutes
 # make bench        the laws, the loop and the tools against peers, 12 minutes on a quiet machine; QUICK=1: part of it
 # make socketcan    motor bus and nodes on vcan0; RUN=COMMAND runs the tests through COMMAND, in a virtual machine for example
 # make pythons      for each supported Python found here: set-up from nothing, a short trial, the nodes
@@ -17,7 +18,7 @@ DEMO := imu sim report
 TEST := $(DEMO) validate test
 SETUP := VENV=$(VENV) .ci/setup
 
-.PHONY: demo test lint faults bench socketcan pythons constraints clean
+.PHONY: demo test lint faults mutations bench socketcan pythons constraints clean
 
 demo:
 	@$(SETUP) $(DEMO)
@@ -36,6 +37,10 @@ lint:
 faults:
 	@$(SETUP) $(TEST)
 	$(BIN)/python -m test.faults.run
+
+mutations:
+	@$(SETUP) $(TEST)
+	$(BIN)/python -m test.faults.mutations
 
 bench:
 	@$(SETUP) $(TEST)
