@@ -78,13 +78,13 @@ JUMP, NO_JUMP = (simulator(fault__encoder_error=[0.0, error, 0.0, 0.0]) for erro
 def refused_on_the_wrong_angle(rig: Rig) -> None:
     """Clear the fault and enable the arm, whose encoder is still wrong: its motors must stay off."""
     rig.probe.wait_until(lambda: rig.probe.state == "fault", 10.0)
-    start = rig.truth.count
+    start = rig.truth.newest()["time"]
     assert rig.probe.trigger("clear_fault").success
     rig.probe.wait_until(lambda: rig.probe.state == "disabled", 10.0)
     assert rig.probe.enable(True).success
     rig.probe.wait_until(lambda: rig.probe.state == "fault", 10.0)
     assert rig.probe.fault == "implausible_zero", rig.probe.fault
-    assert not rig.truth.since(0.0, start)["on"].any(), "the motors were switched on"
+    assert not rig.truth.since(start)["on"].any(), "the motors were switched on"
     NO_JUMP(rig)
 
 

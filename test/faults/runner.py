@@ -29,7 +29,7 @@ def run_case(case: FaultCase, rig: Rig) -> Result:
     Too late a reaction is unsafe only with the shipped time-outs.
     """
     rig.bring_to(case.stage)
-    first_line, start = len(rig.log), max(0, rig.truth.count - 1000)
+    first_line = len(rig.log)
     fault_time = time.time()
     injected = case.inject(rig)
     fault_time = injected if isinstance(injected, float) else fault_time
@@ -38,7 +38,7 @@ def run_case(case: FaultCase, rig: Rig) -> Result:
     if _outcome(rig) not in CARRYING and not case.must_stay_off:
         _wait_until_down(rig)
     outcome = _outcome(rig)
-    records = rig.truth.since(fault_time - BEFORE, start)
+    records = rig.truth.since(fault_time - BEFORE)
     failures = _failures(case, rig, outcome, records, fault_time)
     if any("Traceback" in line for line in rig.log[first_line:]):
         failures.append("exception")
@@ -142,11 +142,11 @@ def not_run(case: FaultCase, error: BaseException) -> Result:
 
 
 class RigPool:
-    """Keeps a rig for the next case of its type. A context manager: the rig ends with it."""
+    """Keeps the `rig` of the last case for the next case of its type. A context manager: the rig ends with it."""
 
     def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
         self._folder, self._shipped_timeouts = folder, shipped_timeouts
-        self._rig: Rig | None = None
+        self.rig: Rig | None = None
         self._count = 0
 
     def __enter__(self) -> RigPool:
@@ -174,17 +174,17 @@ class RigPool:
         return result
 
     def _rig_for(self, case: FaultCase) -> Rig:
-        if self._rig is not None and (type(self._rig) is not case.rig or self._rig.have_ended):
+        if self.rig is not None and (type(self.rig) is not case.rig or self.rig.have_ended):
             self._close()
-        if self._rig is None:
+        if self.rig is None:
             self._count += 1
             folder = self._folder / str(self._count)
             folder.mkdir()
-            self._rig = case.rig(folder, self._shipped_timeouts)
-            self._rig.start()
-        return self._rig
+            self.rig = case.rig(folder, self._shipped_timeouts)
+            self.rig.start()
+        return self.rig
 
     def _close(self) -> None:
-        rig, self._rig = self._rig, None
+        rig, self.rig = self.rig, None
         if rig is not None:
             rig.close()
