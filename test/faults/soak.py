@@ -32,9 +32,9 @@ from exo_gravity.core.motors import EXIT
 
 from ..support import CONFIG
 from ..support.launched_nodes import LaunchedNodes, Parameters
-from .actions import enable, foreign_frames, in_turn, pause, publish, send_signal, simulator, states_at, tilt
-from .cases import CONTINUE, EFFORTS, STATES, STOP, TILT
-from .fault_case import PROCESS_REACTION, FaultCase
+from .actions import enable, foreign_frames, in_turn, pause, publish, send_signal, states_at, tilt
+from .cases import CONTINUE, EFFORTS, END_SILENCE, ERROR, NO_ERROR, SILENCE, STATES, STOP, TILT
+from .fault_case import ALL_JOINTS, PROCESS_REACTION, FaultCase
 from .rigs import BothArmsRig, WearerRig
 from .runner import Result, RigPool
 
@@ -72,18 +72,20 @@ class SoakRig(BothArmsRig):
         return [resident(self.process(node).pid) for node in NODES]
 
 
+# fmt: off
 FAULTS = (
     FaultCase("arm disabled", enable(False), SoakRig),
     FaultCase("NaN joint states", publish(JointState, STATES, states_at([math.nan] * 4)), SoakRig, None),
     FaultCase("NaN tilt", publish(Vector3Stamped, TILT, tilt(math.nan)), SoakRig, None),
-    FaultCase("second publisher of efforts", publish(JointState, EFFORTS, lambda rig: rig.probe.effort_commands[-1]), SoakRig),
+    FaultCase("second publisher of efforts", publish(JointState, EFFORTS, lambda rig: rig.probe.effort_commands[-1]),
+        SoakRig),
     FaultCase("foreign EXIT to motor 2, once", foreign_frames(EXIT), SoakRig, steps_from=0.05),
-    FaultCase("bus silent for 1 s", in_turn(
-        simulator(fault__bus_silent=True), pause(1.0), simulator(fault__bus_silent=False)), SoakRig, unreached=(0, 1, 2, 3)),
-    FaultCase("motor 2 reports an error", simulator(fault__error=[0, 1, 0, 0]), SoakRig, clear=simulator(fault__error=[0] * 4)),
+    FaultCase("bus silent for 1 s", in_turn(SILENCE, pause(1.0), END_SILENCE), SoakRig, unreached=ALL_JOINTS),
+    FaultCase("motor 2 reports an error", ERROR, SoakRig, clear=NO_ERROR),
     FaultCase("compensator frozen", send_signal("compensator", STOP), SoakRig, PROCESS_REACTION,
         clear=send_signal("compensator", CONTINUE)),
-)  # fmt: skip
+)
+# fmt: on
 
 
 def resident(pid: int) -> float:
