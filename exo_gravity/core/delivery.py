@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from exo_gravity.core.drive import Drive
 from exo_gravity.core.faults import Fault, FaultCode
 from exo_gravity.core.limits import JointSample, Limits
 
@@ -29,6 +30,7 @@ class DeliveryMonitor:
     def __init__(self, limits: Limits, peak_effort: Sequence[float]) -> None:
         self._limits = limits
         self._peak = tuple(peak_effort)
+        self._received: list[tuple[float, float] | None] = [None] * len(self._peak)  # effort and damping replied to
         self.reset()
 
     def reset(self) -> None:
@@ -44,6 +46,16 @@ class DeliveryMonitor:
         """Whether each joint (4,) does not deliver its torque."""
         return tuple(time >= PERSISTENCE for time in self._bad_time)
 
+    def applied(self, drive: Drive, silent: Sequence[bool]) -> tuple[Sequence[float], Sequence[float]]:
+        """Return the effort (4,) Nm and damping (4,) Nm s/rad that the motors apply after `drive` was sent.
+
+        A motor that is `silent` (4,) still applies what it last replied to.
+        """
+        sent = zip(drive.effort, drive.damping, strict=True)
+        known = zip(sent, self._received, silent, strict=True)
+        effort, damping = zip(*(old if is_silent and old else new for new, old, is_silent in known), strict=True)
+        return effort, damping
+
     def step(
         self, dt: float, joints: Sequence[JointSample], effort: Sequence[float], damping: Sequence[float]
     ) -> Fault | None:
@@ -57,6 +69,7 @@ class DeliveryMonitor:
                 continue
             has_returned = 0.0 < self._last_time[i] < joint.time - GAP
             self._last_time[i] = joint.time
+            self._received[i] = effort[i], damping[i]
             expected = effort[i] - damping[i] * joint.velocity
             expected = max(-self._peak[i], min(self._peak[i], expected))
             weight = 1.0 if has_returned else share

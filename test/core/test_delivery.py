@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.delivery import DeliveryMonitor
+from exo_gravity.core.drive import Drive
 from exo_gravity.core.limits import JointSample
 
 from ..support.safety_run import LIMITS, PERIOD
@@ -62,3 +63,12 @@ def test_a_current_sensor_with_5_percent_noise_raises_no_false_alarm():
     replies, random = Replies(), np.random.default_rng(1)
     noise = 0.05 * np.maximum(2.0, np.abs(EFFORT))
     assert not any(replies.take(EFFORT + noise * random.standard_normal(4)) for _ in range(50_000))
+
+
+def test_a_silent_motor_applies_what_it_last_replied_to():
+    replies = Replies()
+    replies.take(EFFORT)
+    later = Drive((0.0,) * 4, (5.0,) * 4, True)
+    effort, damping = replies.monitor.applied(later, (False, True, False, False))
+    assert effort == (0.0, EFFORT[1], 0.0, 0.0)
+    assert damping == (5.0, 0.0, 5.0, 5.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import signal
+import time
 
 import numpy as np
 from geometry_msgs.msg import Vector3Stamped
@@ -78,7 +79,7 @@ JUMP, NO_JUMP = (simulator(fault__encoder_error=[0.0, error, 0.0, 0.0]) for erro
 def refused_on_the_wrong_angle(rig: Rig) -> None:
     """Clear the fault and enable the arm, whose encoder is still wrong: its motors must stay off."""
     rig.probe.wait_until(lambda: rig.probe.state == "fault", 10.0)
-    start = rig.truth.newest()["time"]
+    start = time.time()
     assert rig.probe.trigger("clear_fault").success
     rig.probe.wait_until(lambda: rig.probe.state == "disabled", 10.0)
     assert rig.probe.enable(True).success
@@ -115,7 +116,7 @@ HELD_ROWS = (
     FaultCase("parameters that contradict each other", set_contradicting_parameters, limit=None, outcomes=HELD),
     FaultCase("second can_bridge on the bus", start_second_bridge("/second"), limit=None, outcomes=HELD),
     FaultCase("disk full for the recorder", record_on_a_full_disk, limit=None, outcomes=HELD),
-    FaultCase("100,000 random frames", random_frames(100_000, (0, *range(5, 2048))), limit=None),  # 1-4: the motors
+    FaultCase("30,000 random frames", random_frames(30_000, (0, *range(5, 2048))), limit=None),  # 1-4: the motors
     FaultCase("foreign frames, 3,000 a second", random_frames(15_000, range(0x100, 0x200)), limit=None),
     FaultCase("processors overloaded", overload_processors, limit=None),
 )
@@ -140,7 +141,7 @@ MOTORS = (
     FaultCase("foreign SET_ZERO to motor 2, once", foreign_frames(SET_ZERO), unreached=(1,), steps_from=0.05,
         ends_rig=True),
     FaultCase("foreign 6 Nm to motor 2, 500 a second for 2 s", foreign_frames(MOTOR_2.command(-6.0, 0.0), 500.0, 2.0),
-        steps_from=2.1, outcomes=("foreign_command",)),
+        steps_from=2.1, outcomes=("foreign_command",), work_limit=2.0),  # the foreign torque does work until opposed
     FaultCase("foreign zero commands to motor 2, 500 a second for 2 s",
         foreign_frames(MOTOR_2.command(0.0, 0.0), 500.0, 2.0), steps_from=2.1, outcomes=("foreign_command",)),
     FaultCase("second publisher of joint states", publish(JointState, STATES, states_at([1.0] * 4))),
@@ -169,8 +170,9 @@ START = (
         outcomes=("position_jump", "over_speed")),
     FaultCase("foreign EXIT to motor 2 while proving", foreign_frames(EXIT), SignCheckRig, stage="proving signs",
         steps_from=0.05),
-    FaultCase("motor 2 restarts while ramping in", RESTART, SignCheckRig, stage="ramping in", clear=RESTARTED,
-        steps_from=0.3),
+    # A hanging arm needs hardly any torque, so that none is missed.
+    FaultCase("motor 2 restarts while ramping in", RESTART, SignCheckRig, None, "ramping in", clear=RESTARTED,
+        steps_from=0.3, outcomes=("active", "ramping in", "torque_not_delivered")),
     FaultCase("imu frozen while ramping in", send_signal("imu", STOP), SignCheckRig, PROCESS_REACTION, "ramping in",
         clear=send_signal("imu", CONTINUE)),
     FaultCase("can_bridge killed while proving", send_signal("can_bridge", KILL), SignCheckRig, PROCESS_REACTION,

@@ -36,11 +36,8 @@ def second_effort(value: float) -> Action:
 EFFORT_COMMANDS = (
     FaultCase("effort NaN", second_effort(math.nan), CommandedRig, in_tests=True),
     FaultCase("effort infinite", second_effort(math.inf), CommandedRig),
-    FaultCase("effort of 1e308 Nm", second_effort(1e308), CommandedRig),
     FaultCase("three efforts", change_message(lambda message: message.effort.pop()), CommandedRig),
     FaultCase("a wrong name", change_message(lambda message: message.name.__setitem__(3, "left_knee")), CommandedRig),
-    FaultCase("a name twice", change_message(lambda message: message.name.__setitem__(3, message.name[2])),
-        CommandedRig),
     FaultCase("no names", change_message(lambda message: setattr(message, "name", [])), CommandedRig),
     FaultCase("no efforts", change_message(lambda message: setattr(message, "effort", [])), CommandedRig),
     FaultCase("stamps an hour old", shift_stamp(-HOUR), CommandedRig),

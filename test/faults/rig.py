@@ -25,7 +25,7 @@ from ..support.launched_nodes import GENTLE, REAL, SIMULATED, LaunchedNodes, Par
 from ..support.ros_probe import RosProbe
 from ..support.truth import Truth
 
-HORIZONTAL = (0.0, 1.5, 0.0, 0.3)  # rad; joint 2 carries 3.8 Nm, joint 3 0.2 Nm
+RAISED = (0.0, 1.3, 0.0, 0.3)  # rad, nearly horizontal
 HOME = [0.0, 0.05, 0.05, 0.05]  # rad, hanging and within the limits
 HELP_TIME = 20.0  # s for which the wearer holds it there
 NEAR = 0.15  # rad from the pose, in which the arm need not be moved again
@@ -44,14 +44,14 @@ class Rig:
 
     base = "sim.yaml"
     rate = 250.0  # Hz
-    pose: Sequence[float] = HORIZONTAL
+    pose: Sequence[float] = RAISED
     bridge: ClassVar[Parameters] = {}
     compensator: ClassVar[Parameters] = {}
     simulator: ClassVar[Parameters] = {}
 
     def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
         self.folder, self.shipped_timeouts = folder, shipped_timeouts
-        self.script = self.write_script("pose", [{"move": list(self.pose), "over": 1.5}, {"hold": 600.0}])
+        self.script = self.write_script("pose", [{"move": list(self.pose), "over": 1.0}, {"hold": 600.0}])
         # The hand stays: a joint with little friction would swing out of its limits again.
         self._home = self.write_script("home", [{"move": HOME, "over": 1.0}, {"move": HOME, "over": HELP_TIME}])
         self.probe = RosProbe()
@@ -194,12 +194,11 @@ class Rig:
         return [line for nodes in self.nodes for line in nodes.log]
 
     def close(self) -> None:
-        try:
-            for nodes in filter(LaunchedNodes.has_started, self.nodes):
-                nodes.stop()
-        finally:
-            kill_watchdogs(self._bridges)
-            self.probe.close()
+        with contextlib.ExitStack() as stack:  # each is done although another one fails; the last one first
+            stack.callback(self.probe.close)
+            stack.callback(lambda: kill_watchdogs(self._bridges))
+            for nodes in reversed([nodes for nodes in self.nodes if nodes.has_started()]):
+                stack.callback(nodes.stop)
 
 
 def kill_watchdogs(bridges: Collection[int]) -> None:

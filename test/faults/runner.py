@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .fault_case import FaultCase
-from .judge import MAX_GAP, MAX_WORK, Response, measure
+from .judge import MAX_GAP, Response, measure
 from .rig import CARRYING, Rig
 from .rigs import BothArmsRig
 
@@ -35,6 +35,8 @@ def run_case(case: FaultCase, rig: Rig) -> Result:
     fault_time = injected if isinstance(injected, float) else fault_time
     _observe(case, rig)
     case.clear(rig)
+    if rig.truth.motors_are_off():  # the last state of a killed bridge stands until the launcher has ended
+        rig.probe.wait_until(lambda: _outcome(rig) not in CARRYING, DESCENT)
     if _outcome(rig) not in CARRYING and not case.must_stay_off:
         _wait_until_down(rig)
     outcome = _outcome(rig)
@@ -61,8 +63,6 @@ def _observe(case: FaultCase, rig: Rig) -> None:
             return
     # A bridge that has given up a motor that it cannot reach is in `fault`, and that motor still on.
     probe.wait_until(lambda: probe.state == "fault" or rig.truth.motors_are_off(), DESCENT)
-    if rig.truth.motors_are_off():  # the last state of a killed bridge stands until the launcher has ended
-        probe.wait_until(lambda: _outcome(rig) not in CARRYING, DESCENT)
 
 
 def _wait_until_down(rig: Rig) -> None:
@@ -100,7 +100,7 @@ def _failures(case: FaultCase, rig: Rig, outcome: str, records: np.ndarray, faul
         "too late": rig.shipped_timeouts and must_react and late,
         "too fast": response.top_speed > case.speed_limit,
         "torque step": response.excess > 0.0,
-        "driven by a motor": not carried and response.work > MAX_WORK,
+        "driven by a motor": not carried and response.work > case.work_limit,
         "switched on again": response.re_enabled,
         f"truth stops for {response.gap:.1f} s": response.gap > MAX_GAP,
     }

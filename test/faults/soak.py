@@ -67,6 +67,10 @@ class SoakRig(BothArmsRig):
         without = ("can_bridge", "compensator", "imu", "recorder")
         return self._nodes(without=without, truth=True, simulator=self.simulator)
 
+    def wait_until(self, end: float) -> None:
+        """Receive messages until `end` (monotonic s)."""
+        self.probe.wait_until(lambda: time.monotonic() > end, 2 * MINUTE)
+
     def memory(self) -> list[float]:
         """Return the resident memory of each of NODES in MB."""
         return [resident(self.process(node).pid) for node in NODES]
@@ -107,10 +111,10 @@ def strike(minutes: float, seed: int, folder: Path, console: Console) -> tuple[l
                 for line in result.pop("log", ()):
                     console.print("    ", line, markup=False)
                 break
+            assert isinstance(pool.rig, SoakRig)
             memory.append(pool.rig.memory())
-            probe = pool.rig.probe
-            probe.wait_until(lambda end=start + (minute + 1) * MINUTE: time.monotonic() > end, 2 * MINUTE)
-        else:
+            pool.rig.wait_until(start + (minute + 1) * MINUTE)
+        if isinstance(pool.rig, SoakRig):
             pool.rig.bring_to("active")
     return results, memory, folder / "1" / "bag"
 
