@@ -22,6 +22,7 @@ GAP = 0.015  # s without a reply, after which a motor may have restarted: its ne
 TEST_TORQUE = 0.4  # Nm, each way, that shows that a motor is on
 TEST_TIME = 0.06  # s, each way
 TEST_SHARE = 0.5  # of the test torque that must appear in the replies
+TEST_ATTEMPTS = 3
 
 
 class DeliveryMonitor:
@@ -89,7 +90,8 @@ class DeliveryMonitor:
 class SwitchOnCheck:
     """Checks that all four motors are on: a short push each way, under damping, must appear in their replies.
 
-    effort: (4,) Nm to apply now. done: whether the check has ended. Joints with `torque` 0 are skipped.
+    effort: (4,) Nm to apply now. done: whether the check has ended. A failed check is repeated, TEST_ATTEMPTS in all: on
+    a busy computer replies may be late.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -98,9 +100,14 @@ class SwitchOnCheck:
         self._torque = [min(TEST_TORQUE, most) for most in limits.max_effort]
         self._rate = limits.max_effort_rate
         self.effort = [0.0] * len(self._torque)
+        self._attempts = 0
+        self._last_time = [0.0] * len(self._torque)
+        self._begin()
+
+    def _begin(self) -> None:
         self._elapsed = 0.0
         self._sums = [[0.0, 0.0] for _ in self._torque]
-        self._counts = [0, 0]
+        self._counts = [[0, 0] for _ in self._torque]
 
     def step(self, dt: float, joints: Sequence[JointSample]) -> Fault | None:
         """Advance by `dt` s with the replies to the last commands; return the fault that they show, if any."""
@@ -108,20 +115,25 @@ class SwitchOnCheck:
         phase, into = divmod(self._elapsed, TEST_TIME)
         if phase >= 2:
             return self._finish(dt)
-        if into > 0.4 * TEST_TIME:
-            self._counts[int(phase)] += 1
-            for sums, joint in zip(self._sums, joints, strict=True):
-                sums[int(phase)] += joint.effort
-        for i, torque in enumerate(self._torque):
-            self._approach(i, torque if phase == 0 else -torque, dt)
+        for i, joint in enumerate(joints):
+            if into > 0.4 * TEST_TIME and joint.time > self._last_time[i]:
+                self._counts[i][int(phase)] += 1
+                self._sums[i][int(phase)] += joint.effort
+            self._last_time[i] = joint.time
+            self._approach(i, self._torque[i] if phase == 0 else -self._torque[i], dt)
         return None
 
     def _finish(self, dt: float) -> Fault | None:
-        for i, (name, torque, sums) in enumerate(zip(self._names, self._torque, self._sums, strict=True)):
-            forward, backward = (total / max(1, count) for total, count in zip(sums, self._counts, strict=True))
+        for name, torque, sums, counts in zip(self._names, self._torque, self._sums, self._counts, strict=True):
+            forward, backward = (total / max(1, count) for total, count in zip(sums, counts, strict=True))
             if forward - backward < TEST_SHARE * 2.0 * torque:
+                self._attempts += 1
+                if self._attempts < TEST_ATTEMPTS:
+                    self._begin()
+                    return None
                 reason = f"{name}: the motor did not switch on: {torque:g} Nm commanded, {forward:.2f} Nm replied"
                 return Fault(FaultCode.TORQUE_NOT_DELIVERED, reason)
+        for i in range(len(self.effort)):
             self._approach(i, 0.0, dt)
         self.done = not any(self.effort)
         return None
