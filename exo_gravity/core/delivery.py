@@ -90,8 +90,8 @@ class DeliveryMonitor:
 class SwitchOnCheck:
     """Checks that all four motors are on: a short push each way, under damping, must appear in their replies.
 
-    effort: (4,) Nm to apply now. done: whether the check has ended. A failed check is repeated, TEST_ATTEMPTS in all: on
-    a busy computer replies may be late.
+    effort: (4,) Nm to apply now. done: whether the check has ended. It is made up to TEST_ATTEMPTS times: on a busy
+    computer replies may be late.
     """
 
     def __init__(self, limits: Limits) -> None:
