@@ -109,8 +109,11 @@ class SwitchOnCheck:
         self._sums = [[0.0, 0.0] for _ in self._torque]
         self._counts = [[0, 0] for _ in self._torque]
 
-    def step(self, dt: float, joints: Sequence[JointSample]) -> Fault | None:
-        """Advance by `dt` s with the replies to the last commands; return the fault that they show, if any."""
+    def step(self, dt: float, joints: Sequence[JointSample], damping: Sequence[float]) -> Fault | None:
+        """Advance by `dt` s with the replies to the last commands; return the fault that they show, if any.
+
+        damping: (4,) Nm s/rad, last sent. Its torque is part of the replies, and a light joint moves.
+        """
         self._elapsed += dt
         phase, into = divmod(self._elapsed, TEST_TIME)
         if phase >= 2:
@@ -118,7 +121,7 @@ class SwitchOnCheck:
         for i, joint in enumerate(joints):
             if into > 0.4 * TEST_TIME and joint.time > self._last_time[i]:
                 self._counts[i][int(phase)] += 1
-                self._sums[i][int(phase)] += joint.effort
+                self._sums[i][int(phase)] += joint.effort + damping[i] * joint.velocity
             self._last_time[i] = joint.time
             self._approach(i, self._torque[i] if phase == 0 else -self._torque[i], dt)
         return None

@@ -183,7 +183,7 @@ class SafetyMachine:
             self.trip(*fault, now)
 
     def _prove(self, now: float, joints: Sequence[JointSample], dt: float) -> None:
-        fault = self._proving.step(dt, joints)
+        fault = self._proving.step(dt, joints, self._sent.damping)
         self.waiting_for = self._proving.hint
         if fault:
             self.trip(*fault, now)
