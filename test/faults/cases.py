@@ -104,7 +104,7 @@ def not_thrown_back(records: np.ndarray) -> str:
 
 
 def push_elbow(rig: Rig) -> None:
-    script = rig.write_script("push", [{"push": [0.0, 0.0, 0.0, 0.8], "over": 0.5}, {"hold": 600.0}])
+    script = rig.write_script("push", [{"push": [0.0, 0.0, 0.0, 0.5], "over": 0.2}, {"hold": 600.0}])
     assert rig.probe.set_parameters("simulator", trial=str(script)).successful
 
 

@@ -171,7 +171,7 @@ class BowRig(Rig):
 class WallRig(Rig):
     """The elbow's upper limit is within reach of a push, and far from the mechanical stop."""
 
-    pose = (0.0, 0.3, 0.3, 0.6)
+    pose = (0.0, 0.3, 0.3, 1.0)
     bridge: ClassVar[Parameters] = {"position_max": [1.65, 3.14, 2.53, 1.2]}
 
 
