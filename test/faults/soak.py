@@ -101,7 +101,7 @@ def resident(pid: int) -> float:
 def strike(minutes: float, seed: int, folder: Path, console: Console) -> tuple[list[Result], list[list[float]], Path]:
     """Run the soak; return the results, the memory (minutes, nodes) in MB, and the recording."""
     dice, results, memory = random.Random(seed), [], []
-    with RigPool(folder) as pool:
+    with RigPool(folder, shipped_timeouts=False) as pool:
         start = time.monotonic()
         for minute in range(round(minutes)):
             result = pool.run(dice.choice(FAULTS))
