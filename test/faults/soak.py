@@ -147,9 +147,11 @@ def main() -> int:
     console = Console(width=150, highlight=False)
     with tempfile.TemporaryDirectory() as folder:
         results, memory, recording = strike(options.minutes, options.seed, Path(folder), console)
-        failed = find_failures(results, memory, recording)
-    for node, first, last in zip(NODES, memory[min(WARM_UP, len(memory) - 1)], memory[-1], strict=True):
-        console.print(f"{node}: {first:.1f} MB, at the end {last:.1f} MB")
+        failed = find_failures(results, memory, recording) if memory else results[0]
+    for node, *sizes in zip(NODES, *memory, strict=True) if memory else ():
+        console.print(
+            f"{node}: {min(sizes[WARM_UP:], default=0.0):.1f} MB after the start, {sizes[-1]:.1f} MB at the end"
+        )
     options.output.parent.mkdir(parents=True, exist_ok=True)
     options.output.write_text(json.dumps({"results": results, "memory": memory, "failed": failed}, indent=1) + "\n")
     console.print(f"{len(results)} faults; failed: {failed or 'nothing'}", markup=False)
