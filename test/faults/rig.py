@@ -99,16 +99,15 @@ class Rig:
                 self._start_over(stage)
                 return
             while not self._is_at_pose():
-                self._get_carried()
+                self.get_carried(self.probe)
                 self.probe.bring_to(self.script)
                 self._wait_for_states(self.rate / 4)
             if stage == "letting down":
                 assert self.probe.enable(False).success
                 self.probe.wait_until(lambda: abs(self.true_velocity(1)) > 0.2)
 
-    def _get_carried(self) -> None:
+    def get_carried(self, probe: RosProbe) -> None:
         """Wait until the arm is carried; the wearer moves an arm that hangs outside its limits or away from home."""
-        probe = self.probe
         helped = -math.inf
         while probe.state != "active":
             misplaced = probe.fault == "implausible_zero" or probe.status_contains("can_bridge", "to be moved")
@@ -119,13 +118,8 @@ class Rig:
                 probe.trigger("clear_fault")
             elif probe.state == "disabled":
                 probe.enable(True)
-            self._wait_for_report()
-
-    def _wait_for_report(self) -> None:
-        """Wait for the next diagnostics of the bridge."""
-        name = "/right/can_bridge"
-        last = self.probe.statuses.get(name)
-        self.probe.wait_until(lambda: self.probe.statuses.get(name) is not last)
+            last = probe.statuses.get(f"{probe.arm}/can_bridge")
+            probe.wait_until(lambda: probe.statuses.get(f"{probe.arm}/can_bridge") is not last)
 
     def _wait_for_states(self, count: float) -> None:
         seen = len(self.probe.joint_states)

@@ -124,6 +124,8 @@ class BothArmsRig(Rig):
         with self.left.time_limit(CARRY_LIMIT):
             newest = self.left_truth.newest()
             if self.left.state != "active" or newest is None or abs(newest["position"][1] - self.pose[1]) > NEAR:
+                self.left.wait_until(lambda: self.left.state)
+                self.get_carried(self.left)
                 self.left.bring_to(self.script)
         super().bring_to(stage)
 

@@ -54,7 +54,7 @@ class SoakRig(BothArmsRig):
 
     pose = WearerRig.pose
     compensator: ClassVar[Parameters] = WearerRig.compensator
-    simulator: ClassVar[Parameters] = WearerRig.simulator
+    simulator: ClassVar[Parameters] = {"wearer": WearerRig.simulator["wearer"]}
 
     def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
         content = yaml.safe_load((CONFIG / "sim_both.yaml").read_text())
