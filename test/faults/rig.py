@@ -59,6 +59,7 @@ class Rig:
         self.nodes = [*self._make_nodes(device.bus["port"]), device]
         self.truth = Truth(device.truth_path())
         self._bridges: set[int] = set()  # IDs of their processes
+        self.second_bridge: tuple[int | None, list[str]] = (None, [])  # exit code and log of the last one started
 
     def start(self) -> None:
         """Start the nodes, the simulated device first."""
