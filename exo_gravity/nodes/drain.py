@@ -26,7 +26,10 @@ class LossCounter:
         self._newest: deque[int] = deque(maxlen=MAX_PUBLISHERS)  # number of each publisher's last message
 
     def take(self, number: int) -> None:
-        """Count a message; 0: without a number. It continues the nearest lower number, or is a new publisher's first."""
+        """Count the message `number`, 0 if it has none.
+
+        It continues the nearest lower number, or is the first of a new publisher.
+        """
         previous = max((other for other in self._newest if other < number), default=0)
         if previous:
             self.lost += number - previous - 1

@@ -119,8 +119,7 @@ class Rig:
                 probe.trigger("clear_fault")
             elif probe.state == "disabled":
                 probe.enable(True)
-            last = probe.statuses.get(f"{probe.arm}/can_bridge")
-            probe.wait_until(lambda: probe.statuses.get(f"{probe.arm}/can_bridge") is not last)
+            probe.wait_for_report()
 
     def _wait_for_states(self, count: float) -> None:
         seen = len(self.probe.joint_states)
