@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from pathlib import Path
 from types import TracebackType
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..support.ros_probe import Timeout
 from .fault_case import FaultCase
 from .judge import MAX_GAP, Response, measure
 from .rig import CARRYING, Rig
@@ -33,12 +35,14 @@ def run_case(case: FaultCase, rig: Rig) -> Result:
     fault_time = time.time()
     injected = case.inject(rig)
     fault_time = injected if isinstance(injected, float) else fault_time
-    _observe(case, rig)
+    with contextlib.suppress(Timeout):  # then the arm is still carried
+        _observe(case, rig)
     case.clear(rig)
-    if rig.truth.motors_are_off():  # the last state of a killed bridge stands until the launcher has ended
-        rig.probe.wait_until(lambda: _outcome(rig) not in CARRYING, DESCENT)
-    if _outcome(rig) not in CARRYING and not case.must_stay_off:
-        _wait_until_down(rig)
+    with contextlib.suppress(Timeout):  # then it is not down
+        if rig.truth.motors_are_off():  # the last state of a killed bridge stands until the launcher has ended
+            rig.probe.wait_until(lambda: _outcome(rig) not in CARRYING, DESCENT)
+        if _outcome(rig) not in CARRYING and not case.must_stay_off:
+            _wait_until_down(rig)
     outcome = _outcome(rig)
     records = rig.truth.since(fault_time - BEFORE)
     failures = _failures(case, rig, outcome, records, fault_time)
