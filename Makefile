@@ -24,11 +24,11 @@ demo:
 	@$(SETUP) $(DEMO)
 	$(BIN)/trial demo
 
-# The nodes' tests need a quiet machine; the others share its cores.
+# The nodes' tests need a quiet machine, and run two at a time; the others share its cores.
 test:
 	@$(SETUP) $(TEST)
 	$(BIN)/python -m pytest -m "not real_time" -n auto
-	$(BIN)/python -m pytest -m real_time
+	$(BIN)/python -m pytest -m real_time -n 2
 
 lint:
 	@$(SETUP) $(TEST) dev
