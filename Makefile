@@ -1,8 +1,8 @@
 # make demo         four nodes as processes on the simulated device, about 75 s; a table and figures in trials/
 # make test         all tests
 # make lint         ruff, mypy, ament's flake8 and pep257, shellcheck
-# make faults       the whole fault matrix on the simulated device, 11 minutes; a table and build/faults.json
-# make mutations    deliberate defects, each of which must turn a row of the fault matrix unsafe; RUNTIME minutes
+# make faults       the whole fault matrix on the simulated device, 20 minutes; a table and build/faults.json
+# make mutations    deliberate defects, each of which must turn a row of the fault matrix unsafe; 7 minutes
 # make bench        the laws, the loop and the tools against peers, 12 minutes on a quiet machine; QUICK=1: part of it
 # make socketcan    motor bus and nodes on vcan0; RUN=COMMAND runs the tests through COMMAND, in a virtual machine for example
 # make pythons      for each supported Python found here: set-up from nothing, a short trial, the nodes

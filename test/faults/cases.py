@@ -157,7 +157,6 @@ DESCENT = (
     FaultCase("motor 2 restarts in 15 ms while let down", SHORT_RESTART, stage="letting down", clear=RESTARTED,
         steps_from=0.3),
     FaultCase("foreign EXIT to motor 2 while let down", foreign_frames(EXIT), stage="letting down", steps_from=0.05),
-    FaultCase("watchdog killed while let down", signal_watchdog(KILL), stage="letting down", ends_rig=True),
     FaultCase("can_bridge killed while let down", send_signal("can_bridge", KILL), limit=PROCESS_REACTION,
         stage="letting down"),
 )
@@ -211,7 +210,6 @@ PROCESSES = (
         ends_rig=True, outcomes=("command_stale",)),
     FaultCase("launcher killed", lambda rig: rig.launcher.kill(), LauncherRig, PROCESS_REACTION),
     FaultCase("launcher interrupted", lambda rig: rig.launcher.send_signal(INTERRUPT), LauncherRig, PROCESS_REACTION),
-    FaultCase("launcher terminated", lambda rig: rig.launcher.send_signal(TERMINATE), LauncherRig, PROCESS_REACTION),
     FaultCase("can_bridge killed beside a frozen launcher",
         in_turn(lambda rig: rig.launcher.send_signal(STOP), send_signal("can_bridge", KILL)), LauncherRig,
         PROCESS_REACTION, clear=lambda rig: rig.launcher.send_signal(CONTINUE)),
