@@ -10,7 +10,7 @@ from sensor_msgs.msg import JointState
 from .fault_case import Action, FaultCase
 from .rigs import CommandedRig, ExternalClockRig
 
-HOUR = 3600.0  # s
+HOUR = 3600  # s
 
 
 def change_message(change: Callable[[JointState], object]) -> Action:
