@@ -2,7 +2,8 @@
 # make calibrate-demo  a simulated arm with a wrong parameter file, calibrated, 5 minutes; a picture before and after
 # make test         all tests
 # make lint         ruff, mypy, ament's flake8 and pep257, shellcheck
-# make faults       the whole fault matrix on the simulated device, 11 minutes; a table and build/faults.json
+# make faults       the whole fault matrix on the simulated device, 20 minutes; a table and build/faults.json
+# make mutations    deliberate defects, each of which must turn a row of the fault matrix unsafe; 7 minutes
 # make bench        the laws, the loop and the tools against peers, 12 minutes on a quiet machine; QUICK=1: part of it
 # make socketcan    motor bus and nodes on vcan0; RUN=COMMAND runs the tests through COMMAND, in a virtual machine for example
 # make pythons      for each supported Python found here: set-up from nothing, a short trial, the nodes
@@ -18,7 +19,7 @@ DEMO := imu sim report
 TEST := $(DEMO) validate test
 SETUP := VENV=$(VENV) .ci/setup
 
-.PHONY: demo calibrate-demo test lint faults bench socketcan pythons constraints clean
+.PHONY: demo calibrate-demo test lint faults mutations bench socketcan pythons constraints clean
 
 demo:
 	@$(SETUP) $(DEMO)
@@ -28,11 +29,11 @@ calibrate-demo:
 	@$(SETUP) $(DEMO) calibrate
 	$(BIN)/python -m exo_gravity.tools.calibration.demo
 
-# The nodes' tests need a quiet machine; the others share its cores.
+# The nodes' tests need a quiet machine, and run two at a time; the others share its cores.
 test:
 	@$(SETUP) $(TEST)
 	$(BIN)/python -m pytest -m "not real_time" -n auto
-	$(BIN)/python -m pytest -m real_time
+	$(BIN)/python -m pytest -m real_time -n 2
 
 lint:
 	@$(SETUP) $(TEST) dev
@@ -41,6 +42,10 @@ lint:
 faults:
 	@$(SETUP) $(TEST)
 	$(BIN)/python -m test.faults.run
+
+mutations:
+	@$(SETUP) $(TEST)
+	$(BIN)/python -m test.faults.mutations
 
 bench:
 	@$(SETUP) $(TEST)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from exo_gravity.core.drive import Drive
 from exo_gravity.core.faults import Fault, FaultCode
 from exo_gravity.core.limits import JointSample, Limits
 
@@ -21,6 +22,7 @@ GAP = 0.015  # s without a reply, after which a motor may have restarted: its ne
 TEST_TORQUE = 0.4  # Nm, each way, that shows that a motor is on
 TEST_TIME = 0.06  # s, each way
 TEST_SHARE = 0.5  # of the test torque that must appear in the replies
+TEST_ATTEMPTS = 3
 
 
 class DeliveryMonitor:
@@ -29,6 +31,7 @@ class DeliveryMonitor:
     def __init__(self, limits: Limits, peak_effort: Sequence[float]) -> None:
         self._limits = limits
         self._peak = tuple(peak_effort)
+        self._received: list[tuple[float, float] | None] = [None] * len(self._peak)  # effort and damping replied to
         self.reset()
 
     def reset(self) -> None:
@@ -44,6 +47,16 @@ class DeliveryMonitor:
         """Whether each joint (4,) does not deliver its torque."""
         return tuple(time >= PERSISTENCE for time in self._bad_time)
 
+    def applied(self, drive: Drive, silent: Sequence[bool]) -> tuple[Sequence[float], Sequence[float]]:
+        """Return the effort (4,) Nm and damping (4,) Nm s/rad that the motors apply after `drive` was sent.
+
+        A motor that is `silent` (4,) still applies what it last replied to.
+        """
+        sent = zip(drive.effort, drive.damping, strict=True)
+        known = zip(sent, self._received, silent, strict=True)
+        effort, damping = zip(*(old if is_silent and old else new for new, old, is_silent in known), strict=True)
+        return effort, damping
+
     def step(
         self, dt: float, joints: Sequence[JointSample], effort: Sequence[float], damping: Sequence[float]
     ) -> Fault | None:
@@ -57,6 +70,7 @@ class DeliveryMonitor:
                 continue
             has_returned = 0.0 < self._last_time[i] < joint.time - GAP
             self._last_time[i] = joint.time
+            self._received[i] = effort[i], damping[i]
             expected = effort[i] - damping[i] * joint.velocity
             expected = max(-self._peak[i], min(self._peak[i], expected))
             weight = 1.0 if has_returned else share
@@ -76,7 +90,8 @@ class DeliveryMonitor:
 class SwitchOnCheck:
     """Checks that all four motors are on: a short push each way, under damping, must appear in their replies.
 
-    effort: (4,) Nm to apply now. done: whether the check has ended. Joints with `torque` 0 are skipped.
+    effort: (4,) Nm to apply now. done: whether the check has ended. It is made up to TEST_ATTEMPTS times: on a busy
+    computer replies may be late.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -85,30 +100,43 @@ class SwitchOnCheck:
         self._torque = [min(TEST_TORQUE, most) for most in limits.max_effort]
         self._rate = limits.max_effort_rate
         self.effort = [0.0] * len(self._torque)
+        self._attempts = 0
+        self._last_time = [0.0] * len(self._torque)
+        self._begin()
+
+    def _begin(self) -> None:
         self._elapsed = 0.0
         self._sums = [[0.0, 0.0] for _ in self._torque]
-        self._counts = [0, 0]
+        self._counts = [[0, 0] for _ in self._torque]
 
-    def step(self, dt: float, joints: Sequence[JointSample]) -> Fault | None:
-        """Advance by `dt` s with the replies to the last commands; return the fault that they show, if any."""
+    def step(self, dt: float, joints: Sequence[JointSample], damping: Sequence[float]) -> Fault | None:
+        """Advance by `dt` s with the replies to the last commands; return the fault that they show, if any.
+
+        damping: (4,) Nm s/rad, last sent. Its torque is part of the replies, and a light joint moves.
+        """
         self._elapsed += dt
         phase, into = divmod(self._elapsed, TEST_TIME)
         if phase >= 2:
             return self._finish(dt)
-        if into > 0.4 * TEST_TIME:
-            self._counts[int(phase)] += 1
-            for sums, joint in zip(self._sums, joints, strict=True):
-                sums[int(phase)] += joint.effort
-        for i, torque in enumerate(self._torque):
-            self._approach(i, torque if phase == 0 else -torque, dt)
+        for i, joint in enumerate(joints):
+            if into > 0.4 * TEST_TIME and joint.time > self._last_time[i]:
+                self._counts[i][int(phase)] += 1
+                self._sums[i][int(phase)] += joint.effort + damping[i] * joint.velocity
+            self._last_time[i] = joint.time
+            self._approach(i, self._torque[i] if phase == 0 else -self._torque[i], dt)
         return None
 
     def _finish(self, dt: float) -> Fault | None:
-        for i, (name, torque, sums) in enumerate(zip(self._names, self._torque, self._sums, strict=True)):
-            forward, backward = (total / max(1, count) for total, count in zip(sums, self._counts, strict=True))
+        for name, torque, sums, counts in zip(self._names, self._torque, self._sums, self._counts, strict=True):
+            forward, backward = (total / max(1, count) for total, count in zip(sums, counts, strict=True))
             if forward - backward < TEST_SHARE * 2.0 * torque:
+                self._attempts += 1
+                if self._attempts < TEST_ATTEMPTS:
+                    self._begin()
+                    return None
                 reason = f"{name}: the motor did not switch on: {torque:g} Nm commanded, {forward:.2f} Nm replied"
                 return Fault(FaultCode.TORQUE_NOT_DELIVERED, reason)
+        for i in range(len(self.effort)):
             self._approach(i, 0.0, dt)
         self.done = not any(self.effort)
         return None

@@ -183,7 +183,7 @@ class SafetyMachine:
             self.trip(*fault, now)
 
     def _prove(self, now: float, joints: Sequence[JointSample], dt: float) -> None:
-        fault = self._proving.step(dt, joints)
+        fault = self._proving.step(dt, joints, self._sent.damping)
         self.waiting_for = self._proving.hint
         if fault:
             self.trip(*fault, now)
@@ -240,7 +240,8 @@ class SafetyMachine:
         self._silent = silent
 
     def _let_down(self, now: float) -> None:
-        self._descent = ArmDescent(now, self._sent.effort, self._sent.damping, self._peak, self.limits)
+        applied = self._delivery.applied(self._sent, self._silent)
+        self._descent = ArmDescent(now, *applied, self._peak, self.limits)
         self._enter(State.LETTING_DOWN, now)
 
     def _enter(self, state: State, now: float) -> None:

@@ -102,6 +102,11 @@ class Proving:
         """What the wearer should do, or ''."""
         return self._signs.hint
 
-    def step(self, dt: float, joints: Sequence[JointSample]) -> Fault | None:
-        """Advance by `dt` s with the newest readings; return the fault that they show, if any."""
-        return (self._signs if self._switch_on.done else self._switch_on).step(dt, joints)
+    def step(self, dt: float, joints: Sequence[JointSample], damping: Sequence[float]) -> Fault | None:
+        """Advance by `dt` s with the newest readings, and the damping (4,) in Nm s/rad that the motors apply.
+
+        Returns the fault that they show, if any.
+        """
+        if self._switch_on.done:
+            return self._signs.step(dt, joints)
+        return self._switch_on.step(dt, joints, damping)

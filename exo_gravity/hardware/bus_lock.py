@@ -22,7 +22,6 @@ from exo_gravity.hardware.drive_notes import DriveNotes
 
 ATTEMPT_TIME = 1.0  # s; a watchdog with nothing to do may take that long to end after its bridge
 ATTEMPT_PERIOD = 0.02  # s
-LETTING_DOWN = "the watchdog"  # begins the owner's text while a watchdog lets the arm down
 
 Address = tuple[str, str, Mapping[str, Any]]  # interface, channel and options of a python-can bus
 
@@ -30,12 +29,11 @@ Address = tuple[str, str, Mapping[str, Any]]  # interface, channel and options o
 class BusLock:
     """Exclusive ownership of the bus at `address` until `release`. owner: shown to others who want the bus.
 
-    patience: s to wait for a watchdog that is letting the arm down.
     notes: the shared page. descriptor: of the lock file, for the watchdog to inherit. Raises BusError with the present
     owner if the bus is held.
     """
 
-    def __init__(self, address: Address, owner: str, patience: float = 0.0) -> None:
+    def __init__(self, address: Address, owner: str) -> None:
         path = lock_file(address)
         try:
             path.parent.mkdir(mode=0o700, exist_ok=True)
@@ -46,7 +44,7 @@ class BusLock:
             raise BusError(f"lock file {path}: {error.strerror}") from error
         self._page = mmap.mmap(self.descriptor, mmap.PAGESIZE)
         self.notes = DriveNotes(self._page)
-        if not self._is_acquired(patience):
+        if not self._is_acquired():
             holder = self.notes.owner
             self.release()
             raise BusError(f"CAN bus {address[1]} is held by {holder}")
@@ -58,15 +56,14 @@ class BusLock:
         self._page.close()
         os.close(self.descriptor)
 
-    def _is_acquired(self, patience: float) -> bool:
-        start = time.monotonic()
+    def _is_acquired(self) -> bool:
+        end = time.monotonic() + ATTEMPT_TIME
         while True:
             try:
                 fcntl.flock(self.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 return True
             except BlockingIOError:
-                is_descending = self.notes.owner.startswith(LETTING_DOWN)
-                if time.monotonic() - start > (max(patience, ATTEMPT_TIME) if is_descending else ATTEMPT_TIME):
+                if time.monotonic() > end:
                     return False
                 time.sleep(ATTEMPT_PERIOD)
 

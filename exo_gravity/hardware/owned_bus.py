@@ -16,13 +16,12 @@ class OwnedBus:
     """The bus of the arm `charge`, locked for `owner` (shown to others who want the bus) until `close`.
 
     If the previous owner and its watchdog died while the motors were on, that arm is let down first. log: called with
-    what happens then. patience: s to wait for a watchdog that is letting the arm down. Raises BusError if the bus is
-    held or cannot be opened, or if that arm cannot be let down.
+    what happens then. Raises BusError if the bus is held or cannot be opened, or if that arm cannot be let down.
     """
 
-    def __init__(self, charge: Charge, owner: str, log: Callable[[str], None], patience: float = 0.0) -> None:
+    def __init__(self, charge: Charge, owner: str, log: Callable[[str], None]) -> None:
         self._charge = charge
-        self._lock = BusLock(charge.address, owner, patience)
+        self._lock = BusLock(charge.address, owner)
         try:
             _let_down(charge, self._lock.notes, log)
             self.watchdog = Watchdog(self._lock, charge)

@@ -23,7 +23,6 @@ from queue import SimpleQueue
 import can
 
 from exo_gravity.core.validation import FROZEN
-from exo_gravity.hardware.bus_lock import LETTING_DOWN
 from exo_gravity.hardware.drive_notes import DriveNotes
 from exo_gravity.hardware.handover import Charge, let_down
 
@@ -94,8 +93,7 @@ def run(bridge: int, notes: DriveNotes, receiver: Connection, log: Log) -> int:
     if charge is None:
         log.write(f"can_bridge {why}: its motors may still be powered")
         return 1
-    process = f"(PID {os.getpid()}) of {notes.owner}"
-    notes.owner = f"{LETTING_DOWN} {process}; it is letting the arm down, wait until it ends"
+    notes.owner = f"the watchdog (PID {os.getpid()}) of {notes.owner}; it is letting the arm down, wait until it ends"
     log.write(f"can_bridge {why}: letting the arm down")
     if let_down(charge, drive, notes.note, log.write):
         log.write("the arm is down, its motors are off")

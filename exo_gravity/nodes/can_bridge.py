@@ -33,7 +33,6 @@ from exo_gravity.nodes.run import run
 
 REPORT_PERIOD = 0.1  # s
 DESCENT_TIMEOUT = 60.0  # s in which a deactivated arm must be down, with its motors off
-AUTOSTART_PATIENCE = 30.0  # s for the watchdog of a dead bridge to let the arm down
 REMINDER_PERIOD = 10.0  # s between two reminders that a motor cannot be reached
 
 
@@ -57,7 +56,6 @@ class CanBridge(LifecycleNode):
         self._owned: OwnedBus | None = None  # while configured
         self._bus: MotorBus | None = None  # while inactive
         self._loop: ControlLoop | None = None  # while active
-        self._patience = AUTOSTART_PATIENCE if values["autostart"] else 0.0
         self._error = ""  # why the last transition failed
         self._exchange = EffortExchange(self, values["joint_names"], self._limits, lambda: self._loop)
         self._report_writer = BridgeReport(self, values["joint_names"], wire, self._period)
@@ -148,7 +146,7 @@ class CanBridge(LifecycleNode):
         return TransitionCallbackReturn.FAILURE
 
     def _configure(self) -> None:
-        self._owned = OwnedBus(self._charge, self._owner, self.get_logger().error, self._patience)
+        self._owned = OwnedBus(self._charge, self._owner, self.get_logger().error)
         try:
             self._bus = self._owned.open()
         except BaseException:

@@ -16,7 +16,6 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from exo_gravity.bag.joints import FIELDS, Layout
 from exo_gravity.bag.reader import read_bag
-from exo_gravity.core.errors import DataError
 
 from ..support import synthetic_bags as made
 
@@ -163,45 +162,6 @@ def test_the_recorded_wearer_steps_are_the_script(recording, bag):
     np.testing.assert_allclose([step.start for step in steps], [step.start for step in recording.steps], atol=0.006)
 
 
-@pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
-def test_a_recording_cut_short_gives_what_was_written_before(recording, bag, share):
-    (bag / "metadata.yaml").unlink()
-    file = bag / "bag.mcap"
-    file.write_bytes(file.read_bytes()[: round(share * file.stat().st_size)])
-    read = read_bag(bag)
-    (arm,) = read.recordings
-    assert 0.8 * share < len(arm.time) / len(recording.time) <= 1.0
-    assert_same(arm, recording, len(arm.time))
-    assert "cut short" in read.notes[0]
-
-
-def test_a_recording_that_lacks_only_its_index_is_complete(recording, bag):
-    file = bag / "bag.mcap"
-    file.write_bytes(file.read_bytes()[:-40])
-    read = read_bag(bag)
-    assert_same(read.recordings[0], recording)
-    assert not read.notes
-
-
-@pytest.mark.parametrize("share", [0.5, 0.9])
-def test_a_recording_with_compressed_chunks_cut_short_gives_the_whole_chunks(recording, content, tmp_path, share):
-    bag = made.write_bag(tmp_path / "bag", content * 4, compression=CompressionMode.STORAGE)
-    file = bag / "bag.mcap"
-    file.write_bytes(file.read_bytes()[: round(share * file.stat().st_size)])
-    read = read_bag(bag)
-    assert "cut short" in read.notes[0] and len(read.recordings[0].time) > 100
-
-
-def test_a_database_cut_short_gives_the_rows_before(recording, content, tmp_path):
-    bag = made.write_bag(tmp_path / "bag", content, plugin=StoragePlugin.SQLITE3)
-    (bag / "metadata.yaml").unlink()
-    file = bag / "bag.db3"
-    file.write_bytes(file.read_bytes()[: round(0.6 * file.stat().st_size)])
-    read = read_bag(bag)
-    assert len(read.recordings[0].time) > 100
-    assert "cut short" in read.notes[0]
-
-
 def test_the_parts_of_a_recording_are_read_in_the_order_of_their_numbers(recording, content, tmp_path):
     folder = tmp_path / "split"
     folder.mkdir()
@@ -214,190 +174,11 @@ def test_the_parts_of_a_recording_are_read_in_the_order_of_their_numbers(recordi
     np.testing.assert_allclose(read.time, recording.time - 200e-6, atol=1e-8)
 
 
-def test_an_empty_recording_is_reported_as_empty(tmp_path):
-    topics = [("/right/joint_states", made.JOINT_STATE)]
-    with pytest.raises(DataError, match="empty"):
-        read_bag(made.write_bag(tmp_path / "bag", [], topics=topics))
-
-
-def test_the_error_for_a_recording_without_joint_states_lists_its_topics(tmp_path):
-    content = [("/chatter", "std_msgs/msg/String", made.START, made.string("hello"))]
-    with pytest.raises(DataError, match=r"no topic joint_states .* it has /chatter"):
-        read_bag(made.write_bag(tmp_path / "bag", content))
-
-
-def test_joint_states_of_another_type_are_ignored(tmp_path):
-    content = [("/right/joint_states", "std_msgs/msg/String", made.START, made.string("hello"))]
-    with pytest.raises(DataError, match="joint_states"):
-        read_bag(made.write_bag(tmp_path / "bag", content))
-
-
-@pytest.mark.parametrize("name", ["missing", "folder", "text.mcap", "text.db3", "text.txt"])
-def test_a_file_that_is_not_a_recording_is_refused_by_name(tmp_path, name):
-    (tmp_path / "folder").mkdir()
-    for file in ("text.mcap", "text.db3", "text.txt"):
-        (tmp_path / file).write_text("no recording at all, though long enough to look at\n" * 20)
-    with pytest.raises(DataError, match=name):
-        read_bag(tmp_path / name)
-
-
-def test_commands_for_other_joints_are_a_problem_and_positions_are_still_read(recording, tmp_path):
-    content = made.messages(recording, command_names=("a", "b", "c", "d"))
-    read = read_bag(made.write_bag(tmp_path / "bag", content))
-    assert_same(read.recordings[0], recording)
-    (problem,) = read.problems
-    assert "/right/effort_commands" in problem and "a, b, c, d" in problem and "right_joint_1" in problem
-
-
-def test_joint_states_whose_names_change_are_refused(recording, content, tmp_path):
-    stamp = content[-1][2] + 10**9
-    other = made.joint_state(stamp, ("a", "b", "c", "d"), *np.zeros((3, 4)))
-    with pytest.raises(DataError, match=r"/right/joint_states: joint names differ: a, b, c, d"):
-        read_bag(made.write_bag(tmp_path / "bag", [*content, ("/right/joint_states", made.JOINT_STATE, stamp, other)]))
-
-
-def test_an_unreadable_arm_is_a_problem_and_the_other_arm_is_still_read(recording, content, tmp_path):
-    bad = [
-        ("/left/joint_states", made.JOINT_STATE, made.START + k * 10**6, made.joint_state(0, ["a"], [0.0]))
-        for k in range(9)
-    ]
-    read = read_bag(made.write_bag(tmp_path / "bag", [*bad, *content]))
-    assert [arm.name for arm in read.recordings] == ["right"]
-    assert "left" in read.problems[0] and "must be 4" in read.problems[0]
-
-
-def test_a_damaged_message_is_named_by_its_topic(content, tmp_path):
-    broken = [(topic, kind, stamp, data[:40]) for topic, kind, stamp, data in content if kind == made.JOINT_STATE]
-    with pytest.raises(DataError, match=r"/right/joint_states: .* damaged"):
-        read_bag(made.write_bag(tmp_path / "bag", broken))
-
-
-def test_without_commands_the_rest_is_read_with_a_note(recording, content, tmp_path):
-    states = [item for item in content if item[0] != "/right/effort_commands"]
-    read = read_bag(made.write_bag(tmp_path / "bag", states))
-    assert_same(read.recordings[0], recording)
-    assert np.all(np.isnan(read.recordings[0].command)) and "effort_commands" in read.notes[0]
-
-
-@pytest.mark.parametrize("text", ["no JSON", "[1]", "{}", '{"action": "hold", "duration": null}'])
-def test_an_invalid_step_is_one_problem_and_the_rest_is_read(content, recording, tmp_path, text):
-    wrong = ("/right/wearer_step", "std_msgs/msg/String", content[-1][2], made.string(text))
-    read = read_bag(made.write_bag(tmp_path / "bag", [*content, wrong]))
-    assert read.problems == ("/right/wearer_step: invalid wearer_step message",)
-    assert_same(read.recordings[0], recording)
-
-
-def status(level, text, **values):
-    """Topic, type and bytes of a bridge's diagnostics."""
-    types = made.STORE.types
-    pairs = [types["diagnostic_msgs/msg/KeyValue"](key=key, value=value) for key, value in values.items()]
-    entry = types["diagnostic_msgs/msg/DiagnosticStatus"](level, "right/can_bridge", text, "", pairs)
-    kind = "diagnostic_msgs/msg/DiagnosticArray"
-    stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
-    message = types[kind](types["std_msgs/msg/Header"](stamp=stamp, frame_id=""), [entry])
-    return "/diagnostics", kind, bytes(made.STORE.serialize_cdr(message, kind))
-
-
-def test_the_arm_counts_as_carried_from_the_first_to_the_last_carrying_state(content, tmp_path):
-    states = ["checking", "ramping in", "active", "active", "letting down", "fault", "checking", "active", "active"]
-    for tenth, state in enumerate(states):
-        topic, kind, data = status(0, state, state=state)
-        content = [*content, (topic, kind, made.START + tenth * 10**8, data)]
-    content.sort(key=lambda item: item[2])
-    arrival = 0.0002  # s, of the first joint state, at which time begins
-    expected = [(0.1 - arrival, 0.3 - arrival), (0.7 - arrival, 0.8 - arrival)]
-    np.testing.assert_allclose(only(made.write_bag(tmp_path / "bag", content)).carried, expected, atol=1e-9)
-
-
-def with_states(content, *states):
-    """The content with the bridge's state added every half second from 0.1 s on; None for no report."""
-    for number, state in enumerate(states):
-        if state:
-            topic, kind, data = status(0, state, state=state)
-            content = [*content, (topic, kind, made.START + 10**8 + number * 5 * 10**8, data)]
-    return sorted(content, key=lambda item: item[2])
-
-
-def until(content, seconds):
-    return [item for item in content if item[2] < made.START + round(seconds * 1e9)]
-
-
-def test_an_arm_that_is_carried_when_the_recording_ends_was_not_let_down_in_it(content, tmp_path):
-    read = read_bag(made.write_bag(tmp_path / "bag", until(with_states(content, *["active"] * 20), 4.35)))
-    (arm,) = read.recordings
-    assert arm.carried == ((pytest.approx(0.0998), arm.time[-1]),)
-    assert read.notes == (
-        "right: the recording ends while the arm is carried: it does not show how the arm was let down",
-    )
-
-
-def test_a_recording_that_ends_in_the_descent_does_not_claim_that_the_arm_came_down(content, tmp_path):
-    states = ["active"] * 6 + ["letting down"] * 3
-    read = read_bag(made.write_bag(tmp_path / "bag", until(with_states(content, *states), 4.35)))
-    assert read.notes == ("right: the recording ends before the arm was down",)
-
-
-@pytest.mark.parametrize("last", ["disabled", "fault", None])
-def test_an_arm_that_is_off_at_the_end_or_still_observed_gets_no_note(content, tmp_path, last):
-    states = ["active"] * 4 + [last] * 5
-    assert not read_bag(made.write_bag(tmp_path / "bag", until(with_states(content, *states), 4.35))).notes
-
-
-def test_without_a_reported_state_it_is_unknown_when_the_arm_was_carried(content, bag):
-    assert only(bag).carried is None
-
-
-def test_faults_changed_parameters_and_parameters_at_the_start_are_read(content, tmp_path):
-    types = made.STORE.types
-    stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
-
-    def change(name, value):
-        nothing = {
-            "bool_value": False,
-            "integer_value": 0,
-            "string_value": "",
-            "byte_array_value": np.zeros(0, np.uint8),
-        }
-        nothing.update(bool_array_value=np.zeros(0, bool), integer_array_value=np.zeros(0, np.int64))
-        nothing.update(double_array_value=np.zeros(0), string_array_value=[])
-        value = types["rcl_interfaces/msg/ParameterValue"](type=3, double_value=value, **nothing)
-        parameter = types["rcl_interfaces/msg/Parameter"](name=name, value=value)
-        kind = "rcl_interfaces/msg/ParameterEvent"
-        message = types[kind](stamp, "/right/compensator", [], [parameter], [])
-        return "/parameter_events", kind, bytes(made.STORE.serialize_cdr(message, kind))
-
-    snapshot = "/right/compensator:\n  ros__parameters: {law: exact}\n"
-    messages = [
-        (1.0, ("/recorder/parameters", "std_msgs/msg/String", made.string(snapshot))),
-        (2.0, status(0, "fine")),
-        (3.0, status(2, "motor 2 is silent")),
-        (3.5, status(2, "motor 2 is silent")),
-        (4.0, status(0, "fine")),
-        (5.0, change("support", 0.5)),
-    ]
-    extra = [(topic, kind, made.START + 200_000 + round(s * 1e9), data) for s, (topic, kind, data) in messages]
-    read = read_bag(made.write_bag(tmp_path / "bag", sorted([*content, *extra], key=lambda item: item[2])))
-    assert [(round(event.time, 6), event.text) for event in read.events] == [
-        (3.0, "right/can_bridge: motor 2 is silent"),
-        (4.0, "right/can_bridge: OK, fine"),
-        (5.0, "/right/compensator: support = 0.5"),
-    ]
-    assert read.parameters == {"/right/compensator": snapshot}
-
-
 def test_progress_reaches_the_size_of_the_recording(bag):
     seen = []
     read_bag(bag, lambda done, size: seen.append((done, size)))
     assert seen[-1][1] == (bag / "bag.mcap").stat().st_size
     assert 0 < seen[0][0] <= seen[-1][0] <= seen[-1][1]
-
-
-def test_steps_that_are_all_invalid_leave_the_joint_states_readable(content, recording, tmp_path):
-    steps = [("/right/wearer_step", "std_msgs/msg/String", made.START, made.string("gibberish"))]
-    states = [item for item in content if not item[0].endswith("wearer_step")]
-    read = read_bag(made.write_bag(tmp_path / "bag", [*steps, *states]))
-    assert "/right/wearer_step" in read.problems[0]
-    assert_same(read.recordings[0], recording)
 
 
 def test_additional_fields_of_a_virtual_wearers_step_are_ignored(content, tmp_path):

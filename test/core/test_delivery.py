@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from exo_gravity.core.delivery import DeliveryMonitor
+from exo_gravity.core.delivery import DeliveryMonitor, SwitchOnCheck
+from exo_gravity.core.drive import Drive
 from exo_gravity.core.limits import JointSample
 
 from ..support.safety_run import LIMITS, PERIOD
@@ -62,3 +63,22 @@ def test_a_current_sensor_with_5_percent_noise_raises_no_false_alarm():
     replies, random = Replies(), np.random.default_rng(1)
     noise = 0.05 * np.maximum(2.0, np.abs(EFFORT))
     assert not any(replies.take(EFFORT + noise * random.standard_normal(4)) for _ in range(50_000))
+
+
+def test_a_silent_motor_applies_what_it_last_replied_to():
+    replies = Replies()
+    replies.take(EFFORT)
+    later = Drive((0.0,) * 4, (5.0,) * 4, True)
+    effort, damping = replies.monitor.applied(later, (False, True, False, False))
+    assert effort == (0.0, EFFORT[1], 0.0, 0.0)
+    assert damping == (5.0, 0.0, 5.0, 5.0)
+
+
+def test_a_light_joint_that_moves_when_pushed_has_shown_that_its_motor_is_on():
+    check, velocity, damping, now = SwitchOnCheck(LIMITS), [0.0] * 4, (1.5,) * 4, 0.0
+    while not check.done:
+        now += PERIOD
+        torque = [effort - 1.5 * speed for effort, speed in zip(check.effort, velocity, strict=True)]
+        joints = [JointSample(0.5, speed, net, 30, 0, now) for speed, net in zip(velocity, torque, strict=True)]
+        assert not check.step(PERIOD, joints, damping)
+        velocity = [speed + net / 0.005 * PERIOD for speed, net in zip(velocity, torque, strict=True)]  # 0.005 kg m^2

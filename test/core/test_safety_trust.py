@@ -54,7 +54,7 @@ def test_a_motor_that_does_not_switch_on_is_refused_at_every_start():
     arm.machine.disable(arm.now)
     arm.cycle(8.0)
     arm.off.add(3)
-    arm.enable().cycle(1.3)
+    arm.enable().cycle(1.6)
     assert arm.fault_code == "torque_not_delivered"
     assert "d: the motor did not switch on" in arm.machine.fault.reason
 

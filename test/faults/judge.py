@@ -90,7 +90,7 @@ def _steps(records: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the torque steps (n - 1, 4) between records in Nm, and by how much each exceeds what is allowed."""
     torque = records["torque"]
     effort = torque + records["damping"] * records["velocity"]  # the part that damping does not explain
-    step = np.abs(np.diff(effort, axis=0))
+    step = np.minimum(np.abs(np.diff(effort, axis=0)), np.abs(np.diff(torque, axis=0)))
     at_peak = np.abs(torque) > PEAK_TORQUE - RESOLUTION  # there, damping explains less than its share
     step[at_peak[1:] | at_peak[:-1]] = 0.0
     on = records["on"]

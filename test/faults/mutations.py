@@ -90,7 +90,7 @@ MUTATIONS = (
         "a second bridge takes the bus",
         ("second can_bridge on the bus",),
         (
-            Edit(BUS_LOCK, "if not self._is_acquired(patience):", "if False:"),
+            Edit(BUS_LOCK, "if not self._is_acquired():", "if False:"),
             Edit("exo_gravity/hardware/owned_bus.py", "bus.listen()", "pass"),
         ),
     ),
@@ -107,7 +107,7 @@ MUTATIONS = (
     Mutation(
         "a second commander is ignored",
         ("second publisher of efforts",),
-        (Edit("exo_gravity/nodes/can_bridge.py", "if self._commander.is_another(info):", "if False:"),),
+        (Edit("exo_gravity/nodes/effort_exchange.py", "if self._commander.is_another(info):", "if False:"),),
     ),
     Mutation(
         "stale efforts are accepted",

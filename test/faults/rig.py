@@ -25,7 +25,7 @@ from ..support.launched_nodes import GENTLE, REAL, SIMULATED, LaunchedNodes, Par
 from ..support.ros_probe import RosProbe
 from ..support.truth import Truth
 
-HORIZONTAL = (0.0, 1.5, 0.0, 0.3)  # rad; joint 2 carries 3.8 Nm, joint 3 0.2 Nm
+RAISED = (0.0, 1.3, 0.0, 0.3)  # rad, nearly horizontal
 HOME = [0.0, 0.05, 0.05, 0.05]  # rad, hanging and within the limits
 HELP_TIME = 20.0  # s for which the wearer holds it there
 NEAR = 0.15  # rad from the pose, in which the arm need not be moved again
@@ -44,14 +44,14 @@ class Rig:
 
     base = "sim.yaml"
     rate = 250.0  # Hz
-    pose: Sequence[float] = HORIZONTAL
+    pose: Sequence[float] = RAISED
     bridge: ClassVar[Parameters] = {}
     compensator: ClassVar[Parameters] = {}
     simulator: ClassVar[Parameters] = {}
 
     def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
         self.folder, self.shipped_timeouts = folder, shipped_timeouts
-        self.script = self.write_script("pose", [{"move": list(self.pose), "over": 1.5}, {"hold": 600.0}])
+        self.script = self.write_script("pose", [{"move": list(self.pose), "over": 1.0}, {"hold": 600.0}])
         # The hand stays: a joint with little friction would swing out of its limits again.
         self._home = self.write_script("home", [{"move": HOME, "over": 1.0}, {"move": HOME, "over": HELP_TIME}])
         self.probe = RosProbe()
@@ -59,6 +59,7 @@ class Rig:
         self.nodes = [*self._make_nodes(device.bus["port"]), device]
         self.truth = Truth(device.truth_path())
         self._bridges: set[int] = set()  # IDs of their processes
+        self.second_bridge: tuple[int | None, list[str]] = (None, [])  # exit code and log of the last one started
 
     def start(self) -> None:
         """Start the nodes, the simulated device first."""
@@ -99,16 +100,15 @@ class Rig:
                 self._start_over(stage)
                 return
             while not self._is_at_pose():
-                self._get_carried()
+                self.get_carried(self.probe)
                 self.probe.bring_to(self.script)
                 self._wait_for_states(self.rate / 4)
             if stage == "letting down":
                 assert self.probe.enable(False).success
                 self.probe.wait_until(lambda: abs(self.true_velocity(1)) > 0.2)
 
-    def _get_carried(self) -> None:
+    def get_carried(self, probe: RosProbe) -> None:
         """Wait until the arm is carried; the wearer moves an arm that hangs outside its limits or away from home."""
-        probe = self.probe
         helped = -math.inf
         while probe.state != "active":
             misplaced = probe.fault == "implausible_zero" or probe.status_contains("can_bridge", "to be moved")
@@ -119,13 +119,7 @@ class Rig:
                 probe.trigger("clear_fault")
             elif probe.state == "disabled":
                 probe.enable(True)
-            self._wait_for_report()
-
-    def _wait_for_report(self) -> None:
-        """Wait for the next diagnostics of the bridge."""
-        name = "/right/can_bridge"
-        last = self.probe.statuses.get(name)
-        self.probe.wait_until(lambda: self.probe.statuses.get(name) is not last)
+            probe.wait_for_report()
 
     def _wait_for_states(self, count: float) -> None:
         seen = len(self.probe.joint_states)
@@ -194,12 +188,11 @@ class Rig:
         return [line for nodes in self.nodes for line in nodes.log]
 
     def close(self) -> None:
-        try:
-            for nodes in filter(LaunchedNodes.has_started, self.nodes):
-                nodes.stop()
-        finally:
-            kill_watchdogs(self._bridges)
-            self.probe.close()
+        with contextlib.ExitStack() as stack:  # each is done although another one fails; the last one first
+            stack.callback(self.probe.close)
+            stack.callback(lambda: kill_watchdogs(self._bridges))
+            for nodes in reversed([nodes for nodes in self.nodes if nodes.has_started()]):
+                stack.callback(nodes.stop)
 
 
 def kill_watchdogs(bridges: Collection[int]) -> None:

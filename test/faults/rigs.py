@@ -124,6 +124,8 @@ class BothArmsRig(Rig):
         with self.left.time_limit(CARRY_LIMIT):
             newest = self.left_truth.newest()
             if self.left.state != "active" or newest is None or abs(newest["position"][1] - self.pose[1]) > NEAR:
+                self.left.wait_until(lambda: self.left.state)
+                self.get_carried(self.left)
                 self.left.bring_to(self.script)
         super().bring_to(stage)
 
@@ -171,7 +173,7 @@ class BowRig(Rig):
 class WallRig(Rig):
     """The elbow's upper limit is within reach of a push, and far from the mechanical stop."""
 
-    pose = (0.0, 0.3, 0.3, 0.6)
+    pose = (0.0, 0.3, 0.3, 1.0)
     bridge: ClassVar[Parameters] = {"position_max": [1.65, 3.14, 2.53, 1.2]}
 
 

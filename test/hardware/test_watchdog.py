@@ -132,14 +132,6 @@ def test_a_bus_whose_arm_is_being_let_down_is_held_by_the_watchdog(rig, carry):
     rig.assert_let_down()
 
 
-def test_a_patient_owner_waits_until_the_watchdog_has_let_the_arm_down(rig, carry):
-    carrier = carry()
-    carrier.kill()
-    wait_until(lambda: carrier.process.poll() is not None)
-    BusLock(rig.charge.address, "another", patience=60.0).release()
-    rig.assert_let_down()
-
-
 def test_after_bridge_and_watchdog_were_killed_the_next_owner_lets_the_arm_down_first(rig, carry):
     carrier = carry()
     os.kill(carrier.watchdog, signal.SIGSTOP)

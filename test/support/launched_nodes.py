@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import itertools
 import os
 import signal
@@ -68,7 +69,7 @@ class LaunchedNodes:
                 parameters["truth"] = str(self.truth_path(name))
             parameters.update(FAST if node == "can_bridge" else {})
             parameters.update(timing.get(node, {}))
-            parameters.update(changes.get(node, {}))
+            parameters.update(copy.deepcopy(changes.get(node, {})))  # ROS reads no YAML aliases
         unknown = set(changes) - {name.split("/")[-1] for name in content}
         assert not unknown, f"changes of nodes that are left out: {unknown}"
         self.bus: dict[str, Any] = {

@@ -83,6 +83,11 @@ class RosProbe:
         status = self.statuses.get(f"{self.arm}/{node}")
         return next((pair.value for pair in status.values if pair.key == key), None) if status else None
 
+    def wait_for_report(self) -> None:
+        """Wait for the next diagnostics of the bridge."""
+        last = self.statuses.get(f"{self.arm}/can_bridge")
+        self.wait_until(lambda: self.statuses.get(f"{self.arm}/can_bridge") is not last)
+
     @property
     def state(self) -> str | None:
         """The state that can_bridge reports."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from pathlib import Path
 
 import numpy as np
@@ -25,10 +26,13 @@ class Truth:
         count = self.count
         return self._read(count - 1, count)[0] if count else None
 
-    def since(self, time: float, start: int = 0) -> np.ndarray:
-        """Return the records from `time` (wall clock, s) on; those before index `start` are not read."""
-        records = self._read(start, self.count)
-        return records[records["time"] >= time]
+    def since(self, time: float) -> np.ndarray:
+        """Return the records from `time` (wall clock, s) on."""
+        count = self.count
+        if not count:
+            return np.empty(0, RECORD)
+        records = np.memmap(self.path, RECORD, "r", shape=(count,))
+        return self._read(bisect_left(range(count), time, key=lambda index: records["time"][index]), count)
 
     def motors_are_off(self) -> bool:
         """Return whether no motor is on."""
