@@ -1,7 +1,7 @@
 """calibrator: moves the arm through the poses of a calibration, in the compensator's place.
 
 It answers joint states with efforts as `compensator` does. While the bridge starts, it answers with the expected weight
-of the hanging arm; once the bridge reports `active`, `core.tour` begins. After trouble it withdraws, so that the bridge
+of the hanging arm; once the bridge reports `active`, `core.calibration.tour` begins. After trouble it withdraws, so that the bridge
 lets the arm down. It prints one line of JSON for each event:
 
     {"progress": "pose 3 of 12: ..."}   {"observation": {"theta": [4 rad], ..., "speed": 0.1}}
@@ -23,12 +23,12 @@ from geometry_msgs.msg import Vector3Stamped
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
+from exo_gravity.core.calibration.params import CALIBRATOR, tour_of
+from exo_gravity.core.calibration.tour import Measured
 from exo_gravity.core.drive import State
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.gravity import Torque
 from exo_gravity.core.tilt import Tilt
-from exo_gravity.core.tour import Measured
-from exo_gravity.core.tour_params import CALIBRATOR, tour_of
 from exo_gravity.nodes.compensator import NEWEST
 from exo_gravity.nodes.conversions import by_name
 from exo_gravity.nodes.declare import declare
@@ -42,7 +42,7 @@ PLAN_PERIOD = 0.05  # s
 
 
 class CalibratorNode(Node):
-    """The ROS shell around `core.tour.Tour`."""
+    """The ROS shell around `core.calibration.tour.Tour`."""
 
     def __init__(self) -> None:
         super().__init__("calibrator", automatically_declare_parameters_from_overrides=True)

@@ -9,6 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from exo_gravity.core import ArmModel
+from exo_gravity.core.calibration.guess import TorqueGuess
+from exo_gravity.core.calibration.poses import BestPoses, Itinerary
+from exo_gravity.core.calibration.tour import Tour
 from exo_gravity.core.drive import Drive, State
 from exo_gravity.core.gravity import Torque
 from exo_gravity.core.joint_motor import JointMotor
@@ -17,9 +20,6 @@ from exo_gravity.core.moments import load_moments, moments_of
 from exo_gravity.core.motors import ENTER, EXIT, MOTORS
 from exo_gravity.core.safety import SafetyMachine
 from exo_gravity.core.tilt import Tilt
-from exo_gravity.core.tour import Tour
-from exo_gravity.core.tour_guess import TorqueGuess
-from exo_gravity.core.tour_poses import BestPoses, Itinerary
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.virtual_wearer import VirtualWearer

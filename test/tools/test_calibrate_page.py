@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.arm import ArmModel
+from exo_gravity.core.calibration.identification import Observation, identify
 from exo_gravity.core.gravity import gravity_torque
-from exo_gravity.core.identification import Observation, identify
 from exo_gravity.core.moments import load_moments, regressor
 from exo_gravity.core.tilt import Tilt
 from exo_gravity.tools.calibration.outcome import Change, Curve, Outcome

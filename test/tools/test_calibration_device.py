@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core.calibration.friction import friction_stations
+from exo_gravity.core.calibration.poses import BestPoses, FixedStations
 from exo_gravity.core.recording import Recording
-from exo_gravity.core.tour_friction import friction_stations
-from exo_gravity.core.tour_poses import BestPoses, FixedStations
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.tools.calibration import friction, gravity, recorded

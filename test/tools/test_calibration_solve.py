@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core.calibration.identification import Observation
+from exo_gravity.core.calibration.params import CALIBRATOR, tour_of
+from exo_gravity.core.calibration.tour import Measured
 from exo_gravity.core.control_params import wearer_of
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.identification import Observation
 from exo_gravity.core.moments import load_moments, moments_of, regressor
 from exo_gravity.core.param_table import values_of
 from exo_gravity.core.recording import Recording
 from exo_gravity.core.tilt import Tilt
-from exo_gravity.core.tour import Measured
-from exo_gravity.core.tour_params import CALIBRATOR, tour_of
 from exo_gravity.tools.calibration import friction, gravity, live, recorded, scale, wearer
 from exo_gravity.tools.inputs.arms import configured_arm
 from exo_gravity.tools.inputs.parameter_file import load, packaged_config

@@ -19,10 +19,10 @@ from typing import Any
 
 import yaml
 
+from exo_gravity.core.calibration.identification import Observation
+from exo_gravity.core.calibration.tour import Measured
 from exo_gravity.core.control_params import LIMIT_PARAMETERS
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.identification import Observation
-from exo_gravity.core.tour import Measured
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.launcher import Launcher, Stopping, stop_on_signals
 

@@ -10,7 +10,7 @@ import numpy as np
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 
 if TYPE_CHECKING:
-    from exo_gravity.core.identification import Identified, Observation
+    from exo_gravity.core.calibration.identification import Identified, Observation
 
 Value = bool | int | float | str | list[int] | list[float]
 

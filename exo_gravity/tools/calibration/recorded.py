@@ -18,11 +18,11 @@ from rosbags.typesys import Stores, get_typestore
 
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.bag.storage import Storage
+from exo_gravity.core.calibration.average import BINS, Sweep, average
+from exo_gravity.core.calibration.identification import Observation
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.identification import Observation
 from exo_gravity.core.recording import Recording, in_blocks, still_spans
 from exo_gravity.core.tilt import Tilt
-from exo_gravity.core.tour_average import BINS, Sweep, average
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 
 TILT_TOPIC, TILT_TYPE = "/imu/pitch_yaw", "geometry_msgs/msg/Vector3Stamped"

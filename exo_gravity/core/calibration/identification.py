@@ -19,10 +19,16 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.arm import STANDARD_GRAVITY, Vector
-from exo_gravity.core.identification_check import check_fit, check_motors, check_physical, check_told, checked, untold
-from exo_gravity.core.moments import load_moments, regressor
-from exo_gravity.core.pose_choice import TYPICAL_MOMENTS, next_pose
-from exo_gravity.core.pose_fit import (
+from exo_gravity.core.calibration.identification_check import (
+    check_fit,
+    check_motors,
+    check_physical,
+    check_told,
+    checked,
+    untold,
+)
+from exo_gravity.core.calibration.pose_choice import TYPICAL_MOMENTS, next_pose
+from exo_gravity.core.calibration.pose_fit import (
     ANGLE,
     COUNT,
     FACTOR,
@@ -35,6 +41,7 @@ from exo_gravity.core.pose_fit import (
     without_each_pose,
     without_outliers,
 )
+from exo_gravity.core.moments import load_moments, regressor
 
 __all__ = ["Identified", "Observation", "identify", "next_pose"]
 

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from exo_gravity.core.calibration.average import Average, Sweep, average
+from exo_gravity.core.calibration.motion import WINDOW, Line, Station
 from exo_gravity.core.gravity import Torque
-from exo_gravity.core.tour_average import Average, Sweep, average
-from exo_gravity.core.tour_motion import WINDOW, Line, Station
 
 FOLLOWED = 0.7  # of the way of the reference, that each joint must follow in a sweep that counts
 MAX_FAILURES = 3  # pairs of sweeps in which a joint may stick: each shows the controller more of its friction

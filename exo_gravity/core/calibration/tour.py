@@ -14,17 +14,17 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.arm import JOINT_COUNT
+from exo_gravity.core.calibration.guess import TorqueGuess
+from exo_gravity.core.calibration.identification import Observation
+from exo_gravity.core.calibration.motion import Line, Station
+from exo_gravity.core.calibration.poses import Itinerary, Progress
+from exo_gravity.core.calibration.tracking import MassMatrix, Tracker
+from exo_gravity.core.calibration.visit import FOLLOWED, Visit
+from exo_gravity.core.calibration.watch import Watch
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.gravity import Torque
-from exo_gravity.core.identification import Observation
 from exo_gravity.core.limits import Limits
 from exo_gravity.core.tilt import Tilt
-from exo_gravity.core.tour_control import MassMatrix, Tracker
-from exo_gravity.core.tour_guess import TorqueGuess
-from exo_gravity.core.tour_motion import Line, Station
-from exo_gravity.core.tour_poses import Itinerary, Progress
-from exo_gravity.core.tour_visit import FOLLOWED, Visit
-from exo_gravity.core.tour_watch import Watch
 
 SETTLING = 0.4  # s at rest before the first sweep of a pose
 # rad behind the reference, from which on it slows down, and at which it stops and waits for the arm.

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from exo_gravity.core.arm import JOINT_COUNT
+from exo_gravity.core.calibration.pose_choice import TYPICAL_MOMENTS, missing_pose
+from exo_gravity.core.calibration.pose_fit import ANGLE, COUNT, DISTURBED, FACTOR, OFFSET, SCALE
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.moments import MOMENTS
-from exo_gravity.core.pose_choice import TYPICAL_MOMENTS, missing_pose
-from exo_gravity.core.pose_fit import ANGLE, COUNT, DISTURBED, FACTOR, OFFSET, SCALE
 
 if TYPE_CHECKING:
-    from exo_gravity.core.identification import Observation
+    from exo_gravity.core.calibration.identification import Observation
 
 SCALES = (0.3, 3.0)  # true torque per commanded torque; users report 0.75
 SILENT = 0.01  # Nm by which the effort must differ between poses where gravity's torque differs by `EXPECTED`

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from exo_gravity.core.calibration.identification import identify, next_pose
+from exo_gravity.core.calibration.identification_check import check_physical
+from exo_gravity.core.calibration.pose_choice import TYPICAL_MOMENTS, missing_pose
+from exo_gravity.core.calibration.pose_fit import COUNT
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.identification import identify, next_pose
-from exo_gravity.core.identification_check import check_physical
 from exo_gravity.core.moments import regressor
-from exo_gravity.core.pose_choice import TYPICAL_MOMENTS, missing_pose
-from exo_gravity.core.pose_fit import COUNT
 
-from ..support.random_device import LEANING, LENGTH, Device, best
+from ...support.random_device import LEANING, LENGTH, Device, best
 
 SLIPS = {
     "one pose": {2: (0, 0, 0.3, 0)},

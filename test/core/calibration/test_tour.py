@@ -9,24 +9,24 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core.calibration.average import Sweep, average
+from exo_gravity.core.calibration.friction import fit_friction, friction_stations
+from exo_gravity.core.calibration.guess import TorqueGuess
+from exo_gravity.core.calibration.motion import ACCELERATION, MAX_SPEED, Line, Station
+from exo_gravity.core.calibration.params import as_text, stations_of
+from exo_gravity.core.calibration.poses import BestPoses, FixedStations, Progress, candidates, measurable
+from exo_gravity.core.calibration.tour import Tour
+from exo_gravity.core.calibration.tracking import MassMatrix
 from exo_gravity.core.drive import State
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.faults import FaultCode
 from exo_gravity.core.limits import Limits
 from exo_gravity.core.moments import moments_of
 from exo_gravity.core.tilt import Tilt
-from exo_gravity.core.tour import Tour
-from exo_gravity.core.tour_average import Sweep, average
-from exo_gravity.core.tour_control import MassMatrix
-from exo_gravity.core.tour_friction import fit_friction, friction_stations
-from exo_gravity.core.tour_guess import TorqueGuess
-from exo_gravity.core.tour_motion import ACCELERATION, MAX_SPEED, Line, Station
-from exo_gravity.core.tour_params import as_text, stations_of
-from exo_gravity.core.tour_poses import BestPoses, FixedStations, Progress, candidates, measurable
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
-from ..support.tour_run import MOTORS_AS_MOUNTED, NAMES, TourRun
+from ...support.tour_run import MOTORS_AS_MOUNTED, NAMES, TourRun
 
 LIMITS = Limits(NAMES)
 POSE = Station((0.1, 0.5, 0.6, 0.7))

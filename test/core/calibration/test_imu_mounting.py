@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.arm import STANDARD_GRAVITY
+from exo_gravity.core.calibration.imu_mounting import ImuRecord, mounting, six_rests
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.imu_mounting import ImuRecord, mounting, six_rests
 from exo_gravity.core.tilt import rotation_matrix
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu
 
