@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from exo_gravity.core.calibration.params import CALIBRATOR
 from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR, IMU, RECORDER
 from exo_gravity.core.faults import FaultCode
 from exo_gravity.core.param_table import Param
@@ -25,6 +26,7 @@ PARAMETERS = {
     "imu": IMU,
     "simulator": SIMULATOR,
     "recorder": RECORDER,
+    "calibrator": [param for param in CALIBRATOR if param.name.startswith("tour.")],
 }
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 

@@ -11,7 +11,6 @@ from exo_gravity.core.calibration.identification import Identified, Observation,
 from exo_gravity.core.calibration.poses import candidates
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.joint_motor import TORQUE_SCALE_BOUNDS
-from exo_gravity.core.limits import Limits
 from exo_gravity.core.moments import MOMENTS, moments_of
 from exo_gravity.tools.calibration.live import Say, refusals_of, run_tour, tour_parameters
 from exo_gravity.tools.calibration.outcome import Change, Outcome
@@ -41,17 +40,19 @@ def solve(arm: ConfiguredArm, observations: Sequence[Observation], refusals: tup
         reasons = (*refusals, str(error)) if observations or not refusals else refusals
         return Outcome((), (), reasons, arm, tuple(observations))
     changes, impossible = changes_of(arm, identified)
-    suggestion = _suggestion(arm.limits, observations, moments_of(arm.robot))
+    suggestion = _suggestion(arm, observations)
     lines = (*lines_of(arm, identified), *identified.unknown)
     return Outcome(changes, lines, refusals + impossible, arm, tuple(observations), identified, suggestion)
 
 
 def changes_of(arm: ConfiguredArm, identified: Identified) -> tuple[tuple[Change, ...], tuple[str, ...]]:
-    """Return the new values of the parameter file, and why it could not have them."""
+    """Return the new values of the parameter file, and why it could not have them. What is unknown keeps its value."""
     node, error = f"{arm.namespace}/compensator", identified.error
     unit = "as commanded; in kg m once a weight was hung" if identified.relative else "kg m"
-    moments = [round(float(value), 5) for value in identified.moments]
-    scale = [round(old * new, 4) for old, new in zip(arm.can_bridge["torque_scale"], identified.scale, strict=True)]
+    known = np.where(np.isfinite(error), identified.moments, moments_of(arm.robot))
+    moments = [round(float(value), 5) for value in known]
+    factor = np.where(np.isfinite(identified.scale_error), identified.scale, 1.0)
+    scale = [round(old * float(new), 4) for old, new in zip(arm.can_bridge["torque_scale"], factor, strict=True)]
     changes = [
         Change(node, "robot.first_moment", moments[:4], f"{unit}, +-{_row(error[:4])}"),
         Change(node, "robot.off_axis", moments[4:], f"W Z Y3 Y4 {unit}, +-{_row(error[4:])}"),
@@ -89,11 +90,12 @@ def lines_of(arm: ConfiguredArm, identified: Identified) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def _suggestion(limits: Limits, observations: Sequence[Observation], moments: np.ndarray) -> tuple[float, ...]:
+def _suggestion(arm: ConfiguredArm, observations: Sequence[Observation]) -> tuple[float, ...]:
     """Return the pose (4,) in rad that would add the most to `observations`."""
-    poses = candidates(limits)
+    poses = candidates(arm.limits)
     taken = [observation.theta for observation in observations]
-    return tuple(poses[next_pose(taken, poses, observations[-1].direction, moments)].tolist())
+    direction = observations[-1].direction
+    return tuple(poses[next_pose(taken, poses, direction, moments_of(arm.robot), gravity=arm.robot.gravity)].tolist())
 
 
 def _row(values: np.ndarray) -> str:
