@@ -1,8 +1,8 @@
 """calibrator: moves the arm through the poses of a calibration, in the compensator's place.
 
 It answers joint states with efforts as `compensator` does. While the bridge starts, it answers with the expected weight
-of the hanging arm; once the bridge reports `active`, `core.calibration.tour` begins. After trouble it withdraws, so that the bridge
-lets the arm down. It prints one line of JSON for each event:
+of the hanging arm; once the bridge reports `active`, the tour (core/calibration/tour.py) begins. After trouble it
+withdraws, so that the bridge lets the arm down. It prints one line of JSON for each event:
 
     {"progress": "pose 3 of 12: ..."}   {"observation": {"theta": [4 rad], ..., "speed": 0.1}}
     {"trouble": "elbow: ..."}           {"done": true}
