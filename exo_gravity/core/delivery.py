@@ -79,8 +79,8 @@ class DeliveryMonitor:
             tolerance = ABSOLUTE + RELATIVE * abs(self._expected[i])
             before = max(self._bad_time[i], PERSISTENCE / 2) if has_returned else self._bad_time[i]
             self._bad_time[i] = before + dt if abs(self._difference[i]) > tolerance else 0.0
-        for i, is_missing in enumerate(self.missing):
-            if is_missing:
+        for i, bad_time in enumerate(self._bad_time):
+            if bad_time >= PERSISTENCE:
                 reply = self._expected[i] + self._difference[i]
                 reason = f"{self._limits.joint_names[i]}: {self._expected[i]:.2f} Nm commanded, {reply:.2f} Nm replied"
                 return Fault(FaultCode.TORQUE_NOT_DELIVERED, reason)

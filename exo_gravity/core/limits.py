@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from exo_gravity.core.arm import JOINT_COUNT
+from exo_gravity.core.drive import NOTHING
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.faults import Fault, FaultCode
 from exo_gravity.core.motors import MOTOR_ERRORS, MOTORS
@@ -96,10 +97,23 @@ class Limits:
         before: the previous readings. overshoot: rad past a joint limit that is not yet a fault.
         """
         for i, (joint, last) in enumerate(zip(joints, before, strict=True)):
+            if self._is_sound(now, i, joint, last):
+                continue
             fault = self._motor_fault(now, i, joint) or self._motion_fault(i, joint, last, overshoot)
             if fault:
                 return fault
         return None
+
+    def _is_sound(self, now: float, i: int, joint: JointSample, last: JointSample) -> bool:
+        """Return whether a reading is beyond doubt: one check for nearly every reading of the control loop."""
+        return (
+            now - joint.time <= self.reply_timeout
+            and not joint.error
+            and (joint.temperature is None or joint.temperature < self.max_temperature)
+            and abs(joint.velocity) <= self.max_velocity[i]
+            and self.position_min[i] <= joint.position <= self.position_max[i]
+            and abs(joint.position - last.position) <= JUMP
+        )
 
     def _motor_fault(self, now: float, i: int, joint: JointSample) -> Fault | None:
         name = self.joint_names[i]
@@ -157,23 +171,26 @@ class Limits:
                 raise ParameterError(f"effort of {name}", effort[i], f"from -{MAX_COMMAND:g} to {MAX_COMMAND:g} Nm")
             depth = self._depth(i, joint.position)
             permitted = self.max_effort[i] * self._derating(joint.temperature)
-            wanted = share * (effort[i] + _wall_torque(depth, joint.velocity))
+            wall = _wall_torque(depth, joint.velocity) if depth else 0.0
+            wanted = share * (effort[i] + wall)
             clamped = max(-permitted, min(permitted, wanted))
             limited = max(before[i] - step, min(before[i] + step, clamped))
-            for limit, acts in (
-                ("soft wall", depth != 0.0),
-                ("derating", permitted < self.max_effort[i]),
-                ("max_effort", clamped != wanted),
-                ("max_effort_rate", limited != clamped),
-            ):
-                if acts:
-                    acted.add(f"{limit} ({name})")
             shaped.append(limited)
+            if depth != 0.0:
+                acted.add(f"soft wall ({name})")
+            if permitted < self.max_effort[i]:
+                acted.add(f"derating ({name})")
+            if clamped != wanted:
+                acted.add(f"max_effort ({name})")
+            if limited != clamped:
+                acted.add(f"max_effort_rate ({name})")
         return tuple(shaped), acted
 
     def wall_damping(self, joints: Sequence[JointSample]) -> tuple[float, ...]:
         """Return the damping (4,) in Nm s/rad of the soft walls at the joints' positions."""
-        depths = (self._depth(i, joint.position) for i, joint in enumerate(joints))
+        depths = [self._depth(i, joint.position) for i, joint in enumerate(joints)]
+        if not any(depths):
+            return NOTHING
         return tuple(WALL_DAMPING * min(1.0, abs(depth) / WALL_EDGE) for depth in depths)
 
     def _depth(self, i: int, position: float) -> float:
@@ -183,7 +200,7 @@ class Limits:
         return above if above > 0.0 else -max(0.0, below)
 
     def _derating(self, temperature: int | None) -> float:
-        if temperature is None:
+        if temperature is None or temperature <= self.max_temperature - DERATING:
             return 1.0
         return max(0.5, min(1.0, 0.5 + 0.5 * (self.max_temperature - temperature) / DERATING))
 

@@ -26,6 +26,8 @@ class RestTracker:
         )
         if any(moved):
             self.since, self._reference = now, joints
+        if not any(silent):
+            return
         # A silent joint may have moved by the time it replies again.
         self._reference = [
             UNKNOWN if is_silent else reference for reference, is_silent in zip(self._reference, silent, strict=True)

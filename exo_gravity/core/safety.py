@@ -25,6 +25,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.delivery import DeliveryMonitor
 from exo_gravity.core.descent import DAMPING_RISE, ArmDescent
 from exo_gravity.core.drive import CARRYING, NOTHING, OFF, Drive, State
@@ -202,8 +203,10 @@ class SafetyMachine:
         self.acted.update(dict.fromkeys(acted, now))
         # Damping rises at once, since the soft wall already rises with the position, and falls over DAMPING_RISE.
         fall = self.limits.damping / DAMPING_RISE * dt
-        walls = zip(self.limits.wall_damping(joints), self._sent.damping, strict=True)
-        return Drive(shaped, tuple(max(wall, last - fall) for wall, last in walls), True)
+        walls, last = self.limits.wall_damping(joints), self._sent.damping
+        if any(walls) or any(last):
+            walls = tuple(max(wall, before - fall) for wall, before in zip(walls, last, strict=True))
+        return Drive(shaped, walls, True)
 
     def _descend(self, now: float, joints: Sequence[JointSample], dt: float) -> Drive:
         descent = self._descent
@@ -233,8 +236,7 @@ class SafetyMachine:
     def _track(self, now: float, joints: Sequence[JointSample]) -> None:
         """Note which motors are silent, which returned, and whether the arm is at rest as far as its motors reply."""
         silent = [self.limits.is_silent(now, joint) for joint in joints]
-        jumped = (self.limits.is_jump(i, *pair) for i, pair in enumerate(zip(joints, self._before, strict=True)))
-        if any(silent) or any(jumped):
+        if any(silent) or any(map(self.limits.is_jump, range(JOINT_COUNT), joints, self._before)):
             self._is_trusted = False  # a motor may have lost power, and with it the turn count of its encoder
         self._rest.step(now, joints, silent)
         self._silent = silent

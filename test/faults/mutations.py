@@ -117,8 +117,8 @@ MUTATIONS = (
     Mutation(
         "zeros once checked are trusted for ever",
         ("joint 2 jumps by a motor turn, then clear and enable",),
-        (Edit(SAFETY, "zip(joints, self._before, strict=True)))\n        if any(silent) or any(jumped):",
-              "zip(joints, self._before, strict=True)))\n        if False:"),
+        (Edit(SAFETY, "if any(silent) or any(map(self.limits.is_jump, range(JOINT_COUNT), joints, self._before)):",
+              "if False:"),
          Edit(SAFETY, "        if code in DOUBTFUL:\n", "        if False:\n")),
     ),
     Mutation(
