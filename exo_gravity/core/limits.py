@@ -97,47 +97,25 @@ class Limits:
         before: the previous readings. overshoot: rad past a joint limit that is not yet a fault.
         """
         for i, (joint, last) in enumerate(zip(joints, before, strict=True)):
-            if self._is_sound(now, i, joint, last):
-                continue
-            fault = self._motor_fault(now, i, joint) or self._motion_fault(i, joint, last, overshoot)
-            if fault:
-                return fault
-        return None
-
-    def _is_sound(self, now: float, i: int, joint: JointSample, last: JointSample) -> bool:
-        """Return whether a reading is beyond doubt: one check for nearly every reading of the control loop."""
-        return (
-            now - joint.time <= self.reply_timeout
-            and not joint.error
-            and (joint.temperature is None or joint.temperature < self.max_temperature)
-            and abs(joint.velocity) <= self.max_velocity[i]
-            and self.position_min[i] <= joint.position <= self.position_max[i]
-            and abs(joint.position - last.position) <= JUMP
-        )
-
-    def _motor_fault(self, now: float, i: int, joint: JointSample) -> Fault | None:
-        name = self.joint_names[i]
-        if self.is_silent(now, joint):
-            return Fault(FaultCode.MOTOR_SILENT, f"{name}: no reply for more than {self.reply_timeout * 1000:.0f} ms")
-        if joint.error:
-            text = MOTOR_ERRORS.get(joint.error, "unknown")
-            return Fault(FaultCode.MOTOR_ERROR, f"{name}: the motor reports error {joint.error} ({text})")
-        if joint.temperature is not None and joint.temperature >= self.max_temperature:
-            limit = f"the limit is {self.max_temperature:g}"
-            return Fault(FaultCode.OVER_TEMPERATURE, f"{name}: {joint.temperature} degC, {limit}")
-        return None
-
-    def _motion_fault(self, i: int, joint: JointSample, last: JointSample, overshoot: float) -> Fault | None:
-        name, limit = self.joint_names[i], self.max_velocity[i]
-        if not abs(joint.velocity) <= limit:
-            return Fault(FaultCode.OVER_SPEED, f"{name}: {joint.velocity:.2f} rad/s, the limit is {limit:g}")
-        low, high = self.position_min[i], self.position_max[i]
-        if not low - overshoot <= joint.position <= high + overshoot:
-            reason = f"{name}: {joint.position:.3f} rad, the limits are {low:g} to {high:g}"
-            return Fault(FaultCode.OUTSIDE_LIMITS, reason)
-        if self.is_jump(i, joint, last):
-            reason = f"{name}: from {last.position:.3f} to {joint.position:.3f} rad in one step"
-            return Fault(FaultCode.POSITION_JUMP, reason)
+            name, fastest = self.joint_names[i], self.max_velocity[i]
+            low, high = self.position_min[i], self.position_max[i]
+            if self.is_silent(now, joint):
+                reason = f"{name}: no reply for more than {self.reply_timeout * 1000:.0f} ms"
+                return Fault(FaultCode.MOTOR_SILENT, reason)
+            if joint.error:
+                text = MOTOR_ERRORS.get(joint.error, "unknown")
+                return Fault(FaultCode.MOTOR_ERROR, f"{name}: the motor reports error {joint.error} ({text})")
+            if joint.temperature is not None and joint.temperature >= self.max_temperature:
+                limit = f"the limit is {self.max_temperature:g}"
+                return Fault(FaultCode.OVER_TEMPERATURE, f"{name}: {joint.temperature} degC, {limit}")
+            if not abs(joint.velocity) <= fastest:
+                return Fault(FaultCode.OVER_SPEED, f"{name}: {joint.velocity:.2f} rad/s, the limit is {fastest:g}")
+            if not low - overshoot <= joint.position <= high + overshoot:
+                reason = f"{name}: {joint.position:.3f} rad, the limits are {low:g} to {high:g}"
+                return Fault(FaultCode.OUTSIDE_LIMITS, reason)
+            if self.is_jump(i, joint, last):
+                reason = f"{name}: from {last.position:.3f} to {joint.position:.3f} rad in one step"
+                return Fault(FaultCode.POSITION_JUMP, reason)
         return None
 
     def is_jump(self, i: int, joint: JointSample, last: JointSample) -> bool:
@@ -189,7 +167,7 @@ class Limits:
     def wall_damping(self, joints: Sequence[JointSample]) -> tuple[float, ...]:
         """Return the damping (4,) in Nm s/rad of the soft walls at the joints' positions."""
         depths = [self._depth(i, joint.position) for i, joint in enumerate(joints)]
-        if not any(depths):
+        if not any(depths):  # as in nearly every cycle
             return NOTHING
         return tuple(WALL_DAMPING * min(1.0, abs(depth) / WALL_EDGE) for depth in depths)
 
@@ -202,7 +180,7 @@ class Limits:
     def _derating(self, temperature: int | None) -> float:
         if temperature is None or temperature <= self.max_temperature - DERATING:
             return 1.0
-        return max(0.5, min(1.0, 0.5 + 0.5 * (self.max_temperature - temperature) / DERATING))
+        return max(0.5, 0.5 + 0.5 * (self.max_temperature - temperature) / DERATING)
 
 
 def _wall_torque(depth: float, velocity: float) -> float:

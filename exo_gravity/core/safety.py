@@ -203,10 +203,8 @@ class SafetyMachine:
         self.acted.update(dict.fromkeys(acted, now))
         # Damping rises at once, since the soft wall already rises with the position, and falls over DAMPING_RISE.
         fall = self.limits.damping / DAMPING_RISE * dt
-        walls, last = self.limits.wall_damping(joints), self._sent.damping
-        if any(walls) or any(last):
-            walls = tuple(max(wall, before - fall) for wall, before in zip(walls, last, strict=True))
-        return Drive(shaped, walls, True)
+        walls = zip(self.limits.wall_damping(joints), self._sent.damping, strict=True)
+        return Drive(shaped, tuple(max(wall, last - fall) for wall, last in walls), True)
 
     def _descend(self, now: float, joints: Sequence[JointSample], dt: float) -> Drive:
         descent = self._descent

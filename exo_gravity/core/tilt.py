@@ -71,7 +71,7 @@ def angle_between(a: Vector, b: Vector) -> float:
     return 2.0 * math.atan2(math.dist(a, b), math.dist(a, [-component for component in b]))
 
 
-def rotation_matrix(quaternion: Vector, name: str = "quaternion") -> np.ndarray:
+def rotation_matrix(quaternion: Vector | None, name: str = "quaternion") -> np.ndarray:
     """Return the rotation matrix (3, 3) of a unit quaternion (x, y, z, w), ROS order.
 
     Raises ParameterError that names `name` unless its norm is within 1 % of 1, which allows for rounding in drivers.

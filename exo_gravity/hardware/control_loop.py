@@ -51,9 +51,8 @@ class ControlLoop:
     `latest` (monotonic s). on_cycle(now, samples) is called after every exchange; its errors do not stop the control.
     hand_over(reason) requests the watchdog to end this process and let the arm down; it returns whether one is there.
     period: s of a cycle; it may change. cycles, late, incomplete: counts of all cycles, of those that began more than a
-    period late, and of those in which
-    not every motor replied in time. failure: the exception that ended the control, if any. cycle_errors: count of
-    exceptions in on_cycle; cycle_error is the last one.
+    period late, and of those in which not every motor replied in time. failure: the exception that ended the control,
+    if any. cycle_errors: count of exceptions in on_cycle; cycle_error is the last one.
     """
 
     def __init__(

@@ -200,7 +200,7 @@ class _Reported:
         return self._since_restart >= SETTLE_TIME
 
     def check(self, sample: ImuSample) -> np.ndarray | None:
-        rotation_matrix(() if sample.orientation is None else sample.orientation, "orientation")
+        rotation_matrix(sample.orientation, "orientation")
         return None if sample.acceleration is None else _vector("linear_acceleration", sample.acceleration)
 
     def restart(self, acceleration: np.ndarray | None) -> None:

@@ -9,18 +9,6 @@ from exo_gravity.bag.reader import read_bag
 
 from ..support import synthetic_bags as made
 
-POSES = [[0.1, 0.4, 0.5, 0.6], [-0.2, 0.8, 0.3, 0.9]]
-
-
-@pytest.fixture(scope="module")
-def content():
-    return list(made.messages(made.trial(POSES, hold=2.0, rate=200.0)))
-
-
-def only(path):
-    (recording,) = read_bag(path).recordings
-    return recording
-
 
 def status(level, text, **values):
     """Topic, type and bytes of a bridge's diagnostics."""
@@ -41,7 +29,7 @@ def test_the_arm_counts_as_carried_from_the_first_to_the_last_carrying_state(con
     content.sort(key=lambda item: item[2])
     arrival = 0.0002  # s, of the first joint state, at which time begins
     expected = [(0.1 - arrival, 0.3 - arrival), (0.7 - arrival, 0.8 - arrival)]
-    np.testing.assert_allclose(only(made.write_bag(tmp_path / "bag", content)).carried, expected, atol=1e-9)
+    np.testing.assert_allclose(made.only(made.write_bag(tmp_path / "bag", content)).carried, expected, atol=1e-9)
 
 
 def with_states(content, *states):

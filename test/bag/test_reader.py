@@ -19,7 +19,6 @@ from exo_gravity.bag.reader import read_bag
 
 from ..support import synthetic_bags as made
 
-POSES = [[0.1, 0.4, 0.5, 0.6], [-0.2, 0.8, 0.3, 0.9]]
 FORMS = {
     "mcap": {},
     "sqlite3": {"plugin": StoragePlugin.SQLITE3},
@@ -29,35 +28,9 @@ FORMS = {
 }
 
 
-@pytest.fixture(scope="module")
-def recording():
-    return made.trial(POSES, hold=2.0, rate=200.0)
-
-
-@pytest.fixture(scope="module")
-def content(recording):
-    return list(made.messages(recording))
-
-
-@pytest.fixture
-def bag(content, tmp_path):
-    return made.write_bag(tmp_path / "bag", content)
-
-
-def only(path):
-    (recording,) = read_bag(path).recordings
-    return recording
-
-
-def assert_same(read, written, count=None):
-    assert read.name == written.name and read.joint_names == written.joint_names
-    for field in ("position", "velocity", "effort"):
-        np.testing.assert_allclose(getattr(read, field), getattr(written, field)[:count], rtol=1e-6)
-
-
 @pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
 def test_every_form_of_rosbag2_gives_the_arrays_that_were_written(recording, content, tmp_path, form):
-    assert_same(only(made.write_bag(tmp_path / "bag", content, **form)), recording)
+    made.assert_same(made.only(made.write_bag(tmp_path / "bag", content, **form)), recording)
 
 
 @pytest.mark.parametrize("chunked", [True, False])
@@ -74,11 +47,11 @@ def test_an_mcap_file_of_another_writer_is_read(recording, content, tmp_path, ch
                 )
                 writer.add_message(channel, stamp, data, stamp)
         writer.finish()
-    assert_same(only(tmp_path / "other.mcap"), recording)
+    made.assert_same(made.only(tmp_path / "other.mcap"), recording)
 
 
 def test_time_comes_from_the_stamps_and_is_0_at_the_first_arrival(recording, bag):
-    np.testing.assert_allclose(only(bag).time, recording.time - 200e-6, atol=1e-8)
+    np.testing.assert_allclose(made.only(bag).time, recording.time - 200e-6, atol=1e-8)
 
 
 def test_without_stamps_time_is_the_time_of_arrival(recording, tmp_path):
@@ -86,13 +59,13 @@ def test_without_stamps_time_is_the_time_of_arrival(recording, tmp_path):
         ("/joint_states", made.JOINT_STATE, made.START + round(time * 1e9), made.joint_state(0, made.NAMES, pose))
         for time, pose in zip(recording.time.tolist(), recording.position, strict=True)
     ]
-    read = only(made.write_bag(tmp_path / "bag", states))
+    read = made.only(made.write_bag(tmp_path / "bag", states))
     np.testing.assert_allclose(read.time, recording.time, atol=1e-8)
     assert read.name == "arm"
 
 
 def test_a_command_is_paired_with_the_state_after_the_one_that_it_answers(recording, bag):
-    read = only(bag)
+    read = made.only(bag)
     np.testing.assert_allclose(read.command[1:], recording.command[:-1], rtol=1e-6)
     assert np.all(np.isnan(read.command[0]))
 
@@ -100,14 +73,14 @@ def test_a_command_is_paired_with_the_state_after_the_one_that_it_answers(record
 def test_the_last_command_expires_when_commands_stop(recording, content, tmp_path):
     last = made.START + 2 * 10**9
     some = [item for item in content if item[0] != "/right/effort_commands" or item[2] < last]
-    read = only(made.write_bag(tmp_path / "bag", some))
+    read = made.only(made.write_bag(tmp_path / "bag", some))
     assert np.all(np.isfinite(read.command[(read.time > 0.1) & (read.time < 2.0)]))
     assert np.all(np.isnan(read.command[read.time > 2.3]))
 
 
 def test_joints_are_found_by_name_whatever_their_order(recording, tmp_path):
     names = made.NAMES[::-1]
-    turned = made.trial(POSES[:1], hold=2.0, rate=200.0)
+    turned = made.trial(made.POSES[:1], hold=2.0, rate=200.0)
     content = list(made.messages(turned))
     for k, (topic, kind, stamp, _) in enumerate(content):
         if topic == "/right/effort_commands":
@@ -115,7 +88,7 @@ def test_joints_are_found_by_name_whatever_their_order(recording, tmp_path):
             row = round((answered - made.START) * 200 / 1e9)
             data = made.joint_state(answered, names, effort=turned.command[row][::-1])
             content[k] = topic, kind, stamp, data
-    read = only(made.write_bag(tmp_path / "bag", content))
+    read = made.only(made.write_bag(tmp_path / "bag", content))
     np.testing.assert_allclose(read.command[1:], turned.command[:-1], rtol=1e-6)
 
 
@@ -129,7 +102,7 @@ def test_messages_of_changing_length_and_order_in_one_topic_are_all_decoded(tmp_
         data = made.joint_state(stamp, [made.NAMES[i] for i in order], *values[:, order], frame="x" * int(k % 5))
         content.append(("/right/joint_states", made.JOINT_STATE, stamp, data))
         expected.append(values)
-    read = only(made.write_bag(tmp_path / "bag", content))
+    read = made.only(made.write_bag(tmp_path / "bag", content))
     columns = [made.NAMES.index(name) for name in read.joint_names]
     got = np.stack([read.position, read.velocity, read.effort], axis=1)
     np.testing.assert_allclose(got, np.array(expected)[:, :, columns], rtol=1e-6)
@@ -157,7 +130,7 @@ def test_the_layout_of_any_joint_state_is_what_rosbags_decodes(names, frame, pre
 
 
 def test_the_recorded_wearer_steps_are_the_script(recording, bag):
-    steps = only(bag).steps
+    steps = made.only(bag).steps
     assert [step.action for step in steps] == ["move", "hold", "move", "hold"]
     np.testing.assert_allclose([step.start for step in steps], [step.start for step in recording.steps], atol=0.006)
 
@@ -169,8 +142,8 @@ def test_the_parts_of_a_recording_are_read_in_the_order_of_their_numbers(recordi
     for number, (first, last) in enumerate(itertools.pairwise(edges)):
         part = made.write_bag(tmp_path / f"part_{number}", content[first:last])
         shutil.move(part / f"part_{number}.mcap", folder / f"split_{number}.mcap")
-    read = only(folder)
-    assert_same(read, recording)
+    read = made.only(folder)
+    made.assert_same(read, recording)
     np.testing.assert_allclose(read.time, recording.time - 200e-6, atol=1e-8)
 
 
@@ -185,4 +158,4 @@ def test_additional_fields_of_a_virtual_wearers_step_are_ignored(content, tmp_pa
     done = json.dumps({"step": 4, "of": 4, "action": "done", "duration": 0.0})
     stamp = content[-1][2] + 1
     last = ("/right/wearer_step", "std_msgs/msg/String", stamp, made.string(done))
-    assert only(made.write_bag(tmp_path / "bag", [*content, last])).steps[-1].action == "done"
+    assert made.only(made.write_bag(tmp_path / "bag", [*content, last])).steps[-1].action == "done"

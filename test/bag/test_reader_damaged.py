@@ -11,41 +11,6 @@ from exo_gravity.core.errors import DataError
 
 from ..support import synthetic_bags as made
 
-POSES = [[0.1, 0.4, 0.5, 0.6], [-0.2, 0.8, 0.3, 0.9]]
-FORMS = {
-    "mcap": {},
-    "sqlite3": {"plugin": StoragePlugin.SQLITE3},
-    "mcap with compressed chunks": {"compression": CompressionMode.STORAGE},
-    "compressed file": {"compression": CompressionMode.FILE},
-    "compressed messages": {"compression": CompressionMode.MESSAGE},
-}
-
-
-@pytest.fixture(scope="module")
-def recording():
-    return made.trial(POSES, hold=2.0, rate=200.0)
-
-
-@pytest.fixture(scope="module")
-def content(recording):
-    return list(made.messages(recording))
-
-
-@pytest.fixture
-def bag(content, tmp_path):
-    return made.write_bag(tmp_path / "bag", content)
-
-
-def only(path):
-    (recording,) = read_bag(path).recordings
-    return recording
-
-
-def assert_same(read, written, count=None):
-    assert read.name == written.name and read.joint_names == written.joint_names
-    for field in ("position", "velocity", "effort"):
-        np.testing.assert_allclose(getattr(read, field), getattr(written, field)[:count], rtol=1e-6)
-
 
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
 def test_a_recording_cut_short_gives_what_was_written_before(recording, bag, share):
@@ -55,7 +20,7 @@ def test_a_recording_cut_short_gives_what_was_written_before(recording, bag, sha
     read = read_bag(bag)
     (arm,) = read.recordings
     assert 0.8 * share < len(arm.time) / len(recording.time) <= 1.0
-    assert_same(arm, recording, len(arm.time))
+    made.assert_same(arm, recording, len(arm.time))
     assert "cut short" in read.notes[0]
 
 
@@ -63,7 +28,7 @@ def test_a_recording_that_lacks_only_its_index_is_complete(recording, bag):
     file = bag / "bag.mcap"
     file.write_bytes(file.read_bytes()[:-40])
     read = read_bag(bag)
-    assert_same(read.recordings[0], recording)
+    made.assert_same(read.recordings[0], recording)
     assert not read.notes
 
 
@@ -116,7 +81,7 @@ def test_a_file_that_is_not_a_recording_is_refused_by_name(tmp_path, name):
 def test_commands_for_other_joints_are_a_problem_and_positions_are_still_read(recording, tmp_path):
     content = made.messages(recording, command_names=("a", "b", "c", "d"))
     read = read_bag(made.write_bag(tmp_path / "bag", content))
-    assert_same(read.recordings[0], recording)
+    made.assert_same(read.recordings[0], recording)
     (problem,) = read.problems
     assert "/right/effort_commands" in problem and "a, b, c, d" in problem and "right_joint_1" in problem
 
@@ -147,7 +112,7 @@ def test_a_damaged_message_is_named_by_its_topic(content, tmp_path):
 def test_without_commands_the_rest_is_read_with_a_note(recording, content, tmp_path):
     states = [item for item in content if item[0] != "/right/effort_commands"]
     read = read_bag(made.write_bag(tmp_path / "bag", states))
-    assert_same(read.recordings[0], recording)
+    made.assert_same(read.recordings[0], recording)
     assert np.all(np.isnan(read.recordings[0].command)) and "effort_commands" in read.notes[0]
 
 
@@ -156,7 +121,7 @@ def test_an_invalid_step_is_one_problem_and_the_rest_is_read(content, recording,
     wrong = ("/right/wearer_step", "std_msgs/msg/String", content[-1][2], made.string(text))
     read = read_bag(made.write_bag(tmp_path / "bag", [*content, wrong]))
     assert read.problems == ("/right/wearer_step: invalid wearer_step message",)
-    assert_same(read.recordings[0], recording)
+    made.assert_same(read.recordings[0], recording)
 
 
 def test_steps_that_are_all_invalid_leave_the_joint_states_readable(content, recording, tmp_path):
@@ -164,8 +129,8 @@ def test_steps_that_are_all_invalid_leave_the_joint_states_readable(content, rec
     states = [item for item in content if not item[0].endswith("wearer_step")]
     read = read_bag(made.write_bag(tmp_path / "bag", [*steps, *states]))
     assert "/right/wearer_step" in read.problems[0]
-    assert_same(read.recordings[0], recording)
+    made.assert_same(read.recordings[0], recording)
 
 
 def test_without_a_reported_state_it_is_unknown_when_the_arm_was_carried(content, bag):
-    assert only(bag).carried is None
+    assert made.only(bag).carried is None

@@ -13,6 +13,14 @@ from exo_gravity.core.faults import FaultCode
 from ..support.safety_run import SafetyRun
 
 
+def assert_a_wrong_angle_is_refused(arm):
+    """The encoder of an arm that is off is wrong by a turn of the motor: the arm is not carried."""
+    arm.changes[1].update(position=0.5 + math.radians(40.0))  # one turn of an AK80-9's motor
+    arm.cycle()
+    arm.enable().cycle(1.0)
+    assert arm.fault_code == "implausible_zero"
+
+
 def test_a_motor_that_is_found_off_is_switched_on_again_with_the_torque_that_held_the_arm():
     arm = SafetyRun().until_active()
     arm.off.add(1)
@@ -33,20 +41,14 @@ def test_after_a_fault_that_casts_doubt_on_them_zeros_are_checked_again(doubt):
     arm.machine.trip(FaultCode(doubt), "test", arm.now)
     arm.cycle(10.0)
     assert arm.machine.clear(arm.now)
-    arm.changes[1].update(position=0.5 + math.radians(40.0))  # one turn of an AK80-9's motor
-    arm.cycle()
-    arm.enable().cycle(1.0)
-    assert arm.fault_code == "implausible_zero"
+    assert_a_wrong_angle_is_refused(arm)
 
 
 def test_an_angle_that_jumps_while_the_arm_is_off_is_no_longer_trusted():
     arm = SafetyRun().until_active()
     arm.machine.disable(arm.now)
     arm.cycle(8.0)
-    arm.changes[1].update(position=0.5 + math.radians(40.0))
-    arm.cycle()
-    arm.enable().cycle(1.0)
-    assert arm.fault_code == "implausible_zero"
+    assert_a_wrong_angle_is_refused(arm)
 
 
 def test_a_motor_that_does_not_switch_on_is_refused_at_every_start():

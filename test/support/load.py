@@ -33,7 +33,7 @@ def start_spin(seconds: float) -> subprocess.Popen[bytes]:
 
 
 def _start(*arguments: str) -> subprocess.Popen[bytes]:
-    # A session of its own is an autogroup of its own: the load gets no share of the nodes' precedence.
+    # In a new session, and so in a new autogroup, the load does not run at the nodes' priority.
     return subprocess.Popen([sys.executable, "-m", __name__, *arguments], cwd=ROOT, start_new_session=True)
 
 

@@ -6,12 +6,15 @@ import json
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from exo_gravity.bag.content import Bag
+from exo_gravity.bag.reader import read_bag
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.recording import Recording, ScriptedStep
 
@@ -20,6 +23,8 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 STRING = "std_msgs/msg/String"
 START = 1_700_000_000_000_000_000  # ns
 NAMES = ("right_joint_1", "right_joint_2", "right_joint_3", "right_joint_4")
+POSES = [[0.1, 0.4, 0.5, 0.6], [-0.2, 0.8, 0.3, 0.9]]  # rad
+PUSH = [0.05, 0.25, -0.15, 0.1]  # rad, by which the push moves each joint
 ARM = ArmModel((0.05, 0.13, 0.3, 0.3), (0.03, 0.07, 0.15, 0.15), (0.6, 0.7, 0.6, 0.4))
 POSITION_CODE, VELOCITY_CODE, TORQUE_CODE = 25 / 65535, 90 / 4095, 30 / 4095  # rad, rad/s, Nm
 
@@ -141,3 +146,22 @@ def write_bag(
                 connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
             writer.write(connections[topic], stamp, data)
     return folder
+
+
+def bag_of(*recordings: Recording, **more: Any) -> Bag:
+    """Return a bag with these recordings, not read from a file; `more` are its other fields."""
+    empty: dict[str, Any] = {"events": (), "parameters": {}, "notes": (), "problems": ()}
+    return Bag(Path("demo"), START, recordings, **{**empty, **more})
+
+
+def only(path: Path) -> Recording:
+    """Return the recording of the only arm in the bag at `path`."""
+    (recording,) = read_bag(path).recordings
+    return recording
+
+
+def assert_same(read: Recording, written: Recording, count: int | None = None) -> None:
+    """The arrays that were read are the first `count` rows of those that were written."""
+    assert read.name == written.name and read.joint_names == written.joint_names
+    for field in ("position", "velocity", "effort"):
+        np.testing.assert_allclose(getattr(read, field), getattr(written, field)[:count], rtol=1e-6)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import csv
 import dataclasses
 import io
 import math
@@ -16,31 +15,18 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from exo_gravity.bag.content import Bag, Event
+from exo_gravity.bag.content import Event
 from exo_gravity.core.verdict import HoldCriteria
 from exo_gravity.tools.report import main
 from exo_gravity.tools.reporting.trial_report import analyse, print_report, write
 
+from ..support import csv_rows
 from ..support import synthetic_bags as made
-
-POSES = [[0.1, 0.4, 0.5, 0.6], [-0.2, 0.8, 0.3, 0.9]]
-PUSH = [0.05, 0.25, -0.15, 0.1]
-
-
-def bag_of(*recordings, **more):
-    """A bag with these recordings, not read from a file."""
-    empty = {"events": (), "parameters": {}, "notes": (), "problems": ()}
-    return Bag(Path("demo"), made.START, recordings, **{**empty, **more})
-
-
-@pytest.fixture(scope="module")
-def held():
-    return analyse(bag_of(made.trial(POSES, hold=4.0, push=PUSH)))
 
 
 @pytest.fixture(scope="module")
 def fell():
-    return analyse(bag_of(made.trial(POSES, hold=6.0, fall_after=5.0)))
+    return analyse(made.bag_of(made.trial(made.POSES, hold=6.0, fall_after=5.0)))
 
 
 @pytest.fixture(scope="module")
@@ -48,19 +34,6 @@ def folder(held, tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     write(held, folder)
     return folder
-
-
-@pytest.fixture(scope="module")
-def short_bag(tmp_path_factory):
-    """A bag of two holds with some drift in the elbow, 6 degrees per minute."""
-    drift = np.array([0.0, 0.0, 0.0, math.radians(6.0) / 60.0])
-    recording = made.trial(POSES, hold=4.0, rate=100.0, drift=drift)
-    return made.write_bag(tmp_path_factory.mktemp("bags") / "short", made.messages(recording))
-
-
-def rows(path):
-    with path.open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
 
 
 def printed(report):
@@ -74,7 +47,7 @@ def test_an_arm_that_held_is_0_and_one_that_fell_is_1(held, fell):
 
 
 def test_an_unreadable_part_is_2_even_if_the_rest_held(held):
-    problem = bag_of(*held.bag.recordings, problems=("left: damaged",))
+    problem = made.bag_of(*held.bag.recordings, problems=("left: damaged",))
     assert analyse(problem).exit_code == 2
 
 
@@ -84,7 +57,7 @@ def test_stricter_criteria_make_the_same_recording_fail(held):
 
 def test_holds_csv_has_a_row_for_each_hold_and_joint_with_the_numbers_of_the_analysis(held, folder):
     ((recording, trial),) = held.arms
-    found = rows(folder / "holds.csv")
+    found = csv_rows(folder / "holds.csv")
     assert len(found) == 4 * len(trial.holds) == 12
     for row in found:
         hold, joint = trial.holds[int(row["hold"]) - 1], recording.joint_names.index(row["joint"])
@@ -95,16 +68,16 @@ def test_holds_csv_has_a_row_for_each_hold_and_joint_with_the_numbers_of_the_ana
 
 
 def test_motions_csv_has_the_push_with_its_peak_in_degrees(folder):
-    push = [row for row in rows(folder / "motions.csv") if row["kind"] == "push"]
-    np.testing.assert_allclose([float(row["peak_deg"]) for row in push], np.degrees(PUSH), atol=0.1)
+    push = [row for row in csv_rows(folder / "motions.csv") if row["kind"] == "push"]
+    np.testing.assert_allclose([float(row["peak_deg"]) for row in push], np.degrees(made.PUSH), atol=0.1)
 
 
 def test_an_unknown_torque_error_is_an_empty_cell_and_a_dash(held, tmp_path):
     (whole,) = held.bag.recordings
     arrays = (whole.time, whole.position, whole.velocity, whole.effort, np.full_like(whole.command, math.nan))
-    report = analyse(bag_of(type(whole)(whole.name, whole.joint_names, *arrays, whole.steps)))
+    report = analyse(made.bag_of(type(whole)(whole.name, whole.joint_names, *arrays, whole.steps)))
     write(report, tmp_path)
-    assert {row["torque_error_nm"] for row in rows(tmp_path / "holds.csv")} == {""}
+    assert {row["torque_error_nm"] for row in csv_rows(tmp_path / "holds.csv")} == {""}
     assert "–" in printed(report)
 
 
@@ -174,7 +147,7 @@ def test_the_page_shows_the_verdict_and_each_reason(fell, tmp_path):
 
 def test_text_from_a_recording_cannot_become_markup(held, tmp_path):
     texts = {"events": (Event(1.0, "<script>alert(1)</script>"),), "parameters": {"/a": "/a: <b>\n"}}
-    write(analyse(bag_of(*held.bag.recordings, **texts, notes=("<i>",))), tmp_path)
+    write(analyse(made.bag_of(*held.bag.recordings, **texts, notes=("<i>",))), tmp_path)
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "<script>" not in text and "<b>\n" not in text and "&lt;script&gt;" in text
 
@@ -182,8 +155,8 @@ def test_text_from_a_recording_cannot_become_markup(held, tmp_path):
 @pytest.fixture(scope="module")
 def unscripted():
     """A recording of a real arm: no script, and carried throughout."""
-    whole = made.trial(POSES, hold=4.0)
-    return analyse(bag_of(dataclasses.replace(whole, steps=(), carried=((0.0, whole.time[-1]),))))
+    whole = made.trial(made.POSES, hold=4.0)
+    return analyse(made.bag_of(dataclasses.replace(whole, steps=(), carried=((0.0, whole.time[-1]),))))
 
 
 def test_without_a_script_every_still_phase_is_a_hold_and_the_report_says_so(unscripted):
@@ -204,14 +177,14 @@ def test_a_recording_that_does_not_show_when_the_arm_was_carried_gets_a_note(hel
 
 def test_an_unfinished_trial_is_judged_up_to_its_end_and_gets_a_note(held):
     (whole,) = held.bag.recordings
-    report = analyse(bag_of(dataclasses.replace(whole, carried=((0.0, 15.0),))))
+    report = analyse(made.bag_of(dataclasses.replace(whole, carried=((0.0, 15.0),))))
     assert report.exit_code == 0
     assert "let down at 15.0 s, before the script ended" in " ".join(printed(report).split())
 
 
 def test_a_killed_trial_is_not_said_to_have_been_let_down(tmp_path, capsys):
     """The bag of a trial that is killed while the arm is carried, in its second hold."""
-    recording = made.trial(POSES, hold=6.0, rate=100.0)
+    recording = made.trial(made.POSES, hold=6.0, rate=100.0)
     types = made.STORE.types
     zero = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
     pair = types["diagnostic_msgs/msg/KeyValue"](key="state", value="active")
@@ -232,12 +205,12 @@ def test_a_killed_trial_is_not_said_to_have_been_let_down(tmp_path, capsys):
 
 def test_a_finished_trial_gets_no_note(held):
     (whole,) = held.bag.recordings
-    assert not analyse(bag_of(dataclasses.replace(whole, carried=((0.0, whole.time[-1]),)))).notes
+    assert not analyse(made.bag_of(dataclasses.replace(whole, carried=((0.0, whole.time[-1]),)))).notes
 
 
 def test_the_verdict_on_a_damaged_recording_is_limited_to_the_readable_part(held):
     assert "It held, as far as the recording could be read." in printed(
-        analyse(bag_of(*held.bag.recordings, problems=("x",)))
+        analyse(made.bag_of(*held.bag.recordings, problems=("x",)))
     )
 
 
@@ -249,5 +222,5 @@ def test_the_table_shows_every_hold_and_the_push(held):
 
 
 def test_brackets_in_a_message_are_printed_as_they_are(held):
-    text = printed(analyse(bag_of(*held.bag.recordings, notes=("frame [01 02]",))))
+    text = printed(analyse(made.bag_of(*held.bag.recordings, notes=("frame [01 02]",))))
     assert "frame [01 02]" in text

@@ -2,48 +2,27 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from exo_gravity.bag.content import Bag
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.core.errors import DataError
 from exo_gravity.tools.report import main
 from exo_gravity.tools.reporting.trial_report import analyse, write
 
+from ..support import csv_rows
 from ..support import synthetic_bags as made
-
-POSES = [[0.1, 0.4, 0.5, 0.6], [-0.2, 0.8, 0.3, 0.9]]
-PUSH = [0.05, 0.25, -0.15, 0.1]
-
-
-def bag_of(*recordings, **more):
-    """A bag with these recordings, not read from a file."""
-    empty = {"events": (), "parameters": {}, "notes": (), "problems": ()}
-    return Bag(Path("demo"), made.START, recordings, **{**empty, **more})
-
-
-@pytest.fixture(scope="module")
-def held():
-    return analyse(bag_of(made.trial(POSES, hold=4.0, push=PUSH)))
 
 
 @pytest.fixture(scope="module")
 def short_bag(tmp_path_factory):
     """A bag of two holds with some drift in the elbow, 6 degrees per minute."""
     drift = np.array([0.0, 0.0, 0.0, math.radians(6.0) / 60.0])
-    recording = made.trial(POSES, hold=4.0, rate=100.0, drift=drift)
+    recording = made.trial(made.POSES, hold=4.0, rate=100.0, drift=drift)
     return made.write_bag(tmp_path_factory.mktemp("bags") / "short", made.messages(recording))
-
-
-def rows(path):
-    with path.open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
 
 
 @pytest.mark.parametrize("option", ["--max-drift", "--max-drift-after-push", "--max-rate", "--min-hold"])
@@ -56,7 +35,7 @@ def test_a_limit_that_is_not_a_number_of_0_or_more_is_refused(short_bag, capsys,
 
 
 def test_no_hold_is_reported_with_figures_and_1(tmp_path, capsys):
-    moving = made.trial(POSES, hold=0.5, rate=100.0)
+    moving = made.trial(made.POSES, hold=0.5, rate=100.0)
     bag = made.write_bag(tmp_path / "moving", made.messages(moving, script=False))
     assert main([str(bag), "--output", str(tmp_path / "out")]) == 1
     assert "never still" in capsys.readouterr().out
@@ -98,13 +77,13 @@ def test_a_recording_cut_short_is_reported_and_says_so(short_bag, tmp_path, caps
     cut.write_bytes(whole[: len(whole) * 2 // 3])
     assert main([str(cut), "--output", str(tmp_path / "out")]) in (0, 1)
     assert "cut short" in " ".join(capsys.readouterr().out.split())
-    assert len(rows(tmp_path / "out" / "holds.csv")) >= 4
+    assert len(csv_rows(tmp_path / "out" / "holds.csv")) >= 4
 
 
 def test_the_holds_of_a_bag_are_those_of_its_arrays(short_bag):
     ((_, trial),) = analyse(read_bag(short_bag)).arms
     assert len(trial.holds) == 2
-    np.testing.assert_allclose([hold.pose[:3] for hold in trial.holds], np.array(POSES)[:, :3], atol=1e-3)
+    np.testing.assert_allclose([hold.pose[:3] for hold in trial.holds], np.array(made.POSES)[:, :3], atol=1e-3)
 
 
 def test_without_matplotlib_the_report_is_written_without_figures_and_says_so(short_bag, tmp_path, capsys, monkeypatch):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 import os
 import signal
@@ -19,6 +18,8 @@ from exo_gravity.tools import launcher
 from exo_gravity.tools.launcher import OnLine, StopFlag
 from exo_gravity.tools.trial import main
 from exo_gravity.tools.trials import real_time, session
+
+from ..support import csv_rows
 
 CONFIG = Path(__file__).parents[2] / "config"
 SHORT = {"name": "short", "steps": [{"move": [0.1, 0.6, 1.2, 0.5], "over": 2.0}, {"hold": 4.0}]}
@@ -67,8 +68,7 @@ def changed(folder: Path, changes: Changes) -> Path:
 
 
 def holds(folder: Path) -> list[dict[str, str]]:
-    with (folder / "holds.csv").open() as file:
-        return list(csv.DictReader(file))
+    return csv_rows(folder / "holds.csv")
 
 
 def test_an_offline_trial_ends_with_a_report(run, capsys):

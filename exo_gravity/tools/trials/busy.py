@@ -31,7 +31,7 @@ Status = Mapping[str, Mapping[str, Any]]  # of each node on /diagnostics, as in 
 
 
 def fault_of(status: Status) -> tuple[str, str]:
-    """Return code and message of the first latched fault of a bridge, ('', '') if there is none."""
+    """Return the code and the message of the first fault that a bridge reports, or ('', '')."""
     for name, values in status.items():
         if values.get("fault", "none") != "none":
             return str(values["fault"]), f"{name}: {values['message']}"
