@@ -4,6 +4,7 @@
     ├── ParameterError    a parameter or argument is invalid; nothing was changed
     ├── FrameError        bytes are not a valid frame of an AK motor
     ├── BusError          the CAN bus cannot be opened, or has failed
+    ├── DeviceError       a sensor does not answer, is another one, or has failed
     └── DataError         a recording or a model file is missing, truncated or invalid
 
 Each message names the item, its value and what would be valid.
@@ -39,6 +40,19 @@ class FrameError(ExoGravityError, ValueError):
 
 class BusError(ExoGravityError):
     """The CAN bus cannot be opened, or sending or receiving on it failed."""
+
+
+class DeviceError(ExoGravityError):
+    """A sensor does not answer, is not the one expected, or has failed.
+
+    Attributes: `device`, its name and address; `register`, the one concerned, or None.
+    """
+
+    def __init__(self, device: str, problem: str, register: int | None = None) -> None:
+        where = device if register is None else f"{device}, register 0x{register:02X}"
+        super().__init__(f"{where}: {problem}")
+        self.device = device
+        self.register = register
 
 
 class DataError(ExoGravityError):

@@ -1,0 +1,1 @@
+"""IMUs that the `imu` node reads itself, one file each."""
