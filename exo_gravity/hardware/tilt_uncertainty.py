@@ -1,0 +1,92 @@
+"""How far the estimated tilt may be off: a small model, in which each thing that was not measured has its term.
+
+One standard deviation of the tilt is the root of the sum of the squares of
+    BASE                              VQF's error on real motion: 0.3 to 1.2 degrees RMS (docs/imu.md)
+    BIAS_TIME * s_b                   gyroscope bias not yet learnt: its standard deviation s_b, over VQF's 3 s window
+    v / (g T)                         start: T s after it, the mean acceleration is wrong by a change of speed v over T,
+                                      which is the deviation of the acceleration times CORRELATION_TIME
+    a t^2 / 8                         a gap of t s: rates interpolated, while the rotation accelerated by up to a
+    OVERSHOOT * range * t             t s of saturation: the true rate exceeded the range by this share
+The last two add up, and decay with VQF's time constant.
+"""
+
+from __future__ import annotations
+
+import math
+
+from exo_gravity.core.arm import STANDARD_GRAVITY
+from exo_gravity.core.quaternion import Floats3
+
+MAX_ERROR = math.radians(3.0)  # of a tilt that is used
+SIGMAS = 2.0  # standard deviations that count as "may be off by"
+BASE = math.radians(0.6)
+BIAS_TIME = 2.0  # s
+CORRELATION_TIME = 0.25  # s, a quarter of a stride
+SETTLE_TIME = 1.0  # s, the shortest time from a start to the first tilt
+DECAY_TIME = 3.0  # s, VQF's tauAcc
+LEAST_ACCELERATION = 20.0  # rad/s^2, assumed in a gap even after rest
+PEAK_DECAY_TIME = 1.0  # s in which the largest angular acceleration seen is forgotten
+OVERSHOOT = 0.25
+GAP = 1.5  # periods
+
+
+class TiltUncertainty:
+    """Follows one estimate. sigma: one standard deviation of the tilt, rad."""
+
+    def __init__(self, rate: float, gyroscope_range: float) -> None:
+        self._period = 1.0 / rate
+        self._overshoot = OVERSHOOT * gyroscope_range
+        self._peak = LEAST_ACCELERATION  # rad/s^2
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew: nothing is known but the accelerometer."""
+        self.sigma = math.inf
+        self._lost = 0.0  # rad^2, of gaps and saturation
+        self._run = 0.0  # rad lost in the present run of saturated samples
+        self._age = 0.0  # s since the start
+        self._count = 0
+        self._sum, self._squares = [0.0, 0.0, 0.0], 0.0  # of the acceleration in the world since the start
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether so much rotation was not measured that the estimate must begin anew."""
+        return SIGMAS * math.sqrt(self._lost) > MAX_ERROR
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the tilt is off by no more than MAX_ERROR."""
+        return self._age >= SETTLE_TIME and SIGMAS * self.sigma <= MAX_ERROR
+
+    def advance(self, dt: float, rate: Floats3, last_rate: Floats3, is_saturated: bool) -> None:
+        """Count the rotation that was not measured in the `dt` s since the last sample."""
+        self._age += dt
+        self._lost *= math.exp(-2.0 * dt / DECAY_TIME)
+        self._peak = max(LEAST_ACCELERATION, self._peak * math.exp(-dt / PEAK_DECAY_TIME))
+        if dt > GAP * self._period:
+            self._lost += (self._peak * dt * dt / 8.0) ** 2
+        else:
+            self._peak = max(self._peak, math.dist(rate, last_rate) / max(dt, 0.5 * self._period))
+        run = self._run + self._overshoot * dt if is_saturated else 0.0
+        self._lost += max(0.0, run * run - self._run * self._run)
+        self._run = run
+
+    def combine(self, bias_sigma: float, acceleration_in_world: Floats3 | None) -> None:
+        """Add up the terms. acceleration_in_world: by the present estimate; None if it is not known."""
+        start = self._start_error(acceleration_in_world)
+        bias = BIAS_TIME * bias_sigma
+        self.sigma = math.sqrt(BASE * BASE + bias * bias + start * start + self._lost)
+
+    def _start_error(self, acceleration: Floats3 | None) -> float:
+        if self._age > 10.0 * DECAY_TIME:
+            return 0.0
+        if acceleration is not None:
+            self._count += 1
+            for axis, value in enumerate(acceleration):
+                self._sum[axis] += value
+                self._squares += value * value
+        if not self._count or not self._age:
+            return math.pi
+        mean_square = sum(value * value for value in self._sum) / self._count**2
+        deviation = math.sqrt(max(0.0, self._squares / self._count - mean_square))
+        return deviation * CORRELATION_TIME / (STANDARD_GRAVITY * self._age)
