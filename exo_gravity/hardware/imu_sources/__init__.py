@@ -1,1 +1,59 @@
-"""IMUs that the `imu` node reads itself, one file each."""
+"""IMUs that the `imu` node reads itself, one file each; `open_source` opens the one that the parameters name."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from exo_gravity.core.errors import DeviceError, ParameterError
+from exo_gravity.hardware.imu_sources.bno085 import Bno085
+from exo_gravity.hardware.imu_sources.fifo_source import FifoSource
+from exo_gravity.hardware.imu_sources.i2c import Bus, Registers, open_bus
+from exo_gravity.hardware.imu_sources.icm20948 import Icm20948
+from exo_gravity.hardware.imu_sources.lsm6dsox import Lsm6dsox
+from exo_gravity.hardware.imu_sources.mpu6050 import Mpu6050
+from exo_gravity.hardware.imu_sources.reopening import Reopening
+from exo_gravity.hardware.imu_sources.source import Clock, ImuSource
+from exo_gravity.hardware.imu_sources.witmotion import WitMotion
+
+__all__ = ["ImuSource", "Reopening", "open_source"]
+
+# The address that the usual boards have.
+CHIPS: dict[str, tuple[type[FifoSource], int]] = {
+    "mpu6050": (Mpu6050, 0x68),
+    "icm20948": (Icm20948, 0x69),
+    "lsm6dsox": (Lsm6dsox, 0x6A),
+}
+
+
+def open_source(
+    values: Mapping[str, Any],
+    clock: Clock,
+    self_test: bool = True,
+    *,
+    wait: Callable[[float], Any] = time.sleep,
+    open_i2c: Callable[[int], Bus] = open_bus,
+) -> ImuSource:
+    """Open the IMU that `imu`'s parameter values name by `source`, one of all but 'topic'.
+
+    clock: of the stamps. self_test: test a chip on I2C, which must then be still for a second. Raises DeviceError, and
+    ParameterError if a parameter does not suit the device or a library is missing.
+    """
+    kind = values["source"]
+    if kind in CHIPS:
+        chip, usual_address = CHIPS[kind]
+        number = values["i2c.bus"]
+        bus = open_i2c(number)
+        registers = Registers(bus, values["i2c.address"] or usual_address, kind, f"/dev/i2c-{number}")
+        try:
+            return chip(registers, values["rate"], clock, wait, self_test)
+        except DeviceError:
+            registers.close()
+            raise
+    port, baud = values["serial.port"], values["serial.baud"]
+    if not port:
+        raise ParameterError("serial.port", port, "the sensor's port, e.g. /dev/ttyUSB0")
+    if kind == "witmotion":
+        return WitMotion(port, baud, values["rate"], clock)
+    return Bno085(port, baud, clock)

@@ -7,31 +7,21 @@ from typing import Protocol
 
 from exo_gravity.hardware.trunk_estimator import ImuSample
 
-Clock = Callable[[], float]  # s, of ROS or monotonic
+Clock = Callable[[], float]  # s; the clock of the stamps
 
 
 class ImuSource(Protocol):
-    """An open device. Its samples are in its own axes, in SI units, and stamped when they were taken.
+    """An open device. Its samples are in its own axes, in SI units, with the time at which they were taken.
 
-    name: the device and its address, for messages. rate: samples a second that it was set to. lost: samples known to
-    be lost since it was opened. temperature: degrees Celsius, None where it reports none.
+    name: the device and its address, for messages. rate: samples a second, as set up. lost: samples known to be lost
+    since the device was opened; loss: why the last of them were. temperature: degrees Celsius; None if not reported.
     """
 
-    @property
-    def name(self) -> str:
-        """The device and its address."""
-
-    @property
-    def rate(self) -> float:
-        """Samples a second, as configured."""
-
-    @property
-    def lost(self) -> int:
-        """Samples lost since the device was opened: overflows, bad checksums, gaps in a counter."""
-
-    @property
-    def temperature(self) -> float | None:
-        """Degrees Celsius."""
+    name: str
+    rate: float
+    lost: int
+    loss: str
+    temperature: float | None
 
     def read(self) -> list[ImuSample]:
         """Return every sample since the last call, the oldest first, without waiting for one. Raises DeviceError."""
