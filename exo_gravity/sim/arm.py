@@ -24,6 +24,7 @@ from exo_gravity.core.arm import JOINT_COUNT, MAX_LENGTH, MAX_MASS, ArmModel, fo
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.moments import MAX_OFFSET
 from exo_gravity.core.param_table import check_owned, owned
+from exo_gravity.sim.base_motion import apply_rotation
 
 STEP = 0.001  # s
 
@@ -34,6 +35,7 @@ _MIN_MASS = 0.001  # kg; MuJoCo cannot simulate a massless link
 _STOPS = (-math.pi, math.pi)  # rad
 _BESIDE = (-MAX_OFFSET, MAX_OFFSET)  # m
 _ZERO = (0.0,) * JOINT_COUNT
+_STILL = (0.0, 0.0, 0.0)
 
 # The paper's lengths. Each link carries the motor of the next joint at its far end (AK80-9 0.485 kg, AK60-6 0.368 kg,
 # published motor tables) and 0.1 to 0.25 kg of carbon tube, bracket and cuff.
@@ -124,22 +126,38 @@ class SimulatedArm:
         mujoco.mj_forward(self.model, self.data)
 
     def set_gravity(self, direction: Sequence[float]) -> None:
-        """Set the direction of gravity: (3,) unit vector in the arm's base frame, as in `Tilt.direction`.
+        """Set the direction of gravity on a base at rest: (3,) unit vector in its frame, as in `Tilt.direction`."""
+        self.move_base([self.config.links.gravity * component for component in direction])
 
-        The trunk moves slowly: its acceleration is neglected.
+    def move_base(
+        self,
+        gravity: Sequence[float],
+        angular_velocity: Sequence[float] = _STILL,
+        angular_acceleration: Sequence[float] = _STILL,
+    ) -> None:
+        """Set how the base moves from now on; every vector is (3,) in the base's own frame.
+
+        gravity: m/s^2, less the acceleration of the base's origin. angular_velocity rad/s, angular_acceleration
+        rad/s^2: of the base, against the world.
         """
-        self.model.opt.gravity[:] = [self.config.links.gravity * component for component in direction]
+        self.model.opt.gravity[:] = gravity
+        self._turns = any(angular_velocity) or any(angular_acceleration)
+        self._rotation = np.array(angular_velocity), np.array(angular_acceleration)
+        self.data.xfrc_applied[:] = 0.0
 
     def step(self, torque: Sequence[float], count: int = 1) -> None:
         """Apply `torque`, (4,) Nm of motors and wearer together, for `count` times STEP."""
         self._torque[:] = torque
-        if not self._stribeck.any():
+        if not (self._turns or self._stribeck.any()):
             mujoco.mj_step(self.model, self.data, count)
             return
         for _ in range(count):
             fading = np.exp(-np.square(self._velocity / self._speed))
             self.model.dof_frictionloss[:] = self._coulomb + self._stribeck * fading
-            mujoco.mj_step(self.model, self.data)
+            mujoco.mj_step1(self.model, self.data)
+            if self._turns:
+                apply_rotation(self.model, self.data, *self._rotation)
+            mujoco.mj_step2(self.model, self.data)
 
 
 def _mjcf(config: ArmConfig) -> str:

@@ -1,0 +1,181 @@
+"""How the trunk of a wearer moves: bowing, leaning, walking and sitting down hard.
+
+Each motion gives the trunk's tilt and the acceleration of the shoulder at any time. Trunk axes and the signs of pitch
+and roll as in `core.tilt`; the heading stays constant. Bowing and leaning turn the trunk about the hips. Walking is
+modelled as sines at the frequencies of steps and strides, fading in and out over a second.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+from exo_gravity.core.arm import STANDARD_GRAVITY
+from exo_gravity.core.trial_script import Step
+
+Vector = tuple[float, float, float]
+NONE: Vector = (0.0, 0.0, 0.0)
+# Hip to shoulder: 0.288 of the stature (0.818 - 0.530, Drillis and Contini 1966, in Winter, Biomechanics and Motor
+# Control of Human Movement) of 1.75 m. The shoulder's distance from the spine is neglected.
+HIP_TO_SHOULDER: Vector = (0.0, 0.0, 0.5)  # m
+FADE = 1.0  # s in which walking starts, and stops
+
+
+class TrunkState(NamedTuple):
+    """The trunk at one moment: its tilt in rad, rad/s and rad/s^2, and the shoulder's acceleration in m/s^2.
+
+    acceleration: (3,) in the trunk's axes, without gravity.
+    """
+
+    pitch: float = 0.0
+    roll: float = 0.0
+    pitch_rate: float = 0.0
+    roll_rate: float = 0.0
+    pitch_acceleration: float = 0.0
+    roll_acceleration: float = 0.0
+    acceleration: Vector = NONE
+
+    @property
+    def angular_velocity(self) -> Vector:
+        """(3,) rad/s in the trunk's axes: (roll', pitch' cos roll, -pitch' sin roll)."""
+        return self.roll_rate, self.pitch_rate * math.cos(self.roll), -self.pitch_rate * math.sin(self.roll)
+
+    @property
+    def angular_acceleration(self) -> Vector:
+        """(3,) rad/s^2 in the trunk's axes, the derivative of `angular_velocity`."""
+        cosine, sine, both = math.cos(self.roll), math.sin(self.roll), self.pitch_rate * self.roll_rate
+        bow = self.pitch_acceleration
+        return self.roll_acceleration, bow * cosine - both * sine, -bow * sine - both * cosine
+
+
+class TrunkMotion(Protocol):
+    """A motion of the trunk."""
+
+    def at(self, elapsed: float) -> TrunkState:
+        """Return the trunk's state `elapsed` s after the motion began."""
+        ...
+
+
+@dataclass(frozen=True)
+class Turn:
+    """The trunk turns about the hips from one pitch and roll (rad) to another in `duration` s, with minimum jerk."""
+
+    start: tuple[float, float]
+    end: tuple[float, float]
+    duration: float
+
+    def at(self, elapsed: float) -> TrunkState:
+        """Return the trunk's state `elapsed` s after the motion began."""
+        way, pace, change = _minimum_jerk(elapsed / self.duration)
+        by = self.end[0] - self.start[0], self.end[1] - self.start[1]
+        pitch_rate, roll_rate = (angle * pace / self.duration for angle in by)
+        bow, lean = (angle * change / self.duration**2 for angle in by)
+        state = TrunkState(self.start[0] + way * by[0], self.start[1] + way * by[1], pitch_rate, roll_rate, bow, lean)
+        turning, spin = state.angular_acceleration, state.angular_velocity
+        inward = _cross(spin, _cross(spin, HIP_TO_SHOULDER))
+        a, b, c = _cross(turning, HIP_TO_SHOULDER)
+        return state._replace(acceleration=(a + inward[0], b + inward[1], c + inward[2]))
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Walking at a comfortable speed, around the tilt at which it starts.
+
+    stride: strides per s; a stride is two steps. Amplitudes in m/s^2: `vertical` and `forward` at the frequency of the
+    steps, `heel_strike` (vertical) at twice that, `lateral` at the frequency of the strides. Their RMS, 0.17, 0.10 and
+    0.10 g, are of the order measured on trunks (Menz, Lord and Fitzpatrick 2003; Kavanagh and Menz 2008). pitch_sway,
+    roll_sway: amplitudes in rad at the frequency of the steps and of the strides; the ranges, 2 and 4 degrees, are of
+    the order measured on the thorax (Crosbie et al. 1997). The thorax's rotation about the vertical is neglected.
+    """
+
+    start: tuple[float, float]
+    duration: float
+    stride: float = 0.95
+    vertical: float = 0.23 * STANDARD_GRAVITY
+    heel_strike: float = 0.06 * STANDARD_GRAVITY
+    forward: float = 0.14 * STANDARD_GRAVITY
+    lateral: float = 0.14 * STANDARD_GRAVITY
+    pitch_sway: float = math.radians(1.0)
+    roll_sway: float = math.radians(2.0)
+
+    def at(self, elapsed: float) -> TrunkState:
+        """Return the trunk's state `elapsed` s after the motion began."""
+        fade = min(FADE, self.duration / 2.0)
+        direction = 1.0 if elapsed < self.duration / 2.0 else -1.0
+        share, slope, bend = _minimum_jerk(min(elapsed, self.duration - elapsed) / fade)
+        envelope = share, direction * slope / fade, bend / fade**2
+        strides = 2.0 * math.pi * self.stride
+        phase = strides * elapsed
+        pitch = _swing(self.pitch_sway, 2.0 * strides, elapsed, envelope)
+        roll = _swing(self.roll_sway, strides, elapsed, envelope)
+        ahead = share * self.forward * math.sin(2.0 * phase)
+        left = share * self.lateral * math.cos(phase)
+        up = share * (self.vertical * math.cos(2.0 * phase) + self.heel_strike * math.cos(4.0 * phase))
+        rates = pitch[1], roll[1], pitch[2], roll[2]
+        tilt = self.start[0] + pitch[0], self.start[1] + roll[0]
+        return TrunkState(*tilt, *rates, _in_trunk((ahead, left, up), *tilt))
+
+
+@dataclass(frozen=True)
+class SitDown:
+    """Sitting down hard: the trunk gains `speed` (m/s) downwards in `descent` s and loses it in the `impact`.
+
+    Both accelerations are half sines. speed: of a free fall over the last 3 cm. impact: half a period of 5 Hz, at which
+    a seated trunk resonates (Griffin, Handbook of Human Vibration); its peak is 1.3 g.
+    """
+
+    start: tuple[float, float]
+    speed: float = 0.8
+    descent: float = 0.5
+    impact: float = 0.1
+
+    def at(self, elapsed: float) -> TrunkState:
+        """Return the trunk's state `elapsed` s after the motion began."""
+        up = 0.0
+        if 0.0 <= elapsed < self.descent:
+            up = -self._peak(self.descent) * math.sin(math.pi * elapsed / self.descent)
+        elif self.descent <= elapsed < self.descent + self.impact:
+            up = self._peak(self.impact) * math.sin(math.pi * (elapsed - self.descent) / self.impact)
+        return TrunkState(*self.start, acceleration=_in_trunk((0.0, 0.0, up), *self.start))
+
+    def _peak(self, duration: float) -> float:
+        return math.pi * self.speed / (2.0 * duration)
+
+
+def motion_of(step: Step, pitch: float, roll: float) -> TrunkMotion | None:
+    """Return what the trunk, now at `pitch` and `roll` in rad, does in a step of a script; None if it stays."""
+    here = pitch, roll
+    if step.action == "bow":
+        return Turn(here, (step.value[0], roll), step.duration)
+    if step.action == "lean":
+        return Turn(here, (pitch, step.value[0]), step.duration)
+    if step.action == "walk":
+        return Walk(here, step.duration)
+    return SitDown(here) if step.action == "sit" else None
+
+
+def _minimum_jerk(share: float) -> Vector:
+    """Return the way from 0 to 1 at a share of its duration, and its first and second derivatives by the share."""
+    s = max(0.0, min(1.0, share))
+    way = s**3 * (10.0 - 15.0 * s + 6.0 * s * s)
+    return way, 30.0 * s * s * (1.0 - s) ** 2, 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s)
+
+
+def _swing(amplitude: float, frequency: float, elapsed: float, envelope: Vector) -> Vector:
+    """Return a sine times its envelope, and the first and second derivatives; frequency: rad/s."""
+    size, slope, bend = envelope
+    sine, cosine = amplitude * math.sin(frequency * elapsed), amplitude * math.cos(frequency * elapsed)
+    rate = slope * sine + size * frequency * cosine
+    return size * sine, rate, bend * sine + 2.0 * slope * frequency * cosine - size * frequency**2 * sine
+
+
+def _in_trunk(level: Vector, pitch: float, roll: float) -> Vector:
+    """Return a vector in the axes of an upright trunk (forward, left, up) in those of one at `pitch` and `roll`."""
+    ahead, left, up = level
+    x, z = ahead * math.cos(pitch) - up * math.sin(pitch), ahead * math.sin(pitch) + up * math.cos(pitch)
+    return x, left * math.cos(roll) + z * math.sin(roll), z * math.cos(roll) - left * math.sin(roll)
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
