@@ -19,6 +19,7 @@ import numpy as np
 
 from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.recording import MARGIN, Blocks, Recording, Span, in_blocks, position_resolution, still_spans
+from exo_gravity.core.trial_script import TRUNK_ACTIONS
 
 MIN_HOLD = 2.0  # s
 WINDOW = 10.0  # s, over which `Hold.stray` is judged
@@ -60,9 +61,9 @@ class Hold:
 class Motion:
     """A motion between two holds, or after the last one.
 
-    kind: 'push', 'move', 'slip' (the arm moved during a hold of the script), 'gap' (nothing was recorded) or 'let down'
-    (the arm was not carried throughout: the motors let it down after a fault or at the end). Without a script, a motion
-    that ends within 20 degrees of its start counts as a push.
+    kind: 'push', 'move', an action of the trunk ('bow', 'lean', 'walk', 'sit'), 'slip' (the arm moved during a hold of
+    the script), 'gap' (nothing was recorded) or 'let down' (the arm was not carried throughout: the motors let it down
+    after a fault or at the end). Without a script, a motion that ends within 20 degrees of its start counts as a push.
     peak: (4,) rad, signed, largest distance from the pose before. residual: (4,) rad, pose after minus pose before; NaN
     if the arm was not still again. until_still: s from the first movement, NaN likewise. speed: (4,) rad/s, peak.
     """
@@ -197,7 +198,7 @@ def _kind(recording: Recording, start: float, end: float, empty: bool, residual:
         return "gap"
     if not recording.steps:
         return "push" if np.all(np.abs(residual) < PUSH_OFFSET) else "move"
-    return next((action for action in ("move", "push") if action in actions), "slip")
+    return next((action for action in ("move", "push", *TRUNK_ACTIONS) if action in actions), "slip")
 
 
 def _releases(recording: Recording, blocks: Blocks) -> Iterator[Release]:

@@ -5,6 +5,10 @@
       - {move: [0.0, 0.5, 0.6, 0.5], over: 2.0}      bring the arm to this pose (rad), then let go
       - {hold: 10.0}                                 leave it alone
       - {push: [0.0, 2.0, 1.5, 1.0], over: 0.4}      push it with these joint torques (Nm)
+      - {bow: 0.5, over: 3.0}                        bow to this pitch of the trunk (rad), and leave the arm alone
+      - {lean: 0.3, over: 3.0}                       lean to this roll of the trunk (rad, to the right)
+      - {walk: 60.0}                                 walk
+      - {sit: 2.0}                                   sit down hard, and wait for the rest of the time
 
 A human wearer reads the steps from the screen; the simulator's virtual wearer executes them.
 """
@@ -22,11 +26,18 @@ from exo_gravity.core.arm import four_floats, one_float
 from exo_gravity.core.errors import ParameterError
 
 MAX_DURATION = 3600.0  # s
+TIMED = {"hold": 0.1, "walk": 2.0, "sit": 1.0}  # steps that have only a duration, and the shortest of each in s
+TURNS = {"bow": 1.6, "lean": 0.8}  # steps that turn the trunk, and the largest angle of each in rad
+TRUNK_ACTIONS = ("bow", "lean", "walk", "sit")
 
 
 @dataclass(frozen=True)
 class Step:
-    """One step: `action` is 'move', 'hold' or 'push'; `value` is the pose (4,) in rad, () or the torque (4,) in Nm."""
+    """One step: an `action` and its `value`.
+
+    'move': the pose (4,) in rad; 'push': the torque (4,) in Nm; 'bow', 'lean': the angle (1,) in rad; 'hold', 'walk',
+    'sit': ().
+    """
 
     action: str
     duration: float
@@ -35,13 +46,27 @@ class Step:
     @classmethod
     def parse(cls, entry: Any, where: str) -> Step:
         """Return the step described by a mapping from YAML; `where` is its name in a ParameterError."""
-        if isinstance(entry, Mapping) and set(entry) == {"hold"}:
-            return cls("hold", one_float(f"{where}.hold", entry["hold"], 0.1, MAX_DURATION, "s"))
+        keys = set(entry) if isinstance(entry, Mapping) else set()
+        for action, shortest in TIMED.items():
+            if keys == {action}:
+                return cls(action, one_float(f"{where}.{action}", entry[action], shortest, MAX_DURATION, "s"))
+        for action, bound in TURNS.items():
+            if keys == {action, "over"}:
+                angle = one_float(f"{where}.{action}", entry[action], -bound, bound, "rad")
+                return cls(action, _over(entry, where), (angle,))
         for action, bound, unit in (("move", 3.5, "rad"), ("push", 20.0, "Nm")):
-            if isinstance(entry, Mapping) and set(entry) == {action, "over"}:
+            if keys == {action, "over"}:
                 value = four_floats(f"{where}.{action}", entry[action], -bound, bound, unit)
-                return cls(action, one_float(f"{where}.over", entry["over"], 0.1, 60.0, "s"), tuple(value.tolist()))
-        raise ParameterError(where, entry, "{move: [4 rad], over: s}, {hold: s} or {push: [4 Nm], over: s}")
+                return cls(action, _over(entry, where), tuple(value.tolist()))
+        expected = (
+            "{move: [4 rad], over: s}, {hold: s}, {push: [4 Nm], over: s}, {bow: rad, over: s}, {lean: rad, over: s}, "
+            "{walk: s} or {sit: s}"
+        )
+        raise ParameterError(where, entry, expected)
+
+
+def _over(entry: Mapping[str, Any], where: str) -> float:
+    return one_float(f"{where}.over", entry["over"], 0.1, 60.0, "s")
 
 
 @dataclass(frozen=True)

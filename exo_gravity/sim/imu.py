@@ -1,13 +1,13 @@
-"""A trunk IMU: pitch and roll of the trunk -> gyroscope and accelerometer in the IMU's axes, with sensor errors.
+"""A trunk IMU: the motion of the trunk -> gyroscope and accelerometer in the IMU's axes, with sensor errors.
 
-The trunk's orientation in the world is Ry(pitch) Rx(roll) (`core.tilt`; heading is irrelevant), so its angular velocity
-in its own axes is (roll', pitch' cos roll, -pitch' sin roll). The accelerometer measures specific force: at rest +g
-upward (REP-145). The trunk's own acceleration is neglected, as in the simulated arm.
+The trunk's orientation in the world is Ry(pitch) Rx(roll) (`core.tilt`; heading is irrelevant). The accelerometer
+measures specific force, the acceleration of its own place less gravity: at rest +g upward (REP-145).
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,18 +16,24 @@ import numpy as np
 from exo_gravity.core.arm import MAX_GRAVITY, STANDARD_GRAVITY, one_float
 from exo_gravity.core.param_table import check_owned, owned
 from exo_gravity.core.tilt import gravity_in_trunk, pitch_roll, rotation_matrix
+from exo_gravity.sim.trunk_motion import TrunkState
 
 AVERAGED_SAMPLES = 100  # of one measured tilt
+Sample = tuple[np.ndarray, np.ndarray]  # angular velocity (3,) rad/s and acceleration (3,) m/s^2, in the IMU's axes
 
 
 @dataclass(frozen=True)
 class ImuConfig:
-    """A small MEMS IMU.
+    """A small MEMS IMU. Raises ParameterError that names the offending value.
 
     gyroscope_noise rad/s/sqrt(Hz), accelerometer_noise m/s^2/sqrt(Hz): BMI160 data sheet, 0.007 deg/s and 180 ug.
-    gyroscope_bias rad/s, accelerometer_bias m/s^2: standard deviation per axis of a constant offset; by default
+    gyroscope_bias rad/s, accelerometer_bias m/s^2: standard deviation per axis of the offset at the start; by default
     0.1 deg/s and 5 mg, what remains after a calibration at rest (uncalibrated, the BMI160 has 3 deg/s and 40 mg).
-    gravity: m/s^2. Raises ParameterError that names the offending value.
+    gyroscope_walk rad/s/sqrt(s), accelerometer_walk m/s^2/sqrt(s): random walk of the offsets; Kalibr's example, an
+    ADIS16448.
+    gyroscope_range rad/s, accelerometer_range m/s^2: readings beyond are cut off; the BMI160's 2000 deg/s, and 8 g.
+    delay: s by which the filters of the sensor delay a reading; MPU-6050 register map, low-pass of 94 Hz.
+    position: (3,) m of the IMU from the shoulder, in the trunk's axes. gravity: m/s^2.
     """
 
     rotation_trunk_from_imu: Sequence[float] = owned(
@@ -38,6 +44,12 @@ class ImuConfig:
     accelerometer_noise: float = 180e-6 * STANDARD_GRAVITY
     gyroscope_bias: float = math.radians(0.1)
     accelerometer_bias: float = 5e-3 * STANDARD_GRAVITY
+    gyroscope_walk: float = 4e-6
+    accelerometer_walk: float = 2e-4
+    gyroscope_range: float = math.radians(2000.0)
+    accelerometer_range: float = 8.0 * STANDARD_GRAVITY
+    delay: float = owned(0.003, "delay of the IMU's readings behind their stamps", (0.0, 0.1), "s")
+    position: Sequence[float] = (0.0, 0.0, 0.0)
     gravity: float = STANDARD_GRAVITY
     seed: int = 0
 
@@ -45,12 +57,15 @@ class ImuConfig:
         rotation_matrix(self.rotation_trunk_from_imu, "rotation_trunk_from_imu")
         check_owned(self)
         one_float("gravity", self.gravity, 0.0, MAX_GRAVITY, "m/s^2")
-        for name in ("gyroscope_noise", "accelerometer_noise", "gyroscope_bias", "accelerometer_bias"):
-            one_float(name, getattr(self, name), 0.0, 10.0)
+        for name in ("noise", "bias", "walk"):
+            for sensor in ("gyroscope", "accelerometer"):
+                one_float(f"{sensor}_{name}", getattr(self, f"{sensor}_{name}"), 0.0, 10.0)
+        one_float("gyroscope_range", self.gyroscope_range, 0.1, 100.0, "rad/s")
+        one_float("accelerometer_range", self.accelerometer_range, 1.0, 1000.0, "m/s^2")
 
 
 class SimulatedImu:
-    """Samples of one IMU on one trunk; the same seed gives the same errors."""
+    """Samples of one IMU on one trunk, `rate` of them per s; the same seed gives the same errors."""
 
     def __init__(self, config: ImuConfig | None = None) -> None:
         self.config = config = config or ImuConfig()
@@ -62,21 +77,38 @@ class SimulatedImu:
             config.gyroscope_noise * math.sqrt(bandwidth),
             config.accelerometer_noise * math.sqrt(bandwidth),
         )
+        self._walk = config.gyroscope_walk / math.sqrt(config.rate), config.accelerometer_walk / math.sqrt(config.rate)
+        self._range = np.array(((config.gyroscope_range,), (config.accelerometer_range,)))
+        self._place = np.array(config.position)
+        # True readings, the newest last: as many as the delay spans.
+        self._past: deque[np.ndarray] = deque(maxlen=math.ceil(config.delay * config.rate) + 1)
 
-    def sample(
-        self, pitch: float, roll: float, pitch_rate: float = 0.0, roll_rate: float = 0.0
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return angular velocity (3,) in rad/s and acceleration (3,) in m/s^2, both in the IMU's axes.
+    def sample(self, pitch: float, roll: float, pitch_rate: float = 0.0, roll_rate: float = 0.0) -> Sample:
+        """Return a sample of a trunk that turns steadily: pitch, roll in rad (REP-103), pitch_rate, roll_rate rad/s."""
+        return self.sample_of(TrunkState(pitch, roll, pitch_rate, roll_rate))
 
-        pitch, roll: of the trunk, rad (REP-103). pitch_rate, roll_rate: rad/s.
-        """
-        angular_velocity = np.array((roll_rate, pitch_rate * math.cos(roll), -pitch_rate * math.sin(roll)))
-        force = -self.config.gravity * gravity_in_trunk(pitch, roll)
-        gyroscope_error, accelerometer_error = self._bias + self._errors(*self._noise)
-        return (
-            self._imu_from_trunk @ angular_velocity + gyroscope_error,
-            self._imu_from_trunk @ force + accelerometer_error,
-        )
+    def sample_of(self, state: TrunkState) -> Sample:
+        """Return angular velocity (3,) in rad/s and acceleration (3,) in m/s^2, both in the IMU's axes."""
+        self._past.append(self._readings(state))
+        self._bias += self._errors(*self._walk)
+        readings = self._delayed() + self._bias + self._errors(*self._noise)
+        angular_velocity, acceleration = np.clip(readings, -self._range, self._range)
+        return angular_velocity, acceleration
+
+    def _readings(self, state: TrunkState) -> np.ndarray:
+        """Return the true readings, (2, 3)."""
+        turning, spin_up = np.array(state.angular_velocity), np.array(state.angular_acceleration)
+        force = np.array(state.acceleration) - self.config.gravity * gravity_in_trunk(state.pitch, state.roll)
+        if self._place.any():
+            force += np.cross(spin_up, self._place) + np.cross(turning, np.cross(turning, self._place))
+        return np.array((self._imu_from_trunk @ turning, self._imu_from_trunk @ force))
+
+    def _delayed(self) -> np.ndarray:
+        """Return the readings `delay` s ago, interpolated; the oldest until that time has passed."""
+        back = min(self.config.delay * self.config.rate, len(self._past) - 1.0)
+        whole = int(back)
+        newer = self._past[-1 - whole]
+        return newer if whole == back else newer + (back - whole) * (self._past[-2 - whole] - newer)
 
     def _errors(self, gyroscope: float, accelerometer: float) -> np.ndarray:
         return self._random.normal(size=(2, 3)) * ((gyroscope,), (accelerometer,))

@@ -3,7 +3,7 @@
 import pytest
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.core.trial_script import Step, TrialScript
 
 GOOD = {
     "name": "short",
@@ -21,6 +21,12 @@ def test_a_script_returns_the_active_step_and_the_time_since_its_start():
     assert script.at(13.0)[0] == len(script.steps)
 
 
+def test_steps_of_the_trunk_have_an_angle_or_only_a_duration():
+    steps = [{"bow": 0.5, "over": 3}, {"lean": -0.3, "over": 2.0}, {"walk": 60.0}, {"sit": 2}]
+    parsed = TrialScript.parse({"name": "trunk", "steps": steps}).steps
+    assert parsed == (Step("bow", 3.0, (0.5,)), Step("lean", 2.0, (-0.3,)), Step("walk", 60.0), Step("sit", 2.0))
+
+
 @pytest.mark.parametrize(
     ("content", "name"),
     [
@@ -32,6 +38,9 @@ def test_a_script_returns_the_active_step_and_the_time_since_its_start():
         ({"name": "x", "steps": [{"hold": 1}, {"move": [0, 0, 0], "over": 1}]}, "steps[1].move"),
         ({"name": "x", "steps": [{"move": [0, 0, 0, 90], "over": 1}]}, "steps[0].move"),
         ({"name": "x", "steps": [{"push": [0, 0, 0, 1], "over": -1}]}, "steps[0].over"),
+        ({"name": "x", "steps": [{"bow": 45, "over": 3}]}, "steps[0].bow"),
+        ({"name": "x", "steps": [{"bow": 0.5}]}, "steps[0]"),
+        ({"name": "x", "steps": [{"walk": 0.5}]}, "steps[0].walk"),
     ],
 )
 def test_an_invalid_entry_is_named(content, name):

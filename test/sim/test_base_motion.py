@@ -13,7 +13,8 @@ from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import _mjcf
 from exo_gravity.sim.base_motion import in_base, rotation_in_base
 from exo_gravity.sim.trunk_motion import TrunkState
-from test.support.trunk import orientation
+
+from ..support.trunk import orientation
 
 G = 9.80665
 FRICTIONLESS = {"coulomb_friction": (0.0,) * 4, "viscous_friction": (0.0,) * 4}

@@ -7,7 +7,8 @@ import pytest
 
 from exo_gravity.core.trial_script import Step
 from exo_gravity.sim.trunk_motion import HIP_TO_SHOULDER, SitDown, TrunkState, Turn, Walk, motion_of
-from test.support.trunk import orientation
+
+from ..support.trunk import orientation
 
 START = (0.1, -0.06)
 MOTIONS = {

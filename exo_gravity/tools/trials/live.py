@@ -17,7 +17,7 @@ from rich.live import Live
 from rich.text import Text
 
 from exo_gravity.core.drive import State
-from exo_gravity.core.trial_script import Step, TrialScript
+from exo_gravity.core.trial_script import TRUNK_ACTIONS, Step, TrialScript
 
 SETTLING = 0.5  # s between letting go and the position from which drift is measured
 LEAD = 5.0  # s for a person to get ready when the arm is carried
@@ -159,7 +159,19 @@ def describe(step: Step, guided: bool) -> str:
     if step.action == "push":
         pushed = "once, briefly" if step.duration < 1.0 else f"for {step.duration:g} s, then let go"
         return f"push the arm {pushed}" if guided else "the wearer pushes the arm"
+    if step.action in TRUNK_ACTIONS:
+        return _of_trunk(step) if guided else f"the wearer: {_of_trunk(step)}"
     return f"hands off for {step.duration:g} s"
+
+
+def _of_trunk(step: Step) -> str:
+    if step.action == "walk":
+        return f"walk for {step.duration:g} s, and leave the arm alone"
+    if step.action == "sit":
+        return "sit down hard, and leave the arm alone"
+    angle = math.degrees(step.value[0])
+    way = "forward" if step.action == "bow" else "to the right"
+    return f"{step.action} to {angle:.0f} deg {way} in {step.duration:g} s, and leave the arm alone"
 
 
 def columns(values: Iterable[float], digits: int) -> str:
