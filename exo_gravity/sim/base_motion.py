@@ -13,17 +13,34 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from exo_gravity.core.tilt import Tilt
+from exo_gravity.sim.trunk_motion import TrunkState, Vector
 
-def in_base(side: str, vector: Sequence[float]) -> tuple[float, float, float]:
+
+def in_base(side: str, vector: Sequence[float]) -> Vector:
     """Return a vector (3,) of the trunk's axes in the base frame of the `side` arm, of which the right is a mirror."""
     x, y, z = vector
     return (y if side == "left" else -y), x, -z
 
 
-def rotation_in_base(side: str, vector: Sequence[float]) -> tuple[float, float, float]:
+def rotation_in_base(side: str, vector: Sequence[float]) -> Vector:
     """Return an angular velocity or acceleration (3,) of the trunk in the base frame; a mirror reverses rotations."""
     x, y, z = vector
     return (y, x, -z) if side == "left" else (y, -x, z)
+
+
+def felt_in_base(side: str, state: TrunkState, gravity: float) -> tuple[Vector, Vector, Vector]:
+    """Return what the `side` arm's base feels, each (3,) in its frame, as for `SimulatedArm.move_base`.
+
+    Gravity less acceleration in m/s^2, angular velocity in rad/s, angular acceleration in rad/s^2. gravity: m/s^2.
+    """
+    down, acceleration = Tilt.of(side, state.pitch, state.roll).direction, in_base(side, state.acceleration)
+    x, y, z = (gravity * component - a for component, a in zip(down, acceleration, strict=True))
+    return (
+        (x, y, z),
+        rotation_in_base(side, state.angular_velocity),
+        rotation_in_base(side, state.angular_acceleration),
+    )
 
 
 def apply_rotation(

@@ -18,11 +18,13 @@ import can
 
 from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.sim.arm import STEP, SimulatedArm
+from exo_gravity.sim.base_motion import felt_in_base
 from exo_gravity.sim.can_link import CanLink, Frame
 from exo_gravity.sim.gap_meter import GapMeter
 from exo_gravity.sim.motor import SimulatedMotor
+from exo_gravity.sim.trunk_motion import TrunkMotion, TrunkState, motion_of
 from exo_gravity.sim.truth import TruthLog
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
@@ -32,7 +34,7 @@ IDLE_PERIOD = 0.005  # s after which physics advances even without a frame
 
 
 class SimulatedDevice:
-    """An arm with four motors, on a trunk that tilts, and optionally a wearer who moves it.
+    """An arm with four motors, on a trunk that moves, and optionally a wearer who moves both.
 
     motors: shoulder to elbow, with different CAN IDs. side: 'left' or 'right'. seed: of the reply delays.
 
@@ -63,7 +65,9 @@ class SimulatedDevice:
         self._steps = 0
         self._clock = 0.0  # s elapsed, of which `time` is the part in whole steps
         self._trial: tuple[VirtualWearer, float] | None = None  # the wearer, and the time at which the script starts
-        self._gravity_tilt: tuple[float, float] | None = None
+        self._motion: TrunkMotion | None = None  # of the wearer's current step
+        self._trunk_step: int | None = None  # the step that it belongs to
+        self._base = TrunkState()  # the arm's base moves like this
         self._frames = [0] * JOINT_COUNT  # received by each motor
         self._power_returns = math.inf  # simulated s
 
@@ -88,21 +92,28 @@ class SimulatedDevice:
         """Whether a simulated fault keeps a motor from replying."""
         return self.bus_silent or any(self.cut_off) or any(motor.unplugged for motor in self.motors)
 
+    @property
+    def trunk(self) -> TrunkState:
+        """The trunk's tilt and motion."""
+        return self._base if self._motion else TrunkState(self.pitch, self.roll)
+
+    @property
+    def trunk_moves(self) -> bool:
+        """Whether the wearer's current step moves the trunk."""
+        return self._motion is not None
+
     def return_power(self, delay: float) -> None:
         """Return the power of unplugged motors in `delay` s; they come back switched off."""
         self._power_returns = self.time + delay
 
     def start(self, wearer: VirtualWearer, delay: float = 0.0) -> None:
         """Let `wearer` start the script in `delay` s; replaces any other wearer."""
-        self._trial = (wearer, self.time + delay)
+        self._trial, self._trunk_step, self._motion = (wearer, self.time + delay), None, None
 
     def advance(self, duration: float) -> None:
         """Advance by `duration` s in whole steps; a remainder is kept for the next call."""
         self._clock += duration
-        tilt = (self.pitch, self.roll)
-        if tilt != self._gravity_tilt:
-            self.arm.set_gravity(Tilt.of(self.side, *tilt).direction)
-            self._gravity_tilt = tilt
+        self._move_base(self.trunk)
         if self.truth:
             self.truth.synchronise(self._clock)
         steps = int((self._clock - self.time) / STEP + 1e-6)
@@ -157,6 +168,24 @@ class SimulatedDevice:
             return False
         return all(motor.steady for motor in self.motors)
 
+    def _follow_trunk(self, script: TrialScript, elapsed: float) -> None:
+        """Move the trunk as the wearer's script says, `elapsed` s after its start."""
+        index, since = script.at(elapsed)
+        if elapsed >= 0.0 and index != self._trunk_step:
+            self._trunk_step = index
+            step = script.steps[index] if index < len(script.steps) else None
+            self._motion = motion_of(step, self.pitch, self.roll) if step else None
+        if self._motion:
+            state = self._motion.at(since)
+            self.pitch, self.roll = state.pitch, state.roll
+            self._move_base(state)
+
+    def _move_base(self, state: TrunkState) -> None:
+        """Let the base of the arm move with the trunk."""
+        if state != self._base:
+            self._base = state
+            self.arm.move_base(*felt_in_base(self.side, state, self.arm.config.links.gravity))
+
     def _step(self, theta: list[float], velocity: list[float], count: int) -> None:
         if self.time >= self._power_returns:
             self._power_returns = math.inf
@@ -168,5 +197,6 @@ class SimulatedDevice:
         if self._trial is not None:
             wearer, start = self._trial
             torque = list(map(operator.add, torque, wearer.torque(self.time - start, theta, velocity)))
+            self._follow_trunk(wearer.script, self.time - start)
         self.arm.step(torque, count)
         self._steps += count

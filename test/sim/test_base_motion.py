@@ -11,7 +11,7 @@ import pytest
 from exo_gravity.core.tilt import Tilt
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import _mjcf
-from exo_gravity.sim.base_motion import in_base, rotation_in_base
+from exo_gravity.sim.base_motion import felt_in_base, in_base, rotation_in_base
 from exo_gravity.sim.trunk_motion import TrunkState
 
 from ..support.trunk import orientation
@@ -55,9 +55,7 @@ def accelerate(arm, state, theta, velocity, torque):
     """Return the joint accelerations (4,) of the simulated left arm under `torque`."""
     arm.reset(theta)
     arm.data.qvel[:] = velocity
-    gravity = G * np.array(Tilt.of("left", state.pitch, state.roll).direction) - in_base("left", state.acceleration)
-    turning, spin_up = (rotation_in_base("left", v) for v in (state.angular_velocity, state.angular_acceleration))
-    arm.move_base(gravity, turning, spin_up)
+    arm.move_base(*felt_in_base("left", state, G))
     arm.step(torque)
     return arm.data.qacc.copy()
 
