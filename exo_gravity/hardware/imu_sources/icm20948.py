@@ -19,15 +19,8 @@ from exo_gravity.hardware.imu_sources.invensense import (
 
 REG_BANK_SEL = 0x7F  # in every bank
 # bank 0
-WHO_AM_I, USER_CTRL, PWR_MGMT_1, PWR_MGMT_2, ACCEL_XOUT_H, GYRO_XOUT_H, TEMP_OUT_H = (
-    0,
-    0x03,
-    0x06,
-    0x07,
-    0x2D,
-    0x33,
-    0x39,
-)
+WHO_AM_I, USER_CTRL, PWR_MGMT_1, PWR_MGMT_2 = 0x00, 0x03, 0x06, 0x07
+ACCEL_XOUT_H, GYRO_XOUT_H, TEMP_OUT_H = 0x2D, 0x33, 0x39
 FIFO_EN_2, FIFO_RST, FIFO_MODE, FIFO_COUNTH, FIFO_R_W = 0x67, 0x68, 0x69, 0x70, 0x72
 # bank 1
 SELF_TEST_GYRO, SELF_TEST_ACCEL = 0x02, 0x0E

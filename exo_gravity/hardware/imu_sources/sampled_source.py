@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from exo_gravity.hardware.imu_sources.sample_clock import SampleClock
 from exo_gravity.hardware.imu_sources.source import Clock
-from exo_gravity.hardware.trunk_estimator import ImuSample
+from exo_gravity.hardware.imu_sample import ImuSample
 
 Axes = tuple[float, float, float]
 
