@@ -83,8 +83,15 @@ COMPENSATOR = (
     param_of(Settings, "tilt_timeout"),
     *REAL_TIME_PARAMETERS,
 )
+IMU_SOURCES = ("topic", "mpu6050", "icm20948", "lsm6dsox", "witmotion", "bno085")
 IMU = (
+    Param("source", "topic", "the IMU: a driver's topic, a chip on I2C, or a sensor on a serial port", fixed=True,
+          choices=IMU_SOURCES),
     Param("input_topic", "/imu/data_raw", "topic of the IMU driver's sensor_msgs/Imu", fixed=True),
+    Param("i2c.bus", 1, "number n of the bus /dev/i2c-n", (0, 255), fixed=True),
+    Param("i2c.address", 0, "address of the chip; 0: the usual one of its boards", (0, 0x77), fixed=True),
+    Param("serial.port", "", "the sensor's port, best a name in /dev/serial/by-id", fixed=True),
+    Param("serial.baud", 115200, "the sensor's baud rate", (4800, 921600), fixed=True),
     # No rotation would be a safe default. Four zeros are not a rotation, so the node rejects them.
     Param("rotation_trunk_from_imu", [0.0] * 4, "mounting of the IMU, unit quaternion x, y, z, w; required",
           (-1.0, 1.0), fixed=True),
