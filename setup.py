@@ -10,7 +10,7 @@ tools = ("launcher", "trial", "report", "budget", "validate", "train_anfis", "ca
 extras = {
     # Jazzy as wheels, for a machine without ROS. Where ROS 2 is installed, leave this extra out.
     "ros": ["ros-jazzy-rclpy[fastrtps]==7.1.6", "ros-jazzy-common-interfaces==5.3.6"],
-    "imu": ["imufusion>=1.3"],
+    "imu": ["imufusion>=1.3", "pyserial>=3.5", "smbus2>=0.4.2"],
     "sim": ["mujoco>=3.2"],
     "report": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11", "scipy>=1.11"],
     "calibrate": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11"],

@@ -10,11 +10,6 @@ from typing import Protocol
 
 from exo_gravity.core.errors import DeviceError, ParameterError
 
-try:
-    import smbus2
-except ImportError:  # needed only for an IMU on I2C
-    smbus2 = None  # type: ignore[assignment]  # the module's absence
-
 MAX_BLOCK = 32  # bytes
 
 
@@ -36,8 +31,10 @@ class Bus(Protocol):
 
 def open_bus(number: int) -> Bus:
     """Return the bus /dev/i2c-`number`. Raises DeviceError, and ParameterError without smbus2."""
-    if smbus2 is None:
-        raise ParameterError("source", "an IMU on I2C", "topic, or install the extra imu (smbus2)")
+    try:
+        import smbus2
+    except ImportError:
+        raise ParameterError("source", "an IMU on I2C", "topic, or install the extra imu (smbus2)") from None
     try:
         bus: Bus = smbus2.SMBus(number)
         return bus

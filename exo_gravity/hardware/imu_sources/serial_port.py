@@ -7,11 +7,6 @@ from collections.abc import Callable
 
 from exo_gravity.core.errors import DeviceError, ParameterError
 
-try:
-    import serial
-except ImportError:  # needed only for an IMU on a serial port
-    serial = None  # type: ignore[assignment]  # the module's absence
-
 
 class SerialPort:
     """An open port that is read without waiting."""
@@ -19,8 +14,11 @@ class SerialPort:
     def __init__(self, device: str, port: str, baud: int) -> None:
         """Open `port`. Raises DeviceError, and ParameterError without pyserial."""
         self.name = f"{device} on {port}"
-        if serial is None:
-            raise ParameterError("source", "an IMU on a serial port", "topic, or install the extra imu (pyserial)")
+        try:
+            import serial
+        except ImportError:
+            expected = "topic, or install the extra imu (pyserial)"
+            raise ParameterError("source", "an IMU on a serial port", expected) from None
         try:
             self._port = serial.Serial(port, baud, timeout=0, write_timeout=0.2)
         except (OSError, ValueError) as error:  # pyserial's own errors are OSErrors
