@@ -125,6 +125,14 @@ def test_a_gap_is_counted_and_the_stamps_resume_at_the_present():
     assert clock.lost == 99 and stamps[3][0] == pytest.approx(2.015)
 
 
+def test_after_an_interruption_stamps_still_rise_and_never_precede_the_last_one():
+    clock = SampleClock(100.0)
+    stamps = clock.stamps(1.0, [0]) + clock.stamps(1.01, [0])
+    clock.interrupt()
+    stamps += clock.stamps(1.012, [0]) + clock.stamps(1.02, [0])
+    assert np.all(np.diff(stamps) > 0) and stamps[-1] < 1.02
+
+
 def test_a_clock_that_is_set_back_is_followed_at_once():
     clock, stamps = stamped([1000.0, 1000.01, 500.0, 500.01], [1, 1, 1, 1])
     assert clock.lost == 0 and stamps[2][0] == pytest.approx(499.995)

@@ -108,6 +108,15 @@ def test_no_sample_is_lost_or_out_of_order_when_the_fifo_is_read_late(chip):
     assert rig.bus.longest <= 32
 
 
+def test_the_long_fifo_of_the_lsm6dsox_bridges_two_seconds_and_its_samples_are_never_half_new():
+    rig = Rig("lsm6dsox", Motion(acceleration=counting_motion))
+    source = rig.open(self_test=False)
+    taken = len(rig.chip.sampler.instants)
+    rig.time.wait(2.2)
+    assert len(source.read()) == len(rig.chip.sampler.instants) - taken > 220 and source.loss == ""
+    assert rig.chip.registers[0x12] == 0x44  # CTRL3_C: BDU, IF_INC
+
+
 @pytest.mark.parametrize("fast", [0.96, 1.0, 1.04])
 def test_stamps_follow_the_sensors_own_clock(chip, fast):
     rig = Rig(chip, fast=fast)
@@ -181,6 +190,34 @@ def test_an_unplugged_chip_is_an_error_that_names_device_and_register(chip):
     assert error.value.device == source.name and error.value.register is not None
 
 
+@pytest.mark.parametrize("transfer", [0, 1, 2])
+def test_a_disturbed_transfer_costs_the_samples_of_that_read_alone(chip, transfer):
+    rig = Rig(chip, turning())
+    source = rig.open(self_test=False)
+    rig.read_for(source, 0.2)
+    block = rig.bus.read_i2c_block_data
+    calls = []
+
+    def disturbed(*arguments):
+        calls.append(arguments)
+        if len(calls) == transfer + 1:
+            rig.bus.disturbed = 1
+        return block(*arguments)
+
+    rig.bus.read_i2c_block_data = disturbed
+    rig.time.wait(0.05)
+    assert source.read() == [] and source.loss == "a read failed"
+    taken = len(rig.chip.sampler.instants)
+    samples = rig.read_for(source, 0.2)
+    assert source.lost == pytest.approx(0.05 * source.rate, abs=1)
+    error = np.subtract([sample.time for sample in samples], rig.chip.sampler.instants[taken:])
+    assert np.abs(error).max() < 1 / source.rate
+    assert len(samples) == pytest.approx(0.2 * source.rate, abs=1)
+    assert np.degrees([sample.angular_velocity for sample in samples]) == pytest.approx(
+        np.tile((100, -200, 1500), (len(samples), 1)), abs=0.6 * rig.lsb[0]
+    )
+
+
 @pytest.mark.parametrize("chip", ["mpu6050", "mpu9250", "icm20948"])
 def test_a_chip_whose_actuators_hardly_move_it_fails_its_self_test(chip):
     rig = Rig(chip, response=0.4)
@@ -188,6 +225,13 @@ def test_a_chip_whose_actuators_hardly_move_it_fails_its_self_test(chip):
         rig.open()
     rig.bus.closed = False
     assert rig.read_for(rig.open(self_test=False), 0.1)
+
+
+@pytest.mark.parametrize("response", [0.87, 1.13])
+def test_an_mpu6050_may_differ_from_the_factorys_measurement_by_14_percent(response):
+    assert Rig("mpu6050", response=response).open()
+    with pytest.raises(DeviceError, match="self-test failed"):
+        Rig("mpu6050", response=1.0 + 1.2 * (response - 1.0)).open()
 
 
 @pytest.mark.parametrize(

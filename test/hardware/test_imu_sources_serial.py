@@ -31,7 +31,7 @@ class Rig:
     def read(self, source, data, delay=0.01):
         """Send `data` `delay` s after the last time, and return the samples."""
         self.time.wait(delay)
-        self.sensor.send(data)
+        self.sensor.deliver(data)
         return source.read()
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 from exo_gravity.core.arm import STANDARD_GRAVITY
+from exo_gravity.core.errors import DeviceError
 from exo_gravity.hardware.imu_sources.i2c import Registers
 from exo_gravity.hardware.imu_sources.sampled_source import Axes, Measurement, SampledSource
 from exo_gravity.hardware.imu_sources.source import Clock
@@ -52,7 +53,21 @@ class FifoSource(SampledSource):
         if not now < self._temperature_due <= now + TEMPERATURE_PERIOD:
             self._temperature_due = now + TEMPERATURE_PERIOD
             self.temperature = self._read_temperature()
-        return self._drain()
+        try:
+            return self._drain()
+        except DeviceError as error:
+            # A disturbed transfer: where a sample begins in the FIFO is no longer known.
+            try:
+                return self._lose("a read failed")
+            except DeviceError:
+                raise error from None
+
+    def _lose(self, why: str) -> list[Measurement]:
+        """Give up what is in the FIFO."""
+        self.loss = why
+        self._sample_clock.interrupt()
+        self._empty_fifo()
+        return []
 
     def _reset(self) -> None:
         """Return the chip to its reset values, and wake it."""
@@ -68,6 +83,10 @@ class FifoSource(SampledSource):
 
     def _drain(self) -> list[Measurement]:
         """Return the FIFO's samples."""
+        raise NotImplementedError
+
+    def _empty_fifo(self) -> None:
+        """Empty the FIFO and let it fill anew."""
         raise NotImplementedError
 
     def _read_temperature(self) -> float:

@@ -40,7 +40,7 @@ class Thermometer(NamedTuple):
 
 
 class InvenSense(FifoSource):
-    """Base of the InvenSense chips; `_empty_fifo` differs."""
+    """Base of the InvenSense chips."""
 
     READING: ClassVar[tuple[int, int]]  # registers of acceleration and angular velocity
     fifo: Fifo
@@ -50,9 +50,7 @@ class InvenSense(FifoSource):
         count = int.from_bytes(self._registers.read_block(self.fifo.count_register, 2), "big") & 0x1FFF
         # Not the overflow flag: on some of these chips it is always set (Linux: inv_mpu_ring.c).
         if count > self.fifo.capacity - SAMPLE:
-            self.loss = "FIFO overflowed"
-            self._empty_fifo()
-            return []
+            return self._lose("FIFO overflowed")
         data = self._registers.read_block(self.fifo.data_register, count // SAMPLE * SAMPLE, SAMPLE)
         return [
             Measurement(
@@ -60,10 +58,6 @@ class InvenSense(FifoSource):
             )
             for start in range(0, len(data), SAMPLE)
         ]
-
-    def _empty_fifo(self) -> None:
-        """Empty the FIFO and let it fill anew."""
-        raise NotImplementedError
 
     def _read_temperature(self) -> float:
         (raw,) = struct.unpack(">h", self._registers.read_block(self.thermometer.register, 2))

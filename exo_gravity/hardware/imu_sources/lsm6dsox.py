@@ -89,21 +89,21 @@ class Lsm6dsox(FifoSource):
     def _start(self, rate: float) -> float:
         rate = min(RATES, key=lambda candidate: abs(candidate - rate))
         code = RATES[rate]
-        self._registers.set(FIFO_CTRL4, OFF)
         self._registers.set(FIFO_CTRL3, code << 4 | code)
         self._registers.set(CTRL1_XL, code << 4 | SELECT_16_G)
         self._registers.set(CTRL2_G, code << 4 | SELECT_2000_DPS)
-        self._registers.set(FIFO_CTRL4, CONTINUOUS)
+        self._empty_fifo()
         return rate
+
+    def _empty_fifo(self) -> None:
+        self._half = None
+        self._registers.write(FIFO_CTRL4, OFF)
+        self._registers.write(FIFO_CTRL4, CONTINUOUS)
 
     def _drain(self) -> list[Measurement]:
         low, high = self._registers.read_block(FIFO_STATUS1, 2)
         if high & LOST_WORDS:
-            self.loss = "FIFO overflowed"
-            self._half = None
-            self._registers.write(FIFO_CTRL4, OFF)
-            self._registers.write(FIFO_CTRL4, CONTINUOUS)
-            return []
+            return self._lose("FIFO overflowed")
         data = self._registers.read_block(FIFO_DATA_OUT_TAG, WORD * ((high & 0x03) << 8 | low), WORD)
         words = (data[start : start + WORD] for start in range(0, len(data), WORD))
         return [measurement for word in words if (measurement := self._paired(word))]

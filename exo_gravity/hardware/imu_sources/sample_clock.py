@@ -21,6 +21,11 @@ class SampleClock:
         self.lost = 0
         self._nominal = self._period = 1.0 / rate
         self._last: float | None = None  # stamp of the newest sample
+        self._is_interrupted = False
+
+    def interrupt(self) -> None:
+        """Note that an unknown number of samples is lost before the next one."""
+        self._is_interrupted = True
 
     def stamps(self, arrival: float, skipped: Sequence[int]) -> list[float]:
         """Return a stamp in s for each sample of a batch, rising and at most `arrival`.
@@ -45,10 +50,14 @@ class SampleClock:
             predicted = self._last + steps * self._period
             # On average the newest sample is half a period old.
             error = arrival - self._period / 2 - predicted
-            if abs(error) <= MAX_SLIP * self._period:
+            if abs(error) <= MAX_SLIP * self._period and not self._is_interrupted:
                 period = self._period + PERIOD_GAIN * error * min(steps, MAX_SLIP)
                 self._period = min(max(period, self._nominal * (1 - MAX_DRIFT)), self._nominal * (1 + MAX_DRIFT))
                 return self._last, min(predicted + min(0.5, PHASE_GAIN * steps) * error, arrival)
             self.lost += max(0, round(error / self._period))
+        self._is_interrupted = False
         newest = arrival - self._period / 2
-        return newest - steps * self._period, newest
+        start = newest - steps * self._period
+        if self._last is None or self._last >= arrival:  # the clock was set back
+            return start, newest
+        return max(start, self._last), max(newest, (self._last + arrival) / 2)

@@ -35,6 +35,7 @@ class FakeBus:
 
     def __init__(self, device: Device | None, address: int) -> None:
         self.plugged = True
+        self.disturbed = 0  # transfers to come that are not acknowledged
         self.closed = False
         self.longest = 0  # bytes of a read
         self._device = device
@@ -62,6 +63,7 @@ class FakeBus:
     def _addressed(self, address: int) -> Device:
         if self.closed:
             raise OSError(errno.EBADF, "Bad file descriptor")
-        if not self.plugged or self._device is None or address != self._address:
+        self.disturbed = max(self.disturbed - 1, -1)
+        if self.disturbed >= 0 or not self.plugged or self._device is None or address != self._address:
             raise OSError(errno.EREMOTEIO, "Remote I/O error")  # errno 121
         return self._device

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import select
 import struct
+import termios
+import time
 import tty
 from pathlib import Path
 
@@ -15,27 +18,42 @@ class FakeSerialSensor:
     def __init__(self, port: Path) -> None:
         self.port = port
         self._ours: int | None = None
+        self._theirs: int | None = None
         self.plug()
 
     def plug(self) -> None:
         """Appear as `port`."""
-        self._ours, theirs = os.openpty()
-        tty.setraw(theirs)
+        self._ours, self._theirs = os.openpty()
+        tty.setraw(self._theirs)
         self.port.unlink(missing_ok=True)
-        self.port.symlink_to(os.ttyname(theirs))
-        os.close(theirs)
+        self.port.symlink_to(os.ttyname(self._theirs))
 
     def unplug(self) -> None:
         """Vanish."""
-        if self._ours is not None:
+        if self._ours is not None and self._theirs is not None:
             os.close(self._ours)
-            self._ours = None
+            os.close(self._theirs)
+            self._ours = self._theirs = None
         self.port.unlink(missing_ok=True)
 
     def send(self, data: bytes) -> None:
         """Send bytes to the host."""
         assert self._ours is not None
         os.write(self._ours, data)
+
+    def deliver(self, data: bytes) -> None:
+        """Send bytes, and return when they are there: the kernel passes them on later. Nobody may read meanwhile."""
+        assert self._theirs is not None
+        expected = self._waiting() + len(data)
+        self.send(data)
+        end = time.monotonic() + 5.0
+        while self._waiting() < expected:
+            assert time.monotonic() < end
+
+    def _waiting(self) -> int:
+        assert self._theirs is not None
+        (count,) = struct.unpack("i", fcntl.ioctl(self._theirs, termios.FIONREAD, bytes(4)))
+        return int(count)
 
     def received(self) -> bytes:
         """Return what the host has sent."""
