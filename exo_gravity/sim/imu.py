@@ -31,7 +31,7 @@ class ImuConfig:
     0.1 deg/s and 5 mg, what remains after a calibration at rest (uncalibrated, the BMI160 has 3 deg/s and 40 mg).
     gyroscope_walk rad/s/sqrt(s), accelerometer_walk m/s^2/sqrt(s): random walk of the offsets; Kalibr's example, an
     ADIS16448.
-    gyroscope_range rad/s, accelerometer_range m/s^2: readings beyond are cut off; the BMI160's 2000 deg/s, and 8 g.
+    gyroscope_range rad/s, accelerometer_range m/s^2: readings beyond are cut off; the widest of most chips.
     delay: s by which the filters of the sensor delay a reading; MPU-6050 register map, low-pass of 94 Hz.
     position: (3,) m of the IMU from the shoulder, in the trunk's axes. gravity: m/s^2.
     """
@@ -47,7 +47,7 @@ class ImuConfig:
     gyroscope_walk: float = 4e-6
     accelerometer_walk: float = 2e-4
     gyroscope_range: float = math.radians(2000.0)
-    accelerometer_range: float = 8.0 * STANDARD_GRAVITY
+    accelerometer_range: float = 16.0 * STANDARD_GRAVITY
     delay: float = owned(0.003, "delay of the IMU's readings behind their stamps", (0.0, 0.1), "s")
     position: Sequence[float] = (0.0, 0.0, 0.0)
     gravity: float = STANDARD_GRAVITY

@@ -12,6 +12,7 @@ from exo_gravity.sim import VirtualWearer
 
 from ..support.simulated_device import make_device
 
+
 @pytest.fixture
 def device():
     return make_device()
