@@ -14,8 +14,9 @@ import struct
 
 from exo_gravity.hardware.imu_sources.fifo_source import RADIANS_PER_DEGREE, acceleration_scale
 from exo_gravity.hardware.imu_sources.quaternion import from_angles
-from exo_gravity.hardware.imu_sources.sampled_source import Measurement, SampledSource
+from exo_gravity.hardware.imu_sources.sampled_source import Measurement
 from exo_gravity.hardware.imu_sources.serial_port import Packets, SerialPort
+from exo_gravity.hardware.imu_sources.serial_source import SerialSource
 from exo_gravity.hardware.imu_sources.source import Clock
 
 RATE = 100.0  # Hz, fixed
@@ -24,27 +25,16 @@ ANGLE_PER_LSB = 0.01 * RADIANS_PER_DEGREE
 ACCELERATION_PER_LSB = acceleration_scale(1000.0)
 
 
-class Bno085(SampledSource):
+class Bno085(SerialSource):
     """A BNO085 with PS0 high and PS1 low, which selects UART-RVC."""
 
     def __init__(self, port: str, baud: int, clock: Clock) -> None:
         """Open the port. Raises DeviceError, ParameterError."""
-        self._port = SerialPort("BNO085", port, baud)
-        super().__init__(self._port.name, RATE, clock)
-        self._packets = Packets(b"\xaa\xaa", LENGTH, lambda packet: sum(packet[2:18]) & 0xFF == packet[18])
+        packets = Packets(b"\xaa\xaa", LENGTH, lambda packet: sum(packet[2:18]) & 0xFF == packet[18])
+        super().__init__(SerialPort("BNO085", port, baud), packets, RATE, clock)
         self._counter: int | None = None
 
-    def close(self) -> None:
-        """Close the port; never raises."""
-        self._port.close()
-
-    def _measure(self, now: float) -> list[Measurement]:
-        measurements = [self._measurement(packet) for packet in self._packets.feed(self._port.read())]
-        if self._packets.damaged:
-            self.loss = f"{self._packets.damaged} damaged packets"
-        return measurements
-
-    def _measurement(self, packet: bytes) -> Measurement:
+    def _decode(self, packet: bytes) -> Measurement:
         counter, yaw, pitch, roll, x, y, z = struct.unpack_from("<B6h", packet, 2)
         skipped = 0 if self._counter is None else (counter - self._counter - 1) & 0xFF
         self._counter = counter

@@ -50,10 +50,10 @@ class FifoSource(SampledSource):
         self._registers.close()
 
     def _measure(self, now: float) -> list[Measurement]:
-        if not now < self._temperature_due <= now + TEMPERATURE_PERIOD:
-            self._temperature_due = now + TEMPERATURE_PERIOD
-            self.temperature = self._read_temperature()
         try:
+            if not now < self._temperature_due <= now + TEMPERATURE_PERIOD:
+                self._temperature_due = now + TEMPERATURE_PERIOD
+                self.temperature = self._read_temperature()
             return self._drain()
         except DeviceError as error:
             # A disturbed transfer: where a sample begins in the FIFO is no longer known.
@@ -64,7 +64,7 @@ class FifoSource(SampledSource):
 
     def _lose(self, why: str) -> list[Measurement]:
         """Give up what is in the FIFO."""
-        self.loss = why
+        self._why_lost = why
         self._sample_clock.interrupt()
         self._empty_fifo()
         return []

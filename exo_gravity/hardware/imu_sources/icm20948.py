@@ -34,8 +34,8 @@ BOTH_TO_FIFO = 0x1E  # FIFO_EN_2: accelerometer, gyroscope z, y, x
 RESET_FIFO = 0x1F  # FIFO_RST
 USE_FILTER, SELECT_2000_DPS, SELECT_16_G = 0x01, 0x06, 0x06  # GYRO_CONFIG_1, ACCEL_CONFIG; the filter in bits 5:3
 GYROSCOPE_ACTUATORS, ACCELEROMETER_ACTUATORS = 0x38, 0x1C  # GYRO_CONFIG_2, ACCEL_CONFIG_2
-# Hz of the low-pass filters by their code: accelerometer and gyroscope differ by 7 Hz at most from code 2 on
-BANDWIDTHS = {1: 151.8, 2: 119.5, 3: 51.2, 4: 23.9, 5: 11.6, 6: 5.7}
+# Hz of the low-pass filters by their code: the gyroscope's; the accelerometer's are at most 8 Hz narrower
+BANDWIDTHS = {2: 119.5, 3: 51.2, 4: 23.9, 5: 11.6, 6: 5.7}
 FILTER_RATE = 1125.0  # Hz, divided by 1 + SMPLRT_DIV
 START_UP = 0.1  # s after a reset, and after waking
 
@@ -96,22 +96,20 @@ class Icm20948(InvenSense):
     def _test(self) -> None:
         low_pass = 2 << 3
         self._set_bank_2(
-            {GYRO_SMPLRT_DIV: 0, ACCEL_SMPLRT_DIV_2: 0, GYRO_CONFIG_1: USE_FILTER | low_pass}
-            | {ACCEL_CONFIG: USE_FILTER | low_pass}
+            {
+                GYRO_SMPLRT_DIV: 0,
+                ACCEL_SMPLRT_DIV_2: 0,
+                GYRO_CONFIG_1: USE_FILTER | low_pass,  # 250 deg/s
+                ACCEL_CONFIG: USE_FILTER | low_pass,  # 2 g
+            }
         )
-        means = []
-        for values in (
-            {GYRO_CONFIG_2: 0, ACCEL_CONFIG_2: 0},
-            {GYRO_CONFIG_2: GYROSCOPE_ACTUATORS, ACCEL_CONFIG_2: ACCELEROMETER_ACTUATORS},
-        ):
-            self._set_bank_2(values)
-            means.append(self._mean())
-        gyroscope, accelerometer = (
-            [on - off for off, on in zip(*pair, strict=True)] for pair in zip(*means, strict=True)
-        )
+        gyroscope, accelerometer = self._responses(self._switch_actuators)
         self._registers.write(REG_BANK_SEL, 0x10)
         gyroscope_codes = self._registers.read_block(SELF_TEST_GYRO, 3)
         accelerometer_codes = self._registers.read_block(SELF_TEST_ACCEL, 3)
         self._registers.write(REG_BANK_SEL, 0x00)
         self._judge("gyroscope", gyroscope, factory_6500(gyroscope_codes), gyroscope_6500_passes)
         self._judge("accelerometer", accelerometer, factory_6500(accelerometer_codes), accelerometer_6500_passes)
+
+    def _switch_actuators(self, on: bool) -> None:
+        self._set_bank_2({GYRO_CONFIG_2: on * GYROSCOPE_ACTUATORS, ACCEL_CONFIG_2: on * ACCELEROMETER_ACTUATORS})

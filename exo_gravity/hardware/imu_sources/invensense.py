@@ -63,6 +63,15 @@ class InvenSense(FifoSource):
         (raw,) = struct.unpack(">h", self._registers.read_block(self.thermometer.register, 2))
         return float(raw / self.thermometer.sensitivity + self.thermometer.offset)
 
+    def _responses(self, switch_actuators: Callable[[bool], None]) -> tuple[list[float], list[float]]:
+        """Return how the actuators change angular velocity and acceleration, in LSB."""
+        means = []
+        for on in (False, True):
+            switch_actuators(on)
+            means.append(self._mean())
+        (rate_off, acceleration_off), (rate_on, acceleration_on) = means
+        return _difference(rate_on, rate_off), _difference(acceleration_on, acceleration_off)
+
     def _mean(self) -> tuple[list[float], list[float]]:
         """Return the means of angular velocity and acceleration, in LSB."""
         self._wait(SETTLING)
@@ -85,6 +94,10 @@ class InvenSense(FifoSource):
                     f"self-test failed: {sensor} {axis} responds by {measured:.0f} LSB, the factory measured "
                     f"{expected:.0f}: keep it still and try again, or replace it",
                 )
+
+
+def _difference(a: Sequence[float], b: Sequence[float]) -> list[float]:
+    return [x - y for x, y in zip(a, b, strict=True)]
 
 
 def factory_6500(codes: Sequence[int]) -> list[float]:

@@ -74,17 +74,9 @@ class Mpu6050(InvenSense):
         self._registers.write(USER_CTRL, ENABLE_FIFO)
 
     def _test(self) -> None:
-        scale = SELECT_8_G if self._is_6050 else 0  # of the accelerometer; the gyroscope's is 250 deg/s
         self._set_filter(2)
         self._registers.set(SMPLRT_DIV, 0)
-        means = []
-        for actuators in (0, ALL_AXES):
-            self._registers.set(GYRO_CONFIG, actuators)
-            self._registers.set(ACCEL_CONFIG, actuators | scale)
-            means.append(self._mean())
-        gyroscope, accelerometer = (
-            [on - off for off, on in zip(*pair, strict=True)] for pair in zip(*means, strict=True)
-        )
+        gyroscope, accelerometer = self._responses(self._switch_actuators)
         if self._is_6050:
             factory = _factory_6050(self._registers.read_block(SELF_TEST_6050, 4))
             self._judge("gyroscope", gyroscope, factory[0], _passes_6050)
@@ -94,6 +86,11 @@ class Mpu6050(InvenSense):
             self._judge("gyroscope", gyroscope, factory_6500(codes), gyroscope_6500_passes)
             codes = self._registers.read_block(SELF_TEST_ACCEL_6500, 3)
             self._judge("accelerometer", accelerometer, factory_6500(codes), accelerometer_6500_passes)
+
+    def _switch_actuators(self, on: bool) -> None:
+        actuators = ALL_AXES if on else 0
+        self._registers.set(GYRO_CONFIG, actuators)  # 250 deg/s
+        self._registers.set(ACCEL_CONFIG, actuators | (SELECT_8_G if self._is_6050 else 0))
 
 
 def _factory_6050(codes: bytes) -> tuple[list[float], list[float]]:

@@ -29,6 +29,7 @@ class SampledSource:
         self.lost = 0
         self.loss = ""
         self.temperature: float | None = None
+        self._why_lost = ""  # of samples that are not counted yet
         self._clock = clock
         self._sample_clock = SampleClock(rate)
 
@@ -38,8 +39,8 @@ class SampledSource:
         measurements = self._measure(arrival)
         stamps = self._sample_clock.stamps(arrival, [measurement.skipped for measurement in measurements])
         if self._sample_clock.lost > self.lost:
-            self.lost = self._sample_clock.lost
-            self.loss = self.loss or "not read in time"
+            self.lost, self.loss = self._sample_clock.lost, self._why_lost or "not read in time"
+            self._why_lost = ""
         return [
             ImuSample(stamp, measurement.angular_velocity, measurement.acceleration, measurement.orientation)
             for stamp, measurement in zip(stamps, measurements, strict=True)

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import struct
 
-from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.errors import DeviceError, ParameterError
 from exo_gravity.hardware.imu_sources.fifo_source import RADIANS_PER_DEGREE, acceleration_scale
 from exo_gravity.hardware.imu_sources.quaternion import Quaternion, from_angles
-from exo_gravity.hardware.imu_sources.sampled_source import Axes, Measurement, SampledSource
+from exo_gravity.hardware.imu_sources.sampled_source import Axes, Measurement
 from exo_gravity.hardware.imu_sources.serial_port import Packets, SerialPort
+from exo_gravity.hardware.imu_sources.serial_source import SerialSource
 from exo_gravity.hardware.imu_sources.source import Clock
 
 ACCELERATION, ANGULAR_VELOCITY, ANGLES, QUATERNION = 0x51, 0x52, 0x53, 0x59
@@ -29,7 +30,7 @@ ANGLE_PER_LSB = RADIANS_PER_DEGREE * 180.0 / 32768
 Numbers = tuple[int, int, int, int]  # of a packet
 
 
-class WitMotion(SampledSource):
+class WitMotion(SerialSource):
     """A WitMotion sensor. A sample is complete with its orientation: a quaternion, or angles if it sends none."""
 
     def __init__(self, port: str, baud: int, rate: float, clock: Clock) -> None:
@@ -38,31 +39,20 @@ class WitMotion(SampledSource):
         needed = int(rate * PACKETS_A_SAMPLE * LENGTH * BITS_A_BYTE)
         if baud < needed:
             raise ParameterError("serial.baud", baud, f"{needed} or more for {rate:g} samples a second")
-        self._port = SerialPort("WitMotion", port, baud)
-        super().__init__(self._port.name, rate, clock)
-        self._packets = Packets(b"\x55", LENGTH, _is_whole)
+        opened = SerialPort("WitMotion", port, baud)
+        super().__init__(opened, Packets(b"\x55", LENGTH, _is_whole), rate, clock)
         self._parts: dict[int, Numbers] = {}  # of the present sample, by type
         self._last_type = 0  # that completes a sample
         self._begun = False
         self._skipped = 0  # samples since the last whole one
-        for command in (UNLOCK, CONTENT, bytes((0xFF, 0xAA, 0x03, RATES[rate], 0x00))):
-            self._port.write(command)
+        try:
+            opened.write(UNLOCK + CONTENT + bytes((0xFF, 0xAA, 0x03, RATES[rate], 0x00)))
+        except DeviceError:
+            opened.close()
+            raise
 
-    def close(self) -> None:
-        """Close the port; never raises."""
-        self._port.close()
-
-    def _measure(self, now: float) -> list[Measurement]:
-        measurements = []
-        for packet in self._packets.feed(self._port.read()):
-            if measurement := self._completed(packet[1], struct.unpack_from("<4h", packet, 2)):
-                measurements.append(measurement)
-        if self._packets.damaged:
-            self.loss = f"{self._packets.damaged} damaged packets"
-        return measurements
-
-    def _completed(self, kind: int, numbers: Numbers) -> Measurement | None:
-        """Return the sample that a packet completes."""
+    def _decode(self, packet: bytes) -> Measurement | None:
+        kind, numbers = packet[1], struct.unpack_from("<4h", packet, 2)
         if kind not in (ACCELERATION, ANGULAR_VELOCITY, ANGLES, QUATERNION):
             return None
         if kind == ACCELERATION:  # a sample begins
