@@ -123,8 +123,8 @@ class AnfisLaw:
     def torque(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
         """Return the torque (4,) in Nm at pose `theta` (4,) rad; meaningless where `outside` gives a reason."""
         tau = self.torques(np.array((theta[1:],)))[0].tolist()
-        scale = arm.scale
-        return (0.0, *(scale[joint] * value / self.gravity for joint, value in enumerate(tau, start=1)))
+        felt, scale = tilt.magnitude / self.gravity, arm.scale
+        return (0.0, *(felt * scale[joint] * value for joint, value in enumerate(tau, start=1)))
 
     def torques(self, theta: np.ndarray) -> np.ndarray:
         """Return the torques (n, 3) in Nm of joints 2 to 4 for their angles (n, 3) in rad, at gain 1."""

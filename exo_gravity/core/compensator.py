@@ -9,17 +9,20 @@ not apply, the exact law replaces it, with the same transition, for at least `FA
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from exo_gravity.core.anfis_law import AnfisLaw
-from exo_gravity.core.arm import JOINT_COUNT, MAX_TOTAL_MASS, ArmModel
+from exo_gravity.core.arm import JOINT_COUNT, MAX_TOTAL_MASS, STANDARD_GRAVITY, ArmModel
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.felt_motion import FeltMotion
 from exo_gravity.core.gravity import LAWS, Law, Torque
 from exo_gravity.core.limits import MAX_COMMAND
 from exo_gravity.core.param_table import check_owned, owned
 from exo_gravity.core.tilt import SIDES, Tilt, angle_between
+from exo_gravity.core.turning import turning_torque
 
 MODES = ("one_g", "zero_g")
 LAW_NAMES = (*LAWS, "anfis")
@@ -64,6 +67,7 @@ class Settings:
     max_effort_rate: float = owned(50.0, "fastest change of torque", (1.0, 1000.0), "Nm/s")
     transition_time: float = owned(1.0, "time over which a change of mass, mode or law takes effect", (0.2, 30.0), "s")
     tilt_timeout: float = owned(0.08, "age of the trunk tilt at which the efforts are withdrawn", (0.01, 0.5), "s")
+    inertial: bool = owned(False, "also compensate the trunk's acceleration, as its IMU measures it")
     use_imu: bool = True
     anfis: AnfisLaw | None = None
     arm: ArmModel = field(init=False)
@@ -113,6 +117,7 @@ class Compensator:
         self._tilt_time = -math.inf  # when it was measured
         self._tilt_arrival = -math.inf
         self._tilt_refusal = ""  # why the newest tilt was refused; contains no measured value
+        self._motion = FeltMotion()
         self._ramp_start = -math.inf
         self._last_answer = -math.inf
         self._effort = NO_TORQUE
@@ -157,6 +162,15 @@ class Compensator:
             raise ParameterError("trunk tilt", [pitch, roll], expected)
         self._tilt, self._tilt_time, self._tilt_arrival = tilt, measured, now
 
+    def set_motion(
+        self, now: float, specific_force: Sequence[float], angular_velocity: Sequence[float], age: float = 0.0
+    ) -> None:
+        """Set what the trunk's IMU measured `age` s before `now`; used with `inertial`, while the tilt is fresh.
+
+        specific_force m/s^2, angular_velocity rad/s: (3,) in the trunk's axes. Raises ParameterError.
+        """
+        self._motion.add(now - max(0.0, age), specific_force, angular_velocity)
+
     def step(self, now: float, theta: Sequence[float]) -> Answer:
         """Return the torque for joint angles `theta` (4,) rad at `now` s on a monotonic clock."""
         if len(theta) != JOINT_COUNT or not all(-MAX_ANGLE <= angle <= MAX_ANGLE for angle in theta):
@@ -180,6 +194,10 @@ class Compensator:
     def _law(self, now: float, theta: Sequence[float]) -> Torque:
         """Return the torque of the chosen law, or of the exact law while the chosen one does not apply."""
         settings, tilt = self.settings, self._tilt
+        felt = self._motion.at(now) if settings.inertial and settings.use_imu else None
+        if felt:
+            magnitude = math.hypot(*felt.gravity) / STANDARD_GRAVITY
+            tilt = Tilt.of_gravity(settings.side, felt.gravity)._replace(magnitude=magnitude)
         law = settings.active_law
         reason = law.outside(settings.arm, theta, tilt)
         if reason:
@@ -188,7 +206,11 @@ class Compensator:
             self._fallback = ""
         if self._fallback:
             law = LAWS["exact"]
-        return law.torque(settings.arm, theta, tilt)
+        torque = law.torque(settings.arm, theta, tilt)
+        if felt is None:
+            return torque
+        turning = turning_torque(settings.arm, settings.side, theta, felt.angular_acceleration)
+        return tuple(map(operator.add, torque, turning))
 
     def _transition(self, now: float, theta: Sequence[float]) -> Torque:
         """Return the law's torque plus the remainder of the last change of settings or law."""

@@ -79,6 +79,7 @@ COMPENSATOR = (
     param_of(Settings, "max_effort"),
     param_of(Settings, "max_effort_rate"),
     param_of(Settings, "transition_time"),
+    param_of(Settings, "inertial"),
     Param("use_imu", True, "false assumes an upright trunk (the paper's seated wearer)", fixed=True),
     param_of(Settings, "tilt_timeout"),
     *REAL_TIME_PARAMETERS,

@@ -165,9 +165,9 @@ class ClosedForm(NamedTuple):
 
     def torque(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
         """Return the torque (4,) in Nm."""
-        scale = arm.scale
-        tau = self.unscaled(arm, theta, tilt)
-        return scale[0] * tau[0], scale[1] * tau[1], scale[2] * tau[2], scale[3] * tau[3]
+        a, b, c, d = arm.scale
+        tau, felt = self.unscaled(arm, theta, tilt), tilt.magnitude
+        return felt * a * tau[0], felt * b * tau[1], felt * c * tau[2], felt * d * tau[3]
 
     def outside(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> str:
         """Return '': a closed form applies everywhere."""

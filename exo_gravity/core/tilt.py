@@ -19,11 +19,12 @@ SIDES = ("left", "right")
 
 
 class Tilt(NamedTuple):
-    """The trunk's tilt in one arm's base frame; create it with `Tilt.of`.
+    """The trunk's tilt in one arm's base frame; create it with `Tilt.of` or `Tilt.of_gravity`.
 
     pitch, roll: the trunk's, in rad (REP-103). direction: (3,) unit vector of gravity in the arm's base frame.
     axis_angle: angle between joint 1's axis and gravity in rad, 0..pi; the paper's theta_1. beta, phi: the paper's tilt
-    angles, which its mobile law adds to theta_3 and theta_2.
+    angles, which its mobile law adds to theta_3 and theta_2. magnitude: of gravity as the arm feels it, as a share of
+    its own; the laws multiply their torque by it.
     """
 
     pitch: float
@@ -32,6 +33,7 @@ class Tilt(NamedTuple):
     axis_angle: float
     beta: float
     phi: float
+    magnitude: float = 1.0
 
     @classmethod
     def of(cls, side: str, pitch: float = 0.0, roll: float = 0.0) -> Tilt:
@@ -44,6 +46,23 @@ class Tilt(NamedTuple):
         forward, right, down = _gravity(pitch, outward)
         direction = (-right, forward, down)
         return cls(pitch, roll, direction, math.acos(max(-1.0, min(1.0, down))), -pitch, outward)
+
+    @classmethod
+    def of_gravity(cls, side: str, gravity_in_trunk: Vector) -> Tilt:
+        """Return the tilt of the `side` arm for gravity's direction in the trunk's axes, a vector (3,) of any length.
+
+        It has no singularity: a trunk that bows past 90 degrees, or lies, has a direction like any other. Raises
+        ParameterError.
+        """
+        if side not in SIDES:
+            raise ParameterError("side", side, f"one of {', '.join(SIDES)}")
+        x, y, z = map(float, gravity_in_trunk)
+        pitch, roll = pitch_roll((x, y, z))
+        norm = math.hypot(x, y, z)
+        x, y, z = x / norm, (y if side == "left" else -y) / norm, z / norm
+        return cls(
+            pitch, roll, (y, x, -z), math.acos(max(-1.0, min(1.0, -z))), -pitch, roll if side == "left" else -roll
+        )
 
 
 def _gravity(pitch: float, roll: float) -> tuple[float, float, float]:
@@ -59,8 +78,8 @@ def gravity_in_trunk(pitch: float, roll: float) -> np.ndarray:
 
 def pitch_roll(gravity_in_trunk: Vector) -> tuple[float, float]:
     """Return the trunk's pitch (-pi/2..pi/2) and roll (-pi..pi) in rad for a gravity vector (3,) in its axes."""
-    x, y, z = (float(component) for component in gravity_in_trunk)
-    norm = math.sqrt(x * x + y * y + z * z)
+    x, y, z = map(float, gravity_in_trunk)
+    norm = math.hypot(x, y, z)
     if not 0.0 < norm < math.inf:
         raise ParameterError("gravity_in_trunk", gravity_in_trunk, "a finite, non-zero vector")
     return math.asin(max(-1.0, min(1.0, x / norm))), math.atan2(-y, -z)

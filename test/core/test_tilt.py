@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from exo_gravity.core.arm import ArmModel
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.gravity import LAWS
 from exo_gravity.core.tilt import Tilt, gravity_from_orientation, gravity_in_trunk, pitch_roll, rotation_matrix
 
 # Base frame of the left arm in trunk axes: x0 left, y0 forward, z0 down.
@@ -102,3 +104,25 @@ def test_the_heading_and_the_mounting_of_the_imu_do_not_change_the_tilt_of_the_t
         world_from_imu = world_from_trunk * mounting  # mounting: trunk from IMU
         gravity = gravity_from_orientation(world_from_imu.as_quat(), mounting.as_matrix())
         assert gravity == pytest.approx(gravity_in_trunk(pitch, roll), abs=1e-12)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_the_tilt_of_a_gravity_vector_is_that_of_its_pitch_and_roll(side):
+    for pitch, roll in np.random.default_rng(8).uniform(-1.5, 1.5, (50, 2)):
+        by_angles, by_vector = Tilt.of(side, pitch, roll), Tilt.of_gravity(side, 3.0 * gravity_in_trunk(pitch, roll))
+        for one, other in zip(by_angles, by_vector, strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-12)
+
+
+@pytest.mark.parametrize("gravity", [(0, 0, 0), (math.nan, 0, -1)])
+def test_a_vector_without_a_direction_is_refused(gravity):
+    with pytest.raises(ParameterError):
+        Tilt.of_gravity("left", gravity)
+
+
+def test_the_laws_multiply_their_torque_by_the_magnitude_of_gravity():
+    arm, theta = ArmModel((0.05, 0.13, 0.3, 0.3), (0.05, 0.1, 0.2, 0.1), (0.6, 0.5, 0.6, 0.2)), (0.2, 0.7, 0.6, 0.5)
+    tilt = Tilt.of("left", 0.2, -0.1)
+    for law in LAWS.values():
+        felt = law.torque(arm, theta, tilt._replace(magnitude=1.5))
+        np.testing.assert_allclose(felt, 1.5 * np.array(law.torque(arm, theta, tilt)))
