@@ -15,7 +15,7 @@ from exo_gravity.core.errors import ParameterError
 FROZEN_TIME = 0.1  # s of equal samples
 FROZEN_SAMPLES = 10  # and at least this many
 
-Reading = tuple[tuple[float, ...], ...]
+Reading = tuple[Sequence[float] | None, ...]
 
 
 class FreezeCheck:
@@ -28,13 +28,12 @@ class FreezeCheck:
 
     def check(self, time: float, *vectors: Sequence[float] | None) -> None:
         """Check the reported `vectors` of the sample of `time` (s). Raises ParameterError once they are frozen."""
-        reading = tuple(tuple(vector) for vector in vectors if vector is not None and any(vector))
-        if not reading or reading != self._reading or time < self._since:
-            self._reading, self._since, self._count = reading, time, 1
+        if vectors != self._reading or time < self._since or not any(any(v) for v in vectors if v is not None):
+            self._reading, self._since, self._count = vectors, time, 1
             return
         self._count += 1
         if self._count >= FROZEN_SAMPLES and time - self._since >= FROZEN_TIME:
             expected = "different from sample to sample, as noise makes them: the IMU or its driver is frozen"
             raise ParameterError(
-                "angular_velocity and linear_acceleration", [list(vector) for vector in reading], expected
+                "angular_velocity and linear_acceleration", [list(v) for v in vectors if v is not None], expected
             )

@@ -19,8 +19,8 @@ ACCELEROMETER_RANGE = 16.0 * STANDARD_GRAVITY  # m/s^2
 SATURATED = 0.995  # share of the range
 BEYOND = 1.03  # share of the range: scale factors of MEMS sensors are wrong by up to 3 %
 DEAD = 0.02  # m/s^2: even in free fall noise and bias make more
-# A sample that is its predecessor divided by 9.8, within this share, is in g.
-SAME = 0.25
+ALMOST_NOTHING = 1.5  # m/s^2
+SAME = 0.15  # share of 1 g
 
 
 class ImuSample(NamedTuple):
@@ -74,14 +74,16 @@ class Ranges(NamedTuple):
             raise ParameterError("linear_acceleration", acceleration, expected)
         if largest < DEAD:
             raise ParameterError("linear_acceleration", acceleration, "not zero, as a dead accelerometer reports")
-        if last is not None and _is_in_g(acceleration, last):
+        if largest < ALMOST_NOTHING and last is not None and _is_in_g(acceleration, last):
             raise ParameterError("linear_acceleration", acceleration, "in m/s^2, not in g")
         return acceleration, largest >= SATURATED * self.accelerometer
 
 
 def _is_in_g(acceleration: Floats3, last: Floats3) -> bool:
+    """Return whether `last` was at rest, and `acceleration` is the same divided by 9.8."""
+    was_at_rest = abs(math.hypot(*last) / STANDARD_GRAVITY - 1.0) < SAME
     x, y, z = (STANDARD_GRAVITY * component for component in acceleration)
-    return math.dist((x, y, z), last) < SAME * math.hypot(*last)
+    return was_at_rest and math.dist((x, y, z), last) < SAME * STANDARD_GRAVITY
 
 
 def three_floats(name: str, values: Sequence[float] | None) -> Floats3:

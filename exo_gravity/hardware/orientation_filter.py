@@ -18,6 +18,8 @@ try:
 except ImportError:  # needed only for an IMU that reports no orientation
     VQF = None
 
+BIAS_INTERVAL = 10  # samples; the bias changes slowly
+
 
 class OrientationFilter:
     """Follows one IMU; the heading is arbitrary. bias: (3,) rad/s, its standard deviation bias_sigma rad/s."""
@@ -29,12 +31,13 @@ class OrientationFilter:
         self._period = 1.0 / rate
         self._vqf = VQF(self._period)
         self._due = self._period  # s for which the accelerometer has not been passed on
-        self.bias, self.bias_sigma = self._vqf.getBiasEstimate()
+        self._count = 0
+        self._read_bias()
 
     def restart(self) -> None:
         """Forget the orientation, keep the bias."""
         self._vqf.resetState()
-        self._vqf.setBiasEstimate(self.bias, self.bias_sigma)
+        self._vqf.setBiasEstimate(np.array(self.bias), self.bias_sigma)
         self._due = self._period
 
     def advance(self, dt: float, rate: Floats3, last_rate: Floats3, acceleration: Floats3 | None) -> Quaternion:
@@ -43,7 +46,7 @@ class OrientationFilter:
         rate, last_rate: of this sample and the last one. acceleration: None if it is not known.
         """
         vqf, period = self._vqf, self._period
-        vqf.updateGyr(self._scaled(dt, rate, last_rate))
+        vqf.updateGyr(np.array(self._scaled(dt / period, rate, last_rate)))
         self._due += dt
         count = round(self._due / period)
         self._due -= count * period
@@ -51,17 +54,26 @@ class OrientationFilter:
             measured = np.array(acceleration)
             for _ in range(count):
                 vqf.updateAcc(measured)
-        self.bias, self.bias_sigma = vqf.getBiasEstimate()
+        self._count += 1
+        if self._count % BIAS_INTERVAL == 0:
+            self._read_bias()
         w, x, y, z = vqf.getQuat6D().tolist()
         return x, y, z, w
 
-    def _scaled(self, dt: float, rate: Floats3, last_rate: Floats3) -> np.ndarray:
-        """Return the rate at which VQF turns in its period as far as the IMU has turned in `dt`.
+    def _read_bias(self) -> None:
+        bias, self.bias_sigma = self._vqf.getBiasEstimate()
+        self.bias: Floats3 = tuple(bias.tolist())
 
-        A rate counts for the period that it ends. Over n periods the rates between the two known ones are interpolated.
+    def _scaled(self, periods: float, rate: Floats3, last_rate: Floats3) -> list[float]:
+        """Return the rate at which VQF turns in its period as far as the IMU has turned in `periods` periods.
+
+        A rate counts for the period that it ends. Over several periods the rates between the two known ones are
+        interpolated.
         """
-        periods = dt / self._period
-        mean = np.array(rate)
-        if periods > 1.0:
-            mean += (last_rate - mean) * (0.5 - 0.5 / periods)
-        return self.bias + (mean - self.bias) * periods
+        share = 0.5 - 0.5 / periods if periods > 1.0 else 0.0  # of the last rate
+        (x, y, z), (last_x, last_y, last_z), (bias_x, bias_y, bias_z) = rate, last_rate, self.bias
+        return [
+            bias_x + (x + share * (last_x - x) - bias_x) * periods,
+            bias_y + (y + share * (last_y - y) - bias_y) * periods,
+            bias_z + (z + share * (last_z - z) - bias_z) * periods,
+        ]

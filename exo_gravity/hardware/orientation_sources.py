@@ -8,12 +8,15 @@ from __future__ import annotations
 import math
 from typing import NamedTuple, Protocol
 
-import numpy as np
-
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.quaternion import Floats3, Quaternion, rotated, unit_quaternion, up_in_body
 from exo_gravity.core.tilt import angle_between
+from exo_gravity.hardware.gravity_check import GravityCheck
+from exo_gravity.hardware.imu_consistency import ImuConsistency
 from exo_gravity.hardware.imu_sample import ImuSample, Ranges, three_floats
+from exo_gravity.hardware.mean_acceleration import MeanAcceleration
 from exo_gravity.hardware.orientation_filter import OrientationFilter
+from exo_gravity.hardware.stuck_axis import StuckAxis
 from exo_gravity.hardware.tilt_uncertainty import TiltUncertainty
 
 REPORTED_SIGMA = math.radians(1.0)  # rad; data sheets of fused sensors state 1 to 2 degrees
@@ -23,18 +26,18 @@ MAX_JUMP = 0.01  # rad by which rounding may turn a reported orientation
 
 
 class Measured(NamedTuple):
-    """A checked sample. rate, acceleration: None if not reported, or if the accelerometer is saturated."""
+    """A checked sample. acceleration: None if not reported or saturated. is_saturated: the gyroscope is."""
 
-    rate: Floats3 | None
+    rate: Floats3
     acceleration: Floats3 | None
-    orientation: Quaternion | None = None
-    is_saturated: bool = False  # the gyroscope
+    orientation: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    is_saturated: bool = False
 
 
 class OrientationSource(Protocol):
     """sigma: standard deviation of the tilt, rad. settling: why the orientation cannot be used yet, '' if it can."""
 
-    bias: np.ndarray  # of the gyroscope, (3,) rad/s in the IMU's axes
+    bias: Floats3  # of the gyroscope, rad/s in the IMU's axes
 
     @property
     def sigma(self) -> float: ...
@@ -59,11 +62,16 @@ class Fused:
         self._filter = OrientationFilter(rate)
         self._ranges = ranges
         self._uncertainty = TiltUncertainty(rate, ranges.gyroscope)
+        self._consistency = ImuConsistency()
+        self._stuck = StuckAxis()
+        self._mean = MeanAcceleration()
+        self._gravity = GravityCheck()
         self._last: Measured | None = None
+        self._repeated = 0.0  # s for which the samples have been equal
         self._why = ""
 
     @property
-    def bias(self) -> np.ndarray:
+    def bias(self) -> Floats3:
         return self._filter.bias
 
     @property
@@ -72,39 +80,79 @@ class Fused:
 
     @property
     def settling(self) -> str:
+        if self._consistency.is_suspect:
+            return f"until gyroscope and accelerometer agree on a turn of the trunk; {self._why}"
         return "" if self._uncertainty.is_settled else self._why
 
     def check(self, sample: ImuSample) -> Measured:
         rate, is_saturated = self._ranges.angular_velocity(sample.angular_velocity)
         last = self._last.acceleration if self._last else None
         acceleration, is_clipped = self._ranges.acceleration(sample.acceleration, last)
-        return Measured(rate, None if is_clipped else acceleration, None, is_saturated)
+        return Measured(rate, None if is_clipped else acceleration, is_saturated=is_saturated)
 
     def restart(self, why: str) -> None:
         self._filter.restart()
         self._uncertainty.restart()
-        self._last, self._why = None, why
+        self._consistency.restart()
+        self._stuck.restart()
+        self._mean.restart()
+        self._gravity.restart()
+        self._last, self._why, self._repeated = None, why, 0.0
 
     def advance(self, measured: Measured, dt: float) -> Quaternion:
-        rate = measured.rate
-        last_rate = self._last.rate if self._last else rate
-        self._uncertainty.advance(dt, rate, last_rate, measured.is_saturated)
+        self._count_losses(measured, dt)
         if self._uncertainty.is_lost:
             self.restart("too much rotation was not measured")
-        quaternion = self._filter.advance(dt, rate, last_rate, measured.acceleration)
+        last = self._last or measured
+        quaternion = self._filter.advance(dt, measured.rate, last.rate, measured.acceleration)
+        self._last = measured
         in_world = rotated(quaternion, measured.acceleration) if measured.acceleration else None
         self._uncertainty.combine(self._filter.bias_sigma, in_world)
-        self._last = measured
+        up = up_in_body(quaternion)
+        self._gravity.update(dt, up, measured.acceleration)
+        if measured.acceleration and in_world:
+            self._check(measured, dt, up, in_world)
         return quaternion
+
+    def _count_losses(self, measured: Measured, dt: float) -> None:
+        last = self._last or measured
+        self._uncertainty.advance(dt, measured.rate, last.rate)
+        self._repeated = self._repeated + dt if measured == last else 0.0
+        if self._repeated:
+            self._uncertainty.repeat(dt, self._repeated)
+        elif measured.is_saturated:
+            self._uncertainty.saturate(dt)
+
+    def _check(self, measured: Measured, dt: float, up: Floats3, in_world: Floats3) -> None:
+        """Raise ParameterError if gyroscope and accelerometer contradict each other, or an axis is stuck."""
+        assert measured.acceleration is not None
+        try:
+            self._consistency.update(dt, up, measured.acceleration, self._gravity.deviation)
+            if not measured.is_saturated:
+                self._stuck.update(dt, up, measured.rate, measured.acceleration)
+        except ParameterError as error:
+            if self._stuck.is_stuck:
+                self._uncertainty.distrust(dt, measured.rate)
+            if self._consistency.is_broken or self._stuck.is_sure:
+                self._consistency.suspect()
+                self.restart(f"{error.name} must be {error.expected}")
+            raise
+        try:
+            self._mean.update(dt, in_world)
+        except ParameterError as error:
+            self._consistency.suspect()
+            self._why = f"{error.name} must be {error.expected}"
+            raise
 
 
 class Reported:
     """The orientation that the IMU reports."""
 
-    bias = np.zeros(3)
+    bias = (0.0, 0.0, 0.0)
     sigma = REPORTED_SIGMA
 
     def __init__(self) -> None:
+        self._gravity = GravityCheck()
         self._age = 0.0  # s since the restart
         self._up: Floats3 | None = None
         self._why = ""
@@ -114,17 +162,14 @@ class Reported:
         return "" if self._age >= REPORTED_SETTLE_TIME else self._why
 
     def check(self, sample: ImuSample) -> Measured:
-        rate, acceleration = (
-            None if values is None else three_floats(name, values)
-            for name, values in (
-                ("angular_velocity", sample.angular_velocity),
-                ("linear_acceleration", sample.acceleration),
-            )
-        )
+        rate, acceleration = sample.angular_velocity, sample.acceleration
+        rate = (0.0, 0.0, 0.0) if rate is None else three_floats("angular_velocity", rate)
+        acceleration = None if acceleration is None else three_floats("linear_acceleration", acceleration)
         return Measured(rate, acceleration, unit_quaternion("orientation", sample.orientation))
 
     def restart(self, why: str) -> None:
         self._age, self._up, self._why = 0.0, None, why
+        self._gravity.restart()
 
     def advance(self, measured: Measured, dt: float) -> Quaternion:
         self._age += dt
@@ -133,4 +178,5 @@ class Reported:
         if self._up is not None and angle_between(up, self._up) > MAX_REPORTED_RATE * dt + MAX_JUMP:
             self.restart("orientation jumped")
         self._up = up
+        self._gravity.update(dt, up, measured.acceleration)
         return quaternion

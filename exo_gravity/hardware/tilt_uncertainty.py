@@ -5,9 +5,11 @@ One standard deviation of the tilt is the root of the sum of the squares of
     BIAS_TIME * s_b                   gyroscope bias not yet learnt: its standard deviation s_b, over VQF's 3 s window
     v / (g T)                         start: T s after it, the mean acceleration is wrong by a change of speed v over T,
                                       which is the deviation of the acceleration times CORRELATION_TIME
-    a t^2 / 8                         a gap of t s: rates interpolated, while the rotation accelerated by up to a
+    a t^2 / 8                         a gap of t s: rates interpolated, while the rotation accelerated by a, as of late
     OVERSHOOT * range * t             t s of saturation: the true rate exceeded the range by this share
-The last two add up, and decay with VQF's time constant.
+    a t^2 / 2                         t s of repeated samples: the rate may have changed since
+    w t                               t s at a rate w, of which an axis is stuck
+The last four add up, and decay with VQF's time constant.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ CORRELATION_TIME = 0.25  # s, a quarter of a stride
 SETTLE_TIME = 1.0  # s, the shortest time from a start to the first tilt
 DECAY_TIME = 3.0  # s, VQF's tauAcc
 LEAST_ACCELERATION = 20.0  # rad/s^2, assumed in a gap even after rest
-PEAK_DECAY_TIME = 1.0  # s in which the largest angular acceleration seen is forgotten
+ACCELERATION_TIME = 0.3  # s
 OVERSHOOT = 0.25
 GAP = 1.5  # periods
 
@@ -36,14 +38,15 @@ class TiltUncertainty:
     def __init__(self, rate: float, gyroscope_range: float) -> None:
         self._period = 1.0 / rate
         self._overshoot = OVERSHOOT * gyroscope_range
-        self._peak = LEAST_ACCELERATION  # rad/s^2
+        self._square = 0.0  # of the angular acceleration, (rad/s^2)^2, mean over ACCELERATION_TIME
         self.restart()
 
     def restart(self) -> None:
         """Begin anew: nothing is known but the accelerometer."""
         self.sigma = math.inf
         self._lost = 0.0  # rad^2, of gaps and saturation
-        self._run = 0.0  # rad lost in the present run of saturated samples
+        self._run = 0.0  # rad lost in the present run of samples that do not tell the rotation
+        self._is_losing = False  # whether the run goes on
         self._age = 0.0  # s since the start
         self._count = 0
         self._sum, self._squares = [0.0, 0.0, 0.0], 0.0  # of the acceleration in the world since the start
@@ -58,18 +61,36 @@ class TiltUncertainty:
         """Whether the tilt is off by no more than MAX_ERROR."""
         return self._age >= SETTLE_TIME and SIGMAS * self.sigma <= MAX_ERROR
 
-    def advance(self, dt: float, rate: Floats3, last_rate: Floats3, is_saturated: bool) -> None:
-        """Count the rotation that was not measured in the `dt` s since the last sample."""
+    def advance(self, dt: float, rate: Floats3, last_rate: Floats3) -> None:
+        """Count the rotation that was not measured between the last sample and this one, `dt` s later."""
+        if not self._is_losing:
+            self._run = 0.0
+        self._is_losing = False
         self._age += dt
-        self._lost *= math.exp(-2.0 * dt / DECAY_TIME)
-        self._peak = max(LEAST_ACCELERATION, self._peak * math.exp(-dt / PEAK_DECAY_TIME))
+        self._lost *= max(0.0, 1.0 - 2.0 * dt / DECAY_TIME)
         if dt > GAP * self._period:
-            self._lost += (self._peak * dt * dt / 8.0) ** 2
-        else:
-            self._peak = max(self._peak, math.dist(rate, last_rate) / max(dt, 0.5 * self._period))
-        run = self._run + self._overshoot * dt if is_saturated else 0.0
-        self._lost += max(0.0, run * run - self._run * self._run)
-        self._run = run
+            self._lost += max(LEAST_ACCELERATION**2, self._square) * (dt * dt / 8.0) ** 2
+        elif dt > 0.0:
+            acceleration = math.dist(rate, last_rate) / max(dt, 0.5 * self._period)
+            self._square += (acceleration * acceleration - self._square) * min(1.0, dt / ACCELERATION_TIME)
+
+    def saturate(self, dt: float) -> None:
+        """Count a saturated rate."""
+        self._lose(self._overshoot * dt)
+
+    def repeat(self, dt: float, duration: float) -> None:
+        """Count a sample that repeats the last one, the `duration` s of equal ones having grown by `dt`."""
+        self._lose(0.5 * math.sqrt(self._square) * (2.0 * duration - dt) * dt)
+
+    def distrust(self, dt: float, rate: Floats3) -> None:
+        """Count a rate of which an axis is stuck as not measured."""
+        self._lose(math.hypot(*rate) * dt)
+
+    def _lose(self, angle: float) -> None:
+        """Add an angle in rad; the angles of one run have one direction, those of different runs do not."""
+        self._lost += angle * (angle + 2.0 * self._run)  # the difference of the squares
+        self._run += angle
+        self._is_losing = True
 
     def combine(self, bias_sigma: float, acceleration_in_world: Floats3 | None) -> None:
         """Add up the terms. acceleration_in_world: by the present estimate; None if it is not known."""
@@ -78,7 +99,7 @@ class TiltUncertainty:
         self.sigma = math.sqrt(BASE * BASE + bias * bias + start * start + self._lost)
 
     def _start_error(self, acceleration: Floats3 | None) -> float:
-        if self._age > 10.0 * DECAY_TIME:
+        if self._age > 3.0 * DECAY_TIME:
             return 0.0
         if acceleration is not None:
             self._count += 1

@@ -16,23 +16,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm import STANDARD_GRAVITY, one_float
+from exo_gravity.core.arm import one_float
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.quaternion import Floats3, product, up_in_body
-from exo_gravity.core.tilt import angle_between, pitch_roll, rotation_matrix
+from exo_gravity.core.quaternion import product, up_in_body
+from exo_gravity.core.tilt import pitch_roll, rotation_matrix
 from exo_gravity.hardware.freeze_check import FreezeCheck
 from exo_gravity.hardware.imu_sample import ACCELEROMETER_RANGE, GYROSCOPE_RANGE, ImuSample, Ranges
 from exo_gravity.hardware.orientation_filter import VQF
-from exo_gravity.hardware.orientation_sources import Fused, OrientationSource, Reported
+from exo_gravity.hardware.orientation_sources import Fused, Reported
+from exo_gravity.hardware.stamp_check import StampCheck
 
 __all__ = ["ImuSample", "TrunkEstimator", "TrunkOrientation"]
 
 MAX_GAP = 0.1  # s between two samples, after which the estimate begins anew
-# Estimate and accelerometer differ while the trunk accelerates. If they differ for long while the accelerometer shows
-# 1 g, the driver reports an orientation it does not have, its world z points down, or a unit or an axis is wrong.
-MAX_CONTRADICTION = math.radians(20.0)
-CONTRADICTION_TIME = 0.5  # s; less than the time to settle, so that a wrong orientation is never used
-NEAR_GRAVITY = 0.1  # share of 1 g
 
 
 class TrunkOrientation(NamedTuple):
@@ -73,40 +69,45 @@ class TrunkEstimator:
         x, y, z, w = map(float, rotation_trunk_from_imu)
         self._imu_from_trunk = (-x, -y, -z, w)
         rate = one_float("rate", rate, 2.0 / MAX_GAP, 10_000.0, "Hz")
-        self._fused = Fused(rate, Ranges.of(gyroscope_range, accelerometer_range)) if VQF else None
+        ranges = Ranges.of(gyroscope_range, accelerometer_range)
+        self._fused = Fused(rate, ranges) if VQF else None
         self._reported = Reported()
-        self._source: OrientationSource | None = None
+        self._source: Fused | Reported | None = None
         self._freeze = FreezeCheck()
+        self._stamps = StampCheck(rate)
         self._time = -math.inf
-        self._contradicted = 0.0  # s
 
     @property
     def gyroscope_bias(self) -> np.ndarray:
         """The gyroscope bias that the fusion estimates and subtracts, (3,) rad/s in the IMU's axes."""
-        return self._fused.bias if self._fused else np.zeros(3)
+        return np.array(self._fused.bias if self._fused else (0.0, 0.0, 0.0))
 
     def update(self, sample: ImuSample) -> TrunkOrientation | None:
         """Process a sample; return the trunk's orientation, or None while it is not sure enough.
 
         Raises ParameterError if the sample is impossible, frozen or not later than the last one (it is then ignored),
-        or if the orientation has contradicted the accelerometer for CONTRADICTION_TIME.
+        or if what it measures contradicts itself or the samples before it.
         """
-        source: OrientationSource | None = self._fused if sample.orientation is None else self._reported
+        source: Fused | Reported | None = self._fused if sample.orientation is None else self._reported
         if source is None:
             raise ParameterError("orientation", None, "reported by the IMU, or install vqf to fuse it")
         measured = source.check(sample)
-        dt = self._step(sample.time)
-        self._freeze.check(sample.time, sample.angular_velocity, sample.acceleration)
+        time = float(sample.time)
+        dt = self._step(time)
+        self._freeze.check(time, measured.rate, measured.acceleration)
         if source is not self._source or abs(dt) > MAX_GAP:
             source.restart(f"gap of {dt:.2f} s" if source is self._source else "started")
-            self._source, self._contradicted, dt = source, 0.0, 0.0
+            self._source, dt = source, 0.0
+            self._stamps.restart()
+        self._time = time
+        self._stamps.check(time, dt, sample.arrival)
         quaternion = source.advance(measured, dt)
-        self._time, self.settling = sample.time, source.settling
+        self.settling = source.settling
         up = up_in_body(quaternion)
-        self._compare(up, measured.acceleration, dt)
         if self.settling:
             return None
-        gravity = tuple(-(a * up[0] + b * up[1] + c * up[2]) for a, b, c in self._rows)
+        x, y, z = up
+        gravity = [-a * x - b * y - c * z for a, b, c in self._rows]
         orientation = np.array(product(quaternion, self._imu_from_trunk))
         return TrunkOrientation(*pitch_roll(gravity), orientation, np.array(gravity), source.sigma)
 
@@ -116,16 +117,3 @@ class TrunkEstimator:
         if not math.isfinite(time) or -MAX_GAP <= dt <= 0.0:
             raise ParameterError("stamp", time, "a finite number, later than the last stamp")
         return dt
-
-    def _compare(self, up: Floats3, acceleration: Floats3 | None, dt: float) -> None:
-        """Raise ParameterError once `up` has contradicted an accelerometer that shows 1 g for too long."""
-        if acceleration is not None:
-            norm = math.hypot(*acceleration)
-            if abs(norm / STANDARD_GRAVITY - 1.0) < NEAR_GRAVITY:
-                measured = [component / norm for component in acceleration]
-                contradicts = angle_between(up, measured) > MAX_CONTRADICTION
-                self._contradicted = self._contradicted + dt if contradicts else 0.0
-        if self._contradicted > CONTRADICTION_TIME:
-            limit = math.degrees(MAX_CONTRADICTION)
-            expected = f"within {limit:g} degrees of the accelerometer at rest: check the IMU's axes, units and signs"
-            raise ParameterError("gravity_in_imu", [round(-component, 2) for component in up], expected)

@@ -1,0 +1,73 @@
+"""The clock of the stamps: a slow one makes every turn too small; a second publisher halves the time between samples.
+
+A sensor's rate is steady. So after a start the time between two stamps must stay a multiple of what it has been, which
+must be near the given rate. And the stamps may not fall behind the arrivals, of which those count that came quickest.
+"""
+
+from __future__ import annotations
+
+import math
+
+from exo_gravity.core.errors import ParameterError
+
+LEARN_TIME = 0.8  # s; less than the time to settle
+RATE_BOUNDS = (0.85, 1.18)  # share of the given rate
+AVERAGE_TIME = 0.1  # s
+MAX_CHANGE = 0.03  # share by which the period may change
+JITTER = 1.5  # times the mean deviation of the periods that are further allowed
+MAX_DELAY = 0.03  # s by which stamps may fall behind
+DRIFT = 0.002  # s/s that is normal between a sensor's clock and a computer's
+WINDOW = 0.2  # s over which the shortest delay counts
+
+
+class StampCheck:
+    """Follows the stamps of one IMU."""
+
+    def __init__(self, rate: float) -> None:
+        self._given = 1.0 / rate
+        self.restart()
+
+    def restart(self) -> None:
+        """Learn anew from the next sample on."""
+        self._period = self._given
+        self._is_learning = True
+        self._share, self._jitter = 1.0, 0.0  # of the periods: mean, and mean deviation from it
+        self._age, self._periods = 0.0, 0  # since the start
+        self._usual = self._shortest = math.inf  # s from stamp to arrival
+        self._window_end = -math.inf
+
+    def check(self, time: float, dt: float, arrival: float | None) -> None:
+        """Check the stamp `time` (s), `dt` s after the last one. Raises ParameterError."""
+        if arrival is not None:
+            self._check_delay(time, arrival)
+        periods = max(1, round(dt / self._period))
+        share = dt / self._period / periods
+        k = min(1.0, dt / AVERAGE_TIME)
+        self._jitter += k * (abs(share - self._share) - self._jitter)
+        self._share += k * (share - self._share)
+        if self._is_learning:
+            self._age += dt
+            self._periods += periods if dt else 0
+            if self._age >= LEARN_TIME:
+                self._learn()
+        elif abs(self._share - 1.0) > MAX_CHANGE + JITTER * self._jitter:
+            expected = "evenly spaced as before: its clock has changed, or a second IMU publishes"
+            raise ParameterError("stamp", round(time, 4), expected)
+
+    def _learn(self) -> None:
+        """Take the period from the stamps since the start. Raises ParameterError if it is not the given one."""
+        rate = self._periods / self._age
+        low, high = RATE_BOUNDS
+        if not low <= rate * self._given <= high:
+            raise ParameterError("rate", round(1.0 / self._given, 1), f"about the {rate:.0f} Hz of the stamps")
+        self._period, self._share, self._is_learning = 1.0 / rate, 1.0, False
+
+    def _check_delay(self, time: float, arrival: float) -> None:
+        delay = arrival - time
+        if arrival >= self._window_end:
+            self._usual = min(self._usual + DRIFT * WINDOW, self._shortest)
+            self._shortest, self._window_end = math.inf, arrival + WINDOW
+        self._shortest = min(self._shortest, delay)
+        if self._shortest - self._usual > MAX_DELAY:
+            expected = f"within {MAX_DELAY:g} s of the arrival, as before: the IMU's clock is slow, or its driver lags"
+            raise ParameterError("stamp", round(time, 4), expected)
