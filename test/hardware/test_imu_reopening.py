@@ -72,8 +72,16 @@ def test_a_chip_that_answers_but_sleeps_is_set_up_again(rig):
     rig.chip.reset()
     assert rig.read_for(0.4) == [] and rig.reopening.problem == ""
     rig.read_for(0.2)
-    assert rig.reopening.problem.endswith("no sample for 0.5 s")
+    assert rig.reopening.problem.endswith("no sample for 0.5 s (its supply may have broken down)")
     assert rig.read_for(1.0) and rig.reopening.problem == ""
+
+
+def test_the_time_that_opening_takes_is_not_silence():
+    rig = Rig()
+    rig.reopening.read(rig.time())  # opens, and tests for a second
+    rig.time.wait(0.001)
+    assert rig.reopening.read(rig.time()) == [] and rig.reopening.openings == 1
+    assert rig.read_for(0.1) and rig.reopening.openings == 1
 
 
 def test_a_sensor_that_is_missing_at_the_start_is_opened_when_it_appears():

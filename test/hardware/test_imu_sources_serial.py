@@ -173,6 +173,13 @@ def test_an_unplugged_sensor_is_an_error_that_names_the_port(make_rig, kind):
         rig.open()
 
 
+def test_bytes_without_a_packet_hint_at_the_baud_rate(make_rig):
+    rig = make_rig("bno085")
+    source = rig.open()
+    assert source.silence == "not one byte"
+    assert rig.read(source, bytes(range(100))) == [] and "is serial.baud the sensor's?" in source.silence
+
+
 def test_a_port_must_be_given(make_rig):
     with pytest.raises(ParameterError, match=r"serial\.port = '': must be the sensor's port"):
         make_rig("bno085").open(**{"serial.port": ""})

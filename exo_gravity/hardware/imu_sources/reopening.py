@@ -40,15 +40,16 @@ class Reopening:
         """
         if self.source is None and now < self._retry_at:
             return []
+        self._heard_at = min(self._heard_at, now)
         try:
             if self.source is None:
                 # A self-test needs a sensor at rest: it is not repeated after a loose plug, when the wearer walks.
                 self.source = self._open_source(not self._tested)
-                self._tested, self._heard_at = True, now
+                self._tested, self._heard_at = True, math.inf  # opening takes time: silence counts from the next read
                 self.openings += 1
             samples = self.source.read()
             if not samples and now - self._heard_at > MAX_SILENCE:
-                raise DeviceError(self.source.name, f"no sample for {MAX_SILENCE:g} s")
+                raise DeviceError(self.source.name, f"no sample for {MAX_SILENCE:g} s ({self.source.silence})")
         except DeviceError as error:
             self.close()
             self.problem, self._retry_at = str(error), now + PAUSE

@@ -29,6 +29,7 @@ class SampledSource:
         self.lost = 0
         self.loss = ""
         self.temperature: float | None = None
+        self.silence = "its supply may have broken down"
         self._why_lost = ""  # of samples that are not counted yet
         self._clock = clock
         self._sample_clock = SampleClock(rate)

@@ -16,13 +16,17 @@ class SerialSource(SampledSource):
         self._port = port
         self._packets = packets
         self._damaged = 0  # packets, as last seen
+        self.silence = "not one byte"
 
     def close(self) -> None:
         """Close the port; never raises."""
         self._port.close()
 
     def _measure(self, now: float) -> list[Measurement]:
-        packets = self._packets.feed(self._port.read())
+        data = self._port.read()
+        packets = self._packets.feed(data)
+        if data:
+            self.silence = "not one byte" if packets else "bytes, but no whole packet: is serial.baud the sensor's?"
         if self._packets.damaged > self._damaged:
             self._damaged = self._packets.damaged
             self._why_lost = "damaged packets"

@@ -15,6 +15,7 @@ class ImuSource(Protocol):
 
     name: the device and its address, for messages. rate: samples a second, as set up. lost: samples known to be lost
     since the device was opened; loss: why the last of them were. temperature: degrees Celsius; None if not reported.
+    silence: what may be the reason while no samples come.
     """
 
     name: str
@@ -22,6 +23,7 @@ class ImuSource(Protocol):
     lost: int
     loss: str
     temperature: float | None
+    silence: str
 
     def read(self) -> list[ImuSample]:
         """Return every sample since the last call, the oldest first, without waiting for one. Raises DeviceError."""
