@@ -1,4 +1,4 @@
-"""imu: `sensor_msgs/Imu` from an IMU driver in, the trunk's pitch and roll out, one for each sample.
+"""imu: samples of an IMU in, from a driver's topic or a device, the trunk's pitch and roll out, one for each sample.
 
 While samples are missing, impossible, frozen, not yet settled or from two publishers, it publishes nothing: the tilt
 grows old, the compensator withdraws, and `can_bridge` latches the fault. The reason is logged once, and stays on
@@ -24,6 +24,7 @@ from exo_gravity.nodes.conversions import to_nanoseconds
 from exo_gravity.nodes.declare import declare
 from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics
 from exo_gravity.nodes.hot_path import HotPath
+from exo_gravity.nodes.imu_device import ImuDevice
 from exo_gravity.nodes.run import run
 from exo_gravity.nodes.sole_publisher import DISTRUST, SolePublisher
 
@@ -54,7 +55,8 @@ class ImuNode(Node):
         self._diagnostics = Diagnostics(self)
         self._pitch_yaw = self.create_publisher(Vector3Stamped, PITCH_YAW, DEPTH)
         self._data = self.create_publisher(Imu, DATA, DEPTH)
-        self._samples = HotPath(
+        self._device = None if values["source"] == "topic" else ImuDevice(self, values, self._topic, self._on_imu)
+        self._samples = self._device or HotPath(
             self, Imu, self._topic, self._on_imu, QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         )
         self.create_timer(WATCH_PERIOD, self._report)
@@ -118,7 +120,11 @@ class ImuNode(Node):
             "last refusal": self._last_refusal,
             "gyroscope bias (rad/s)": self._estimator.gyroscope_bias.round(4).tolist(),
         }
-        if not self._received:
+        if self._device:
+            values |= self._device.values
+        if self._device and self._device.problem:
+            self._diagnostics.report(ERROR, self._device.problem, values)
+        elif not self._received:
             self._diagnostics.report(WARN, f"waiting for {self._topic}", values)
         elif age > self._timeout:
             self._diagnostics.report(ERROR, f"no samples on {self._topic}", values)

@@ -1,15 +1,19 @@
 """An IMU on a serial port that the node reads itself, over real DDS in this process."""
 
+import math
 import threading
 import time
 
 import pytest
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import Vector3Stamped
 from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import Imu
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.nodes.conversions import to_nanoseconds
+from exo_gravity.nodes.imu import ImuNode
 from exo_gravity.nodes.imu_device import ImuDevice
 from exo_gravity.nodes.run import keep_to_this_machine
 
@@ -118,3 +122,66 @@ def test_a_parameter_that_does_not_suit_the_device_is_an_error_at_the_start(rig)
     rig.values["source"], rig.values["serial.baud"] = "witmotion", 9600
     with pytest.raises(ParameterError, match=r"serial\.baud = 9600"):
         rig.start()
+
+
+class NodeRig:
+    """The node `imu` in this process, which reads a BNO085 itself, and a listener."""
+
+    def __init__(self, port):
+        self.sensor = FakeSerialSensor(port)
+        arguments = ("source:=bno085", f"serial.port:={port}", "rotation_trunk_from_imu:=[0.0, 0.0, 0.0, 1.0]")
+        rclpy.init(args=["--ros-args", *(part for argument in arguments for part in ("-p", argument))])
+        self.node, self.listener = ImuNode(), rclpy.create_node("imu_listener")
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+        self.executor.add_node(self.listener)
+        self.tilts, self.status = [], DiagnosticStatus()
+        self.listener.create_subscription(Vector3Stamped, "/imu/pitch_yaw", self.tilts.append, 50)
+        self.listener.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
+        self.counter = 0
+
+    def _on_diagnostics(self, message):
+        (self.status,) = message.status
+
+    def send(self):
+        """Send a level sensor's packet with noise, as every real one has."""
+        self.counter += 1
+        self.sensor.send(rvc_packet(self.counter, (0, 20, 0), (0, 342, 940 + self.counter % 3)))
+
+    def wait_until(self, condition, action=lambda: None):
+        end, due = time.monotonic() + 20.0, time.monotonic()
+        while not condition():
+            assert time.monotonic() < end, self.status
+            if time.monotonic() >= due:
+                due += 0.01
+                action()
+            self.executor.spin_once(timeout_sec=0.002)
+
+    def close(self):
+        self.node.close()
+        self.executor.shutdown()
+        self.node.destroy_node()
+        self.listener.destroy_node()
+        rclpy.try_shutdown()
+        self.sensor.unplug()
+
+
+@pytest.fixture
+def node_rig(tmp_path):
+    """The node `imu` with a BNO085."""
+    rig = NodeRig(tmp_path / "imu")
+    yield rig
+    rig.close()
+
+
+def test_the_node_publishes_the_tilt_of_a_sensor_that_it_reads_itself_and_reports_its_absence(node_rig):
+    node_rig.wait_until(lambda: node_rig.tilts, node_rig.send)
+    tilt = node_rig.tilts[-1].vector
+    assert (tilt.x, tilt.y) == pytest.approx((math.radians(20), 0.0), abs=1e-3)
+    node_rig.wait_until(lambda: node_rig.status.message == "publishing", node_rig.send)
+    node_rig.sensor.unplug()
+    node_rig.wait_until(lambda: f"BNO085 on {node_rig.sensor.port}: cannot be" in node_rig.status.message)
+    assert node_rig.status.level == DiagnosticStatus.ERROR
+    node_rig.sensor.plug()
+    node_rig.wait_until(lambda: node_rig.status.message == "publishing", node_rig.send)
+    assert {pair.key: pair.value for pair in node_rig.status.values}["opened"] == "2"
