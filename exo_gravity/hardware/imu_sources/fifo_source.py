@@ -18,6 +18,7 @@ from exo_gravity.hardware.imu_sources.source import Clock
 
 TEMPERATURE_PERIOD = 1.0  # s
 RADIANS_PER_DEGREE = math.pi / 180.0
+THREE_NUMBERS = {order: struct.Struct(f"{order}3h") for order in "<>"}
 
 Wait = Callable[[float], Any]  # s, e.g. time.sleep
 
@@ -96,7 +97,7 @@ class FifoSource(SampledSource):
 
 def axes(data: bytes, scale: float, order: str = ">") -> Axes:
     """Return three 16-bit numbers times `scale`; order: '>' for high byte first, '<' for low byte first."""
-    x, y, z = struct.unpack(f"{order}3h", data)
+    x, y, z = THREE_NUMBERS[order].unpack(data)
     return x * scale, y * scale, z * scale
 
 

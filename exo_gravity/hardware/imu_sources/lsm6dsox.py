@@ -36,7 +36,7 @@ ACCELEROMETER_RESPONSE, GYROSCOPE_RESPONSE = (50.0, 1700.0), (150.0, 700.0)  # m
 
 
 class Lsm6dsox(FifoSource):
-    """An LSM6DSOX or LSM6DSO. Its filters follow its rate: half of it, and about a third, without further registers."""
+    """An LSM6DSOX or LSM6DSO. Its low-pass filters follow its rate without further registers."""
 
     IDENTITY = WHO_AM_I
     KNOWN: ClassVar = {0x6C: "LSM6DSOX"}
