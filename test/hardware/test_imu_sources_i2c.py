@@ -7,6 +7,7 @@ import pytest
 
 from exo_gravity.core.errors import DeviceError
 from exo_gravity.hardware.imu_sources import open_source
+from exo_gravity.hardware.imu_sources.i2c import open_bus
 
 from ..support.fake_imu.bus import FakeBus, FakeTime
 from ..support.fake_imu.chip import G, Motion
@@ -167,6 +168,11 @@ def test_another_chip_is_refused_by_its_who_am_i(chip, register):
 
 def test_the_name_tells_the_chip_its_address_and_its_bus():
     assert Rig("mpu9250").open().name == "MPU-9250 at 0x68 on /dev/i2c-1"
+
+
+def test_a_missing_bus_is_named():
+    with pytest.raises(DeviceError, match=r"^/dev/i2c-251: cannot be opened: No such file or directory$"):
+        open_bus(251)
 
 
 def test_the_address_can_be_set(chip):

@@ -41,6 +41,8 @@ def open_source(
     ParameterError if a parameter does not suit the device or a library is missing.
     """
     kind = values["source"]
+    if kind == "topic":
+        raise ParameterError("source", kind, "a device")
     if kind in CHIPS:
         chip, usual_address = CHIPS[kind]
         number = values["i2c.bus"]
