@@ -21,17 +21,14 @@ from exo_gravity.core.felt_motion import FeltMotion
 from exo_gravity.core.gravity import LAWS, Law, Torque
 from exo_gravity.core.limits import MAX_COMMAND
 from exo_gravity.core.param_table import check_owned, owned
-from exo_gravity.core.tilt import SIDES, Tilt, angle_between
+from exo_gravity.core.tilt import SIDES, Tilt
+from exo_gravity.core.tilt_input import STILL, TiltInput
 from exo_gravity.core.turning import turning_torque
 
 MODES = ("one_g", "zero_g")
 LAW_NAMES = (*LAWS, "anfis")
 # Gain times gravity, m/s^2: twice the Earth's, rounded up. Calibrated gains are 0.8 to 1.3.
 MAX_SCALE = 20.0
-TILT_SPEED = 5.0  # rad/s, faster than a trunk can tilt
-TILT_JUMP = 0.1  # rad, by which two tilts may differ however close in time
-MAX_LEAD = 0.05  # s that the stamp of a tilt may be ahead of our clock: /clock comes in steps, hosts differ by ms
-MAX_LAG = 1.0  # s that it may be behind; beyond, the stamp comes from another clock
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
 RAMP_TIME = 1.0  # s from zero to full torque, at the start and after a break
 # s without an answer, after which the torque ramps in from zero. This is longer than any command_timeout: the arm is
@@ -113,10 +110,7 @@ class Compensator:
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        self._tilt = Tilt.of(settings.side)
-        self._tilt_time = -math.inf  # when it was measured
-        self._tilt_arrival = -math.inf
-        self._tilt_refusal = ""  # why the newest tilt was refused; contains no measured value
+        self._tilt = TiltInput(settings.side, settings.tilt_timeout)
         self._motion = FeltMotion()
         self._ramp_start = -math.inf
         self._last_answer = -math.inf
@@ -135,32 +129,14 @@ class Compensator:
         self._pending = settings
 
     def set_tilt(self, now: float, pitch: float, roll: float, age: float = 0.0) -> None:
-        """Set the trunk's pitch and roll in rad, which arrived at `now` (s) and were measured `age` s earlier.
+        """Set the trunk's pitch and roll; see `TiltInput.set_tilt`."""
+        self._tilt.set_tilt(now, pitch, roll, age)
 
-        Raises ParameterError if a trunk cannot have moved that far since the last measurement, and if `age` is
-        impossible because the clock that stamped the tilt differs from ours.
-        """
-        try:
-            self._set_tilt(now, pitch, roll, age)
-        except ParameterError as error:
-            self._tilt_refusal = f"{error.name} must be {error.expected}"
-            raise
-        self._tilt_refusal = ""
-
-    def _set_tilt(self, now: float, pitch: float, roll: float, age: float) -> None:
-        tilt = Tilt.of(self.settings.side, pitch, roll)
-        if not -MAX_LEAD <= age <= MAX_LAG:
-            expected = (
-                f"from {-MAX_LEAD:g} to {MAX_LAG:g} s: synchronise the clocks of the IMU driver and this computer"
-            )
-            raise ParameterError("age of the trunk tilt by its stamp", round(age, 3), expected)
-        measured = now - max(0.0, age)
-        # The direction is continuous where pitch and roll flip, in a bow through 90 degrees.
-        reach = TILT_JUMP + TILT_SPEED * max(0.0, measured - self._tilt_time)
-        if angle_between(tilt.direction, self._tilt.direction) > reach:
-            expected = f"within {TILT_JUMP:g} rad plus {TILT_SPEED:g} rad/s of the last tilt"
-            raise ParameterError("trunk tilt", [pitch, roll], expected)
-        self._tilt, self._tilt_time, self._tilt_arrival = tilt, measured, now
+    def set_gravity(
+        self, now: float, gravity: Sequence[float], angular_velocity: Sequence[float] = STILL, age: float = 0.0
+    ) -> None:
+        """Set gravity's direction in the trunk's axes; see `TiltInput.set_gravity`."""
+        self._tilt.set_gravity(now, gravity, angular_velocity, age)
 
     def set_motion(
         self, now: float, specific_force: Sequence[float], angular_velocity: Sequence[float], age: float = 0.0
@@ -175,25 +151,16 @@ class Compensator:
         """Return the torque for joint angles `theta` (4,) rad at `now` s on a monotonic clock."""
         if len(theta) != JOINT_COUNT or not all(-MAX_ANGLE <= angle <= MAX_ANGLE for angle in theta):
             return Answer(None, f"joint angles {list(theta)} are not 4 numbers within {MAX_ANGLE:g} rad")
-        if self.settings.use_imu and not now - self._tilt_time <= self.settings.tilt_timeout:
-            return Answer(None, self._why_no_tilt(now))
+        if self.settings.use_imu and (problem := self._tilt.problem(now)):
+            return Answer(None, problem)
         torque = self._transition(now, theta)
         if not all(map(math.isfinite, torque)):
             return Answer(None, f"torque {list(torque)} Nm from the law is not finite")
         return self._limited(now, torque)
 
-    def _why_no_tilt(self, now: float) -> str:
-        timeout = self.settings.tilt_timeout
-        text = f"trunk tilt older than {timeout * 1000:.0f} ms"
-        if self._tilt_time == -math.inf:
-            text = "no trunk tilt yet"
-        elif now - self._tilt_arrival <= timeout:
-            text += " by its stamp: the IMU driver lags, or its clock differs"
-        return f"{text} (the newest was refused: {self._tilt_refusal})" if self._tilt_refusal else text
-
     def _law(self, now: float, theta: Sequence[float]) -> Torque:
         """Return the torque of the chosen law, or of the exact law while the chosen one does not apply."""
-        settings, tilt = self.settings, self._tilt
+        settings, tilt = self.settings, self._tilt.at(now)
         felt = self._motion.at(now) if settings.inertial and settings.use_imu else None
         if felt:
             magnitude = math.hypot(*felt.gravity) / STANDARD_GRAVITY
@@ -219,6 +186,7 @@ class Compensator:
             if self._pending.law != self.settings.law:
                 self._fallback, self._fallback_until = "", -math.inf
             self.settings, self._pending = self._pending, None
+            self._tilt.timeout = self.settings.tilt_timeout
             torque = self._bridged(now, torque, self._law(now, theta))
         self._torque = torque
         return torque

@@ -1,9 +1,9 @@
 """The mean acceleration in the world must be gravity, because a person's velocity is bounded.
 
-Over a time T a change of velocity by v shifts the mean by v / T. For a person who starts to walk v is known; for another
-movement it is the deviation of the acceleration from its mean times the time for which it keeps its direction. A larger
-shift means that the estimate turns the wrong way (a wrong axis, sign or scale of the gyroscope, a slow clock), or that
-the accelerometer is wrong (its unit, a dead axis).
+Over a time T a change of velocity by v shifts the mean by v / T. For a person who starts to walk v is known; for any
+other movement it is the deviation of the acceleration from its mean times the time for which it keeps its direction. A
+larger shift means that the estimate turns the wrong way (a wrong axis, sign or scale of the gyroscope, a slow clock), or
+that the accelerometer is wrong (its unit, a dead axis).
 """
 
 from __future__ import annotations

@@ -11,7 +11,6 @@ withdraws, so that the bridge lets the arm down. It prints one line of JSON for 
 from __future__ import annotations
 
 import json
-import math
 import sys
 import threading
 import time
@@ -19,7 +18,6 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import Vector3Stamped
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
@@ -28,14 +26,14 @@ from exo_gravity.core.calibration.tour import Measured
 from exo_gravity.core.drive import State
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.gravity import Torque
-from exo_gravity.core.tilt import Tilt
-from exo_gravity.nodes.compensator import NEWEST
+from exo_gravity.core.tilt_input import TiltInput
 from exo_gravity.nodes.conversions import by_name
 from exo_gravity.nodes.declare import declare
 from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics
 from exo_gravity.nodes.hot_path import HotPath
 from exo_gravity.nodes.run import run
 from exo_gravity.nodes.sole_publisher import SolePublisher
+from exo_gravity.nodes.tilt_subscription import NEWEST, TiltSubscription
 
 REPORT_PERIOD = 0.1  # s
 PLAN_PERIOD = 0.05  # s
@@ -48,11 +46,9 @@ class CalibratorNode(Node):
         super().__init__("calibrator", automatically_declare_parameters_from_overrides=True)
         values = declare(self, CALIBRATOR)
         self._names = values["joint_names"]
-        self._side = values["side"]
         self._tour = tour_of(values)
-        self._tilt_timeout = values["tilt_timeout"] if values["use_imu"] else math.inf
-        self._tilt = Tilt.of(self._side)
-        self._tilt_time = -math.inf if values["use_imu"] else math.inf  # monotonic s
+        self._uses_imu = values["use_imu"]
+        self._tilt = TiltInput(values["side"], values["tilt_timeout"])
         self._bridge = f"{self.get_namespace().strip('/')}/can_bridge".lstrip("/")
         self._bridge_state, self._bridge_message = "", ""
         self._began = False
@@ -66,7 +62,7 @@ class CalibratorNode(Node):
         self._lock = threading.Lock()  # guards tilt and state: joint states arrive on another thread
         self._joint_states = HotPath(self, JointState, "joint_states", self._on_joint_states, NEWEST)
         if values["use_imu"]:
-            self.create_subscription(Vector3Stamped, "/imu/pitch_yaw", self._on_pitch_yaw, NEWEST)
+            TiltSubscription(self, self._tilt, self._lock, self._on_refused_tilt, self._on_intruder)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self.create_timer(REPORT_PERIOD, self._report)
         self._joint_states.start()
@@ -93,7 +89,7 @@ class CalibratorNode(Node):
         self._command.header.stamp = message.header.stamp
         try:
             if self._source.is_another(info):
-                self._trouble = "more than one publisher of joint_states"
+                self._on_intruder("joint_states")
             effort = self._effort(by_name(message, "position", self._names), by_name(message, "velocity", self._names))
         except ParameterError as error:
             self._trouble, effort = f"joint_states: {error}", None
@@ -104,26 +100,24 @@ class CalibratorNode(Node):
         """Return the effort (4,) in Nm, None to withdraw."""
         now = time.monotonic()
         with self._lock:
-            tilt, age, state = self._tilt, now - self._tilt_time, self._bridge_state
+            tilt, state = self._tilt.at(now), self._bridge_state
+            problem = self._tilt.problem(now) if self._uses_imu else ""
         if self._trouble:
             return None
-        if age > self._tilt_timeout:
+        if problem:
             if self._began:
-                self._trouble = f"trunk tilt older than {self._tilt_timeout * 1000:.0f} ms"
+                self._trouble = problem
             return None
         if not self._began and state != State.ACTIVE.value:
             return self._tour.wait(position, tilt)
         self._began = True
         return self._tour.step(now, position, velocity, tilt)
 
-    def _on_pitch_yaw(self, message: Vector3Stamped) -> None:
-        try:
-            tilt = Tilt.of(self._side, message.vector.y, message.vector.x)
-        except ParameterError as error:
-            self.get_logger().error(f"/imu/pitch_yaw: {error}")
-            return
-        with self._lock:
-            self._tilt, self._tilt_time = tilt, time.monotonic()
+    def _on_refused_tilt(self, topic: str, error: ParameterError) -> None:
+        self.get_logger().error(f"{topic}: {error}", throttle_duration_sec=1.0)
+
+    def _on_intruder(self, topic: str) -> None:
+        self._trouble = f"more than one publisher of {topic}"
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:

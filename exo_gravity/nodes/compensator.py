@@ -15,11 +15,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from geometry_msgs.msg import Vector3Stamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core.anfis_law import AnfisLaw
@@ -30,14 +28,14 @@ from exo_gravity.core.control_params import COMPENSATOR, settings_of
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.hardware.scheduling import request_real_time
 from exo_gravity.nodes.budget_watch import BudgetWatch
-from exo_gravity.nodes.conversions import by_name, to_nanoseconds
+from exo_gravity.nodes.conversions import by_name
 from exo_gravity.nodes.declare import declare, values_after, with_floats
 from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics
 from exo_gravity.nodes.hot_path import HotPath
 from exo_gravity.nodes.run import run
 from exo_gravity.nodes.sole_publisher import DISTRUST, SolePublisher
+from exo_gravity.nodes.tilt_subscription import NEWEST, TiltSubscription
 
-NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 SILENCE = 0.5  # s without joint states until diagnostics report it
 REPORT_PERIOD = 0.5  # s
 MAX_CHANGES = 16  # answers whose reason is new, waiting for the report
@@ -68,7 +66,7 @@ class CompensatorNode(Node):
         self._last_answer = -math.inf
         self._answers = 0
         self._refusal = "none"
-        self._sources = {topic: SolePublisher(self, topic) for topic in ("joint_states", "/imu/pitch_yaw")}
+        self._source = SolePublisher(self, "joint_states")
         # Which input had a second publisher, as a sentence, and when (monotonic s).
         self._intruder, self._intruded = "", -math.inf
         self._publisher = self.create_publisher(JointState, "effort_commands", 1)
@@ -76,7 +74,7 @@ class CompensatorNode(Node):
         self._lock = threading.Lock()  # guards the compensator: joint states arrive on another thread
         self._joint_states = HotPath(self, JointState, "joint_states", self._on_joint_states, NEWEST)
         if values["use_imu"]:
-            self.create_subscription(Vector3Stamped, "/imu/pitch_yaw", self._on_pitch_yaw, NEWEST)
+            TiltSubscription(self, self._compensator, self._lock, self._refused, self._withdraw, self._on_motion)
         self.add_pre_set_parameters_callback(lambda changes: with_floats(self, COMPENSATOR, changes))
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
@@ -102,7 +100,8 @@ class CompensatorNode(Node):
         command.header.stamp = message.header.stamp
         now = time.monotonic()
         try:
-            self._check_publisher("joint_states", info, now)
+            if self._source.is_another(info):
+                self._withdraw("joint_states")
             theta = by_name(message, "position", self._names)
             with self._lock:
                 answer = self._compensator.step(now, theta)
@@ -119,23 +118,13 @@ class CompensatorNode(Node):
             self._changes.append(answer)
             self._changed.trigger()
 
-    def _on_pitch_yaw(self, message: Vector3Stamped, info: dict[str, Any]) -> None:
-        now = time.monotonic()
-        try:
-            self._check_publisher("/imu/pitch_yaw", info, now)
-            with self._lock:
-                self._compensator.set_tilt(now, message.vector.y, message.vector.x, self._age(message))
-        except ParameterError as error:  # the last tilt then grows old, and the efforts are withdrawn
-            self._refused("/imu/pitch_yaw", error)
+    def _on_motion(self, *sample: Any) -> None:
+        if self._compensator.settings.inertial:
+            self._compensator.set_motion(*sample)
 
-    def _age(self, message: Vector3Stamped) -> float:
-        """Return the age of a message in s by its stamp and the node's clock."""
-        return (self.get_clock().now().nanoseconds - to_nanoseconds(message.header.stamp)) * 1e-9
-
-    def _check_publisher(self, topic: str, info: dict, now: float) -> None:
-        """Withdraw for a while if a second publisher sends on `topic`."""
-        if self._sources[topic].is_another(info):
-            self._intruder, self._intruded = f"more than one publisher of {topic}", now
+    def _withdraw(self, topic: str) -> None:
+        """Withdraw for a while: a second publisher sends on `topic`."""
+        self._intruder, self._intruded = f"more than one publisher of {topic}", time.monotonic()
 
     def _refused(self, topic: str, error: ParameterError) -> str:
         """Note an impossible message. Its value goes to /diagnostics only: a hostile sender could fill the log."""
