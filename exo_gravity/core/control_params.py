@@ -16,6 +16,8 @@ from exo_gravity.core.param_table import Param, param_of, params_of
 from exo_gravity.core.tilt import SIDES
 from exo_gravity.core.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
 
+GYROSCOPE_RANGE, GYROSCOPE_RANGES = 34.9, (1.0, 200.0)  # rad/s; 2000 deg/s
+ACCELEROMETER_RANGE, ACCELEROMETER_RANGES = 156.9, (15.0, 4000.0)  # m/s^2; 16 g
 OPTIONS = "can.options"  # parameters below this prefix go to python-can unchanged
 
 JOINT_NAMES = Param(
@@ -96,7 +98,11 @@ IMU = (
     # No rotation would be a safe default. Four zeros are not a rotation, so the node rejects them.
     Param("rotation_trunk_from_imu", [0.0] * 4, "mounting of the IMU, unit quaternion x, y, z, w; required",
           (-1.0, 1.0), fixed=True),
-    Param("rate", 100.0, "approximate sample rate of the IMU", (20.0, 2000.0), "Hz", fixed=True),
+    Param("rate", 100.0, "sample rate of the IMU, within 15 %", (20.0, 2000.0), "Hz", fixed=True),
+    Param("gyroscope_range", GYROSCOPE_RANGE, "rate at which the gyroscope saturates", GYROSCOPE_RANGES, "rad/s",
+          fixed=True),
+    Param("accelerometer_range", ACCELEROMETER_RANGE, "acceleration at which the accelerometer saturates",
+          ACCELEROMETER_RANGES, "m/s^2", fixed=True),
     Param("timeout", 0.1, "time without IMU data that counts as an error", (0.02, 1.0), "s", fixed=True),
 )
 RECORDER = (

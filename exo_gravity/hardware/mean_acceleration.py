@@ -2,7 +2,7 @@
 
 Over a time T a change of velocity by v shifts the mean by v / T. For a person who starts to walk v is known; for any
 other movement it is the deviation of the acceleration from its mean times the time for which it keeps its direction. A
-larger shift means that the estimate turns the wrong way (a wrong axis, sign or scale of the gyroscope, a slow clock), or
+larger shift means that the estimate turns the wrong way (a wrong axis, sign or scale of the gyroscope; a slow clock) or
 that the accelerometer is wrong (its unit, a dead axis).
 """
 

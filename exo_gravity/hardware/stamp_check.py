@@ -35,6 +35,7 @@ class StampCheck:
         self._age, self._periods = 0.0, 0  # since the start
         self._usual = self._shortest = math.inf  # s from stamp to arrival
         self._window_end = -math.inf
+        self._growth = 0.0  # s by which the shortest delay exceeds the usual one
 
     def check(self, time: float, dt: float, arrival: float | None) -> None:
         """Check the stamp `time` (s), `dt` s after the last one. Raises ParameterError."""
@@ -63,11 +64,13 @@ class StampCheck:
         self._period, self._share, self._is_learning = 1.0 / rate, 1.0, False
 
     def _check_delay(self, time: float, arrival: float) -> None:
-        delay = arrival - time
+        """Raise ParameterError while the shortest delay of the last whole window has grown too much."""
         if arrival >= self._window_end:
-            self._usual = min(self._usual + DRIFT * WINDOW, self._shortest)
+            if self._shortest < math.inf:
+                self._usual = min(self._usual + DRIFT * WINDOW, self._shortest)
+                self._growth = self._shortest - self._usual
             self._shortest, self._window_end = math.inf, arrival + WINDOW
-        self._shortest = min(self._shortest, delay)
-        if self._shortest - self._usual > MAX_DELAY:
+        self._shortest = min(self._shortest, arrival - time)
+        if self._growth > MAX_DELAY:
             expected = f"within {MAX_DELAY:g} s of the arrival, as before: the IMU's clock is slow, or its driver lags"
             raise ParameterError("stamp", round(time, 4), expected)

@@ -11,6 +11,7 @@ import math
 import time
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import Vector3, Vector3Stamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -32,6 +33,7 @@ PITCH_YAW, DATA = "/imu/pitch_yaw", "/imu/data"
 # The fusion integrates every sample. A queue of depth 1 would lose samples whenever the node is delayed.
 DEPTH = 50
 WATCH_PERIOD = 0.1  # s
+UNKNOWN_HEADING = math.pi**2  # rad^2, its variance
 
 
 class ImuNode(Node):
@@ -43,7 +45,12 @@ class ImuNode(Node):
         self._topic = self.resolve_topic_name(values["input_topic"])
         if self._topic in (PITCH_YAW, DATA):
             raise ParameterError("input_topic", values["input_topic"], "a topic that this node does not publish")
-        self._estimator = TrunkEstimator(values["rotation_trunk_from_imu"], values["rate"])
+        self._estimator = TrunkEstimator(
+            values["rotation_trunk_from_imu"],
+            values["rate"],
+            values["gyroscope_range"],
+            values["accelerometer_range"],
+        )
         self._timeout = values["timeout"]
         self._arrived = time.monotonic()
         self._driver = SolePublisher(self, self._topic)
@@ -80,7 +87,7 @@ class ImuNode(Node):
             self._refused += 1
             return
         try:
-            orientation = self._estimator.update(sample_of(message))
+            orientation = self._estimator.update(sample_of(message)._replace(arrival=self._arrived))
         except ParameterError as error:
             self._refused += 1
             self._refusal, self._last_refusal = error, str(error)
@@ -100,6 +107,8 @@ class ImuNode(Node):
         data = Imu(header=tilt.header)
         q, rate, acceleration = data.orientation, data.angular_velocity, data.linear_acceleration
         q.x, q.y, q.z, q.w = orientation.orientation.tolist()
+        variance = orientation.uncertainty**2
+        data.orientation_covariance = np.diag((variance, variance, UNKNOWN_HEADING)).ravel()
         # In the trunk's axes. A covariance of zeros means unknown, one of -1 means not reported (REP-145).
         rotation = self._estimator.rotation
         rate.x, rate.y, rate.z = (rotation @ _vector(message.angular_velocity)).tolist()
