@@ -25,6 +25,7 @@ BASE = math.radians(0.6)
 BIAS_TIME = 2.0  # s
 CORRELATION_TIME = 0.25  # s, a quarter of a stride
 SETTLE_TIME = 1.0  # s, the shortest time from a start to the first tilt
+START_TIME = 10.0  # s, after which the error of the start has gone
 DECAY_TIME = 3.0  # s, VQF's tauAcc
 LEAST_ACCELERATION = 20.0  # rad/s^2, assumed in a gap even after rest
 ACCELERATION_TIME = 0.3  # s
@@ -47,6 +48,7 @@ class TiltUncertainty:
         self._lost = 0.0  # rad^2, of gaps and saturation
         self._run = 0.0  # rad lost in the present run of samples that do not tell the rotation
         self._is_losing = False  # whether the run goes on
+        self._start = math.pi  # rad, error of the start
         self._age = 0.0  # s since the start
         self._count = 0
         self._sum, self._squares = [0.0, 0.0, 0.0], 0.0  # of the acceleration in the world since the start
@@ -94,20 +96,21 @@ class TiltUncertainty:
 
     def combine(self, bias_sigma: float, acceleration_in_world: Floats3 | None) -> None:
         """Add up the terms. acceleration_in_world: by the present estimate; None if it is not known."""
-        start = self._start_error(acceleration_in_world)
+        if self._age >= START_TIME:
+            self._start = 0.0
+        elif acceleration_in_world is not None:
+            self._narrow(acceleration_in_world)
         bias = BIAS_TIME * bias_sigma
-        self.sigma = math.sqrt(BASE * BASE + bias * bias + start * start + self._lost)
+        self.sigma = math.sqrt(BASE * BASE + bias * bias + self._start * self._start + self._lost)
 
-    def _start_error(self, acceleration: Floats3 | None) -> float:
-        if self._age > 3.0 * DECAY_TIME:
-            return 0.0
-        if acceleration is not None:
-            self._count += 1
-            for axis, value in enumerate(acceleration):
-                self._sum[axis] += value
-                self._squares += value * value
-        if not self._count or not self._age:
-            return math.pi
+    def _narrow(self, acceleration: Floats3) -> None:
+        """Let the error of the start shrink; a movement after a still start does not make it larger again."""
+        self._count += 1
+        for axis, value in enumerate(acceleration):
+            self._sum[axis] += value
+            self._squares += value * value
+        if self._age < SETTLE_TIME:
+            return
         mean_square = sum(value * value for value in self._sum) / self._count**2
         deviation = math.sqrt(max(0.0, self._squares / self._count - mean_square))
-        return deviation * CORRELATION_TIME / (STANDARD_GRAVITY * self._age)
+        self._start = min(self._start, deviation * CORRELATION_TIME / (STANDARD_GRAVITY * self._age))

@@ -1,0 +1,51 @@
+"""The estimator on real motion with an optical reference: excerpts of BROAD, see test/data/broad/README.md."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bench.imu_report import report
+from bench.imu_trials import by_estimator, by_vqf, lost_samples, read_trials, score
+
+TRIALS = list(read_trials())
+each_trial = pytest.mark.parametrize("trial", TRIALS, ids=[trial.name for trial in TRIALS])
+
+
+@each_trial
+def test_on_real_motion_the_tilt_is_as_good_as_vqfs_and_never_off_by_5_degrees(trial):
+    here, vqf = score(trial, "here"), score(trial, "VQF, its defaults")
+    assert here.rms <= max(1.1 * vqf.rms, vqf.rms + 0.1)
+    assert here.largest < 5.0
+    assert here.published >= 0.99
+
+
+@each_trial
+def test_with_3_percent_of_the_samples_lost_too(trial):
+    lossy, vqf = score(trial.without(lost_samples(len(trial.times), 0.03)), "here"), score(trial, "VQF, its defaults")
+    assert lossy.rms <= max(1.1 * vqf.rms, vqf.rms + 0.1)
+    assert lossy.largest < 5.0
+    assert lossy.published >= 0.99
+
+
+def test_evenly_spaced_samples_give_vqf_alone():
+    trial = TRIALS[0]
+    here, alone = by_estimator(trial), by_vqf(trial)
+    published = np.isfinite(here[:, 0])
+    assert published.mean() > 0.9
+    # The bias is read every tenth sample, and matters only to rounding.
+    np.testing.assert_allclose(here[published], alone[published], atol=1e-5)
+
+
+def test_jitter_of_the_stamps_costs_little():
+    trial = TRIALS[2]
+    jitter = np.random.default_rng(1).uniform(-0.3, 0.3, len(trial.times)) / trial.rate
+    jittered = type(trial)(**{**vars(trial), "times": trial.times + jitter})
+    assert score(jittered, "here").rms < score(trial, "here").rms + 0.1
+    assert score(jittered, "here").published >= 0.99
+
+
+def test_the_report_has_a_row_for_each_trial_and_a_column_for_each_method():
+    lines = report(TRIALS[:1]).splitlines()
+    assert len(lines) == 4 and lines[0].startswith("| trial | here | published |")
+    assert lines[2].startswith("| 03 undisturbed slow rotation C | 0.")
