@@ -30,6 +30,7 @@ from exo_gravity.nodes.run import run
 from exo_gravity.sim import SimulatedImu, VirtualWearer
 from exo_gravity.sim.device import MAX_CATCH_UP
 from exo_gravity.sim.device_params import SIMULATOR, device_of, imu_of, set_faults
+from exo_gravity.sim.trunk_motion import TrunkState
 
 TRUNK_SPEED = 0.5  # rad/s at which the trunk moves to a new tilt
 
@@ -105,18 +106,23 @@ class Simulator(Node):
 
     def _move_trunk(self) -> None:
         device, largest = self._device, TRUNK_SPEED * self._trunk_period
-        pitch_step, roll_step = (
-            max(-largest, min(largest, target - present))
-            for target, present in zip(self._trunk_target, (device.pitch, device.roll), strict=True)
-        )
-        device.pitch += pitch_step
-        device.roll += roll_step
+        state = device.trunk
+        if device.trunk_moves:  # by the script: the trunk stays where that leaves it
+            self._trunk_target = state.pitch, state.roll
+        else:
+            pitch_step, roll_step = (
+                max(-largest, min(largest, target - present))
+                for target, present in zip(self._trunk_target, (device.pitch, device.roll), strict=True)
+            )
+            device.pitch += pitch_step
+            device.roll += roll_step
+            rates = pitch_step / self._trunk_period, roll_step / self._trunk_period
+            state = TrunkState(device.pitch, device.roll, *rates)
         if self._imu_publisher:
-            self._imu_publisher.publish(self._imu_message(pitch_step, roll_step))
+            self._imu_publisher.publish(self._imu_message(state))
 
-    def _imu_message(self, pitch_step: float, roll_step: float) -> Imu:
-        device, rate = self._device, self._imu.config.rate
-        sample = self._imu.sample(device.pitch, device.roll, pitch_step * rate, roll_step * rate)
+    def _imu_message(self, state: TrunkState) -> Imu:
+        sample = self._imu.sample_of(state)
         message = Imu()
         message.header.stamp = self.get_clock().now().to_msg()
         message.header.frame_id = "imu"

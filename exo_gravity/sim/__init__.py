@@ -14,7 +14,8 @@ or without a bus, as fast as possible:
 
 Faults and tilt may be set from any thread: `device.pitch`, `device.roll`, `device.bus_silent`,
 `device.motors[n].unplugged`, `.temperature`, `.error`. The true state: `device.time`, `device.arm.positions`,
-`.velocities`. The trunk's IMU: `SimulatedImu(ImuConfig(...)).sample(pitch, roll, pitch_rate, roll_rate)`.
+`.velocities`. A script moves the trunk, too: `device.trunk` is its motion, and `SimulatedImu(ImuConfig(...)).sample_of`
+what its IMU measures.
 """
 
 from exo_gravity.sim.arm import STEP, ArmConfig, SimulatedArm

@@ -52,6 +52,7 @@ SIMULATOR = (
     Param("imu.topic", "", "topic of the trunk's IMU; empty: this simulator has no IMU", fixed=True),
     _param("imu.rate", ImuConfig, "rate"),
     _param("imu.rotation_trunk_from_imu", ImuConfig, "rotation_trunk_from_imu"),
+    _param("imu.delay", ImuConfig, "delay"),
     Param("trunk.pitch", 0.0, "forward tilt of the trunk, approached at 0.5 rad/s", (-3.1, 3.1), "rad"),
     Param("trunk.roll", 0.0, "tilt of the trunk to the right, approached at 0.5 rad/s", (-3.1, 3.1), "rad"),
     Param("trial", "", "script file for the virtual wearer; if set while the node runs, the wearer starts at once"),
@@ -94,4 +95,5 @@ def set_faults(device: SimulatedDevice, values: Mapping[str, Any]) -> None:
 
 def imu_of(values: Mapping[str, Any]) -> ImuConfig:
     """Return the trunk's IMU that parameter values describe. Raises ParameterError."""
-    return ImuConfig(values["imu.rotation_trunk_from_imu"], values["imu.rate"], gravity=values["gravity"])
+    owned = {field: values[f"imu.{field}"] for field in ("rotation_trunk_from_imu", "rate", "delay")}
+    return ImuConfig(**owned, gravity=values["gravity"])

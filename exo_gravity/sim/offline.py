@@ -14,6 +14,7 @@ from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from exo_gravity.core.recording import Recording, ScriptedStep
 from exo_gravity.core.safety import SafetyMachine
 from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.sim.device import SimulatedDevice
+from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 START_TIMEOUT = 60.0  # s for the motors to be switched on
@@ -40,11 +42,33 @@ MOTORS_OFF = (State.DISABLED, State.FAULT)
 CARRIED = (State.RAMPING_IN, State.ACTIVE)
 
 
+class TrunkReading(NamedTuple):
+    """What the `imu` node publishes, vectors (3,) in the trunk's axes.
+
+    gravity: unit vector. specific_force m/s^2, angular_velocity rad/s: as measured.
+    """
+
+    gravity: Sequence[float]
+    specific_force: Sequence[float]
+    angular_velocity: Sequence[float]
+
+
+class TrunkSensor(Protocol):
+    """An IMU that samples in every n-th cycle, n being `cycles`."""
+
+    cycles: int
+
+    def measure(self, now: float, state: TrunkState) -> TrunkReading | None:
+        """Return the reading of a sample at `now` in s, None if there is none."""
+        ...
+
+
 @dataclass(frozen=True)
 class ArmSetup:
     """One arm: `device` is the truth; motors, limits and settings are the controller's parameters.
 
-    rate: control cycles per s. tilt: pitch and roll of the trunk in rad as measured, None without an IMU.
+    rate: control cycles per s. tilt: pitch and roll of the trunk in rad as measured, None without an IMU. trunk: the
+    IMU of a trunk that moves, in place of `tilt`.
     """
 
     name: str
@@ -54,6 +78,7 @@ class ArmSetup:
     settings: Settings
     rate: float
     tilt: tuple[float, float] | None
+    trunk: TrunkSensor | None = None
 
 
 class OfflineTrial:
@@ -77,6 +102,7 @@ class OfflineTrial:
         self._efforts: tuple[Sequence[float] | None, float] = (None, -math.inf)
         self._reason = ""  # why the compensator has withdrawn
         self._tilt_time = -math.inf  # of the compensator's newest tilt
+        self._reading: tuple[TrunkReading | None, float] = (None, 0.0)  # on its way, and when it was taken
         self._samples = [UNKNOWN] * JOINT_COUNT
         self._powered = False
         # Both are pure, and an arm at rest repeats its frames: caching them saves the most time.
@@ -102,6 +128,7 @@ class OfflineTrial:
         second = 0.0
         for cycle in itertools.count():
             now = cycle / self.arm.rate
+            self._deliver_tilt(cycle, now)
             self._cycle(now)
             if self._safety.state in MOTORS_OFF:
                 break
@@ -122,15 +149,29 @@ class OfflineTrial:
         position = [joint.position for joint in self._samples]
         if not any(arm.limits.is_silent(now, joint) for joint in self._samples):
             self._record(now, position, effort)
-            if arm.tilt and now - self._tilt_time >= TILT_PERIOD:
-                self._compensator.set_tilt(now, *arm.tilt)
-                self._tilt_time = now
             answer = self._compensator.step(now, position)
             self._efforts = answer.effort, min(joint.time for joint in self._samples)
             if answer.reason and answer.reason != self._reason:
                 self._note(now, f"withdrawn: {answer.reason}")
             self._reason = answer.reason
         arm.device.advance(1.0 / arm.rate)
+
+    def _deliver_tilt(self, cycle: int, now: float) -> None:
+        """Give the compensator the newest tilt; that of an IMU arrives one cycle after the sample."""
+        arm, (reading, taken) = self.arm, self._reading
+        if not arm.settings.use_imu:
+            return
+        if arm.trunk is None:
+            if arm.tilt and now - self._tilt_time >= TILT_PERIOD:
+                self._compensator.set_tilt(now, *arm.tilt)
+                self._tilt_time = now
+            return
+        if reading:
+            age, turning = now - taken, reading.angular_velocity
+            self._compensator.set_gravity(now, reading.gravity, turning, age)
+            self._compensator.set_motion(now, reading.specific_force, turning, age)
+        due = cycle % arm.trunk.cycles == 0
+        self._reading = (arm.trunk.measure(now, arm.device.trunk) if due else None), now
 
     def _exchange(self, drive: Drive, now: float) -> None:
         """Send `drive` to the motors and read their replies, with the same frames as `MotorBus`."""

@@ -1,6 +1,6 @@
 """trial --offline: the simulated arms of a parameter file perform a script without ROS, faster than real time.
 
-This is the only tool that imports `sim`: without ROS it cannot start the simulator as a node.
+It and `trunk_imu` are the only tools that import `sim`: without ROS they cannot start the simulator as a node.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import yaml
 from rich.console import Console
@@ -16,12 +17,13 @@ from rich.progress import Progress
 from exo_gravity.bag.content import Bag, Event
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.recording import Recording
-from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.core.trial_script import TRUNK_ACTIONS, TrialScript
 from exo_gravity.sim.device_params import SIMULATOR, device_of, imu_of, set_faults
 from exo_gravity.sim.imu import SimulatedImu, measured_tilt
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial
 from exo_gravity.tools.inputs.arms import named, node_values, read_arm
 from exo_gravity.tools.inputs.parameter_file import Nodes, load
+from exo_gravity.tools.trials.trunk_imu import TrunkImu
 
 
 def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
@@ -33,8 +35,9 @@ def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
     namespaces = [node.removesuffix("/simulator") for node in nodes if node.endswith("/simulator")]
     if not namespaces:
         raise ParameterError("params", str(params), "a file with a simulator: --offline runs the simulated device only")
-    tilt = _tilt(nodes, namespaces)
-    return [_trial(nodes, namespace, script, tilt) for namespace in namespaces]
+    moves = any(step.action in TRUNK_ACTIONS for step in script.steps)
+    tilt = None if moves else _tilt(nodes, namespaces)
+    return [_trial(nodes, namespaces, namespace, script, tilt) for namespace in namespaces]
 
 
 def run_offline(
@@ -74,24 +77,37 @@ def _run_one(trial: OfflineTrial, console: Console, should_stop: Callable[[], bo
     return recording
 
 
-def _trial(nodes: Nodes, namespace: str, script: TrialScript, tilt: tuple[float, float] | None) -> OfflineTrial:
-    """Return the trial of the arm in `namespace`."""
+def _trial(
+    nodes: Nodes, namespaces: list[str], namespace: str, script: TrialScript, tilt: tuple[float, float] | None
+) -> OfflineTrial:
+    """Return the trial of the arm in `namespace`; tilt: of a trunk that does not move, as measured."""
     arm = read_arm(nodes, namespace)
     simulator = node_values(nodes, f"{namespace}/simulator", SIMULATOR)
     with named(f"{namespace}/simulator"):
         device = device_of(simulator)
         set_faults(device, simulator)
-    setup = ArmSetup(arm.name, device, arm.motors, arm.limits, arm.settings(), arm.can_bridge["rate"], tilt)
+    rate = arm.can_bridge["rate"]
+    trunk = None
+    if tilt is None and (mounted := _imu(nodes, namespaces)):
+        trunk = TrunkImu(imu_of(mounted[0]), mounted[1], rate)
+    setup = ArmSetup(arm.name, device, arm.motors, arm.limits, arm.settings(), rate, tilt, trunk)
     return OfflineTrial(setup, script, simulator["trial_delay"])
 
 
 def _tilt(nodes: Nodes, namespaces: list[str]) -> tuple[float, float] | None:
-    """Return the trunk's pitch and roll (rad) as its IMU measures them, None without an IMU."""
+    """Return the trunk's pitch and roll (rad) as its IMU measures them at rest, None without an IMU."""
+    if (mounted := _imu(nodes, namespaces)) is None:
+        return None
+    simulator, rotation = mounted
+    with named("/imu"):
+        trunk = simulator["trunk.pitch"], simulator["trunk.roll"]
+        return measured_tilt(*trunk, SimulatedImu(imu_of(simulator)), rotation)
+
+
+def _imu(nodes: Nodes, namespaces: list[str]) -> tuple[dict[str, Any], Sequence[float]] | None:
+    """Return the parameters of the simulator with the trunk's IMU and the mounting that /imu assumes, or None."""
     for namespace in namespaces:
         simulator = node_values(nodes, f"{namespace}/simulator", SIMULATOR)
         if simulator["imu.topic"] and "/imu" in nodes:
-            with named("/imu"):
-                rotation = nodes["/imu"].get("rotation_trunk_from_imu", [])
-                trunk = simulator["trunk.pitch"], simulator["trunk.roll"]
-                return measured_tilt(*trunk, SimulatedImu(imu_of(simulator)), rotation)
+            return simulator, nodes["/imu"].get("rotation_trunk_from_imu", [])
     return None

@@ -1,0 +1,49 @@
+"""An offline trial of an arm on a trunk that moves, with little friction: device, controller, IMU and estimator."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from exo_gravity.core import ArmModel
+from exo_gravity.core.compensator import Settings
+from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.limits import Limits
+from exo_gravity.core.motors import MOTORS
+from exo_gravity.core.recording import Recording
+from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.sim import ArmConfig, ImuConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
+from exo_gravity.sim.offline import ArmSetup, OfflineTrial
+from exo_gravity.tools.trials.trunk_imu import TrunkImu
+
+FRICTION = 0.03  # Nm in each joint
+POSE = (0.0, 0.4, 0.5, 1.0)  # rad
+LENGTH = (0.05, 0.13, 0.30, 0.30)
+ROBOT = ArmModel(LENGTH, (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))  # of config/exo.yaml
+TRUE = ArmModel(LENGTH, (0.045, 0.115, 0.235, 0.13), (0.60, 0.46, 0.61, 0.198))  # of config/sim.yaml
+MOUNTING = (0.0, 0.0, 0.5**0.5, 0.5**0.5)
+RATE = 250.0  # Hz
+JOINTS = ("rotation", "abduction", "flexion", "elbow")
+
+
+def trunk_trial(*steps: dict[str, Any], seed: int = 0, **settings: Any) -> OfflineTrial:
+    """Return a trial: the arm is brought to POSE and let go, and 2 s later `steps` begin."""
+    motors = [JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1)]
+    rated = (3.0, 9.0, 3.0, 3.0)
+    limits = Limits(JOINTS, (-1.65, -0.17, -0.78, -0.17), (1.65, 3.14, 2.53, 3.14), (5.0, 5.0, 5.0, 6.0), rated)
+    arm = SimulatedArm(ArmConfig(TRUE, coulomb_friction=(FRICTION,) * 4))
+    device = SimulatedDevice(arm, [SimulatedMotor(motor) for motor in motors])
+    trunk = TrunkImu(ImuConfig(MOUNTING, seed=seed), MOUNTING, RATE)
+    script = TrialScript.parse({"name": "trunk", "steps": [{"move": list(POSE), "over": 3.0}, {"hold": 2.0}, *steps]})
+    setup = ArmSetup("right", device, motors, limits, Settings("right", ROBOT, **settings), RATE, None, trunk)
+    return OfflineTrial(setup, script, 8.0)
+
+
+def moved(recording: Recording, steps: Sequence[str]) -> float:
+    """Return by how many degrees a joint moved at most while the `steps` (actions) lasted, from their start."""
+    spans = [step for step in recording.steps if step.action in steps]
+    during = (recording.time >= spans[0].start) & (recording.time <= spans[-1].end)
+    position = np.degrees(recording.position[during])
+    return float(np.abs(position - position[0]).max())
