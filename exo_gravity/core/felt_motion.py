@@ -20,7 +20,8 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.quaternion import Floats3
 
 WINDOW = 0.045  # s; the samples that the parabola fits, 5 at 100 Hz
-MIN_SAMPLES = 4
+MIN_SAMPLES = 4  # that it fits at a lower rate, or after losses, if
+LONGEST_WINDOW = 0.085  # s holds as many, as from 40 Hz on
 # s from the sample's stamp, besides its age: 3 for the sensor's low-pass (MPU-6050, 94 Hz), 6 until the middle of the
 # 4 ms in which the motors execute the torque.
 EFFECT = 0.009
@@ -55,7 +56,7 @@ class FeltMotion:
             return
         self._time = time
         self._samples.append((time, values))
-        while self._samples[0][0] < time - WINDOW:
+        while self._samples[0][0] < time - (WINDOW if len(self._samples) > MIN_SAMPLES else LONGEST_WINDOW):
             self._samples.popleft()
         self._parabola = None
         if len(self._samples) >= MIN_SAMPLES:

@@ -51,6 +51,12 @@ def test_too_few_or_too_old_samples_tell_nothing():
     assert following(shaken, lambda t: STILL).at(1.1) is None
 
 
+@pytest.mark.parametrize("rate", [40.0, 50.0, 250.0, 1000.0])
+def test_a_shake_is_felt_at_any_usual_rate(rate):
+    felt = following(shaken, lambda t: STILL, period=1.0 / rate).at(1.0)
+    assert felt.gravity[2] == pytest.approx(-shaken(1.0 + EFFECT)[2], abs=0.1)
+
+
 def test_a_gap_is_not_bridged():
     felt = following(shaken, lambda t: STILL)
     felt.add(1.3, shaken(1.3), STILL)

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from exo_gravity.core.trial_script import TrialScript
-from exo_gravity.tools.trials.live import LEAD, Progress
+from exo_gravity.core.trial_script import Step, TrialScript
+from exo_gravity.tools.trials.live import LEAD, Progress, describe
 from exo_gravity.tools.trials.real_time import follow
 
 SCRIPT = TrialScript.parse(
@@ -139,3 +139,10 @@ def test_a_latched_fault_ends_the_trial_with_its_reason(nodes, state):
     screen.at(0.0, bridge={"level": 2, "message": message, "state": state, "fault": "motor_silent"})
     why = follow(screen.progress, SCRIPT, threading.Event(), lambda: None, nodes)
     assert why == f"right/can_bridge: {message}"
+
+
+def test_the_steps_of_the_trunk_are_instructions_too() -> None:
+    assert describe(Step("bow", 3.0, (0.52,)), True) == "bow to 30 deg forward in 3 s, and leave the arm alone"
+    assert describe(Step("lean", 2.0, (-0.26,)), True) == "lean to -15 deg to the right in 2 s, and leave the arm alone"
+    assert describe(Step("walk", 60.0), True) == "walk for 60 s, and leave the arm alone"
+    assert describe(Step("sit", 2.0), False) == "the wearer: sit down hard, and leave the arm alone"

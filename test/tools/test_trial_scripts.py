@@ -25,7 +25,7 @@ CONFIG = Path(__file__).parents[2] / "config"
 RATED = (3.0, 9.0, 3.0, 3.0)  # Nm
 
 
-@pytest.mark.parametrize("name", ["demo", "two_poses", "thirteen_poses"])
+@pytest.mark.parametrize("name", ["bow_and_walk", "demo", "two_poses", "thirteen_poses"])
 def test_a_packaged_trial_stays_within_rated_torque_and_clear_of_the_joint_limits(name):
     _, script = read_script(name)
     values = yaml.safe_load((CONFIG / "exo.yaml").read_text())
@@ -56,7 +56,7 @@ def test_an_unknown_name_is_answered_with_the_packaged_trials():
     with pytest.raises(ParameterError) as caught:
         read_script("nosuch")
     assert str(caught.value) == (
-        "trial = 'nosuch': must be demo, thirteen_poses, two_poses or a YAML file with a script"
+        "trial = 'nosuch': must be bow_and_walk, demo, thirteen_poses, two_poses or a YAML file with a script"
     )
 
 
