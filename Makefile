@@ -5,6 +5,7 @@
 # make faults       the whole fault matrix on the simulated device, 20 minutes; a table and build/faults.json
 # make mutations    deliberate defects, each of which must turn a row of the fault matrix unsafe; 7 minutes
 # make bench        the laws, the loop and the tools against peers, 12 minutes on a quiet machine; QUICK=1: part of it
+# make imu-report   the trunk's inclination error on recorded motion, here and by VQF and imufusion; TRIALS=FOLDER
 # make socketcan    motor bus and nodes on vcan0; RUN=COMMAND runs the tests through COMMAND, in a virtual machine for example
 # make pythons      for each supported Python found here: set-up from nothing, a short trial, the nodes
 # make constraints  renews the versions in constraints/
@@ -19,7 +20,7 @@ DEMO := imu sim report
 TEST := $(DEMO) validate test
 SETUP := VENV=$(VENV) .ci/setup
 
-.PHONY: demo calibrate-demo test lint faults mutations bench socketcan pythons constraints clean
+.PHONY: demo calibrate-demo test lint faults mutations bench imu-report socketcan pythons constraints clean
 
 demo:
 	@$(SETUP) $(DEMO)
@@ -50,6 +51,10 @@ mutations:
 bench:
 	@$(SETUP) $(TEST)
 	$(BIN)/python -m bench $(if $(QUICK),--quick)
+
+imu-report:
+	@$(SETUP) imu validate
+	$(BIN)/python -m bench.imu_report $(TRIALS)
 
 socketcan:
 	@$(SETUP) $(TEST)

@@ -10,11 +10,11 @@ tools = ("launcher", "trial", "report", "budget", "validate", "train_anfis", "ca
 extras = {
     # Jazzy as wheels, for a machine without ROS. Where ROS 2 is installed, leave this extra out.
     "ros": ["ros-jazzy-rclpy[fastrtps]==7.1.6", "ros-jazzy-common-interfaces==5.3.6"],
-    "imu": ["imufusion>=1.3", "pyserial>=3.5", "smbus2>=0.4.2"],
+    "imu": ["pyserial>=3.5", "smbus2>=0.4.2", "vqf>=2.1"],
     "sim": ["mujoco>=3.2"],
     "report": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11", "scipy>=1.11"],
     "calibrate": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11"],
-    "validate": ["pin>=2.7", "roboticstoolbox-python>=1.1.1", "threadpoolctl>=3.0"],
+    "validate": ["imufusion>=1.3", "pin>=2.7", "roboticstoolbox-python>=1.1.1", "threadpoolctl>=3.0"],
     "test": [
         "hypothesis>=6.100",
         "mcap-ros2-support>=0.5",

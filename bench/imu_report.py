@@ -1,8 +1,8 @@
 """python -m bench.imu_report [FOLDER] [--write FILE]: the trunk's inclination error here, by VQF and by imufusion.
 
 Writes one table as Markdown: for each trial the error in degrees, RMS (largest), over the samples in motion. FOLDER
-holds trials as .npz files; by default the excerpts of BROAD in test/data/broad. --write puts the table into FILE between
-the lines `<!-- imu-report -->` and `<!-- end of imu-report -->`. imufusion is left out where it is not installed.
+holds trials as .npz files; by default it is test/data/broad. --write puts the table into FILE, between the lines
+`<!-- imu-report -->` and `<!-- end of imu-report -->`. imufusion is left out where it is not installed.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ def report(trials: list[Trial]) -> str:
     """Return the table."""
     methods = [name for name in METHODS if name != "imufusion, its defaults" or importlib.util.find_spec("imufusion")]
     head = ["trial", "here", "published", f"here, {LOST:.0%} of the samples lost", *methods[1:]]
-    rows, costs = [head, ["---"] * len(head)], {name: [] for name in methods}
+    rows = [head, ["---"] * len(head)]
+    costs: dict[str, list[float]] = {name: [] for name in methods}
     for trial in trials:
         scores = {name: score(trial, name) for name in methods}
         lossy = score(trial.without(lost_samples(len(trial.times), LOST)), "here")

@@ -82,7 +82,7 @@ def pitch_roll(gravity_in_trunk: Vector) -> tuple[float, float]:
     norm = math.hypot(x, y, z)
     if not 0.0 < norm < math.inf:
         raise ParameterError("gravity_in_trunk", gravity_in_trunk, "a finite, non-zero vector")
-    return math.asin(max(-1.0, min(1.0, x / norm))), math.atan2(-y, -z)
+    return math.atan2(x, math.hypot(y, z)), math.atan2(-y, -z)
 
 
 def angle_between(a: Vector, b: Vector) -> float:

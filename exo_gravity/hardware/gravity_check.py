@@ -37,11 +37,11 @@ class GravityCheck:
     def update(self, dt: float, up: Floats3, acceleration: Floats3 | None) -> None:
         """Raise ParameterError once `up`, the world's z axis in the IMU's axes, has been contradicted for too long."""
         if acceleration is not None:
-            norm = math.hypot(*acceleration)
+            x, y, z = acceleration
+            norm = math.hypot(x, y, z)
             now = abs(norm / STANDARD_GRAVITY - 1.0)
             self.deviation += (now - self.deviation) * min(1.0, dt / QUIET_TIME)
             if self.is_quiet and now < QUIET:
-                x, y, z = acceleration
                 contradicts = up[0] * x + up[1] * y + up[2] * z < norm * math.cos(MAX_CONTRADICTION)
                 self._contradicted = self._contradicted + dt if contradicts else 0.0
         if self._contradicted > CONTRADICTION_TIME:

@@ -1,12 +1,10 @@
 """Gyroscope and accelerometer against each other: a wrong unit, swapped or reversed axes.
 
-The two must show the same turn of gravity over the last 0.2 s. While a person moves, the accelerometer also measures
-the movement, which shows in its length: the more that deviates from 1 g, the larger a turn must be to be compared.
-- No turn by the accelerometer, near 1 g, where the gyroscope shows one: refused at once. (A gyroscope in deg/s.)
-- Different turns: refused at once until the two have agreed on a turn, because axes and units are wrong from the start
-  or not at all; later only if it goes on.
-After a contradiction that went on, the two must agree on a turn before the estimate is used again. The limits were set
-on the trials of docs/imu.md, where they withhold 0.1 % of the samples.
+The two must show the same turn of gravity over the last second. While a person moves, the accelerometer also measures
+the movement, which shows in its length: the more that deviates from 1 g, the larger a turn must be to be compared. A
+sample is refused while the turns differ, or while only the gyroscope shows one (a gyroscope in deg/s). If that goes on,
+the estimate begins anew, and is used only after the two have agreed on a turn, or at rest. The limits were set on the
+trials of docs/imu.md, of whose samples they refuse 0.05 %.
 """
 
 from __future__ import annotations
@@ -16,14 +14,14 @@ import math
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.quaternion import Floats3
 
-TURN_TIME = 0.2  # s over which the two turns are compared
-CLEAR_TURN = 0.05  # of a unit vector: 3 degrees
-CLEAR = (2.0, 3.0)  # times the deviation from 1 g, that a turn must also exceed; before and after an agreement
-NO_TURN = 0.2  # share of the gyroscope's turn; a gyroscope in deg/s turns 57 times as far as the accelerometer
-UNLIKE = 0.8  # share of the gyroscope's turn by which the two differ, with other axes or another sign
-ALIKE = 0.5
-AGREEMENT_TIME = 0.05  # s of like turns
-PATIENCE = 0.15  # s of unlike turns; like ones count against them. In good data it was up to 0.11 s
+TURN_TIME = 1.0  # s over which the two turns are compared
+CLEAR_TURN = 0.04  # of a unit vector: 2.3 degrees
+CLEAR = 6.0  # times the deviation from 1 g, that a turn must also exceed
+NO_TURN = 0.1  # share of the gyroscope's turn; a gyroscope in deg/s turns 57 times as far as the accelerometer
+UNLIKE = 0.6  # share of the gyroscope's turn by which the two differ, with other axes or another sign
+ALIKE = 0.3
+AGREEMENT_TIME = 0.2  # s of like turns
+PATIENCE = 0.06  # s of unlike turns; like ones count against them. In good data it was up to 0.03 s
 FORGET_TIME = 2.0  # s
 QUIET = 0.1  # share of 1 g
 SHORT_TIME = 0.012  # s; a movement can look like a contradiction for as long
@@ -77,20 +75,19 @@ class ImuConsistency:
 
     def _compare(self, dt: float, turn: Floats3, size: float, measured_turn: Floats3, deviation: float) -> None:
         self._rest = 0.0
-        has_agreed = self._agreed >= AGREEMENT_TIME
-        is_clear = size > CLEAR[has_agreed] * deviation
+        is_clear = size > CLEAR * deviation
         unlike = math.dist(turn, measured_turn)
         if is_clear and unlike < ALIKE * size:
             self._agreed += dt
             self._unlike = max(0.0, self._unlike - 2.0 * dt)
-            self.is_suspect = self.is_suspect and not has_agreed
+            self.is_suspect = self.is_suspect and self._agreed < AGREEMENT_TIME
         has_no_turn = deviation < QUIET and math.hypot(*measured_turn) < NO_TURN * size
         if not has_no_turn and not (is_clear and unlike > UNLIKE * size):
             self._run = 0.0
             return
         self._run += dt
         self._unlike += dt
-        if self._run > SHORT_TIME and (has_no_turn or not has_agreed or self.is_broken):
+        if self._run > SHORT_TIME:
             expected = "the turn that the accelerometer shows: check the gyroscope's unit, axes and signs"
             raise ParameterError("turn by angular_velocity", [round(v, 3) for v in turn], expected)
 

@@ -16,7 +16,7 @@ from exo_gravity.core.quaternion import Floats3
 
 AVERAGE_TIME = 2.0  # s
 OFFSET = 0.04  # share of 1 g: bias and scale of an accelerometer that was never calibrated
-WALK = 1.5 / STANDARD_GRAVITY  # s: m/s, per 1 g
+WALK = 0.75 / STANDARD_GRAVITY  # s: m/s, per 1 g; 0.45 m/s is needed for an IMU swung in a circle by hand
 DIRECTION_TIME = 0.3  # s
 LEAST_TIME = 0.5  # s of samples
 
@@ -36,12 +36,12 @@ class MeanAcceleration:
     def update(self, dt: float, acceleration_in_world: Floats3) -> None:
         """Raise ParameterError if the mean of `acceleration_in_world` (3,) m/s^2 cannot be gravity."""
         self._age += dt
-        share = min(1.0, max(dt / AVERAGE_TIME, dt / self._age)) if self._age else 1.0
+        share = dt / (self._age if self._age < AVERAGE_TIME else AVERAGE_TIME) if dt else 1.0
         x, y, z = acceleration_in_world
         x, y, z = x / STANDARD_GRAVITY - self._x, y / STANDARD_GRAVITY - self._y, z / STANDARD_GRAVITY - self._z
         self._x, self._y, self._z = self._x + share * x, self._y + share * y, self._z + share * z
         self._square += share * ((1.0 - share) * (x * x + y * y + z * z) - self._square)
-        if self._age < LEAST_TIME:
+        if self._age < LEAST_TIME or not dt:
             return
         shift = math.hypot(self._x, self._y, self._z - 1.0)
         limit = OFFSET + (WALK + DIRECTION_TIME * math.sqrt(self._square)) / min(self._age, AVERAGE_TIME)

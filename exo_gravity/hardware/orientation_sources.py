@@ -21,6 +21,7 @@ from exo_gravity.hardware.tilt_uncertainty import TiltUncertainty
 
 REPORTED_SIGMA = math.radians(1.0)  # rad; data sheets of fused sensors state 1 to 2 degrees
 REPORTED_SETTLE_TIME = 1.0  # s of continuous samples before a reported orientation is used
+LEVEL: Quaternion = (0.0, 0.0, 0.0, 1.0)
 MAX_REPORTED_RATE = 15.0  # rad/s; a reported orientation that turns faster has jumped: no trunk turns so fast
 MAX_JUMP = 0.01  # rad by which rounding may turn a reported orientation
 
@@ -30,7 +31,7 @@ class Measured(NamedTuple):
 
     rate: Floats3
     acceleration: Floats3 | None
-    orientation: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    orientation: Quaternion = LEVEL
     is_saturated: bool = False
 
 
@@ -88,13 +89,12 @@ class Fused:
         rate, is_saturated = self._ranges.angular_velocity(sample.angular_velocity)
         last = self._last.acceleration if self._last else None
         acceleration, is_clipped = self._ranges.acceleration(sample.acceleration, last)
-        return Measured(rate, None if is_clipped else acceleration, is_saturated=is_saturated)
+        return Measured(rate, None if is_clipped else acceleration, LEVEL, is_saturated)
 
     def restart(self, why: str) -> None:
         self._filter.restart()
         self._uncertainty.restart()
         self._consistency.restart()
-        self._stuck.restart()
         self._mean.restart()
         self._gravity.restart()
         self._last, self._why, self._repeated = None, why, 0.0

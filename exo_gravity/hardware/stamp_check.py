@@ -32,7 +32,7 @@ class StampCheck:
         self._period = self._given
         self._is_learning = True
         self._share, self._jitter = 1.0, 0.0  # of the periods: mean, and mean deviation from it
-        self._age, self._periods = 0.0, 0  # since the start
+        self._age, self._periods, self._count = 0.0, 0, 0  # s, periods and samples since the start
         self._usual = self._shortest = math.inf  # s from stamp to arrival
         self._window_end = -math.inf
         self._growth = 0.0  # s by which the shortest delay exceeds the usual one
@@ -49,6 +49,7 @@ class StampCheck:
         if self._is_learning:
             self._age += dt
             self._periods += periods if dt else 0
+            self._count += dt > 0.0
             if self._age >= LEARN_TIME:
                 self._learn()
         elif abs(self._share - 1.0) > MAX_CHANGE + JITTER * self._jitter:
@@ -60,7 +61,8 @@ class StampCheck:
         rate = self._periods / self._age
         low, high = RATE_BOUNDS
         if not low <= rate * self._given <= high:
-            raise ParameterError("rate", round(1.0 / self._given, 1), f"about the {rate:.0f} Hz of the stamps")
+            expected = f"about the {self._count / self._age:.0f} Hz of the stamps"
+            raise ParameterError("rate", round(1.0 / self._given, 1), expected)
         self._period, self._share, self._is_learning = 1.0 / rate, 1.0, False
 
     def _check_delay(self, time: float, arrival: float) -> None:

@@ -10,6 +10,7 @@ repeated value counts only when the trunk turned meanwhile by what the axis shou
 from __future__ import annotations
 
 import math
+import operator
 
 from exo_gravity.core.arm import STANDARD_GRAVITY
 from exo_gravity.core.errors import ParameterError
@@ -24,60 +25,58 @@ AXES = "xyz"
 
 
 class StuckAxis:
-    """Follows one IMU that reports no orientation. is_stuck: an axis is; is_sure: it has been for SURE_TIME."""
+    """Follows one IMU that reports no orientation.
+
+    is_stuck: an axis is, by the last sample. is_sure: it has been for SURE_TIME; it is then stuck until its value
+    changes, even after a restart.
+    """
 
     def __init__(self) -> None:
-        self.restart()
-
-    def restart(self) -> None:
-        """Begin anew with the next sample."""
-        self.is_stuck = False
-        self._stuck_time = 0.0  # s
-        self._rate: Floats3 = (math.nan,) * 3
-        self._acceleration: Floats3 = (math.nan,) * 3
-        self._counts = [0] * 6  # of equal values, gyroscope and accelerometer
+        self.is_stuck = self.is_sure = False
+        self._values: tuple[float, ...] = (math.nan,) * 6  # gyroscope and accelerometer
+        self._counts = [0] * 6  # of equal values
+        self._stuck_times = [0.0] * 6  # s
         self._turns = [0.0] * 3  # rad by the other axes while a gyroscope's axis repeated its value
         self._ups = [0.0] * 3  # of the estimate's vertical, when an accelerometer's axis began to repeat its value
 
     def update(self, dt: float, up: Floats3, rate: Floats3, acceleration: Floats3) -> None:
         """Raise ParameterError if an axis is stuck. up: the estimate's vertical in the IMU's axes."""
-        counts = self._counts
-        self._stuck_time = self._stuck_time + dt if self.is_stuck else 0.0
-        self.is_stuck = False
-        self._rate, last_rate = rate, self._rate
-        self._acceleration, last_acceleration = acceleration, self._acceleration
-        for axis in range(3):
-            if rate[axis] != last_rate[axis]:
-                counts[axis], self._turns[axis] = 0, 0.0
-            else:
-                counts[axis] += 1
-                if counts[axis] >= LEAST_COUNT:
-                    self._check_gyroscope(axis, dt, up, rate, acceleration)
-            if acceleration[axis] != last_acceleration[axis]:
-                counts[3 + axis], self._ups[axis] = 0, up[axis]
-            else:
-                counts[3 + axis] += 1
-                moved = STANDARD_GRAVITY * abs(up[axis] - self._ups[axis])
-                if counts[3 + axis] >= LEAST_COUNT and moved > ACCELERATION:
-                    self._refuse("linear_acceleration", axis, acceleration)
+        self.is_stuck = self.is_sure = False
+        values, last = (*rate, *acceleration), self._values
+        self._values = values
+        equal = tuple(map(operator.eq, values, last))
+        if any(equal) or any(self._counts):
+            for axis in range(6):
+                if not equal[axis]:
+                    self._counts[axis], self._stuck_times[axis] = 0, 0.0
+                elif self._repeats(axis, dt, up, rate, acceleration):
+                    self._refuse(axis, dt, values)
 
-    @property
-    def is_sure(self) -> bool:
-        """Whether an axis has been stuck for a while."""
-        return self._stuck_time >= SURE_TIME
+    def _repeats(self, axis: int, dt: float, up: Floats3, rate: Floats3, acceleration: Floats3) -> bool:
+        """Count an equal value; return whether the axis is stuck."""
+        if self._counts[axis] == 0:
+            if axis < 3:
+                self._turns[axis] = 0.0
+            else:
+                self._ups[axis - 3] = up[axis - 3]
+        self._counts[axis] += 1
+        return self._counts[axis] >= LEAST_COUNT and self._is_stuck(axis, dt, up, rate, acceleration)
 
-    def _check_gyroscope(self, axis: int, dt: float, up: Floats3, rate: Floats3, acceleration: Floats3) -> None:
+    def _is_stuck(self, axis: int, dt: float, up: Floats3, rate: Floats3, acceleration: Floats3) -> bool:
+        if self._stuck_times[axis] >= SURE_TIME:
+            return True
+        if axis >= 3:
+            return STANDARD_GRAVITY * abs(up[axis - 3] - self._ups[axis - 3]) > ACCELERATION
         norm = math.hypot(*acceleration)
         if abs(norm / STANDARD_GRAVITY - 1.0) < NEAR_GRAVITY:
             self._turns[axis] = 0.0
-            error = math.dist(up, (acceleration[0] / norm, acceleration[1] / norm, acceleration[2] / norm))
-        else:
-            self._turns[axis] += math.hypot(*rate[:axis], *rate[axis + 1 :]) * dt
-            error = self._turns[axis]
-        if error > TURN:
-            self._refuse("angular_velocity", axis, rate)
+            return math.dist(up, (acceleration[0] / norm, acceleration[1] / norm, acceleration[2] / norm)) > TURN
+        self._turns[axis] += math.hypot(*rate[:axis], *rate[axis + 1 :]) * dt
+        return self._turns[axis] > TURN
 
-    def _refuse(self, name: str, axis: int, values: Floats3) -> None:
-        self.is_stuck = True
-        expected = f"different from sample to sample while the trunk turns: the {AXES[axis]} axis is stuck"
-        raise ParameterError(name, values, expected)
+    def _refuse(self, axis: int, dt: float, values: tuple[float, ...]) -> None:
+        self._stuck_times[axis] += dt
+        self.is_stuck, self.is_sure = True, self._stuck_times[axis] >= SURE_TIME
+        name, shown = ("angular_velocity", values[:3]) if axis < 3 else ("linear_acceleration", values[3:])
+        expected = f"different from sample to sample while the trunk turns: the {AXES[axis % 3]} axis is stuck"
+        raise ParameterError(name, shown, expected)

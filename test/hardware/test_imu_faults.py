@@ -1,0 +1,165 @@
+"""Faults of IMUs, drivers and clocks: named, and no tilt is published that is off by more than 5 degrees.
+
+Each fault is put into the simulated motion of a trunk that bows, leans and then walks, from the start or amid the
+motion; every published tilt is judged by the true one.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+
+import numpy as np
+import pytest
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.hardware import ImuSample, TrunkEstimator
+
+from ..support.imu_faults import (
+    STILL_TIME,
+    G,
+    Motion,
+    bowing_and_walking,
+    follow,
+    lost,
+    second_publisher,
+    slow_clock,
+    stuck,
+    values,
+)  # fmt: skip
+
+MOTION = bowing_and_walking()
+WRONG = 5.0  # degrees
+
+
+def frozen(array):
+    return np.tile(array[0], (len(array), 1))
+
+
+def without_a_number(array):
+    return np.where(np.arange(3) == 1, math.nan, array)
+
+
+FAULTS = {
+    "frozen bytes": (values(frozen, frozen), "the IMU or its driver is frozen"),
+    "NaN": (values(without_a_number), "angular_velocity .* 3 finite numbers"),
+    "a gyroscope in deg/s": (values(np.degrees), "check the gyroscope's unit|is it in deg/s"),
+    "an accelerometer in g": (values(None, lambda a: a / G), "in m/s.2, not in g|check units, axes and signs"),
+    "a clock at half the speed": (slow_clock(0.5), "its clock has changed|clock is slow"),
+    "a clock 10 % slow": (slow_clock(0.9), "its clock has changed|clock is slow"),
+    "a second publisher": (second_publisher, "a second IMU publishes|check units, axes and signs"),
+    **{f"gyroscope {axis} stuck": (values(stuck(k)), f"the {axis} axis is stuck") for k, axis in enumerate("xyz")},
+    **{
+        f"accelerometer {axis} stuck": (values(None, stuck(k)), f"the {axis} axis is stuck")
+        for k, axis in enumerate("xyz")
+    },
+}
+# The accelerometer alone tells these, and while the trunk moves it also measures the movement. The figures are the time
+# in s for which a wrong tilt is published until the fault has been told from movement.
+TOLD_BY_MOTION = {
+    "gyroscope reversed": (values(np.negative), 0.05),
+    "gyroscope x reversed": (values(lambda w: w * (-1, 1, 1)), 0.2),
+    "gyroscope y reversed": (values(lambda w: w * (1, -1, 1)), 0.05),
+    "gyroscope x and y swapped": (values(lambda w: w[:, [1, 0, 2]]), 1.0),
+    "gyroscope y and z swapped": (values(lambda w: w[:, [0, 2, 1]]), 2.0),
+    "gyroscope x and z swapped": (values(lambda w: w[:, [2, 1, 0]]), 2.6),
+}
+
+
+def wrong_time(motion, outcome):
+    return np.nansum(outcome.errors > WRONG) / motion.rate
+
+
+def test_without_a_fault_every_tilt_is_published_and_right():
+    outcome = follow(MOTION)
+    after = MOTION.times > 1.1
+    assert np.isfinite(outcome.errors[after]).all() and np.nanmax(outcome.errors) < 1.0
+
+
+@pytest.mark.parametrize("start", [0.0, 6.0], ids=["from the start", "amid the motion"])
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_named_and_no_wrong_tilt_is_published(fault, start):
+    apply, name = FAULTS[fault]
+    motion = apply(MOTION, round(start * MOTION.rate))
+    outcome = follow(motion)
+    assert any(re.search(name, text) for text in outcome.refusals)
+    assert wrong_time(motion, outcome) == 0.0
+
+
+@pytest.mark.parametrize("fault", TOLD_BY_MOTION)
+def test_a_wrong_axis_or_sign_is_named_within_a_few_bows(fault):
+    apply, longest = TOLD_BY_MOTION[fault]
+    motion = apply(MOTION, 0)
+    outcome = follow(motion)
+    named = [k for k, text in enumerate(outcome.refusals) if "check the gyroscope's unit, axes and signs" in text]
+    assert motion.times[named[0]] < STILL_TIME + 4.0
+    assert wrong_time(motion, outcome) <= longest
+    assert np.isfinite(outcome.errors[motion.times > STILL_TIME]).mean() < 0.35
+
+
+def test_3_percent_of_the_samples_lost_cost_nothing():
+    motion = lost(0.03)(MOTION, 0)
+    outcome = follow(motion)
+    assert np.nanmax(outcome.errors) < 1.0 and np.isfinite(outcome.errors[motion.times > 1.1]).all()
+
+
+def saturated(duration):
+    """The motion, with a knock at 5 s that turns faster than the gyroscope's range for `duration` s."""
+    gyroscope = MOTION.gyroscope.copy()
+    gyroscope[(MOTION.times >= 5.0) & (MOTION.times < 5.0 + duration), 2] = math.radians(2000.0)
+    return Motion(**{**vars(MOTION), "gyroscope": gyroscope})
+
+
+def test_a_saturated_sample_is_carried_as_uncertainty_and_a_longer_saturation_withheld_until_it_is_known_again():
+    settled = TrunkEstimator((0, 0, 0, 1))
+    for k in range(300):
+        before = settled.update(ImuSample(k / 100, (0.0, 0.0, 1e-6 * (-1) ** k), (0.0, 0.0, G)))
+    after = settled.update(ImuSample(3.0, (0.0, 0.0, math.radians(2000.0)), (0.0, 0.01, G)))
+    assert after is None or after.uncertainty > before.uncertainty
+    outcome = follow(saturated(0.05))
+    missing = np.isnan(outcome.errors) & (MOTION.times > 1.1)
+    assert MOTION.times[missing].min() < 5.03 and 0.9 < np.sum(missing) / MOTION.rate < 3.0
+    assert np.nanmax(outcome.errors) < WRONG
+
+
+def test_an_uncertain_estimate_comes_back_without_a_jump():
+    outcome = follow(saturated(0.05))
+    back = np.flatnonzero(np.isfinite(outcome.errors) & (MOTION.times > 5.05))
+    assert outcome.errors[back[0]] < 3.0 and np.abs(np.diff(outcome.errors[back])).max() < 0.5
+
+
+def test_values_beyond_the_given_ranges_are_refused_and_at_the_range_accepted():
+    estimator = TrunkEstimator((0, 0, 0, 1), 100.0, gyroscope_range=4.4, accelerometer_range=19.6)
+    for k in range(200):
+        estimator.update(ImuSample(k / 100, (0.0, 0.0, 1e-6 * (-1) ** k), (0.0, 0.0, G)))
+    with pytest.raises(ParameterError, match="gyroscope_range = 4"):
+        estimator.update(ImuSample(2.0, (0.0, 5.0, 0.0), (0.0, 0.0, G)))
+    with pytest.raises(ParameterError, match="accelerometer_range = 19"):
+        estimator.update(ImuSample(2.0, (0.0, 0.0, 0.0), (0.0, 25.0, G)))
+    assert estimator.update(ImuSample(2.01, (0.0, 0.0, 0.0), (0.0, 19.6, G))) is not None
+
+
+@pytest.mark.parametrize(("name", "value"), [("gyroscope_range", 0.0), ("accelerometer_range", 9.0)])
+def test_a_range_that_no_sensor_has_is_refused(name, value):
+    with pytest.raises(ParameterError, match=name):
+        TrunkEstimator((0, 0, 0, 1), 100.0, **{name: value})
+
+
+def test_a_rate_that_the_stamps_contradict_is_refused_with_the_right_one():
+    outcome = follow(Motion(**{**vars(MOTION), "rate": 60.0}))
+    assert "rate = 60.0: must be about the 100 Hz of the stamps" in outcome.refusals
+    assert np.isnan(outcome.errors).all()
+
+
+def test_a_clock_that_is_slow_from_the_start_is_told_by_the_arrivals():
+    motion = slow_clock(0.97)(MOTION, 0)
+    outcome = follow(motion)
+    first = next(k for k, text in enumerate(outcome.refusals) if text)
+    assert "the IMU's clock is slow, or its driver lags" in outcome.refusals[first]
+    assert motion.arrivals[first] - motion.arrivals[0] < 2.5
+
+
+def test_late_messages_alone_are_not_a_slow_clock():
+    late = 1000.0 + MOTION.times + np.random.default_rng(5).exponential(0.02, len(MOTION.times))
+    outcome = follow(Motion(**{**vars(MOTION), "arrivals": late}))
+    assert not any(outcome.refusals)
