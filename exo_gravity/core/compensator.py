@@ -44,10 +44,10 @@ class Settings:
     """Settings of the compensator. All but `side` and `use_imu` may change while the arm is worn.
 
     side: 'left' or 'right'. robot: the exoskeleton's own arm. wearer_mass (4,) kg, wearer_cog (4,) m: the wearer's
-    segments on each link. use_imu: False assumes an upright trunk. anfis: the model for the law 'anfis'. The other
-    fields are parameters of `compensator`. Two fields are derived: `arm` is the compensated arm, which is the robot in
-    One-G and the robot plus `support` times the wearer in Zero-G; `active_law` is the law in use. Raises
-    ParameterError.
+    segments on each link. shoulder_from_imu: (3,) m in the trunk's axes, for `inertial`. use_imu: False assumes an
+    upright trunk. anfis: the model for the law 'anfis'. The other fields are parameters of `compensator`. Two fields
+    are derived: `arm` is the compensated arm, which is the robot in One-G and the robot plus `support` times the wearer
+    in Zero-G; `active_law` is the law in use. Raises ParameterError.
     """
 
     side: str
@@ -65,6 +65,7 @@ class Settings:
     transition_time: float = owned(1.0, "time over which a change of mass, mode or law takes effect", (0.2, 30.0), "s")
     tilt_timeout: float = owned(0.08, "age of the trunk tilt at which the efforts are withdrawn", (0.01, 0.5), "s")
     inertial: bool = owned(False, "also compensate the trunk's acceleration, as its IMU measures it")
+    shoulder_from_imu: Sequence[float] = STILL
     use_imu: bool = True
     anfis: AnfisLaw | None = None
     arm: ArmModel = field(init=False)
@@ -161,7 +162,7 @@ class Compensator:
     def _law(self, now: float, theta: Sequence[float]) -> Torque:
         """Return the torque of the chosen law, or of the exact law while the chosen one does not apply."""
         settings, tilt = self.settings, self._tilt.at(now)
-        felt = self._motion.at(now) if settings.inertial and settings.use_imu else None
+        felt = self._motion.at(now, settings.shoulder_from_imu) if settings.inertial and settings.use_imu else None
         if felt:
             magnitude = math.hypot(*felt.gravity) / STANDARD_GRAVITY
             tilt = Tilt.of_gravity(settings.side, felt.gravity)._replace(magnitude=magnitude)

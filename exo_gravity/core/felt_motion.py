@@ -63,16 +63,24 @@ class FeltMotion:
             times = np.array([taken - time for taken, _ in self._samples])
             self._parabola = np.linalg.lstsq(np.vander(times, 3), [row for _, row in self._samples], rcond=None)[0]
 
-    def at(self, time: float) -> Felt | None:
-        """Return what the arm will feel of a torque computed at `time` (s), None if too few samples tell it."""
+    def at(self, time: float, shoulder_from_imu: Sequence[float] = (0.0, 0.0, 0.0)) -> Felt | None:
+        """Return what the arm will feel when a torque computed at `time` (s) acts, None if too few samples tell it.
+
+        shoulder_from_imu: (3,) m in the trunk's axes. Where the trunk turns, its places accelerate differently.
+        """
         lead = time - self._time + EFFECT
         if self._parabola is None or lead > WINDOW + EFFECT:
             return None
         lead = min(lead, MAX_LEAD)
         bend, slope, newest = self._parabola
-        x, y, z = (-(newest + lead * (slope + lead * bend))[:3]).tolist()
+        values = newest + lead * (slope + lead * bend)
+        force, turning, spin_up = values[:3], values[3:], (slope + 2.0 * lead * bend)[3:]
+        if any(shoulder_from_imu):
+            force = force + np.cross(spin_up, shoulder_from_imu)
+            force += np.cross(turning, np.cross(turning, shoulder_from_imu))
+        x, y, z = (-force).tolist()
         low, high = FELT_RANGE
         norm = math.hypot(x, y, z)
         share = max(low, min(high, norm)) / max(norm, 1e-9)
-        a, b, c = (slope + 2.0 * lead * bend)[3:].tolist()
+        a, b, c = spin_up.tolist()
         return Felt((share * x, share * y, share * z), (a, b, c))

@@ -79,3 +79,13 @@ def test_free_fall_and_blows_are_felt_only_within_a_range(force):
 def test_numbers_that_are_not_finite_are_refused():
     with pytest.raises(ParameterError):
         FeltMotion().add(0.0, (0.0, 0.0, math.nan), STILL)
+
+
+def test_the_shoulder_of_a_trunk_that_turns_accelerates_other_than_the_imu():
+    w, sway, lever = 2 * math.pi * 0.95, 0.3, (0.0, -0.2, 0.1)
+    felt = following(lambda t: (0.0, 0.0, G), lambda t: (sway * math.sin(w * t), 0.0, 0.0)).at(1.0, lever)
+    phase = w * (1.0 + EFFECT)
+    turning, spin_up = np.array((sway * math.sin(phase), 0, 0)), np.array((sway * w * math.cos(phase), 0, 0))
+    expected = (0, 0, -G) - np.cross(spin_up, lever) - np.cross(turning, np.cross(turning, lever))
+    np.testing.assert_allclose(felt.gravity, expected, atol=0.02)
+    assert np.linalg.norm(expected - (0, 0, -G)) > 0.3
