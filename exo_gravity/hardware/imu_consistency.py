@@ -4,7 +4,7 @@ The two must show the same turn of gravity over the last second. While a person 
 the movement, which shows in its length: the more that deviates from 1 g, the larger a turn must be to be compared. A
 sample is refused while the turns differ, or while only the gyroscope shows one (a gyroscope in deg/s). If that goes on,
 the estimate begins anew, and is used only after the two have agreed on a turn, or at rest. The limits were set on the
-trials of docs/imu.md, of whose samples they refuse 0.05 %.
+trials of docs/imu.md, of whose samples they refuse 0.04 %.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ NO_TURN = 0.1  # share of the gyroscope's turn; a gyroscope in deg/s turns 57 ti
 UNLIKE = 0.6  # share of the gyroscope's turn by which the two differ, with other axes or another sign
 ALIKE = 0.3
 AGREEMENT_TIME = 0.2  # s of like turns
-PATIENCE = 0.06  # s of unlike turns; like ones count against them. In good data it was up to 0.03 s
+PATIENCE = 0.06  # s of unlike turns; like ones count against them. In good data it was up to 0.04 s
 FORGET_TIME = 2.0  # s
 QUIET = 0.1  # share of 1 g
 SHORT_TIME = 0.012  # s; a movement can look like a contradiction for as long

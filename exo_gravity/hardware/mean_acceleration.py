@@ -19,6 +19,7 @@ OFFSET = 0.04  # share of 1 g: bias and scale of an accelerometer that was never
 WALK = 0.75 / STANDARD_GRAVITY  # s: m/s, per 1 g; 0.45 m/s is needed for an IMU swung in a circle by hand
 DIRECTION_TIME = 0.3  # s
 LEAST_TIME = 0.5  # s of samples
+MEAN = "mean linear_acceleration in the world"
 
 
 class MeanAcceleration:
@@ -48,4 +49,4 @@ class MeanAcceleration:
         if shift > limit:
             mean = [round(STANDARD_GRAVITY * component, 2) for component in (self._x, self._y, self._z)]
             expected = f"within {STANDARD_GRAVITY * limit:.2f} m/s^2 of gravity upwards: check units, axes and signs"
-            raise ParameterError("mean linear_acceleration in the world", mean, expected)
+            raise ParameterError(MEAN, mean, expected)

@@ -14,13 +14,14 @@ from exo_gravity.core.tilt import angle_between
 from exo_gravity.hardware.gravity_check import GravityCheck
 from exo_gravity.hardware.imu_consistency import ImuConsistency
 from exo_gravity.hardware.imu_sample import ImuSample, Ranges, three_floats
-from exo_gravity.hardware.mean_acceleration import MeanAcceleration
+from exo_gravity.hardware.mean_acceleration import MEAN, MeanAcceleration
 from exo_gravity.hardware.orientation_filter import OrientationFilter
 from exo_gravity.hardware.stuck_axis import StuckAxis
 from exo_gravity.hardware.tilt_uncertainty import TiltUncertainty
 
 REPORTED_SIGMA = math.radians(1.0)  # rad; data sheets of fused sensors state 1 to 2 degrees
 REPORTED_SETTLE_TIME = 1.0  # s of continuous samples before a reported orientation is used
+CHECK_PERIOD = 0.0055  # s between two comparisons of gyroscope and accelerometer
 LEVEL: Quaternion = (0.0, 0.0, 0.0, 1.0)
 MAX_REPORTED_RATE = 15.0  # rad/s; a reported orientation that turns faster has jumped: no trunk turns so fast
 MAX_JUMP = 0.01  # rad by which rounding may turn a reported orientation
@@ -69,6 +70,8 @@ class Fused:
         self._gravity = GravityCheck()
         self._last: Measured | None = None
         self._repeated = 0.0  # s for which the samples have been equal
+        self._contradiction: ParameterError | None = None  # by the last check
+        self._unchecked = CHECK_PERIOD  # s since then
         self._why = ""
 
     @property
@@ -98,6 +101,7 @@ class Fused:
         self._mean.restart()
         self._gravity.restart()
         self._last, self._why, self._repeated = None, why, 0.0
+        self._contradiction, self._unchecked = None, CHECK_PERIOD
 
     def advance(self, measured: Measured, dt: float) -> Quaternion:
         self._count_losses(measured, dt)
@@ -124,25 +128,36 @@ class Fused:
             self._uncertainty.saturate(dt)
 
     def _check(self, measured: Measured, dt: float, up: Floats3, in_world: Floats3) -> None:
-        """Raise ParameterError if gyroscope and accelerometer contradict each other, or an axis is stuck."""
+        """Raise ParameterError if an axis is stuck, or if gyroscope and accelerometer contradict each other."""
         assert measured.acceleration is not None
-        try:
-            self._consistency.update(dt, up, measured.acceleration, self._gravity.deviation)
-            if not measured.is_saturated:
+        if not measured.is_saturated:
+            try:
                 self._stuck.update(dt, up, measured.rate, measured.acceleration)
-        except ParameterError as error:
-            if self._stuck.is_stuck:
+            except ParameterError as error:
                 self._uncertainty.distrust(dt, measured.rate)
-            if self._consistency.is_broken or self._stuck.is_sure:
-                self._consistency.suspect()
-                self.restart(f"{error.name} must be {error.expected}")
-            raise
-        try:
-            self._mean.update(dt, in_world)
-        except ParameterError as error:
-            self._consistency.suspect()
-            self._why = f"{error.name} must be {error.expected}"
-            raise
+                if self._stuck.is_sure:
+                    self._doubt(error)
+                raise
+        self._unchecked += dt
+        if self._unchecked >= CHECK_PERIOD:
+            self._contradiction, dt, self._unchecked = None, self._unchecked, 0.0
+            try:
+                self._consistency.update(dt, up, measured.acceleration, self._gravity.deviation)
+                self._mean.update(dt, in_world)
+            except ParameterError as error:
+                self._contradiction = error
+                if self._consistency.is_broken:
+                    self._doubt(error)
+                elif error.name == MEAN:
+                    self._consistency.suspect()
+                    self._why = f"{error.name} must be {error.expected}"
+        if self._contradiction:
+            raise self._contradiction
+
+    def _doubt(self, error: ParameterError) -> None:
+        """Begin anew, and wait for gyroscope and accelerometer to agree."""
+        self._consistency.suspect()
+        self.restart(f"{error.name} must be {error.expected}")
 
 
 class Reported:

@@ -61,7 +61,7 @@ class StampCheck:
         rate = self._periods / self._age
         low, high = RATE_BOUNDS
         if not low <= rate * self._given <= high:
-            expected = f"about the {self._count / self._age:.0f} Hz of the stamps"
+            expected = f"about the {self._count / self._age:.0f} Hz of the stamps, unless a second IMU publishes"
             raise ParameterError("rate", round(1.0 / self._given, 1), expected)
         self._period, self._share, self._is_learning = 1.0 / rate, 1.0, False
 
