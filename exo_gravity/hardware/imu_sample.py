@@ -28,15 +28,13 @@ class ImuSample(NamedTuple):
 
     time: s, when it was taken, not when it arrived. angular_velocity: (3,) rad/s; acceleration: (3,) m/s^2, +9.8
     upward at rest (REP-145). orientation: (x, y, z, w), world from IMU, world z up. None marks what the IMU does not
-    report; without an orientation the other two are required. arrival: s on this computer's monotonic clock, by which
-    the clock of the stamps is checked; None leaves it unchecked.
+    report; without an orientation the other two are required.
     """
 
     time: float
     angular_velocity: Sequence[float] | None
     acceleration: Sequence[float] | None
     orientation: Sequence[float] | None = None
-    arrival: float | None = None
 
 
 class Ranges(NamedTuple):

@@ -1,12 +1,11 @@
 """The clock of the stamps: a slow one makes every turn too small; a second publisher halves the time between samples.
 
 A sensor's rate is steady. So after a start the time between two stamps must stay a multiple of what it has been, which
-must be near the given rate. And the stamps may not fall behind the arrivals, of which those count that came quickest.
+must be near the given rate. A clock that is a little slow from the start shows in the age of its stamps, by which the
+compensator withdraws.
 """
 
 from __future__ import annotations
-
-import math
 
 from exo_gravity.core.errors import ParameterError
 
@@ -15,9 +14,6 @@ RATE_BOUNDS = (0.85, 1.18)  # share of the given rate
 AVERAGE_TIME = 0.1  # s
 MAX_CHANGE = 0.03  # share by which the period may change
 JITTER = 1.5  # times the mean deviation of the periods that are further allowed
-MAX_DELAY = 0.03  # s by which stamps may fall behind
-DRIFT = 0.002  # s/s that is normal between a sensor's clock and a computer's
-WINDOW = 0.2  # s over which the shortest delay counts
 
 
 class StampCheck:
@@ -33,14 +29,9 @@ class StampCheck:
         self._is_learning = True
         self._share, self._jitter = 1.0, 0.0  # of the periods: mean, and mean deviation from it
         self._age, self._periods, self._count = 0.0, 0, 0  # s, periods and samples since the start
-        self._usual = self._shortest = math.inf  # s from stamp to arrival
-        self._window_end = -math.inf
-        self._growth = 0.0  # s by which the shortest delay exceeds the usual one
 
-    def check(self, time: float, dt: float, arrival: float | None) -> None:
+    def check(self, time: float, dt: float) -> None:
         """Check the stamp `time` (s), `dt` s after the last one. Raises ParameterError."""
-        if arrival is not None:
-            self._check_delay(time, arrival)
         periods = max(1, round(dt / self._period))
         share = dt / self._period / periods
         k = min(1.0, dt / AVERAGE_TIME)
@@ -64,15 +55,3 @@ class StampCheck:
             expected = f"about the {self._count / self._age:.0f} Hz of the stamps, unless a second IMU publishes"
             raise ParameterError("rate", round(1.0 / self._given, 1), expected)
         self._period, self._share, self._is_learning = 1.0 / rate, 1.0, False
-
-    def _check_delay(self, time: float, arrival: float) -> None:
-        """Raise ParameterError while the shortest delay of the last whole window has grown too much."""
-        if arrival >= self._window_end:
-            if self._shortest < math.inf:
-                self._usual = min(self._usual + DRIFT * WINDOW, self._shortest)
-                self._growth = self._shortest - self._usual
-            self._shortest, self._window_end = math.inf, arrival + WINDOW
-        self._shortest = min(self._shortest, arrival - time)
-        if self._growth > MAX_DELAY:
-            expected = f"within {MAX_DELAY:g} s of the arrival, as before: the IMU's clock is slow, or its driver lags"
-            raise ParameterError("stamp", round(time, 4), expected)

@@ -100,7 +100,7 @@ class TrunkEstimator:
             self._source, dt = source, 0.0
             self._stamps.restart()
         self._time = time
-        self._stamps.check(time, dt, sample.arrival)
+        self._stamps.check(time, dt)
         quaternion = source.advance(measured, dt)
         self.settling = source.settling
         up = up_in_body(quaternion)

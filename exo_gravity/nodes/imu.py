@@ -87,7 +87,7 @@ class ImuNode(Node):
             self._refused += 1
             return
         try:
-            orientation = self._estimator.update(sample_of(message)._replace(arrival=self._arrived))
+            orientation = self._estimator.update(sample_of(message))
         except ParameterError as error:
             self._refused += 1
             self._refusal, self._last_refusal = error, str(error)

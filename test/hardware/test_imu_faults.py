@@ -45,8 +45,7 @@ FAULTS = {
     "NaN": (values(without_a_number), "angular_velocity .* 3 finite numbers"),
     "a gyroscope in deg/s": (values(np.degrees), "check the gyroscope's unit|is it in deg/s"),
     "an accelerometer in g": (values(None, lambda a: a / G), "in m/s.2, not in g|check units, axes and signs"),
-    "a clock at half the speed": (slow_clock(0.5), "its clock has changed|clock is slow"),
-    "a clock 10 % slow": (slow_clock(0.9), "its clock has changed|clock is slow"),
+    "a clock at half the speed": (slow_clock(0.5), "its clock has changed|Hz of the stamps"),
     "a second publisher": (second_publisher, "a second IMU publishes|check units, axes and signs"),
     **{f"gyroscope {axis} stuck": (values(stuck(k)), f"the {axis} axis is stuck") for k, axis in enumerate("xyz")},
     **{
@@ -145,21 +144,14 @@ def test_a_range_that_no_sensor_has_is_refused(name, value):
         TrunkEstimator((0, 0, 0, 1), 100.0, **{name: value})
 
 
+def test_a_clock_that_becomes_10_percent_slow_is_named_within_a_fifth_of_a_second():
+    motion = slow_clock(0.9)(MOTION, 600)
+    outcome = follow(motion)
+    named = [k for k, text in enumerate(outcome.refusals) if "its clock has changed" in text]
+    assert named[0] < 620 and np.nanmax(outcome.errors) < 1.5
+
+
 def test_a_rate_that_the_stamps_contradict_is_refused_with_the_right_one():
     outcome = follow(Motion(**{**vars(MOTION), "rate": 60.0}))
     assert outcome.refusals[-1].startswith("rate = 60.0: must be about the 100 Hz of the stamps")
     assert np.isnan(outcome.errors).all()
-
-
-def test_a_clock_that_is_slow_from_the_start_is_told_by_the_arrivals():
-    motion = slow_clock(0.97)(MOTION, 0)
-    outcome = follow(motion)
-    first = next(k for k, text in enumerate(outcome.refusals) if text)
-    assert "the IMU's clock is slow, or its driver lags" in outcome.refusals[first]
-    assert motion.arrivals[first] - motion.arrivals[0] < 2.5
-
-
-def test_late_messages_alone_are_not_a_slow_clock():
-    late = 1000.0 + MOTION.times + np.random.default_rng(5).exponential(0.02, len(MOTION.times))
-    outcome = follow(Motion(**{**vars(MOTION), "arrivals": late}))
-    assert not any(outcome.refusals)

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 
-import imufusion
 import numpy as np
 import pytest
 import rclpy
@@ -17,7 +16,7 @@ from rclpy.executors import SingleThreadedExecutor
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 
-from exo_gravity.core.tilt import gravity_in_trunk
+from exo_gravity.hardware import ImuSample, TrunkEstimator
 from exo_gravity.nodes.conversions import to_nanoseconds, to_time
 
 from ..support.handheld_imu import read_recording
@@ -112,20 +111,23 @@ def imu(request, monkeypatch):
         imu.close()
 
 
-def test_every_sample_of_a_recording_gives_the_tilt_that_imufusion_alone_gives(imu):
-    time, gyroscope, accelerometer = read_recording()
-    ahrs, expected = imufusion.Ahrs(), {}
-    for stamp, dt, rate, acceleration in zip(time, np.diff(time, prepend=-0.01), gyroscope, accelerometer, strict=True):
-        ahrs.set_sample_period(dt)
-        ahrs.update_no_magnetometer(rate, acceleration)
-        if not ahrs.get_flags().startup:
-            expected[round(stamp * 1e9)] = -ahrs.get_gravity().astype(float)
-        imu.send(stamp, np.radians(rate), G * acceleration)
-    imu.wait_until(lambda: max(expected) in imu.tilts)
+def test_every_sample_of_a_recording_gives_the_tilt_of_the_estimator_with_its_covariance(imu):
+    messages = {}
+    imu.node.create_subscription(Imu, "/imu/data", lambda m: messages.update({to_nanoseconds(m.header.stamp): m}), 1000)
+    estimator, expected = TrunkEstimator(UPRIGHT), {}
+    for moment, rate, acceleration in zip(*(column[:3000] for column in read_recording()), strict=True):
+        stamp = round(moment * 1e9)
+        answer = estimator.update(ImuSample(stamp * 1e-9, np.radians(rate).tolist(), (G * acceleration).tolist()))
+        if answer is not None:
+            expected[stamp] = answer
+        imu.send(moment, np.radians(rate), G * acceleration)
+    imu.wait_until(lambda: max(expected) in imu.tilts and max(expected) in messages)
     assert imu.tilts.keys() == expected.keys()
-    given = np.array([gravity_in_trunk(tilt.y, tilt.x) for tilt in imu.tilts.values()])
-    error = np.linalg.norm(given - list(expected.values()), axis=1)
-    assert np.degrees(error.max()) < 0.1
+    for stamp, tilt in imu.tilts.items():
+        assert (tilt.y, tilt.x) == pytest.approx((expected[stamp].pitch, expected[stamp].roll), abs=1e-9)
+    for stamp, message in messages.items():
+        variance = expected[stamp].uncertainty ** 2
+        assert message.orientation_covariance == pytest.approx(np.diag((variance, variance, math.pi**2)).ravel())
 
 
 def test_a_nan_sample_is_refused_with_a_reason_and_gives_no_tilt(imu):

@@ -18,17 +18,13 @@ STILL_TIME = 3.0  # s at the start of each motion
 
 @dataclass(frozen=True)
 class Motion:
-    """Samples of an IMU in its own axes, (n, 3), and gravity's true direction there, (n, 3); times (n,) s.
-
-    arrivals: (n,) s, or None if the estimator is not told.
-    """
+    """Samples of an IMU in its own axes, (n, 3), and gravity's true direction there, (n, 3); times (n,) s."""
 
     rate: float
     times: np.ndarray
     gyroscope: np.ndarray
     accelerometer: np.ndarray
     gravity: np.ndarray
-    arrivals: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -61,14 +57,11 @@ def follow(motion: Motion) -> Outcome:
     """Feed the samples to an estimator."""
     estimator = TrunkEstimator((0.0, 0.0, 0.0, 1.0), motion.rate)
     answers, refusals = np.full(motion.gravity.shape, np.nan), []
-    arrivals = [None] * len(motion.times) if motion.arrivals is None else motion.arrivals.tolist()
-    samples = zip(
-        motion.times.tolist(), motion.gyroscope.tolist(), motion.accelerometer.tolist(), arrivals, strict=True
-    )
-    for k, (time, gyroscope, accelerometer, arrival) in enumerate(samples):
+    columns = (motion.times.tolist(), motion.gyroscope.tolist(), motion.accelerometer.tolist())
+    for k, sample in enumerate(zip(*columns, strict=True)):
         refusals.append("")
         try:
-            answer = estimator.update(ImuSample(time, gyroscope, accelerometer, None, arrival))
+            answer = estimator.update(ImuSample(*sample))
         except ParameterError as error:
             refusals[-1] = str(error)
             continue
@@ -107,12 +100,12 @@ def stuck(axis: int) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def slow_clock(share: float) -> Fault:
-    """Return the fault of stamps that advance by `share` of the time; the samples arrive in time."""
+    """Return the fault of stamps that advance by `share` of the time."""
 
     def apply(motion: Motion, first: int) -> Motion:
         times = motion.times.copy()
         times[first:] = times[first] + share * (times[first:] - times[first])
-        return replace(motion, times=times, arrivals=1000.0 + motion.times)
+        return replace(motion, times=times)
 
     return apply
 
