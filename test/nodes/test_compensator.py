@@ -15,7 +15,7 @@ import rclpy
 import yaml
 from geometry_msgs.msg import Vector3Stamped
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import Imu, JointState
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.compensator import LONGEST_STEP
@@ -91,12 +91,15 @@ def test_a_thousand_valid_and_invalid_changes_neither_step_the_torque_nor_stop_t
 class TiltFeeder:
     """Publishes every 10 ms, from a thread, the tilt of a trunk that bows by `bow` rad.
 
-    lag: age of the stamps in s. speed: rad/s at which the bow grows, up to 180 degrees.
+    lag: age of the stamps in s. speed: rad/s at which the bow grows, up to 180 degrees. vector_bow: rad, of which
+    gravity's vector is published too; None for none.
     """
 
     def __init__(self, node: Any, bow: float) -> None:
         self.bow = bow
         self.lag = self.speed = 0.0
+        self.vector_bow: float | None = None
+        self._vectors = node.create_publisher(Imu, "/imu/data", 1)
         self._publisher = node.create_publisher(Vector3Stamped, "/imu/pitch_yaw", 1)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._publish)
@@ -113,6 +116,14 @@ class TiltFeeder:
             message.vector.y = math.pi - self.bow if flipped else self.bow
             message.vector.x = math.pi if flipped else 0.0
             self._publisher.publish(message)
+            if self.vector_bow is not None:
+                self._publish_vector(message.header.stamp, self.vector_bow)
+
+    def _publish_vector(self, stamp: Any, bow: float) -> None:
+        message = Imu()
+        message.header.stamp = stamp
+        message.orientation.y, message.orientation.w = math.sin(bow / 2.0), math.cos(bow / 2.0)
+        self._vectors.publish(message)
 
     def close(self) -> None:
         self._stopping.set()
@@ -143,6 +154,22 @@ def test_a_tilt_is_believed_by_its_stamp_and_not_by_its_arrival(launch, probe, f
         assert not commands[-1].effort
         tilt.lag = 0.0
         probe.wait_until(lambda: probe.status_contains("compensator", "compensating"))
+
+
+def test_gravitys_vector_goes_before_pitch_and_roll_which_count_again_when_it_ends(launch, probe, feed, tilt):
+    launch(without=OTHER_NODES)
+    feed()
+    by_angles, by_vector = (gravity_torque(ROBOT, POSE, Tilt.of("right", bow).direction) for bow in (0.3, 0.36))
+    commands = probe.effort_commands
+
+    def is_compensated(expected):
+        return commands and commands[-1].effort and np.allclose(commands[-1].effort, expected, atol=1e-9)
+
+    probe.wait_until(lambda: is_compensated(by_angles))
+    tilt.vector_bow = 0.36
+    probe.wait_until(lambda: is_compensated(by_vector))
+    tilt.vector_bow = None
+    probe.wait_until(lambda: is_compensated(by_angles))
 
 
 def test_a_trunk_that_bows_past_90_degrees_stays_compensated(launch, probe, feed, tilt):
