@@ -21,6 +21,7 @@ from exo_gravity.core.felt_motion import FeltMotion
 from exo_gravity.core.gravity import LAWS, Law, Torque
 from exo_gravity.core.limits import MAX_COMMAND
 from exo_gravity.core.param_table import check_owned, owned
+from exo_gravity.core.quaternion import Floats3
 from exo_gravity.core.tilt import SIDES, Tilt
 from exo_gravity.core.tilt_input import STILL, TiltInput
 from exo_gravity.core.turning import turning_torque
@@ -65,7 +66,7 @@ class Settings:
     transition_time: float = owned(1.0, "time over which a change of mass, mode or law takes effect", (0.2, 30.0), "s")
     tilt_timeout: float = owned(0.08, "age of the trunk tilt at which the efforts are withdrawn", (0.01, 0.5), "s")
     inertial: bool = owned(False, "also compensate the trunk's acceleration, as its IMU measures it")
-    shoulder_from_imu: Sequence[float] = STILL
+    shoulder_from_imu: Floats3 = STILL
     use_imu: bool = True
     anfis: AnfisLaw | None = None
     arm: ArmModel = field(init=False)

@@ -18,6 +18,7 @@ import numpy as np
 from exo_gravity.core.arm import STANDARD_GRAVITY
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.quaternion import Floats3
+from exo_gravity.core.vector3 import acceleration_of, plus
 
 WINDOW = 0.045  # s; the samples that the parabola fits, 5 at 100 Hz
 MIN_SAMPLES = 4  # that it fits at a lower rate, or after losses, if
@@ -63,7 +64,7 @@ class FeltMotion:
             times = np.array([taken - time for taken, _ in self._samples])
             self._parabola = np.linalg.lstsq(np.vander(times, 3), [row for _, row in self._samples], rcond=None)[0]
 
-    def at(self, time: float, shoulder_from_imu: Sequence[float] = (0.0, 0.0, 0.0)) -> Felt | None:
+    def at(self, time: float, shoulder_from_imu: Floats3 = (0.0, 0.0, 0.0)) -> Felt | None:
         """Return what the arm will feel when a torque computed at `time` (s) acts, None if too few samples tell it.
 
         shoulder_from_imu: (3,) m in the trunk's axes. Where the trunk turns, its places accelerate differently.
@@ -74,13 +75,10 @@ class FeltMotion:
         lead = min(lead, MAX_LEAD)
         bend, slope, newest = self._parabola
         values = newest + lead * (slope + lead * bend)
-        force, turning, spin_up = values[:3], values[3:], (slope + 2.0 * lead * bend)[3:]
-        if any(shoulder_from_imu):
-            force = force + np.cross(spin_up, shoulder_from_imu)
-            force += np.cross(turning, np.cross(turning, shoulder_from_imu))
-        x, y, z = (-force).tolist()
+        a, b, c = (slope + 2.0 * lead * bend)[3:].tolist()
+        x, y, z, *turning = values.tolist()
+        x, y, z = plus((x, y, z), acceleration_of(shoulder_from_imu, (turning[0], turning[1], turning[2]), (a, b, c)))
         low, high = FELT_RANGE
         norm = math.hypot(x, y, z)
         share = max(low, min(high, norm)) / max(norm, 1e-9)
-        a, b, c = spin_up.tolist()
-        return Felt((share * x, share * y, share * z), (a, b, c))
+        return Felt((-share * x, -share * y, -share * z), (a, b, c))

@@ -13,6 +13,7 @@ from functools import lru_cache
 
 from exo_gravity.core.arm import ArmModel
 from exo_gravity.core.quaternion import Floats3
+from exo_gravity.core.vector3 import cross, dot, plus
 
 Link = tuple[float, float, float]  # length m, centre of gravity m, mass kg
 
@@ -33,13 +34,13 @@ def turning_torque(
     for (length, cog, mass), (origin, axis, along), gain in zip(
         _links(arm)[::-1], _frames(arm, theta)[::-1], arm.gain.tolist()[::-1], strict=True
     ):
-        place = _plus(origin, along, cog)
-        push = _cross(alpha, place)
-        force = _plus(force, push, mass)
-        moment = _plus(moment, _cross(place, push), mass)
-        spin = _plus(alpha, along, -_dot(along, alpha))
-        moment = _plus(moment, spin, mass * length**2 / 12.0)
-        torque.append(gain * _dot(axis, _plus(moment, _cross(origin, force), -1.0)))
+        place = plus(origin, along, cog)
+        push = cross(alpha, place)
+        force = plus(force, push, mass)
+        moment = plus(moment, cross(place, push), mass)
+        spin = plus(alpha, along, -dot(along, alpha))
+        moment = plus(moment, spin, mass * length**2 / 12.0)
+        torque.append(gain * dot(axis, plus(moment, cross(origin, force), -1.0)))
     return tuple(torque[::-1])
 
 
@@ -67,26 +68,13 @@ def _frames(arm: ArmModel, theta: Sequence[float]) -> list[tuple[Floats3, Floats
     swing: Floats3 = (-s1, c1, 0.0)  # the axis of joint 2
     second: Floats3 = (s2 * c1, s2 * s1, c2)
     bend: Floats3 = (-c2 * c1, -c2 * s1, s2)  # the axis of joints 3 and 4
-    third = _plus(_plus((0.0, 0.0, 0.0), second, math.cos(t3)), swing, math.sin(t3))
-    fourth = _plus(_plus((0.0, 0.0, 0.0), second, math.cos(t3 + t4)), swing, math.sin(t3 + t4))
-    shoulder = _plus((0.0, 0.0, 0.0), first, l1)
-    flexion = _plus(shoulder, second, l2)
+    third = plus(plus((0.0, 0.0, 0.0), second, math.cos(t3)), swing, math.sin(t3))
+    fourth = plus(plus((0.0, 0.0, 0.0), second, math.cos(t3 + t4)), swing, math.sin(t3 + t4))
+    shoulder = plus((0.0, 0.0, 0.0), first, l1)
+    flexion = plus(shoulder, second, l2)
     return [
         ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), first),
         (shoulder, swing, second),
         (flexion, bend, third),
-        (_plus(flexion, third, l3), bend, fourth),
+        (plus(flexion, third, l3), bend, fourth),
     ]
-
-
-def _plus(a: Floats3, b: Floats3, times: float) -> Floats3:
-    """Return a + times b."""
-    return a[0] + times * b[0], a[1] + times * b[1], a[2] + times * b[2]
-
-
-def _dot(a: Floats3, b: Floats3) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _cross(a: Floats3, b: Floats3) -> Floats3:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

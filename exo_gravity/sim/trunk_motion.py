@@ -13,6 +13,7 @@ from typing import NamedTuple, Protocol
 
 from exo_gravity.core.arm import STANDARD_GRAVITY
 from exo_gravity.core.trial_script import Step
+from exo_gravity.core.vector3 import acceleration_of
 
 Vector = tuple[float, float, float]
 NONE: Vector = (0.0, 0.0, 0.0)
@@ -72,10 +73,8 @@ class Turn:
         pitch_rate, roll_rate = (angle * pace / self.duration for angle in by)
         bow, lean = (angle * change / self.duration**2 for angle in by)
         state = TrunkState(self.start[0] + way * by[0], self.start[1] + way * by[1], pitch_rate, roll_rate, bow, lean)
-        turning, spin = state.angular_acceleration, state.angular_velocity
-        inward = _cross(spin, _cross(spin, HIP_TO_SHOULDER))
-        a, b, c = _cross(turning, HIP_TO_SHOULDER)
-        return state._replace(acceleration=(a + inward[0], b + inward[1], c + inward[2]))
+        turning, spin_up = state.angular_velocity, state.angular_acceleration
+        return state._replace(acceleration=acceleration_of(HIP_TO_SHOULDER, turning, spin_up))
 
 
 @dataclass(frozen=True)
@@ -175,7 +174,3 @@ def _in_trunk(level: Vector, pitch: float, roll: float) -> Vector:
     ahead, left, up = level
     x, z = ahead * math.cos(pitch) - up * math.sin(pitch), ahead * math.sin(pitch) + up * math.cos(pitch)
     return x, left * math.cos(roll) + z * math.sin(roll), z * math.cos(roll) - left * math.sin(roll)
-
-
-def _cross(a: Vector, b: Vector) -> Vector:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
