@@ -2,9 +2,8 @@
 
 The two must show the same turn of gravity over the last second. While a person moves, the accelerometer also measures
 the movement, which shows in its length: the more that deviates from 1 g, the larger a turn must be to be compared. A
-sample is refused while the turns differ, or while only the gyroscope shows one (a gyroscope in deg/s). If that goes on,
-the estimate begins anew, and is used only after the two have agreed on a turn, or at rest. The limits were set on the
-trials of docs/imu.md, of whose samples they refuse 0.04 %.
+sample is refused while the turns differ. If that goes on, the estimate begins anew, and is used only after the two have
+agreed on a turn, or at rest. The limits were set on the trials of docs/imu.md, of whose samples they refuse 0.05 %.
 """
 
 from __future__ import annotations
@@ -17,13 +16,11 @@ from exo_gravity.core.quaternion import Floats3
 TURN_TIME = 1.0  # s over which the two turns are compared
 CLEAR_TURN = 0.04  # of a unit vector: 2.3 degrees
 CLEAR = 6.0  # times the deviation from 1 g, that a turn must also exceed
-NO_TURN = 0.1  # share of the gyroscope's turn; a gyroscope in deg/s turns 57 times as far as the accelerometer
 UNLIKE = 0.6  # share of the gyroscope's turn by which the two differ, with other axes or another sign
 ALIKE = 0.3
 AGREEMENT_TIME = 0.2  # s of like turns
 PATIENCE = 0.06  # s of unlike turns; like ones count against them. In good data it was up to 0.04 s
 FORGET_TIME = 2.0  # s
-QUIET = 0.1  # share of 1 g
 SHORT_TIME = 0.012  # s; a movement can look like a contradiction for as long
 AT_REST, REST_TIME = 0.03, 3.0  # share of 1 g; s: at rest the estimate is right whatever the gyroscope measures
 
@@ -81,8 +78,7 @@ class ImuConsistency:
             self._agreed += dt
             self._unlike = max(0.0, self._unlike - 2.0 * dt)
             self.is_suspect = self.is_suspect and self._agreed < AGREEMENT_TIME
-        has_no_turn = deviation < QUIET and math.hypot(*measured_turn) < NO_TURN * size
-        if not has_no_turn and not (is_clear and unlike > UNLIKE * size):
+        if not (is_clear and unlike > UNLIKE * size):
             self._run = 0.0
             return
         self._run += dt
