@@ -5,7 +5,8 @@ One standard deviation of the tilt is the root of the sum of the squares of
     BIAS_TIME * s_b                   gyroscope bias not yet learnt: its standard deviation s_b, over VQF's 3 s window
     v / (g T)                         start: T s after it, the mean acceleration is wrong by a change of speed v over T,
                                       which is the deviation of the acceleration times CORRELATION_TIME
-    a t^2 / 8                         a gap of t s: rates interpolated, while the rotation accelerated by a, as of late
+    a t^2 n / 30                      a gap of t s or n periods, 5 at most: rates interpolated, while the rotation
+                                      accelerated by a, as of late; measured on the same trials
     OVERSHOOT * range * t             t s of saturation: the true rate exceeded the range by this share
     a t^2 / 2                         t s of repeated samples: the rate may have changed since
     w t                               t s at a rate w, of which an axis is stuck
@@ -34,6 +35,7 @@ OVERSHOOT = 0.25
 JUMP = math.radians(2.0)  # a sample; in good data a knock made 1.4 degrees
 UNUSUAL = 8.0  # times the angular acceleration of late
 GAP = 1.5  # periods
+LONG_GAP, GAP_DIVISOR = 5.0, 30.0
 
 
 class TiltUncertainty:
@@ -74,7 +76,8 @@ class TiltUncertainty:
         self._age += dt
         self._lost *= max(0.0, 1.0 - 2.0 * dt / DECAY_TIME)
         if dt > GAP * self._period:
-            self._lost += max(LEAST_ACCELERATION**2, self._square) * (dt * dt / 8.0) ** 2
+            share = min(dt / self._period, LONG_GAP) / GAP_DIVISOR
+            self._lost += max(LEAST_ACCELERATION**2, self._square) * (share * dt * dt) ** 2
         elif dt > 0.0:
             change = math.dist(rate, last_rate)
             acceleration = change / max(dt, 0.5 * self._period)

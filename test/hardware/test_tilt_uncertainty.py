@@ -47,7 +47,13 @@ def test_saturated_samples_add_up_over_a_run():
 def test_a_gap_adds_by_its_square_and_the_angular_acceleration_of_late(acceleration, assumed):
     uncertainty = settled(acceleration)
     uncertainty.advance(0.05, STILL, STILL)
-    assert added(uncertainty) == pytest.approx(assumed * 0.05**2 / 8, rel=0.05)
+    assert added(uncertainty) == pytest.approx(assumed * 0.05**2 / 6, rel=0.05)
+
+
+def test_one_lost_sample_adds_less_than_a_long_gap():
+    uncertainty = settled(acceleration=100.0)
+    uncertainty.advance(0.02, STILL, STILL)
+    assert added(uncertainty) == pytest.approx(100.0 * 0.02**2 / 15, rel=0.05)
 
 
 def test_repeated_samples_add_by_the_square_of_their_time():
