@@ -64,10 +64,14 @@ LAWS = (
 
 
 class Result(NamedTuple):
-    """time: s since the motion began. moved: degrees, of the joint that is farthest away. trouble: '' or the fault."""
+    """Samples since the motion began: time in s, and how far the farthest joint has moved in degrees.
+
+    command: (n, 4) Nm. trouble: '' or the fault.
+    """
 
     time: np.ndarray
     moved: np.ndarray
+    command: np.ndarray
     trouble: str
 
     @property
@@ -95,7 +99,8 @@ def simulate(
     start, end = recording.steps[2].start, min(recording.steps[-1].end, (recording.carried or ((0.0, 0.0),))[-1][1])
     during = (recording.time >= start) & (recording.time <= end)
     position = np.degrees(recording.position[during])
-    return Result(recording.time[during] - start, np.abs(position - position[0]).max(axis=1), trial.trouble)
+    moved = np.abs(position - position[0]).max(axis=1)
+    return Result(recording.time[during] - start, moved, recording.command[during], trial.trouble)
 
 
 def worst(law: Law, motion: str, friction: tuple[float, ...]) -> Result:
