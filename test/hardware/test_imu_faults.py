@@ -12,6 +12,7 @@ import re
 import numpy as np
 import pytest
 
+from bench.imu_trials import read_trials
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.hardware import ImuSample, TrunkEstimator
 
@@ -125,6 +126,30 @@ def test_an_uncertain_estimate_comes_back_without_a_jump():
     outcome = follow(saturated(0.05))
     back = np.flatnonzero(np.isfinite(outcome.errors) & (MOTION.times > 5.05))
     assert outcome.errors[back[0]] < 3.0 and np.abs(np.diff(outcome.errors[back])).max() < 0.5
+
+
+def test_a_knock_beyond_the_range_is_followed_by_the_new_tilt_after_a_second_of_rest():
+    estimator, random = TrunkEstimator((0, 0, 0, 1)), np.random.default_rng(8)
+
+    def feed(start, seconds, up, rate=(0.0, 0.0, 0.0)):
+        for k in range(round(100 * seconds)):
+            noise = random.normal(0.0, 0.002, 6)
+            yield start + k / 100, estimator.update(ImuSample(start + k / 100, rate + noise[:3], G * up + noise[3:]))
+
+    list(feed(0.0, 3.0, np.array((0.0, 0.0, 1.0))))
+    turned = np.array((0.0, math.sin(1.0), math.cos(1.0)))  # the true turn: 1 rad; the saturated rate shows 1.4
+    knock = list(feed(3.0, 0.04, turned, (math.radians(2000.0), 0.0, 0.0)))
+    after = [(time, answer) for time, answer in feed(3.04, 4.0, turned) if answer is not None]
+    assert knock[-1][1] is None and after[0][0] < 4.5
+    assert all(answer.roll == pytest.approx(1.0, abs=0.02) for _, answer in after)
+
+
+@pytest.mark.parametrize(("name", "start"), [("03", 11.77), ("07", 6.0), ("16", 13.99), ("25", 8.44)])
+def test_in_strong_motion_a_frozen_imu_is_withheld_before_the_tilt_is_wrong(name, start):
+    trial = next(trial for trial in read_trials() if trial.name.startswith(name))
+    motion = Motion(trial.rate, trial.times, trial.angular_velocity, trial.acceleration, trial.gravity)
+    outcome = follow(FAULTS["frozen bytes"][0](motion, int(start * motion.rate)))
+    assert wrong_time(motion, outcome) == 0.0
 
 
 def test_values_beyond_the_given_ranges_are_refused_and_at_the_range_accepted():
