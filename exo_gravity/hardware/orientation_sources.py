@@ -6,7 +6,7 @@ Both check a sample first, which changes nothing, and then advance by it.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.quaternion import Floats3, Quaternion, rotated, unit_quaternion, up_in_body
@@ -36,27 +36,6 @@ class Measured(NamedTuple):
     is_saturated: bool = False
 
 
-class OrientationSource(Protocol):
-    """sigma: standard deviation of the tilt, rad. settling: why the orientation cannot be used yet, '' if it can."""
-
-    bias: Floats3  # of the gyroscope, rad/s in the IMU's axes
-
-    @property
-    def sigma(self) -> float: ...
-
-    @property
-    def settling(self) -> str: ...
-
-    def check(self, sample: ImuSample) -> Measured:
-        """Return the checked sample; raises ParameterError if it is impossible."""
-
-    def restart(self, why: str) -> None:
-        """Begin anew with the next sample."""
-
-    def advance(self, measured: Measured, dt: float) -> Quaternion:
-        """Return the orientation, world from IMU, `dt` s after the last sample; 0 for the first one."""
-
-
 class Fused:
     """Orientation by VQF."""
 
@@ -76,25 +55,30 @@ class Fused:
 
     @property
     def bias(self) -> Floats3:
+        """The gyroscope's bias, rad/s in the IMU's axes."""
         return self._filter.bias
 
     @property
     def sigma(self) -> float:
+        """Standard deviation of the tilt, rad."""
         return self._uncertainty.sigma
 
     @property
     def settling(self) -> str:
+        """Why the orientation cannot be used yet; '' if it can."""
         if self._consistency.is_suspect:
             return f"until gyroscope and accelerometer agree on a turn of the trunk; {self._why}"
         return "" if self._uncertainty.is_settled else self._why
 
     def check(self, sample: ImuSample) -> Measured:
+        """Return the checked sample; raises ParameterError if it is impossible."""
         rate, is_saturated = self._ranges.angular_velocity(sample.angular_velocity)
         last = self._last.acceleration if self._last else None
         acceleration, is_clipped = self._ranges.acceleration(sample.acceleration, last)
         return Measured(rate, None if is_clipped else acceleration, LEVEL, is_saturated)
 
     def restart(self, why: str) -> None:
+        """Begin anew with the next sample."""
         self._filter.restart()
         self._uncertainty.restart()
         self._consistency.restart()
@@ -104,6 +88,10 @@ class Fused:
         self._contradiction, self._unchecked = None, CHECK_PERIOD
 
     def advance(self, measured: Measured, dt: float) -> Quaternion:
+        """Return the orientation, world from IMU, `dt` s after the last sample; 0 for the first one.
+
+        Raises ParameterError if the sample contradicts itself or those before it.
+        """
         self._count_losses(measured, dt)
         if self._uncertainty.is_lost:
             self.restart("too much rotation was not measured")
@@ -174,19 +162,26 @@ class Reported:
 
     @property
     def settling(self) -> str:
+        """Why the orientation cannot be used yet; '' if it can."""
         return "" if self._age >= REPORTED_SETTLE_TIME else self._why
 
     def check(self, sample: ImuSample) -> Measured:
+        """Return the checked sample; raises ParameterError if it is impossible."""
         rate, acceleration = sample.angular_velocity, sample.acceleration
         rate = (0.0, 0.0, 0.0) if rate is None else three_floats("angular_velocity", rate)
         acceleration = None if acceleration is None else three_floats("linear_acceleration", acceleration)
         return Measured(rate, acceleration, unit_quaternion("orientation", sample.orientation))
 
     def restart(self, why: str) -> None:
+        """Begin anew with the next sample."""
         self._age, self._up, self._why = 0.0, None, why
         self._gravity.restart()
 
     def advance(self, measured: Measured, dt: float) -> Quaternion:
+        """Return the orientation, world from IMU, `dt` s after the last sample; 0 for the first one.
+
+        Raises ParameterError if the sample contradicts itself or those before it.
+        """
         self._age += dt
         quaternion = measured.orientation
         up = up_in_body(quaternion)

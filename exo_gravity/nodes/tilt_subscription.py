@@ -27,11 +27,13 @@ NOT_REPORTED = -1.0  # first entry of a covariance (REP-145)
 class TiltTarget(Protocol):
     """What is told the tilt: a `core.tilt_input.TiltInput`, or a compensator."""
 
-    def set_tilt(self, now: float, pitch: float, roll: float, age: float = 0.0) -> None: ...
+    def set_tilt(self, now: float, pitch: float, roll: float, age: float = 0.0) -> None:
+        """Set pitch and roll."""
 
     def set_gravity(
         self, now: float, gravity: Sequence[float], angular_velocity: Sequence[float] = STILL, age: float = 0.0
-    ) -> None: ...
+    ) -> None:
+        """Set gravity's direction."""
 
 
 class TiltSubscription:
