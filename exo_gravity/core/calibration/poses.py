@@ -113,10 +113,11 @@ class BestPoses:
     def _is_holdable(
         self, poses: np.ndarray, start: np.ndarray, guess: TorqueGuess, friction: Sequence[float]
     ) -> np.ndarray:
-        """Return which poses (n,) the motors can hold, and reach from `start`."""
+        """Return which poses (n,) the motors can hold, reach from `start`, and leave for the hanging arm."""
         shares = np.linspace(0.0, 1.0, WAYPOINTS + 1)[1:, None, None]
-        ways = start + shares * (poses - start)
-        return holdable(ways.reshape(-1, JOINT_COUNT), self.limits, guess, friction).reshape(WAYPOINTS, -1).all(axis=0)
+        ways = np.concatenate([end + shares * (poses - end) for end in (start, np.array(self.limits.home))])
+        can = holdable(ways.reshape(-1, JOINT_COUNT), self.limits, guess, friction)
+        return np.asarray(can.reshape(2 * WAYPOINTS, -1).all(axis=0))
 
 
 def candidates(limits: Limits, seed: int = 1) -> np.ndarray:

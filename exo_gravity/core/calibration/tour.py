@@ -189,7 +189,7 @@ class Tour:
         self._masses = self._mass_matrix()
 
     def _mass_matrix(self) -> MassMatrix:
-        return MassMatrix(self._guess.length, self._guess.common_moments[:JOINT_COUNT])
+        return MassMatrix(self._guess.length, self._guess.common_moments[:JOINT_COUNT], self._load)
 
     def _slope(self, station: Station) -> np.ndarray:
         """Return how the expected torque changes with the angles at a station, (4, 4) Nm/rad."""
