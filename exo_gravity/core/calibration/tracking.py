@@ -20,6 +20,9 @@ REACH = (0.8, 0.8, 0.8, 0.6)  # of a link's length, at which its mass is assumed
 FREQUENCY_PER_RATE = 0.12  # natural frequency in rad/s per control cycle per s; two cycles of delay cost 27 degrees
 MAX_FREQUENCY = 20.0  # rad/s
 INTEGRAL_SHARE = 0.4  # of the frequency, at which the integral part acts; unstable from 2 on
+# Times the smallest inertia in any direction, that the integral part adds in all. Without it, two joints that stick on
+# opposite sides of their path would cancel each other's integral where the inertia of both together is small.
+FLOOR = 2.0
 USUAL_FRICTION = 0.15  # Nm, until it is measured
 # Of the friction, per s, by which its compensation changes: a joint that rests anywhere within its friction would jump.
 FRICTION_RATE = 6.0
@@ -104,7 +107,8 @@ class Tracker:
         frequency = self._frequency
         stiff = matrix @ error * frequency**2
         push = stiff + matrix @ speed_error * 2.0 * frequency
-        integral = self._integral + INTEGRAL_SHARE * frequency * dt * stiff
+        weakest = float(np.linalg.eigvalsh(matrix)[0])
+        integral = self._integral + INTEGRAL_SHARE * frequency * dt * (stiff + FLOOR * weakest * error * frequency**2)
         self._compensate_friction(dt, error, speed_error, heading)
         torque = expected + self._slide + push + integral
         is_saturated = np.abs(torque) > self._max_effort
