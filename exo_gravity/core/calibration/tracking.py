@@ -108,8 +108,9 @@ class Tracker:
         stiff = matrix @ error * frequency**2
         push = stiff + matrix @ speed_error * 2.0 * frequency
         weakest = float(np.linalg.eigvalsh(matrix)[0])
-        integral = self._integral + INTEGRAL_SHARE * frequency * dt * (stiff + FLOOR * weakest * error * frequency**2)
-        self._compensate_friction(dt, error, speed_error, heading)
+        growth = INTEGRAL_SHARE * frequency * dt * (stiff + FLOOR * weakest * error * frequency**2)
+        is_turning = self._compensate_friction(dt, error, speed_error, heading)
+        integral = self._integral + np.where(is_turning, 0.0, growth)
         torque = expected + self._slide + push + integral
         is_saturated = np.abs(torque) > self._max_effort
         self.saturated = np.where(is_saturated, self.saturated + dt, 0.0)
@@ -118,10 +119,18 @@ class Tracker:
         self.correction = push + self._integral
         return tuple(np.clip(torque, -self._max_effort, self._max_effort).tolist())
 
-    def _compensate_friction(self, dt: float, error: np.ndarray, speed_error: np.ndarray, heading: np.ndarray) -> None:
+    def _compensate_friction(
+        self, dt: float, error: np.ndarray, speed_error: np.ndarray, heading: np.ndarray
+    ) -> np.ndarray:
+        """Move the compensation towards the heading; return which joints (4,) still lack some of it.
+
+        Their integral part would learn the lack, and push too far afterwards.
+        """
         step = FRICTION_RATE * self.friction * dt
         wanted = self.friction * np.clip(heading / FULL_FRICTION_SPEED, -1.0, 1.0)
         change = np.clip(wanted - self._slide, -step, step)
         way = np.sign(heading)
         is_ahead = (error * way < -AHEAD) | (speed_error * way < -FASTER)
-        self._slide += np.where(is_ahead & (change * way > 0.0), 0.0, change)
+        waits = is_ahead & (change * way > 0.0)
+        self._slide += np.where(waits, 0.0, change)
+        return np.asarray(~waits & (np.abs(wanted - self._slide) > step))
