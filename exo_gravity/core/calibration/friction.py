@@ -62,7 +62,8 @@ def fit_friction(speed: np.ndarray, torque: np.ndarray) -> Friction:
     if len(np.unique(speed)) < 3:
         raise DataError(f"friction was measured at {len(np.unique(speed))} speeds, must be at least 3")
     if speed.max() < LEAST_RATIO * speed.min():
-        raise DataError(f"friction was measured from {speed.min():.2f} to {speed.max():.2f} rad/s, must be 1 to 2 or more")
+        measured = f"from {speed.min():.2f} to {speed.max():.2f} rad/s"
+        raise DataError(f"friction was measured {measured}, the fastest must be {LEAST_RATIO:g} times the slowest")
     best = _fit(speed, torque, 1.0, with_stribeck=False)
     if len(np.unique(speed)) > 3:
         fits = [_fit(speed, torque, float(own), with_stribeck=True) for own in STRIBECK_SPEEDS]
