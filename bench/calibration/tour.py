@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import random
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,7 +26,7 @@ from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.motors import ENTER, EXIT
 from exo_gravity.core.safety import SafetyMachine
 from exo_gravity.core.tilt import Tilt
-from exo_gravity.sim import SimulatedDevice, SimulatedMotor
+from exo_gravity.sim import SimulatedDevice
 from exo_gravity.sim.device_params import SIMULATOR, device_of, imu_of
 from exo_gravity.sim.imu import SimulatedImu, measured_tilt
 from exo_gravity.tools.calibration.live import LiveTour
@@ -36,25 +35,6 @@ from exo_gravity.tools.inputs.parameter_file import load
 
 LONGEST = 420.0  # s
 HANDS, SINKING = 1.0, 5.0  # Nm s/rad of the hands that let the arm hang, and s that it takes
-TORQUE_NOISE = 0.02  # of the torque that a motor gives, from one command to the next
-
-
-class NoisyMotor(SimulatedMotor):
-    """A motor whose torque differs a little with each command."""
-
-    def __init__(self, motor: SimulatedMotor, seed: int) -> None:
-        super().__init__(motor.joint, motor.firmware)
-        self._noise = random.Random(seed)
-        self._share = 1.0
-
-    def receive(self, data: bytes, position: float, velocity: float, now: float) -> bytes | None:
-        """Execute the frame `data`, with another error of the torque than before."""
-        self._share = self._noise.gauss(1.0, TORQUE_NOISE)
-        return super().receive(data, position, velocity, now)
-
-    def torque(self, position: float, velocity: float) -> float:
-        """Return the torque in Nm on the joint."""
-        return self._share * super().torque(position, velocity)
 
 
 @dataclass
@@ -127,7 +107,6 @@ def player_of(nodes: Mapping[str, Any], path: Path, namespace: str = "/right") -
     bridge = node_values(content, f"{namespace}/can_bridge", CAN_BRIDGE)
     simulator = node_values(content, f"{namespace}/simulator", SIMULATOR)
     device = device_of(simulator)
-    device.motors = tuple(NoisyMotor(motor, index) for index, motor in enumerate(device.motors))
     _let_hang(device)
     imu = SimulatedImu(imu_of(simulator))
     tilt = measured_tilt(device.pitch, device.roll, imu, content["/imu"]["rotation_trunk_from_imu"])
