@@ -129,7 +129,8 @@ def untold(unknowns: np.ndarray, error: np.ndarray, hidden: np.ndarray, relative
         said.append(
             f"The weight at the elbow speaks for joint 3's zero being {elbow:+.1f} +- {elbow_error:.1f} degrees off."
         )
-    tilt, tilt_error = (float(np.degrees(np.linalg.norm(vector[TILT]))) for vector in (unknowns, error))
-    if tilt > max(3.0 * tilt_error / math.sqrt(3.0), LEAST_TILT):
+    tilt = math.degrees(float(np.linalg.norm(unknowns[TILT])))
+    tilt_error = math.degrees(math.hypot(*np.sort(error[TILT])[:2]))  # a turn about gravity does not show
+    if tilt > max(3.0 * tilt_error, LEAST_TILT):
         said.append(f"Gravity seems {tilt:.1f} degrees off what the IMU says: check rotation_trunk_from_imu.")
     return tuple(said)
