@@ -167,12 +167,18 @@ def _hand(device: Device, rng: np.random.Generator, rest: np.ndarray) -> Hand:
 
 
 def _creep(params: Path) -> float:
-    """Return the creep in deg/min of the arm of `params`, let go on a trunk that is tilted otherwise than the stand."""
+    """Return the creep in deg/min of the arm of `params`, let go on a trunk that is tilted otherwise than the stand.
+
+    Raises WayError if it did not come to that.
+    """
     content = yaml.safe_load(params.read_text(encoding="utf-8"))
     content[SIMULATOR_NODE]["ros__parameters"]["trunk"] = TRUNK
     worn = params.with_suffix(".worn.yaml")
     worn.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-    return demo.creep(demo.held(worn))
+    recordings = demo.held(worn)
+    if not all(any(step.action == "hold" for step in recording.steps) for recording in recordings):
+        raise WayError(f"{params.name}: the arm was not held in every pose")
+    return demo.creep(recordings)
 
 
 def _imu_error(device: Device, folder: Path) -> float:
