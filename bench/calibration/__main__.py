@@ -51,14 +51,16 @@ def main() -> int:
     print(text)
     options.output.parent.mkdir(parents=True, exist_ok=True)
     options.output.with_suffix(".md").write_text("\n".join([text, *failed]), encoding="utf-8")
-    content = {"rows": [row._asdict() for row in rows], "failed": failed, "devices": [_plain(r) for r in results]}
-    options.output.with_suffix(".json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    devices = [dataclasses.asdict(result) for result in results]
+    content = {"rows": [row._asdict() for row in rows], "failed": failed, "devices": devices}
+    table = json.dumps(content, indent=1, default=_plain)
+    options.output.with_suffix(".json").write_text(f"{table}\n", encoding="utf-8")
     return 0 if all(row.held for row in rows) else 1
 
 
-def _plain(result: Result) -> dict[str, Any]:
-    fields = dataclasses.asdict(result)
-    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in fields.items()}
+def _plain(value: np.ndarray | np.generic) -> Any:
+    """Return a value of NumPy as JSON knows it."""
+    return value.tolist()
 
 
 if __name__ == "__main__":
