@@ -25,8 +25,10 @@ class Sweep(NamedTuple):
 
 
 class Average(NamedTuple):
-    """theta (4,) rad; effort, friction, spread (standard error of effort), unrest (4,) Nm, largest change of the effort
-    from one cycle to another."""
+    """What sweeps show at theta, (4,) rad; all others (4,) Nm.
+
+    spread: standard error of effort. unrest: largest change of the effort from one cycle to another.
+    """
 
     theta: np.ndarray
     effort: np.ndarray
