@@ -1,5 +1,6 @@
 # make demo         four nodes as processes on the simulated device, about 75 s; a table and figures in trials/
 # make calibrate-demo  a simulated arm with a wrong parameter file, calibrated, 5 minutes; a picture before and after
+# make calibrate-study  20 random simulated devices, calibrated from motors to an arm that holds, offline, 20 minutes
 # make test         all tests
 # make lint         ruff, mypy, ament's flake8 and pep257, shellcheck
 # make faults       the whole fault matrix on the simulated device, 20 minutes; a table and build/faults.json
@@ -20,7 +21,7 @@ DEMO := imu sim report
 TEST := $(DEMO) validate test
 SETUP := VENV=$(VENV) .ci/setup
 
-.PHONY: demo calibrate-demo test lint faults mutations bench imu-report socketcan pythons constraints clean
+.PHONY: demo calibrate-demo calibrate-study test lint faults mutations bench imu-report socketcan pythons constraints clean
 
 demo:
 	@$(SETUP) $(DEMO)
@@ -29,6 +30,10 @@ demo:
 calibrate-demo:
 	@$(SETUP) $(DEMO) calibrate
 	$(BIN)/python -m exo_gravity.tools.calibration.demo
+
+calibrate-study:
+	@$(SETUP) $(TEST) calibrate
+	$(BIN)/python -m bench.calibration
 
 # The nodes' tests need a quiet machine, and run two at a time; the others share its cores.
 test:

@@ -126,8 +126,9 @@ class CalibratorNode(Node):
                 with self._lock:
                     self._bridge_state, self._bridge_message = state, status.message
                 has_fault = any(pair.key == "fault" and pair.value != "none" for pair in status.values)
-                if has_fault and not self._trouble and not self._tour.trouble:
-                    self._trouble = status.message
+                has_left = self._began and not self._tour.done and state != State.ACTIVE.value
+                if (has_fault or has_left) and not self._trouble and not self._tour.trouble:
+                    self._trouble = status.message if has_fault else f"the bridge stopped carrying: {state}"
 
     def _report(self) -> None:
         tour = self._tour

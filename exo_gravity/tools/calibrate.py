@@ -86,6 +86,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
+    from exo_gravity.tools.calibration.gravity_direction import with_mounting
     from exo_gravity.tools.calibration.page import page_of
     from exo_gravity.tools.calibration.person import Person
     from exo_gravity.tools.calibration.yaml_file import check_output, write_changes
@@ -103,7 +104,7 @@ def _run(options: argparse.Namespace) -> int:
     if bag is None and options.command != "motors":
         require_ros("calibrate")
     run: Callable[..., Outcome] = import_module(f"exo_gravity.tools.calibration.{options.command}").run
-    outcome = run(options, arm, person.say)
+    outcome = with_mounting(run(options, arm, person.say), options.params)
     for line in outcome.lines:
         person.say(line)
     if outcome.changes and not outcome.refusals:

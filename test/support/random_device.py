@@ -41,7 +41,7 @@ class Device:
         self.offset = rng.normal(0.0, 0.02, 4)
 
     def effort(self, theta: Vector, direction: Vector, added: np.ndarray | float = 0.0) -> np.ndarray:
-        """The commanded effort (n, 4) that holds the arm without friction."""
+        """Return the commands (n, 4) in Nm that hold the arm without friction."""
         return regressor(theta, direction) @ (self.moments + added) / self.scale + self.offset
 
     def observe(

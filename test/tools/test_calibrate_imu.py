@@ -14,7 +14,7 @@ from exo_gravity.tools.calibrate import main
 from exo_gravity.tools.calibration.imu import read_imu
 from exo_gravity.tools.inputs.parameter_file import load, packaged_config
 
-from ..core.test_imu_mounting import record, rests
+from ..support.imu_records import record, rests
 from ..support.synthetic_bags import START, STORE, Entry, write_bag
 
 IMU = "sensor_msgs/msg/Imu"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,10 +14,13 @@ from exo_gravity.core.calibration.poses import BestPoses, FixedStations
 from exo_gravity.core.recording import Recording
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
+from exo_gravity.tools import calibrate
 from exo_gravity.tools.calibration import friction, gravity, recorded
+from exo_gravity.tools.calibration.recorded import TILT_TOPIC, TILT_TYPE
 from exo_gravity.tools.inputs.arms import configured_arm
 from exo_gravity.tools.inputs.parameter_file import packaged_config
 
+from ..support.synthetic_bags import START, STORE, messages, write_bag
 from ..support.tour_run import MOTORS_AS_MOUNTED, TourRun
 
 ARM = configured_arm(packaged_config("sim.yaml"))
@@ -57,29 +61,62 @@ def test_two_tours_with_and_without_a_weight_give_kilograms_and_true_scales(tour
     assert np.abs(remainder).max() < 0.2 * FRICTION.min()
 
 
-def test_the_recording_of_a_tour_gives_the_same_torques(tours):
-    run, tour = tours[0]
+def recorded_by(run, folder, torque_scale=1.0):
+    """Write what the nodes would have published during `run` as a bag; return its folder.
+
+    torque_scale: that of the bridge, which divides the efforts by it.
+    """
     table = np.array(run.log)
     nothing = np.full((len(table), 4), np.nan)
-    recording = Recording("right", ARM.joint_names, table[:, 0], table[:, 1:5], nothing, nothing, table[:, 5:9])
-    found = list(recorded._sweeps(recording, replace(ARM, compensator={**ARM.compensator, "use_imu": False}), None))
+    efforts = table[:, 5:9] * torque_scale
+    states = Recording("right", ARM.joint_names, table[:, 0], table[:, 1:5], nothing, nothing, efforts)
+    tilts = ((TILT_TOPIC, TILT_TYPE, START + round(now * 1e9), vector(run.tilt)) for now in table[::10, 0])
+    return write_bag(folder, sorted((*messages(states), *tilts), key=lambda entry: entry[2]))
+
+
+def vector(tilt):
+    types, (pitch, roll) = STORE.types, tilt
+    header = types["std_msgs/msg/Header"](stamp=types["builtin_interfaces/msg/Time"](sec=0, nanosec=0), frame_id="")
+    message = types[TILT_TYPE](header=header, vector=types["geometry_msgs/msg/Vector3"](x=roll, y=pitch, z=0.0))
+    return bytes(STORE.serialize_cdr(message, TILT_TYPE))
+
+
+def test_the_recording_of_a_tour_gives_the_same_torques(tours, tmp_path):
+    run, tour = tours[0]
+    found = recorded.sweeps_of(recorded_by(run, tmp_path / "bag"), ARM)
     assert len(found) >= 10  # up to two for each pose; none where a joint sticks for a moment
-    for one in found:
+    for one, speed in found:
         poses = [measured.observation for measured in tour.measured]
         same = min(poses, key=lambda o: np.abs(np.subtract(o.theta, one.theta)).max())
         np.testing.assert_allclose(one.theta, same.theta, atol=0.02)
+        np.testing.assert_allclose(one.direction, same.direction, atol=1e-6)
         np.testing.assert_allclose(one.effort, same.effort, atol=0.06)
         np.testing.assert_allclose(one.friction, same.friction, atol=0.06)
+        assert np.all((speed > 0.03) & (speed < 0.3))
 
 
-def test_sweeps_at_five_speeds_give_the_friction_of_each_joint():
+def test_recordings_without_and_with_the_weight_give_kilograms_and_true_scales(tours, tmp_path):
+    files = [str(packaged_config("sim.yaml")), str(tmp_path / "1.yaml"), str(tmp_path / "2.yaml")]
+    bare = str(recorded_by(tours[0][0], tmp_path / "bare"))
+    assert calibrate.main(["gravity", "--params", files[0], "--output", files[1], "--bag", bare]) == 0
+    scale = configured_arm(Path(files[1])).can_bridge["torque_scale"]
+    loaded = str(recorded_by(tours[1][0], tmp_path / "loaded", scale))
+    weight = ["--mass", "0.5", "--lever", "0.25"]
+    assert calibrate.main(["scale", "--params", files[1], "--output", files[2], "--bag", loaded, *weight]) == 0
+    found = configured_arm(Path(files[2]))
+    np.testing.assert_allclose(found.can_bridge["torque_scale"][1:], SCALES[1:], rtol=0.04)
+    np.testing.assert_allclose(found.robot.first_moment[1:], TRUTH.first_moment[1:], rtol=0.04)
+
+
+def test_sweeps_at_five_speeds_give_the_friction_of_each_joint_live_and_recorded(tmp_path):
     truth = ArmConfig(TRUTH, coulomb_friction=(0.25, 0.35, 0.18, 0.22), viscous_friction=(0.1, 0.2, 0.1, 0.1))
     run = TourRun(truth=truth)
     tour = run.run(FixedStations(friction_stations(run.limits)))
     assert tour.trouble == ""
-    outcome = friction.solve(ARM, tour.measured)
-    assert outcome.refusals == ()
-    speed = outcome.curves[0].speed
-    for joint, curve in enumerate(outcome.curves):
-        true = truth.coulomb_friction[joint] + truth.viscous_friction[joint] * speed
-        np.testing.assert_allclose(curve.fit[speed >= 0.05], true[speed >= 0.05], atol=0.02)
+    for measured in (tour.measured, recorded.sweeps_of(recorded_by(run, tmp_path / "bag"), ARM)):
+        outcome = friction.solve(ARM, measured)
+        assert outcome.refusals == ()
+        for joint, curve in enumerate(outcome.curves):
+            steady = curve.speed >= 0.05
+            true = truth.coulomb_friction[joint] + truth.viscous_friction[joint] * curve.speed[steady]
+            np.testing.assert_allclose(curve.fit[steady], true, atol=0.02)

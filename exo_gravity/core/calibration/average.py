@@ -25,8 +25,10 @@ class Sweep(NamedTuple):
 
 
 class Average(NamedTuple):
-    """theta (4,) rad; effort, friction, spread (standard error of effort), unrest (4,) Nm, largest change of the effort
-    from one cycle to another."""
+    """What sweeps show at theta, (4,) rad; all others (4,) Nm.
+
+    spread: standard error of effort. unrest: largest change of the effort from one cycle to another.
+    """
 
     theta: np.ndarray
     effort: np.ndarray
@@ -35,13 +37,16 @@ class Average(NamedTuple):
     unrest: np.ndarray
 
 
-def average(sweeps: Sequence[Sweep], slope: np.ndarray) -> Average:
+def average(sweeps: Sequence[Sweep], slope: np.ndarray, bend: np.ndarray | None = None) -> Average:
     """Return the average of `sweeps`, which alternate between there and back.
 
     slope: (4, 4) Nm/rad, change of the expected torque with each angle, which relates efforts at different angles.
+    bend: (4,) Nm/rad^2, second derivative while all joints turn alike. Without it a sweep of 0.07 rad shows up to 0.3 %
+    less than the torque at its middle.
     """
     theta = np.mean([sweep.position.mean(axis=0) for sweep in sweeps], axis=0)
-    bins = np.array([_in_bins(sweep, theta, slope) for sweep in sweeps])  # (sweeps, BINS, 4)
+    bent = np.zeros(JOINT_COUNT) if bend is None else bend
+    bins = np.array([_in_bins(sweep, theta, slope, bent) for sweep in sweeps])  # (sweeps, BINS, 4)
     there, back = bins[0::2], bins[1::2]
     gravity = (there + back) / 2.0
     cycles = gravity.mean(axis=1)
@@ -51,8 +56,9 @@ def average(sweeps: Sequence[Sweep], slope: np.ndarray) -> Average:
     return Average(theta, cycles.mean(axis=0), friction, np.hypot(scatter, RESOLUTION), np.ptp(cycles, axis=0))
 
 
-def _in_bins(sweep: Sweep, theta: np.ndarray, slope: np.ndarray) -> np.ndarray:
+def _in_bins(sweep: Sweep, theta: np.ndarray, slope: np.ndarray, bend: np.ndarray) -> np.ndarray:
     """Return the mean effort (BINS, 4) of a sweep in order of the angle, reduced to `theta`."""
-    reduced = sweep.effort - (sweep.position - theta) @ slope.T
+    away = sweep.position - theta
+    reduced = sweep.effort - away @ slope.T - np.outer(away.mean(axis=1) ** 2 / 2.0, bend)
     parts = np.array_split(reduced if sweep.forward else reduced[::-1], BINS)
     return np.array([part.mean(axis=0) for part in parts])

@@ -21,6 +21,7 @@ SWEEP_TIME = 1.2  # s of a sweep's half at steady speed
 AMPLITUDE = (0.05, 0.3)  # rad
 STRIBECK_SPEEDS = np.geomspace(0.01, 0.2, 30)  # rad/s
 SIGNIFICANT = 3.0  # standard errors, from which on a Stribeck part is kept
+LEAST_RATIO = 2.0  # of the fastest to the slowest speed
 RESOLUTION = 0.003  # Nm: standard error of a friction that was measured once
 
 
@@ -55,11 +56,14 @@ def friction_stations(limits: Limits) -> list[Station]:
 def fit_friction(speed: np.ndarray, torque: np.ndarray) -> Friction:
     """Return the friction that fits `torque` (n,) in Nm at `speed` (n,) rad/s.
 
-    Raises DataError for fewer than 3 speeds.
+    Raises DataError for fewer than 3 speeds, or less than a factor of 2 between them.
     """
     speed, torque = np.asarray(speed, dtype=float), np.asarray(torque, dtype=float)
     if len(np.unique(speed)) < 3:
         raise DataError(f"friction was measured at {len(np.unique(speed))} speeds, must be at least 3")
+    if speed.max() < LEAST_RATIO * speed.min():
+        measured = f"from {speed.min():.2f} to {speed.max():.2f} rad/s"
+        raise DataError(f"friction was measured {measured}, the fastest must be {LEAST_RATIO:g} times the slowest")
     best = _fit(speed, torque, 1.0, with_stribeck=False)
     if len(np.unique(speed)) > 3:
         fits = [_fit(speed, torque, float(own), with_stribeck=True) for own in STRIBECK_SPEEDS]

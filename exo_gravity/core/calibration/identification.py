@@ -5,15 +5,15 @@ The commanded effort that holds the arm in a pose is, without friction, which av
     effort = torque(moments + load) / scale + offset          torque: `core.moments.regressor` times the moments
 
 A pose that does not fit the others (a hand on the arm, a slipping joint) is left out. A result that no arm can have is
-refused, with the pose that is missing. Held poses do not tell a common factor of all scales and moments, unless a known
-weight hung in some of them; nor a moment across link 3 or 4 from an error of that joint's zero.
+refused, with the pose that is missing. Held poses do not tell a common factor of all scales and moments without a known
+weight; nor a moment across link 3 or 4 from an error of that joint's zero.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -35,9 +35,11 @@ from exo_gravity.core.calibration.pose_fit import (
     MOMENT,
     OFFSET,
     SCALE,
+    TILT,
     Rows,
     Solution,
     final,
+    turned_regressor,
     without_each_pose,
     without_outliers,
 )
@@ -49,6 +51,7 @@ LEAST_SPREAD = 0.003  # Nm; about half a code of an AK motor's 12-bit torque
 # Moments across and along the links between which an angle turns a weight: Y3 and M3, Y4 and M4, Z and M4.
 BESIDE = ((6, 2), (7, 3), (5, 3))
 BESIDE_ERROR = 0.05  # rad, of a weight's place; 3 degrees
+TILT_ERROR = 0.03  # rad about each axis, of gravity's measured direction: an IMU's mounting, or a stand's uprightness
 EXACT = 1e-6  # error of a value that is held
 HIDDEN = 0.1  # share of an unknown, in combinations that are not known, from which it is not known itself
 
@@ -80,9 +83,10 @@ class Identified:
     torque, not in kilograms. scale_error: (4,), standard error, infinite if not known; 0 if the scale was not solved.
     Two standard errors cover 95 %, also for few poses. offset, friction: (4,) Nm as commanded. residual: (n, 4) Nm,
     effort minus prediction. held_out: (n, 4) Nm, the same predicted without that pose, NaN where the others do not
-    suffice. singular_values: of the information in the poses, the largest first; those below 1 are the combinations
-    that are not known. unknown: sentences, each of which names what the poses do not tell and what would. rejected:
-    index and reason of each observation that the result does not use.
+    suffice. singular_values: of the information in the poses, the largest first; below 1: combinations that are not
+    known. unknown: sentences on what the poses do not tell, and what would. rejected: index and reason of each
+    observation that is not used. tilt, tilt_error: (3,) rad in the base frame, rotation of gravity from the measured to
+    the true direction, and its standard error.
     """
 
     moments: np.ndarray
@@ -97,6 +101,8 @@ class Identified:
     unknown: tuple[str, ...]
     rejected: tuple[tuple[int, str], ...] = ()
     relative: bool = False
+    tilt: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    tilt_error: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     @property
     def error(self) -> np.ndarray:
@@ -145,18 +151,21 @@ def identify(
         untold(unknowns, error, hidden, is_relative),
         rejected,
         is_relative,
+        unknowns[TILT],
+        error[TILT],
     )
 
 
 def _rows(observations: Sequence[Observation], length: Vector, gravity: float) -> Rows:
     """Return the observations as arrays, with every unknown free."""
     theta, direction, effort, spread, weights = checked(observations)
-    load = np.array([load_moments(length, mass, lever) for mass, lever in weights])
+    load = np.array([load_moments(length, *weight) for weight in weights])
     beside = np.zeros((*load.shape, 3))
     for angle, (across, along) in enumerate(BESIDE):
         beside[:, across, angle] = load[:, along]
     return Rows(
         regressor(theta, direction, gravity),
+        turned_regressor(theta, direction, gravity),
         load,
         beside,
         effort,
@@ -173,7 +182,7 @@ def _common(known: Identified) -> float:
 
 
 def _start(known: Identified | None, solve_scale: bool) -> np.ndarray:
-    """Return the unknowns (20,) at which the search starts; if scales are solved, with the common factor removed."""
+    """Return the unknowns (23,) at which the search starts; if scales are solved, with the common factor removed."""
     start = np.zeros(COUNT)
     start[FACTOR] = 1.0
     start[1:4] = TYPICAL_MOMENTS[1:4]
@@ -188,10 +197,10 @@ def _start(known: Identified | None, solve_scale: bool) -> np.ndarray:
 def _with_conditions(rows: Rows, start: np.ndarray, known: Identified | None, solve_scale: bool) -> Rows:
     """Return `rows` with what is held, and with `known` as linear conditions."""
     free = np.ones(COUNT, dtype=bool)
-    free[SCALE] = free[OFFSET] = solve_scale
+    free[SCALE] = free[OFFSET] = free[TILT] = solve_scale
     free[ANGLE] = bool(np.any(rows.load))
     free[FACTOR] = solve_scale and free[ANGLE.start]
-    anchor = np.eye(COUNT)[ANGLE] / BESIDE_ERROR
+    anchor = np.vstack((np.eye(COUNT)[ANGLE] / BESIDE_ERROR, np.eye(COUNT)[TILT] / TILT_ERROR))
     if solve_scale:
         common = np.zeros((1, COUNT))
         common[0, SCALE] = np.array((0.0, 1.0, 1.0, 1.0)) / EXACT  # the common factor is the weight's
@@ -216,7 +225,7 @@ def _bounded(rows: Rows, start: np.ndarray) -> tuple[Rows, Solution]:
 
 
 def _in_kilograms(solution: Solution, known: Identified | None, is_loaded: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return the unknowns (20,) and their covariance (20, 20) without the factor by which a weight seems too heavy."""
+    """Return the unknowns (23,) and their covariance (23, 23) without the factor by which a weight seems too heavy."""
     unknowns, covariance = solution.unknowns.copy(), solution.covariance.copy()
     if known is not None and not known.relative and not is_loaded:
         unknowns[FACTOR] = math.exp(-_common(known))
@@ -229,10 +238,8 @@ def _in_kilograms(solution: Solution, known: Identified | None, is_loaded: bool)
     change[SCALE, FACTOR] = -1.0 / factor
     unknowns[MOMENT] /= factor
     unknowns[SCALE] -= math.log(factor)
-    freedom = solution.freedom.min() + 6.0
     # Student's distribution: for few poses two standard errors would cover less than 95 %.
-    few = 1.0 + 1.25 / freedom
-    return unknowns, few**2 * change @ covariance @ change.T
+    return unknowns, (1.0 + 1.25 / (solution.freedom.min() + 6.0)) ** 2 * change @ covariance @ change.T
 
 
 def _residuals(rows: Rows, keep: np.ndarray, used: Rows, solution: Solution) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.calibration.pose_choice import TYPICAL_MOMENTS, missing_pose
-from exo_gravity.core.calibration.pose_fit import ANGLE, COUNT, DISTURBED, FACTOR, OFFSET, SCALE
+from exo_gravity.core.calibration.pose_fit import ANGLE, COUNT, DISTURBED, FACTOR, OFFSET, SCALE, TILT
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.moments import MOMENTS
 
@@ -23,11 +23,12 @@ EXPECTED = 0.3  # Nm
 MISFIT = 0.1  # of the peak effort
 LEAST_MISFIT = 0.1  # Nm
 LEAST_ZERO_ERROR = 0.5  # deg worth a sentence
+LEAST_TILT = 1.0  # deg worth a sentence
 # Unknowns of joint 1, which carries nothing while its axis is vertical.
 FIRST_JOINT = (0, MOMENTS.index("W"), SCALE.start, OFFSET.start)
 PER_JOINT = tuple(f"{what} {n + 1}" for what in ("torque scale", "offset") for n in range(JOINT_COUNT))
 NAMES = (*MOMENTS, *PER_JOINT)
-TILT = "tilt the stand by 20 degrees or more"
+LEAN = "lean the stand by 10 to 14 degrees to the arm's side, where the arm still hangs close to its home"
 
 
 def checked(
@@ -71,7 +72,7 @@ def check_fit(residual: np.ndarray, effort: np.ndarray) -> None:
 
 
 def check_told(hidden: np.ndarray, count: int, direction: np.ndarray, gravity: float) -> None:
-    """Raise DataError that names the missing pose if `count` poses do not tell `hidden` (20,) of joints 2 to 4."""
+    """Raise DataError that names the missing pose if `count` poses do not tell `hidden` (23,) of joints 2 to 4."""
     missing = hidden.copy()
     missing[list(FIRST_JOINT)] = False
     if missing[FACTOR]:
@@ -110,13 +111,13 @@ def check_physical(
 
 
 def untold(unknowns: np.ndarray, error: np.ndarray, hidden: np.ndarray, relative: bool) -> tuple[str, ...]:
-    """Return what the poses do not tell, and what would, in sentences; unknowns, their errors, and `hidden`: (20,)."""
+    """Return what the poses do not tell, and what would, in sentences; unknowns, their errors, and `hidden`: (23,)."""
     said = []
     if relative:
         said.append("A common factor of all torque scales and moments: hang a known weight on link 4.")
     if np.any(hidden[:FACTOR]):
         names = ", ".join(NAMES[index] for index in np.flatnonzero(hidden[:FACTOR]))
-        said.append(f"{names}: joint 1 carries nothing while its axis is vertical: {TILT}.")
+        said.append(f"{names}: joint 1 carries nothing while its axis is vertical: {LEAN}.")
     for joint, along, across in ((4, 3, 7), (3, 2, 6)):
         angle = math.degrees(math.atan2(unknowns[across], unknowns[along]))
         said.append(
@@ -128,4 +129,8 @@ def untold(unknowns: np.ndarray, error: np.ndarray, hidden: np.ndarray, relative
         said.append(
             f"The weight at the elbow speaks for joint 3's zero being {elbow:+.1f} +- {elbow_error:.1f} degrees off."
         )
+    tilt = math.degrees(float(np.linalg.norm(unknowns[TILT])))
+    tilt_error = math.degrees(math.hypot(*np.sort(error[TILT])[:2]))  # a turn about gravity does not show
+    if tilt > max(3.0 * tilt_error, LEAST_TILT):
+        said.append(f"Gravity seems {tilt:.1f} degrees off what the IMU says: check rotation_trunk_from_imu.")
     return tuple(said)

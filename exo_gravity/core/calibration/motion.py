@@ -10,6 +10,7 @@ import numpy as np
 MAX_SPEED = 0.3  # rad/s, of any joint
 ACCELERATION = 0.5  # rad/s^2
 WINDOW = 0.55  # of a sweep's amplitude: the part on both sides of the pose that is measured
+LEAD = 0.3  # s at rest before each motion, in which the joints are brought to the edge of moving
 
 
 class Station(NamedTuple):
@@ -36,15 +37,15 @@ class Station(NamedTuple):
     @property
     def duration(self) -> float:
         """Time in s that the sweeps take."""
-        return 2 * self.cycles * Line(self.low, self.high, self.speed).duration
+        return 2 * self.cycles * (Line(self.low, self.high, self.speed).duration + LEAD)
 
 
 def durations(ways: np.ndarray) -> np.ndarray:
-    """Return the time (n,) in s of motions by `ways` (n, 4) rad."""
+    """Return the time (n,) in s of motions by `ways` (n, 4) rad, with the rest before them."""
     length = np.abs(ways).max(axis=1)
     speed = np.minimum(MAX_SPEED, np.sqrt(length * ACCELERATION))
     steady = np.divide(length, speed, out=np.zeros_like(length), where=length > 0.0)
-    return np.asarray(steady + speed / ACCELERATION)
+    return np.asarray(steady + speed / ACCELERATION + LEAD)
 
 
 class Line:

@@ -46,21 +46,23 @@ def next_pose(
 
 
 def told_by(theta: np.ndarray, direction: Vector, moments: np.ndarray, gravity: float) -> np.ndarray:
-    """Return the derivative of the efforts in the poses (n, 4) by the unknowns, divided by their noise: (n, 4, 20)."""
+    """Return the derivative of the efforts in the poses (n, 4) by the unknowns, divided by their noise: (n, 4, 23)."""
     rows = regressor(theta, direction, gravity)
     torque = rows @ moments
     noise = np.hypot(NOISE, NOISE_SHARE * torque)
     count = len(theta)
     empty = np.zeros((0, COUNT))
     load, beside = np.zeros((count, len(MOMENTS))), np.zeros((count, len(MOMENTS), 3))
-    poses = Rows(rows, load, beside, torque, noise, np.ones(COUNT, dtype=bool), empty, np.zeros(0))
+    poses = Rows(
+        rows, np.zeros((*rows.shape, 3)), load, beside, torque, noise, np.ones(COUNT, dtype=bool), empty, np.zeros(0)
+    )
     unknowns = NOTHING_KNOWN.copy()
     unknowns[MOMENT] = moments
     return np.asarray(poses.jacobian(unknowns) / noise[..., None])
 
 
 def missing_pose(hidden: np.ndarray, direction: Vector, moments: np.ndarray, gravity: float) -> str:
-    """Return, in words, the pose of `GRID` that tells most about the unknowns of which `hidden` (20,) are not known."""
+    """Return, in words, the pose of `GRID` that tells most about the unknowns of which `hidden` (23,) are not known."""
     poses = np.radians(list(itertools.product(*GRID)))
     told = told_by(poses, direction, moments, gravity) * NATURAL * hidden
     best = poses[int(np.argmax((told**2).sum(axis=(1, 2))))]

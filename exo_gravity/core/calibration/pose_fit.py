@@ -1,11 +1,12 @@
 """Weighted least squares for the unknowns of an arm in held poses.
 
 The unknowns are the eight moments in kg m, the logarithm of the four torque scales, the four offsets in Nm, the factor
-by which moments and scales are too large in common, by which a known weight seems too heavy, and three angles by which
-the weight seems to lie beside the links: a zero of joint 3 or 4 that is off by a degree moves a weight by more than a
-light forearm's own moment. The commanded effort is `torque(moments + factor * load) / scale + offset`: nearly linear,
-so a few Gauss-Newton steps solve it. Each step leaves alone what the poses do not tell: the combinations whose standard
-error exceeds `NATURAL`.
+by which moments and scales are too large in common, by which a known weight seems too heavy, three angles by which the
+weight seems to lie beside the links (a zero of joint 3 or 4 that is off by a degree moves a weight by more than a light
+forearm's own moment), and the rotation of gravity's direction from the measured to the true one: nobody mounts an IMU,
+or stands upright, to better than a degree. The commanded effort is `torque(moments + factor * load) / scale + offset`:
+nearly linear, so a few Gauss-Newton steps solve it. Each step leaves alone what the poses do not tell: the combinations
+whose standard error exceeds `NATURAL`.
 
 Errors are larger in some joints than the observations state (gear friction is not the same in every pose), so each
 joint gets a factor of its own, estimated from its residuals and pooled with the others where poses are few.
@@ -19,17 +20,18 @@ import numpy as np
 
 from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.moments import MOMENTS
+from exo_gravity.core.moments import MOMENTS, regressor
 
 MOMENT = slice(0, 8)
 SCALE = slice(8, 12)
 OFFSET = slice(12, 16)
 FACTOR = 16
 ANGLE = slice(17, 20)  # of the load along Y3, Y4 and Z
-COUNT = 20
-# kg m, logarithm, Nm, 1, rad: a combination of unknowns that may be wrong by this much is not known.
-NATURAL = np.repeat((0.1, 0.3, 0.3, 0.3, 0.3), (len(MOMENTS), JOINT_COUNT, JOINT_COUNT, 1, 3))
-NOTHING_KNOWN = np.repeat((0.0, 1.0, 0.0), (FACTOR, 1, 3))
+TILT = slice(20, 23)  # rotation vector of gravity in the base frame
+COUNT = 23
+# kg m, logarithm, Nm, 1, rad, rad: a combination of unknowns that may be wrong by this much is not known.
+NATURAL = np.repeat((0.1, 0.3, 0.3, 0.3, 0.3, 0.1), (len(MOMENTS), JOINT_COUNT, JOINT_COUNT, 1, 3, 3))
+NOTHING_KNOWN = np.repeat((0.0, 1.0, 0.0), (FACTOR, 1, COUNT - FACTOR - 1))
 HUBER = 2.0  # standard errors beyond which a residual counts linearly
 POOLING = 6.0  # degrees of freedom with which all joints together inform the error of each
 STEPS = 40
@@ -45,11 +47,13 @@ OUTLIER = 32.0  # such a sum from which a pose is left out: of good poses, one i
 class Rows:
     """What is fitted, for n poses: `regressor` (n, 4, 8), `load` (n, 8) kg m, `effort` and its error `sigma` (n, 4) Nm.
 
-    beside: (n, 8, 3), change of `load` with each angle. free: (20,), the unknowns to be solved. anchor: (k, 20) and
-    anchor_value: (k,), linear conditions on the unknowns, already divided by their standard errors.
+    turned: (n, 4, 8, 3), change of `regressor` with each component of the tilt. beside: (n, 8, 3), change of `load`
+    with each angle. free: (23,), the unknowns to be solved. anchor: (k, 23) and anchor_value: (k,), linear conditions
+    on the unknowns, already divided by their standard errors.
     """
 
     regressor: np.ndarray
+    turned: np.ndarray
     load: np.ndarray
     beside: np.ndarray
     effort: np.ndarray
@@ -60,31 +64,36 @@ class Rows:
 
     def only(self, keep: np.ndarray) -> Rows:
         """Return the poses that `keep` (n,) selects."""
-        names = ("regressor", "load", "beside", "effort", "sigma")
+        names = ("regressor", "turned", "load", "beside", "effort", "sigma")
         return replace(self, **{name: getattr(self, name)[keep] for name in names})
 
     def predicted(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the commanded effort (n, 4) in Nm."""
-        moments = unknowns[MOMENT] + unknowns[FACTOR] * (self.load + self.beside @ unknowns[ANGLE])
-        torque = np.einsum("njk,nk->nj", self.regressor, moments)
+        torque = np.einsum("njk,nk->nj", self.regressor + self.turned @ unknowns[TILT], self._moments(unknowns))
         return np.asarray(torque * np.exp(-unknowns[SCALE]) + unknowns[OFFSET])
 
+    def _moments(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return the moments (n, 8) in kg m, with the load."""
+        return np.asarray(unknowns[MOMENT] + unknowns[FACTOR] * (self.load + self.beside @ unknowns[ANGLE]))
+
     def jacobian(self, unknowns: np.ndarray) -> np.ndarray:
-        """Return the derivative of `predicted` by the unknowns, (n, 4, 20)."""
+        """Return the derivative of `predicted` by the unknowns, (n, 4, 23)."""
         result = np.zeros((*self.effort.shape, COUNT))
-        result[..., MOMENT] = self.regressor * np.exp(-unknowns[SCALE])[:, None]
+        share = np.exp(-unknowns[SCALE])[:, None]
+        result[..., MOMENT] = (self.regressor + self.turned @ unknowns[TILT]) * share
         joints = np.arange(JOINT_COUNT)
         result[:, joints, SCALE.start + joints] = unknowns[OFFSET] - self.predicted(unknowns)
         result[:, joints, OFFSET.start + joints] = 1.0
         load = self.load + self.beside @ unknowns[ANGLE]
         result[..., FACTOR] = np.einsum("njk,nk->nj", result[..., MOMENT], load)
         result[..., ANGLE] = unknowns[FACTOR] * (result[..., MOMENT] @ self.beside)
+        result[..., TILT] = np.einsum("njkt,nk->njt", self.turned, self._moments(unknowns)) * share
         return result
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """unknowns: (20,). covariance: (20, 20) of what is known. hidden: (20,), share 0..1 of each that is not known.
+    """unknowns: (23,). covariance: (23, 23) of what is known. hidden: (23,), share 0..1 of each that is not known.
 
     singular_values: of the poses alone, in units of `NATURAL`, the largest first. residual: (n, 4) Nm. hat: (n, 4, n,
     4), derivative of the predicted by the measured effort, both divided by sigma.
@@ -103,8 +112,15 @@ class Solution:
         return np.asarray(1.0 - np.einsum("njnj->nj", self.hat)).sum(axis=0)
 
 
+def turned_regressor(theta: np.ndarray, direction: np.ndarray, gravity: float) -> np.ndarray:
+    """Return the change of `regressor` (n, 4, 8, 3) with a small rotation vector of `direction` (n, 3), in rad."""
+    along = np.stack([regressor(theta, axis, gravity) for axis in np.eye(3)], axis=-1)  # linear in the direction
+    turn = np.stack([np.cross(axis, direction) for axis in np.eye(3)], axis=-1)
+    return np.asarray(np.einsum("njka,nat->njkt", along, turn))
+
+
 def solve(rows: Rows, start: np.ndarray, weight: np.ndarray | None = None) -> Solution:
-    """Return the least-squares solution from `start` (20,); weight: (n, 4) of the squared residuals, 1 by default."""
+    """Return the least-squares solution from `start` (23,); weight: (n, 4) of the squared residuals, 1 by default."""
     root = np.sqrt(np.ones_like(rows.effort) if weight is None else weight) / rows.sigma
     unknowns, step = start.copy(), np.full(COUNT, np.inf)
     for _ in range(STEPS):
@@ -122,7 +138,7 @@ def solve(rows: Rows, start: np.ndarray, weight: np.ndarray | None = None) -> So
 
 
 def _inverse(whitened: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Return the pseudo-inverse (20, m) of `whitened` (m, 20), without what is not known."""
+    """Return the pseudo-inverse (23, m) of `whitened` (m, 23), without what is not known."""
     natural = NATURAL * free
     left, size, right = np.linalg.svd(whitened * natural, full_matrices=False)
     told = size > 1.0

@@ -18,7 +18,7 @@ from exo_gravity.core.limits import WALL_WIDTH, Limits
 CANDIDATES = 800
 MOST_UPWARDS = 0.3  # sine of the largest angle above the horizontal, of links 3 and 4
 SHARE = 0.85  # of max_effort that a pose may need
-DEVIATIONS = 2.0  # of the expected torque, that a pose must leave room for
+DEVIATIONS = (2.0, 1.0, 0.0)  # of the expected torque, that a pose must leave room for; less where none does
 USUAL_FRICTION = 0.5  # Nm, until it is measured
 WAYPOINTS = 8  # of the way to a pose, at which the motors must hold the arm too
 FIRST_EDGE = 0.1  # rad in addition, at the first pose
@@ -90,9 +90,13 @@ class BestPoses:
         if not len(taken) and not self._is_started:
             self._is_started = True
             return Station(tuple(self._home.tolist()))
-        possible = np.flatnonzero(self._is_in_time(len(taken), progress))
-        possible = possible[self._is_holdable(self._candidates[possible], progress.position, guess, friction)]
-        if not len(possible):
+        in_time = np.flatnonzero(self._is_in_time(len(taken), progress))
+        for deviations in DEVIATIONS:
+            can = self._is_holdable(self._candidates[in_time], progress.position, guess, friction, deviations)
+            possible = in_time[can]
+            if len(possible):
+                break
+        else:
             raise DataError("no further pose can be held within max_effort: is it too small for the arm?")
         seen = list(taken) or [self._home]
         poses = self._candidates[possible]
@@ -111,12 +115,17 @@ class BestPoses:
         return np.asarray(fits if fits.any() else way + home <= (way + home).min() + 1.0)
 
     def _is_holdable(
-        self, poses: np.ndarray, start: np.ndarray, guess: TorqueGuess, friction: Sequence[float]
+        self, poses: np.ndarray, start: np.ndarray, guess: TorqueGuess, friction: Sequence[float], deviations: float
     ) -> np.ndarray:
-        """Return which poses (n,) the motors can hold, and reach from `start`."""
+        """Return which poses (n,) the motors can hold, reach from `start`, and leave for the hanging arm."""
         shares = np.linspace(0.0, 1.0, WAYPOINTS + 1)[1:, None, None]
-        ways = start + shares * (poses - start)
-        return holdable(ways.reshape(-1, JOINT_COUNT), self.limits, guess, friction).reshape(WAYPOINTS, -1).all(axis=0)
+        sweep = Station((0.0,) * JOINT_COUNT).amplitude * np.array((-1.0, 1.0))[:, None, None]
+        start, home = start + shares * (poses - start), self.limits.home + shares * (poses - self.limits.home)
+        result = np.ones(len(poses), dtype=bool)
+        for way, room in ((start, deviations), (poses + sweep, deviations), (home, 0.0)):
+            can = holdable(way.reshape(-1, JOINT_COUNT), self.limits, guess, friction, room)
+            result &= can.reshape(len(way), -1).all(axis=0)
+        return result
 
 
 def candidates(limits: Limits, seed: int = 1) -> np.ndarray:
@@ -136,10 +145,19 @@ def measurable(limits: Limits, amplitude: float) -> tuple[np.ndarray, np.ndarray
     return np.array(limits.position_min) + margin, np.array(limits.position_max) - margin
 
 
-def holdable(poses: np.ndarray, limits: Limits, guess: TorqueGuess, friction: Sequence[float]) -> np.ndarray:
-    """Return at which of `poses` (n, 4) rad the motors can hold the arm, and move it against `friction` (4,) Nm."""
+def holdable(
+    poses: np.ndarray,
+    limits: Limits,
+    guess: TorqueGuess,
+    friction: Sequence[float],
+    deviations: float = DEVIATIONS[0],
+) -> np.ndarray:
+    """Return at which of `poses` (n, 4) rad the motors can hold the arm, and move it against `friction` (4,) Nm.
+
+    deviations: standard deviations of the expected torque for which there must be room.
+    """
     mean, deviation = guess.torques(poses)
     slide = [own or USUAL_FRICTION for own in friction]
     return np.asarray(
-        np.all(np.abs(mean) + DEVIATIONS * deviation + slide <= SHARE * np.array(limits.max_effort), axis=1)
+        np.all(np.abs(mean) + deviations * deviation + slide <= SHARE * np.array(limits.max_effort), axis=1)
     )

@@ -16,7 +16,7 @@ import numpy as np
 from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.calibration.guess import TorqueGuess
 from exo_gravity.core.calibration.identification import Observation
-from exo_gravity.core.calibration.motion import Line, Station
+from exo_gravity.core.calibration.motion import LEAD, Line, Station
 from exo_gravity.core.calibration.poses import Itinerary, Progress
 from exo_gravity.core.calibration.tracking import MassMatrix, Tracker
 from exo_gravity.core.calibration.visit import FOLLOWED, Visit
@@ -26,7 +26,7 @@ from exo_gravity.core.gravity import Torque
 from exo_gravity.core.limits import Limits
 from exo_gravity.core.tilt import Tilt
 
-SETTLING = 0.4  # s at rest before the first sweep of a pose
+SETTLING = 0.1  # s at rest after the way to a pose
 # rad behind the reference, from which on it slows down, and at which it stops and waits for the arm.
 SLOW_ERROR, STOP_ERROR = 0.04, 0.08
 MAX_SKIPPED = 2  # poses in which a joint may stick
@@ -61,6 +61,7 @@ class Tour:
         self._guess = guess
         self._itinerary = itinerary
         self._load = load
+        self._most = np.array(limits.max_effort)
         self._tracker = Tracker(rate, limits.max_effort)
         self._masses = self._mass_matrix()
         self._matrix = np.eye(JOINT_COUNT)
@@ -91,6 +92,9 @@ class Tour:
         """
         if self.trouble:
             return None
+        if self.done:  # the bridge lets the arm down: it is no longer watched
+            torque = self._guess.torque(position) + self._tracker.correction
+            return tuple(np.clip(torque, -self._most, self._most).tolist())
         if self._now == -math.inf:
             self._watch = Watch(self._limits.joint_names, self._limits.max_effort, tilt)
             self._now = now
@@ -110,7 +114,9 @@ class Tour:
         if not self.trouble:
             if self._visit and self._is_sweeping and self._line.is_measured(self._line_time):
                 self._visit.note(position, self._effort, tilt.direction)  # the effort of the last cycle
-            self.trouble = self._carry(dt, position, pace * heading - velocity, error, heading)
+            # Friction is compensated before the motion begins: a joint that breaks away late would jump.
+            coming = self._line.at(self._line_time + LEAD)[1] if self._line_time < LEAD else heading
+            self.trouble = self._carry(dt, position, pace * heading - velocity, error, coming)
         return None if self.trouble else self._effort
 
     def _carry(
@@ -185,13 +191,15 @@ class Tour:
         self._masses = self._mass_matrix()
 
     def _mass_matrix(self) -> MassMatrix:
-        return MassMatrix(self._guess.length, self._guess.common_moments[:JOINT_COUNT])
+        return MassMatrix(self._guess.length, self._guess.common_moments[:JOINT_COUNT], self._load)
 
-    def _slope(self, station: Station) -> np.ndarray:
-        """Return how the expected torque changes with the angles at a station, (4, 4) Nm/rad."""
+    def _shape(self, station: Station) -> tuple[np.ndarray, np.ndarray]:
+        """Return how the expected torque changes at a station: slope and bend, as for `average`."""
         steps = ANGLE_STEP * np.eye(JOINT_COUNT)
-        after, before = (self._guess.torques(np.array(station.theta) + sign * steps)[0] for sign in (1.0, -1.0))
-        return np.asarray((after - before).T / (2.0 * ANGLE_STEP))
+        torque = self._guess.torques
+        after, before = (torque(np.array(station.theta) + sign * steps)[0] for sign in (1.0, -1.0))
+        low, middle, high = torque(np.array(station.theta) + ANGLE_STEP * np.array(((-1.0,), (0.0,), (1.0,))))[0]
+        return (after - before).T / (2.0 * ANGLE_STEP), (low - 2.0 * middle + high) / ANGLE_STEP**2
 
     def plan(self) -> None:
         """Choose the next pose if one is due. It takes 0.1 s and more: not on the thread of `step`."""
@@ -218,11 +226,11 @@ class Tour:
         if station:
             angles = " ".join(f"{math.degrees(angle):.0f}" for angle in station.theta)
             self.progress = f"pose {len(self.measured) + 1} of {self._itinerary.count}: {angles} deg"
-            self._visit = Visit(station, self._slope(station))
+            self._visit = Visit(station, *self._shape(station))
             self._start(Line(position, station.low), SETTLING)
         else:
             self._visit, self.progress = None, "back to the hanging arm"
             self._start(Line(position, np.array(self._limits.home)), SETTLING)
 
     def _start(self, line: Line, pause: float, is_sweeping: bool = False) -> None:
-        self._line, self._line_time, self._pause, self._is_sweeping = line, 0.0, pause, is_sweeping
+        self._line, self._line_time, self._pause, self._is_sweeping = line, -LEAD, pause, is_sweeping

@@ -13,12 +13,18 @@ import numpy as np
 
 from exo_gravity.core.arm import JOINT_COUNT, Vector
 from exo_gravity.core.gravity import Torque
+from exo_gravity.core.moments import load_moments
 
 ROTOR = (0.0015, 0.005, 0.0015, 0.0015)  # kg m^2 at the output: an AK80-9 at joint 2, else a little more than an AK60-6
+# kg m^2 added to each joint: with it a 1 kg weight on link 4 at 100 Hz is carried without sticking (measured).
+ADDED = 0.005
 REACH = (0.8, 0.8, 0.8, 0.6)  # of a link's length, at which its mass is assumed
 FREQUENCY_PER_RATE = 0.12  # natural frequency in rad/s per control cycle per s; two cycles of delay cost 27 degrees
 MAX_FREQUENCY = 20.0  # rad/s
 INTEGRAL_SHARE = 0.4  # of the frequency, at which the integral part acts; unstable from 2 on
+# Times the smallest inertia in any direction, that the integral part adds in all. Without it, two joints that stick on
+# opposite sides of their path would cancel each other's integral where the inertia of both together is small.
+FLOOR = 2.0
 USUAL_FRICTION = 0.15  # Nm, until it is measured
 # Of the friction, per s, by which its compensation changes: a joint that rests anywhere within its friction would jump.
 FRICTION_RATE = 6.0
@@ -30,16 +36,20 @@ FULL_FRICTION_SPEED = 0.03  # rad/s of the reference, from which on friction is 
 class MassMatrix:
     """The approximate mass matrix of an arm that is known by its first moments: one point of mass on each link.
 
-    length: (4,) m. moment: M1..M4 in kg m.
+    length: (4,) m. moment: M1..M4 in kg m, with the load. load: a weight in kg on link 4, and its distance from the
+    elbow in m.
     """
 
-    def __init__(self, length: Vector, moment: Vector) -> None:
-        self._length = np.asarray(length, dtype=float)
-        self._reach = self._length * REACH
-        self._mass = np.zeros(JOINT_COUNT)
+    def __init__(self, length: Vector, moment: Vector, load: tuple[float, float] = (0.0, 0.0)) -> None:
+        lengths = np.asarray(length, dtype=float)
+        bare = np.asarray(moment, dtype=float) - load_moments(lengths.tolist(), *load)[:JOINT_COUNT]
+        own = np.zeros(JOINT_COUNT)
+        reach = np.maximum(lengths * REACH, 0.01)
         for link in reversed(range(JOINT_COUNT)):
-            own = moment[link] - self._mass[link + 1 :].sum() * self._length[link]
-            self._mass[link] = max(0.0, own) / max(self._reach[link], 0.01)
+            own[link] = max(0.0, bare[link] - own[link + 1 :].sum() * lengths[link]) / reach[link]
+        self._length = lengths
+        # Link, mass in kg, and distance from the link's joint in m.
+        self._points = [*zip(range(JOINT_COUNT), own, reach, strict=True), (JOINT_COUNT - 1, *load)]
 
     def at(self, theta: Sequence[float]) -> np.ndarray:
         """Return the mass matrix (4, 4) in kg m^2 at `theta` (4,) rad."""
@@ -53,9 +63,9 @@ class MassMatrix:
         along = np.array((x1, x2, x3, x4))
         origins = np.zeros((JOINT_COUNT, 3))
         origins[1:] = np.cumsum(along[:-1] * self._length[:-1, None], axis=0)
-        matrix = np.diag(ROTOR)
-        for link, mass in enumerate(self._mass):
-            point = origins[link] + self._reach[link] * along[link]
+        matrix = np.diag(ROTOR) + ADDED * np.eye(JOINT_COUNT)
+        for link, mass, reach in self._points:
+            point = origins[link] + reach * along[link]
             jacobian = np.cross(axes[: link + 1], point - origins[: link + 1])
             matrix[: link + 1, : link + 1] += mass * jacobian @ jacobian.T
         return matrix
@@ -99,7 +109,8 @@ class Tracker:
         frequency = self._frequency
         stiff = matrix @ error * frequency**2
         push = stiff + matrix @ speed_error * 2.0 * frequency
-        integral = self._integral + INTEGRAL_SHARE * frequency * dt * stiff
+        weakest = float(np.linalg.eigvalsh(matrix)[0])
+        integral = self._integral + INTEGRAL_SHARE * frequency * dt * (stiff + FLOOR * weakest * error * frequency**2)
         self._compensate_friction(dt, error, speed_error, heading)
         torque = expected + self._slide + push + integral
         is_saturated = np.abs(torque) > self._max_effort

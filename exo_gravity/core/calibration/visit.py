@@ -10,22 +10,22 @@ from exo_gravity.core.calibration.average import Average, Sweep, average
 from exo_gravity.core.calibration.motion import WINDOW, Line, Station
 from exo_gravity.core.gravity import Torque
 
-FOLLOWED = 0.7  # of the way of the reference, that each joint must follow in a sweep that counts
+FOLLOWED = 0.5  # of the way of the reference, that each joint must follow in a sweep that counts
 MAX_FAILURES = 3  # pairs of sweeps in which a joint may stick: each shows the controller more of its friction
 
 
 class Visit:
     """Collects the samples of the sweeps through `station`.
 
-    slope: (4, 4) Nm/rad, change of the expected torque with the angles. stuck_joints: those that did not follow one of
-    the last two sweeps, with the part of the way that they did.
+    slope: (4, 4) Nm/rad, change of the expected torque with the angles; bend: its curvature, as for `average`.
+    stuck_joints: those that did not follow one of the last two sweeps, with the part of the way that they did.
     """
 
-    def __init__(self, station: Station, slope: np.ndarray) -> None:
+    def __init__(self, station: Station, slope: np.ndarray, bend: np.ndarray) -> None:
         self.station = station
         self.stuck_joints: dict[int, float] = {}
         self._failures = 0
-        self._slope = slope
+        self._slope, self._bend = slope, bend
         self._sweeps: list[Sweep] = []
         self._samples: list[tuple[Sequence[float], Torque]] = []
         self._directions: list[tuple[float, float, float]] = []
@@ -67,7 +67,7 @@ class Visit:
         ways = [np.abs(sweep.position[-1] - sweep.position[0]) for sweep in self._sweeps[-2:]]
         shares = np.min(ways, axis=0) / (2.0 * WINDOW * self.station.amplitude)
         self.stuck_joints = {joint: float(share) for joint, share in enumerate(shares) if share < FOLLOWED}
-        return average(self._sweeps[-2:], self._slope).friction
+        return average(self._sweeps[-2:], self._slope, self._bend).friction
 
     def start_again(self, failed: bool) -> None:
         """Discard the sweeps so far; failed: because a joint did not follow."""
@@ -76,4 +76,4 @@ class Visit:
 
     def result(self) -> Average:
         """Return the average of the sweeps."""
-        return average(self._sweeps, self._slope)
+        return average(self._sweeps, self._slope, self._bend)

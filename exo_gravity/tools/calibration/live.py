@@ -138,7 +138,7 @@ def follow(tour: LiveTour, line: str, record: Path, say: Say) -> None:
             tour.measured.append(measured_of(event["observation"]))
         elif event.get("progress"):
             say(event["progress"])
-        elif event.get("trouble"):
+        elif event.get("trouble") and not tour.done:
             tour.trouble = tour.trouble or event["trouble"]
             tour.was_late = tour.was_late or any(sign in line for sign in LATE)
         elif event.get("done"):

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
@@ -35,20 +35,40 @@ HELD_TIME = 1.0  # s
 UNKNOWN_FRICTION = 0.4  # Nm, of a joint of which no sweep was recorded
 
 
+class Swept(NamedTuple):
+    """What two sweeps, there and back, show, and the mean speed (4,) in rad/s at which each joint turned."""
+
+    observation: Observation
+    speed: np.ndarray
+
+
 def observations_of(path: Path, arm: ConfiguredArm) -> list[Observation]:
     """Return the observations in the recording of `arm` at `path`. Raises DataError if there are none."""
+    recording, _, tilts = _recorded(path, arm)
+    sweeps = [swept.observation for swept in _sweeps(recording, arm, tilts)]
+    observations = sweeps + list(_held(recording, arm, tilts, sweeps))
+    if not observations:
+        raise DataError(f"{path}: no pose of {arm.name} was held for {HELD_TIME:g} s, or passed slowly there and back")
+    return observations
+
+
+def sweeps_of(path: Path, arm: ConfiguredArm) -> list[Swept]:
+    """Return the sweeps there and back in the recording of `arm` at `path`. Raises DataError if there are none."""
+    sweeps = list(_sweeps(*_recorded(path, arm)))
+    if not sweeps:
+        raise DataError(f"{path}: {arm.name} never passed a pose slowly there and back, all joints turning")
+    return sweeps
+
+
+def _recorded(path: Path, arm: ConfiguredArm) -> tuple[Recording, ConfiguredArm, np.ndarray | None]:
+    """Return the recording of `arm`, the arm, and the trunk's tilts, None where it uses none."""
     bag = read_bag(path)
     found = [recording for recording in bag.recordings if recording.name == arm.name]
     if not found:
         names = ", ".join(recording.name for recording in bag.recordings)
         raise DataError(f"{path}: no arm {arm.name}; it has {names}")
-    recording = _in_order_of(found[0], arm)
     tilts = _tilts(path, bag.start) if arm.compensator["use_imu"] else None
-    sweeps = list(_sweeps(recording, arm, tilts))
-    observations = sweeps + list(_held(recording, arm, tilts, sweeps))
-    if not observations:
-        raise DataError(f"{path}: no pose of {arm.name} was held for {HELD_TIME:g} s, or passed slowly there and back")
-    return observations
+    return _in_order_of(found[0], arm), arm, tilts
 
 
 def _in_order_of(recording: Recording, arm: ConfiguredArm) -> Recording:
@@ -88,7 +108,7 @@ def _effort(recording: Recording, part: slice | np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(commanded), commanded, measured)
 
 
-def _sweeps(recording: Recording, arm: ConfiguredArm, tilts: np.ndarray | None) -> Iterator[Observation]:
+def _sweeps(recording: Recording, arm: ConfiguredArm, tilts: np.ndarray | None) -> Iterator[Swept]:
     """Yield an observation for every two runs one after the other in which all joints turn to and fro."""
     runs = [run for span in recording.while_carried(-math.inf, math.inf) for run in _runs(recording, *span)]
     last_end = -math.inf
@@ -100,10 +120,10 @@ def _sweeps(recording: Recording, arm: ConfiguredArm, tilts: np.ndarray | None) 
         if recording.time[there.start] < last_end:
             continue  # each run counts once
         direction = _direction(arm, tilts, *recording.time[[there.start, back.stop - 1]])
-        observation = _there_and_back(recording, there, back, direction)
-        if observation:
+        swept = _there_and_back(recording, there, back, direction)
+        if swept:
             last_end = recording.time[back.stop - 1]
-            yield observation
+            yield swept
 
 
 def _runs(recording: Recording, start: float, end: float) -> Iterator[slice]:
@@ -123,23 +143,26 @@ def _runs(recording: Recording, start: float, end: float) -> Iterator[slice]:
             yield slice(first + int(low), first + int(high))
 
 
-def _there_and_back(recording: Recording, there: slice, back: slice, direction: np.ndarray) -> Observation | None:
-    """Return the observation in the middle of the way that both runs have in common; None if that is short."""
+def _there_and_back(recording: Recording, there: slice, back: slice, direction: np.ndarray) -> Swept | None:
+    """Return what is seen in the middle of the way that both runs have in common; None if that is short."""
     position = recording.position.astype(float)
     spans = [np.sort(position[[run.start, run.stop - 1]], axis=0) for run in (there, back)]
     low, high = np.maximum(spans[0][0], spans[1][0]), np.minimum(spans[0][1], spans[1][1])
     if np.any(high - low < LEAST_WAY):
         return None
     middle, reach = (low + high) / 2.0, (high - low) * (0.5 - EDGE)
-    sweeps = []
+    sweeps, speeds = [], []
     for forward, run in ((True, there), (False, back)):
         inside = np.flatnonzero(np.all(np.abs(position[run] - middle) <= reach, axis=1)) + run.start
         if len(inside) < 2 * BINS:
             return None
+        ends = inside[[0, -1]]
+        speeds.append(np.abs(np.diff(position[ends], axis=0)[0]) / np.diff(recording.time[ends]))
         sweeps.append(Sweep(forward, position[inside], _effort(recording, inside).astype(float)))
     result = average(sweeps, np.zeros((4, 4)))
     sign = np.sign(position[there.stop - 1] - position[there.start])
-    return Observation(result.theta, direction, result.effort, sign * result.friction, result.spread)
+    observation = Observation(result.theta, direction, result.effort, sign * result.friction, result.spread)
+    return Swept(observation, np.mean(speeds, axis=0))
 
 
 def _held(

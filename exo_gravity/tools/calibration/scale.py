@@ -1,6 +1,7 @@
 """calibrate scale: the real torque per commanded torque of each motor, from a known weight on the last link.
 
-Two tours, without and with the weight. The weight hangs while the arm is down and its motors are off.
+Two tours, without and with the weight. The weight hangs while the arm is down and its motors are off. A recording
+(`--bag`) is one with the weight, of an arm that `calibrate gravity` has calibrated: what it holds without is known.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import argparse
 from typing import Any
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.gravity import gravity_torque
 from exo_gravity.core.moments import load_moments
 from exo_gravity.tools.calibration.gravity import solve
 from exo_gravity.tools.calibration.live import LiveTour, Say, is_simulated, refusals_of, run_tour, tour_parameters
@@ -26,7 +28,7 @@ def run(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> Outcome:
     if options.mass * options.lever < LEAST_MOMENT:
         raise ParameterError("mass times lever", options.mass * options.lever, f"at least {LEAST_MOMENT:g} kg m")
     if options.bag:
-        raise ParameterError("bag", str(options.bag), "left out: a recording does not tell when the weight hung")
+        return _recorded(options, arm)
     stopping = stop_on_signals()
     without = _tour(options, arm, say, stopping, {})
     refusals = refusals_of(without, options.record)
@@ -39,6 +41,16 @@ def run(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> Outcome:
         refusals = refusals_of(loaded, options.record)
         measured = without.measured + loaded.measured
     return solve(arm, [one.observation for one in measured], refusals)
+
+
+def _recorded(options: argparse.Namespace, arm: ConfiguredArm) -> Outcome:
+    """Solve for scales and moments from a recording with the weight, and the file's arm in the same poses without."""
+    from exo_gravity.tools.calibration.recorded import observations_of
+
+    observations = observations_of(options.bag, arm)
+    bare = [one._replace(effort=gravity_torque(arm.robot, one.theta, one.direction)) for one in observations]
+    loaded = [one._replace(load_mass=options.mass, load_lever=options.lever) for one in observations]
+    return solve(arm, [*bare, *loaded])
 
 
 def _tour(

@@ -58,7 +58,9 @@ def test_the_prediction_of_a_pose_from_the_others_is_nearly_as_good_as_its_measu
 def test_the_held_out_prediction_is_that_of_a_fit_without_the_pose():
     observations = Device(1).tour()
     found, without = identify(observations, LENGTH), identify(observations[1:], LENGTH)
-    predicted = regressor(observations[0].theta, LEANING)[0] @ without.moments / without.scale + without.offset
+    direction = LEANING + np.cross(without.tilt, LEANING)
+    predicted = regressor(observations[0].theta, direction / np.linalg.norm(direction))[0] @ without.moments
+    predicted = predicted / without.scale + without.offset
     np.testing.assert_allclose(found.held_out[0], observations[0].effort - predicted, atol=2e-3)
 
 

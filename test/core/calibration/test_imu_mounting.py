@@ -7,13 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from exo_gravity.core.arm import STANDARD_GRAVITY
 from exo_gravity.core.calibration.imu_mounting import ImuRecord, mounting, six_rests
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.tilt import rotation_matrix
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu
 
-RATE = 100.0
+from ...support.imu_records import RATE, record, rests
 
 
 def random_quaternion(rng: np.random.Generator) -> np.ndarray:
@@ -24,26 +23,6 @@ def random_quaternion(rng: np.random.Generator) -> np.ndarray:
 def angle_of(error: np.ndarray) -> float:
     """Return the angle in rad of a rotation matrix."""
     return math.acos(max(-1.0, min(1.0, (np.trace(error) - 1.0) / 2.0)))
-
-
-def record(
-    quaternion: np.ndarray,
-    bow: float = 0.7,
-    lean: float = 0.0,
-    seed: int = 0,
-    upright: float = 2.0,
-    posture: tuple[float, float] = (0.0, 0.0),
-) -> ImuRecord:
-    """Return 2 s upright, a bow in 1.5 s that leans sideways by `lean` rad, 2 s bowed, back, and 2 s upright."""
-    time = np.arange(0.0, upright + 7.0, 1.0 / RATE)
-    s = np.interp(time, np.cumsum((0.0, upright, 1.5, 2.0, 1.5, 2.0)), (0.0, 0.0, 1.0, 1.0, 0.0, 0.0))
-    share = s * s * (3.0 - 2.0 * s)
-    pitch, roll = posture[0] + bow * share, posture[1] + lean * share
-    imu = SimulatedImu(ImuConfig(tuple(quaternion), RATE, seed=seed))
-    rates = np.gradient(pitch, time), np.gradient(roll, time)
-    samples = [imu.sample(*row) for row in zip(pitch, roll, *rates, strict=True)]
-    gyroscope, accelerometer = (np.array(column) for column in zip(*samples, strict=True))
-    return ImuRecord(time, gyroscope, accelerometer)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -115,17 +94,6 @@ def test_an_imu_that_is_never_still_or_silent_is_refused() -> None:
         mounting(ImuRecord(time, shaken, 9.81 * shaken))
     with pytest.raises(DataError, match="3 IMU samples"):
         mounting(ImuRecord(time[:3], shaken[:3], shaken[:3]))
-
-
-def rests(count: int, scale: np.ndarray, bias: np.ndarray) -> ImuRecord:
-    """Return an IMU that lies on `count` of its sides for 2 s each, turned in 1 s."""
-    sides = np.array([(0, 0, 1), (0, 1, 0), (1, 0, 0), (0, -1, 0), (-1, 0, 0), (0, 0, -1)], float)[:count]
-    rng = np.random.default_rng(3)
-    force = np.repeat(sides * STANDARD_GRAVITY, 300, axis=0) / scale + bias
-    rate = 1e-3 * rng.standard_normal(force.shape)
-    for side in range(count):
-        rate[300 * side : 300 * side + 100] += (1.5, 0.3, 0.0)
-    return ImuRecord(np.arange(len(force)) / RATE, rate, force + 0.01 * rng.standard_normal(force.shape))
 
 
 def test_six_rests_show_scale_and_bias_of_the_accelerometer() -> None:

@@ -75,6 +75,13 @@ def test_errors_are_within_a_few_of_the_stated_standard_errors(wrong_file):
     assert np.mean(ratio < 2.0) > 0.9 and ratio.max() < 6.0
 
 
+def test_a_tour_that_is_done_does_not_watch_the_bridge_let_the_arm_down(wrong_file):
+    _, tour, _ = wrong_file
+    moved, still, upright = (0.0, 0.5, 0.4, 0.8), (0.0,) * 4, Tilt.of("right")
+    later = [tour.step(1000.0 + cycle / 100.0, moved, still, upright) for cycle in range(300)]
+    assert None not in later and not tour.trouble
+
+
 def test_a_tour_is_slow_and_no_limit_of_the_bridge_acts(wrong_file):
     run, _, _ = wrong_file
     positions = np.array(run.log)[:, 1:5]

@@ -1,0 +1,115 @@
+"""The study of `calibrate` on one device, and what the command line says when something is wrong: all offline."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import pytest
+
+from exo_gravity.core.calibration.motion import Station
+from exo_gravity.core.calibration.params import as_text
+from exo_gravity.sim.virtual_wearer import VirtualWearer
+from exo_gravity.tools import calibrate
+from exo_gravity.tools.calibration import gravity
+from exo_gravity.tools.calibration.live import LiveTour
+from exo_gravity.tools.inputs.parameter_file import packaged_config
+
+from .calibration.device import draw
+from .calibration.tour import Player, run_tour
+from .calibration.verdict import verdict
+from .calibration.way import go
+
+Torque = Callable[[float, Player], Sequence[float] | None]
+NOTHING = (0.0,) * 4
+
+
+class Hand(VirtualWearer):
+    """Puts the torque that `torque(time, player)` returns, (4,) Nm, on the joints."""
+
+    def __init__(self, torque: Torque, player: Player) -> None:
+        self._torque, self._player = torque, player
+
+    def idle(self, time: float, duration: float) -> bool:
+        return False
+
+    def torque(self, time: float, theta: Sequence[float], velocity: Sequence[float]) -> tuple[float, ...]:
+        return tuple(self._torque(time, self._player) or NOTHING)
+
+
+def slip(time: float, player: Player) -> Sequence[float]:
+    """The flexion's torque changes by and by, as if the joint slipped on its shaft."""
+    return 0.0, 0.0, min(1.5, 0.1 * max(0.0, time - 20.0)), 0.0
+
+
+def grip(time: float, player: Player) -> Sequence[float] | None:
+    """A hand holds the elbow where it is after 20 s."""
+    if time < 20.0:
+        return None
+    arm = player.device.arm
+    held = player.__dict__.setdefault("held", arm.positions[3])
+    return 0.0, 0.0, 0.0, 60.0 * (held - arm.positions[3]) - 2.0 * arm.velocities[3]
+
+
+def unplug(time: float, player: Player) -> None:
+    """The motor of the abduction loses its power."""
+    player.device.motors[1].unplugged = time > 25.0
+
+
+def gravity_with(folder: Path, trouble: Torque | None, changes: Mapping[str, Any], *more: str) -> int:
+    """Run `calibrate gravity` on the device of sim.yaml with `changes` of the calibrator; return the exit code."""
+
+    def prepare(player: Player) -> None:
+        if trouble:
+            player.device.start(Hand(trouble, player))
+
+    def run(options: argparse.Namespace, nodes: Mapping[str, Any], say: object) -> LiveTour:
+        nodes["/right/calibrator"]["ros__parameters"].update(changes)
+        return run_tour([], prepare)(options, nodes, say)
+
+    params, output = str(packaged_config("sim.yaml")), str(folder / "new.yaml")
+    with patch.object(gravity, "run_tour", run):
+        return calibrate.main(["gravity", "--params", params, "--output", output, *more])
+
+
+# A pose that needs 2 Nm of the flexion, which may give 1: chosen poses would avoid it.
+WEAK = {"max_effort": [3.0, 9.0, 1.0, 3.0], "tour.stations": as_text([Station((0.0, 0.3, 1.2, 0.2))])}
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize(
+    ("trouble", "changes", "more", "joint", "words"),
+    [
+        (slip, {}, (), "right_shoulder_flexion", ("between two passes", "beyond its weight and friction")),
+        (grip, {}, (), "right_elbow_flexion", ("is a hand on the arm?", "a hand is on the arm")),
+        (None, WEAK, (), "right_shoulder_flexion", ("saturated",)),
+        (unplug, {}, (), "right_shoulder_abduction", ("no reply for more than 100 ms",)),
+        (None, {}, ("--poses", "3"), "3 poses do not tell", ("add the pose",)),
+    ],
+    ids=["a slipping joint", "a touched arm", "a saturated motor", "a silent motor", "too few poses"],
+)
+def test_trouble_is_told_by_name_and_nothing_is_fitted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], trouble: Torque | None, changes: dict[str, Any],
+    more: tuple[str, ...], joint: str, words: tuple[str, ...],
+) -> None:  # fmt: skip
+    assert gravity_with(tmp_path, trouble, changes, *more) == 1
+    said = capsys.readouterr().err
+    assert f"calibrate: not calibrated: {joint}" in said and any(part in said for part in words), said
+    assert not (tmp_path / "new.yaml").exists()
+
+
+@pytest.mark.timeout(400)
+def test_a_random_device_is_calibrated_from_motors_to_an_arm_that_holds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setitem(os.environ, "OMP_NUM_THREADS", "1")
+    result = go(draw(0, tmp_path), tmp_path, fewer_poses=4)
+    missed = [row for row in verdict([result], []) if not row.held and "within 2 standard errors" not in row.what]
+    assert not missed  # of one device, 8 moments are too few to judge their standard errors
+    assert math.isfinite(result.creep[0])
