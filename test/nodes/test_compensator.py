@@ -49,6 +49,7 @@ def largest_excess(commands: Sequence[JointState], rate: float) -> tuple[float, 
     Compensator and test may both have missed messages: from stamp k to stamp k + n there are at most n steps. Steps to
     zero are left out: the compensator starts again from zero after 50 ms without a joint state.
     """
+    commands = list(commands)  # more arrive meanwhile
     efforts = np.array([command.effort for command in commands])
     numbers = np.array([to_nanoseconds(command.header.stamp) for command in commands])
     steps = np.abs(np.diff(efforts, axis=0)).max(axis=1)
