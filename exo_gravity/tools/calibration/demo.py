@@ -22,7 +22,7 @@ from exo_gravity.tools import calibrate
 from exo_gravity.tools.calibration.outcome import Change
 from exo_gravity.tools.calibration.yaml_file import write_changes
 from exo_gravity.tools.inputs.parameter_file import packaged_config
-from exo_gravity.tools.reporting.colours import FAINT, GRID_LINE, INK, JOINT_COLOURS
+from exo_gravity.tools.reporting.colours import FAINT, INK, JOINT_COLOURS, make_plain
 from exo_gravity.tools.reporting.table import degrees, joint_labels
 from exo_gravity.tools.trials.offline import OfflineTrial, simulated_trials
 
@@ -110,10 +110,8 @@ def picture(before: Sequence[Recording], after: Sequence[Recording]) -> Figure:
 
 
 def _plain(axis: Axes) -> None:
+    make_plain(axis)
     axis.set(xlim=(0.0, HOLD), xlabel="Time since it was let go (s)")
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.spines[["left", "bottom"]].set_color(FAINT)
-    axis.grid(axis="y", color=GRID_LINE, lw=0.5)
 
 
 def main(folder: Path | None = None) -> int:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from exo_gravity.tools.calibration.outcome import Curve
 from exo_gravity.tools.calibration.torque_table import TorqueTable
-from exo_gravity.tools.reporting.colours import FAINT, GRID_LINE, HOLD_COLOUR, INK, JOINT_COLOURS
+from exo_gravity.tools.reporting.colours import FAINT, HOLD_COLOUR, INK, JOINT_COLOURS, make_plain
 
 WIDTH = 11.0  # inches
 ROOM = 0.08  # of the data's range, around it
@@ -81,9 +81,5 @@ def friction_figure(curves: Sequence[Curve], labels: Sequence[str]) -> Figure:
 
 
 def _plain(axis: Axes) -> None:
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.spines[["left", "bottom"]].set_color(FAINT)
-    axis.tick_params(color=FAINT, labelcolor=INK, labelsize=9)
-    axis.grid(axis="y", color=GRID_LINE, lw=0.5)
-    axis.set_axisbelow(True)
+    make_plain(axis)
     axis.margins(y=0.12)

@@ -17,7 +17,14 @@ from matplotlib.patches import Patch
 from exo_gravity.core.recording import Recording
 from exo_gravity.core.trial_analysis import Hold, TrialAnalysis
 from exo_gravity.core.verdict import HoldCriteria
-from exo_gravity.tools.reporting.colours import FAINT, GRID_LINE, HOLD_COLOUR, INK, JOINT_COLOURS, PUSH_COLOUR
+from exo_gravity.tools.reporting.colours import (
+    FAINT,
+    HOLD_COLOUR,
+    INK,
+    JOINT_COLOURS,
+    PUSH_COLOUR,
+    make_plain,
+)
 from exo_gravity.tools.reporting.table import degrees, joint_labels, per_minute
 
 INTERVALS = 2_000  # per curve
@@ -135,9 +142,5 @@ def _legend(figure: Figure, recording: Recording, analysis: TrialAnalysis, comma
 
 
 def _plain(axis: Axes) -> None:
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.spines[["left", "bottom"]].set_color(FAINT)
-    axis.tick_params(color=FAINT, labelcolor=INK, labelsize=9)
-    axis.grid(axis="y", color=GRID_LINE, lw=0.5)
-    axis.set_axisbelow(True)
+    make_plain(axis)
     axis.margins(x=0)
