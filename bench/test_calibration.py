@@ -14,6 +14,7 @@ import pytest
 
 from exo_gravity.core.calibration.motion import Station
 from exo_gravity.core.calibration.params import as_text
+from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 from exo_gravity.tools import calibrate
 from exo_gravity.tools.calibration import gravity
@@ -33,6 +34,7 @@ class Hand(VirtualWearer):
     """Puts the torque that `torque(time, player)` returns, (4,) Nm, on the joints."""
 
     def __init__(self, torque: Torque, player: Player) -> None:
+        super().__init__(TrialScript.parse({"name": "hand", "steps": [{"hold": 3600.0}]}))
         self._torque, self._player = torque, player
 
     def idle(self, time: float, duration: float) -> bool:

@@ -20,6 +20,7 @@ from exo_gravity.core.moments import load_moments, moments_of
 from exo_gravity.core.motors import ENTER, EXIT, MOTORS
 from exo_gravity.core.safety import SafetyMachine
 from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.virtual_wearer import VirtualWearer
@@ -37,6 +38,7 @@ class Hand(VirtualWearer):
     """A wearer who applies the torque that `disturb(time, device)` returns, (4,) Nm."""
 
     def __init__(self, disturb: Disturb, device: SimulatedDevice) -> None:
+        super().__init__(TrialScript.parse({"name": "hand", "steps": [{"hold": 3600.0}]}))
         self._disturb, self._device = disturb, device
 
     def idle(self, time: float, duration: float) -> bool:
