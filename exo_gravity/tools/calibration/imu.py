@@ -30,7 +30,8 @@ NODE = "/imu"
 IMU_TYPE = "sensor_msgs/msg/Imu"
 ROTATION = "rotation_trunk_from_imu"
 REQUEST = (
-    "stand upright for 3 s, bow straight ahead by 45 degrees or so, stay there for 3 s, stand upright again for 3 s"
+    "stand upright for 3 s, bow straight ahead by 45 degrees or so, stay there for 3 s, stand upright again for 3 s; "
+    "bow three times in all"
 )
 
 
@@ -80,10 +81,12 @@ def _mounting_result(found: Mounting) -> tuple[tuple[Change, ...], tuple[str, ..
     accuracy = f"±{error} degrees about the trunk's x, y, z, of which posture is the larger part"
     lines = (
         f"{ROTATION}: {' '.join(f'{value:.4f}' for value in quaternion)} (x, y, z, w), {accuracy}",
-        f"the bow was {math.degrees(found.bow):.0f} degrees",
+        f"{found.bows} bow{'s' if found.bows > 1 else ''}, the deepest {math.degrees(found.bow):.0f} degrees",
         f"gyroscope bias {bias} rad/s, ±{bias_error}; the imu node estimates it by itself",
     )
-    note = f"{accuracy}, from a bow of {math.degrees(found.bow):.0f} degrees; gyroscope bias {bias} rad/s"
+    note = (
+        f"{accuracy}, from {found.bows} x {math.degrees(found.bow):.0f} degrees of bowing; gyroscope bias {bias} rad/s"
+    )
     return (Change(NODE, ROTATION, quaternion, note),), lines
 
 
@@ -95,7 +98,7 @@ def _accelerometer_line(fit: AccelerometerFit) -> str:
 
 
 def _record(options: argparse.Namespace, say: Callable[[object], None]) -> Path:
-    """Record while the person stands, bows and stands; return the recording's folder."""
+    """Record while the person stands and bows; return the recording's folder."""
     bag = Path(options.output).with_suffix(".bag").resolve()
     if bag.exists():
         raise DataError(f"{bag} exists: choose another --output, or use it with --bag")
