@@ -21,7 +21,7 @@ from exo_gravity.core.calibration.tour import Tour
 from exo_gravity.core.control_params import CAN_BRIDGE, limits_of, motors_of
 from exo_gravity.core.drive import Drive, State
 from exo_gravity.core.gravity import Torque
-from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.joint_motor import JointMotor, peaks_of
 from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.motors import ENTER, EXIT
 from exo_gravity.core.safety import SafetyMachine
@@ -57,7 +57,7 @@ class Player:
 
     def play(self) -> None:
         """Play until the motors are off."""
-        safety = SafetyMachine(self.limits, 1.0 / self.rate, [motor.peak_effort for motor in self.motors])
+        safety = SafetyMachine(self.limits, 1.0 / self.rate, *peaks_of(self.motors))
         safety.enable(0.0)
         effort: Torque | None = None
         answered, began = -math.inf, False

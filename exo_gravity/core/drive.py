@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from enum import Enum
 from typing import NamedTuple
 
@@ -31,6 +32,12 @@ class Drive(NamedTuple):
     damping: tuple[float, ...]
     powered: bool
     enter: tuple[bool, ...] = (False, False, False, False)
+
+    def within(self, peak_damping: tuple[float, ...]) -> Drive:
+        """Return the drive with no more damping than `peak_damping` (4,) Nm s/rad."""
+        if not any(map(operator.gt, self.damping, peak_damping)):
+            return self
+        return self._replace(damping=tuple(map(min, self.damping, peak_damping)))
 
 
 # The states in which torque is applied on request.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from exo_gravity.core.errors import ParameterError
@@ -46,6 +47,11 @@ class JointMotor:
         """The largest torque in Nm at the joint, for seconds."""
         return min(self.spec.peak_torque, self.spec.torque_range) * self.torque_scale
 
+    @property
+    def peak_damping(self) -> float:
+        """The largest damping in Nm s/rad at the joint that a command can ask for."""
+        return self.spec.kd_max * self.torque_scale
+
     def command(self, effort: float, damping: float) -> bytes:
         """Return the frame for a joint `effort` in Nm and `damping` in Nm s/rad, clamped to the wire format.
 
@@ -82,3 +88,8 @@ class JointMotor:
     def joint_effort(self, motor_torque: float) -> float:
         """Return the joint torque in Nm for a torque in the motor's Nm."""
         return self.direction * motor_torque * self.torque_scale
+
+
+def peaks_of(motors: Sequence[JointMotor]) -> tuple[list[float], list[float]]:
+    """Return the largest torque (n,) in Nm and damping (n,) in Nm s/rad that `motors` apply at their joints."""
+    return [motor.peak_effort for motor in motors], [motor.peak_damping for motor in motors]

@@ -40,13 +40,19 @@ class SafetyMachine:
     """Decides, cycle by cycle, what the motors of one arm receive. Not thread-safe: one thread owns it.
 
     period: s of a cycle. After a pause the torque continues as if only one period had passed: it never catches up.
-    peak_effort: (4,) Nm, what the motors can apply to brake the arm on its way down; by default `max_effort`.
+    peak_effort, peak_damping: (4,) Nm and Nm s/rad, the most that the motors apply; `max_effort` and any by default.
 
     state: the State. fault: the latched Fault or None. waiting_for: what CHECKING or PROVING waits for. acted: for each
     limit that has acted, by name, the last time. is_unreached: whether a motor that may be on cannot be reached.
     """
 
-    def __init__(self, limits: Limits, period: float, peak_effort: Sequence[float] | None = None) -> None:
+    def __init__(
+        self,
+        limits: Limits,
+        period: float,
+        peak_effort: Sequence[float] | None = None,
+        peak_damping: Sequence[float] = (math.inf,) * 4,
+    ) -> None:
         self.limits = limits
         self.state = State.DISABLED
         self.fault: Fault | None = None
@@ -54,7 +60,7 @@ class SafetyMachine:
         self.acted: dict[str, float] = {}
         self.is_unreached = False
         self._period = period
-        self._peak = tuple(peak_effort or limits.max_effort)
+        self._peak, self._peak_damping = tuple(peak_effort or limits.max_effort), tuple(peak_damping)
         self._since = 0.0
         self._now = -math.inf
         self._sent = OFF  # last sent to the motors
@@ -130,7 +136,7 @@ class SafetyMachine:
             self._check_delivery(now, joints, dt)
         if self.state in CARRYING:
             self._watch(now, joints, effort, effort_time)
-        drive = self._drive(now, joints, effort, dt)
+        drive = self._drive(now, joints, effort, dt).within(self._peak_damping)
         self._before = joints
         self._sent = drive
         return drive

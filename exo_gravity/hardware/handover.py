@@ -14,7 +14,7 @@ import can
 from exo_gravity.core.delivery import ABSOLUTE, RELATIVE
 from exo_gravity.core.drive import Drive
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.joint_motor import JointMotor, peaks_of
 from exo_gravity.core.limits import JointSample, Limits
 from exo_gravity.core.safety import SafetyMachine
 from exo_gravity.hardware.control_loop import ControlLoop
@@ -57,7 +57,7 @@ def let_down(
         log(str(error))
         return False
     motors = MotorBus(bus, charge.motors, powered=True, note=note, reopen=charge.open)
-    machine = SafetyMachine(charge.limits, charge.period, [motor.peak_effort for motor in charge.motors])
+    machine = SafetyMachine(charge.limits, charge.period, *peaks_of(charge.motors))
     machine.take_over(*_applied(motors, drive, charge.period), time.monotonic())
     loop = ControlLoop(motors, machine, charge.period)
     loop.start()

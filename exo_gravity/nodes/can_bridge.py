@@ -16,6 +16,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from exo_gravity.core.control_params import CAN_BRIDGE, OPTIONS, limits_of, motors_of
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.faults import FaultCode
+from exo_gravity.core.joint_motor import peaks_of
 from exo_gravity.core.safety import SafetyMachine
 from exo_gravity.core.validation import check_bridge
 from exo_gravity.core.wire import check_rate
@@ -158,7 +159,7 @@ class CanBridge(LifecycleNode):
         if self._owned is None:
             raise BusError("the node is not configured")
         bus, self._bus = self._bus or self._owned.open(), None
-        safety = SafetyMachine(self._limits, self._period, [motor.peak_effort for motor in self._motors])
+        safety = SafetyMachine(self._limits, self._period, *peaks_of(self._motors))
         hand_over = self._owned.watchdog.hand_over
         loop = ControlLoop(bus, safety, self._period, self._exchange.publish, self._exchange.get_efforts, hand_over)
         loop.start()

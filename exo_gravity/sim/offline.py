@@ -21,7 +21,7 @@ from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.compensator import Compensator, Settings
 from exo_gravity.core.drive import Drive, State
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.joint_motor import JointMotor, peaks_of
 from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.motors import ENTER, EXIT
 from exo_gravity.core.recording import Recording, ScriptedStep
@@ -71,7 +71,7 @@ class OfflineTrial:
         self._delay = delay
         self._start = math.inf  # s, of the script
         self._carried: list[float] = []  # s, the first and the last time at which the motors carried the arm
-        self._safety = SafetyMachine(arm.limits, 1.0 / arm.rate, [motor.peak_effort for motor in arm.motors])
+        self._safety = SafetyMachine(arm.limits, 1.0 / arm.rate, *peaks_of(arm.motors))
         self._compensator = Compensator(arm.settings)
         # The newest efforts, and when the readings that they answer were taken.
         self._efforts: tuple[Sequence[float] | None, float] = (None, -math.inf)

@@ -1,13 +1,14 @@
 """The way down, judged by the simulated arm's true motion: slow, to the ground in time, and no drop at the end."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from exo_gravity.core import Tilt, gravity_torque
 from exo_gravity.core.drive import OFF, State
-from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.joint_motor import JointMotor, peaks_of
 from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.motors import ENTER, EXIT, MOTORS
 from exo_gravity.core.safety import SafetyMachine
@@ -26,30 +27,33 @@ class Lowered:
     """An arm that its motors hold at `theta` until a fault lets it down. The speed is the arm's own, at 1 kHz.
 
     grounded: s until the joints that gravity moves stayed within 0.2 rad of where they ended. switched_off: s.
-    top_speed, speed_after_exit: rad/s, the latter over the 3 s after EXIT.
+    top_speed, speed_after_exit: rad/s, the latter over the 3 s after EXIT. switched_on_again: whether a motor was taken
+    for one that is off.
     """
 
-    def __init__(self, theta, friction, body_mass=0.0, pitch=0.0, roll=0.0):
+    def __init__(self, theta, friction, body_mass=0.0, pitch=0.0, roll=0.0, motors=MOTORS_OF_ARM):
+        self.motors = motors
         mass, cog = Wearer(body_mass).on_links((0.05, 0.13, 0.3, 0.3)) if body_mass else ((0.0,) * 4, (0.0,) * 4)
         config = ArmConfig(
             wearer_mass=mass, wearer_cog=cog, coulomb_friction=(friction,) * 4, viscous_friction=(0.0,) * 4
         )
         self.arm = SimulatedArm(config)
-        self.device = SimulatedDevice(self.arm, [SimulatedMotor(motor) for motor in MOTORS_OF_ARM])
+        self.device = SimulatedDevice(self.arm, [SimulatedMotor(motor) for motor in self.motors])
         self.device.pitch, self.device.roll = pitch, roll
         self.device.advance(0.001)
         self.arm.reset(theta)
         links = config.links.with_wearer(mass, cog)
         self.holding = gravity_torque(links, theta, Tilt.of("right", pitch, roll).direction)
-        self.machine = SafetyMachine(LIMITS, 1.0 / RATE, [motor.peak_effort for motor in MOTORS_OF_ARM])
+        self.machine = SafetyMachine(LIMITS, 1.0 / RATE, *peaks_of(self.motors))
         self.top_speed = self.speed_after_exit = 0.0
+        self.switched_on_again = False
         self._samples = [UNKNOWN] * 4
         self._track = []
         self._now = 0.0
         self._lower()
 
     def _lower(self):
-        for motor, effort in zip(MOTORS_OF_ARM, self.holding, strict=True):
+        for motor, effort in zip(self.motors, self.holding, strict=True):
             self.device.exchange(motor.can_id, motor.command(effort, 0.0))
             self._take(motor, self.device.exchange(motor.can_id, ENTER))
         self.machine.take_over(self.holding.tolist(), (0.0,) * 4, 0.0)
@@ -57,11 +61,12 @@ class Lowered:
             drive = self.machine.step(self._now, tuple(self._samples), None, -math.inf)
             if drive == OFF:
                 break
-            for motor, effort, damping in zip(MOTORS_OF_ARM, drive.effort, drive.damping, strict=True):
+            self.switched_on_again = self.switched_on_again or any(drive.enter)
+            for motor, effort, damping in zip(self.motors, drive.effort, drive.damping, strict=True):
                 self._take(motor, self.device.exchange(motor.can_id, motor.command(effort, damping)))
             self.top_speed = max(self.top_speed, self._advance(1.0 / RATE))
             self._track.append((self._now, *self.arm.positions))
-        for motor in MOTORS_OF_ARM:
+        for motor in self.motors:
             self.device.exchange(motor.can_id, EXIT)
         self.switched_off = self._now
         track = np.array(self._track)[:, 2:]  # joint 1 turns about the vertical: it has no ground
@@ -105,7 +110,7 @@ def test_from_other_poses_and_on_a_tilted_trunk_it_comes_down_as_slowly(theta, p
 @pytest.mark.parametrize("theta", POSES[1:4])
 def test_a_passive_arm_of_75_kg_comes_down_as_slowly_wherever_the_motors_can_hold_it(theta):
     lowered = Lowered(theta, 0.05, 75.0)
-    assert np.all(np.abs(lowered.holding) <= [motor.peak_effort for motor in MOTORS_OF_ARM])
+    assert np.all(np.abs(lowered.holding) <= peaks_of(MOTORS_OF_ARM)[0])
     assert lowered.top_speed < TOP_SPEED
     assert lowered.speed_after_exit < TOP_SPEED / 4
 
@@ -115,3 +120,10 @@ def test_an_arm_upright_overhead_is_not_left_to_fall():
     assert lowered.top_speed < TOP_SPEED
     assert lowered.speed_after_exit < TOP_SPEED / 4
     assert abs(lowered.arm.positions[1]) < 0.2
+
+
+def test_motors_that_apply_less_damping_than_asked_for_are_not_taken_for_motors_that_are_off():
+    weak = [replace(motor, torque_scale=0.6) for motor in MOTORS_OF_ARM]  # kd_max is then 3 Nm s/rad at the joint
+    lowered = Lowered(HORIZONTAL, 0.2, motors=weak)
+    assert lowered.machine.fault is None and not lowered.switched_on_again
+    assert lowered.top_speed < TOP_SPEED

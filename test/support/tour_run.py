@@ -14,7 +14,7 @@ from exo_gravity.core.calibration.poses import BestPoses, Itinerary
 from exo_gravity.core.calibration.tour import Tour
 from exo_gravity.core.drive import Drive, State
 from exo_gravity.core.gravity import Torque
-from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.joint_motor import JointMotor, peaks_of
 from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.moments import load_moments, moments_of
 from exo_gravity.core.motors import ENTER, EXIT, MOTORS
@@ -78,7 +78,7 @@ class TourRun:
         moments = moments_of(self.assumed) + load_moments(self.assumed.length.tolist(), *self.load)
         guess = TorqueGuess(self.assumed.length, moments, tilt, self.assumed.gravity)
         tour = Tour(self.limits, guess, itinerary or BestPoses(self.limits, 12, 230.0), self.rate, self.load)
-        safety = SafetyMachine(self.limits, 1.0 / self.rate, [motor.peak_effort for motor in MOTORS_AS_MOUNTED])
+        safety = SafetyMachine(self.limits, 1.0 / self.rate, *peaks_of(MOTORS_AS_MOUNTED))
         safety.enable(0.0)
         samples: list[JointSample] = [UNKNOWN] * 4
         effort: Torque | None = None

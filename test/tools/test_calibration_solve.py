@@ -145,7 +145,7 @@ def sweep_recording(held=False):
 
 def test_a_recording_of_slow_sweeps_gives_gravity_and_friction():
     upright = replace(ARM, compensator={**ARM.compensator, "use_imu": False})
-    found = list(recorded._sweeps(sweep_recording(), upright, None))
+    found = [one.observation for one in recorded._sweeps(sweep_recording(), upright, None)]
     assert len(found) == 6
     torque = gravity_torque(TRUTH, [o.theta for o in found], DOWN)
     np.testing.assert_allclose([o.effort for o in found], torque, atol=0.005)

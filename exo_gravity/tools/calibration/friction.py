@@ -48,9 +48,7 @@ def solve(arm: ConfiguredArm, measured: Sequence[Measured | Swept], refusals: tu
         if fit.coulomb <= 0.0
     )
     changes = tuple(Change(f"{arm.namespace}/can_bridge", "", 0, f"friction of {line}") for line in lines)
-    curves = tuple(
-        Curve(speed[:, joint], torque[:, joint], fit.at(speed[:, joint])) for joint, fit in enumerate(fits)
-    )
+    curves = tuple(Curve(speed[:, joint], torque[:, joint], fit.at(speed[:, joint])) for joint, fit in enumerate(fits))
     return Outcome(changes, lines, refusals + negative, arm, observations, curves=curves)
 
 
