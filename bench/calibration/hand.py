@@ -107,7 +107,7 @@ def write_bow(folder: Path, quaternion: np.ndarray, rng: np.random.Generator) ->
     share = np.interp(time, edges, (*(0.0, 0.0, 1.0, 1.0) * BOWS, 0.0, 0.0))
     share = share * share * (3.0 - 2.0 * share)
     upright = rng.normal(0.0, POSTURE, 2)
-    pitch = upright[0] + rng.uniform(*BOW, BOWS)[bow] * share
+    pitch = upright[0] + rng.uniform(BOW[0], BOW[1], BOWS)[bow] * share
     roll = upright[1] + rng.normal(0.0, LEAN, BOWS)[bow] * share
     imu = SimulatedImu(ImuConfig(tuple(quaternion), RATE, seed=int(rng.integers(1000))))
     types = get_typestore(Stores.ROS2_JAZZY)

@@ -131,7 +131,7 @@ def untold(unknowns: np.ndarray, covariance: np.ndarray, hidden: np.ndarray, rel
         )
     square, axes = np.linalg.eigh(covariance[TILT, TILT])  # the least known turn, the last, is the one about gravity
     tilt = math.degrees(float(np.linalg.norm(unknowns[TILT] @ axes[:, :2])))
-    tilt_error = math.degrees(math.sqrt(max(0.0, square[:2].sum())))
+    tilt_error = math.degrees(math.sqrt(max(0.0, float(square[:2].sum()))))
     if tilt > max(3.0 * tilt_error, LEAST_TILT):
         said.append(f"Gravity seems {tilt:.1f} degrees off what the IMU says: check rotation_trunk_from_imu.")
     return tuple(said)

@@ -194,8 +194,8 @@ def final(rows: Rows, start: np.ndarray) -> tuple[Rows, Solution]:
 def _common_error(rows: Rows, solution: Solution) -> np.ndarray:
     """Return the covariance (23, 23) that the error `COMMON` of each joint and weight causes."""
     torque = (rows.predicted(solution.unknowns) - solution.unknowns[OFFSET]) / rows.sigma
-    _, group = np.unique(rows.load, axis=0, return_inverse=True)
-    shared = np.arange(group.max() + 1)[:, None, None, None] == group.reshape(-1, 1)
+    loads, group = np.unique(rows.load, axis=0, return_inverse=True)
+    shared = np.arange(len(loads))[:, None, None, None] == group.reshape(-1, 1)
     columns = COMMON * torque * shared * np.eye(JOINT_COUNT)[:, None, :]
     change = columns.reshape(-1, torque.size) @ solution.inverse[:, : torque.size].T
     return np.asarray(change.T @ change)

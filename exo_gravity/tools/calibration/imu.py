@@ -79,14 +79,13 @@ def _mounting_result(found: Mounting) -> tuple[tuple[Change, ...], tuple[str, ..
     bias_error = " ".join(f"{value:.4f}" for value in found.gyroscope_bias_error)
     quaternion = [round(float(value), 6) for value in found.quaternion]
     accuracy = f"±{error} degrees about the trunk's x, y, z, of which posture is the larger part"
+    bows = f"{found.bows} {'bow' if found.bows == 1 else 'bows'} of up to {math.degrees(found.bow):.0f} degrees"
     lines = (
         f"{ROTATION}: {' '.join(f'{value:.4f}' for value in quaternion)} (x, y, z, w), {accuracy}",
-        f"{found.bows} bow{'s' if found.bows > 1 else ''}, the deepest {math.degrees(found.bow):.0f} degrees",
+        f"from {bows}",
         f"gyroscope bias {bias} rad/s, ±{bias_error}; the imu node estimates it by itself",
     )
-    note = (
-        f"{accuracy}, from {found.bows} x {math.degrees(found.bow):.0f} degrees of bowing; gyroscope bias {bias} rad/s"
-    )
+    note = f"{accuracy}, from {bows}; gyroscope bias {bias} rad/s"
     return (Change(NODE, ROTATION, quaternion, note),), lines
 
 
