@@ -38,9 +38,9 @@ def with_mounting(outcome: Outcome, params: Path) -> Outcome:
     turn = found.tilt if is_whole else axes[:, :2] @ axes[:, :2].T @ found.tilt
     angle, quaternion = math.degrees(float(np.linalg.norm(turn))), turned(rotation, _turn_in_trunk(arm.side, turn))
     if is_whole:
-        accuracy = f"±{math.degrees(error):.1f} degrees, heading ±{math.degrees(heading_error):.1f}"
+        accuracy = f"±{math.degrees(error):.2f} degrees, heading ±{math.degrees(heading_error):.2f}"
     else:
-        accuracy = f"±{math.degrees(error):.1f} degrees, heading unchanged"
+        accuracy = f"±{math.degrees(error):.2f} degrees, heading unchanged"
     note = f"{accuracy}, from the arm's weight: {angle:.1f} degrees from the value before"
     lines = (f"{ROTATION}: corrected by {angle:.1f} degrees, {accuracy}", *(() if is_whole else (NO_HEADING,)))
     change = Change(NODE, ROTATION, [round(value, 6) for value in quaternion], note)
