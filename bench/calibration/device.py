@@ -28,6 +28,7 @@ ZERO = 3.0  # rad, and whole turns of the rotor in addition
 ROTOR_TURNS = 2
 # rad, pitch and roll of the stand. It leans to the arm's side: joint 1 then carries something, and hangs at its zero.
 STAND = (-0.1, 0.17), (0.1, 0.24)
+LEANT = (0.12, 0.2)  # rad, by which the stand is leant otherwise when the weight is hung, forward or back
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +36,7 @@ class Device:
     """One device. params: its file, with nominal masses, default motors, and the true device as the simulator.
 
     moments: (8,) kg m, true ones. can_id, direction, zero: (4,), true ones. quaternion: true trunk from IMU.
+    leant: pitch and roll of the stand in rad with the weight; without it, the file's.
     """
 
     seed: int
@@ -45,6 +47,7 @@ class Device:
     zero: list[float]
     scale: list[float]
     quaternion: np.ndarray
+    leant: tuple[float, float]
 
     @property
     def moments(self) -> np.ndarray:
@@ -81,7 +84,9 @@ def draw(seed: int, folder: Path) -> Device:
     params = folder / "0.yaml"
     params.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     links = ArmModel(nominal.length, cog, mass, off_axis=off_axis_of(mass, *beside))
-    return Device(seed, params, links, can_id, direction, zero, scale, quaternion)
+    other_pitch = stand[0] - math.copysign(rng.uniform(*LEANT), stand[0])  # to the side where there is more room
+    leant = (other_pitch, float(rng.uniform(STAND[0][1], STAND[1][1])))
+    return Device(seed, params, links, can_id, direction, zero, scale, quaternion, leant)
 
 
 def _friction(rng: np.random.Generator) -> dict[str, Any]:

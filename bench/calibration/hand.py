@@ -25,7 +25,8 @@ POSTURE = np.radians(0.7)  # of a person who stands upright, standard deviation 
 BOW = np.radians((35.0, 60.0))
 LEAN = np.radians(1.5)  # sideways at the end of the bow, standard deviation
 RATE = 100.0  # Hz of the IMU
-PHASES = (0.0, 3.0, 1.5, 3.0, 1.5, 3.0)  # s: upright, down, bowed, up, upright
+BOWS = 3
+PHASES = 3.0, 1.5, 3.0, 1.5  # s: upright, down, bowed, up
 
 
 class Hand:
@@ -99,12 +100,15 @@ def hanging(links: ArmModel) -> np.ndarray:
 
 
 def write_bow(folder: Path, quaternion: np.ndarray, rng: np.random.Generator) -> Path:
-    """Write a recording of an IMU on a person who stands, bows and stands, none of it perfectly; return its folder."""
-    time = np.arange(0.0, sum(PHASES), 1.0 / RATE)
-    share = np.interp(time, np.cumsum(PHASES), (0.0, 0.0, 1.0, 1.0, 0.0, 0.0))
+    """Write a recording of an IMU on a person who stands and bows `BOWS` times, not perfectly; return its folder."""
+    edges = np.cumsum((0.0, *PHASES * BOWS, PHASES[0]))
+    time = np.arange(0.0, edges[-1], 1.0 / RATE)
+    bow = (time / sum(PHASES)).astype(int).clip(max=BOWS - 1)
+    share = np.interp(time, edges, (*(0.0, 0.0, 1.0, 1.0) * BOWS, 0.0, 0.0))
     share = share * share * (3.0 - 2.0 * share)
     upright = rng.normal(0.0, POSTURE, 2)
-    pitch, roll = upright[0] + rng.uniform(*BOW) * share, upright[1] + rng.normal(0.0, LEAN) * share
+    pitch = upright[0] + rng.uniform(BOW[0], BOW[1], BOWS)[bow] * share
+    roll = upright[1] + rng.normal(0.0, LEAN, BOWS)[bow] * share
     imu = SimulatedImu(ImuConfig(tuple(quaternion), RATE, seed=int(rng.integers(1000))))
     types = get_typestore(Stores.ROS2_JAZZY)
     vector, covariance = types.types["geometry_msgs/msg/Vector3"], np.zeros(9)

@@ -45,11 +45,15 @@ def _motors(results: Sequence[Result]) -> list[Row]:
         Row(f"motors: {name}", f"{part} of {count}", "all", part == count)
         for name, part in zip(names, right, strict=True)
     ]
-    worst = " ".join(f"{value:.1f}" for value in hanging.max(axis=0))
-    free = Row("motors: zero error if the arm hangs, worst of each joint", f"{worst} deg", "", True)
+    largest = " ".join(f"{value:.1f}" for value in hanging.max(axis=0))
+    free = Row("motors: zero error if the arm hangs, worst of each joint", f"{largest} deg", "", True)
     turns = Row("motors: turns of the rotor after power-up told", f"{told} of {count}", "all", told == count)
-    posture = f"{np.median(imu):.1f} deg, worst {imu.max():.1f}"
-    return [*rows, free, turns, Row("imu: mounting error from the bow, median", posture, "", True)]
+    typical, worst = np.median(imu, axis=0), imu.max(axis=0)
+    mounting = [
+        Row(f"imu: mounting error {when}, median", f"{typical[i]:.1f} deg, worst {worst[i]:.1f}", "", True)
+        for i, when in enumerate(("from three bows", "after the weight on two leans"))
+    ]
+    return [*rows, free, turns, *mounting]
 
 
 def _moments(results: Sequence[Result]) -> list[Row]:
@@ -109,6 +113,7 @@ def progress(result: Result) -> str:
     worst = float(error.max() / result.true_moments.max())
     before, after = (f"{value:.2f}" if math.isfinite(value) else "?" for value in result.creep)
     return (
-        f"device {result.seed}: {right}, IMU {result.imu_error:.1f} deg off, moments {worst:.2%} off, {inside} of 8 "
-        f"within 2 SE, held out {held_out:.2%} of peak, {result.minutes:.1f} min, creep {before} to {after} deg/min"
+        f"device {result.seed}: {right}, IMU {result.imu_error[0]:.1f}, then {result.imu_error[1]:.1f} deg off, "
+        f"moments {worst:.2%} off, {inside} of 8 within 2 SE, held out {held_out:.2%} of peak, "
+        f"{result.minutes:.1f} min, creep {before} to {after} deg/min"
     )

@@ -9,10 +9,11 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -24,6 +25,7 @@ from exo_gravity.core.tilt import rotation_matrix
 from exo_gravity.sim.device_params import SIMULATOR, device_of
 from exo_gravity.tools import calibrate
 from exo_gravity.tools.calibration import demo, gravity, motors, scale
+from exo_gravity.tools.calibration.live import LiveTour
 from exo_gravity.tools.calibration.outcome import Outcome
 from exo_gravity.tools.calibration.person import Person
 from exo_gravity.tools.inputs.arms import ConfiguredArm, configured_arm, node_values
@@ -46,10 +48,10 @@ class Result:
     """What the way of one device showed; lengths (8,) in the order of MOMENTS, (4,) by joint.
 
     hanging_error: deg, (4,), of the zero if the arm hangs. turns_told: whether a jump by turns of the rotor at power-up
-    was refused, and nothing else. imu_error: deg. moments, true_moments, error: kg m; error: one standard error.
-    scale_ratio: found by true. held_out: Nm, (n, 4). peak: Nm, the largest torque of gravity. new_pose: Nm, largest
-    error in poses not visited. poses, minutes: of `calibrate gravity`. speed: rad/s, 99.9th percentile and maximum.
-    creep: deg/min, before and after.
+    was refused, and nothing else. imu_error: deg, after the bow and at the end. moments, true_moments, error: kg m;
+    error: one standard error. scale_ratio: found by true. held_out: Nm, (n, 4). peak: Nm, the largest torque of
+    gravity. new_pose: Nm, largest error in poses not visited. poses, minutes: of `calibrate gravity`. speed: rad/s,
+    99.9th percentile and maximum. creep: deg/min, before and after.
     """
 
     seed: int
@@ -57,7 +59,7 @@ class Result:
     zero_error: np.ndarray
     hanging_error: np.ndarray
     turns_told: bool
-    imu_error: float
+    imu_error: tuple[float, float]
     moments: np.ndarray
     true_moments: np.ndarray
     error: np.ndarray
@@ -92,7 +94,7 @@ def go(device: Device, folder: Path, fewer_poses: int = 0) -> Result:
     tour = players[0].tour
     outcomes: list[Outcome] = []
     lever = rng.uniform(*LEVER)
-    with _offline(scale, players), _noted(scale, outcomes):
+    with _offline(scale, players, device.leant), _noted(scale, outcomes):
         _calibrate("scale", folder, 3, "--mass", f"{MASS:g}", "--lever", f"{lever:.4f}")
     old, new = configured_arm(folder / "2.yaml"), configured_arm(folder / "4.yaml")
     found = outcomes[0].identified
@@ -102,7 +104,7 @@ def go(device: Device, folder: Path, fewer_poses: int = 0) -> Result:
     creeps = (_creep(folder / "2.yaml"), _creep(folder / "4.yaml"))
     return Result(
         device.seed, (right[0], right[1], bool(np.abs(zero_error).max() < 0.2)), zero_error, hanging_error, turns_told,
-        _imu_error(device, folder), found.moments, device.moments, found.error, *_scales(device, new, found),
+        _imu_errors(device, folder), found.moments, device.moments, found.error, *_scales(device, new, found),
         found.held_out, _peak(device), _new_pose(device, old, new, rng), len(tour.measured), tour.elapsed / 60.0,
         speed_quantiles(players), creeps,
     )  # fmt: skip
@@ -121,8 +123,17 @@ def _calibrate(command: str, folder: Path, step: int, *more: str) -> None:
 
 
 @contextlib.contextmanager
-def _offline(module: ModuleType, players: list[Player]) -> Iterator[None]:
-    with patch.object(module, "run_tour", run_tour(players)):
+def _offline(module: ModuleType, players: list[Player], leant: Sequence[float] = ()) -> Iterator[None]:
+    """Let tours of `module` run without nodes; leant: pitch and roll in rad of the stand while the weight hangs."""
+    play = run_tour(players)
+
+    def run(options: argparse.Namespace, nodes: Mapping[str, Any], *more: object) -> LiveTour:
+        simulator = nodes[SIMULATOR_NODE]["ros__parameters"]
+        if leant and "wearer" in simulator:
+            simulator["trunk"] = dict(zip(("pitch", "roll"), leant, strict=True))
+        return play(options, nodes, *more)
+
+    with patch.object(module, "run_tour", run):
         yield
 
 
@@ -181,11 +192,12 @@ def _creep(params: Path) -> float:
     return demo.creep(recordings)
 
 
-def _imu_error(device: Device, folder: Path) -> float:
-    """Return the angle in degrees between the mounting found and the true one."""
-    found = load(folder / "2.yaml")["/imu"]["rotation_trunk_from_imu"]
-    error = rotation_matrix(found) @ rotation_matrix(device.quaternion.tolist()).T
-    return math.degrees(math.acos(min(1.0, (float(np.trace(error)) - 1.0) / 2.0)))
+def _imu_errors(device: Device, folder: Path) -> tuple[float, float]:
+    """Return the angle in degrees between the mounting and the true one, after the bow and after all."""
+    true = rotation_matrix(device.quaternion.tolist())
+    found = [rotation_matrix(load(folder / name)["/imu"]["rotation_trunk_from_imu"]) for name in ("2.yaml", "4.yaml")]
+    bow, end = (math.degrees(math.acos(min(1.0, (float(np.trace(one @ true.T)) - 1.0) / 2.0))) for one in found)
+    return bow, end
 
 
 def _scales(device: Device, new: ConfiguredArm, found: Identified) -> tuple[np.ndarray, np.ndarray]:

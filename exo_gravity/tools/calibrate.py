@@ -5,7 +5,7 @@
     friction   Coulomb, viscous and Stribeck friction of each joint, from slow sweeps
     scale      real torque per commanded torque of each motor, from a known weight on the last link
     wearer     the moments of the wearer's relaxed arm
-    imu        how the IMU is mounted on the trunk, from standing upright and bowing once
+    imu        how the IMU is mounted on the trunk, from standing upright and bowing
 
 The new file is the old one with new values, their uncertainty and the date. Beside it are a page (NEW.html) and
 what was measured (NEW.jsonl). No existing file is ever overwritten.
@@ -36,7 +36,7 @@ COMMANDS = {
     "friction": "friction of each joint, from slow sweeps",
     "scale": "torque scale of each motor, from a known weight on the last link",
     "wearer": "the moments of the wearer's relaxed arm",
-    "imu": "the mounting of the IMU, from standing upright and bowing once",
+    "imu": "the mounting of the IMU, from standing upright and bowing",
 }
 MAX_POSES = 12
 

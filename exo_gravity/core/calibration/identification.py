@@ -51,7 +51,7 @@ LEAST_SPREAD = 0.003  # Nm; about half a code of an AK motor's 12-bit torque
 # Moments across and along the links between which an angle turns a weight: Y3 and M3, Y4 and M4, Z and M4.
 BESIDE = ((6, 2), (7, 3), (5, 3))
 BESIDE_ERROR = 0.05  # rad, of a weight's place; 3 degrees
-TILT_ERROR = 0.03  # rad about each axis, of gravity's measured direction: an IMU's mounting, or a stand's uprightness
+TILT_ERROR = 0.05  # rad about each axis, of gravity's measured direction: an IMU's mounting, mostly its heading
 EXACT = 1e-6  # error of a value that is held
 HIDDEN = 0.1  # share of an unknown, in combinations that are not known, from which it is not known itself
 
@@ -85,8 +85,8 @@ class Identified:
     effort minus prediction. held_out: (n, 4) Nm, the same predicted without that pose, NaN where the others do not
     suffice. singular_values: of the information in the poses, the largest first; below 1: combinations that are not
     known. unknown: sentences on what the poses do not tell, and what would. rejected: index and reason of each
-    observation that is not used. tilt, tilt_error: (3,) rad in the base frame, rotation of gravity from the measured to
-    the true direction, and its standard error.
+    observation that is not used. tilt: (3,) rad in the base frame, rotation of gravity from the measured to the true
+    direction, and tilt_covariance (3, 3). One lean of the stand does not tell the turn about gravity, two do.
     """
 
     moments: np.ndarray
@@ -102,7 +102,7 @@ class Identified:
     rejected: tuple[tuple[int, str], ...] = ()
     relative: bool = False
     tilt: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    tilt_error: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    tilt_covariance: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
 
     @property
     def error(self) -> np.ndarray:
@@ -148,11 +148,11 @@ def identify(
         np.median([observation.friction for observation in observations], axis=0),
         *_residuals(rows, keep, used, solution),
         solution.singular_values,
-        untold(unknowns, error, hidden, is_relative),
+        untold(unknowns, covariance, hidden, is_relative),
         rejected,
         is_relative,
         unknowns[TILT],
-        error[TILT],
+        covariance[TILT, TILT],
     )
 
 

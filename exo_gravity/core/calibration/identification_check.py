@@ -110,8 +110,8 @@ def check_physical(
             )
 
 
-def untold(unknowns: np.ndarray, error: np.ndarray, hidden: np.ndarray, relative: bool) -> tuple[str, ...]:
-    """Return what the poses do not tell, and what would, in sentences; unknowns, their errors, and `hidden`: (23,)."""
+def untold(unknowns: np.ndarray, covariance: np.ndarray, hidden: np.ndarray, relative: bool) -> tuple[str, ...]:
+    """Return what the poses do not tell, and what would, in sentences; unknowns and `hidden`: (23,)."""
     said = []
     if relative:
         said.append("A common factor of all torque scales and moments: hang a known weight on link 4.")
@@ -124,13 +124,14 @@ def untold(unknowns: np.ndarray, error: np.ndarray, hidden: np.ndarray, relative
             f"{MOMENTS[across]} of link {joint} from an error of joint {joint}'s zero: it looks like one of "
             f"{angle:+.1f} degrees; check the zero with a level or at a stop."
         )
-    elbow, elbow_error = math.degrees(unknowns[ANGLE][0]), math.degrees(error[ANGLE][0])
+    elbow, elbow_error = math.degrees(unknowns[ANGLE][0]), math.degrees(math.sqrt(covariance[ANGLE, ANGLE][0, 0]))
     if elbow and abs(elbow) > max(3.0 * elbow_error, LEAST_ZERO_ERROR):
         said.append(
             f"The weight at the elbow speaks for joint 3's zero being {elbow:+.1f} +- {elbow_error:.1f} degrees off."
         )
-    tilt = math.degrees(float(np.linalg.norm(unknowns[TILT])))
-    tilt_error = math.degrees(math.hypot(*np.sort(error[TILT])[:2]))  # a turn about gravity does not show
+    square, axes = np.linalg.eigh(covariance[TILT, TILT])  # the least known turn, the last, is the one about gravity
+    tilt = math.degrees(float(np.linalg.norm(unknowns[TILT] @ axes[:, :2])))
+    tilt_error = math.degrees(math.sqrt(max(0.0, float(square[:2].sum()))))
     if tilt > max(3.0 * tilt_error, LEAST_TILT):
         said.append(f"Gravity seems {tilt:.1f} degrees off what the IMU says: check rotation_trunk_from_imu.")
     return tuple(said)

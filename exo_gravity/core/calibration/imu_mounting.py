@@ -1,8 +1,8 @@
-"""How an IMU is mounted on the trunk: from standing upright, bowing once, and standing upright again.
+"""How an IMU is mounted on the trunk: from standing upright, bowing, and standing upright again.
 
 Upright, the accelerometer shows the trunk's z axis (up). Between upright and bowed the trunk turns about its y axis, so
 gravity moves in the plane across it: y is along bowed x upright. The gyroscope's axis and angle must agree. Posture
-limits the result: nobody stands upright, or bows straight ahead, to better than a degree or so.
+limits the result: nobody stands upright, or bows straight ahead, to better than a degree or so. Several bows average.
 
 Six rests of the IMU on different sides show the accelerometer's scale and bias: in each it must show one g.
 """
@@ -10,6 +10,7 @@ Six rests of the IMU on different sides show the accelerometer's scale and bias:
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -46,12 +47,13 @@ class ImuRecord(NamedTuple):
 class Mounting(NamedTuple):
     """quaternion: trunk from IMU, (x, y, z, w). error: (3,) rad, standard error about the trunk's x, y and z.
 
-    bow: rad. gyroscope_bias: (3,) rad/s, with its standard error.
+    bows: how many. bow: rad, the deepest. gyroscope_bias: (3,) rad/s, with its standard error.
     """
 
     quaternion: np.ndarray
     error: np.ndarray
     bow: float
+    bows: int
     gyroscope_bias: np.ndarray
     gyroscope_bias_error: np.ndarray
 
@@ -71,7 +73,7 @@ class _Phase(NamedTuple):
 
 
 def mounting(record: ImuRecord) -> Mounting:
-    """Return the mounting that a record of standing, bowing and standing shows.
+    """Return the mounting that a record of standing, bowing and standing, once or several times, shows.
 
     Raises DataError, which says what to do, if there are no still phases upright, bowed and upright; if the bow is too
     small or not about one axis; or if gyroscope and accelerometer contradict each other.
@@ -92,20 +94,38 @@ def mounting(record: ImuRecord) -> Mounting:
         raise DataError("the record must begin and end upright: stand for 2 s before the bow and after it")
     others = [phase.up for phase in standing]
     z = _unit(np.mean(others, axis=0))
-    y = _unit(np.cross(bowed.up, z))
+    bows = _bows(phases, standing)
+    axes = [_unit(np.cross(lowest.up, z)) for _, lowest in bows]
+    y = _unit(np.mean(axes, axis=0))
     resting = np.concatenate([record.angular_velocity[phase.first : phase.beyond] for phase in phases])
     bias = resting.mean(axis=0)
-    off_axis = _check_turn(record, upright, bowed, bias, y, bow)
+    off_axis = [
+        _check_turn(record, *pair, bias, axis, angle_between(pair[1].up, pair[0].up))
+        for pair, axis in zip(bows, axes, strict=True)
+    ]
     level = math.hypot(SENSOR, max(POSTURE, *(angle_between(up, z) for up in others)))
-    heading = math.hypot(level / math.sin(min(bow, math.pi / 2)), off_axis / 2.0)
+    sideways = level / math.sin(min(bow, math.pi / 2)), float(np.mean(off_axis)) / 2.0
+    heading = max(level, math.hypot(*sideways) / math.sqrt(len(bows)))
     return Mounting(
         _quaternion(np.stack((np.cross(y, z), y, z))),
         np.array((level, level, heading)),
         bow,
+        len(bows),
         bias,
         # The sway is correlated over about a second: as many independent samples as seconds.
         resting.std(axis=0) / math.sqrt(max(1.0, len(resting) * float(np.median(np.diff(record.time))))),
     )
+
+
+def _bows(phases: Sequence[_Phase], standing: Sequence[_Phase]) -> list[tuple[_Phase, _Phase]]:
+    """Return the upright phase before each bow, and the lowest phase of the bow."""
+    bows = []
+    for before, after in pairwise(standing):
+        between = [phase for phase in phases if before.first < phase.first < after.first]
+        lowest = max(between, key=lambda phase: angle_between(phase.up, before.up), default=before)
+        if angle_between(lowest.up, before.up) >= MIN_BOW:
+            bows.append((before, lowest))
+    return bows
 
 
 def _check_turn(

@@ -40,6 +40,7 @@ MEDIAN_CAUSED = 3.36  # of the sum of four such squares
 LEAST_OUTLIER = 0.03  # Nm, and this share of the peak effort: a smaller error does no harm, nor does a hand cause it
 SHARE_OF_PEAK = 0.01
 DISTURBED = "Was it touched, does a joint slip or touch a stop?"
+COMMON = 0.002  # of torque: error of all sweeps of a joint in one tour, which their scatter does not show
 OUTLIER = 32.0  # such a sum from which a pose is left out: of good poses, one in 500,000
 
 
@@ -96,7 +97,8 @@ class Solution:
     """unknowns: (23,). covariance: (23, 23) of what is known. hidden: (23,), share 0..1 of each that is not known.
 
     singular_values: of the poses alone, in units of `NATURAL`, the largest first. residual: (n, 4) Nm. hat: (n, 4, n,
-    4), derivative of the predicted by the measured effort, both divided by sigma.
+    4), derivative of the predicted by the measured effort, both divided by sigma. inverse: (23, 4 n + k), change of the
+    unknowns with each measured effort and condition, divided by its error.
     """
 
     unknowns: np.ndarray
@@ -105,6 +107,7 @@ class Solution:
     singular_values: np.ndarray
     residual: np.ndarray
     hat: np.ndarray
+    inverse: np.ndarray
 
     @property
     def freedom(self) -> np.ndarray:
@@ -157,7 +160,7 @@ def _solution(rows: Rows, unknowns: np.ndarray, root: np.ndarray) -> Solution:
     count = len(rows.effort)
     hat = (jacobian @ inverse[:, : 4 * count]).reshape(count, 4, count, 4)
     residual = rows.effort - rows.predicted(unknowns)
-    return Solution(unknowns, covariance, hidden, singular_values, residual, hat)
+    return Solution(unknowns, covariance, hidden, singular_values, residual, hat, inverse)
 
 
 def robust(rows: Rows, start: np.ndarray) -> tuple[Rows, Solution]:
@@ -174,7 +177,10 @@ def robust(rows: Rows, start: np.ndarray) -> tuple[Rows, Solution]:
 
 
 def final(rows: Rows, start: np.ndarray) -> tuple[Rows, Solution]:
-    """Return the plain least-squares solution, and the rows with the error that its residuals show."""
+    """Return the plain least-squares solution, and the rows with the error that its residuals show.
+
+    The covariance includes a relative error of `COMMON` that all poses of a joint with the same weight share.
+    """
     scaled, solution = rows, solve(rows, start)
     for _ in range(3):
         freedom = np.maximum(solution.freedom, 0.0)
@@ -182,7 +188,17 @@ def final(rows: Rows, start: np.ndarray) -> tuple[Rows, Solution]:
         factor = _pooled(squares / np.maximum(freedom, 1e-9), freedom)
         scaled = replace(rows, sigma=rows.sigma * np.sqrt(factor))
         solution = solve(scaled, solution.unknowns)
-    return scaled, solution
+    return scaled, replace(solution, covariance=solution.covariance + _common_error(scaled, solution))
+
+
+def _common_error(rows: Rows, solution: Solution) -> np.ndarray:
+    """Return the covariance (23, 23) that the error `COMMON` of each joint and weight causes."""
+    torque = (rows.predicted(solution.unknowns) - solution.unknowns[OFFSET]) / rows.sigma
+    loads, group = np.unique(rows.load, axis=0, return_inverse=True)
+    shared = np.arange(len(loads))[:, None, None, None] == group.reshape(-1, 1)
+    columns = COMMON * torque * shared * np.eye(JOINT_COUNT)[:, None, :]
+    change = columns.reshape(-1, torque.size) @ solution.inverse[:, : torque.size].T
+    return np.asarray(change.T @ change)
 
 
 def _pooled(factor: np.ndarray, freedom: np.ndarray) -> np.ndarray:

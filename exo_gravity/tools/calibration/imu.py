@@ -30,7 +30,8 @@ NODE = "/imu"
 IMU_TYPE = "sensor_msgs/msg/Imu"
 ROTATION = "rotation_trunk_from_imu"
 REQUEST = (
-    "stand upright for 3 s, bow straight ahead by 45 degrees or so, stay there for 3 s, stand upright again for 3 s"
+    "stand upright for 3 s, bow straight ahead by 45 degrees or so, stay there for 3 s, stand upright again for 3 s; "
+    "bow three times in all"
 )
 
 
@@ -78,12 +79,13 @@ def _mounting_result(found: Mounting) -> tuple[tuple[Change, ...], tuple[str, ..
     bias_error = " ".join(f"{value:.4f}" for value in found.gyroscope_bias_error)
     quaternion = [round(float(value), 6) for value in found.quaternion]
     accuracy = f"±{error} degrees about the trunk's x, y, z, of which posture is the larger part"
+    bows = f"{found.bows} {'bow' if found.bows == 1 else 'bows'} of up to {math.degrees(found.bow):.0f} degrees"
     lines = (
         f"{ROTATION}: {' '.join(f'{value:.4f}' for value in quaternion)} (x, y, z, w), {accuracy}",
-        f"the bow was {math.degrees(found.bow):.0f} degrees",
+        f"from {bows}",
         f"gyroscope bias {bias} rad/s, ±{bias_error}; the imu node estimates it by itself",
     )
-    note = f"{accuracy}, from a bow of {math.degrees(found.bow):.0f} degrees; gyroscope bias {bias} rad/s"
+    note = f"{accuracy}, from {bows}; gyroscope bias {bias} rad/s"
     return (Change(NODE, ROTATION, quaternion, note),), lines
 
 
@@ -95,7 +97,7 @@ def _accelerometer_line(fit: AccelerometerFit) -> str:
 
 
 def _record(options: argparse.Namespace, say: Callable[[object], None]) -> Path:
-    """Record while the person stands, bows and stands; return the recording's folder."""
+    """Record while the person stands and bows; return the recording's folder."""
     bag = Path(options.output).with_suffix(".bag").resolve()
     if bag.exists():
         raise DataError(f"{bag} exists: choose another --output, or use it with --bag")

@@ -1,7 +1,8 @@
 """calibrate scale: the real torque per commanded torque of each motor, from a known weight on the last link.
 
-Two tours, without and with the weight. The weight hangs while the arm is down and its motors are off. A recording
-(`--bag`) is one with the weight, of an arm that `calibrate gravity` has calibrated: what it holds without is known.
+Two tours, without and with the weight. The weight hangs while the arm is down and its motors are off. If the stand then
+leans otherwise, the IMU's heading shows too. A recording (`--bag`) is one with the weight, of an arm that `calibrate
+gravity` has calibrated: what it holds without is known.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.launcher import Stopping, stop_on_signals
 
 POSES = 8  # of each tour
+LEAN = "Lean the stand forward or back by about 10 degrees (12 at most from upright): this shows the IMU's heading"
 LEAST_MOMENT = 0.03  # kg m: a lighter weight is lost in the torque's resolution
 
 
@@ -36,7 +38,7 @@ def run(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> Outcome:
     if not refusals:
         load = {"tour.load_mass": options.mass, "tour.load_lever": options.lever}
         if not is_simulated(options.params, arm):
-            options.ask(f"Hang {options.mass:g} kg on link 4, {options.lever:g} m from the elbow")
+            options.ask(f"Hang {options.mass:g} kg on link 4, {options.lever:g} m from the elbow. {LEAN}")
         loaded = _tour(options, arm, say, stopping, load)
         refusals = refusals_of(loaded, options.record)
         measured = without.measured + loaded.measured

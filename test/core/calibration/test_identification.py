@@ -10,6 +10,7 @@ import pytest
 from exo_gravity.core import ArmModel, Tilt
 from exo_gravity.core.calibration.identification import Observation, identify
 from exo_gravity.core.calibration.pose_choice import TYPICAL_MOMENTS
+from exo_gravity.core.calibration.pose_fit import COMMON
 from exo_gravity.core.moments import MOMENTS, load_moments, moments_of, off_axis_of, regressor
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
 
@@ -38,6 +39,20 @@ def test_two_standard_errors_cover_90_to_99_percent_of_the_moments_and_the_scale
     scale = np.array([(found.scale - device.scale) / found.scale_error for device, found in twenty()])
     covered = np.abs(np.hstack((size, scale))) < 2.0
     assert 0.90 <= covered.mean() <= 0.99
+
+
+def test_two_standard_errors_cover_an_error_that_all_sweeps_of_a_joint_and_a_tour_share():
+    size = []
+    for device in map(Device, range(200, 220)):
+        factor = 1.0 + COMMON * device.rng.normal(size=(2, 4))
+        observations = [
+            one._replace(effort=device.offset + (one.effort - device.offset) * factor[int(one.load_mass > 0.0)])
+            for one in device.tour(bare=8, weighed=8)
+        ]
+        found = identify(observations, LENGTH)
+        size.append((found.moments - device.moments) / found.error)
+        size.append((found.scale - device.scale) / found.scale_error)
+    assert 0.90 <= np.mean(np.abs(np.concatenate(size)) < 2.0) <= 0.99
 
 
 def test_the_torque_in_other_poses_is_right_to_2_percent_of_the_peak():

@@ -36,6 +36,20 @@ def test_any_mounting_is_found_within_its_stated_error(seed: int) -> None:
     assert found.quaternion[3] >= 0.0 and np.linalg.norm(found.quaternion) == pytest.approx(1.0)
 
 
+def test_three_bows_are_averaged() -> None:
+    quaternion = np.array((0.0, 0.0, 0.0, 1.0))
+    leans = (0.09, -0.05, -0.04)
+    bows = [record(quaternion, lean=lean, seed=seed) for seed, lean in enumerate(leans)]
+    length = bows[0].time[-1] + 1.0 / RATE
+    time = np.concatenate([bow.time + i * length for i, bow in enumerate(bows)])
+    together = mounting(ImuRecord(time, *(np.concatenate(column) for column in list(zip(*bows, strict=True))[1:])))
+    one = mounting(bows[0])
+    assert (one.bows, together.bows) == (1, 3)
+    assert angle_of(rotation_matrix(one.quaternion)) > 0.08
+    assert angle_of(rotation_matrix(together.quaternion)) < 0.02
+    assert together.error[2] < one.error[2]
+
+
 def test_the_gyroscope_bias_is_found() -> None:
     quaternion = np.array((0.0, 0.0, 0.0, 1.0))
     still = record(quaternion)
