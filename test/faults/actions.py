@@ -136,6 +136,18 @@ def raw_imu(rig: Rig) -> Imu:
     return message
 
 
+def trunk_imu(x: float, w: float) -> Callable[[Rig], Imu]:
+    """Return what makes a message of /imu/data with the orientation (x, 0, 0, w)."""
+
+    def make(rig: Rig) -> Imu:
+        message = Imu()
+        message.header.stamp = rig.probe.node.get_clock().now().to_msg()
+        message.orientation.x, message.orientation.w = x, w
+        return message
+
+    return make
+
+
 def random_frames(count: int, ids: Iterable[int]) -> Action:
     def inject(rig: Rig) -> None:
         sender = start_frames(rig.nodes[0].bus, count, FRAME_RATE, ids)

@@ -35,6 +35,7 @@ from .actions import (
     start_second_bridge,
     states_at,
     tilt,
+    trunk_imu,
 )
 from .command_cases import CLOCK, EFFORT_COMMANDS
 from .fault_case import ALL_JOINTS, PROCESS_REACTION, FaultCase
@@ -54,6 +55,7 @@ from .rigs import (
 )
 
 STATES, EFFORTS, TILT, RAW_IMU = "/right/joint_states", "/right/effort_commands", "/imu/pitch_yaw", "/imu/data_raw"
+TRUNK_IMU = "/imu/data"
 MOTOR_TURN = 0.698  # rad of joint 2 for one turn of its rotor
 RECOVERY = 6.0  # s in which the launcher brings down an arm that has lost its bridge and its watchdog
 HELD = ("active",)
@@ -113,6 +115,7 @@ def push_elbow(rig: Rig) -> None:
 HELD_ROWS = (
     FaultCase("NaN joint states", publish(JointState, STATES, states_at([math.nan] * 4)), limit=None),
     FaultCase("NaN tilt", publish(Vector3Stamped, TILT, tilt(math.nan)), limit=None),
+    FaultCase("NaN orientation of the trunk", publish(Imu, TRUNK_IMU, trunk_imu(math.nan, 1.0)), limit=None),
     FaultCase("impossible parameters", set_impossible_parameters, limit=None, outcomes=HELD),
     FaultCase("parameters that contradict each other", set_contradicting_parameters, limit=None, outcomes=HELD),
     FaultCase("second can_bridge on the bus", start_second_bridge("/second"), limit=None, outcomes=HELD,
@@ -148,6 +151,7 @@ MOTORS = (
         foreign_frames(MOTOR_2.command(0.0, 0.0), 500.0, 2.0), steps_from=2.1, outcomes=("foreign_command",)),
     FaultCase("second publisher of joint states", publish(JointState, STATES, states_at([1.0] * 4))),
     FaultCase("second publisher of the tilt", publish(Vector3Stamped, TILT, tilt(1.0))),
+    FaultCase("second publisher of the trunk's orientation", publish(Imu, TRUNK_IMU, trunk_imu(0.6, 0.8))),
     FaultCase("second publisher of the raw IMU", publish(Imu, RAW_IMU, raw_imu), limit=0.3),
 )
 DESCENT = (
