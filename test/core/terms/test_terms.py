@@ -1,0 +1,217 @@
+"""Each term alone, and the sum of all behind its shaper."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.param_table import values_of
+from exo_gravity.core.terms.coupling import Coupling
+from exo_gravity.core.terms.damping import Damping
+from exo_gravity.core.terms.friction import MAX_SPEED, MOVING, STILL, Friction
+from exo_gravity.core.terms.inertia import TANK, EnergyTank, Inertia
+from exo_gravity.core.terms.settings import TermSettings, term_parameters, term_settings_of
+from exo_gravity.core.terms.shaper import LONGEST_STEP, Shaper, Shaping
+from exo_gravity.core.terms.soft_limits import SoftLimits
+from exo_gravity.core.terms.spring import PosePath, Spring
+from exo_gravity.core.terms.term import TermState
+from exo_gravity.core.terms.terms import Terms
+from exo_gravity.sim.arm import DEFAULT_LINKS
+
+NAMES = ("rotation", "abduction", "flexion", "elbow")
+ZERO = (0.0,) * 4
+STATE = TermState(1.0, 0.002, (0.2, 0.7, 0.6, 0.5), ZERO, ZERO, ZERO, 0.0)
+four = st.tuples(*[st.floats(-40.0, 40.0)] * 4)
+ALL = TermSettings(
+    friction=Friction(0.7, (0.2, 0.4, 0.2, 0.2), (0.02,) * 4),
+    inertia=Inertia(0.7),
+    damping=Damping((0.05, 0.1, 0.05, 0.05)),
+    spring=Spring((2.0, 4.0, 2.0, 1.0)),
+    coupling=Coupling(1.5),
+    limits=SoftLimits((2.0,) * 4),
+)
+
+
+@given(four, st.floats(0.0, 0.85))
+def test_friction_is_along_the_motion_and_below_what_the_joint_loses(velocity, share):
+    friction = Friction(share, (0.2, 0.4, 0.2, 0.1), (0.02, 0.05, 0.02, 0.0))
+    for v, tau, coulomb, viscous in zip(
+        velocity, friction.torque(STATE._replace(velocity=velocity)), friction.coulomb, friction.viscous, strict=True
+    ):
+        assert tau * v >= 0.0
+        assert abs(tau) <= share * (coulomb + viscous * min(abs(v), MAX_SPEED))
+
+
+def test_friction_is_zero_at_standstill_and_does_not_step():
+    friction = Friction(0.8, (0.2,) * 4)
+    speeds = np.linspace(-2.0 * MOVING, 2.0 * MOVING, 400)
+    torque = np.array([friction.torque(STATE._replace(velocity=(v, 0.0, 0.0, 0.0)))[0] for v in speeds])
+    one_code = 2.0 * 45.0 / 4095.0
+    assert one_code < STILL  # standstill reads as half a code, and may flicker to the next
+    assert not torque[np.abs(speeds) <= STILL].any()
+    assert np.abs(np.diff(torque)).max() < 0.01
+    assert torque[-1] == pytest.approx(0.16)
+
+
+def test_coupling_pulls_both_joints_so_that_no_way_around_gives_energy():
+    coupling = Coupling(3.0, "shoulder_abduction", "elbow_flexion", ratio=0.5, offset=0.1, max_effort=0.4)
+    angle = np.linspace(0.0, 2.0 * math.pi, 2001)
+    way = np.stack((0.0 * angle, 0.8 + 0.5 * np.cos(angle), 0.0 * angle, 0.6 + 0.4 * np.sin(angle)), axis=1)
+    torque = np.array([coupling.torque(STATE._replace(position=tuple(q))) for q in way])
+    work = ((torque[1:] + torque[:-1]) / 2.0 * np.diff(way, axis=0)).sum()
+    assert abs(work) < 1e-4
+    assert np.abs(torque[:, 3]).max() == pytest.approx(0.4)
+
+
+def test_the_workspace_is_free_inside_and_pushes_back_outside():
+    limits = SoftLimits((3.0,) * 4, lower=(-1.0, 0.2, 0.0, 0.0), upper=(1.0, 1.0, 1.0, 1.0), max_effort=(0.5,) * 4)
+    inside = STATE._replace(position=(0.9, 0.3, 0.5, 0.99), velocity=(1.0,) * 4)
+    assert limits.torque(inside) == ZERO
+    outside = STATE._replace(position=(1.1, 0.1, 9.0, -0.1))
+    assert limits.torque(outside) == pytest.approx((-0.3, 0.3, -0.5, 0.3))
+
+
+def test_a_spring_follows_a_recorded_path_and_stays_at_its_end():
+    path = PosePath((0.0, 1.0, 3.0), ((0.0,) * 4, (1.0, 0.0, 0.0, 0.5), (1.0, 1.0, 0.0, 0.5)))
+    spring = Spring((2.0,) * 4, max_effort=(9.0 / 2,) * 4, path=path)
+    halfway = {-1.0: ZERO, 0.5: (0.5, 0.0, 0.0, 0.25), 2.0: (1.0, 0.5, 0.0, 0.5), 9.0: path.poses[2]}
+    for elapsed, pose in halfway.items():
+        torque = spring.torque(STATE._replace(position=ZERO, elapsed=elapsed))
+        assert torque == pytest.approx(2.0 * np.array(pose))
+
+
+@pytest.mark.parametrize(
+    ("times", "poses"),
+    [((), ()), ((0.0, 0.0), (ZERO, ZERO)), ((1.0,), (ZERO,)), ((0.0,), ((0.0,) * 3,)), ((0.0,), ((math.nan,) * 4,)),
+     ((0.0, 0.1), (ZERO, (1.0, 0.0, 0.0, 0.0))), ((0.0, math.nan), (ZERO, ZERO))],
+)  # fmt: skip
+def test_an_impossible_path_is_refused(times, poses):
+    with pytest.raises(ParameterError):
+        PosePath(times, poses)
+
+
+def test_a_path_is_read_from_csv_and_a_wrong_file_is_refused():
+    path = PosePath.load("0, 0, 0, 0, 0\n\n1.5,0.1,0.2,0.3,-0.4\n")
+    assert path == PosePath((0.0, 1.5), (ZERO, (0.1, 0.2, 0.3, -0.4)))
+    for text in ("", "0,0,0,0", "t,a,b,c,d\n0,0,0,0,0", "0,0,0,0,0\n0.1,3,0,0,0", "0,0,0,0,nan"):
+        with pytest.raises(DataError, match="not a path"):
+            PosePath.load(text)
+
+
+def test_the_tank_gives_what_it_holds_and_no_more():
+    tank, given = EnergyTank(), 0.0
+    for _ in range(4000):
+        given += tank.pass_on((1.0, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.002, 0.0)[0] * 0.002
+    assert 0.9 * TANK < given <= TANK
+    taken = tank.pass_on((-1.0, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.002, 0.0)
+    assert taken[0] == -1.0  # a torque that takes energy always passes
+
+
+class Driven:
+    """Terms under a clock, at one state."""
+
+    def __init__(self, chosen: TermSettings) -> None:
+        self.terms, self.now, self.outputs = Terms(NAMES, chosen, DEFAULT_LINKS), 10.0, []
+
+    def run(self, seconds: float, position=STATE.position, velocity=ZERO, period: float = 0.002):
+        for _ in range(max(1, round(seconds / period))):
+            self.now += period
+            self.outputs.append(self.terms.torque(self.now, position, velocity, ZERO))
+        return self.outputs[-1]
+
+
+def test_without_terms_nothing_is_added():
+    driven = Driven(TermSettings())
+    assert driven.run(1.0, velocity=(1.0,) * 4) == ZERO
+    assert driven.terms.active == []
+
+
+def test_a_spring_that_is_switched_on_and_off_pulls_without_a_step():
+    driven = Driven(TermSettings())
+    driven.run(0.1)
+    spring = Spring((2.0, 4.0, 2.0, 1.0), pose=(0.5, 0.3, 0.3, 0.4), max_effort=(1.0,) * 4)
+    for chosen, expected in ((TermSettings(spring=spring), (0.6, -1.0, -0.6, -0.1)), (TermSettings(), ZERO)):
+        driven.terms.apply(chosen, DEFAULT_LINKS)
+        driven.outputs.clear()
+        half = driven.run(0.5)
+        assert driven.run(0.6) == pytest.approx(expected)
+        assert np.abs(np.diff(driven.outputs, axis=0)).max() <= 1.0 * 0.002 * 1.001
+        assert np.abs(half).max() == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_second_change_during_the_first_does_not_step_either():
+    driven = Driven(TermSettings())
+    driven.run(0.1)
+    for stiffness in (4.0, 0.0, 2.0, 5.0):
+        driven.terms.apply(TermSettings(spring=Spring((stiffness,) * 4)), DEFAULT_LINKS)
+        driven.run(0.3)
+    driven.run(1.5)
+    assert np.abs(np.diff(driven.outputs, axis=0)).max() < 0.02
+    assert driven.outputs[-1][1] == pytest.approx(-2.0)
+
+
+def test_after_a_pause_the_terms_begin_again_from_no_torque():
+    driven = Driven(ALL)
+    assert driven.run(2.0) != ZERO
+    driven.now += 0.3
+    assert np.abs(driven.run(0.002)).max() <= 50.0 * 0.002
+
+
+wild = st.one_of(st.floats(-30.0, 30.0), st.sampled_from([math.nan, math.inf, -math.inf, 1e308]))
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.tuples(st.tuples(*[wild] * 4), st.sampled_from([0.0, 0.001, 0.002, 0.01, 0.05])), max_size=60))
+def test_whatever_the_terms_give_the_shaped_torque_is_bounded_and_rate_limited(sums):
+    shaper = Shaper(Shaping())
+    for total, dt in sums:
+        before = shaper.output
+        after = shaper.shape(total, dt)
+        assert all(abs(tau) <= limit for tau, limit in zip(after, shaper.shaping.max_effort, strict=True))
+        steps = np.abs(np.subtract(after, before))
+        assert steps.max() <= shaper.shaping.max_effort_rate * min(dt, LONGEST_STEP) + 1e-12
+        assert bool(shaper.refusal) is not math.isfinite(sum(total))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(four, four, st.sampled_from([0.001, 0.002, 0.01])), min_size=1, max_size=40))
+def test_all_terms_together_stay_bounded_in_any_state(states):
+    terms, now = Terms(NAMES, ALL, DEFAULT_LINKS), 1.0
+    for position, velocity, dt in states:
+        now += dt
+        torque = terms.torque(now, position, velocity, ZERO)
+        assert all(abs(tau) <= limit for tau, limit in zip(torque, ALL.terms.max_effort, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("chosen", "name"),
+    [
+        (TermSettings(spring=Spring((50.0, 0.0, 0.0, 0.0))), "spring.stiffness"),
+        (TermSettings(limits=SoftLimits((0.0, 0.0, 0.0, 9.0))), "limits.stiffness"),
+        (TermSettings(damping=Damping((0.0, 0.0, 0.0, 3.0))), "damping.viscosity"),
+        (TermSettings(coupling=Coupling(30.0)), "coupling.stiffness"),
+    ],
+)
+def test_a_spring_or_damper_that_would_be_unstable_when_late_is_refused_with_the_most_that_is_stable(chosen, name):
+    with pytest.raises(ParameterError, match=f"^{name} = .* at most .* late is stable"):
+        chosen.check(DEFAULT_LINKS)
+    ALL.check(DEFAULT_LINKS)
+
+
+def test_parameters_make_settings_and_name_their_group_in_errors():
+    table = term_parameters()
+    assert term_settings_of(values_of(table, {})) == TermSettings()
+    values = values_of(table, {"friction.share": 0.5, "coupling.leader": "elbow_flexion", "spring.pose": [0.1] * 4})
+    built = term_settings_of(values)
+    assert (built.friction.share, built.coupling.leader, built.spring.pose) == (0.5, "elbow_flexion", (0.1,) * 4)
+    with pytest.raises(ParameterError, match=r"^coupling.follower = 'elbow_flexion'"):
+        term_settings_of({**values, "coupling.follower": "elbow_flexion"})
+    with pytest.raises(ParameterError, match=r"^limits.upper"):
+        term_settings_of({**values, "limits.upper": [-3.0] * 4})
+    assert not any(getattr(replace(TermSettings()), p.name.split(".")[0]) is None for p in table)

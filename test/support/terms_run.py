@@ -1,0 +1,133 @@
+"""Terms on the simulated arm, through CAN frames and a delay: who gave which energy, and does the arm come to rest."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from exo_gravity.core import LAWS, ArmModel, Tilt
+from exo_gravity.core.arm import Vector
+from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.motors import ENTER, MOTORS
+from exo_gravity.core.terms.settings import TermSettings
+from exo_gravity.core.terms.terms import Terms
+from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
+from exo_gravity.sim.arm import DEFAULT_LINKS
+
+NAMES = ("rotation", "abduction", "flexion", "elbow")
+MOTORS_OF_ARM = [JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1)]
+UPRIGHT = Tilt.of("right")
+COULOMB = (0.2, 0.4, 0.2, 0.2)  # Nm of the simulated arm, by default
+
+Push = Callable[[float, Sequence[float], Sequence[float]], Vector]  # time, angles, velocities -> (4,) Nm
+
+
+POSE = (0.2, 0.7, 0.6, 0.7)  # rad
+
+
+def no_push(_time: float, _theta: Sequence[float], _velocity: Sequence[float]) -> Sequence[float]:
+    return (0.0,) * 4
+
+
+def sines(seed: int, until: float, strength: float = 2.0, stiffness: float = 2.0) -> Push:
+    """Return random pushes on all joints, 0.2 to 3 Hz, that end at `until` s; a spring of `stiffness` Nm/rad stays."""
+    rng = np.random.default_rng(seed)
+    frequency, phase = rng.uniform(0.2, 3.0, (3, 4)), rng.uniform(0.0, 6.0, (3, 4))
+    size = strength * rng.uniform(0.1, 0.5, (3, 4)) * (1.0, 2.0, 1.0, 0.5)
+
+    def push(time: float, theta: Sequence[float], _velocity: Sequence[float]) -> Vector:
+        elastic = stiffness * np.subtract(POSE, theta)
+        if time > until:
+            return elastic
+        return (size * np.sin(2.0 * math.pi * frequency * time + phase)).sum(axis=0) + elastic
+
+    return push
+
+
+@dataclass
+class TermsRun:
+    """An arm under exact gravity compensation and `settings`, in cycles of `period` s, with torques that act `delay` s
+    after the reading, one period at least.
+
+    config: the true arm; links: what the controller takes for it. given: J that the terms gave to the arm so far; its
+    largest value so far is `most_given`. rubbed: J that the joints' friction
+    took. worst_balance: the largest difference of the two so far.
+    """
+
+    settings: TermSettings
+    config: ArmConfig = field(default_factory=ArmConfig)
+    links: ArmModel = DEFAULT_LINKS
+    pose: Sequence[float] = POSE
+    period: float = 0.002
+    delay: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.device = SimulatedDevice(SimulatedArm(self.config), [SimulatedMotor(motor) for motor in MOTORS_OF_ARM])
+        self.device.arm.reset(self.pose)
+        self.terms = Terms(NAMES, self.settings, self.links)
+        self.given = self.most_given = self.rubbed = self.worst_balance = 0.0
+        self.positions: list[list[float]] = []
+        self.applied: list[np.ndarray] = []
+        self._gravity: deque[Sequence[float]] = deque([LAWS["exact"].torque(self.links, self.pose, UPRIGHT)])
+        self._extra: deque[Sequence[float]] = deque([(0.0,) * 4])
+        self._late = max(1, round(self.delay / self.period))
+        for motor in MOTORS_OF_ARM:
+            self.device.exchange(motor.can_id, motor.command(0.0, 0.0))
+            self.device.exchange(motor.can_id, ENTER)
+
+    def run(self, seconds: float, push: Push = no_push) -> None:
+        """Advance; `push` is another torque on the joints, that of a wearer."""
+        for _ in range(round(seconds / self.period)):
+            self._cycle(push)
+
+    def _cycle(self, push: Push) -> None:
+        device, theta, velocity = self.device, [], []
+        extra = np.array(self._extra[0])
+        for joint, motor in enumerate(MOTORS_OF_ARM):
+            answer = device.exchange(motor.can_id, motor.command(self._gravity[0][joint] + float(extra[joint]), 0.0))
+            assert answer
+            reply = motor.joint_reply(answer[1])
+            theta.append(reply.position)
+            velocity.append(reply.velocity)
+        self._gravity.append(LAWS["exact"].torque(self.links, theta, UPRIGHT))
+        self._extra.append(self.terms.torque(100.0 + device.time, theta, velocity, self._gravity[-1]))
+        while len(self._extra) > self._late:
+            self._extra.popleft()
+            self._gravity.popleft()
+        before = np.array(device.arm.positions)
+        outside = np.asarray(push(device.time, device.arm.positions, device.arm.velocities))
+        self._advance(outside)
+        moved = np.array(device.arm.positions) - before
+        self.given += float(extra @ moved)
+        viscous = np.abs(moved) / self.period * self.config.viscous_friction
+        self.rubbed += float(np.abs(moved) @ (viscous + self.config.coulomb_friction))
+        self.most_given = max(self.most_given, self.given)
+        self.worst_balance = max(self.worst_balance, self.given - self.rubbed)
+        self.positions.append(device.arm.positions)
+        self.applied.append(extra)
+
+    def _advance(self, outside: np.ndarray) -> None:
+        """Advance the device by one period, with the torque of a wearer."""
+        device = self.device
+        for _ in range(round(self.period / 0.001)):
+            state = device.arm.positions, device.arm.velocities
+            motors = [m.torque(q, v) for m, q, v in zip(device.motors, *state, strict=True)]
+            device.arm.step((outside + motors).tolist())
+            device._steps += 1
+
+    def comes_to_rest(self, push: Push, seconds: float = 15.0) -> bool:
+        """Return whether no joint moves by 0.05 degrees in half a second, at some time in the next `seconds`."""
+        for _ in range(round(2.0 * seconds)):
+            self.run(0.5, push)
+            if self.travel(0.5) < 0.05:
+                return True
+        return False
+
+    def travel(self, seconds: float) -> float:
+        """Return how far a joint moved to and fro in the last `seconds`, in degrees."""
+        last = np.array(self.positions[-round(seconds / self.period) :])
+        return float(np.degrees(np.ptp(last, axis=0).max()))
