@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.compensator import Settings
+from exo_gravity.core.compensator_settings import Settings
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import Limits
 from exo_gravity.core.motors import MOTORS

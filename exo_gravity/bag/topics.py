@@ -5,7 +5,7 @@ from __future__ import annotations
 JOINT_STATE = "sensor_msgs/msg/JointState"
 STRING = "std_msgs/msg/String"
 # Of each arm, in its namespace
-STATES, COMMANDS, STEPS = "joint_states", "effort_commands", "wearer_step"
+STATES, COMMANDS, STEPS, ASSIST = "joint_states", "effort_commands", "wearer_step", "assist_efforts"
 # Of all
 DIAGNOSTICS, PARAMETER_EVENTS = "/diagnostics", "/parameter_events"
 # Of the recorder, in the recording alone

@@ -11,25 +11,19 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from exo_gravity.core.anfis_law import AnfisLaw
-from exo_gravity.core.arm import JOINT_COUNT, MAX_TOTAL_MASS, STANDARD_GRAVITY, ArmModel
+from exo_gravity.core.arm import JOINT_COUNT, STANDARD_GRAVITY
+from exo_gravity.core.compensator_settings import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.felt_motion import FeltMotion
-from exo_gravity.core.gravity import LAWS, Law, Torque
-from exo_gravity.core.limits import MAX_COMMAND
-from exo_gravity.core.param_table import check_owned, owned
-from exo_gravity.core.quaternion import Floats3
-from exo_gravity.core.tilt import SIDES, Tilt
+from exo_gravity.core.gravity import LAWS, NO_TORQUE, Torque
+from exo_gravity.core.terms.coupling import JOINTS
+from exo_gravity.core.terms.terms import Terms
+from exo_gravity.core.tilt import Tilt
 from exo_gravity.core.tilt_input import STILL, TiltInput
 from exo_gravity.core.turning import turning_torque
 
-MODES = ("one_g", "zero_g")
-LAW_NAMES = (*LAWS, "anfis")
-# Gain times gravity, m/s^2: twice the Earth's, rounded up. Calibrated gains are 0.8 to 1.3.
-MAX_SCALE = 20.0
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
 RAMP_TIME = 1.0  # s from zero to full torque, at the start and after a break
 # s without an answer, after which the torque ramps in from zero. This is longer than any command_timeout: the arm is
@@ -37,61 +31,6 @@ RAMP_TIME = 1.0  # s from zero to full torque, at the start and after a break
 BREAK = 0.2
 LONGEST_STEP = 0.01  # s counted by the rate limit after a pause, so that the torque does not catch up in one step
 MAX_ANGLE = 26.0  # rad, more than an AK motor can report with any zero
-NO_TORQUE: Torque = (0.0, 0.0, 0.0, 0.0)
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Settings of the compensator. All but `side` and `use_imu` may change while the arm is worn.
-
-    side: 'left' or 'right'. robot: the exoskeleton's own arm. wearer_mass (4,) kg, wearer_cog (4,) m: the wearer's
-    segments on each link. shoulder_from_imu: (3,) m in the trunk's axes, for `inertial`. use_imu: False assumes an
-    upright trunk. anfis: the model for the law 'anfis'. The other fields are parameters of `compensator`. Two fields
-    are derived: `arm` is the compensated arm, which is the robot in One-G and the robot plus `support` times the wearer
-    in Zero-G; `active_law` is the law in use. Raises ParameterError.
-    """
-
-    side: str
-    robot: ArmModel
-    law: str = owned("exact", "law that computes the gravity torque", choices=LAW_NAMES)
-    mode: str = owned("one_g", "one_g compensates the robot; zero_g also compensates the wearer's arm", choices=MODES)
-    support: float = owned(1.0, "share of the wearer's arm that zero_g compensates", (0.0, 1.0))
-    wearer_mass: Sequence[float] = NO_TORQUE
-    wearer_cog: Sequence[float] = NO_TORQUE
-    max_total_mass: float = owned(
-        10.0, "largest total mass; a larger one probably has the wrong unit", (0.5, MAX_TOTAL_MASS), "kg"
-    )
-    max_effort: Sequence[float] = owned((3.0, 9.0, 3.0, 3.0), "torque limit per joint", (0.0, MAX_COMMAND), "Nm")
-    max_effort_rate: float = owned(50.0, "fastest change of torque", (1.0, 1000.0), "Nm/s")
-    transition_time: float = owned(1.0, "time over which a change of mass, mode or law takes effect", (0.2, 30.0), "s")
-    tilt_timeout: float = owned(0.08, "age of the trunk tilt at which the efforts are withdrawn", (0.01, 0.5), "s")
-    inertial: bool = owned(False, "also compensate the trunk's acceleration, as its IMU measures it")
-    shoulder_from_imu: Floats3 = STILL
-    use_imu: bool = True
-    anfis: AnfisLaw | None = None
-    arm: ArmModel = field(init=False)
-    active_law: Law = field(init=False)
-
-    def __post_init__(self) -> None:
-        if self.side not in SIDES:
-            raise ParameterError("side", self.side, f"one of {', '.join(SIDES)}")
-        check_owned(self)
-        law = self.anfis if self.law == "anfis" else LAWS[self.law]
-        if law is None:
-            raise ParameterError("law", self.law, "used with anfis_file, a model from train_anfis")
-        if self.law != "exact":
-            self.robot.check_masses(f"law {self.law}")
-        # Computed in every mode, so that an impossible wearer is refused now and not when the mode becomes zero_g.
-        whole = self.robot.with_wearer(self.wearer_mass, self.wearer_cog, self.support)
-        if whole.total_mass > self.max_total_mass:
-            robot, wearer = self.robot.total_mass, whole.total_mass - self.robot.total_mass
-            bound = f"at most max_total_mass = {self.max_total_mass:g} (robot {robot:.2f}, wearer's share {wearer:.2f})"
-            raise ParameterError("total mass in kg", round(whole.total_mass, 2), bound)
-        if max(self.robot.scale) > MAX_SCALE:
-            scale = [round(value, 2) for value in self.robot.scale]
-            raise ParameterError("gain times gravity", scale, f"at most {MAX_SCALE:g} m/s^2, twice the Earth's gravity")
-        object.__setattr__(self, "arm", whole if self.mode == "zero_g" else self.robot)
-        object.__setattr__(self, "active_law", law)
 
 
 class Answer(NamedTuple):
@@ -108,10 +47,14 @@ class Answer(NamedTuple):
 
 
 class Compensator:
-    """The control law and its state: ramp, rate limit, and the remainder of the last change of settings."""
+    """The control law and its state: ramp, rate limit, and the remainder of the last change of settings.
 
-    def __init__(self, settings: Settings) -> None:
+    names: of the joints (4,), for the outer loop's input. terms: what is added to gravity compensation.
+    """
+
+    def __init__(self, settings: Settings, names: Sequence[str] = JOINTS) -> None:
         self.settings = settings
+        self.terms = Terms(names, settings.terms, settings.moving)
         self._tilt = TiltInput(settings.side, settings.tilt_timeout)
         self._motion = FeltMotion()
         self._ramp_start = -math.inf
@@ -129,6 +72,7 @@ class Compensator:
         if settings.side != self.settings.side:
             raise ParameterError("side", settings.side, f"{self.settings.side}, because the side cannot change")
         self._pending = settings
+        self.terms.apply(settings.terms, settings.moving)
 
     def set_tilt(self, now: float, pitch: float, roll: float, age: float = 0.0) -> None:
         """Set the trunk's pitch and roll; see `TiltInput.set_tilt`."""
@@ -149,8 +93,11 @@ class Compensator:
         """
         self._motion.add(now - max(0.0, age), specific_force, angular_velocity)
 
-    def step(self, now: float, theta: Sequence[float]) -> Answer:
-        """Return the torque for joint angles `theta` (4,) rad at `now` s on a monotonic clock."""
+    def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Answer:
+        """Return the torque for joint angles `theta` (4,) rad at `now` s on a monotonic clock.
+
+        velocity: (4,) rad/s, None if not known: then the terms add nothing.
+        """
         if len(theta) != JOINT_COUNT or not all(-MAX_ANGLE <= angle <= MAX_ANGLE for angle in theta):
             return Answer(None, f"joint angles {list(theta)} are not 4 numbers within {MAX_ANGLE:g} rad")
         if self.settings.use_imu and (problem := self._tilt.problem(now)):
@@ -158,7 +105,8 @@ class Compensator:
         torque = self._transition(now, theta)
         if not all(map(math.isfinite, torque)):
             return Answer(None, f"torque {list(torque)} Nm from the law is not finite")
-        return self._limited(now, torque)
+        added = self.terms.torque(now, theta, velocity, torque) if velocity else NO_TORQUE
+        return self._limited(now, torque, added)
 
     def _law(self, now: float, theta: Sequence[float]) -> Torque:
         """Return the torque of the chosen law, or of the exact law while the chosen one does not apply."""
@@ -218,7 +166,7 @@ class Compensator:
             return torque
         return tuple(t + left * r for t, r in zip(torque, self._remainder, strict=True))
 
-    def _limited(self, now: float, torque: Torque) -> Answer:
+    def _limited(self, now: float, torque: Torque, added: Torque) -> Answer:
         dt = now - self._last_answer
         if not 0.0 <= dt <= BREAK:
             self._ramp_start, self._effort, dt = now, NO_TORQUE, 0.0
@@ -226,10 +174,12 @@ class Compensator:
         ramp = min(1.0, (now - self._ramp_start) / RAMP_TIME)
         step = self.settings.max_effort_rate * min(dt, LONGEST_STEP)
         effort, clamped = [], []
-        for joint, (wanted, last, limit) in enumerate(zip(torque, self._effort, self.settings.max_effort, strict=True)):
-            if abs(wanted) > limit:
+        columns = zip(torque, added, self._effort, self.settings.max_effort, strict=True)
+        for joint, (gravity, more, last, limit) in enumerate(columns):
+            if not -limit <= gravity <= limit:
                 clamped.append(joint)
-            target = ramp * max(-limit, min(limit, wanted))
-            effort.append(max(last - step, min(last + step, target)))
+            wanted = gravity + more
+            target = ramp * (limit if wanted > limit else -limit if wanted < -limit else wanted)
+            effort.append(last + step if target > last + step else last - step if target < last - step else target)
         self._effort = tuple(effort)
         return Answer(self._effort, clamped=tuple(clamped), fallback=self._fallback)

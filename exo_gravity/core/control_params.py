@@ -7,12 +7,14 @@ from typing import Any
 
 from exo_gravity.core.anfis_law import AnfisLaw
 from exo_gravity.core.arm import MAX_GAIN, MAX_GRAVITY, MAX_LENGTH, MAX_MASS, MAX_MOMENT, STANDARD_GRAVITY, ArmModel
-from exo_gravity.core.compensator import Settings
+from exo_gravity.core.compensator_settings import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.joint_motor import MAX_CAN_ID, TORQUE_SCALE_BOUNDS, JointMotor
 from exo_gravity.core.limits import Limits
 from exo_gravity.core.motors import MOTORS, WIRE_RANGE_BOUNDS
 from exo_gravity.core.param_table import Param, param_of, params_of
+from exo_gravity.core.terms.settings import term_parameters, term_settings_of
+from exo_gravity.core.terms.spring import PosePath
 from exo_gravity.core.tilt import SIDES
 from exo_gravity.core.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
 
@@ -86,6 +88,8 @@ COMPENSATOR = (
           (-1.0, 1.0), "m"),
     Param("use_imu", True, "false assumes an upright trunk (the paper's seated wearer)", fixed=True),
     param_of(Settings, "tilt_timeout"),
+    *term_parameters(),
+    Param("spring.path_file", "", "CSV file with the path of the spring, rows of s and 4 angles in rad; empty: pose"),
     *REAL_TIME_PARAMETERS,
 )
 IMU_SOURCES = ("topic", "mpu6050", "icm20948", "lsm6dsox", "witmotion", "bno085")
@@ -133,10 +137,10 @@ def limits_of(values: Mapping[str, Any]) -> Limits:
     return Limits(tuple(values["joint_names"]), **{param.name: values[param.name] for param in LIMIT_PARAMETERS})
 
 
-def settings_of(values: Mapping[str, Any], anfis: AnfisLaw | None = None) -> Settings:
+def settings_of(values: Mapping[str, Any], anfis: AnfisLaw | None = None, path: PosePath | None = None) -> Settings:
     """Return the settings that `compensator`'s parameter values describe, or raise ParameterError.
 
-    anfis: the model in `anfis_file`, or None if no file is given.
+    anfis: the model in `anfis_file`, path: the way in `spring.path_file`; None if no file is given.
     """
     robot = robot_of(values)
     mass, cog = wearer_of(values)
@@ -148,6 +152,8 @@ def settings_of(values: Mapping[str, Any], anfis: AnfisLaw | None = None) -> Set
         shoulder_from_imu=tuple(values["shoulder_from_imu"]),
         use_imu=values["use_imu"],
         anfis=anfis,
+        terms=term_settings_of(values, path),
+        robot_by_mass=ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"]),
         **{param.name: values[param.name] for param in params_of(Settings)},
     )
 

@@ -24,6 +24,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.tilt import Tilt
 
 Torque = tuple[float, ...]  # (4,) Nm in joint order
+NO_TORQUE: Torque = (0.0, 0.0, 0.0, 0.0)
 Values = Iterable[Any]  # plain floats if xp is `math`, arrays (n,) if it is `numpy`
 BLOCK = 4096  # poses computed at once, so that intermediate arrays fit the processor's cache
 

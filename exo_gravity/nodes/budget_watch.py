@@ -21,7 +21,7 @@ from rclpy.parameter import parameter_value_to_python
 
 from exo_gravity.core.arm import ArmModel
 from exo_gravity.core.budget import Workspace, budget, motor_torques, overload
-from exo_gravity.core.compensator import Settings
+from exo_gravity.core.compensator_settings import Settings
 from exo_gravity.core.control_params import CAN_BRIDGE
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.param_table import values_of

@@ -11,9 +11,9 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
@@ -23,12 +23,15 @@ from sensor_msgs.msg import JointState
 from exo_gravity.core.anfis_law import AnfisLaw
 from exo_gravity.core.arm import ArmModel
 from exo_gravity.core.budget import USUAL_TILT
-from exo_gravity.core.compensator import Answer, Compensator, Settings
+from exo_gravity.core.compensator import Answer, Compensator
+from exo_gravity.core.compensator_settings import Settings
 from exo_gravity.core.control_params import COMPENSATOR, settings_of
 from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.terms.spring import PosePath
 from exo_gravity.hardware.scheduling import request_real_time
+from exo_gravity.nodes.assist_efforts import AssistEfforts
 from exo_gravity.nodes.budget_watch import BudgetWatch
-from exo_gravity.nodes.conversions import by_name
+from exo_gravity.nodes.conversions import by_name, velocity_of
 from exo_gravity.nodes.declare import declare, values_after, with_floats
 from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics
 from exo_gravity.nodes.hot_path import HotPath
@@ -38,17 +41,23 @@ from exo_gravity.nodes.tilt_subscription import NEWEST, TiltSubscription
 
 SILENCE = 0.5  # s without joint states until diagnostics report it
 REPORT_PERIOD = 0.5  # s
+Loaded = TypeVar("Loaded")
 MAX_CHANGES = 16  # answers whose reason is new, waiting for the report
 
 
 def read_settings(values: dict[str, Any]) -> Settings:
-    """Return the settings that parameter values describe, with the model in `anfis_file`, or raise ParameterError."""
-    path = values["anfis_file"]
+    """Return the settings that parameter values describe, with the files they name, or raise ParameterError."""
+    anfis = _loaded(AnfisLaw.load, values, "anfis_file", "a file from train_anfis")
+    return settings_of(values, anfis, _loaded(PosePath.load, values, "spring.path_file", "a file with a path"))
+
+
+def _loaded(load: Callable[[str], Loaded], values: dict[str, Any], name: str, expected: str) -> Loaded | None:
+    """Return what is in the file that parameter `name` gives, None if it gives none. Raises ParameterError."""
+    path = values[name]
     try:
-        anfis = AnfisLaw.load(Path(path).read_text(encoding="utf-8")) if path else None
-    except (OSError, DataError) as error:
-        raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
-    return settings_of(values, anfis)
+        return load(Path(path).read_text(encoding="utf-8")) if path else None
+    except (OSError, UnicodeDecodeError, DataError) as error:
+        raise ParameterError(name, path, f"{expected} ({error})") from None
 
 
 class CompensatorNode(Node):
@@ -58,7 +67,7 @@ class CompensatorNode(Node):
         super().__init__("compensator", automatically_declare_parameters_from_overrides=True)
         values = declare(self, COMPENSATOR)
         self._names = values["joint_names"]
-        self._compensator = Compensator(read_settings(values))
+        self._compensator = Compensator(read_settings(values), self._names)
         self._diagnostics = Diagnostics(self)
         self._budget = BudgetWatch(self, self._names, math.radians(USUAL_TILT) if values["use_imu"] else 0.0)
         self._answer = Answer(None)
@@ -72,6 +81,7 @@ class CompensatorNode(Node):
         self._publisher = self.create_publisher(JointState, "effort_commands", 1)
         self._command = JointState(name=self._names)  # one message, reused
         self._lock = threading.Lock()  # guards the compensator: joint states arrive on another thread
+        self._assist = AssistEfforts(self, self._compensator.terms.assist, self._lock)
         self._joint_states = HotPath(self, JointState, "joint_states", self._on_joint_states, NEWEST)
         if values["use_imu"]:
             TiltSubscription(self, self._compensator, self._lock, self._refused, self._withdraw, self._on_motion)
@@ -82,18 +92,20 @@ class CompensatorNode(Node):
         self._changed = self.create_guard_condition(self._report_changes)
         self.create_timer(REPORT_PERIOD, self._report_current)
         self._log(self._compensator.settings)
+        self._assist.start()
         self._joint_states.start()
         for refused in request_real_time(values["thread_priority"], values["lock_memory"]):
             self.get_logger().warning(refused)
 
     @property
     def failure(self) -> Exception | None:
-        """The exception that ended the thread of the joint states."""
-        return self._joint_states.failure
+        """The exception that ended the thread of the joint states, or that of the assistance."""
+        return self._joint_states.failure or self._assist.failure
 
     def close(self) -> None:
         """Stop answering joint states."""
         self._joint_states.stop()
+        self._assist.stop()
 
     def _on_joint_states(self, message: JointState, info: dict[str, Any]) -> None:
         command = self._command
@@ -103,8 +115,9 @@ class CompensatorNode(Node):
             if self._source.is_another(info):
                 self._withdraw("joint_states")
             theta = by_name(message, "position", self._names)
+            velocity = velocity_of(message, self._names)
             with self._lock:
-                answer = self._compensator.step(now, theta)
+                answer = self._compensator.step(now, theta, velocity)
         except ParameterError as error:
             answer = Answer(None, self._refused("joint_states", error))
         if now - self._intruded < DISTRUST:
@@ -141,7 +154,7 @@ class CompensatorNode(Node):
     def _apply_parameters(self, _changes: list[Parameter]) -> None:
         try:
             settings = read_settings(values_after(self, COMPENSATOR))
-        except ParameterError as error:  # checked just before: only anfis_file can have changed since
+        except ParameterError as error:  # checked just before: only a file can have changed since
             self.get_logger().error(f"parameters not applied: {error}")
             return
         with self._lock:
@@ -170,8 +183,17 @@ class CompensatorNode(Node):
             "wearer cog (m)": _row(s.wearer_cog),
             "mass carried (kg)": f"{s.arm.total_mass:.3f}",
             "max effort (Nm)": _row(s.max_effort),
+            **self._of_terms(),
             "budget": self._budget.text,
             "last refused message": self._refusal,
+        }
+
+    def _of_terms(self) -> dict[str, object]:
+        terms = self._compensator.terms
+        return {
+            "terms": ", ".join(terms.active) or "none",
+            "assist": terms.assist.report,
+            "inertia tank (J)": f"{terms.energy:.2f}",
         }
 
     def _report_changes(self) -> None:
@@ -196,6 +218,8 @@ class CompensatorNode(Node):
         elif answer.clamped:
             joints = ", ".join(self._names[joint] for joint in answer.clamped)
             self._diagnostics.report(WARN, f"gravity exceeds max_effort: {joints}", values)
+        elif problem := self._compensator.terms.problem:
+            self._diagnostics.report(WARN, f"gravity compensation alone: {problem}", values)
         else:
             self._diagnostics.report(OK, "compensating", values)
 

@@ -38,3 +38,11 @@ def by_name(message: JointState, field: str, names: Sequence[str]) -> tuple[floa
     if not all(map(math.isfinite, result)):
         raise ParameterError(field, list(result), "finite numbers")
     return result
+
+
+def velocity_of(message: JointState, names: Sequence[str]) -> tuple[float, ...] | None:
+    """Return `message`'s velocities (n,) in the order of `names`, None if they are missing or not finite."""
+    try:
+        return by_name(message, "velocity", names)
+    except ParameterError:
+        return None

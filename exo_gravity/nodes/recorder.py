@@ -27,7 +27,7 @@ from rclpy.task import Future
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
-from exo_gravity.bag.topics import LOSSES, PARAMETERS, STATES, leaf
+from exo_gravity.bag.topics import ASSIST, LOSSES, PARAMETERS, STATES, leaf
 from exo_gravity.bag.writer import BagWriter, offered_qos
 from exo_gravity.core.control_params import RECORDER
 from exo_gravity.nodes.declare import declare
@@ -42,6 +42,7 @@ SHARED_TOPICS = {
     "/diagnostics": DiagnosticArray,
     "/parameter_events": ParameterEvent,
 }
+OF_ARMS = {**ARM_TOPICS, ASSIST: JointState}
 DRAIN_PERIOD = 0.05  # s between two writes of what has arrived
 DISCOVERY_PERIOD = 0.5  # s between two searches for new topics and nodes
 LIVE_PERIOD = 0.1  # s between two lines of live state
@@ -117,7 +118,7 @@ class Recorder(Node):
         """Subscribe to new topics, and request the parameters of new nodes."""
         known = {drain.topic for drain in self._drains}
         for topic, types in self.get_topic_names_and_types():
-            msgtype = SHARED_TOPICS.get(topic) or ARM_TOPICS.get(leaf(topic))
+            msgtype = SHARED_TOPICS.get(topic) or OF_ARMS.get(leaf(topic))
             if msgtype and topic not in known and type_name(msgtype) in types:
                 self._guarded(topic, self._subscribe, topic, msgtype)
         for name, namespace in self.get_node_names_and_namespaces():

@@ -19,7 +19,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from exo_gravity.core.arm import JOINT_COUNT
-from exo_gravity.core.compensator import Compensator, Settings
+from exo_gravity.core.compensator import Compensator
+from exo_gravity.core.compensator_settings import Settings
 from exo_gravity.core.drive import Drive, State
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.joint_motor import JointMotor, peaks_of
@@ -149,7 +150,7 @@ class OfflineTrial:
         position = [joint.position for joint in self._samples]
         if not any(arm.limits.is_silent(now, joint) for joint in self._samples):
             self._record(now, position, effort)
-            answer = self._compensator.step(now, position)
+            answer = self._compensator.step(now, position, [joint.velocity for joint in self._samples])
             self._efforts = answer.effort, min(joint.time for joint in self._samples)
             if answer.reason and answer.reason != self._reason:
                 self._note(now, f"withdrawn: {answer.reason}")

@@ -52,6 +52,7 @@ class PublishingArm:
         create = self.node.create_publisher
         self.states = create(JointState, "joint_states", 1)
         self.efforts = create(JointState, "effort_commands", 1)
+        self.assist = create(JointState, "assist_efforts", 1)
         self.imu = create(Imu, "/imu/data_raw", qos_profile_sensor_data)
         self.faults = create(DiagnosticArray, "/diagnostics", 10)
         self.steps = create(String, "wearer_step", LATCHED)
@@ -71,7 +72,7 @@ class PublishingArm:
 
     def is_recorded(self):
         """Return whether every topic that is to be recorded has a subscriber."""
-        publishers = (self.states, self.efforts, self.imu, self.faults, self.steps)
+        publishers = (self.states, self.efforts, self.assist, self.imu, self.faults, self.steps)
         return all(publisher.get_subscription_count() for publisher in publishers)
 
     def publish(self, k):
@@ -83,6 +84,7 @@ class PublishingArm:
             message.header.stamp = stamp
         self.states.publish(state)
         self.efforts.publish(effort)
+        self.assist.publish(effort)
         self.imu.publish(image)
         self.executor.spin_once(timeout_sec=0.002)
 
@@ -132,7 +134,7 @@ def test_ctrl_c_closes_the_recording_and_ends_the_node_with_0(session):
     assert code == 0 and (path / "metadata.yaml").exists()
 
 
-@pytest.mark.parametrize("topic", ["/right/joint_states", "/right/effort_commands"])
+@pytest.mark.parametrize("topic", ["/right/joint_states", "/right/effort_commands", "/right/assist_efforts"])
 def test_every_message_of_an_arm_is_in_the_recording(session, topic):
     field = "position" if topic.endswith("states") else "effort"
     assert [round(getattr(message, field)[0]) for _, message in recorded(session[0], topic)] == list(range(COUNT))

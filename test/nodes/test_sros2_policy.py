@@ -1,7 +1,7 @@
 """config/sros2/policy.xml against the running nodes: what each publishes, subscribes to, serves and calls.
 
-The nodes are those of config/sim_both.yaml and a recorder; their bridges are not enabled. These tests do not show that
-DDS enforces the policy, which takes a middleware built with security.
+The nodes are those of config/sim_both.yaml, a recorder, and an outer loop for each arm; the bridges are not enabled.
+These tests do not show that DDS enforces the policy, which takes a middleware built with security.
 """
 
 from __future__ import annotations
@@ -13,8 +13,11 @@ import xml.etree.ElementTree as ElementTree
 import pytest
 import rclpy
 import yaml
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import NodeNameNonExistentError
 from rosbags.typesys import Stores, get_typestore
+from sensor_msgs.msg import JointState
 
 from exo_gravity.bag.storage import Storage
 from exo_gravity.core.errors import DataError
@@ -28,7 +31,10 @@ RULES = {"topics": ("topic", {"publish", "subscribe"}), "services": ("service", 
 RECORDER_CALLS = ("get_parameters", "list_parameters")  # on every node
 NODES = (
     "/imu", "/recorder",
-    *(f"/{arm}/{node}" for arm in ("left", "right") for node in ("can_bridge", "compensator", "simulator")),
+    *(
+        f"/{arm}/{node}"
+        for arm in ("left", "right") for node in ("can_bridge", "compensator", "simulator", "outer_loop")
+    ),
 )  # fmt: skip
 NOTHING = {"publish": set(), "subscribe": set(), "reply": set(), "request": set()}
 
@@ -76,6 +82,26 @@ def parameter_file(folder):
     return path
 
 
+def outer_loops(context):
+    """Return an executor with a node for each arm, as a user's own controller might be."""
+    executor = SingleThreadedExecutor(context=context)
+    for arm in ("left", "right"):
+        node = rclpy.create_node("outer_loop", namespace=arm, context=context)
+        node.create_publisher(JointState, "assist_efforts", 1)
+        node.create_subscription(JointState, "joint_states", lambda message: None, 1)
+        node.create_subscription(DiagnosticArray, "/diagnostics", lambda message: None, 1)
+        executor.add_node(node)
+    return executor
+
+
+def spin(executor, ending):
+    while not ending.is_set():
+        executor.spin_once(timeout_sec=0.1)
+    for node in executor.get_nodes():
+        node.destroy_node()
+    executor.shutdown()
+
+
 def lasting_rules(rules_of):
     """Return the rules of each node, without the recorder's requests: its clients exist for a moment only."""
     return {node: {**rules_of(node), **({"request": set()} if node == "/recorder" else {})} for node in NODES}
@@ -99,8 +125,12 @@ def session(tmp_path_factory):
     rclpy.init(context=context)
     observer = rclpy.create_node("observer", context=context)
     launcher = Launcher(parameter_file(folder), on_line=lambda node, line: None)
-    thread = threading.Thread(target=launcher.run, args=(ending,))
-    thread.start()
+    threads = [
+        threading.Thread(target=launcher.run, args=(ending,)),
+        threading.Thread(target=spin, args=(outer_loops(context), ending)),
+    ]
+    for thread in threads:
+        thread.start()
     expected = lasting_rules(read_policy().get), set(NODES) - {"/recorder"}
     found, end = None, time.monotonic() + 90.0
     while found != expected and time.monotonic() < end:  # the tests below show the difference
@@ -110,7 +140,8 @@ def session(tmp_path_factory):
             nodes_with_recorded_parameters(folder / "bag") - {"/observer"},
         )
     ending.set()
-    thread.join()
+    for thread in threads:
+        thread.join()
     observer.destroy_node()
     rclpy.try_shutdown(context=context)
     return found
@@ -140,9 +171,10 @@ def test_the_operator_may_call_every_service_and_subscribe_to_every_topic():
 
 
 @pytest.mark.parametrize("arm", ["left", "right"])
-def test_only_an_arms_compensator_may_publish_its_efforts(arm):
-    publishers = [name for name, rules in read_policy().items() if f"/{arm}/effort_commands" in rules["publish"]]
-    assert publishers == [f"/{arm}/compensator"]
+@pytest.mark.parametrize(("topic", "node"), [("effort_commands", "compensator"), ("assist_efforts", "outer_loop")])
+def test_only_one_node_of_an_arm_may_publish_its_efforts(arm, topic, node):
+    publishers = [name for name, rules in read_policy().items() if f"/{arm}/{topic}" in rules["publish"]]
+    assert publishers == [f"/{arm}/{node}"]
 
 
 def test_the_file_has_the_structure_of_an_access_control_policy_of_version_0_2_0():

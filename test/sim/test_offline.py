@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.compensator import Settings
+from exo_gravity.core.compensator_settings import Settings
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import Limits

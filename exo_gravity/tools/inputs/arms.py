@@ -16,12 +16,13 @@ import numpy as np
 
 from exo_gravity.core.anfis_law import AnfisLaw
 from exo_gravity.core.arm import ArmModel
-from exo_gravity.core.compensator import Settings
+from exo_gravity.core.compensator_settings import Settings
 from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR, OPTIONS, limits_of, motors_of, settings_of
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import Limits
 from exo_gravity.core.param_table import Param, values_of
+from exo_gravity.core.terms.spring import PosePath
 from exo_gravity.tools.inputs.parameter_file import Nodes, load, packaged_config
 
 
@@ -67,7 +68,15 @@ class ConfiguredArm:
     def settings(self) -> Settings:
         """Return the compensator's settings, with the model in `anfis_file`. Raises ParameterError."""
         with named(f"{self.namespace}/compensator"):
-            return settings_of(self.compensator, _anfis_model(self.compensator["anfis_file"]))
+            return settings_of(self.compensator, _anfis_model(self.compensator["anfis_file"]), self._path())
+
+    def _path(self) -> PosePath | None:
+        """Return the path in `spring.path_file`, None for no file."""
+        path = self.compensator["spring.path_file"]
+        try:
+            return PosePath.load(Path(path).read_text(encoding="utf-8")) if path else None
+        except (OSError, UnicodeDecodeError, DataError) as error:
+            raise ParameterError("spring.path_file", path, f"a file with a path ({error})") from None
 
 
 def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:

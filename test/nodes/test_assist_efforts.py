@@ -1,0 +1,183 @@
+"""The compensator's node with an outer loop and terms, over real DDS in this process."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+
+from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.nodes.compensator import CompensatorNode
+from exo_gravity.nodes.run import keep_to_this_machine
+
+from ..support.joint_state_feeder import PARTS, POSE
+
+keep_to_this_machine()
+pytestmark = pytest.mark.real_time  # efforts that are 50 ms late are faded, as they must be
+NAMES = [f"right_{part}" for part in PARTS]
+ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
+GRAVITY = gravity_torque(ROBOT, POSE)
+ASSIST = (0.5, -0.5, 0.25, 0.0)
+STILL = (0.0,) * 4
+
+
+class Rig:
+    """A compensator, and a node that plays the bridge and the outer loop. added: (4,) Nm beyond gravity, the newest."""
+
+    def __init__(self) -> None:
+        names = ["--ros-args", "-r", "__ns:=/right", "-p", "use_imu:=false"]
+        rclpy.init(args=names)
+        self.node = CompensatorNode()
+        self.user = rclpy.create_node("outer_loop")
+        self.executor, self._of_node = SingleThreadedExecutor(), SingleThreadedExecutor()
+        self.executor.add_node(self.user)
+        self._of_node.add_node(self.node)
+        self._closing = False
+        # On a thread of its own, so that neither node keeps the other from sending.
+        self._thread = threading.Thread(target=self._spin)
+        self._thread.start()
+        self.joint_states = self.user.create_publisher(JointState, "joint_states", 1)
+        self.assist = self.user.create_publisher(JointState, "assist_efforts", 1)
+        self.added, self.velocity, self.names, self.efforts = np.full(4, np.nan), STILL, NAMES, ASSIST
+        self.values: dict[str, str] = {}
+        self.message = ""
+        self.user.create_subscription(JointState, "effort_commands", self._on_command, 1)
+        self.user.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+        self.assisted, self.without = False, 0  # number of successive commands without addition
+        self.user.create_timer(0.005, self._send)
+
+    def _spin(self) -> None:
+        while not self._closing:
+            self._of_node.spin_once(timeout_sec=0.05)
+
+    def _send(self) -> None:
+        stamp = self.user.get_clock().now().to_msg()
+        states = JointState(name=NAMES, position=POSE, velocity=self.velocity)
+        states.header.stamp = stamp
+        self.joint_states.publish(states)
+        if self.assisted:
+            efforts = JointState(name=self.names, effort=self.efforts)
+            efforts.header.stamp = stamp
+            self.assist.publish(efforts)
+
+    def _on_command(self, message: JointState) -> None:
+        self.added = np.subtract(message.effort, GRAVITY) if message.effort else np.full(4, np.nan)
+        self.without = self.without + 1 if self.adds(STILL) else 0
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name == "right/compensator":
+                self.message, self.values = status.message, {item.key: item.value for item in status.values}
+
+    def set(self, **values: object) -> list[str]:
+        """Set parameters (`__` for a dot) and return why each was refused, '' if it was not."""
+        changes = [Parameter(name.replace("__", "."), value=value) for name, value in values.items()]
+        return [result.reason for result in self.node.set_parameters(changes)]
+
+    def wait_until(self, condition: Callable[[], object]) -> None:
+        end = time.monotonic() + 20.0
+        while not condition():
+            assert time.monotonic() < end, (self.added, self.message, self.values)
+            self.executor.spin_once(timeout_sec=0.01)
+
+    def close(self) -> None:
+        self._closing = True
+        self._thread.join()
+        self.node.close()
+        self._of_node.shutdown()
+        self.executor.shutdown()
+        self.user.destroy_node()
+        self.node.destroy_node()
+        rclpy.try_shutdown()
+
+    def adds(self, torque: tuple[float, ...], tolerance: float = 1e-6) -> bool:
+        return bool(np.allclose(self.added, torque, atol=tolerance))
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    rig = Rig()
+    yield rig
+    rig.close()
+
+
+def test_efforts_of_the_outer_loop_are_added_and_the_arm_stays_carried_without_them(rig):
+    rig.assisted = True
+    rig.wait_until(lambda: rig.adds(STILL) and rig.values.get("assist") == "off")
+    assert rig.set(assist__max_effort=[1.0] * 4) == [""]
+    rig.wait_until(lambda: rig.adds(ASSIST))
+    rig.wait_until(lambda: rig.values["assist"] == "assisting" and rig.values["terms"] == "assist")
+    rig.assisted = False
+    rig.wait_until(lambda: rig.adds(STILL))
+    rig.wait_until(lambda: rig.values["assist"] == "waiting: assist_efforts stopped")
+    assert rig.message == "compensating"
+
+
+@pytest.mark.parametrize(
+    ("names", "efforts", "reason"),
+    [(NAMES, (math.nan, 0.0, 0.0, 0.0), "must be numbers within 40 Nm"), (["x", *NAMES[1:]], ASSIST, "must name")],
+)
+def test_wrong_efforts_are_withdrawn_and_reported_while_gravity_compensation_goes_on(rig, names, efforts, reason):
+    rig.assisted = True
+    rig.set(assist__max_effort=[1.0] * 4)
+    rig.wait_until(lambda: rig.adds(ASSIST))
+    rig.names, rig.efforts = names, efforts
+    rig.wait_until(lambda: rig.adds(STILL))
+    rig.wait_until(lambda: rig.message.startswith("gravity compensation alone: ") and reason in rig.message)
+    rig.names, rig.efforts = NAMES, ASSIST
+    rig.wait_until(lambda: rig.adds(ASSIST) and rig.message == "compensating")
+
+
+def test_a_second_outer_loop_ends_the_assistance_of_both(rig):
+    rig.assisted = True
+    rig.set(assist__max_effort=[1.0] * 4)
+    rig.wait_until(lambda: rig.adds(ASSIST))
+    other = rig.user.create_publisher(JointState, "assist_efforts", 1)
+    message = JointState(name=NAMES, effort=(0.0, 1.0, 0.0, 0.0))
+
+    def send() -> None:
+        message.header.stamp = rig.user.get_clock().now().to_msg()
+        other.publish(message)
+
+    timer = rig.user.create_timer(0.007, send)
+    rig.wait_until(lambda: rig.adds(STILL) and "more than one publisher" in rig.message)
+    timer.cancel()
+    rig.wait_until(lambda: rig.adds(ASSIST))
+
+
+def test_terms_are_set_live_and_need_velocities(rig):
+    rig.velocity = (0.5, -0.5, 0.0, 0.0)
+    rig.wait_until(lambda: rig.adds(STILL))
+    assert rig.set(friction__coulomb=[0.2, 0.4, 0.2, 0.2], friction__share=0.5) == ["", ""]
+    rig.wait_until(lambda: rig.adds((0.1, -0.2, 0.0, 0.0)))
+    rig.wait_until(lambda: rig.values["terms"] == "friction")
+    rig.velocity = ()
+    rig.wait_until(lambda: rig.adds(STILL))
+
+
+def test_a_spring_follows_the_path_in_a_file(rig, tmp_path):
+    file = tmp_path / "way.csv"
+    end = np.add(POSE, (0.2, 0.0, 0.0, 0.0))
+    file.write_text("".join(f"{t},{','.join(map(str, pose))}\n" for t, pose in ((0.0, POSE), (1.0, end))))
+    assert "a file with a path" in rig.set(spring__path_file=str(tmp_path / "none.csv"))[0]
+    rig.wait_until(lambda: rig.adds(STILL))
+    assert rig.set(spring__path_file=str(file), spring__stiffness=[2.0, 2.0, 2.0, 1.0]) == ["", ""]
+    rig.wait_until(lambda: rig.adds((0.4, 0.0, 0.0, 0.0)))
+    rig.velocity = ()  # without velocities a spring would not be damped
+    rig.wait_until(lambda: rig.without > 100)
+
+
+def test_a_spring_beyond_what_the_arm_can_bear_is_refused_by_its_name(rig):
+    reasons = rig.set(spring__stiffness=[50.0, 0.0, 0.0, 0.0], coupling__follower="shoulder_abduction")
+    assert reasons[0].startswith("spring.stiffness = ") and "late is stable" in reasons[0]
+    assert reasons[1].startswith("coupling.follower = ")
+    assert rig.set(spring__stiffness=[2.0, 2.0, 2.0, 1.0]) == [""]
