@@ -12,11 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from exo_gravity.core.arm import JOINT_COUNT, four_floats, one_float
+from exo_gravity.core.gravity import NO_TORQUE, Torque
 from exo_gravity.core.trial_script import TrialScript
 
-Torque = tuple[float, ...]  # (4,) Nm
 Path = list[tuple[float, float]]  # of each joint: position in rad, velocity in rad/s
-NO_TORQUE: Torque = (0.0,) * JOINT_COUNT
 _MOVING = 0.75  # share of a move's duration in which the hand moves; then it holds the arm still
 
 
@@ -68,7 +67,7 @@ class VirtualWearer:
             return NO_TORQUE
         step = self.script.steps[index]
         if step.action == "move":
-            path = _minimum_jerk(self._start, step.value, since, _MOVING * step.duration)
+            path = minimum_jerk(self._start, step.value, since, _MOVING * step.duration)
             return self._lead(path, theta, velocity, period)
         if step.action == "push":
             share = math.sin(math.pi * since / step.duration)
@@ -95,7 +94,7 @@ class VirtualWearer:
         return tuple(torque)
 
 
-def _minimum_jerk(start: Sequence[float], end: Sequence[float], since: float, duration: float) -> Path:
+def minimum_jerk(start: Sequence[float], end: Sequence[float], since: float, duration: float) -> Path:
     """Return position and velocity of each joint `since` s into a minimum-jerk move from `start` to `end`."""
     s = min(1.0, since / duration)
     way = s**3 * (10.0 - 15.0 * s + 6.0 * s * s)

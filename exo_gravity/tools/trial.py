@@ -25,7 +25,7 @@ from exo_gravity.tools.trials.scripts import packaged_trials
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="trial", description="Run a trial from start to report.")
     option = parser.add_argument
-    option("name", help=f"{', '.join(packaged_trials())}, or a YAML file with a script")
+    option("name", help=f"{', '.join(packaged_trials())}, effort, or a YAML file with a script")
     option("--params", metavar="FILE", help="parameter file (default: the simulated right arm)")
     option("--output", metavar="DIR", default="trials", help="where to create the trial's folder (%(default)s)")
     option("--offline", action="store_true", help="on the simulated device, without ROS and faster than real time")
@@ -46,7 +46,9 @@ def main(args: Sequence[str] | None = None) -> int:
         with extras("trial", "report"):
             from rich.console import Console
 
-            from exo_gravity.tools.trials import session
+            from exo_gravity.tools.trials import effort, session
+        if options.name == effort.NAME:
+            return effort.run(params, Path(options.output), options.offline, Console(highlight=False))
         request = session.Session(options.name, params, Path(options.output), options.offline, options.max_rate)
         return session.run(request, Console(highlight=False))
     except ExoGravityError as error:
