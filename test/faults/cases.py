@@ -39,6 +39,7 @@ from .actions import (
 )
 from .command_cases import CLOCK, EFFORT_COMMANDS
 from .fault_case import ALL_JOINTS, PROCESS_REACTION, FaultCase
+from .outer_loop_cases import OUTER_LOOP
 from .rig import Rig
 from .rigs import (
     BothArmsRig,
@@ -237,4 +238,4 @@ ARMS = (
         PROCESS_REACTION),
 )
 # fmt: on
-CASES = (*HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *CLOCK, *ARMS)
+CASES = (*HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *OUTER_LOOP, *CLOCK, *ARMS)

@@ -23,6 +23,7 @@ from ..support import ROOT
 COPIED = ("exo_gravity", "test", "config")
 ROW_LIMIT = 240.0  # s for each row, with the start of its nodes
 SAFETY, DESCENT, LIMITS = (f"exo_gravity/core/{name}.py" for name in ("safety", "descent", "limits"))
+ASSIST = "exo_gravity/core/terms/assist.py"
 BUS_LOCK, WATCHDOG = "exo_gravity/hardware/bus_lock.py", "exo_gravity/hardware/watchdog_process.py"
 
 
@@ -132,6 +133,11 @@ MUTATIONS = (
             ),
             Edit(DESCENT, "free >= REST_TIME and now - rest_since >= REST_TIME", "free >= 0.0"),
         ),
+    ),
+    Mutation(
+        "the last effort of an outer loop that ended stays",
+        ("outer loop killed",),
+        (Edit(ASSIST, "elif now - self._stamp > self.valid:", "elif self._stamp == -math.inf:"),),
     ),
 )  # fmt: skip
 
