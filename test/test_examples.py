@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import re
 import runpy
+import time
 from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float32MultiArray
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.wearer import Wearer
@@ -92,3 +97,71 @@ def test_without_torque_the_same_simulated_arm_falls(capsys, monkeypatch):
     monkeypatch.setattr("exo_gravity.core.gravity_torque", lambda arm, theta: [0.0] * 4)
     _, output = run("simulated_loop.py", capsys)
     assert moved(output) > 20.0
+
+
+def test_the_simulated_arm_repeats_the_way_that_a_hand_taught_it(capsys):
+    variables, output = run("teach_and_repeat.py", capsys)
+    match = re.fullmatch(r"The arm repeats the way within ([0-9.]+) degrees, on average ([0-9.]+)\.\n", output)
+    assert match and float(match[1]) < 15.0 and float(match[2]) < 6.0
+    taught, repeated = np.degrees(variables["poses"]), np.degrees(variables["repeated"])
+    assert np.ptp(taught, axis=0).min() > 15.0  # there was a way to repeat
+    assert np.abs(repeated[-1] - taught[-1]).max() < 6.0
+
+
+class EmgRig:
+    """The node of emg_assistance.py, and one that publishes a synthetic EMG and hears the efforts for the elbow."""
+
+    def __init__(self) -> None:
+        rclpy.init()
+        self.node = runpy.run_path(str(ROOT / "examples" / "emg_assistance.py"))["EmgAssistance"]()
+        self.user = rclpy.create_node("emg_driver")
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+        self.executor.add_node(self.user)
+        self.elbow: list[float] = []
+        self.user.create_subscription(JointState, "/right/assist_efforts", self._on_efforts, 10)
+        self._publisher = self.user.create_publisher(Float32MultiArray, "/emg", 10)
+        self._rng = np.random.default_rng(1)
+
+    def _on_efforts(self, message: JointState) -> None:
+        assert message.name[3] == "right_elbow_flexion" and not any(message.effort[:3])
+        self.elbow.append(message.effort[3])
+
+    def contract(self, biceps: float, triceps: float, seconds: float = 1.0) -> float:
+        """Send EMG whose rectified means are given in mV, on an electrode offset; return the elbow's last effort."""
+        deviation = np.array((biceps, triceps)) * 1e-3 * np.sqrt(np.pi / 2.0)
+        for _ in range(round(seconds / 0.01)):
+            volts = 1e-3 + self._rng.normal(size=(10, 2)) * deviation
+            self._publisher.publish(Float32MultiArray(data=volts.ravel().tolist()))
+            self.wait(0.01)
+        return self.elbow[-1]
+
+    def wait(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0.0:
+            self.executor.spin_once(timeout_sec=left)
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+        self.user.destroy_node()
+        rclpy.try_shutdown()
+
+
+@pytest.fixture
+def emg():
+    rig = EmgRig()
+    yield rig
+    rig.close()
+
+
+def test_the_elbow_is_assisted_in_proportion_to_the_biceps_and_against_the_triceps(emg):
+    emg.contract(0.01, 0.01, 2.0)  # the offset of the electrodes is removed
+    assert emg.contract(0.01, 0.01) == 0.0
+    assert emg.contract(0.21, 0.01, 1.5) == pytest.approx(1.0, abs=0.25)
+    assert emg.contract(0.9, 0.01, 1.5) == 2.0
+    assert emg.contract(0.01, 0.21, 2.0) == pytest.approx(-1.0, abs=0.25)
+    emg.wait(0.2)
+    heard = len(emg.elbow)
+    emg.wait(0.2)
+    assert len(emg.elbow) == heard  # without a signal nothing is sent

@@ -1,0 +1,70 @@
+"""An outer loop: assists the right elbow in proportion to the wearer's muscle signals. Needs ROS.
+
+Subscribes to /emg (std_msgs/Float32MultiArray, biceps and triceps in V, sample after sample, 1,000 a second) and
+publishes /right/assist_efforts at 100 Hz. The compensator adds them once `assist.max_effort` is not 0.
+"""
+
+from math import exp, pi
+
+import rclpy
+from rclpy.duration import Duration
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float32MultiArray
+
+NAMES = [f"right_{part}" for part in ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")]
+SAMPLE = 0.001  # s
+CUT_OFF = 3.0  # Hz: the envelope then follows the force of a muscle
+REST, STRONGEST = 0.02e-3, 0.4e-3  # V, envelopes of the resting and of the strongest contraction; measure them first
+LEAST = 0.05  # share of the strongest contraction below which nothing happens
+SILENCE = Duration(seconds=0.05)  # without EMG
+FULL_EFFORT = 2.0  # Nm for the strongest contraction
+
+
+class Envelope:
+    """One muscle: mean removed, rectified, low-passed twice, normalised to 0..1."""
+
+    def __init__(self):
+        self.mean = self.once = self.twice = 0.0
+
+    def add(self, volt):
+        self.mean += (1.0 - exp(-2.0 * pi * 0.5 * SAMPLE)) * (volt - self.mean)  # electrodes drift below 0.5 Hz
+        share = 1.0 - exp(-2.0 * pi * CUT_OFF * SAMPLE)
+        self.once += share * (abs(volt - self.mean) - self.once)
+        self.twice += share * (self.once - self.twice)
+
+    @property
+    def activation(self):
+        share = (self.twice - REST) / (STRONGEST - REST)
+        return 0.0 if share < LEAST else min(1.0, share)
+
+
+class EmgAssistance(Node):
+    """From EMG samples to efforts."""
+
+    def __init__(self):
+        super().__init__("emg_assistance")
+        self.biceps, self.triceps = Envelope(), Envelope()
+        self.heard = self.get_clock().now()
+        self.publisher = self.create_publisher(JointState, "/right/assist_efforts", 1)
+        self.create_subscription(Float32MultiArray, "/emg", self.on_emg, 10)
+        self.create_timer(0.01, self.publish)
+
+    def on_emg(self, message):
+        for biceps, triceps in zip(message.data[::2], message.data[1::2], strict=True):
+            self.biceps.add(biceps)
+            self.triceps.add(triceps)
+        self.heard = self.get_clock().now()
+
+    def publish(self):
+        if self.get_clock().now() - self.heard > SILENCE:  # no message: the compensator fades the assistance
+            return
+        elbow = FULL_EFFORT * (self.biceps.activation - self.triceps.activation)
+        message = JointState(name=NAMES, effort=[0.0, 0.0, 0.0, elbow])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self.publisher.publish(message)
+
+
+if __name__ == "__main__":
+    rclpy.init()
+    rclpy.spin(EmgAssistance())
