@@ -28,6 +28,7 @@ class Envelope:
         self.mean = self.once = self.twice = 0.0
 
     def add(self, volt):
+        """Take a sample."""
         self.mean += (1.0 - exp(-2.0 * pi * 0.5 * SAMPLE)) * (volt - self.mean)  # electrodes drift below 0.5 Hz
         share = 1.0 - exp(-2.0 * pi * CUT_OFF * SAMPLE)
         self.once += share * (abs(volt - self.mean) - self.once)
@@ -35,6 +36,7 @@ class Envelope:
 
     @property
     def activation(self):
+        """How strongly the muscle contracts, 0..1."""
         share = (self.twice - REST) / (STRONGEST - REST)
         return 0.0 if share < LEAST else min(1.0, share)
 
@@ -51,12 +53,14 @@ class EmgAssistance(Node):
         self.create_timer(0.01, self.publish)
 
     def on_emg(self, message):
+        """Take samples of both muscles, in turn."""
         for biceps, triceps in zip(message.data[::2], message.data[1::2], strict=True):
             self.biceps.add(biceps)
             self.triceps.add(triceps)
         self.heard = self.get_clock().now()
 
     def publish(self):
+        """Send the elbow's effort while there is EMG."""
         if self.get_clock().now() - self.heard > SILENCE:  # no message: the compensator fades the assistance
             return
         elbow = FULL_EFFORT * (self.biceps.activation - self.triceps.activation)

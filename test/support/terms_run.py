@@ -50,12 +50,11 @@ def sines(seed: int, until: float, strength: float = 2.0, stiffness: float = 2.0
 
 @dataclass
 class TermsRun:
-    """An arm under exact gravity compensation and `settings`, in cycles of `period` s, with torques that act `delay` s
-    after the reading, one period at least.
+    """An arm under exact gravity compensation and `settings`, in cycles of `period` s.
 
-    config: the true arm; links: what the controller takes for it. given: J that the terms gave to the arm so far; its
-    largest value so far is `most_given`. rubbed: J that the joints' friction
-    took. worst_balance: the largest difference of the two so far.
+    The torques act `delay` s after the reading, one period at least. config: the true arm; links: what the controller
+    takes for it. given: J that the terms gave to the arm so far; its largest value so far is `most_given`. rubbed: J
+    that the joints' friction took. worst_balance: the largest difference of the two so far.
     """
 
     settings: TermSettings
