@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import os
 import sys
 import threading
 import time
@@ -19,6 +17,8 @@ from exo_gravity.core.motors import ENTER, MOTORS
 from exo_gravity.hardware.handover import Charge
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 
+from ..support.ports import own_ports
+
 MOTORS_OF_ARM = tuple(JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1))
 LIMITS = Limits(("a", "b", "c", "d"), (-1.6,) * 4, (3.1,) * 4, (6.0,) * 4, (3.0, 9.0, 3.0, 3.0))
 PERIOD = 0.004
@@ -26,7 +26,7 @@ POSE = (0.0, 0.6, 0.3, 0.3)
 SAFE_SPEED = 1.0  # rad/s
 AFTER_EXIT = 1.0  # s for which a joint that was dropped would turn
 
-_PORTS = itertools.count(30_000 + os.getpid() % 10_000)
+_PORTS = own_ports(30_000)
 
 
 class SimulatedRig:

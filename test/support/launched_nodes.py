@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import itertools
 import os
 import signal
 import subprocess
@@ -19,10 +18,11 @@ import yaml
 from exo_gravity.tools.launcher import Launcher
 
 from . import CONFIG
+from .ports import own_ports
 
 Parameters = Mapping[str, Any]
 
-PORTS = itertools.count(20_000 + 2 * (os.getpid() % 5_000), 2)  # two buses for each, apart from other test runs
+PORTS = own_ports(20_000)
 GROUP = "239.74.163.2"
 NO_IMU: Parameters = {"use_imu": False}  # for the compensator, which then starts without waiting for a tilt
 FAST: Parameters = {"sign_check_torque": 0.0, "ramp_time": 0.5, "fade_time": 0.5, "damping": 1.5}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import signal
 import threading
@@ -20,11 +19,12 @@ from exo_gravity.tools.trial import main
 from exo_gravity.tools.trials import real_time, session
 
 from ..support import csv_rows
+from ..support.ports import own_ports
 
 CONFIG = Path(__file__).parents[2] / "config"
 SHORT = {"name": "short", "steps": [{"move": [0.1, 0.6, 1.2, 0.5], "over": 2.0}, {"hold": 4.0}]}
 RATED = (3.0, 9.0, 3.0, 3.0)  # Nm
-PORTS = itertools.count(30_000 + os.getpid() % 10_000)  # different from those of test/nodes
+PORTS = own_ports(30_000)
 Changes = dict[str, dict[str, Any]]  # parameters by node
 
 
