@@ -12,6 +12,7 @@ import math
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.quaternion import Floats3
+from exo_gravity.core.vector3 import plus
 
 TURN_TIME = 1.0  # s over which the two turns are compared
 CLEAR_TURN = 0.04  # of a unit vector: 2.3 degrees
@@ -64,7 +65,7 @@ class ImuConsistency:
         self._unlike -= self._unlike * dt / FORGET_TIME
         size = math.dist(up, self._up)
         if size > CLEAR_TURN:
-            turn, measured_turn = difference(up, self._up), difference(measured, self._measured)
+            turn, measured_turn = plus(up, self._up, -1.0), plus(measured, self._measured, -1.0)
             self._compare(dt, turn, size, measured_turn, deviation)
         elif self.is_suspect:
             self._rest = self._rest + dt if deviation < AT_REST else 0.0
@@ -93,8 +94,3 @@ def blended(a: Floats3, b: Floats3, share: float) -> Floats3:
     k = share if share < 1.0 else 1.0
     (x, y, z), (u, v, w) = a, b
     return x + k * (u - x), y + k * (v - y), z + k * (w - z)
-
-
-def difference(a: Floats3, b: Floats3) -> Floats3:
-    """Return a - b."""
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]

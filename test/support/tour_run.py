@@ -6,12 +6,14 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+import mujoco
 import numpy as np
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.calibration.guess import TorqueGuess
 from exo_gravity.core.calibration.poses import BestPoses, Itinerary
 from exo_gravity.core.calibration.tour import Tour
+from exo_gravity.core.calibration.tracking import MassMatrix
 from exo_gravity.core.drive import Drive, State
 from exo_gravity.core.gravity import Torque
 from exo_gravity.core.joint_motor import JointMotor, peaks_of
@@ -136,3 +138,12 @@ def worst_error(tour: Tour, truth: ArmModel) -> float:
         float(np.abs(np.subtract(o.effort, gravity_torque(truth, o.theta, o.direction))).max())
         for o, _ in tour.measured
     )
+
+
+def assert_close_to_device(matrix: MassMatrix, arm: SimulatedArm, atol: float) -> None:
+    """`matrix` is within `atol` kg m^2 of the mass matrix of the simulated arm in three poses."""
+    for theta in ((0.0,) * 4, (0.3, 0.8, 0.7, 0.5), (-0.5, 1.5, 1.2, 1.0)):
+        arm.reset(theta)
+        true = np.zeros((4, 4))
+        mujoco.mj_fullM(arm.model, arm.data, true)
+        np.testing.assert_allclose(matrix.at(theta), true, atol=atol)

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.gravity import Torque
 from exo_gravity.core.param_table import check_owned, owned
-from exo_gravity.core.terms.term import DELAY, TermState
+from exo_gravity.core.terms.term import DELAY, TermState, check_stable
 
 
 @dataclass(frozen=True)
@@ -27,11 +26,7 @@ class Damping:
 
     def check(self, least_inertia: Sequence[float]) -> None:
         """Raise ParameterError unless the viscosity damps these inertias (4,) kg m^2 although it acts late."""
-        most = [inertia / (2.0 * DELAY) for inertia in least_inertia]
-        if any(b > limit for b, limit in zip(self.viscosity, most, strict=True)):
-            shown = [round(limit, 3) for limit in most]
-            expected = f"at most {shown} Nm s/rad, which {1000 * DELAY:.0f} ms late is stable"
-            raise ParameterError("damping.viscosity", list(self.viscosity), expected)
+        check_stable("damping.viscosity", self.viscosity, [i / (2.0 * DELAY) for i in least_inertia], "Nm s/rad")
 
     def torque(self, state: TermState) -> Torque:
         """Return the torque (4,) in Nm, against the motion."""

@@ -15,7 +15,7 @@ from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.gravity import Torque
 from exo_gravity.core.param_table import check_owned, owned
-from exo_gravity.core.terms.term import LATE, TermState, check_stiffness
+from exo_gravity.core.terms.term import LATE, TermState, check_stiffness, clamp
 
 MAX_PATH_SPEED = 2.0  # rad/s between two poses of a path
 
@@ -86,8 +86,7 @@ class Spring:
         torque = []
         columns = zip(self.stiffness, pose, state.position, state.velocity, self.max_effort, strict=True)
         for k, to, q, v, most in columns:
-            pull = k * (to - q)
-            torque.append((most if pull > most else -most if pull < -most else pull) - LATE * k * v)
+            torque.append(clamp(k * (to - q), most) - LATE * k * v)
         return tuple(torque)
 
 

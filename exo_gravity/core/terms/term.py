@@ -1,7 +1,7 @@
 """What a term is: a torque on top of gravity compensation, computed from the arm's state.
 
     Friction, Damping, Spring, Coupling, SoftLimits    frozen dataclasses of parameters, which are terms themselves
-    Inertia                                             the same, with an `EnergyTank` beside it
+    Inertia                                             the same, plus an `EnergyTank`
 
 Each has one parameter that is 0 by default and switches it off. The torque reaches the joint late: the motor's reply,
 the computation, the bus. DELAY is what every term must bear without harm; the tests vary it from 0 to 10 ms.
@@ -59,9 +59,11 @@ def check_stiffness(name: str, stiffness: Sequence[float], least_inertia: Sequen
     A spring that acts DELAY late gives the energy of a damping of -stiffness * DELAY. Virtual damping acts as late, so
     inertia / (2 DELAY) is the most that damps: twice what the spring needs.
     """
-    most = [inertia / (4.0 * DELAY**2) for inertia in least_inertia]
-    if any(k > limit for k, limit in zip(stiffness, most, strict=True)):
-        shown = [round(limit, 2) for limit in most]
-        raise ParameterError(
-            name, list(stiffness), f"at most {shown} Nm/rad, which {1000 * DELAY:.0f} ms late is stable"
-        )
+    check_stable(name, stiffness, [inertia / (4.0 * DELAY**2) for inertia in least_inertia], "Nm/rad")
+
+
+def check_stable(name: str, values: Sequence[float], most: Sequence[float], unit: str) -> None:
+    """Raise ParameterError that names `name` unless `values` (4,) are at most `most` (4,), both in `unit`."""
+    if any(value > limit for value, limit in zip(values, most, strict=True)):
+        shown = [round(limit, 3) for limit in most]
+        raise ParameterError(name, list(values), f"at most {shown} {unit}, which {1000 * DELAY:.0f} ms late is stable")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-Quaternion = tuple[float, float, float, float]
+from exo_gravity.core.quaternion import Quaternion
 
 
 def from_angles(*turns: tuple[str, float]) -> Quaternion:

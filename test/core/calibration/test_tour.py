@@ -26,7 +26,7 @@ from exo_gravity.core.tilt import Tilt
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
-from ...support.tour_run import MOTORS_AS_MOUNTED, NAMES, TourRun
+from ...support.tour_run import MOTORS_AS_MOUNTED, NAMES, TourRun, assert_close_to_device
 
 LIMITS = Limits(NAMES)
 POSE = Station((0.1, 0.5, 0.6, 0.7))
@@ -197,14 +197,8 @@ def test_the_expected_torque_learns_scale_and_moments_of_each_joint():
 
 
 def test_the_mass_matrix_is_close_to_that_of_the_device():
-    import mujoco
-
     arm, matrix = SimulatedArm(), MassMatrix(DEFAULT_LINKS.length, DEFAULT_LINKS.first_moment)
-    for theta in ((0.0,) * 4, (0.3, 0.8, 0.7, 0.5), (-0.5, 1.5, 1.2, 1.0)):
-        arm.reset(theta)
-        true = np.zeros((4, 4))
-        mujoco.mj_fullM(arm.model, arm.data, true)
-        np.testing.assert_allclose(matrix.at(theta), true, atol=0.012)
+    assert_close_to_device(matrix, arm, 0.012)
 
 
 def test_chosen_poses_are_within_the_limits_and_can_be_held():

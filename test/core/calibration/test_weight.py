@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 
 from exo_gravity.core.calibration.guess import TorqueGuess
@@ -14,7 +13,7 @@ from exo_gravity.core.tilt import Tilt
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
-from ...support.tour_run import NAMES
+from ...support.tour_run import NAMES, assert_close_to_device
 
 WEIGHT = (1.0, 0.28)  # kg, m from the elbow
 MOMENTS = moments_of(DEFAULT_LINKS) + load_moments(DEFAULT_LINKS.length.tolist(), *WEIGHT)
@@ -23,11 +22,7 @@ MOMENTS = moments_of(DEFAULT_LINKS) + load_moments(DEFAULT_LINKS.length.tolist()
 def test_the_mass_matrix_with_a_weight_is_close_to_that_of_the_device():
     arm = SimulatedArm(ArmConfig(wearer_mass=(0, 0, 0, WEIGHT[0]), wearer_cog=(0, 0, 0, WEIGHT[1])))
     matrix = MassMatrix(DEFAULT_LINKS.length, MOMENTS[:4], WEIGHT)
-    for theta in ((0.0,) * 4, (0.3, 0.8, 0.7, 0.5), (-0.5, 1.5, 1.2, 1.0)):
-        arm.reset(theta)
-        true = np.zeros((4, 4))
-        mujoco.mj_fullM(arm.model, arm.data, true)
-        np.testing.assert_allclose(matrix.at(theta), true, atol=0.025)
+    assert_close_to_device(matrix, arm, 0.025)
 
 
 def test_the_sweeps_of_a_chosen_pose_and_the_way_home_need_no_more_than_the_motors_may_give():
