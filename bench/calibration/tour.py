@@ -57,7 +57,7 @@ class Player:
 
     def play(self) -> None:
         """Play until the motors are off."""
-        safety = SafetyMachine(self.limits, 1.0 / self.rate, *peaks_of(self.motors))
+        safety = SafetyMachine(self.limits, 1.0 / self.rate, peaks_of(self.motors))
         safety.enable(0.0)
         effort: Torque | None = None
         answered, began = -math.inf, False

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors import MotorReply, MotorSpec, pack_command, standstill, unpack_reply
@@ -90,6 +91,13 @@ class JointMotor:
         return self.direction * motor_torque * self.torque_scale
 
 
-def peaks_of(motors: Sequence[JointMotor]) -> tuple[list[float], list[float]]:
-    """Return the largest torque (n,) in Nm and damping (n,) in Nm s/rad that `motors` apply at their joints."""
-    return [motor.peak_effort for motor in motors], [motor.peak_damping for motor in motors]
+class Peaks(NamedTuple):
+    """The most that the motors of an arm apply at its joints: effort (4,) in Nm, damping (4,) in Nm s/rad."""
+
+    effort: tuple[float, ...]
+    damping: tuple[float, ...] = (math.inf,) * 4
+
+
+def peaks_of(motors: Sequence[JointMotor]) -> Peaks:
+    """Return what `motors` apply at most."""
+    return Peaks(tuple(motor.peak_effort for motor in motors), tuple(motor.peak_damping for motor in motors))

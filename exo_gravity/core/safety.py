@@ -31,6 +31,7 @@ from exo_gravity.core.descent import DAMPING_RISE, ArmDescent
 from exo_gravity.core.drive import CARRYING, NOTHING, OFF, Drive, State
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.faults import DOUBTFUL, Fault, FaultCode
+from exo_gravity.core.joint_motor import Peaks
 from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.rest import RestTracker
 from exo_gravity.core.start_gate import Proving, StartGate
@@ -40,19 +41,13 @@ class SafetyMachine:
     """Decides, cycle by cycle, what the motors of one arm receive. Not thread-safe: one thread owns it.
 
     period: s of a cycle. After a pause the torque continues as if only one period had passed: it never catches up.
-    peak_effort, peak_damping: (4,) Nm and Nm s/rad, the most that the motors apply; `max_effort` and any by default.
+    peaks: the most that the motors apply; by default `max_effort`, and any damping.
 
     state: the State. fault: the latched Fault or None. waiting_for: what CHECKING or PROVING waits for. acted: for each
     limit that has acted, by name, the last time. is_unreached: whether a motor that may be on cannot be reached.
     """
 
-    def __init__(
-        self,
-        limits: Limits,
-        period: float,
-        peak_effort: Sequence[float] | None = None,
-        peak_damping: Sequence[float] = (math.inf,) * 4,
-    ) -> None:
+    def __init__(self, limits: Limits, period: float, peaks: Peaks | None = None) -> None:
         self.limits = limits
         self.state = State.DISABLED
         self.fault: Fault | None = None
@@ -60,16 +55,16 @@ class SafetyMachine:
         self.acted: dict[str, float] = {}
         self.is_unreached = False
         self._period = period
-        self._peak, self._peak_damping = tuple(peak_effort or limits.max_effort), tuple(peak_damping)
+        self._peaks = peaks or Peaks(tuple(limits.max_effort))
         self._since = 0.0
         self._now = -math.inf
         self._sent = OFF  # last sent to the motors
-        self._descent = ArmDescent(0.0, NOTHING, NOTHING, self._peak, limits)
+        self._descent = ArmDescent(0.0, NOTHING, NOTHING, self._peaks.effort, limits)
         self._rest = RestTracker()
         self._before: Sequence[JointSample] = (UNKNOWN,) * 4
         self._silent: Sequence[bool] = (True,) * 4
         self._is_trusted = False  # zeros and signs
-        self._delivery = DeliveryMonitor(limits, self._peak)
+        self._delivery = DeliveryMonitor(limits, self._peaks.effort)
         self._gate = StartGate(limits, 0.0)
         self._proving = Proving(limits, signs=True)
 
@@ -136,7 +131,7 @@ class SafetyMachine:
             self._check_delivery(now, joints, dt)
         if self.state in CARRYING:
             self._watch(now, joints, effort, effort_time)
-        drive = self._drive(now, joints, effort, dt).within(self._peak_damping)
+        drive = self._drive(now, joints, effort, dt).within(self._peaks.damping)
         self._before = joints
         self._sent = drive
         return drive
@@ -247,7 +242,7 @@ class SafetyMachine:
 
     def _let_down(self, now: float) -> None:
         applied = self._delivery.applied(self._sent, self._silent)
-        self._descent = ArmDescent(now, *applied, self._peak, self.limits)
+        self._descent = ArmDescent(now, *applied, self._peaks.effort, self.limits)
         self._enter(State.LETTING_DOWN, now)
 
     def _enter(self, state: State, now: float) -> None:

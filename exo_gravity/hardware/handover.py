@@ -57,7 +57,7 @@ def let_down(
         log(str(error))
         return False
     motors = MotorBus(bus, charge.motors, powered=True, note=note, reopen=charge.open)
-    machine = SafetyMachine(charge.limits, charge.period, *peaks_of(charge.motors))
+    machine = SafetyMachine(charge.limits, charge.period, peaks_of(charge.motors))
     machine.take_over(*_applied(motors, drive, charge.period), time.monotonic())
     loop = ControlLoop(motors, machine, charge.period)
     loop.start()

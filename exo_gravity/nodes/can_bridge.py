@@ -159,7 +159,7 @@ class CanBridge(LifecycleNode):
         if self._owned is None:
             raise BusError("the node is not configured")
         bus, self._bus = self._bus or self._owned.open(), None
-        safety = SafetyMachine(self._limits, self._period, *peaks_of(self._motors))
+        safety = SafetyMachine(self._limits, self._period, peaks_of(self._motors))
         hand_over = self._owned.watchdog.hand_over
         loop = ControlLoop(bus, safety, self._period, self._exchange.publish, self._exchange.get_efforts, hand_over)
         loop.start()

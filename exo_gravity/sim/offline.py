@@ -97,7 +97,7 @@ class OfflineTrial:
         self._delay = delay
         self._start = math.inf  # s, of the script
         self._carried: list[float] = []  # s, the first and the last time at which the motors carried the arm
-        self._safety = SafetyMachine(arm.limits, 1.0 / arm.rate, *peaks_of(arm.motors))
+        self._safety = SafetyMachine(arm.limits, 1.0 / arm.rate, peaks_of(arm.motors))
         self._compensator = Compensator(arm.settings)
         # The newest efforts, and when the readings that they answer were taken.
         self._efforts: tuple[Sequence[float] | None, float] = (None, -math.inf)

@@ -67,7 +67,7 @@ class Carried:
         rig.switch_on(rig.carrying)
         self.motors = MotorBus(self.bus, MOTORS_OF_ARM, powered=True, note=self.drives.append, reopen=self.bus.reopen)
         self.motors.exchange(Drive(rig.carrying, NOTHING, True), time.monotonic() + 1.0)
-        self.safety = SafetyMachine(LIMITS, PERIOD, *peaks_of(MOTORS_OF_ARM))
+        self.safety = SafetyMachine(LIMITS, PERIOD, peaks_of(MOTORS_OF_ARM))
         self.safety.state = State.ACTIVE
         self.safety._sent = Drive(rig.carrying, NOTHING, True)
         self.failure_of_efforts: Exception | None = None

@@ -82,7 +82,7 @@ class TourRun:
         moments = moments_of(self.assumed) + load_moments(self.assumed.length.tolist(), *self.load)
         guess = TorqueGuess(self.assumed.length, moments, tilt, self.assumed.gravity)
         tour = Tour(self.limits, guess, itinerary or BestPoses(self.limits, 12, 230.0), self.rate, self.load)
-        safety = SafetyMachine(self.limits, 1.0 / self.rate, *peaks_of(MOTORS_AS_MOUNTED))
+        safety = SafetyMachine(self.limits, 1.0 / self.rate, peaks_of(MOTORS_AS_MOUNTED))
         safety.enable(0.0)
         samples: list[JointSample] = [UNKNOWN] * 4
         effort: Torque | None = None
