@@ -57,9 +57,9 @@ def main() -> None:
     noise = {name: 10.0 * getattr(IMU, name) for name in ("gyroscope_noise", "accelerometer_noise")}
     show("ten times the noise", walked(INERTIAL, replace(IMU, **noise)))
     for name, place in PLACES.items():
-        told = INERTIAL._replace(settings={"inertial": True, "shoulder_from_imu": tuple(-x for x in place)})
+        placed = INERTIAL._replace(settings={"inertial": True, "shoulder_from_imu": tuple(-x for x in place)})
         imu = replace(IMU, position=place)
-        show(f"IMU {name}; with shoulder_from_imu", walked(INERTIAL, imu), walked(told, imu))
+        show(f"IMU {name}; with shoulder_from_imu", walked(INERTIAL, imu), walked(placed, imu))
     for friction in (LOW, USUAL):
         for law in (INERTIAL, DEFAULT):
             results = (shaken(law, frequency, friction) for frequency in VIBRATIONS)

@@ -19,7 +19,7 @@ from exo_gravity.tools.inputs.parameter_file import packaged_config
 
 BRIDGE, SIMULATOR = "/right/can_bridge", "/right/simulator"
 SPREAD = 0.3  # of masses, centres of gravity and torque scales
-BESIDE = 0.015  # m, of the centres of gravity from the links
+BESIDE = 0.015  # m, the largest offset of a centre of gravity from its link
 COULOMB = (0.1, 0.4)  # Nm
 VISCOUS = (0.02, 0.1)  # Nm s/rad
 DAMPING = 3.4  # Nm s/rad: what the weakest motor can apply; the bridge takes a lack of it for a lack of torque

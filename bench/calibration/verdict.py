@@ -39,7 +39,7 @@ def _motors(results: Sequence[Result]) -> list[Row]:
     right = np.array([result.motors_right for result in results]).sum(axis=0)
     zero, hanging = (np.abs([getattr(result, name) for result in results]) for name in ("zero_error", "hanging_error"))
     imu = np.array([result.imu_error for result in results])
-    told = sum(result.turns_told for result in results)
+    detected = sum(result.turns_told for result in results)
     names = ("IDs right", "directions right", f"zeros right from the jig (worst {zero.max():.2f} deg)")
     rows = [
         Row(f"motors: {name}", f"{part} of {count}", "all", part == count)
@@ -47,7 +47,7 @@ def _motors(results: Sequence[Result]) -> list[Row]:
     ]
     largest = " ".join(f"{value:.1f}" for value in hanging.max(axis=0))
     free = Row("motors: zero error if the arm hangs, worst of each joint", f"{largest} deg", "", True)
-    turns = Row("motors: turns of the rotor after power-up told", f"{told} of {count}", "all", told == count)
+    turns = Row("motors: rotor turns after power-up detected", f"{detected} of {count}", "all", detected == count)
     typical, worst = np.median(imu, axis=0), imu.max(axis=0)
     mounting = [
         Row(f"imu: mounting error {when}, median", f"{typical[i]:.1f} deg, worst {worst[i]:.1f}", "", True)

@@ -23,8 +23,8 @@ from exo_gravity.core.vector3 import acceleration_of, plus
 WINDOW = 0.045  # s; the samples that the parabola fits, 5 at 100 Hz
 MIN_SAMPLES = 4  # that it fits at a lower rate, or after losses, if
 LONGEST_WINDOW = 0.085  # s holds as many, as from 40 Hz on
-# s from the sample's stamp, besides its age: 3 for the sensor's low-pass (MPU-6050, 94 Hz), 6 until the middle of the
-# 4 ms in which the motors execute the torque.
+# s, added to the sample's age: 3 ms of delay in the sensor's low-pass filter (MPU-6050, 94 Hz), and 6 ms until the
+# middle of the 4 ms for which the motors apply the torque.
 EFFECT = 0.009
 MAX_LEAD = 0.03  # s beyond the newest sample; the parabola is not extrapolated farther
 FELT_RANGE = (0.2 * STANDARD_GRAVITY, 3.0 * STANDARD_GRAVITY)  # m/s^2; sitting down hard is felt as 2.3 g

@@ -19,7 +19,7 @@ NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class AssistEfforts:
-    """Passes each message to `assist`, under `lock`, on a thread of its own."""
+    """Passes each message to `assist` on its own thread, holding `lock`."""
 
     def __init__(self, node: Node, assist: AssistInput, lock: threading.Lock) -> None:
         self._clock = node.get_clock()

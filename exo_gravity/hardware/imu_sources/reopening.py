@@ -1,6 +1,6 @@
 """Keeps an IMU open: after a failure it is opened again, with a pause between the attempts.
 
-A state machine without a clock of its own: time is an argument.
+A state machine; the caller passes the time.
 """
 
 from __future__ import annotations
