@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterable, Sequence
 
 from rich.table import Table
@@ -10,13 +11,13 @@ from rich.table import Table
 from exo_gravity.core.motors import MOTOR_ERRORS
 from exo_gravity.hardware.bus_scan import Answer, BusScan
 
-SILENCE = 3  # missed polls in a row: a single reply may be late on a busy computer
+MAX_SILENCE = 0.15  # s: some replies in a row may be late on a busy computer
 
 
 class Watch:
     """Polls the motors `can_ids`, and keeps how far each has turned since the start.
 
-    joints: names by ID, as far as known. was_silent: IDs that missed SILENCE polls in a row.
+    joints: names by ID, as far as known. was_silent: IDs that did not answer for MAX_SILENCE.
     """
 
     def __init__(self, bus: BusScan, can_ids: Sequence[int], joints: dict[int, str]) -> None:
@@ -28,14 +29,14 @@ class Watch:
         self.furthest: dict[int, float] = dict.fromkeys(can_ids, 0.0)  # rad, signed
         self.back: dict[int, float] = dict.fromkeys(can_ids, 0.0)  # rad, the largest turn the other way, 0 or more
         self.was_silent: set[int] = set()
-        self._missed = dict.fromkeys(can_ids, 0)  # polls in a row
+        self._answered = dict.fromkeys(can_ids, time.monotonic())  # s, when each answered last
 
     def __call__(self) -> Table:
         """Poll once, and return the table of all motors."""
         answers = self._bus.poll(self._ids)
-        for can_id in self._ids:
-            self._missed[can_id] = 0 if can_id in answers else self._missed[can_id] + 1
-        silent = {can_id for can_id, count in self._missed.items() if count >= SILENCE}
+        now = time.monotonic()
+        self._answered |= dict.fromkeys(answers, now)
+        silent = {can_id for can_id, answered in self._answered.items() if now - answered > MAX_SILENCE}
         self.was_silent |= silent
         self._last |= answers
         for can_id, answer in answers.items():
