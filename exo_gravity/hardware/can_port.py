@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 
 import can
+from can.interfaces.socketcan import SocketcanBus
 
 from exo_gravity.core.errors import BusError
 
@@ -23,12 +24,13 @@ class CanPort:
     """Sends and receives classic CAN frames. Not thread-safe: one thread owns it.
 
     reopen: opens the bus again and raises BusError if it cannot; None if a failed bus must stay failed.
-    name: of the bus.
+    name: of the bus. marks_echoes: whether `is_rx` is false only for frames that this port sent.
     """
 
     def __init__(self, bus: can.BusABC, reopen: Callable[[], can.BusABC] | None = None) -> None:
         self._bus = bus
         self.name = str(bus.channel_info)
+        self.marks_echoes = not isinstance(bus, SocketcanBus)
         self._reopen = reopen
         self._failing_since: float | None = None
         self._error = ""

@@ -2,6 +2,9 @@
 
 Most buses do not return a frame to its sender. Some return it and mark it (`is_rx` is false). udp_multicast returns it
 unmarked, in order. The first frames show whether a bus echoes.
+
+SocketCAN sets the same mark on every frame from this computer, also on those of another process
+(Documentation/networking/can.rst of Linux, MSG_DONTROUTE). There it does not show an echo.
 """
 
 from __future__ import annotations
@@ -20,10 +23,11 @@ Frame = tuple[int, bytes]
 
 
 class FrameFilter:
-    """Knows the CAN IDs `motor_ids` and which frames were sent."""
+    """Knows the CAN IDs `motor_ids` and which frames were sent. marks_echoes: whether `is_rx` is false for echoes only."""
 
-    def __init__(self, motor_ids: Collection[int]) -> None:
+    def __init__(self, motor_ids: Collection[int], marks_echoes: bool = True) -> None:
         self._motor_ids = frozenset(motor_ids)
+        self._marks_echoes = marks_echoes
         self._awaited: deque[Frame] = deque(maxlen=MOST_AWAITED)  # sent, their echoes not yet received
         self._sent = self._returned = 0
         self._is_echoing: bool | None = None  # None: not yet known
@@ -45,7 +49,8 @@ class FrameFilter:
             return "extended, remote or FD frame"
         can_id, data = message.arbitration_id, bytes(message.data)
         if len(data) == 8 and can_id in self._motor_ids and data[0] != can_id:
-            return "echo" if not message.is_rx or self._is_echo(can_id, data) else FOREIGN_COMMAND
+            is_marked = self._marks_echoes and not message.is_rx
+            return "echo" if is_marked or self._is_echo(can_id, data) else FOREIGN_COMMAND
         is_reply = len(data) in (6, 8) and data[0] in self._motor_ids and can_id in (MASTER_ID, data[0])
         return REPLY if is_reply else "foreign frame"
 

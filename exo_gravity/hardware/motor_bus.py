@@ -73,7 +73,7 @@ class MotorBus:
         self.foreign_commands = 0
         self.foreign_command = ""
         self._port = CanPort(bus, reopen)
-        self._filter = FrameFilter(ids)
+        self._filter = FrameFilter(ids, self._port.marks_echoes)
         self._motors = tuple(motors)
         self._joint_of = {motor.can_id: joint for joint, motor in enumerate(motors)}
         self._powered = powered

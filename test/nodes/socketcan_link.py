@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from exo_gravity.core.drive import OFF, Drive
+from exo_gravity.core.drive import NOTHING, OFF, Drive
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.motors import EXIT, MOTORS
@@ -25,7 +25,7 @@ def set_link(state: str) -> None:
 def test_a_link_that_is_down_is_a_bus_error_and_the_motors_are_switched_off_once_it_is_up():
     ours, other = (open_bus(*VCAN, {}) for _ in range(2))
     bus = MotorBus(ours, [JointMotor(AK60, can_id) for can_id in IDS])
-    bus.exchange(Drive((0.0,) * 4, 0.0, True), time.monotonic())
+    bus.exchange(Drive(NOTHING, NOTHING, True), time.monotonic())
     set_link("down")
     try:
         for _ in range(3):
