@@ -13,7 +13,7 @@ import time
 
 from exo_gravity.core.drive import NOTHING, Drive
 from exo_gravity.core.limits import UNKNOWN
-from exo_gravity.hardware.control_loop import REPLY_WAIT
+from exo_gravity.core.wire import REPLY_SHARE
 from exo_gravity.hardware.scheduling import favour
 
 from .direct_arm import DirectArm, run_paced
@@ -33,7 +33,7 @@ def main() -> None:
         now = time.monotonic()
         all_replied = UNKNOWN not in bus.samples  # an ENTER sent earlier might be lost
         effort = arm.law([joint.position for joint in bus.samples]) if all_replied else NOTHING
-        bus.exchange(Drive(effort, NOTHING, powered=all_replied), now + REPLY_WAIT * period)
+        bus.exchange(Drive(effort, NOTHING, powered=all_replied), now + REPLY_SHARE * period)
 
     try:
         run_paced(period, cycle, stopping)

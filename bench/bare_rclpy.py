@@ -23,7 +23,7 @@ from sensor_msgs.msg import JointState
 
 from exo_gravity.core.drive import NOTHING, Drive
 from exo_gravity.core.limits import UNKNOWN
-from exo_gravity.hardware.control_loop import REPLY_WAIT
+from exo_gravity.core.wire import REPLY_SHARE
 from exo_gravity.hardware.scheduling import favour
 from exo_gravity.nodes.run import keep_to_this_machine
 
@@ -45,7 +45,7 @@ def bridge_thread(node: Node, arm: DirectArm, period: float, stopping: list[bool
     def cycle() -> None:
         all_replied = UNKNOWN not in bus.samples  # an ENTER sent earlier might be lost
         drive = Drive(newest["effort"], NOTHING, powered=all_replied)
-        bus.exchange(drive, time.monotonic() + REPLY_WAIT * period)
+        bus.exchange(drive, time.monotonic() + REPLY_SHARE * period)
         if all_replied:
             position, velocity, effort, *_ = zip(*bus.samples, strict=True)
             message = JointState(name=arm.joint_names, position=position, velocity=velocity, effort=effort)

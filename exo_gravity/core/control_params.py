@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from exo_gravity.core.anfis_law import AnfisLaw
@@ -11,16 +12,20 @@ from exo_gravity.core.compensator_settings import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.joint_motor import MAX_CAN_ID, TORQUE_SCALE_BOUNDS, JointMotor
 from exo_gravity.core.limits import Limits
-from exo_gravity.core.motors import MOTORS, WIRE_RANGE_BOUNDS
+from exo_gravity.core.motors import MOTORS, WIRE_RANGE_BOUNDS, MotorSpec
 from exo_gravity.core.param_table import Param, param_of, params_of
 from exo_gravity.core.terms.settings import term_parameters, term_settings_of
 from exo_gravity.core.terms.spring import PosePath
 from exo_gravity.core.tilt import SIDES
 from exo_gravity.core.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
+from exo_gravity.core.wire import BITRATE, MAX_STATUS_RATE, Traffic
+from exo_gravity.core.wire_formats import FORMATS
 
 GYROSCOPE_RANGE, GYROSCOPE_RANGES = 34.9, (1.0, 200.0)  # rad/s; 2000 deg/s
 ACCELEROMETER_RANGE, ACCELEROMETER_RANGES = 156.9, (15.0, 4000.0)  # m/s^2; 16 g
 OPTIONS = "can.options"  # parameters below this prefix go to python-can unchanged
+# python-can's interfaces that open a bus at another bit rate than the motors' unless they are given one.
+NEED_BITRATE = ("cantact", "gs_usb", "ixxat", "kvaser", "pcan", "slcan", "usb2can", "vector")
 
 JOINT_NAMES = Param(
     "joint_names",
@@ -42,10 +47,16 @@ MOTOR_PARAMETERS = (
     Param("direction", [1, 1, 1, 1], "1 or -1: joint angle = direction * (motor angle - zero)", (-1, 1), fixed=True),
     Param("zero", [0.0] * 4, "motor angle at which the joint angle is 0", (-12.5, 12.5), "rad", fixed=True),
     Param("torque_scale", [1.0] * 4, "real output torque per commanded Nm", TORQUE_SCALE_BOUNDS, fixed=True),
-    Param("velocity_range", [45.0, 50.0, 45.0, 45.0], "velocity range of the firmware's wire format",
-          WIRE_RANGE_BOUNDS, "rad/s", fixed=True),
-    Param("torque_range", [15.0, 18.0, 15.0, 15.0], "torque range of the firmware's wire format",
-          WIRE_RANGE_BOUNDS, "Nm", fixed=True),
+    Param("wire_format", ["mit"] * 4, "wire format of the motor's board: mit for V1 and V2, mit_v3 for V3",
+          choices=tuple(FORMATS), fixed=True),
+    Param("velocity_range", [0.0] * 4, "velocity range of the firmware's wire format; 0: the usual one of the motor",
+          (0.0, WIRE_RANGE_BOUNDS[1]), "rad/s", fixed=True),
+    Param("torque_range", [0.0] * 4, "torque range of the firmware's wire format; 0: the usual one of the motor",
+          (0.0, WIRE_RANGE_BOUNDS[1]), "Nm", fixed=True),
+    Param("torque_per_ampere", [0.0] * 4, "V3: output torque by the current in status frames; 0: rated torque by "
+          "rated current", (0.0, 10.0), "Nm/A", fixed=True),
+    Param("status_rate", MAX_STATUS_RATE, "V3: status frames a second, as set on the boards", (1.0, MAX_STATUS_RATE),
+          "Hz", fixed=True),
 )
 LIMIT_PARAMETERS = params_of(Limits, fixed=True)
 CAN_BRIDGE = (
@@ -123,13 +134,43 @@ def motors_of(values: Mapping[str, Any]) -> tuple[JointMotor, ...]:
     ids = values["can_id"]
     if len(set(ids)) != len(ids):
         raise ParameterError("can_id", ids, "4 different IDs")
-    columns = ("motor", "can_id", "direction", "zero", "torque_scale", "velocity_range", "torque_range")
+    columns = ("motor", "wire_format", "velocity_range", "torque_range", "torque_per_ampere")
+    specs = [_spec_of(*column) for column in zip(*(values[name] for name in columns), strict=True)]
     return tuple(
-        JointMotor(MOTORS[motor].with_ranges(velocity_range, torque_range), can_id, direction, zero, scale)
-        for motor, can_id, direction, zero, scale, velocity_range, torque_range in zip(
-            *(values[column] for column in columns), strict=True
+        JointMotor(spec, can_id, direction, zero, scale, FORMATS[wire_format])
+        for spec, can_id, direction, zero, scale, wire_format in zip(
+            specs, ids, *(values[name] for name in ("direction", "zero", "torque_scale", "wire_format")), strict=True
         )
     )
+
+
+def _spec_of(
+    name: str, wire_format: str, velocity_range: float, torque_range: float, torque_per_ampere: float
+) -> MotorSpec:
+    """Return a motor with the ranges of its firmware, 0 for the usual ones; raises ParameterError.
+
+    A range that is usual on another board only is refused: it would scale every torque without an error.
+    """
+    usual = FORMATS[wire_format].ranged(MOTORS[name])
+    for field, given in (("velocity_range", velocity_range), ("torque_range", torque_range)):
+        own, others = getattr(usual, field), {getattr(each.ranged(MOTORS[name]), field) for each in FORMATS.values()}
+        if given != own and given in others:
+            expected = (
+                f"{own:g}, or 0, for an {name} with wire_format = {wire_format}: that is the range of another board"
+            )
+            raise ParameterError(field, given, expected)
+    spec = usual.with_ranges(velocity_range or usual.velocity_range, torque_range or usual.torque_range)
+    return replace(spec, torque_per_ampere=torque_per_ampere or usual.torque_per_ampere)
+
+
+def traffic_of(values: Mapping[str, Any], options: Mapping[str, Any]) -> Traffic:
+    """Return the traffic on the bus of the four motors; options: those of python-can. Raises ParameterError."""
+    interface, bitrate = values["can.interface"], options.get("bitrate")
+    if bitrate is None and interface in NEED_BITRATE:
+        raise ParameterError(f"{OPTIONS}.bitrate", bitrate, f"set for {interface}, as on the motors, e.g. {BITRATE}")
+    replying = sum(FORMATS[name].replies for name in values["wire_format"])
+    reporting = len(values["wire_format"]) - replying
+    return Traffic(replying, reporting, status_rate=values["status_rate"], bitrate=bitrate or BITRATE)
 
 
 def limits_of(values: Mapping[str, Any]) -> Limits:

@@ -1,4 +1,4 @@
-"""A motor on a joint: joint angle, effort and damping <-> the frames of `core.motors`."""
+"""A motor on a joint: joint angle, effort and damping <-> the frames of its wire format."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors import MotorReply, MotorSpec, pack_command, standstill, unpack_reply
+from exo_gravity.core.motors import MotorReply, MotorSpec, standstill
+from exo_gravity.core.wire_formats import MIT, WireFormat
+from exo_gravity.core.wire_formats.wire_format import Frame
 
-# The first byte of a reply is the motor's ID. The first byte of our commands is 0x7f or 0x80, because their position is
-# always 0. With IDs below 0x7f a command echoed by the bus cannot look like a reply.
+# In the format `mit` the first byte of a reply is the motor's ID. The first byte of our commands is 0x7f or 0x80,
+# because their position is always 0. With IDs below 0x7f a command echoed by the bus cannot look like a reply.
 MAX_CAN_ID = 126
 TORQUE_SCALE_BOUNDS = (0.2, 2.0)
 
@@ -22,7 +24,7 @@ class JointMotor:
 
     can_id: 1..MAX_CAN_ID. direction: +1 or -1; joint angle = direction * (motor angle - zero). zero: motor angle in rad
     at which the joint angle is 0. torque_scale: real output torque per commanded Nm (users report 0.75 for one AK80-9).
-    Raises ParameterError.
+    wire_format: of the board. Raises ParameterError.
     """
 
     spec: MotorSpec
@@ -30,6 +32,7 @@ class JointMotor:
     direction: int = 1
     zero: float = 0.0
     torque_scale: float = 1.0
+    wire_format: WireFormat = MIT
 
     def __post_init__(self) -> None:
         if not isinstance(self.can_id, int) or not 1 <= self.can_id <= MAX_CAN_ID:
@@ -53,8 +56,23 @@ class JointMotor:
         """The largest damping in Nm s/rad at the joint that a command can ask for."""
         return self.spec.kd_max * self.torque_scale
 
+    @property
+    def command_id(self) -> int:
+        """The arbitration ID of commands to this motor."""
+        return self.wire_format.command_id(self.can_id)
+
+    @property
+    def enter(self) -> tuple[Frame, ...]:
+        """The frames that switch the motor on, before its next command."""
+        return self.wire_format.enter(self.can_id)
+
+    @property
+    def exit(self) -> tuple[Frame, ...]:
+        """The frames that switch the motor off."""
+        return self.wire_format.exit(self.can_id)
+
     def command(self, effort: float, damping: float) -> bytes:
-        """Return the frame for a joint `effort` in Nm and `damping` in Nm s/rad, clamped to the wire format.
+        """Return the data of a command: a joint `effort` in Nm and `damping` in Nm s/rad, clamped to the wire format.
 
         Raises ParameterError on NaN or infinity.
         """
@@ -64,11 +82,11 @@ class JointMotor:
             torque -= kd * standstill(self.spec)
         if math.isfinite(torque) and abs(torque) > self.spec.torque_range:
             torque = math.copysign(self.spec.torque_range, torque)
-        return pack_command(self.spec, 0.0, 0.0, 0.0, kd, torque)
+        return self.wire_format.pack_command(self.spec, 0.0, 0.0, 0.0, kd, torque)
 
     def joint_reply(self, data: bytes | bytearray) -> MotorReply:
-        """Return the content of a reply in the joint's rad, rad/s and Nm. Raises FrameError."""
-        reply = unpack_reply(self.spec, data)
+        """Return the content of a reply or status frame in the joint's rad, rad/s and Nm. Raises FrameError."""
+        reply = self.wire_format.unpack_reply(self.spec, self.can_id, data)
         return MotorReply(
             reply.motor_id,
             self.joint_position(reply.position),

@@ -44,7 +44,8 @@ class MotorSpec:
 
     position_range rad, velocity_range rad/s, torque_range Nm: the wire range is +- this value. kp_max Nm/rad, kd_max
     Nm s/rad: the wire range starts at 0. rated_torque, peak_torque: Nm at the output. gear_ratio: motor turns per turn
-    of the output.
+    of the output. pole_pairs: of the motor. torque_per_ampere: Nm at the output, rated torque by rated current; only V3
+    boards report a current.
     """
 
     name: str
@@ -53,6 +54,8 @@ class MotorSpec:
     rated_torque: float
     peak_torque: float
     gear_ratio: int
+    pole_pairs: int
+    torque_per_ampere: float
     position_range: float = 12.5
     kp_max: float = 500.0
     kd_max: float = 5.0
@@ -69,8 +72,26 @@ class MotorSpec:
 MOTORS = {
     spec.name: spec
     for spec in (
-        MotorSpec("AK60-6", velocity_range=45.0, torque_range=15.0, rated_torque=3.0, peak_torque=9.0, gear_ratio=6),
-        MotorSpec("AK80-9", velocity_range=50.0, torque_range=18.0, rated_torque=9.0, peak_torque=18.0, gear_ratio=9),
+        MotorSpec(
+            "AK60-6",
+            velocity_range=45.0,
+            torque_range=15.0,
+            rated_torque=3.0,
+            peak_torque=9.0,
+            gear_ratio=6,
+            pole_pairs=14,
+            torque_per_ampere=3.0 / 7.4,
+        ),
+        MotorSpec(
+            "AK80-9",
+            velocity_range=50.0,
+            torque_range=18.0,
+            rated_torque=9.0,
+            peak_torque=18.0,
+            gear_ratio=9,
+            pole_pairs=21,
+            torque_per_ampere=9.0 / 10.3,
+        ),
     )
 }
 
@@ -103,11 +124,11 @@ def pack_command(spec: MotorSpec, position: float, velocity: float, kp: float, k
     or a value outside the spec's range.
     """
     word = (
-        _code("position", position, -spec.position_range, spec.position_range, 0xFFFF) << 48
-        | _code("velocity", velocity, -spec.velocity_range, spec.velocity_range, 0xFFF) << 36
-        | _code("kp", kp, 0.0, spec.kp_max, 0xFFF) << 24
-        | _code("kd", kd, 0.0, spec.kd_max, 0xFFF) << 12
-        | _code("torque", torque, -spec.torque_range, spec.torque_range, 0xFFF)
+        to_code("position", position, -spec.position_range, spec.position_range, 0xFFFF) << 48
+        | to_code("velocity", velocity, -spec.velocity_range, spec.velocity_range, 0xFFF) << 36
+        | to_code("kp", kp, 0.0, spec.kp_max, 0xFFF) << 24
+        | to_code("kd", kd, 0.0, spec.kd_max, 0xFFF) << 12
+        | to_code("torque", torque, -spec.torque_range, spec.torque_range, 0xFFF)
     )
     data = word.to_bytes(8, "big")
     # With all other fields at their maximum, the top torque codes spell ENTER, EXIT or SET_ZERO. Send the code below.
@@ -120,11 +141,11 @@ def unpack_command(spec: MotorSpec, data: bytes | bytearray) -> MotorCommand:
         raise FrameError(data, "8 bytes and not a special frame")
     word = int.from_bytes(data, "big")
     return MotorCommand(
-        _value(word >> 48, -spec.position_range, spec.position_range, 0xFFFF),
-        _value(word >> 36 & 0xFFF, -spec.velocity_range, spec.velocity_range, 0xFFF),
-        _value(word >> 24 & 0xFFF, 0.0, spec.kp_max, 0xFFF),
-        _value(word >> 12 & 0xFFF, 0.0, spec.kd_max, 0xFFF),
-        _value(word & 0xFFF, -spec.torque_range, spec.torque_range, 0xFFF),
+        from_code(word >> 48, -spec.position_range, spec.position_range, 0xFFFF),
+        from_code(word >> 36 & 0xFFF, -spec.velocity_range, spec.velocity_range, 0xFFF),
+        from_code(word >> 24 & 0xFFF, 0.0, spec.kp_max, 0xFFF),
+        from_code(word >> 12 & 0xFFF, 0.0, spec.kd_max, 0xFFF),
+        from_code(word & 0xFFF, -spec.torque_range, spec.torque_range, 0xFFF),
     )
 
 
@@ -143,9 +164,9 @@ def pack_reply(
     """
     word = (
         _whole("motor_id", motor_id, 0, 255) << 40
-        | _code("position", position, -spec.position_range, spec.position_range, 0xFFFF) << 24
-        | _code("velocity", velocity, -spec.velocity_range, spec.velocity_range, 0xFFF) << 12
-        | _code("torque", torque, -spec.torque_range, spec.torque_range, 0xFFF)
+        | to_code("position", position, -spec.position_range, spec.position_range, 0xFFFF) << 24
+        | to_code("velocity", velocity, -spec.velocity_range, spec.velocity_range, 0xFFF) << 12
+        | to_code("torque", torque, -spec.torque_range, spec.torque_range, 0xFFF)
     )
     data = word.to_bytes(6, "big")
     if temperature is None:
@@ -160,9 +181,9 @@ def unpack_reply(spec: MotorSpec, data: bytes | bytearray) -> MotorReply:
     word = int.from_bytes(data[:6], "big")
     return MotorReply(
         word >> 40,
-        _value(word >> 24 & 0xFFFF, -spec.position_range, spec.position_range, 0xFFFF),
-        _value(word >> 12 & 0xFFF, -spec.velocity_range, spec.velocity_range, 0xFFF),
-        _value(word & 0xFFF, -spec.torque_range, spec.torque_range, 0xFFF),
+        from_code(word >> 24 & 0xFFFF, -spec.position_range, spec.position_range, 0xFFFF),
+        from_code(word >> 12 & 0xFFF, -spec.velocity_range, spec.velocity_range, 0xFFF),
+        from_code(word & 0xFFF, -spec.torque_range, spec.torque_range, 0xFFF),
         data[6] - 40 if len(data) == 8 else None,
         data[7] if len(data) == 8 else None,
     )
@@ -171,16 +192,18 @@ def unpack_reply(spec: MotorSpec, data: bytes | bytearray) -> MotorReply:
 def standstill(spec: MotorSpec) -> float:
     """Return the velocity in rad/s that a motor decodes from a command of 0 rad/s."""
     span = spec.velocity_range
-    return _value(_code("velocity", 0.0, -span, span, 0xFFF), -span, span, 0xFFF)
+    return from_code(to_code("velocity", 0.0, -span, span, 0xFFF), -span, span, 0xFFF)
 
 
-def _code(name: str, value: float, low: float, high: float, codes: int) -> int:
+def to_code(name: str, value: float, low: float, high: float, codes: int) -> int:
+    """Return the nearest of the codes 0..`codes` for a value in `low`..`high`. Raises ParameterError outside."""
     if not low <= value <= high:  # rejects NaN too
         raise ParameterError(name, value, f"from {low:g} to {high:g}")
     return round((value - low) * (codes / (high - low)))
 
 
-def _value(code: int, low: float, high: float, codes: int) -> float:
+def from_code(code: int, low: float, high: float, codes: int) -> float:
+    """Return the value of a code: 0 is `low`, `codes` is `high`."""
     return low + code * ((high - low) / codes)
 
 

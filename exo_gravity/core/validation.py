@@ -8,17 +8,23 @@ from collections.abc import Sequence
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import Limits
+from exo_gravity.core.wire import MAX_STATUS_RATE, REPLY_SHARE
 
 FROZEN = 0.08  # s without a drive from the control loop while the watchdog itself runs, after which it takes over
 PERIODS = 2  # control periods that must fit into each time-out, so that one late cycle is not a fault
 
 
-def check_bridge(rate: float, motors: Sequence[JointMotor], limits: Limits) -> None:
+def check_bridge(
+    rate: float, motors: Sequence[JointMotor], limits: Limits, status_rate: float = MAX_STATUS_RATE
+) -> None:
     """Check the parameters of a `can_bridge` with control rate `rate` (Hz) against each other.
 
-    Raises ParameterError that names both values.
+    status_rate: Hz, of V3 boards. Raises ParameterError that names both values.
     """
     _check_rate(rate, limits)
+    if rate > REPLY_SHARE * status_rate + 1e-9 and not all(motor.wire_format.replies for motor in motors):
+        expected = f"at most {REPLY_SHARE * status_rate:g} Hz: each cycle awaits a status frame, status_rate"
+        raise ParameterError("rate", rate, f"{expected} = {status_rate:g} Hz")
     peak = [motor.peak_effort for motor in motors]
     if any(effort > most + 1e-9 for effort, most in zip(limits.max_effort, peak, strict=True)):
         shown = [round(effort, 2) for effort in peak]

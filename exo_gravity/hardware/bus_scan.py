@@ -1,8 +1,11 @@
-"""Finds the AK motors on a bus without moving any: MIT mode of V1 and V2 boards.
+"""Finds the AK motors on a bus without moving any, whatever the wire formats of their boards.
 
-A motor that is off still answers a command frame. The scan sends each ID a command with zero gains and zero torque,
-whose bytes are the same for every motor type: all ranges but those of the gains are symmetric. ENTER is never sent, so
-torque never flows. IDs above `MAX_CAN_ID` are not scanned: there, an echoed command could be taken for a reply.
+V1 and V2 boards: a motor that is off still answers a command frame. The scan sends each ID a command with zero gains
+and zero torque, whose bytes are the same for every motor type: all ranges but those of the gains are symmetric. ENTER
+is never sent, so torque never flows. IDs above `MAX_CAN_ID` are not scanned: there, an echoed command could be taken
+for a reply.
+
+V3 boards: they are found by their status frames, and are never sent anything, because a command switches them on.
 """
 
 from __future__ import annotations
@@ -12,9 +15,14 @@ import time
 from collections.abc import Iterable
 from typing import NamedTuple
 
+import can
+
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.joint_motor import MAX_CAN_ID
 from exo_gravity.core.motors import MOTORS, pack_command, unpack_reply
+from exo_gravity.core.wire_formats import MIT, MIT_V3
+from exo_gravity.core.wire_formats.mit import MASTER_ID
+from exo_gravity.core.wire_formats.wire_format import COMMAND, EXTENDED, REPLY, Frame
 from exo_gravity.hardware.bus_lock import Address, BusLock
 from exo_gravity.hardware.can_port import CanPort
 from exo_gravity.hardware.motor_bus import open_bus
@@ -26,17 +34,16 @@ LISTEN_TIME = 0.12  # s before the first frame, as in hardware/motor_bus.py
 REPLY_TIME = 0.01  # s: a motor replies within 0.4 ms; a USB adapter and a busy computer add some
 ATTEMPTS = 2  # for each ID, in case a frame is lost
 MAX_STALE_FRAMES = 256  # read before each command; two motors with one ID may never stop answering each other
-MASTER_ID = 0  # the arbitration ID of some firmwares' replies
-STATUS_FRAME = 0x29  # (STATUS_FRAME << 8) | motor ID, 29 bits: what V3 boards send on their own timer
-
-Frame = tuple[int, bytes]  # arbitration ID and data
+STATUS_TIME = 0.12  # s in which the next status frame of a V3 board is awaited
+V3_IDS = frozenset(range(1, 256))
 
 
 class Answer(NamedTuple):
     """What a motor replied.
 
-    reply_id: arbitration ID, the motor's own or 0. reply_length: 6 or 8 bytes. position: motor angle in rad.
-    temperature: degC; error: code of MOTOR_ERRORS; both None from 6-byte firmware.
+    reply_id: arbitration ID, the motor's own or 0, or that of a V3 board's status frames. reply_length: 6 or 8 bytes.
+    position: motor angle in rad. temperature: degC; error: code of MOTOR_ERRORS; both None from 6-byte firmware.
+    wire_format: name of the board's format.
     """
 
     can_id: int
@@ -45,6 +52,7 @@ class Answer(NamedTuple):
     position: float
     temperature: int | None
     error: int | None
+    wire_format: str = MIT.name
 
 
 class Scan(NamedTuple):
@@ -64,7 +72,7 @@ class BusScan:
     def __init__(self, address: Address) -> None:
         self._lock = BusLock(address, f"calibrate motors (PID {os.getpid()})")
         self.name = address[1]
-        self._v3_ids: set[int] = set()
+        self._v3: dict[int, Answer] = {}  # the newest status of each V3 board
         try:
             if self._lock.notes.drive.powered:
                 raise BusError(
@@ -94,9 +102,9 @@ class BusScan:
 
     def scan(self, can_ids: Iterable[int] = ALL_IDS) -> Scan:
         """Ask every ID; return who answers, and what is wrong. Raises BusError if the bus fails."""
-        found: dict[int, Answer] = {}
+        found = {can_id: self._v3[can_id] for can_id in can_ids if can_id in self._v3}
         problems: dict[str, None] = {}
-        for can_id in can_ids:
+        for can_id in sorted(set(can_ids) - set(found)):
             for sent in range(1, ATTEMPTS + 1):
                 replies, others = self._ask(can_id)
                 for reply_id, data in others:
@@ -109,18 +117,19 @@ class BusScan:
                 if replies:
                     found[can_id] = replies[0]
                     break
-        for can_id in sorted(self._v3_ids):
-            problems[f"ID {can_id}: sends the status frames of a V3 board, whose wire format is not supported"] = None
+        for can_id in sorted(can_id for can_id in self._v3 if can_id > MAX_CAN_ID):
+            problems[f"ID {can_id}: a V3 board; its ID must be from 1 to {MAX_CAN_ID}"] = None
         return Scan(tuple(found[can_id] for can_id in sorted(found)), tuple(problems))
 
     def poll(self, can_ids: Iterable[int]) -> dict[int, Answer]:
         """Return the newest answer of each of these motors; a silent one is missing. Raises BusError."""
         answers = {}
+        reporting = set(can_ids) & set(self._v3)
         for can_id in can_ids:
-            replies, _ = self._ask(can_id, is_alone=False)
+            replies = [] if can_id in reporting else self._ask(can_id, is_alone=False)[0]
             if replies:
                 answers[can_id] = replies[-1]
-        return answers
+        return answers | self._statuses(reporting)
 
     def _listen(self) -> None:
         end = time.monotonic() + LISTEN_TIME
@@ -128,24 +137,47 @@ class BusScan:
             message = self._port.receive(remaining)
             if message is None or message.is_error_frame or message.is_remote_frame:
                 continue
-            if message.is_extended_id:
-                if message.arbitration_id >> 8 == STATUS_FRAME:
-                    self._v3_ids.add(message.arbitration_id & 0xFF)
-            elif message.arbitration_id <= MAX_CAN_ID:
-                raise BusError(
-                    f"CAN bus {self.name} is in use: a frame with ID {message.arbitration_id} was heard; stop the "
-                    "other host; if there is none, two motors with one ID answer each other: switch their power off"
-                )
+            heard = message.arbitration_id
+            if (heard > MAX_CAN_ID) if not message.is_extended_id else self._note_status(message) != COMMAND:
+                continue
+            raise BusError(
+                f"CAN bus {self.name} is in use: a frame with ID {heard} was heard; stop the other host; if there is "
+                "none, two motors with one ID answer each other: switch their power off"
+            )
+
+    def _statuses(self, can_ids: set[int]) -> dict[int, Answer]:
+        """Return the next status of each of these V3 boards; a silent one is missing."""
+        self._drain()
+        before = dict(self._v3)
+        end = time.monotonic() + STATUS_TIME
+        while (remaining := end - time.monotonic()) > 0.0 and any(self._v3[i] is before[i] for i in can_ids):
+            message = self._port.receive(remaining)
+            if message is not None and message.is_extended_id:
+                self._note_status(message)
+        return {i: self._v3[i] for i in can_ids if self._v3[i] is not before[i]}
+
+    def _note_status(self, message: can.Message) -> str:
+        """Note the status in a frame with a 29-bit ID, if it is one; return what the frame is."""
+        frame_id = message.arbitration_id | EXTENDED
+        kind, can_id = MIT_V3.classify(frame_id, message.data, V3_IDS)
+        if kind == REPLY:
+            reply = MIT_V3.unpack_reply(SPEC, can_id, message.data)
+            state = reply.position, reply.temperature, reply.error
+            self._v3[can_id] = Answer(can_id, message.arbitration_id, 8, *state, MIT_V3.name)
+        return kind
+
+    def _drain(self) -> None:
+        for _ in range(MAX_STALE_FRAMES):
+            if self._port.receive(0.0) is None:
+                break
 
     def _ask(self, can_id: int, is_alone: bool = True) -> tuple[list[Answer], list[Frame]]:
         """Send one command; return the replies of this motor, and other short frames.
 
         is_alone: whether to wait for further replies after the first.
         """
-        for _ in range(MAX_STALE_FRAMES):
-            if self._port.receive(0.0) is None:
-                break
-        self._port.send(can_id, NOTHING)
+        self._drain()
+        self._port.send((can_id, NOTHING))
         replies: list[Answer] = []
         others: list[Frame] = []
         end = time.monotonic() + REPLY_TIME

@@ -15,6 +15,7 @@ import can
 from can.interfaces.socketcan import SocketcanBus
 
 from exo_gravity.core.errors import BusError
+from exo_gravity.core.wire_formats.wire_format import EXTENDED, ID_BITS, Frame
 
 REOPEN_AFTER = 0.02  # s of failures in a row after which the bus is opened again
 REOPEN_PERIOD = 0.1  # s between two attempts
@@ -38,11 +39,12 @@ class CanPort:
         self._is_closing = False
         self._reopened: can.BusABC | None = None
 
-    def send(self, can_id: int, data: bytes) -> None:
-        """Send one frame with an 11-bit ID. Raises BusError."""
+    def send(self, frame: Frame) -> None:
+        """Send one frame. Raises BusError."""
+        frame_id, data = frame
         bus = self._open_bus()
         try:
-            bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+            bus.send(can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED))
         except Exception as error:
             raise self._failure(error) from error
 

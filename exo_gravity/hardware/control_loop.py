@@ -24,12 +24,12 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.faults import FaultCode
 from exo_gravity.core.limits import JointSample
 from exo_gravity.core.safety import SafetyMachine
+from exo_gravity.core.wire import REPLY_SHARE
 from exo_gravity.hardware import last_resort
 from exo_gravity.hardware.motor_bus import MotorBus
 
 EFFORT_WAIT = 0.5  # share of a cycle's idle time for which the loop may wait for late efforts
 SMOOTHING = 0.02  # per cycle, of the measured work time
-REPLY_WAIT = 0.8  # share of a cycle in which replies are awaited; the rest is for publishing them
 MAX_ERRORS = 3  # unexpected exceptions in a row after which the state machine is no longer trusted
 HAND_OVER_TIME = 0.5  # s in which a watchdog that takes over has ended this process
 
@@ -192,7 +192,7 @@ class ControlLoop:
             self.safety.disable(now)
         drive = self._drive = self.safety.step(now, tuple(self._bus.samples), *efforts)
         try:
-            complete = self._bus.exchange(drive, now + REPLY_WAIT * self.period)
+            complete = self._bus.exchange(drive, now + REPLY_SHARE * self.period)
         except BusError as error:
             self.safety.trip(FaultCode.BUS_ERROR, str(error), now)
             complete = False

@@ -1,12 +1,13 @@
 """The AK motors of one arm on one python-can bus, in MIT mode: command all, collect the replies until a deadline.
 
-A motor replies only when commanded, 200-400 us later, with its own ID or the master's (0). The first byte of our
-commands is 0x7f, 0x80 or 0xff; that of a reply is the motor's ID, which `JointMotor` keeps below those. So a command is
-never taken for a reply. Frames of other devices are ignored and counted by kind.
+The wire formats of the boards (core/wire_formats) may differ. A motor of V1 and V2 boards replies only when commanded,
+200-400 us later. A V3 board sends status frames on its own timer: the first one after a command counts as its reply.
+Frames of other devices are ignored and counted by kind.
 
 A motor obeys every sender. A command to one of our motors that we did not send is answered at once with our own.
 
-A zero command precedes ENTER and EXIT: the motor remembers its last command, and ENTER would carry it out.
+A zero command precedes the frames that switch a V1 or V2 board on or off: the motor remembers its last command, and
+ENTER would carry it out. A command switches a V3 board on, so it gets none while the arm is off.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import contextlib
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import chain
 from typing import Any
 
 import can
@@ -25,13 +27,14 @@ from exo_gravity.core.drive import OFF, Drive
 from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import UNKNOWN, JointSample
-from exo_gravity.core.motors import ENTER, EXIT, SET_ZERO
+from exo_gravity.core.wire_formats.wire_format import REPLY, Frame
 from exo_gravity.hardware.can_port import CanPort
-from exo_gravity.hardware.frame_filter import FOREIGN_COMMAND, REPLY, FrameFilter
+from exo_gravity.hardware.frame_filter import FOREIGN_COMMAND, FrameFilter
 
 MAX_STALE_FRAMES = 256  # frames read before each cycle: the capacity of udp_multicast, more than any cycle produces
 EXIT_PERIOD = 0.5  # s between two EXIT frames to motors that are off, in case one was lost,
 UNCONFIRMED_EXIT_PERIOD = 0.02  # s, and to motors that have not replied since the first EXIT
+OFF_EFFORT = 0.2  # Nm that a V3 board may report when it is off: it reports unasked, so a frame alone proves nothing
 LAST_REPLIES = 0.02  # s for which replies to the last frames are awaited
 LISTEN_TIME = 0.12  # s before the first frame
 SETTLING_TIME = 0.02  # s of it in which late replies to the previous owner may still arrive
@@ -73,12 +76,14 @@ class MotorBus:
         self.foreign_commands = 0
         self.foreign_command = ""
         self._port = CanPort(bus, reopen)
-        self._filter = FrameFilter(ids, self._port.marks_echoes)
+        self._filter = FrameFilter(motors, self._port.marks_echoes)
         self._motors = tuple(motors)
+        self._asked = frozenset(joint for joint, motor in enumerate(motors) if motor.wire_format.replies)
         self._joint_of = {motor.can_id: joint for joint, motor in enumerate(motors)}
         self._powered = powered
         self._unconfirmed = set(range(JOINT_COUNT)) if powered else set()  # not known to be off
-        self._commands: list[bytes | None] = [None] * JOINT_COUNT  # last sent
+        self._ids = tuple(motor.command_id for motor in motors)
+        self._commands: list[Frame | None] = [None] * JOINT_COUNT  # last sent
         self._corrected = [-math.inf] * JOINT_COUNT  # s
         self._foreign_time = -math.inf
         self._note = note
@@ -103,8 +108,9 @@ class MotorBus:
         self._answered.clear()
         self.foreign_commands = 0
         self.receive_until(end)
-        if self.foreign_commands or self._answered:
-            heard = self.foreign_command or f"motor {self._motors[min(self._answered)].can_id} replies to another host"
+        replies = self._answered & self._asked
+        if self.foreign_commands or replies:
+            heard = self.foreign_command or f"motor {self._motors[min(replies)].can_id} replies to another host"
             raise BusError(f"CAN bus {self._port.name} is in use: {heard}; stop the other commander first")
 
     def exchange(self, drive: Drive, deadline: float) -> bool:
@@ -132,9 +138,9 @@ class MotorBus:
         self._port.confirm()
         return len(self._answered) == JOINT_COUNT
 
-    def receive_until(self, deadline: float) -> None:
-        """Receive until `deadline` (monotonic s), and answer foreign commands. Raises BusError."""
-        while (remaining := deadline - time.monotonic()) > 0.0:
+    def receive_until(self, deadline: float, is_done: Callable[[], bool] = lambda: False) -> None:
+        """Receive until `deadline` (monotonic s) or `is_done()`, and answer foreign commands. Raises BusError."""
+        while not is_done() and (remaining := deadline - time.monotonic()) > 0.0:
             message = self._port.receive(remaining)
             if message is not None:
                 self._take(message)
@@ -143,8 +149,11 @@ class MotorBus:
         """Make the present pose every motor's zero; only while they are off. They are silent for up to 1.5 s."""
         if self._powered:
             raise BusError("set_zero: refused while the motors are on")
+        frames = [motor.wire_format.set_zero(motor.can_id) for motor in self._motors]
+        if not all(frames):
+            raise BusError(f"set_zero: motor {self._motors[frames.index(())].can_id} has a board without such a frame")
         self._send_commands(OFF)
-        self._send_all(SET_ZERO)
+        self._send_each(frames)
 
     def stop(self) -> bool:
         """Send the last frames, a zero command and EXIT, twice; then close the bus. Never raises.
@@ -154,18 +163,15 @@ class MotorBus:
         for _ in range(2):
             self._is_confirming = True
             for motor in self._motors:
-                for data in (motor.command(0.0, 0.0), EXIT):
+                for frame in ((motor.command_id, motor.command(0.0, 0.0)), *motor.exit):
                     try:
-                        self._send(motor.can_id, data)
+                        self._send(frame)
                     except BusError:
                         self.ignored["unsent"] += 1
             self._powered = False
             end = time.monotonic() + LAST_REPLIES
             with contextlib.suppress(BusError):
-                while self._unconfirmed and (remaining := end - time.monotonic()) > 0.0:
-                    message = self._port.receive(remaining)
-                    if message is not None:
-                        self._take(message)
+                self.receive_until(end, lambda: not self._unconfirmed)
         if not self._unconfirmed:
             self._note(OFF)
         self._port.close()
@@ -180,31 +186,31 @@ class MotorBus:
             self._powered, self._exit_sent = True, -math.inf
             self._unconfirmed = set(range(JOINT_COUNT))
             self._send_commands(OFF)
-            self._send_all(ENTER)
+            self._send_each([motor.enter for motor in self._motors])
 
     def _switch_off(self) -> None:
         period = UNCONFIRMED_EXIT_PERIOD if self._unconfirmed else EXIT_PERIOD
         if self._powered or time.monotonic() - self._exit_sent > period:
-            self._send_all(EXIT)
+            self._send_each([motor.exit for motor in self._motors])
             self._exit_sent = time.monotonic()
         self._powered = False
 
     def _send_commands(self, drive: Drive) -> None:
-        columns = (self._motors, drive.effort, drive.damping, drive.enter)
-        for joint, (motor, effort, damping, enter) in enumerate(zip(*columns, strict=True)):
-            command = self._commands[joint] = motor.command(effort, damping)
-            if enter:
-                self._send(motor.can_id, command)
-                self._send(motor.can_id, ENTER)
-            self._send(motor.can_id, command)
+        for joint, motor in enumerate(self._motors):
+            if not drive.powered and joint not in self._asked:
+                continue
+            command = self._commands[joint] = self._ids[joint], motor.command(drive.effort[joint], drive.damping[joint])
+            if drive.enter[joint]:
+                self._send_each([(command, *motor.enter)])
+            self._send(command)
 
-    def _send_all(self, data: bytes) -> None:
-        for motor in self._motors:
-            self._send(motor.can_id, data)
+    def _send_each(self, frames: Iterable[Sequence[Frame]]) -> None:
+        for frame in chain.from_iterable(frames):
+            self._send(frame)
 
-    def _send(self, can_id: int, data: bytes) -> None:
-        self._filter.sent(can_id, data)
-        self._port.send(can_id, data)
+    def _send(self, frame: Frame) -> None:
+        self._filter.sent(frame)
+        self._port.send(frame)
 
     def _drain(self) -> None:
         """Read replies that arrived after their cycle, so that they do not count for this one."""
@@ -215,32 +221,29 @@ class MotorBus:
             self._take(message)
 
     def _take(self, message: can.Message) -> None:
-        kind = self._filter.kind(message)
+        kind, can_id = self._filter.sort(message)
         if kind != REPLY:
             self.ignored[kind] += 1
             if kind == FOREIGN_COMMAND:
-                self._oppose(self._joint_of[message.arbitration_id], bytes(message.data))
+                self._oppose(self._joint_of[can_id], bytes(message.data))
             return
-        joint = self._joint_of[message.data[0]]
-        reply = self._motors[joint].joint_reply(bytes(message.data))
+        joint = self._joint_of[can_id]
+        reply = self._motors[joint].joint_reply(message.data)
         self._answered.add(joint)
-        if self._is_confirming:
+        if self._is_confirming and (joint in self._asked or abs(reply.torque) < OFF_EFFORT):
             self._unconfirmed.discard(joint)
         self.samples[joint] = JointSample(*reply[1:], time.monotonic())
 
     def _oppose(self, joint: int, foreign: bytes) -> None:
         """Send our last command again after a foreign one, so that the motor obeys it for less than a millisecond."""
         now = time.monotonic()
-        can_id, command = self._motors[joint].can_id, self._commands[joint]
+        motor, command = self._motors[joint], self._commands[joint]
         self.foreign_commands += 1
         self._foreign_time = now
-        self.foreign_command = f"another sender commands motor {can_id} (frame [{foreign.hex(' ')}])"
+        self.foreign_command = f"another sender commands motor {motor.can_id} (frame [{foreign.hex(' ')}])"
         if not self._powered or command is None:
             return
-        if foreign == EXIT:
-            self._send(can_id, command)
-            self._send(can_id, ENTER)
-        elif now - self._corrected[joint] < CORRECTION_PERIOD:
-            return
-        self._corrected[joint] = now
-        self._send(can_id, command)
+        is_exit = foreign in [data for _, data in motor.exit]
+        if is_exit or now - self._corrected[joint] >= CORRECTION_PERIOD:
+            self._send_each([(command, *motor.enter) if is_exit else (), (command,)])
+            self._corrected[joint] = now

@@ -10,7 +10,7 @@ from rclpy.node import Node
 from exo_gravity.core.drive import State
 from exo_gravity.core.limits import Limits
 from exo_gravity.core.rate import Rate
-from exo_gravity.core.wire import Load, load
+from exo_gravity.core.wire import Traffic
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics
 from exo_gravity.nodes.run import open_to_others
@@ -18,7 +18,7 @@ from exo_gravity.nodes.run import open_to_others
 RECENT = 2.0  # s for which a limit that acted is still shown
 
 
-def log_limits(node: Node, limits: Limits, wire: Load, rate: float) -> None:
+def log_limits(node: Node, limits: Limits, traffic: Traffic, rate: float) -> None:
     """Log the limits, the bus load at `rate` (Hz), and whether other hosts can command the arm."""
     log = node.get_logger()
     efforts = ", ".join(f"{effort:g}" for effort in limits.max_effort)
@@ -26,11 +26,13 @@ def log_limits(node: Node, limits: Limits, wire: Load, rate: float) -> None:
         f"limits: {efforts} Nm, {limits.max_effort_rate:g} Nm/s, {max(limits.max_velocity):g} rad/s, "
         f"{limits.max_temperature:g} degC, effort commands at most {limits.command_timeout * 1000:.0f} ms old"
     )
-    worst = load(rate, len(limits.joint_names), worst=True)
+    wire, worst = traffic.load(rate), traffic.load(rate, worst=True)
     log.info(
-        f"bus load at {rate:g} Hz: {wire.bits_per_second / 1000:.0f} kbit/s, {wire.share:.0%} of the bus, "
-        f"{worst.share:.0%} at worst; the bus is full at {int(wire.largest_rate)} Hz"
+        f"bus load at {rate:g} Hz: {wire.bits_per_second / 1000:.0f} of {traffic.bitrate / 1000:g} kbit/s, "
+        f"{wire.share:.0%} of the bus, {worst.share:.0%} at worst; the bus is full at {int(wire.largest_rate)} Hz"
     )
+    if warning := traffic.warning(rate):
+        log.warning(warning)
     opening = open_to_others()
     if opening:
         log.warning(
@@ -39,12 +41,12 @@ def log_limits(node: Node, limits: Limits, wire: Load, rate: float) -> None:
 
 
 class BridgeReport:
-    """The status of one bridge. wire: the bus load at full rate. period: s of a cycle."""
+    """The status of one bridge."""
 
-    def __init__(self, node: Node, names: Sequence[str], wire: Load, period: float) -> None:
+    def __init__(self, node: Node, names: Sequence[str], traffic: Traffic) -> None:
         self._diagnostics = Diagnostics(node)
         self._names = names
-        self._load = wire.share * period  # s on the bus per cycle
+        self._traffic = traffic
         self._rate = Rate()
 
     def send(self, loop: ControlLoop | None, refusal: str, answered: float) -> None:
@@ -66,7 +68,7 @@ class BridgeReport:
             "fault": safety.fault.code if safety.fault else "none",
             "limits acting": acting or "none",
             "rate (Hz)": f"{rate:.1f}",
-            "bus load (%)": f"{100.0 * self._load * rate:.0f}",
+            "bus load (%)": f"{100.0 * self._traffic.load(rate).share:.0f}" if rate else "0",
             "age of efforts (ms)": f"{1000.0 * (now - answered):.1f}",
             "cycles": loop.cycles,
             "late cycles": loop.late,

@@ -13,13 +13,12 @@ from collections.abc import Callable
 
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
-from exo_gravity.core.control_params import CAN_BRIDGE, OPTIONS, limits_of, motors_of
+from exo_gravity.core.control_params import CAN_BRIDGE, OPTIONS, limits_of, motors_of, traffic_of
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.faults import FaultCode
 from exo_gravity.core.joint_motor import peaks_of
 from exo_gravity.core.safety import SafetyMachine
 from exo_gravity.core.validation import check_bridge
-from exo_gravity.core.wire import check_rate
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.handover import Charge
 from exo_gravity.hardware.motor_bus import MotorBus
@@ -48,21 +47,23 @@ class CanBridge(LifecycleNode):
         values = declare(self, CAN_BRIDGE, free_prefix=OPTIONS)
         self._motors = motors_of(values)
         self._limits = limits_of(values)
-        check_bridge(values["rate"], self._motors, self._limits)
+        check_bridge(values["rate"], self._motors, self._limits, values["status_rate"])
         self._period = 1.0 / values["rate"]
-        self._charge = Charge(bus_of(self, values), self._motors, self._limits, self._period)
+        address = bus_of(self, values)
+        traffic = traffic_of(values, address[2])
+        traffic.check(values["rate"])
+        self._charge = Charge(address, self._motors, self._limits, self._period)
         self._owner = f"{self.get_fully_qualified_name()} (PID {os.getpid()})"
         self._real_time = values["thread_priority"], values["lock_memory"]
-        wire = check_rate(values["rate"], len(self._motors))
         self._owned: OwnedBus | None = None  # while configured
         self._bus: MotorBus | None = None  # while inactive
         self._loop: ControlLoop | None = None  # while active
         self._error = ""  # why the last transition failed
         self._exchange = EffortExchange(self, values["joint_names"], self._limits, lambda: self._loop)
-        self._report_writer = BridgeReport(self, values["joint_names"], wire, self._period)
+        self._report_writer = BridgeReport(self, values["joint_names"], traffic)
         BridgeServices(self, lambda: self._loop, self._motors, self._limits)
         self.create_timer(REPORT_PERIOD, self._report)
-        log_limits(self, self._limits, wire, values["rate"])
+        log_limits(self, self._limits, traffic, values["rate"])
         if values["autostart"]:
             for trigger in (self.trigger_configure, self.trigger_activate):
                 if trigger() is not TransitionCallbackReturn.SUCCESS:

@@ -22,6 +22,7 @@ from exo_gravity.sim.arm import STEP, ArmConfig, SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu
 from exo_gravity.sim.motor import Firmware, SimulatedMotor
+from exo_gravity.sim.v3_motor import SimulatedV3Motor, simulated_motor
 from exo_gravity.sim.virtual_wearer import Hand, VirtualWearer
 
 __all__ = [
@@ -34,5 +35,7 @@ __all__ = [
     "SimulatedDevice",
     "SimulatedImu",
     "SimulatedMotor",
+    "SimulatedV3Motor",
     "VirtualWearer",
+    "simulated_motor",
 ]

@@ -12,10 +12,9 @@ from collections import deque
 import can
 
 from exo_gravity.core.errors import BusError
+from exo_gravity.core.wire_formats.wire_format import EXTENDED, ID_BITS, Frame
 
 MAX_PENDING_ECHOES = 512  # twice the number of frames that a udp_multicast socket buffers
-
-Frame = tuple[int, bytes]  # arbitration ID and data
 
 
 class CanLink:
@@ -28,7 +27,7 @@ class CanLink:
         self._no_echo = False
 
     def receive(self, timeout: float) -> tuple[Frame | None, float]:
-        """Return the next frame with an 11-bit ID that is not an echo, or None, and its age in s.
+        """Return the next frame that is not an echo, or None, and its age in s.
 
         A remote frame is returned without data.
         """
@@ -39,22 +38,25 @@ class CanLink:
             if error.__cause__ is None or isinstance(error.__cause__, OSError):
                 raise BusError(f"receiving on {self._bus.channel_info} failed: {error}") from error
             return None, 0.0
-        if message is None or message.is_extended_id or message.is_error_frame or message.is_fd:
+        if message is None or message.is_error_frame or message.is_fd:
             return None, 0.0
-        frame = message.arbitration_id, bytes(message.data)
+        frame = message.arbitration_id | (EXTENDED if message.is_extended_id else 0), bytes(message.data)
         if self._is_echo(frame):
             return None, 0.0
         return frame, max(0.0, time.time() - message.timestamp)
 
     def send(self, frame: Frame) -> None:
-        """Send a reply."""
+        """Send a reply or a status frame."""
         if not self._no_echo:
             self._pending.append(frame)
             if len(self._pending) > MAX_PENDING_ECHOES:
                 self._no_echo = not self._echo_seen
                 self._pending.clear()
+        frame_id, data = frame
         try:
-            self._bus.send(can.Message(arbitration_id=frame[0], data=frame[1], is_extended_id=False))
+            self._bus.send(
+                can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED)
+            )
         except can.CanError as error:
             raise BusError(f"sending on {self._bus.channel_info} failed: {error}") from error
 

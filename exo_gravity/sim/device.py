@@ -2,7 +2,8 @@
 
 `run` plays it in real time on a python-can bus. `advance` and `exchange` play it without a bus, as fast as possible.
 Physics catches up with the clock in steps of 1 ms before a frame is processed, so a motor always replies with the
-present state of the arm. A reply is sent 200 to 400 us after its command, as measured on AK motors.
+present state of the arm. A reply is sent 200 to 400 us after its command, as measured on AK motors. V3 boards send
+status frames on their own timer, only in `run`.
 """
 
 from __future__ import annotations
@@ -19,13 +20,15 @@ import can
 from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.core.wire_formats.wire_format import Frame
 from exo_gravity.sim.arm import STEP, SimulatedArm
 from exo_gravity.sim.base_motion import felt_in_base
-from exo_gravity.sim.can_link import CanLink, Frame
+from exo_gravity.sim.can_link import CanLink
 from exo_gravity.sim.gap_meter import GapMeter
 from exo_gravity.sim.motor import SimulatedMotor
 from exo_gravity.sim.trunk_motion import TrunkMotion, TrunkState, motion_of
 from exo_gravity.sim.truth import TruthLog
+from exo_gravity.sim.v3_motor import SimulatedV3Motor, StatusTimer
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 REPLY_DELAY = (200e-6, 400e-6)  # s
@@ -60,7 +63,7 @@ class SimulatedDevice:
         self.truth: TruthLog | None = None
         self.slip = 0.0
         self.gaps = GapMeter()
-        self._joint_of_id = {can_id: joint for joint, can_id in enumerate(ids)}
+        self._joint_of_id = {can_id: joint for joint, motor in enumerate(motors) for can_id in motor.received_ids}
         self._random = random.Random(seed)
         self._steps = 0
         self._clock = 0.0  # s elapsed, of which `time` is the part in whole steps
@@ -130,8 +133,15 @@ class SimulatedDevice:
         motor, arm = self.motors[joint], self.arm
         self._frames[joint] += 1
         position = arm.positions[joint] + self.encoder_error[joint]
-        reply = motor.receive(data, position, arm.velocities[joint], self.time)
+        reply = motor.receive(data, position, arm.velocities[joint], self.time, can_id)
         return None if reply is None else (motor.reply_id, reply)
+
+    def status(self, joint: int) -> Frame | None:
+        """Return the present status frame of a V3 board; None if it cannot send, and for other boards."""
+        motor = self.motors[joint]
+        if self.bus_silent or self.cut_off[joint] or not isinstance(motor, SimulatedV3Motor):
+            return None
+        return motor.status(self.arm.positions[joint] + self.encoder_error[joint], self.arm.velocities[joint])
 
     def run(
         self, bus: can.BusABC, should_stop: Callable[[], bool], on_idle: Callable[[float], None] = lambda now: None
@@ -143,8 +153,9 @@ class SimulatedDevice:
         link = CanLink(bus)
         outbox: list[tuple[float, Frame]] = []  # replies by the time at which they are due, a heap
         last = time.monotonic()
+        timer = StatusTimer(self.motors, last, self._random)
         while not should_stop():
-            due = min(outbox[0][0], last + IDLE_PERIOD) if outbox else last + IDLE_PERIOD
+            due = min(last + IDLE_PERIOD, timer.next, outbox[0][0] if outbox else math.inf)
             frame, age = link.receive(max(0.0, due - time.monotonic()))
             now = time.monotonic()
             self.gaps.note(now, self.powered, frame is not None)
@@ -155,6 +166,9 @@ class SimulatedDevice:
                 heapq.heappush(outbox, (now + delay, reply))
             while outbox and outbox[0][0] <= time.monotonic():
                 link.send(heapq.heappop(outbox)[1])
+            for joint in timer.due(last):
+                if frame := self.status(joint):
+                    link.send(frame)
             if not outbox:
                 on_idle(last)
 

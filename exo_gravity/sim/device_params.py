@@ -13,8 +13,9 @@ from exo_gravity.core.tilt import SIDES
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.imu import ImuConfig
-from exo_gravity.sim.motor import Firmware, SimulatedMotor
+from exo_gravity.sim.motor import Firmware
 from exo_gravity.sim.truth import TruthLog
+from exo_gravity.sim.v3_motor import simulated_motor
 
 
 def _param(name: str, owner: type, field: str) -> Param:
@@ -73,8 +74,13 @@ def device_of(values: Mapping[str, Any]) -> SimulatedDevice:
     """Return the device that parameter values describe, with its trunk tilted. Raises ParameterError."""
     links = ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"], gravity=values["gravity"])
     arm = ArmConfig(links, **{field: values[name] for field, name in ARM_FIELDS.items()})
-    firmware = Firmware(values["reply_to_master"], values["reply_length"], current_noise=values["current_noise"])
-    motors = [SimulatedMotor(motor, firmware) for motor in motors_of(values)]
+    firmware = Firmware(
+        values["reply_to_master"],
+        values["reply_length"],
+        current_noise=values["current_noise"],
+        status_rate=values["status_rate"],
+    )
+    motors = [simulated_motor(motor, firmware) for motor in motors_of(values)]
     device = SimulatedDevice(SimulatedArm(arm), motors, values["side"])
     device.pitch, device.roll = values["trunk.pitch"], values["trunk.roll"]
     if values["truth"]:

@@ -18,8 +18,9 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.motors import ENTER, EXIT, SET_ZERO, MotorCommand, pack_reply, unpack_command
 from exo_gravity.core.param_table import owned
+from exo_gravity.core.wire import MAX_STATUS_RATE
+from exo_gravity.core.wire_formats.mit import MASTER_ID
 
-MASTER_ID = 0
 _NO_COMMAND = MotorCommand(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -28,19 +29,22 @@ class Firmware:
     """Differences between firmwares, except the wire ranges (`MotorSpec.with_ranges`).
 
     reply_length: 8 bytes, or 6 without temperature and error. zero_silence: s for which the motor ignores frames after
-    SET_ZERO; users report 0.5 to 1.5. current_noise: standard deviation of one reply.
+    SET_ZERO; users report 0.5 to 1.5. current_noise: standard deviation of one reply. status_rate: status frames per s
+    of a V3 board.
     """
 
     reply_to_master: bool = owned(False, "replies carry ID 0 instead of the motor's own")
     reply_length: int = owned(8, "bytes of a reply, 6 or 8", (6, 8))
     zero_silence: float = 1.0
     current_noise: float = owned(0.0, "noise of the torque in replies, as a share of it", (0.0, 0.5))
+    status_rate: float = MAX_STATUS_RATE
 
     def __post_init__(self) -> None:
         if self.reply_length not in (6, 8):
             raise ParameterError("reply_length", self.reply_length, "6 or 8 bytes")
         one_float("zero_silence", self.zero_silence, 0.0, 10.0, "s")
         one_float("current_noise", self.current_noise, 0.0, 0.5)
+        one_float("status_rate", self.status_rate, 1.0, MAX_STATUS_RATE, "Hz")
 
 
 class SimulatedMotor:
@@ -68,6 +72,11 @@ class SimulatedMotor:
         return MASTER_ID if self.firmware.reply_to_master else self.joint.can_id
 
     @property
+    def received_ids(self) -> tuple[int, ...]:
+        """Arbitration IDs of the frames that the motor obeys."""
+        return (self.joint.can_id,)
+
+    @property
     def entered(self) -> bool:
         """Whether the motor is on: after ENTER, before EXIT."""
         return self._entered
@@ -82,10 +91,13 @@ class SimulatedMotor:
         """Whether the torque stays constant until the next frame, however the joint moves."""
         return not (self.unplugged or (self._entered and (self._command.kp or self._command.kd)))
 
-    def receive(self, data: bytes, position: float, velocity: float, now: float) -> bytes | None:
+    def receive(
+        self, data: bytes, position: float, velocity: float, now: float, frame_id: int | None = None
+    ) -> bytes | None:
         """Execute the frame `data` and return the bytes of the reply, or None if the motor does not reply.
 
         position, velocity: of the joint, rad and rad/s. now: simulated time in s, for the silence after SET_ZERO.
+        frame_id: arbitration ID, one of `received_ids`.
         """
         if self.unplugged or now < self._silent_until or len(data) != 8:
             return None
@@ -115,22 +127,27 @@ class SimulatedMotor:
         if command.kp:
             torque += command.kp * (command.position - joint.motor_position(position))
         peak = joint.spec.peak_torque
-        return joint.direction * _clamp(torque * joint.torque_scale, peak)
+        return joint.direction * clamp(torque * joint.torque_scale, peak)
 
-    def _reply(self, position: float, velocity: float) -> bytes:
+    def _readings(self, position: float, velocity: float) -> tuple[float, float, float]:
+        """Return the motor's angle, speed and torque in rad, rad/s and Nm, within the ranges of the wire format."""
         joint, spec = self.joint, self.joint.spec
         torque = joint.direction * self.torque(position, velocity) / joint.torque_scale
         if self.firmware.current_noise:
             torque *= self._random.gauss(1.0, self.firmware.current_noise)
-        values = (
-            _clamp(joint.motor_position(position), spec.position_range),
-            _clamp(joint.direction * velocity, spec.velocity_range),
-            _clamp(torque, spec.torque_range),
+        return (
+            clamp(joint.motor_position(position), spec.position_range),
+            clamp(joint.direction * velocity, spec.velocity_range),
+            clamp(torque, spec.torque_range),
         )
+
+    def _reply(self, position: float, velocity: float) -> bytes:
+        values = self._readings(position, velocity)
+        spec, can_id = self.joint.spec, self.joint.can_id
         if self.firmware.reply_length == 6:
-            return pack_reply(spec, joint.can_id, *values)
+            return pack_reply(spec, can_id, *values)
         temperature = round(max(-40.0, min(215.0, self.temperature)))
-        return pack_reply(spec, joint.can_id, *values, temperature, self.error)
+        return pack_reply(spec, can_id, *values, temperature, self.error)
 
     def _forget(self) -> None:
         self._entered = False
@@ -138,5 +155,6 @@ class SimulatedMotor:
         self._silent_until = -math.inf
 
 
-def _clamp(value: float, limit: float) -> float:
+def clamp(value: float, limit: float) -> float:
+    """Return `value` within -`limit`..`limit`."""
     return value if -limit <= value <= limit else math.copysign(limit, value)

@@ -25,7 +25,6 @@ from exo_gravity.core.drive import Drive, State
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.joint_motor import JointMotor, peaks_of
 from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
-from exo_gravity.core.motors import ENTER, EXIT
 from exo_gravity.core.recording import Recording, ScriptedStep
 from exo_gravity.core.safety import SafetyMachine
 from exo_gravity.core.trial_script import TrialScript
@@ -176,16 +175,19 @@ class OfflineTrial:
 
     def _exchange(self, drive: Drive, now: float) -> None:
         """Send `drive` to the motors and read their replies, with the same frames as `MotorBus`."""
-        send = self.arm.device.exchange
+        device, send = self.arm.device, self.arm.device.exchange
         for joint, motor in enumerate(self.arm.motors):
             command = self._pack[joint]
             if drive.powered and (drive.enter[joint] or not self._powered):
-                send(motor.can_id, command(0.0, 0.0))
-                send(motor.can_id, ENTER)
-            reply = send(motor.can_id, command(drive.effort[joint], drive.damping[joint]))
+                for frame in ((motor.command_id, command(0.0, 0.0)), *motor.enter):
+                    send(*frame)
+            reply = None
+            if drive.powered or motor.wire_format.replies:
+                reply = send(motor.command_id, command(drive.effort[joint], drive.damping[joint]))
             if self._powered and not drive.powered:
-                reply = send(motor.can_id, EXIT)
-            if reply:
+                for frame in motor.exit:
+                    reply = send(*frame)
+            if reply := reply or device.status(joint):
                 self._samples[joint] = JointSample(*self._unpack[joint](reply[1])[1:], now)
         self._powered = drive.powered
 

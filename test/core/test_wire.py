@@ -10,7 +10,7 @@ from exo_gravity.core.wire import (
     BITRATE,
     TYPICAL_COMMAND,
     TYPICAL_REPLY,
-    check_rate,
+    Traffic,
     frame_bits,
     load,
     stuffed_bits,
@@ -89,9 +89,9 @@ def test_shorter_replies_and_fewer_motors_load_the_bus_less():
 
 
 def test_a_rate_beyond_the_bus_capacity_is_rejected_with_the_largest_rate():
-    assert check_rate(1000.0, 4).share < 1.0
+    assert Traffic(4).check(1000.0).share < 1.0
     with pytest.raises(ParameterError, match=r"rate = 600\.0: must be at most 516 Hz"):
-        check_rate(600.0, 8)
+        Traffic(8).check(600.0)
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ import pytest
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors import ENTER, SET_ZERO, unpack_command
+from exo_gravity.core.wire_formats import MIT, MIT_V3
 from exo_gravity.hardware.bus_lock import Address, BusLock
 from exo_gravity.hardware.bus_scan import NOTHING, BusScan
 from exo_gravity.sim import Firmware, SimulatedDevice
@@ -167,12 +168,41 @@ def test_a_bus_that_another_host_commands_is_refused(address: Address) -> None:
         BusScan(address)
 
 
-def test_a_v3_board_is_told_by_its_status_frames(address: Address) -> None:
-    status = frame(0x2905, bytes(8), is_extended_id=True)
+def test_motors_of_both_formats_are_found_on_one_bus_and_the_v3_boards_are_sent_nothing(address: Address) -> None:
+    device = make_device(Firmware(status_rate=100.0), formats=(MIT, MIT_V3, MIT, MIT_V3))
+    device.encoder_error = (0.5, -0.2, 1.0, 0.3)
+    with device_on(address, device), BusScan(address) as bus, responder(address, lambda message: []) as received:
+        answers, problems = bus.scan(range(1, 7))
+        polled = bus.poll((1, 2, 3, 4))
+    assert problems == ()
+    assert [(answer.can_id, answer.wire_format) for answer in answers] == [
+        (1, "mit"), (2, "mit_v3"), (3, "mit"), (4, "mit_v3"),
+    ]  # fmt: skip
+    assert [answer.position for answer in answers] == pytest.approx([0.5, -0.2, 1.0, 0.3], abs=0.02)
+    assert (answers[1].temperature, answers[1].error, answers[1].reply_id) == (30, 0, 0x2902)
+    assert sorted(polled) == [1, 2, 3, 4]
+    sent = {message.arbitration_id for message in received if bytes(message.data) == NOTHING}
+    assert sent == {1, 3, 5, 6}
+    assert not device.powered
+
+
+def test_a_v3_board_that_falls_silent_is_missing(address: Address) -> None:
+    device = make_device(Firmware(status_rate=100.0), formats=(MIT_V3,) * 4)
+    with device_on(address, device), BusScan(address) as bus:
+        device.motors[2].unplugged = True
+        assert sorted(bus.poll((1, 2, 3, 4))) == [1, 2, 4]
+
+
+def test_a_v3_board_with_an_id_that_no_parameter_can_have_is_told(address: Address) -> None:
+    status = frame(0x29C8, bytes(8), is_extended_id=True)
     with chatter(address, status), BusScan(address) as bus:
-        assert bus.scan(range(1, 4)).problems == (
-            "ID 5: sends the status frames of a V3 board, whose wire format is not supported",
-        )
+        assert bus.scan(range(1, 4)).problems == ("ID 200: a V3 board; its ID must be from 1 to 126",)
+
+
+def test_a_bus_on_which_another_host_commands_a_v3_board_is_refused(address: Address) -> None:
+    command = frame(0x0803, bytes(8), is_extended_id=True)
+    with chatter(address, command), pytest.raises(BusError, match="a frame with ID 2051 was heard"):
+        BusScan(address)
 
 
 def test_a_late_reply_is_not_taken_for_a_second_motor(address: Address) -> None:

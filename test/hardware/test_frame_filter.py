@@ -11,7 +11,8 @@ from exo_gravity.hardware.frame_filter import FOREIGN_COMMAND, FrameFilter
 
 from ..support.simulated_device import frame
 
-COMMAND = JointMotor(MOTORS["AK60-6"], 1).command(1.0, 0.0)
+MOTORS_ON_BUS = tuple(JointMotor(MOTORS["AK60-6"], can_id) for can_id in (1, 2))
+COMMAND = MOTORS_ON_BUS[0].command(1.0, 0.0)
 
 
 def marked() -> can.Message:
@@ -20,16 +21,16 @@ def marked() -> can.Message:
 
 
 def test_a_marked_command_is_an_echo_on_a_bus_that_marks_only_echoes() -> None:
-    assert FrameFilter((1, 2)).kind(marked()) == "echo"
+    assert FrameFilter(MOTORS_ON_BUS).sort(marked()) == ("echo", 0)
 
 
 def test_on_socketcan_a_marked_command_that_we_did_not_send_is_foreign() -> None:
-    assert FrameFilter((1, 2), marks_echoes=False).kind(marked()) == FOREIGN_COMMAND
+    assert FrameFilter(MOTORS_ON_BUS, marks_echoes=False).sort(marked()) == (FOREIGN_COMMAND, 1)
 
 
 @pytest.mark.parametrize("marks_echoes", [True, False])
 def test_a_command_that_we_sent_is_an_echo_when_it_comes_back(marks_echoes: bool) -> None:
-    frames = FrameFilter((1, 2), marks_echoes)
-    frames.sent(1, COMMAND)
-    assert frames.kind(frame(1, COMMAND)) == "echo"
-    assert frames.kind(frame(1, COMMAND)) == FOREIGN_COMMAND
+    frames = FrameFilter(MOTORS_ON_BUS, marks_echoes)
+    frames.sent((1, COMMAND))
+    assert frames.sort(frame(1, COMMAND)) == ("echo", 0)
+    assert frames.sort(frame(1, COMMAND)) == (FOREIGN_COMMAND, 1)

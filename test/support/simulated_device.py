@@ -9,17 +9,29 @@ import can
 
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.motors import MOTORS, pack_command
-from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
+from exo_gravity.core.wire_formats import MIT, WireFormat
+from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, simulated_motor
 
 SPECS = [MOTORS[name] for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6")]
 RAISED = (0.3, 0.8, 0.7, 0.6)  # rad
 
 
 def make_device(
-    firmware: Firmware | None = None, ids: Sequence[int] = (1, 2, 3, 4), config: ArmConfig | None = None
+    firmware: Firmware | None = None,
+    ids: Sequence[int] = (1, 2, 3, 4),
+    config: ArmConfig | None = None,
+    formats: Sequence[WireFormat] = (MIT,) * 4,
 ) -> SimulatedDevice:
-    joints = [JointMotor(spec, can_id) for spec, can_id in zip(SPECS, ids, strict=True)]
-    return SimulatedDevice(SimulatedArm(config), [SimulatedMotor(joint, firmware) for joint in joints])
+    joints = joints_of(formats, ids)
+    return SimulatedDevice(SimulatedArm(config), [simulated_motor(joint, firmware) for joint in joints])
+
+
+def joints_of(formats: Sequence[WireFormat], ids: Sequence[int] = (1, 2, 3, 4)) -> tuple[JointMotor, ...]:
+    """Return the default motors with boards of these formats."""
+    columns = zip(SPECS, ids, formats, strict=True)
+    return tuple(
+        JointMotor(wire_format.ranged(spec), can_id, wire_format=wire_format) for spec, can_id, wire_format in columns
+    )
 
 
 def command(joint: int, torque: float = 0.0, kd: float = 0.0) -> bytes:
