@@ -7,7 +7,7 @@ import itertools
 import math
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import can
@@ -18,9 +18,10 @@ from rich.console import Console
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.wire_formats import MIT, MIT_V3, WireFormat
 from exo_gravity.hardware.bus_lock import BusLock
 from exo_gravity.hardware.bus_scan import BusScan
-from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
+from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice, simulated_motor
 from exo_gravity.tools.calibrate import main
 from exo_gravity.tools.calibration.motors import run
 from exo_gravity.tools.calibration.outcome import Outcome
@@ -42,13 +43,20 @@ class Bench:
     moves the arm, by the word that begins the request. requests: what the person was asked.
     """
 
-    def __init__(self, folder: Path, seed: int, firmware: Firmware | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        seed: int,
+        firmware: Firmware | None = None,
+        formats: Sequence[WireFormat] = (MIT,) * 4,
+    ) -> None:
         rng = np.random.default_rng(seed)
         self.ids = [int(i) for i in rng.choice(np.arange(1, IDS), 4, replace=False)]
         self.directions = [int(d) for d in rng.choice((1, -1), 4)]
         self.zeros = [float(z) for z in rng.uniform(-3.0, 3.0, 4)]
-        columns = zip(SPECS, self.ids, self.directions, self.zeros, strict=True)
-        motors = [SimulatedMotor(JointMotor(*column), firmware) for column in columns]
+        specs = [each.ranged(spec) for each, spec in zip(formats, SPECS, strict=True)]
+        columns = zip(specs, self.ids, self.directions, self.zeros, (1.0,) * 4, formats, strict=True)
+        motors = [simulated_motor(JointMotor(*column), firmware) for column in columns]
         self.device = SimulatedDevice(SimulatedArm(), motors)
         self.pose = [0.0] * 4
         self.swing = 0.0  # rad, of the elbow, while the arm should be still
@@ -104,8 +112,8 @@ def make_bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Call
     monkeypatch.setattr(BusScan.scan, "__defaults__", (range(1, IDS),))
     benches: list[Bench] = []
 
-    def make_bench(seed: int = 0, firmware: Firmware | None = None) -> Bench:
-        benches.append(Bench(tmp_path, seed, firmware))
+    def make_bench(seed: int = 0, firmware: Firmware | None = None, *formats: WireFormat) -> Bench:
+        benches.append(Bench(tmp_path, seed, firmware, formats or (MIT,) * 4))
         return benches[-1]
 
     yield make_bench
@@ -130,13 +138,24 @@ def test_every_id_direction_and_zero_is_found(make_bench: Callable[..., Bench], 
     assert shown == sorted(map(str, bench.ids), key=int)
 
 
+def test_motors_of_both_wire_formats_are_calibrated_on_one_bus(make_bench: Callable[..., Bench]) -> None:
+    bench = make_bench(15, Firmware(status_rate=100.0), MIT_V3, MIT, MIT, MIT_V3)
+    outcome = bench.calibrate()
+    values = {change.name: change.value for change in outcome.changes}
+    assert outcome.refusals == ()
+    assert values["can_id"] == bench.ids and values["direction"] == bench.directions
+    assert values["wire_format"] == ["mit_v3", "mit", "mit", "mit_v3"]
+    assert values["zero"] == pytest.approx(bench.zeros, abs=0.003)
+    assert not bench.device.powered
+
+
 def test_a_jig_gives_the_zero_at_its_own_angles(make_bench: Callable[..., Bench]) -> None:
     bench = make_bench(4)
     jig = (0.0, 30.0, 0.0, 90.0)
     bench.motions["bring the arm to 0 30 0 90 deg, hands off, until it is still"] = [math.radians(a) for a in jig]
     outcome = bench.calibrate(jig)
     assert next(c.value for c in outcome.changes if c.name == "zero") == pytest.approx(bench.zeros, abs=0.002)
-    assert "measured at 0 30 0 90 deg" in outcome.changes[2].note
+    assert "measured at 0 30 0 90 deg" in outcome.changes[3].note
 
 
 def test_a_motor_that_does_not_answer_is_told_and_nothing_is_asked(make_bench: Callable[..., Bench]) -> None:
@@ -176,7 +195,7 @@ def test_a_joint_moved_both_ways_is_asked_for_again(make_bench: Callable[..., Be
     bench.during = swing
     outcome = bench.calibrate()
     assert any("turned both ways: move the joint in one direction only" in line for line in bench.said)
-    assert outcome.changes[1].value == bench.directions
+    assert outcome.changes[2].value == bench.directions
 
 
 def test_an_arm_that_swings_gives_no_zero(make_bench: Callable[..., Bench]) -> None:
@@ -216,7 +235,7 @@ def test_a_zero_that_survives_a_power_up_is_noted(make_bench: Callable[..., Benc
     bench.during = switch
     outcome = bench.calibrate()
     assert outcome.refusals == ()
-    assert outcome.changes[2].note.endswith("the same after a power-up with the arm hanging")
+    assert outcome.changes[3].note.endswith("the same after a power-up with the arm hanging")
 
 
 def test_a_bus_that_a_bridge_holds_is_refused(make_bench: Callable[..., Bench]) -> None:

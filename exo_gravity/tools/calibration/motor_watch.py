@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 
 from rich.table import Table
 
+from exo_gravity.core.joint_motor import MAX_CAN_ID
 from exo_gravity.core.motors import MOTOR_ERRORS
 from exo_gravity.hardware.bus_scan import Answer, BusScan
 
@@ -59,7 +60,8 @@ def motor_table(
     silent: Iterable[int] = (),
 ) -> Table:
     """Return the table of the motors that answer; turns: rad by ID, since the person was asked to move a joint."""
-    table = Table("ID", "joint", "angle deg", "turned deg", "degC", "error", "reply", "reply ID", header_style="bold")
+    columns = ("ID", "joint", "angle deg", "turned deg", "degC", "error", "reply", "reply ID", "wire format")
+    table = Table(*columns, header_style="bold")
     for answer in sorted(answers):
         error = "-" if answer.error is None else MOTOR_ERRORS.get(answer.error, str(answer.error))
         table.add_row(
@@ -70,6 +72,7 @@ def motor_table(
             "-" if answer.temperature is None else str(answer.temperature),
             error,
             f"{answer.reply_length} bytes",
-            str(answer.reply_id),
+            hex(answer.reply_id) if answer.reply_id > MAX_CAN_ID else str(answer.reply_id),
+            answer.wire_format,
         )
     return table

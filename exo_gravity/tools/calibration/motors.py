@@ -62,7 +62,7 @@ def run(options: argparse.Namespace, arm: ConfiguredArm, say: Callable[[object],
         if len(answers) < JOINT_COUNT:
             ids = ", ".join(str(answer.can_id) for answer in answers) or "none"
             count = f"IDs that answer: {ids}. An arm has {JOINT_COUNT} motors"
-            problems = (*problems, f"{count}: check power, plugs, terminators and the bit rate of 1 Mbit/s")
+            problems = (*problems, f"{count}: check power, plugs, terminators and the bit rate")
         if problems:
             return Outcome((), (), problems, arm)
         return _Search(bus, arm, answers, options.wait, say).outcome(options.pose)
@@ -76,6 +76,7 @@ class _Search:
     ) -> None:
         self._bus, self._arm, self._wait, self._say = bus, arm, wait, say
         self._ids = [answer.can_id for answer in answers]
+        self._formats = {answer.can_id: answer.wire_format for answer in answers}
         self._joints: dict[int, str] = {}
         self._errors = tuple(
             f"motor {answer.can_id} reports the error {MOTOR_ERRORS.get(answer.error, answer.error)}"
@@ -107,6 +108,7 @@ class _Search:
         exactly = f"rad, measured {where}, ±{unrest:.4f} and as exact as that pose; {survival[0]}"
         changes = (
             Change(node, "can_id", ids, "found by moving each joint by hand"),
+            Change(node, "wire_format", [self._formats[i] for i in ids], "as each board answers"),
             Change(node, "direction", directions, "found by moving each joint by hand in its positive direction"),
             Change(node, "zero", [round(zero, 4) for zero in zeros], exactly),
         )
