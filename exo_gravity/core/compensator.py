@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from exo_gravity.core.arm import JOINT_COUNT, STANDARD_GRAVITY
 from exo_gravity.core.compensator_settings import Settings
+from exo_gravity.core.effort_limiter import BREAK, EffortLimiter
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.felt_motion import FeltMotion
 from exo_gravity.core.gravity import LAWS, NO_TORQUE, Torque
@@ -22,21 +23,17 @@ from exo_gravity.core.terms.coupling import JOINTS
 from exo_gravity.core.terms.terms import Terms
 from exo_gravity.core.tilt import Tilt
 from exo_gravity.core.tilt_input import STILL, TiltInput
+from exo_gravity.core.transition import Transition
 from exo_gravity.core.turning import turning_torque
 
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
-RAMP_TIME = 1.0  # s from zero to full torque, at the start and after a break
-# s without an answer, after which the torque ramps in from zero. This is longer than any command_timeout: the arm is
-# already being let down, so the restart from zero cannot drop it.
-BREAK = 0.2
-LONGEST_STEP = 0.01  # s counted by the rate limit after a pause, so that the torque does not catch up in one step
 MAX_ANGLE = 26.0  # rad, more than an AK motor can report with any zero
 
 
 class Answer(NamedTuple):
     """One answer of the compensator.
 
-    effort: (4,) Nm, or None for the given `reason`. clamped: indices (0..3) of the joints whose torque exceeded
+    effort: (n,) Nm, or None for the given `reason`. clamped: indices of the joints whose torque exceeded
     `max_effort`. fallback: why the exact law replaced the chosen one, or ''.
     """
 
@@ -57,12 +54,9 @@ class Compensator:
         self.terms = Terms(names, settings.terms, settings.moving)
         self._tilt = TiltInput(settings.side, settings.tilt_timeout)
         self._motion = FeltMotion()
-        self._ramp_start = -math.inf
-        self._last_answer = -math.inf
-        self._effort = NO_TORQUE
+        self._limiter = EffortLimiter(JOINT_COUNT)
+        self._transition = Transition()  # of the last change of law or settings
         self._torque = NO_TORQUE  # before ramp and limits
-        self._remainder = NO_TORQUE
-        self._change_time: float | None = None  # time of the last change of law or settings; None after the transition
         self._pending: Settings | None = None
         self._fallback = ""  # why the exact law replaces the chosen one
         self._fallback_until = -math.inf
@@ -102,11 +96,13 @@ class Compensator:
             return Answer(None, f"joint angles {list(theta)} are not 4 numbers within {MAX_ANGLE:g} rad")
         if self.settings.use_imu and (problem := self._tilt.problem(now)):
             return Answer(None, problem)
-        torque = self._transition(now, theta)
+        torque = self._without_step(now, theta)
         if not all(map(math.isfinite, torque)):
             return Answer(None, f"torque {list(torque)} Nm from the law is not finite")
         added = self.terms.torque(now, theta, velocity, torque) if velocity else NO_TORQUE
-        return self._limited(now, torque, added)
+        s = self.settings
+        effort, clamped = self._limiter.limit(now, torque, added, s.max_effort, s.max_effort_rate)
+        return Answer(effort, clamped=clamped, fallback=self._fallback)
 
     def _law(self, now: float, theta: Sequence[float]) -> Torque:
         """Return the torque of the chosen law, or of the exact law while the chosen one does not apply."""
@@ -129,7 +125,7 @@ class Compensator:
         turning = turning_torque(settings.arm, settings.side, theta, felt.angular_acceleration)
         return tuple(map(operator.add, torque, turning))
 
-    def _transition(self, now: float, theta: Sequence[float]) -> Torque:
+    def _without_step(self, now: float, theta: Sequence[float]) -> Torque:
         """Return the law's torque plus the remainder of the last change of settings or law."""
         torque = self._current(now, theta)
         if self._pending is not None:
@@ -137,7 +133,7 @@ class Compensator:
                 self._fallback, self._fallback_until = "", -math.inf
             self.settings, self._pending = self._pending, None
             self._tilt.timeout = self.settings.tilt_timeout
-            torque = self._bridged(now, torque, self._law(now, theta))
+            torque = self._transition.begin(now, torque, self._law(now, theta))
         self._torque = torque
         return torque
 
@@ -145,41 +141,7 @@ class Compensator:
         """Return the torque by the current settings."""
         replaced = bool(self._fallback)
         torque = self._law(now, theta)
-        if bool(self._fallback) != replaced and 0.0 <= now - self._last_answer <= BREAK:
+        if bool(self._fallback) != replaced and 0.0 <= now - self._limiter.last_answer <= BREAK:
             # Continue from the last torque: the replaced law may not apply at `theta`.
-            return self._bridged(now, self._torque, torque)
-        return self._blended(now, torque)
-
-    def _bridged(self, now: float, before: Torque, after: Torque) -> Torque:
-        """Begin the transition between two torques; return its start, `before`."""
-        self._remainder = tuple(b - a for b, a in zip(before, after, strict=True))
-        self._change_time = now
-        return before
-
-    def _blended(self, now: float, torque: Torque) -> Torque:
-        """Return `torque` plus what is left at `now` of the remainder."""
-        if self._change_time is None:
-            return torque
-        left = 1.0 - (now - self._change_time) / self.settings.transition_time
-        if left <= 0.0:
-            self._change_time = None
-            return torque
-        return tuple(t + left * r for t, r in zip(torque, self._remainder, strict=True))
-
-    def _limited(self, now: float, torque: Torque, added: Torque) -> Answer:
-        dt = now - self._last_answer
-        if not 0.0 <= dt <= BREAK:
-            self._ramp_start, self._effort, dt = now, NO_TORQUE, 0.0
-        self._last_answer = now
-        ramp = min(1.0, (now - self._ramp_start) / RAMP_TIME)
-        step = self.settings.max_effort_rate * min(dt, LONGEST_STEP)
-        effort, clamped = [], []
-        columns = zip(torque, added, self._effort, self.settings.max_effort, strict=True)
-        for joint, (gravity, more, last, limit) in enumerate(columns):
-            if not -limit <= gravity <= limit:
-                clamped.append(joint)
-            wanted = gravity + more
-            target = ramp * (limit if wanted > limit else -limit if wanted < -limit else wanted)
-            effort.append(last + step if target > last + step else last - step if target < last - step else target)
-        self._effort = tuple(effort)
-        return Answer(self._effort, clamped=tuple(clamped), fallback=self._fallback)
+            return self._transition.begin(now, self._torque, torque)
+        return self._transition.blended(now, torque, self.settings.transition_time)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.compensator import LONGEST_STEP
+from exo_gravity.core.effort_limiter import LONGEST_STEP
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.tilt import Tilt, pitch_roll
 from exo_gravity.core.tilt_input import MAX_LEAD

@@ -6,8 +6,9 @@ import random
 import numpy as np
 import pytest
 
-from exo_gravity.core.compensator import LONGEST_STEP, Compensator
+from exo_gravity.core.compensator import Compensator
 from exo_gravity.core.control_params import COMPENSATOR, settings_of
+from exo_gravity.core.effort_limiter import LONGEST_STEP
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.param_table import values_of
 
