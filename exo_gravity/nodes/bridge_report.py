@@ -9,13 +9,15 @@ from rclpy.node import Node
 
 from exo_gravity.core.drive import State
 from exo_gravity.core.limits import Limits
+from exo_gravity.core.motor_load import MotorLoad
 from exo_gravity.core.rate import Rate
 from exo_gravity.core.wire import Traffic
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics
+from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics, milliseconds, row
 from exo_gravity.nodes.run import open_to_others
 
 RECENT = 2.0  # s for which a limit that acted is still shown
+SLOW = 0.9  # share of the set rate below which the loop counts as slow
 
 
 def log_limits(node: Node, limits: Limits, traffic: Traffic, rate: float) -> None:
@@ -41,13 +43,20 @@ def log_limits(node: Node, limits: Limits, traffic: Traffic, rate: float) -> Non
 
 
 class BridgeReport:
-    """The status of one bridge."""
+    """The status of one bridge.
 
-    def __init__(self, node: Node, names: Sequence[str], traffic: Traffic) -> None:
+    period: s of a cycle. rated: (4,) Nm, the motors' rated torque at the joints.
+    """
+
+    def __init__(
+        self, node: Node, names: Sequence[str], traffic: Traffic, period: float, rated: Sequence[float]
+    ) -> None:
         self._diagnostics = Diagnostics(node)
         self._names = names
         self._traffic = traffic
         self._rate = Rate()
+        self._slow = SLOW / period  # Hz
+        self._motors = MotorLoad(rated)
 
     def send(self, loop: ControlLoop | None, refusal: str, answered: float) -> None:
         """Report on `loop`, None while the node is inactive.
@@ -63,13 +72,14 @@ class BridgeReport:
             sorted(limit for limit, time_acted in tuple(safety.acted.items()) if time_acted > now - RECENT)
         )
         rate = self._rate.update(now, loop.cycles)
+        self._motors.update(now, loop.samples)
         values: dict[str, object] = {
             "state": safety.state.value,
             "fault": safety.fault.code if safety.fault else "none",
             "limits acting": acting or "none",
             "rate (Hz)": f"{rate:.1f}",
             "bus load (%)": f"{100.0 * self._traffic.load(rate).share:.0f}" if rate else "0",
-            "age of efforts (ms)": f"{1000.0 * (now - answered):.1f}",
+            "age of efforts (ms)": milliseconds(now - answered),
             "cycles": loop.cycles,
             "late cycles": loop.late,
             "incomplete cycles": loop.incomplete,
@@ -77,12 +87,28 @@ class BridgeReport:
             "publishing errors": f"{loop.cycle_errors}, last: {loop.cycle_error}" if loop.cycle_errors else "none",
             "last refused message": refusal,
         }
-        for name, joint in zip(self._names, loop.samples, strict=True):
+        values |= self._of_joints(loop)
+        warnings = [f"limited by {acting}"] if acting else []
+        hot = [name for name, share in zip(self._names, self._motors.share, strict=True) if share > 1.0]
+        if hot:
+            warnings.append(f"above rated torque for too long: {', '.join(hot)}")
+        if 0.0 < rate < self._slow:
+            warnings.append(f"slower than {self._slow:.0f} Hz")
+        self._diagnostics.report(*_headline(loop, ", ".join(warnings)), values)
+
+    def _of_joints(self, loop: ControlLoop) -> dict[str, object]:
+        values: dict[str, object] = {}
+        columns = self._names, loop.samples, self._motors.power, self._motors.rms, self._motors.share
+        for name, joint, power, rms, share in zip(*columns, strict=True):
             values[f"{name} temperature (degC)"] = joint.temperature
-        self._diagnostics.report(*_headline(loop, acting), values)
+            values[f"{name} torque (Nm)"] = row([joint.effort], 2)
+            values[f"{name} power (W)"] = row([power], 1)
+            values[f"{name} RMS torque (Nm)"] = row([rms], 2)
+            values[f"{name} RMS of rated torque (%)"] = row([100.0 * share], 0)
+        return values
 
 
-def _headline(loop: ControlLoop, acting: str) -> tuple[bytes, str]:
+def _headline(loop: ControlLoop, warnings: str) -> tuple[bytes, str]:
     safety = loop.safety
     if loop.failure:
         return ERROR, f"the control thread has ended: {loop.failure}"
@@ -92,4 +118,4 @@ def _headline(loop: ControlLoop, acting: str) -> tuple[bytes, str]:
         return ERROR, f"{safety.state.value}: {safety.fault.code}: {safety.fault.reason}"
     if safety.state is State.CHECKING:
         return WARN, f"checking: waiting for {safety.waiting_for}"
-    return (WARN, f"{safety.state.value}, limited by {acting}") if acting else (OK, safety.state.value)
+    return (WARN, f"{safety.state.value}, {warnings}") if warnings else (OK, safety.state.value)

@@ -13,6 +13,7 @@ from collections.abc import Callable
 
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
+from exo_gravity.core.budget import motor_torques
 from exo_gravity.core.control_params import CAN_BRIDGE, OPTIONS, limits_of, motors_of, traffic_of
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.faults import FaultCode
@@ -60,7 +61,8 @@ class CanBridge(LifecycleNode):
         self._loop: ControlLoop | None = None  # while active
         self._error = ""  # why the last transition failed
         self._exchange = EffortExchange(self, values["joint_names"], self._limits, lambda: self._loop)
-        self._report_writer = BridgeReport(self, values["joint_names"], traffic)
+        rated, _ = motor_torques(values["motor"], values["torque_scale"])
+        self._report_writer = BridgeReport(self, values["joint_names"], traffic, self._period, rated)
         BridgeServices(self, lambda: self._loop, self._motors, self._limits)
         self.create_timer(REPORT_PERIOD, self._report)
         log_limits(self, self._limits, traffic, values["rate"])

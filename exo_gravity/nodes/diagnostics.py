@@ -1,15 +1,18 @@
-"""A node's status: regularly on /diagnostics, and in the log whenever it changes."""
+"""A node's status: regularly on /diagnostics, and in the log whenever it changes.
+
+Levels: OK works, WARN works within a limit or waits, ERROR does not work, STALE had input that no longer arrives.
+"""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+OK, WARN, ERROR, STALE = (getattr(DiagnosticStatus, level) for level in ("OK", "WARN", "ERROR", "STALE"))
 
 PERIOD = 0.45  # s; a little less than a multiple of the nodes' timer periods, which jitter
 
@@ -25,7 +28,7 @@ class Diagnostics:
         self._sent = -math.inf
 
     def report(self, level: bytes, message: str, values: Mapping[str, object] | None = None) -> None:
-        """Publish `level` (OK, WARN or ERROR), `message` and `values` if they are due; log them if they changed."""
+        """Publish `level`, one of the four, `message` and `values` if they are due; log them if they changed."""
         now, changed = time.monotonic(), (level, message) != self._last
         if not changed and now - self._sent < PERIOD:
             return
@@ -46,7 +49,17 @@ class Diagnostics:
             # One call site per severity: rclpy refuses a call site whose severity changes.
             if level == OK:
                 logger.info(message)
-            elif level == WARN:
+            elif level in (WARN, STALE):
                 logger.warning(message)
             else:
                 logger.error(message)
+
+
+def row(values: Iterable[float], digits: int = 3) -> str:
+    """Return numbers as text, with at most `digits` decimals, no trailing zeros and no negative zero."""
+    return ", ".join(f"{round(float(value), digits) + 0.0:.12g}" for value in values)
+
+
+def milliseconds(seconds: float) -> str:
+    """Return a duration as text in ms with one decimal, 'none' if it is infinite."""
+    return f"{1000.0 * seconds:.1f}" if math.isfinite(seconds) else "none"

@@ -23,7 +23,7 @@ from exo_gravity.core.rate import Rate
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator, TrunkOrientation
 from exo_gravity.nodes.conversions import to_nanoseconds
 from exo_gravity.nodes.declare import declare
-from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics
+from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics, milliseconds, row
 from exo_gravity.nodes.hot_path import HotPath
 from exo_gravity.nodes.imu_device import ImuDevice
 from exo_gravity.nodes.run import run
@@ -122,12 +122,13 @@ class ImuNode(Node):
         age, refusal, self._refusal = now - self._arrived, self._refusal, None
         values = {
             "rate (Hz)": f"{self._rate.update(now, self._received):.0f}",
-            "age (s)": f"{age:.3f}",
+            "age of samples (ms)": milliseconds(age),
             "received": self._received,
+            "missed": self._driver.missed,
             "published": self._published,
             "refused": self._refused,
             "last refusal": self._last_refusal,
-            "gyroscope bias (rad/s)": self._estimator.gyroscope_bias.round(4).tolist(),
+            "gyroscope bias (rad/s)": row(self._estimator.gyroscope_bias, 4),
         }
         if self._device:
             values |= self._device.values

@@ -62,7 +62,7 @@ class ImuDevice:
             "device": source.name,
             "opened": self._reopening.openings,
             "lost samples": f"{source.lost} {source.loss}".rstrip(),
-            "temperature (C)": "unknown" if source.temperature is None else f"{source.temperature:.1f}",
+            "temperature (degC)": "unknown" if source.temperature is None else f"{source.temperature:.1f}",
         }
 
     def start(self) -> None:

@@ -18,12 +18,16 @@ COUNT_PERIOD = 0.5  # s between two counts of the publishers
 
 
 class SolePublisher:
-    """Checks the `info` of each message of one topic, which rclpy passes to callbacks of two arguments."""
+    """Checks the `info` of each message of one topic, which rclpy passes to callbacks of two arguments.
+
+    missed: count of messages that were published and not received, where the middleware numbers them.
+    """
 
     def __init__(self, node: Node, topic: str) -> None:
         self._node = node
         self._topic = node.resolve_topic_name(topic)
         self._number = 0
+        self.missed = 0
         self._count = 1
         self._counted = -math.inf  # monotonic s
 
@@ -33,7 +37,10 @@ class SolePublisher:
         if number is None:
             return self._count_publishers() > 1
         previous, self._number = self._number, number
-        return number <= previous
+        if number <= previous:
+            return True
+        self.missed += number - previous - 1 if previous else 0
+        return False
 
     def _count_publishers(self) -> int:
         """Return the number of publishers that discovery lists, at most COUNT_PERIOD old."""
