@@ -78,6 +78,10 @@ class Compensator:
         """Set gravity's direction in the trunk's axes; see `TiltInput.set_gravity`."""
         self._tilt.set_gravity(now, gravity, angular_velocity, age)
 
+    def tilt_age(self, now: float) -> float:
+        """Return the age of the newest tilt in s."""
+        return self._tilt.age(now)
+
     def set_motion(
         self, now: float, specific_force: Sequence[float], angular_velocity: Sequence[float], age: float = 0.0
     ) -> None:

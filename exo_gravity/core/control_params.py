@@ -8,6 +8,7 @@ from typing import Any
 
 from exo_gravity.core.anfis_law import AnfisLaw
 from exo_gravity.core.arm import MAX_GAIN, MAX_GRAVITY, MAX_LENGTH, MAX_MASS, MAX_MOMENT, STANDARD_GRAVITY, ArmModel
+from exo_gravity.core.command_fade import COMMAND_PARAMETERS
 from exo_gravity.core.compensator_settings import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.joint_motor import MAX_CAN_ID, TORQUE_SCALE_BOUNDS, JointMotor
@@ -99,6 +100,7 @@ COMPENSATOR = (
           (-1.0, 1.0), "m"),
     Param("use_imu", True, "false assumes an upright trunk (the paper's seated wearer)", fixed=True),
     param_of(Settings, "tilt_timeout"),
+    *COMMAND_PARAMETERS,
     *term_parameters(),
     Param("spring.path_file", "", "CSV file with the path of the spring, rows of s and 4 angles in rad; empty: pose"),
     *REAL_TIME_PARAMETERS,

@@ -35,6 +35,12 @@ class Tilt(NamedTuple):
     phi: float
     magnitude: float = 1.0
 
+    @property
+    def gravity_in_trunk(self) -> tuple[float, float, float]:
+        """Unit vector of gravity (3,) in the trunk's axes, if this is the tilt of the left arm."""
+        x, y, z = self.direction
+        return y, x, -z
+
     @classmethod
     def of(cls, side: str, pitch: float = 0.0, roll: float = 0.0) -> Tilt:
         """Return the tilt of the `side` ('left' or 'right') arm for a trunk at `pitch` and `roll` in rad."""

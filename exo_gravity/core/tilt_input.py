@@ -78,6 +78,10 @@ class TiltInput:
         turned = a + lead * (b * z - c * y), b + lead * (c * x - a * z), c + lead * (a * y - b * x)
         return Tilt.of_gravity(self._side, turned)
 
+    def age(self, now: float) -> float:
+        """Return the age of the newest tilt at `now` by its stamp, in s; infinite if there is none."""
+        return now - self._time
+
     def problem(self, now: float) -> str:
         """Return why there is no fresh tilt at `now`; '' if there is one."""
         if now - self._time <= self.timeout:

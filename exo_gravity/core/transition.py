@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-Torque = tuple[float, ...]
+from exo_gravity.core.gravity import Torque
 
 
 class Transition:

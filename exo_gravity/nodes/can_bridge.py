@@ -62,7 +62,7 @@ class CanBridge(LifecycleNode):
         self._error = ""  # why the last transition failed
         self._exchange = EffortExchange(self, values["joint_names"], self._limits, lambda: self._loop)
         rated, _ = motor_torques(values["motor"], values["torque_scale"])
-        self._report_writer = BridgeReport(self, values["joint_names"], traffic, self._period, rated)
+        self._report_writer = BridgeReport(self, values["joint_names"], traffic, self._period, rated.tolist())
         BridgeServices(self, lambda: self._loop, self._motors, self._limits)
         self.create_timer(REPORT_PERIOD, self._report)
         log_limits(self, self._limits, traffic, values["rate"])

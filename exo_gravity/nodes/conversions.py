@@ -21,18 +21,18 @@ def to_nanoseconds(stamp: Time) -> int:
     return stamp.sec * 1_000_000_000 + stamp.nanosec
 
 
-def by_name(message: JointState, field: str, names: Sequence[str]) -> tuple[float, ...]:
+def by_name(message: JointState, field: str, names: Sequence[str], exact: bool = True) -> tuple[float, ...]:
     """Return `message`'s position, velocity or effort (n,) in the order of `names`.
 
-    Raises ParameterError unless the message has exactly these names, each once, and one finite value for each. An
-    absent joint is an error, never 0.
+    Raises ParameterError unless the message has these names, each once, and one finite value for each; if `exact`, also
+    if it has others. An absent joint is an error, never 0.
     """
     values, given = getattr(message, field), message.name
     if len(values) != len(given):
         raise ParameterError(field, list(values), f"{len(given)} values, one for each name")
     if given != list(names):
-        if sorted(given) != sorted(names):
-            raise ParameterError("name", list(given), f"exactly {', '.join(names)}, each once")
+        if sorted(given) != sorted(names) if exact else any(given.count(name) != 1 for name in names):
+            raise ParameterError("name", list(given), f"{'exactly ' if exact else ''}{', '.join(names)}, each once")
         values = [values[given.index(name)] for name in names]
     result = tuple(values)
     if not all(map(math.isfinite, result)):
@@ -40,9 +40,9 @@ def by_name(message: JointState, field: str, names: Sequence[str]) -> tuple[floa
     return result
 
 
-def velocity_of(message: JointState, names: Sequence[str]) -> tuple[float, ...] | None:
+def velocity_of(message: JointState, names: Sequence[str], exact: bool = True) -> tuple[float, ...] | None:
     """Return `message`'s velocities (n,) in the order of `names`, None if they are missing or not finite."""
     try:
-        return by_name(message, "velocity", names)
+        return by_name(message, "velocity", names, exact)
     except ParameterError:
         return None

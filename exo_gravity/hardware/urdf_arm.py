@@ -1,0 +1,101 @@
+"""The gravity torques of any serial arm, from its URDF, by Pinocchio (extra `urdf`).
+
+A URDF gives each link's mass and centre of gravity and each joint's place and axis. With the joint velocities and
+accelerations zero, recursive Newton-Euler leaves the torque that holds the arm (`computeGeneralizedGravity`). Gravity
+comes as a vector in the root link's axes, so that the base may tilt.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from exo_gravity.core.errors import ParameterError
+
+TURNING = ("revolute", "continuous")
+
+
+class UrdfArm:
+    """The arm that `joint_names` (n,) move in the URDF `text`; the URDF's other joints are fixed at 0.
+
+    A `core.any_arm.GravityModel`: max_effort (n,) Nm are the joints' effort limits in the URDF, 0 where it has none;
+    mass in kg is that of all links that they move. Raises ParameterError if the text is not a URDF, its links have no
+    mass, Pinocchio is missing, or a joint is missing or does not turn.
+    """
+
+    def __init__(self, text: str, joint_names: Sequence[str]) -> None:
+        types = _joint_types(text)
+        for name in joint_names:
+            if types.get(name) not in TURNING:
+                found = f"; it is {types[name]}" if name in types else ""
+                expected = f"turning joints of the URDF ({', '.join(_turning(types)) or 'it has none'}){found}"
+                raise ParameterError("joint_names", name, expected)
+        pin = _pinocchio()
+        try:
+            self._model = pin.buildModelFromXML(text)
+        except (RuntimeError, ValueError) as error:
+            raise ParameterError("urdf", _beginning(text), f"a URDF that Pinocchio reads ({error})") from None
+        self._data = self._model.createData()
+        self._gravity_torque = pin.computeGeneralizedGravity
+        self._q = pin.neutral(self._model)
+        numbers = [self._model.getJointId(name) for name in joint_names]
+        joints = [self._model.joints[number] for number in numbers]
+        # A continuous joint has two coordinates, cosine and sine.
+        self._places = [(joint.idx_q, joint.nq == 2) for joint in joints]
+        self._order = [joint.idx_v for joint in joints]
+        limits = (float(self._model.effortLimit[index]) for index in self._order)
+        self.max_effort = tuple(limit if 0.0 < limit < math.inf else 0.0 for limit in limits)
+        pin.computeSubtreeMasses(self._model, self._data)
+        self.mass = max(self._data.mass[number] for number in numbers)
+        if not self.mass > 0.0:
+            raise ParameterError(
+                "mass of the URDF's links", self.mass, "above 0 kg: it lacks inertial elements"
+            )
+
+    def torque(self, theta: Sequence[float], gravity: Sequence[float]) -> tuple[float, ...]:
+        """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad.
+
+        gravity: (3,) m/s^2 in the axes of the URDF's root link.
+        """
+        q = self._q
+        for angle, (place, is_pair) in zip(theta, self._places, strict=True):
+            if is_pair:
+                q[place], q[place + 1] = math.cos(angle), math.sin(angle)
+            else:
+                q[place] = angle
+        self._model.gravity.linear = np.array(gravity)
+        torque = self._gravity_torque(self._model, self._data, q)
+        return tuple(float(torque[index]) for index in self._order)
+
+
+def _pinocchio() -> Any:
+    try:
+        import pinocchio
+    except ImportError:
+        raise ParameterError("law", "urdf", "used with Pinocchio: pip install 'exo_gravity[urdf]'") from None
+    return pinocchio
+
+
+def _joint_types(text: str) -> dict[str, str]:
+    """Return the type of each joint in the URDF `text` by name. Raises ParameterError."""
+    try:
+        robot = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ParameterError("urdf", _beginning(text), f"the XML of a URDF ({error})") from None
+    if robot.tag != "robot":
+        raise ParameterError("urdf", _beginning(text), "a URDF, whose outermost element is robot")
+    if any("xacro" in element.tag for element in robot.iter()):
+        raise ParameterError("urdf", _beginning(text), "a URDF without xacro elements: run xacro first")
+    return {joint.get("name", ""): joint.get("type", "") for joint in robot.findall("joint")}
+
+
+def _turning(types: dict[str, str]) -> list[str]:
+    return [name for name, kind in types.items() if kind in TURNING]
+
+
+def _beginning(text: str) -> str:
+    return f"{text[:60].strip()} ..."

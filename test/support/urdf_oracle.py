@@ -1,0 +1,38 @@
+"""Gravity torques of a URDF by MuJoCo, to compare Pinocchio's with."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+UNUSED = ("visual", "collision")
+
+
+class MujocoArm:
+    """The arm that `joint_names` (n,) move in the URDF `text`; its other joints stay at 0."""
+
+    def __init__(self, text: str, joint_names: Sequence[str]) -> None:
+        robot = ElementTree.fromstring(text)
+        for link in robot.findall("link"):
+            for element in [child for child in link if child.tag in UNUSED]:
+                link.remove(element)
+        settings = ElementTree.SubElement(robot, "mujoco")
+        # Fused links would lose their names, not their masses. Some descriptions have inertias that no body can have.
+        bounds: dict[str, str] = {"boundmass": "1e-14", "boundinertia": "1e-14"}  # MuJoCo refuses links without mass
+        ElementTree.SubElement(settings, "compiler", fusestatic="false", balanceinertia="true", **bounds)
+        self._model = mujoco.MjModel.from_xml_string(ElementTree.tostring(robot, encoding="unicode"))
+        self._data = mujoco.MjData(self._model)
+        joints = [self._model.joint(name) for name in joint_names]
+        self._positions = [int(joint.qposadr[0]) for joint in joints]
+        self._speeds = [int(joint.dofadr[0]) for joint in joints]
+
+    def torque(self, theta: Sequence[float], gravity: Sequence[float]) -> np.ndarray:
+        """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad; gravity: (3,) m/s^2, of the root link."""
+        self._model.opt.gravity = gravity
+        self._data.qpos[:] = 0.0
+        self._data.qpos[self._positions] = theta
+        mujoco.mj_forward(self._model, self._data)
+        return self._data.qfrc_bias[self._speeds].copy()
