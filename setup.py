@@ -5,7 +5,7 @@ from setuptools import find_packages, setup
 package_name = "exo_gravity"
 # The one list of executables, each named after its module. The launcher reads the nodes from the entry points.
 nodes = ("can_bridge", "imu", "compensator", "simulator", "recorder", "calibrator")
-tools = ("launcher", "trial", "report", "budget", "validate", "train_anfis", "calibrate")
+tools = ("launcher", "trial", "report", "budget", "validate", "train_anfis", "calibrate", "urdf")
 
 extras = {
     # Jazzy as wheels, for a machine without ROS. Where ROS 2 is installed, leave this extra out.

@@ -1,0 +1,68 @@
+"""urdf --params FILE: writes the robot description (URDF) of the arms of a parameter file, for RViz and other programs.
+
+The root link is `trunk` (REP-103); the joints have the names and the order of `joint_names`. `law: exact` with gains of
+1 computes the torques of this description.
+
+Exit code 0: written. 2: wrong use or wrong file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from exo_gravity.core.errors import ExoGravityError, ParameterError
+from exo_gravity.core.tilt import SIDES
+from exo_gravity.core.urdf import ArmDescription, urdf
+from exo_gravity.tools.inputs.arms import ConfiguredArm, configured_arm, configured_arms, named
+
+
+def description_of(arm: ConfiguredArm) -> ArmDescription:
+    """Return what the parameter file states about an arm."""
+    values = arm.compensator
+    return ArmDescription(
+        arm.side,
+        arm.robot,
+        values["robot.mass"],
+        arm.limits,
+        values["friction.viscous"],
+        values["friction.coulomb"],
+        values["shoulder_from_imu"],
+    )
+
+
+def urdf_of(params: str | Path, side: str = "", meshes: str = "") -> str:
+    """Return the URDF of the arms in a parameter file, or of the arm on one `side`. Raises ParameterError."""
+    arms = [configured_arm(params, side)] if side else configured_arms(params)
+    with named(f"{arms[0].namespace}/compensator" if len(arms) == 1 else str(params)):
+        return urdf([description_of(arm) for arm in arms], meshes)
+
+
+def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="urdf", description="Write the robot description of the arms of a file.")
+    option = parser.add_argument
+    option("--params", required=True, metavar="FILE", help="ROS 2 parameter file with the arms")
+    option("--side", default="", choices=SIDES, help="only this arm (default: every arm of the file)")
+    option("--meshes", default="", metavar="URI", help="folder with LINK.stl per link, as package://NAME/FOLDER")
+    option("--output", metavar="FILE", help="file to write (default: standard output)")
+    return parser.parse_args(args)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit code."""
+    options = _arguments(args)
+    try:
+        text = urdf_of(options.params, options.side, options.meshes)
+        if not options.output:
+            print(text, end="")
+            return 0
+        try:
+            Path(options.output).write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise ParameterError("output", options.output, f"a file to write to ({error.strerror})") from None
+    except ExoGravityError as error:
+        print(f"urdf: {error}", file=sys.stderr)
+        return 2
+    return 0
