@@ -16,59 +16,16 @@ are abduction and flexion on both sides. The gain c_n is no part of a descriptio
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 from xml.etree import ElementTree
 
-from exo_gravity.core.arm import JOINT_COUNT, ZEROS, ArmModel, Vector
+from exo_gravity.core.arm import JOINT_COUNT
+from exo_gravity.core.arm_description import ArmDescription, Point
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.limits import Limits
-from exo_gravity.core.tilt import SIDES
 from exo_gravity.core.urdf_shapes import add_link_shapes, add_material, add_mesh, add_trunk_shapes, numbers
 
 ROOT = "trunk"
-HALF_BREADTH = 0.15  # m from the middle of the trunk to the axis of joint 1, if `shoulder` is not given
 TUBE_RADIUS = 0.03  # m; each link has the inertia of a thin tube
-
-Point = tuple[float, float, float]
-
-
-@dataclass(frozen=True, eq=False)
-class ArmDescription:
-    """What a description states about one arm.
-
-    side: 'left' or 'right'. robot: the arm without a wearer. mass: (4,) kg, used if `robot` is given by its moments.
-    limits: names, position, speed and torque limits of the joints. damping (4,) Nm s/rad, friction (4,) Nm: of the
-    joints, 0 for unknown. shoulder: (3,) m, the arm's base in the trunk's axes; zeros for unknown.
-    """
-
-    side: str
-    robot: ArmModel
-    mass: Vector
-    limits: Limits
-    damping: Vector = ZEROS
-    friction: Vector = ZEROS
-    shoulder: Vector = (0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        if self.side not in SIDES:
-            raise ParameterError("side", self.side, f"one of {', '.join(SIDES)}")
-
-    @property
-    def outward(self) -> float:
-        """1 if the arm is on the trunk's +y side (left), -1 otherwise."""
-        return 1.0 if self.side == "left" else -1.0
-
-    @property
-    def base(self) -> Point:
-        """Origin of joint 1 in the trunk's axes, m."""
-        x, y, z = map(float, self.shoulder)
-        return (x, y, z) if any((x, y, z)) else (0.0, self.outward * HALF_BREADTH, 0.0)
-
-    @property
-    def links(self) -> tuple[str, ...]:
-        """Names of the links (4,), and of the frame at the far end of link 4."""
-        return (*(f"{self.side}_link_{n}" for n in range(1, JOINT_COUNT + 1)), f"{self.side}_end")
 
 
 class Body(NamedTuple):
@@ -141,9 +98,14 @@ def axes(arm: ArmDescription) -> tuple[Point, ...]:
     return (0.0, 0.0, -arm.outward), (arm.outward, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, -1.0, 0.0)
 
 
+def ends(arm: ArmDescription) -> tuple[Point, ...]:
+    """Return the far end of each of the four links in the frame of its joint, m."""
+    first, *others = arm.robot.length.tolist()
+    return ((0.0, arm.outward * first, 0.0), *((0.0, 0.0, -length) for length in others))
+
+
 def _add_arm(robot: ElementTree.Element, arm: ArmDescription, names: Sequence[str], meshes: str) -> None:
-    lengths = arm.robot.length.tolist()
-    ends = ((0.0, arm.outward * lengths[0], 0.0), *((0.0, 0.0, -length) for length in lengths[1:]))
+    lengths, end = arm.robot.length.tolist(), ends(arm)
     axis, parent, origin = axes(arm), ROOT, arm.base
     for n, (name, body) in enumerate(zip(names, bodies(arm), strict=True)):
         _add_joint(robot, name, "revolute", parent, arm.links[n], origin)
@@ -154,8 +116,8 @@ def _add_arm(robot: ElementTree.Element, arm: ArmDescription, names: Sequence[st
             add_mesh(link, meshes)
         else:
             next_axis = axis[n + 1] if n + 1 < JOINT_COUNT else None
-            add_link_shapes(link, ends[n], next_axis, body.centre, sideways=n == 0)
-        parent, origin = arm.links[n], ends[n]
+            add_link_shapes(link, end[n], next_axis, body.centre, sideways=n == 0)
+        parent, origin = arm.links[n], end[n]
     _add_joint(robot, f"{arm.links[-1]}_joint", "fixed", parent, arm.links[-1], origin)
     ElementTree.SubElement(robot, "link", name=arm.links[-1])
 

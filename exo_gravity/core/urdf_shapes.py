@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from xml.etree.ElementTree import Element, SubElement
 
-Point = tuple[float, float, float]
+from exo_gravity.core.arm_description import Point
 
 COLOURS = {
     "person": (0.80, 0.76, 0.70, 0.6),

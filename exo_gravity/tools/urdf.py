@@ -13,31 +13,18 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from exo_gravity.core.arm_description import described
 from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.core.tilt import SIDES
-from exo_gravity.core.urdf import ArmDescription, urdf
-from exo_gravity.tools.inputs.arms import ConfiguredArm, configured_arm, configured_arms, named
-
-
-def description_of(arm: ConfiguredArm) -> ArmDescription:
-    """Return what the parameter file states about an arm."""
-    values = arm.compensator
-    return ArmDescription(
-        arm.side,
-        arm.robot,
-        values["robot.mass"],
-        arm.limits,
-        values["friction.viscous"],
-        values["friction.coulomb"],
-        values["shoulder_from_imu"],
-    )
+from exo_gravity.core.urdf import urdf
+from exo_gravity.tools.inputs.arms import configured_arm, configured_arms, named
 
 
 def urdf_of(params: str | Path, side: str = "", meshes: str = "") -> str:
     """Return the URDF of the arms in a parameter file, or of the arm on one `side`. Raises ParameterError."""
     arms = [configured_arm(params, side)] if side else configured_arms(params)
     with named(f"{arms[0].namespace}/compensator" if len(arms) == 1 else str(params)):
-        return urdf([description_of(arm) for arm in arms], meshes)
+        return urdf([described(arm.compensator, arm.can_bridge) for arm in arms], meshes)
 
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
