@@ -4,7 +4,7 @@ from setuptools import find_packages, setup
 
 package_name = "exo_gravity"
 # The one list of executables, each named after its module. The launcher reads the nodes from the entry points.
-nodes = ("can_bridge", "imu", "compensator", "simulator", "recorder", "calibrator")
+nodes = ("can_bridge", "imu", "compensator", "simulator", "recorder", "calibrator", "robot_model")
 tools = ("launcher", "trial", "report", "budget", "validate", "train_anfis", "calibrate", "urdf")
 
 extras = {

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from exo_gravity.core.calibration.params import CALIBRATOR
-from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR, IMU, RECORDER
+from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR, IMU, RECORDER, ROBOT_MODEL
 from exo_gravity.core.faults import FaultCode
 from exo_gravity.core.param_table import Param
 from exo_gravity.sim.device_params import SIMULATOR
@@ -26,6 +26,7 @@ PARAMETERS = {
     "imu": IMU,
     "simulator": SIMULATOR,
     "recorder": RECORDER,
+    "robot_model": ROBOT_MODEL,
     "calibrator": [param for param in CALIBRATOR if param.name.startswith("tour.")],
 }
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end of table -->)", re.DOTALL)

@@ -1,4 +1,4 @@
-"""The parameters of `can_bridge`, `compensator`, `imu` and `recorder`, and the objects built from their values."""
+"""The parameters of each node but `simulator` and `calibrator`, and the objects built from their values."""
 
 from __future__ import annotations
 
@@ -127,6 +127,11 @@ IMU = (
 RECORDER = (
     Param("output", "", "new folder for the recording", fixed=True, required=True),
     Param("live", False, "print the latest state as one line of JSON, ten times a second", fixed=True),
+)
+ROBOT_MODEL = (
+    Param("rate", 30.0, "joint states of all arms per second", (1.0, 100.0), "Hz", fixed=True),
+    Param("meshes", "", "address of a folder with LINK.stl for each link, as package://NAME/FOLDER; empty: tubes",
+          fixed=True),
 )
 # fmt: on
 

@@ -43,6 +43,7 @@ SHARED_TOPICS = {
     "/parameter_events": ParameterEvent,
 }
 OF_ARMS = {**ARM_TOPICS, ASSIST: JointState}
+REPEATER = "robot_model"  # its joint states are those of the arms once more
 DRAIN_PERIOD = 0.05  # s between two writes of what has arrived
 DISCOVERY_PERIOD = 0.5  # s between two searches for new topics and nodes
 LIVE_PERIOD = 0.1  # s between two lines of live state
@@ -153,7 +154,8 @@ class Recorder(Node):
             self._guarded("live state", self._live.write, counts)
 
     def _subscribe(self, topic: str, msgtype: type) -> None:
-        offered = [publisher.qos_profile for publisher in self.get_publishers_info_by_topic(topic)]
+        publishers = self.get_publishers_info_by_topic(topic)
+        offered = [publisher.qos_profile for publisher in publishers if publisher.node_name != REPEATER]
         if not offered:
             return  # a subscriber without a publisher; try again later
         reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)

@@ -32,6 +32,7 @@ DESCENT_TIMEOUT = 40.0  # s for a bridge to let its arm down, after which it is 
 WATCHDOG_TIMEOUT = 30.0  # s for the watchdog of a dead bridge to let the arm down
 RECOVERY = {"EXO_GRAVITY_RECOVER": "1"}  # starts can_bridge for one purpose: to let down an arm that was left behind
 STOP_TIMEOUT = 5.0  # s for any other node to end
+OBSERVERS = ("/recorder", "/robot_model")  # nothing depends on them
 LOG_FORMAT = "{severity} {message}"
 
 OnLine = Callable[[str, str], None]  # (node, line of its log)
@@ -89,11 +90,11 @@ class Launcher:
     def dead(self) -> tuple[str, int] | None:
         """Return the name and exit code of a node that has ended, None while all run.
 
-        A recorder may end, because a full disk must not let the arm down.
+        A recorder may end, because a full disk must not let the arm down, and so may what viewers need.
         """
         for node, process in self._processes.items():
             code = process.poll()
-            if code is not None and not node.endswith("/recorder"):
+            if code is not None and not node.endswith(OBSERVERS):
                 return node, code
         return None
 

@@ -1,0 +1,151 @@
+"""The node `robot_model` beside the real compensators and bridges of both arms, whose joint states the test sends."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+import rclpy
+import yaml
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Vector3Stamped
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from visualization_msgs.msg import Marker, MarkerArray
+
+from exo_gravity.core.urdf import ROOT
+from exo_gravity.tools.urdf import urdf_of
+
+from ..support import CONFIG
+from ..support.joint_state_feeder import PARTS
+
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+READINGS = {"left": (0.1, 0.2, 0.3, 0.4), "right": (-0.1, 0.5, 0.6, 0.7)}
+EFFORT = (0.0, 1.5, 1.2, 0.2)
+
+
+def names(side):
+    return [f"{side}_{part}" for part in PARTS]
+
+
+class Viewer:
+    """A node that sends the joint states of both arms and the tilt, and keeps the newest of what robot_model sends."""
+
+    def __init__(self):
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self.node = rclpy.create_node("viewer", context=self.context)
+        self.sent = {side: self.node.create_publisher(JointState, f"/{side}/joint_states", 1) for side in READINGS}
+        self.tilt = self.node.create_publisher(Vector3Stamped, "/imu/pitch_yaw", 1)
+        self.description, self.states, self.problem = "", JointState(), ""
+        self.markers: dict[tuple[str, int], Marker] = {}
+        self.node.create_subscription(String, "/robot_description", self._on_description, LATCHED)
+        self.node.create_subscription(JointState, "/joint_states", self._on_states, 1)
+        self.node.create_subscription(MarkerArray, "/robot_model/markers", self._on_markers, 1)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+        self.sides = set(READINGS)
+        self.node.create_timer(0.02, self._send)
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._spin)
+        self._thread.start()
+
+    def _spin(self):
+        while not self._closing.is_set():
+            self._executor.spin_once(timeout_sec=0.1)
+
+    def close(self):
+        self._closing.set()
+        self._thread.join()
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+    def _send(self):
+        stamp = self.node.get_clock().now().to_msg()
+        for side in tuple(self.sides):
+            message = JointState(name=names(side), position=READINGS[side], velocity=(0.0,) * 4, effort=EFFORT)
+            message.header.stamp = stamp
+            self.sent[side].publish(message)
+        tilt = Vector3Stamped()
+        tilt.header.stamp, tilt.vector.y = stamp, 0.5
+        self.tilt.publish(tilt)
+
+    def _on_description(self, message):
+        self.description = message.data
+
+    def _on_states(self, message):
+        self.states = message
+
+    def _on_markers(self, message):
+        self.markers = {(marker.ns, marker.id): marker for marker in message.markers}
+
+    def _on_diagnostics(self, message):
+        self.problem = next((s.message for s in message.status if s.name == "robot_model"), self.problem)
+
+    def wait_until(self, condition, timeout=60.0):
+        end = time.monotonic() + timeout
+        while not condition():
+            assert time.monotonic() < end, f"{self.problem!r}, joints {list(self.states.name)}"
+            self._closing.wait(0.05)
+
+
+@pytest.fixture
+def viewer():
+    viewer = Viewer()
+    yield viewer
+    viewer.close()
+
+
+@pytest.fixture
+def nodes(launch, tmp_path):
+    """Both arms without their simulators; the bridges stay inactive, so that the test's joint states are the only ones."""
+    content = yaml.safe_load((CONFIG / "sim_both.yaml").read_text(encoding="utf-8"))
+    base = tmp_path / "both.yaml"
+    content["/robot_model"] = {"ros__parameters": {"rate": 50.0}}
+    content["/recorder"] = {"ros__parameters": {"output": str(tmp_path / "bag")}}
+    base.write_text(yaml.safe_dump(content), encoding="utf-8")
+    return launch(base=base, without=("simulator", "imu"), can_bridge={"autostart": False})
+
+
+def test_a_viewer_gets_the_description_the_joint_states_of_both_arms_and_markers(nodes, viewer):
+    viewer.wait_until(lambda: viewer.description == urdf_of(nodes.path) and len(viewer.states.name) == 8)
+    position = dict(zip(viewer.states.name, viewer.states.position, strict=True))
+    effort = dict(zip(viewer.states.name, viewer.states.effort, strict=True))
+    for side, theta in READINGS.items():
+        assert [position[name] for name in names(side)] == list(theta)
+        assert [effort[name] for name in names(side)] == list(EFFORT)
+    groups = {"gravity"} | {f"{side}/{kind}" for side in READINGS for kind in ("limits", "torques", "states")}
+    viewer.wait_until(lambda: {group for group, _ in viewer.markers} == groups)
+    assert {marker.header.frame_id for marker in viewer.markers.values()} == {ROOT}
+    texts = {marker.text for marker in viewer.markers.values() if marker.type == Marker.TEXT_VIEW_FACING}
+    assert {"1.50 Nm", "right: inactive", "left: inactive"} <= texts
+    arrow = viewer.markers["gravity", 0]
+    forward, down = (getattr(arrow.points[1], axis) - getattr(arrow.points[0], axis) for axis in "xz")
+    assert forward > 0 > down and forward / -down == pytest.approx(0.5463, abs=1e-3)  # tan of the pitch
+
+
+def test_an_arm_that_falls_silent_disappears_and_the_other_stays(nodes, viewer):
+    viewer.wait_until(lambda: len(viewer.states.name) == 8)
+    viewer.sides = {"right"}
+    viewer.wait_until(lambda: list(viewer.states.name) == names("right"))
+    viewer.wait_until(lambda: not any(group.startswith("left") for group, _ in viewer.markers))
+    viewer.wait_until(lambda: viewer.problem == "no messages on /left/joint_states")
+
+
+def test_a_recording_holds_each_joint_state_once_and_the_arms_run_on_if_robot_model_ends(nodes, viewer, tmp_path):
+    viewer.wait_until(lambda: len(viewer.states.name) == 8)
+    nodes.process("/robot_model").kill()
+    nodes.process("/robot_model").wait()
+    assert nodes.launcher.dead() is None
+    nodes.stop()
+    with AnyReader([tmp_path / "bag"], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
+        topics = {connection.topic for connection in bag.connections}
+    assert "/joint_states" not in topics
+    assert {"/left/joint_states", "/right/joint_states"} <= topics
