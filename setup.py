@@ -15,7 +15,9 @@ extras = {
     "report": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11", "scipy>=1.11"],
     "calibrate": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11"],
     "validate": ["imufusion>=1.3", "pin>=2.7", "roboticstoolbox-python>=1.1.1", "threadpoolctl>=3.0"],
+    "urdf": ["pin>=2.7"],  # law: urdf
     "test": [
+        "example-robot-data>=4.3",
         "hypothesis>=6.100",
         "mcap-ros2-support>=0.5",
         "pytest>=8.0",

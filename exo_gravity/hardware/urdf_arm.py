@@ -52,9 +52,7 @@ class UrdfArm:
         pin.computeSubtreeMasses(self._model, self._data)
         self.mass = max(self._data.mass[number] for number in numbers)
         if not self.mass > 0.0:
-            raise ParameterError(
-                "mass of the URDF's links", self.mass, "above 0 kg: it lacks inertial elements"
-            )
+            raise ParameterError("mass of the URDF's links", self.mass, "above 0 kg: it lacks inertial elements")
 
     def torque(self, theta: Sequence[float], gravity: Sequence[float]) -> tuple[float, ...]:
         """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad.

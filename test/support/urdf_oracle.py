@@ -30,7 +30,7 @@ class MujocoArm:
         self._speeds = [int(joint.dofadr[0]) for joint in joints]
 
     def torque(self, theta: Sequence[float], gravity: Sequence[float]) -> np.ndarray:
-        """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad; gravity: (3,) m/s^2, of the root link."""
+        """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad; gravity: (3,) m/s^2 in the root."""
         self._model.opt.gravity = gravity
         self._data.qpos[:] = 0.0
         self._data.qpos[self._positions] = theta

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.anfis_law import AnfisLaw
+from exo_gravity.core.any_arm import LAW as URDF_LAW
 from exo_gravity.core.arm import ArmModel
 from exo_gravity.core.compensator_settings import Settings
 from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR, OPTIONS, limits_of, motors_of, settings_of
@@ -85,13 +86,22 @@ def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:
     Raises ParameterError where a node is missing or a parameter is unknown or impossible.
     """
     can_bridge = node_values(nodes, f"{namespace}/can_bridge", CAN_BRIDGE)
-    compensator = node_values(nodes, f"{namespace}/compensator", COMPENSATOR)
+    compensator = node_values(_with_own_law(nodes, f"{namespace}/compensator"), f"{namespace}/compensator", COMPENSATOR)
     with named(f"{namespace}/can_bridge"):
         motors, limits = motors_of(can_bridge), limits_of(can_bridge)
     with named(f"{namespace}/compensator"):
         # The robot does not depend on the law, and the model of `law: anfis` may not be trained yet.
         robot = settings_of({**compensator, "law": "exact"}).robot
     return ConfiguredArm(namespace, can_bridge, compensator, motors, limits, robot)
+
+
+def _with_own_law(nodes: Nodes, node: str) -> Nodes:
+    """Return the nodes with the law `exact` in place of `urdf`, whose torques a URDF of this arm shares."""
+    given = nodes.get(node, {})
+    if given.get("law") != URDF_LAW:
+        return nodes
+    own = {name: value for name, value in given.items() if not name.startswith(f"{URDF_LAW}.")}
+    return {**nodes, node: {**own, "law": "exact"}}
 
 
 def configured_arms(params: str | Path) -> list[ConfiguredArm]:

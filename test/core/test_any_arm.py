@@ -1,0 +1,97 @@
+"""The compensator of n joints, with a pendulum of two joints as its model."""
+
+import math
+import random
+
+import pytest
+
+from exo_gravity.core.any_arm import AnyArm, any_arm_settings, any_arm_table
+from exo_gravity.core.effort_limiter import LONGEST_STEP, RAMP_TIME
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.param_table import values_of
+
+PERIOD = 0.004  # s
+POSE = (0.4, -0.7)
+
+
+class Pendulum:
+    """Two joints about y, each with 1 kg m; it hangs along -z."""
+
+    max_effort = (30.0, 0.0)
+    mass = 2.0
+
+    def torque(self, theta, gravity):
+        (first, second), (x, _, z) = theta, gravity
+        lower = -z * math.sin(first + second) - x * math.cos(first + second)
+        return lower - z * math.sin(first) - x * math.cos(first), lower
+
+
+def settings(**changes):
+    given = {"joint_names": ["a", "b"], "max_effort": [0.0, 20.0], "use_imu": False, **changes}
+    return any_arm_settings(values_of(any_arm_table(2), given), Pendulum())
+
+
+def steps(arm, start, seconds):
+    return [arm.step(start + n * PERIOD, POSE).effort for n in range(round(seconds / PERIOD))]
+
+
+def test_it_ramps_in_and_then_gives_the_models_torque_times_the_gain():
+    arm = AnyArm(Pendulum(), settings(gain=[1.0, 0.5], max_effort_rate=1000.0))
+    efforts = steps(arm, 5.0, RAMP_TIME + 0.1)
+    first, second = Pendulum().torque(POSE, (0.0, 0.0, -9.80665))
+    assert efforts[0] == (0.0, 0.0)
+    assert efforts[125] == pytest.approx((0.5 * first, 0.25 * second), rel=0.01)
+    assert efforts[-1] == pytest.approx((first, 0.5 * second), abs=1e-12)
+
+
+def test_gravity_comes_from_the_tilt_in_the_root_links_axes():
+    arm = AnyArm(Pendulum(), settings(use_imu=True, max_effort_rate=1000.0, tilt_timeout=0.5))
+    assert arm.step(1.0, POSE).reason == "no trunk tilt yet"
+    for n in range(300):
+        arm.set_gravity(2.0 + n * PERIOD, (0.6, 0.0, -0.8))
+        answer = arm.step(2.0 + n * PERIOD, POSE)
+    assert answer.effort == pytest.approx(Pendulum().torque(POSE, (0.6 * 9.80665, 0.0, -0.8 * 9.80665)), abs=1e-9)
+    assert arm.step(4.0, POSE).reason == "trunk tilt older than 500 ms"
+
+
+def test_pitch_and_roll_give_the_same_gravity_as_the_vector():
+    arm = AnyArm(Pendulum(), settings(use_imu=True, max_effort_rate=1000.0))
+    for n in range(300):
+        arm.set_tilt(2.0 + n * PERIOD, math.asin(0.6), 0.0)
+        answer = arm.step(2.0 + n * PERIOD, POSE)
+    assert answer.effort == pytest.approx(Pendulum().torque(POSE, (0.6 * 9.80665, 0.0, -0.8 * 9.80665)), abs=1e-9)
+
+
+def test_random_changes_of_settings_never_step_the_torque():
+    chance, arm, now = random.Random(3), AnyArm(Pendulum(), settings()), 1.0
+    last = (0.0, 0.0)
+    for n in range(3000):
+        if n % 50 == 0:
+            gain = [chance.uniform(0.0, 2.0) for _ in range(2)]
+            arm.apply(settings(gain=gain, gravity=chance.uniform(0.0, 25.0), transition_time=0.2))
+        now += PERIOD
+        effort = arm.step(now, POSE).effort
+        assert all(abs(a - b) <= 50.0 * min(PERIOD, LONGEST_STEP) + 1e-9 for a, b in zip(effort, last, strict=True))
+        last = effort
+
+
+def test_torque_beyond_the_limit_of_the_urdf_is_clamped_and_named():
+    arm = AnyArm(Pendulum(), settings(max_effort=[3.0, 20.0], max_effort_rate=1000.0))
+    for n in range(300):
+        answer = arm.step(1.0 + n * PERIOD, (1.5, 0.0))
+    assert answer.effort[0] == 3.0 and answer.clamped == (0,)
+
+
+@pytest.mark.parametrize("theta", [(0.0,), (0.0, 0.0, 0.0), (math.nan, 0.0), (0.0, 30.0)])
+def test_impossible_angles_are_refused(theta):
+    assert "are not 2 numbers within 26 rad" in AnyArm(Pendulum(), settings()).step(1.0, theta).reason
+
+
+def test_a_joint_without_any_effort_limit_is_refused():
+    with pytest.raises(ParameterError, match=r"max_effort of b = 0\.0: must be greater than 0"):
+        settings(max_effort=[0.0, 0.0])
+
+
+def test_a_list_must_have_one_entry_per_joint():
+    with pytest.raises(ParameterError, match="gain"):
+        settings(gain=[1.0] * 3)

@@ -1,0 +1,107 @@
+"""Torques of arms from their URDF: against MuJoCo, and against the exact law on the exoskeleton's own description."""
+
+from importlib.metadata import distribution
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rtbdata
+
+from exo_gravity.core import gravity_torque
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.tilt import Tilt
+from exo_gravity.hardware.urdf_arm import UrdfArm
+from exo_gravity.tools.inputs.arms import configured_arm
+from exo_gravity.tools.inputs.parameter_file import packaged_config
+from exo_gravity.tools.urdf import urdf_of
+
+from ..support.urdf_oracle import MujocoArm
+
+EXAMPLES = "cmeel.prefix/share/example-robot-data/robots"
+KUKA = "xacro/kuka_description/kuka_kr16/urdf/kr16_2.urdf"
+ARMS = {
+    # The UR5 as a table arm; the Panda with two prismatic fingers, which stay at 0; the Kinova with continuous joints.
+    "ur5": ("ur_description/urdf/ur5_robot.urdf",
+            [f"{part}_joint" for part in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")]),
+    "panda": ("panda_description/urdf/panda.urdf", [f"panda_joint{n}" for n in range(1, 8)]),
+    "kinova": ("kinova_description/robots/kinova.urdf", [f"j2s6s200_joint_{n}" for n in range(1, 7)]),
+    "kr16": (KUKA, [f"joint_a{n}" for n in range(1, 7)]),
+}  # fmt: skip
+POSES = 200
+ONE_LINK = """<robot name="one">
+<link name="base"/>
+<link name="link"><inertial><origin xyz="0 0 -0.5"/><mass value="{mass}"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="j" type="{kind}"><parent link="base"/><child link="link"/><axis xyz="0 1 0"/>
+<limit lower="-1" upper="1" effort="5" velocity="1"/></joint>
+</robot>"""
+
+
+def description(path: str) -> str:
+    if path == KUKA:
+        return Path(rtbdata.__path__[0], path).read_text(encoding="utf-8")
+    return distribution("example-robot-data").locate_file(f"{EXAMPLES}/{path}").read_text(encoding="utf-8")
+
+
+def random_gravity(random: np.random.Generator) -> np.ndarray:
+    gravity = random.normal(size=3)
+    return 9.80665 * gravity / np.linalg.norm(gravity)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_the_torques_of_published_arms_equal_mujocos_in_any_pose_under_any_tilt(name):
+    path, joints = ARMS[name]
+    text, random = description(path), np.random.default_rng(1)
+    arm, mujoco = UrdfArm(text, joints), MujocoArm(text, joints)
+    largest = 0.0
+    for _ in range(POSES):
+        theta, gravity = random.uniform(-np.pi, np.pi, len(joints)), random_gravity(random)
+        torque = arm.torque(theta, gravity)
+        assert np.allclose(torque, mujoco.torque(theta, gravity), rtol=0.0, atol=1e-11)
+        largest = max(largest, *np.abs(torque))
+    assert largest > 10.0
+
+
+def test_the_joints_may_come_in_any_order():
+    path, joints = ARMS["kinova"]
+    text, random = description(path), np.random.default_rng(2)
+    order = random.permutation(len(joints))
+    theta, gravity = random.uniform(-3.0, 3.0, len(joints)), random_gravity(random)
+    mixed = UrdfArm(text, [joints[n] for n in order])
+    assert np.allclose(
+        mixed.torque(theta[order], gravity), np.array(UrdfArm(text, joints).torque(theta, gravity))[order]
+    )
+    assert sorted(mixed.max_effort) == [20.0, 20.0, 20.0, 40.0, 40.0, 80.0]
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_the_exoskeletons_own_description_gives_the_torques_of_the_exact_law(side):
+    params = packaged_config("sim_both.yaml")
+    own, random = configured_arm(params, side), np.random.default_rng(3)
+    for text in (urdf_of(params, side), urdf_of(params)):  # one arm, and both on one trunk
+        arm = UrdfArm(text, own.joint_names)
+        for _ in range(POSES):
+            theta, gravity = random.uniform(-3.0, 3.0, 4), random_gravity(random)
+            exact = gravity_torque(own.robot, theta, Tilt.of_gravity(side, gravity).direction)
+            assert np.allclose(arm.torque(theta, gravity), exact, rtol=0.0, atol=1e-9)
+        assert arm.mass == pytest.approx(own.robot.total_mass)
+
+
+@pytest.mark.parametrize(("text", "joint", "problem"), [
+    ("<robot", "j", "the XML of a URDF"),
+    ("<sdf/>", "j", "whose outermost element is robot"),
+    ("<robot xmlns:xacro='http://wiki.ros.org/xacro'><xacro:include/></robot>", "j", "run xacro first"),
+    (ONE_LINK.format(mass=1, kind="prismatic"), "j", "it is prismatic"),
+    (ONE_LINK.format(mass=1, kind="revolute"), "k", r"turning joints of the URDF \(j\)"),
+    (ONE_LINK.format(mass=0, kind="revolute"), "j", "above 0 kg"),
+    (ONE_LINK.replace('child link="link"', 'child link="x"').format(mass=1, kind="revolute"), "j", "Pinocchio reads"),
+])  # fmt: skip
+def test_a_description_that_cannot_be_used_is_refused_with_the_reason(text, joint, problem):
+    with pytest.raises(ParameterError, match=problem):
+        UrdfArm(text, [joint])
+
+
+def test_one_link_takes_its_weight_times_its_lever():
+    arm = UrdfArm(ONE_LINK.format(mass=2, kind="continuous"), ["j"])
+    assert arm.torque([np.pi / 2], (0.0, 0.0, -10.0)) == pytest.approx([10.0])
+    assert arm.max_effort == (5.0,)
