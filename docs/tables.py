@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from exo_gravity.core.any_arm import any_arm_table
 from exo_gravity.core.calibration.params import CALIBRATOR
 from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR, IMU, RECORDER, ROBOT_MODEL
 from exo_gravity.core.faults import FaultCode
@@ -23,6 +24,7 @@ COMMAND = "python docs/tables.py"
 PARAMETERS = {
     "can_bridge": CAN_BRIDGE,
     "compensator": COMPENSATOR,
+    "any_arm": any_arm_table(1),
     "imu": IMU,
     "simulator": SIMULATOR,
     "recorder": RECORDER,

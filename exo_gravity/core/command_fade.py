@@ -34,7 +34,8 @@ COMMAND_PARAMETERS = (
           fixed=True),
     Param("multi_array.timeout", 0.05, "age of the joint states at which the torque begins to fade", (0.01, 0.15), "s",
           fixed=True),
-    Param("multi_array.fade_time", 2.0, "time over which it fades", (0.5, 30.0), "s", fixed=True),
+    # A launcher kills a node 5 s after it asked it to end. A fade must be over by then.
+    Param("multi_array.fade_time", 2.0, "time over which it fades", (0.5, 3.0), "s", fixed=True),
 )
 # fmt: on
 
