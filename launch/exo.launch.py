@@ -1,25 +1,167 @@
-"""Starts `launcher`, which starts one process per node: `ros2 launch exo_gravity exo.launch.py params:=FILE`."""
+"""Starts the nodes of a parameter file: `ros2 launch exo_gravity exo.launch.py params:=FILE`.
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, ExecuteProcess, Shutdown
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
-from launch_ros.substitutions import ExecutableInPackage, FindPackageShare
+When a node ends on which the arm depends, or on Ctrl-C, all stop, with SIGTERM: first the bridges, which need the others
+while they let the arms down, then the others, the recorders last. A terminal sends Ctrl-C to every node at once; so all
+but the bridges ignore SIGINT. If `ros2 launch` itself is killed, each node stops with its standard input.
+
+The nodes are no `LifecycleNode` actions: with those, `ros2 launch` would be one more DDS participant beside a worn arm.
+`can_bridge` activates itself (`autostart`); `ros2 lifecycle` works as with any lifecycle node.
+"""
+
+import asyncio
+import os
+import signal
+from pathlib import Path
+
+from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
+from launch.actions import (
+    DeclareLaunchArgument,
+    EmitEvent,
+    OpaqueCoroutine,
+    OpaqueFunction,
+    RegisterEventHandler,
+    Shutdown,
+)
+from launch.event_handlers import OnExecutionComplete, OnProcessExit, OnProcessStart, OnShutdown
+from launch.events import matches_action
+from launch.events.process import ProcessExited, ProcessStarted, SignalProcess
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+from exo_gravity.tools.inputs.executables import executable
+from exo_gravity.tools.inputs.node_set import (
+    ABSOLUTE_TOPICS,
+    DESCENT_TIMEOUT,
+    ENDED_WELL,
+    RECOVERY,
+    RECOVERY_TIMEOUT,
+    STOP_TIMEOUT,
+    SUPERVISED,
+    Stages,
+    check_buses,
+    chosen,
+    in_namespace,
+    is_observer,
+)
+from exo_gravity.tools.inputs.parameter_file import load, packaged_config
+
+LONGEST_STOP = DESCENT_TIMEOUT + RECOVERY_TIMEOUT  # s until the last bridge is done; `launch` then ends the others
+
+
+class Stopping:
+    """Stops `nodes` in order. Its methods are event handlers, which return the actions that follow."""
+
+    def __init__(self, nodes: dict[str, Node]) -> None:
+        self._nodes = nodes
+        self._running: set[str] = set()
+        self._stages = Stages.of(nodes)
+        self._is_stopping = False
+        self._troubles: list[str] = []
+
+    def handlers(self) -> list[RegisterEventHandler]:
+        """Return the actions that register the handlers."""
+        return [
+            RegisterEventHandler(OnProcessStart(on_start=self._on_start)),
+            RegisterEventHandler(OnProcessExit(on_exit=self._on_exit)),
+            RegisterEventHandler(OnShutdown(on_shutdown=self._on_shutdown)),
+        ]
+
+    def _name(self, action: object) -> str:
+        """Return the full name of the node that an action starts, '' for another action."""
+        return next((name for name, node in self._nodes.items() if node is action), "")
+
+    def _on_start(self, event: ProcessStarted, _context: LaunchContext) -> None:
+        self._running.update(filter(None, [self._name(event.action)]))
+
+    def _on_exit(self, event: ProcessExited, _context: LaunchContext) -> list[LaunchDescriptionEntity]:
+        name = self._name(event.action)
+        if name not in self._stages.bridges or event.returncode in ENDED_WELL:
+            return self._ended(name, event.returncode) if name else []
+        recovery = OpaqueCoroutine(coroutine=self._recover, args=[name], ignore_shutdown=True)
+        done = OnExecutionComplete(
+            target_action=recovery, on_completion=lambda _event, _context: self._ended(name, event.returncode)
+        )
+        return [RegisterEventHandler(done), recovery]
+
+    def _on_shutdown(self, _event: object, _context: LaunchContext) -> list[LaunchDescriptionEntity]:
+        self._is_stopping = True
+        return self._stop_next()
+
+    async def _recover(self, _context: LaunchContext, name: str) -> None:
+        """Let the arm of a dead bridge down if its watchdog does not, with the bridge's own executable."""
+        details = self._nodes[name].process_details
+        environment = {**(details["env"] or os.environ), **RECOVERY}
+        process = await asyncio.create_subprocess_exec(*details["cmd"], env=environment, start_new_session=True)
+        try:
+            is_off = await asyncio.wait_for(process.wait(), RECOVERY_TIMEOUT) == 0
+        except asyncio.TimeoutError:
+            process.kill()
+            is_off = False
+        if not is_off:
+            self._troubles.append(f"the motors of {name} may still be powered: cut their supply")
+
+    def _ended(self, name: str, code: int) -> list[LaunchDescriptionEntity]:
+        self._running.discard(name)
+        if self._is_stopping:
+            return self._stop_next()
+        if is_observer(name):
+            return []
+        self._is_stopping = True
+        self._troubles.insert(0, f"{name} ended with exit code {code}; all nodes were stopped")
+        return [Shutdown(reason=f"{name} ended with exit code {code}")]
+
+    def _stop_next(self) -> list[LaunchDescriptionEntity]:
+        """Return the actions that stop the first stage of which a node runs. Raises RuntimeError: exit code 1."""
+        for stage in self._stages:
+            if running := [self._nodes[name] for name in stage if name in self._running]:
+                return [EmitEvent(event=_terminate(node)) for node in running]
+        if self._troubles:
+            raise RuntimeError("; ".join(self._troubles))
+        return []
+
+
+def _terminate(node: Node) -> SignalProcess:
+    return SignalProcess(signal_number=signal.SIGTERM, process_matcher=matches_action(node))
+
+
+def _node(full_name: str, params: Path, namespace: str, log_level: str) -> Node:
+    parent, name = f"{namespace}{full_name}".rsplit("/", 1)
+    is_bridge = name == "can_bridge"
+    return Node(
+        executable=executable(full_name),
+        name=name,
+        namespace=parent or "/",
+        parameters=[str(params)],
+        remappings=[(topic, f"{namespace}{topic}") for topic in ABSOLUTE_TOPICS if namespace],
+        ros_arguments=["--enclave", f"{parent}/{name}", "--log-level", log_level],
+        additional_env=SUPERVISED if is_bridge else {**SUPERVISED, "EXO_GRAVITY_IGNORE_SIGINT": "1"},
+        output="screen",
+        sigterm_timeout=str(DESCENT_TIMEOUT if is_bridge else LONGEST_STOP),
+        sigkill_timeout=str(STOP_TIMEOUT),
+    )
+
+
+def _start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
+    def argument(name: str) -> str:
+        return LaunchConfiguration(name).perform(context)
+
+    params, namespace = Path(argument("params")).resolve(), argument("namespace").strip("/")
+    namespace = f"/{namespace}" if namespace else ""
+    content = load(params)
+    check_buses(content)
+    path = in_namespace(params, namespace)
+    names = chosen(content, argument("only").split())
+    nodes = {name: _node(name, path, namespace, argument("log_level")) for name in names}
+    return [*Stopping(nodes).handlers(), *nodes.values()]
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return what `ros2 launch` runs: the launcher, with 30 s to let the arms down when it is stopped."""
-    packaged = PathJoinSubstitution([FindPackageShare("exo_gravity"), "config", "exo.yaml"])
-    launcher = ExecutableInPackage(package="exo_gravity", executable="launcher")
-    return LaunchDescription(
-        [
-            DeclareLaunchArgument(
-                "params", default_value=packaged, description="parameter file: one top-level key per node"
-            ),
-            ExecuteProcess(
-                cmd=[launcher, "--params", LaunchConfiguration("params")],
-                output="screen",
-                sigterm_timeout="30",  # s: the launcher lets the arms down before it ends
-                on_exit=Shutdown(),
-            ),
-        ]
+    """Return what `ros2 launch` runs."""
+    arguments = (
+        ("params", str(packaged_config("exo.yaml")), "parameter file: one top-level key per node"),
+        ("namespace", "", "namespace in front of every node of the file, and of the topics /imu/..."),
+        ("only", "", "start only the nodes whose full names match one of these shell patterns"),
+        ("log_level", "info", "debug, info, warn, error or fatal, for every node"),
     )
+    declared = [DeclareLaunchArgument(name, default_value=value, description=text) for name, value, text in arguments]
+    return LaunchDescription([*declared, OpaqueFunction(function=_start)])

@@ -30,10 +30,10 @@ class BusLock:
     """Exclusive ownership of the bus at `address` until `release`. owner: shown to others who want the bus.
 
     notes: the shared page. descriptor: of the lock file, for the watchdog to inherit. Raises BusError with the present
-    owner if the bus is held.
+    owner if the bus is still held after `patience` s.
     """
 
-    def __init__(self, address: Address, owner: str) -> None:
+    def __init__(self, address: Address, owner: str, patience: float = ATTEMPT_TIME) -> None:
         path = lock_file(address)
         try:
             path.parent.mkdir(mode=0o700, exist_ok=True)
@@ -44,7 +44,7 @@ class BusLock:
             raise BusError(f"lock file {path}: {error.strerror}") from error
         self._page = mmap.mmap(self.descriptor, mmap.PAGESIZE)
         self.notes = DriveNotes(self._page)
-        if not self._is_acquired():
+        if not self._is_acquired(patience):
             holder = self.notes.owner
             self.release()
             raise BusError(f"CAN bus {address[1]} is held by {holder}")
@@ -56,8 +56,8 @@ class BusLock:
         self._page.close()
         os.close(self.descriptor)
 
-    def _is_acquired(self) -> bool:
-        end = time.monotonic() + ATTEMPT_TIME
+    def _is_acquired(self, patience: float) -> bool:
+        end = time.monotonic() + patience
         while True:
             try:
                 fcntl.flock(self.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

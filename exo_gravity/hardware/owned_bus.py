@@ -46,12 +46,13 @@ class OwnedBus:
         self._lock.release()
 
 
-def recover(charge: Charge, owner: str, log: Callable[[str], None]) -> bool:
+def recover(charge: Charge, owner: str, log: Callable[[str], None], patience: float) -> bool:
     """Let down an arm that a dead owner left with its motors on, and release the bus; return whether they are off.
 
-    Raises BusError if the bus is held or cannot be opened, or if a motor does not reply.
+    patience: s for the dead owner's watchdog to do so first. Raises BusError if the bus is still held then or cannot be
+    opened, or if a motor does not reply.
     """
-    lock = BusLock(charge.address, owner)
+    lock = BusLock(charge.address, owner, patience)
     try:
         _let_down(charge, lock.notes, log)
         return not lock.notes.drive.powered

@@ -14,7 +14,8 @@ from exo_gravity.hardware.owned_bus import recover
 from exo_gravity.nodes.declare import bus_of, declare
 from exo_gravity.nodes.run import keep_to_this_machine
 
-RECOVER = "EXO_GRAVITY_RECOVER"  # set by the launcher, which starts the executable for this
+# Set by whoever starts the executable for this: time in s for the watchdog of the dead bridge to let the arm down.
+RECOVER = "EXO_GRAVITY_RECOVER"
 
 
 def is_requested() -> bool:
@@ -31,7 +32,7 @@ def run_recovery() -> int:
         values = declare(node, CAN_BRIDGE, free_prefix=OPTIONS)
         charge = Charge(bus_of(node, values), motors_of(values), limits_of(values), 1.0 / values["rate"])
         owner = f"{node.get_fully_qualified_name()} (PID {os.getpid()})"
-        return 0 if recover(charge, owner, node.get_logger().error) else 1
+        return 0 if recover(charge, owner, node.get_logger().error, float(os.environ[RECOVER])) else 1
     except ExoGravityError as error:
         node.get_logger().error(str(error))
         return 1

@@ -63,8 +63,10 @@ def run(make_node: Callable[[], Node], priority: int = 0, args: list[str] | None
     """
     keep_to_this_machine()
     ending: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda received, _: ending.append(received))
+    # A terminal sends Ctrl-C to all nodes of a launch file at once; those that a bridge needs wait for SIGTERM.
+    waits = bool(os.environ.get("EXO_GRAVITY_IGNORE_SIGINT"))
+    signal.signal(signal.SIGINT, signal.SIG_IGN if waits else lambda received, _: ending.append(received))
+    signal.signal(signal.SIGTERM, lambda received, _: ending.append(received))
     if priority:
         favour(priority)
     executable = os.path.basename(sys.argv[0])

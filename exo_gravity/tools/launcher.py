@@ -8,6 +8,8 @@ launcher dies, the nodes stop by themselves: each watches its standard input, wh
 If a bridge dies, its watchdog lets the arm down. If both die, the launcher starts the bridge's executable once more, to
 let the arm down and nothing else.
 
+`--only PATTERN` starts a part of the nodes, for an arm whose nodes run on two computers.
+
 Exit code 0: stopped by Ctrl-C or SIGTERM. 1: a node ended, or motors may still be powered. 2: wrong use or wrong file.
 """
 
@@ -23,16 +25,23 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from exo_gravity.core.errors import ExoGravityError, ParameterError
+from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.tools.cli.extras import require_ros
 from exo_gravity.tools.inputs.executables import executable, node_names
-from exo_gravity.tools.inputs.parameter_file import Nodes, load, packaged_config
+from exo_gravity.tools.inputs.node_set import (
+    DESCENT_TIMEOUT,
+    ENDED_WELL,
+    RECOVERY,
+    RECOVERY_TIMEOUT,
+    STOP_TIMEOUT,
+    SUPERVISED,
+    Stages,
+    check_buses,
+    chosen,
+    is_observer,
+)
+from exo_gravity.tools.inputs.parameter_file import load, packaged_config
 
-DESCENT_TIMEOUT = 40.0  # s for a bridge to let its arm down, after which it is killed
-WATCHDOG_TIMEOUT = 30.0  # s for the watchdog of a dead bridge to let the arm down
-RECOVERY = {"EXO_GRAVITY_RECOVER": "1"}  # starts can_bridge for one purpose: to let down an arm that was left behind
-STOP_TIMEOUT = 5.0  # s for any other node to end
-OBSERVERS = ("/recorder", "/robot_model")  # nothing depends on them
 LOG_FORMAT = "{severity} {message}"
 
 OnLine = Callable[[str, str], None]  # (node, line of its log)
@@ -46,14 +55,17 @@ def print_line(node: str, line: str) -> None:
 
 
 class Launcher:
-    """The processes of one parameter file."""
+    """The processes of one parameter file.
 
-    def __init__(self, params: str | Path, on_line: OnLine = print_line) -> None:
-        """Read the parameter file; on_line is called with each line that a node prints. Raises ParameterError."""
+    on_line is called with each line that a node prints. only: shell patterns of the nodes to start; () starts all.
+    Raises ParameterError.
+    """
+
+    def __init__(self, params: str | Path, on_line: OnLine = print_line, only: Sequence[str] = ()) -> None:
         self._path = Path(params).resolve()
         nodes = load(self._path)
-        _check_buses(nodes)
-        self._commands = {node: self._command(node) for node in nodes}
+        check_buses(nodes)
+        self._commands = {node: self._command(node) for node in chosen(nodes, only)}
         self._processes: dict[str, subprocess.Popen[str]] = {}
         self._readers: dict[str, threading.Thread] = {}
         self._on_line = on_line
@@ -62,11 +74,11 @@ class Launcher:
     def start(self) -> None:
         """Start every node."""
         for node in self._commands:
-            self._processes[node], self._readers[node] = self._start(node, {"EXO_GRAVITY_SUPERVISED": "1"})
+            self._processes[node], self._readers[node] = self._start(node, SUPERVISED)
 
     def _start(self, node: str, variables: Mapping[str, str]) -> tuple[subprocess.Popen[str], threading.Thread]:
         """Start one node with more environment `variables`; return its process and the reader of its log."""
-        environment = {**os.environ, "PYTHONUNBUFFERED": "1", **variables}
+        environment = {**os.environ, **variables}
         environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         environment.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", LOG_FORMAT)
         process = subprocess.Popen(
@@ -88,13 +100,10 @@ class Launcher:
         return self._processes[node]
 
     def dead(self) -> tuple[str, int] | None:
-        """Return the name and exit code of a node that has ended, None while all run.
-
-        A recorder may end, because a full disk must not let the arm down, and so may what viewers need.
-        """
+        """Return the name and exit code of a node that has ended, None while all run. Observers do not count."""
         for node, process in self._processes.items():
             code = process.poll()
-            if code is not None and not node.endswith(OBSERVERS):
+            if code is not None and not is_observer(node):
                 return node, code
         return None
 
@@ -103,9 +112,7 @@ class Launcher:
 
         Sets `maybe_powered` to the bridges whose motors may still be on.
         """
-        bridges = [node for node in self._processes if node.endswith("/can_bridge")]
-        recorders = [node for node in self._processes if node.endswith("/recorder")]
-        others = [node for node in self._processes if node not in (*bridges, *recorders)]
+        bridges, others, recorders = Stages.of(self._processes)
         self._terminate(bridges, DESCENT_TIMEOUT)
         self.maybe_powered = [node for node in bridges if not self._is_off(node)]
         self._terminate(others, STOP_TIMEOUT)
@@ -131,17 +138,13 @@ class Launcher:
     def _is_off(self, node: str) -> bool:
         """Return whether the motors of a bridge that has ended are off; let its arm down if nothing else has.
 
-        The watchdog of a dead bridge keeps the output open until the arm is down. If it has died as well, the bridge's
-        executable lets the arm down.
+        The bridge's executable waits for the watchdog of the dead bridge, and lets the arm down if that has died too.
         """
         if _has_ended_well(self._processes[node]):
             return True
-        self._readers[node].join(WATCHDOG_TIMEOUT)
-        if self._readers[node].is_alive():
-            return False
         recovery, reader = self._start(node, RECOVERY)
         try:
-            return recovery.wait(DESCENT_TIMEOUT) == 0
+            return recovery.wait(RECOVERY_TIMEOUT) == 0
         except subprocess.TimeoutExpired:
             recovery.kill()
             return False
@@ -171,20 +174,8 @@ class Launcher:
 
 
 def _has_ended_well(process: subprocess.Popen[str]) -> bool:
-    """Return whether a node has ended by itself: stopped (0), or with wrong parameters or no bus (2)."""
-    return process.poll() in (0, 2)
-
-
-def _check_buses(nodes: Nodes) -> None:
-    """Raise ParameterError if two bridges would command motors on the same bus, which has one owner."""
-    owner: dict[tuple[tuple[str, str], ...], str] = {}
-    for node, parameters in nodes.items():
-        if not node.endswith("/can_bridge"):
-            continue
-        bus = tuple(sorted((k, str(v)) for k, v in parameters.items() if k.startswith("can.")))
-        other = owner.setdefault(bus, node)
-        if other != node:
-            raise ParameterError(f"{node} can", dict(bus), f"different from the bus of {other}: one arm per bus")
+    """Return whether a node has ended by itself."""
+    return process.poll() in ENDED_WELL
 
 
 class StopFlag:
@@ -227,6 +218,13 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
         f"executable can_bridge in the namespace /right, /imu starts imu. Executables: {', '.join(node_names())}.",
     )
     parser.add_argument("--params", metavar="FILE", help="ROS 2 parameter file (default: the packaged sim.yaml)")
+    parser.add_argument(
+        "--only",
+        metavar="PATTERN",
+        nargs="+",
+        default=(),
+        help="start only the nodes whose full names match a shell pattern: '*/can_bridge' /imu",
+    )
     return parser.parse_args(args)
 
 
@@ -236,7 +234,7 @@ def main(args: Sequence[str] | None = None) -> None:
     require_ros("launcher")
     stopping = stop_on_signals()
     try:
-        launcher = Launcher(options.params or packaged_config("sim.yaml"))
+        launcher = Launcher(options.params or packaged_config("sim.yaml"), only=options.only)
         dead = launcher.run(stopping)
     except ExoGravityError as error:
         print(f"launcher: {error}", file=sys.stderr)

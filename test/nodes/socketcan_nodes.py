@@ -67,6 +67,7 @@ def nodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Lau
     params.write_text(yaml.safe_dump(content))
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(launcher, "DESCENT_TIMEOUT", launcher.DESCENT_TIMEOUT * SLOWER)
+    monkeypatch.setattr(launcher, "RECOVERY_TIMEOUT", launcher.RECOVERY_TIMEOUT * SLOWER)
     log: list[str] = []
     nodes = Launcher(params, lambda node, line: log.append(f"{node}: {line}"))
     nodes.start()

@@ -79,3 +79,22 @@ def test_without_rclpy_one_line_says_how_to_get_it(capsys, monkeypatch):
     error = capsys.readouterr().err
     assert ended.value.code == 2 and error.startswith("launcher: the Python package rclpy is not found: ")
     assert "exo_gravity[ros]" in error and error.count("\n") == 1
+
+
+def test_only_a_part_of_the_nodes_is_started(monkeypatch):
+    started: list[Launcher] = []
+    monkeypatch.setattr(Launcher, "run", lambda launcher, stopping: started.append(launcher))
+    main(["--params", str(SIM), "--only", "*/can_bridge", "/imu"])
+    launcher = started[0]
+    monkeypatch.setattr(Launcher, "_start", lambda launcher, node, variables: (node, None))
+    launcher.start()
+    assert [launcher.process(node) for node in ("/imu", "/right/can_bridge")] == ["/imu", "/right/can_bridge"]
+    with pytest.raises(KeyError):
+        launcher.process("/right/compensator")
+
+
+def test_a_pattern_that_matches_no_node_is_refused_with_the_list_of_nodes(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["--params", str(SIM), "--only", "/imu", "*/bridge"])
+    error = capsys.readouterr().err
+    assert ended.value.code == 2 and "only = '*/bridge': must be a pattern that matches one of /imu" in error

@@ -1,0 +1,109 @@
+"""Two computers in network namespaces, joined by a wire with delay, jitter and loss.
+
+    robot eth0 -- veth -- [ forwarder ] -- veth -- eth0 desk
+
+No namespace has another interface, so that nothing leaves this machine. The kernel may lack netem: the forwarder is a
+process of its own (forwarder.py). Without root, a user namespace permits all of this.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+ADDRESSES = {"robot": "10.77.0.1", "desk": "10.77.0.2"}
+START_TIMEOUT = 20.0  # s
+# Ends with its standard input, and with it the namespace.
+HOLDER = ("sh", "-c", "echo ready; read _")
+
+
+@dataclass(frozen=True)
+class Wire:
+    """delay: ms one way. jitter: ms that are added at random, at most; packets keep their order. loss: share each way."""
+
+    delay: float = 0.0
+    jitter: float = 0.0
+    loss: float = 0.0
+
+
+class Network:
+    """The namespaces `robot` and `desk`, and the forwarder between them, within a `with` block."""
+
+    def __init__(self, wire: Wire) -> None:
+        self._wire = wire
+        self._processes: list[subprocess.Popen[str]] = []
+        self._namespaces: dict[str, int] = {}  # name -> PID of its holder
+
+    def __enter__(self) -> Network:
+        try:
+            self._make()
+        except BaseException:
+            self._end()
+            raise
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self._end()
+
+    def start(self, computer: str, command: Sequence[str], environment: Mapping[str, str]) -> subprocess.Popen[str]:
+        """Start `command` on a computer; the caller reads its output and ends it."""
+        return self._popen([*self._enter(computer), *command], {**os.environ, **environment})
+
+    def _make(self) -> None:
+        new_user = [] if os.getuid() == 0 else ["--user", "--map-root-user"]
+        self._hold("wire", ["unshare", *new_user, "--net"])
+        for name in ADDRESSES:
+            self._hold(name, [*self._enter("wire"), "unshare", "--net"])
+        for name, address in ADDRESSES.items():
+            holder = str(self._namespaces[name])
+            self._ip("wire", f"link add {name} type veth peer name eth0 netns {holder}")
+            self._ip("wire", f"link set {name} up")
+            for command in (
+                "link set lo up",
+                f"address add {address}/24 dev eth0",
+                "link set eth0 up",
+                "route add 224.0.0.0/4 dev eth0",  # for the CAN bus over UDP, whose frames never leave (hop limit 0)
+            ):
+                self._ip(name, command)
+        words = [f"{key}={value}" for key, value in asdict(self._wire).items()]
+        command = [sys.executable, "-m", "test.two_computers.forwarder", *ADDRESSES, *words]
+        self._wait_until_ready(self._popen([*self._enter("wire"), *command], {**os.environ, "PYTHONPATH": str(ROOT)}))
+
+    def _hold(self, name: str, unshare: Sequence[str]) -> None:
+        self._namespaces[name] = self._wait_until_ready(self._popen([*unshare, *HOLDER])).pid
+
+    def _enter(self, name: str) -> list[str]:
+        user = [] if os.getuid() == 0 else ["--user", "--preserve-credentials"]
+        return ["nsenter", "--target", str(self._namespaces[name]), *user, "--net"]
+
+    def _ip(self, name: str, arguments: str) -> None:
+        subprocess.run([*self._enter(name), "ip", *arguments.split()], check=True, timeout=START_TIMEOUT)
+
+    def _popen(self, command: Sequence[str], environment: Mapping[str, str] | None = None) -> subprocess.Popen[str]:
+        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        process = subprocess.Popen(command, env=environment, cwd=ROOT, start_new_session=True, **pipes)
+        self._processes.append(process)
+        return process
+
+    def _wait_until_ready(self, process: subprocess.Popen[str]) -> subprocess.Popen[str]:
+        assert process.stdout is not None
+        if process.stdout.readline() != "ready\n":
+            raise RuntimeError(f"{process.args}: ended with exit code {process.wait()}")
+        return process
+
+    def _end(self) -> None:
+        for process in reversed(self._processes):
+            if process.stdin is not None and not process.stdin.closed:
+                process.stdin.close()
+            try:
+                process.wait(START_TIMEOUT)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
