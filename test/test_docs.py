@@ -16,6 +16,7 @@ ROOT = Path(__file__).parents[1]
 TABLES = ROOT / "docs" / "tables.py"
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 NODES = ("can_bridge", "compensator", "imu", "simulator", "recorder", "calibrator")
+EXAMPLE = re.compile(r"```python\n(.*?)```\s*```text\n(.*?)```", re.DOTALL)
 FOLDERS = "bench|config|docs|examples|exo_gravity|launch|test|core|hardware|sim|bag|nodes|tools"
 
 
@@ -41,7 +42,7 @@ def test_the_tables_in_docs_equal_the_declarations() -> None:
 
 def test_every_table_has_its_place_in_a_document() -> None:
     places = {n for path in DOCUMENTS for n in re.findall(r"<!-- table: (\w+) -->", path.read_text(encoding="utf-8"))}
-    assert places == {*NODES, "any_arm", "faults"}
+    assert places == {*NODES, "any_arm", "faults", "topics"}
 
 
 @pytest.mark.parametrize(
@@ -80,11 +81,17 @@ def test_every_path_in_backticks_exists(path: Path) -> None:
         assert (ROOT / text).exists() or (ROOT / "exo_gravity" / text).exists(), text
 
 
-def test_the_readmes_library_example_prints_what_the_readme_shows() -> None:
-    example = re.search(r"```python\n(.*?)```\s*```text\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL)
-    assert example
-    code, shown = example.groups()
-    printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):
-        exec(code, {})
-    assert printed.getvalue() == shown
+@pytest.mark.parametrize("path", [path for path in DOCUMENTS if EXAMPLE.search(path.read_text("utf-8"))], ids=name)
+def test_the_programs_in_a_document_print_what_it_shows(path: Path) -> None:
+    names: dict[str, object] = {}
+    for code, shown in EXAMPLE.findall(path.read_text(encoding="utf-8")):
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            exec(code, names)
+        assert printed.getvalue() == shown
+
+
+def test_the_site_has_every_document() -> None:
+    toctrees = re.findall(r"```{toctree}\n(.*?)```", (ROOT / "docs" / "index.md").read_text("utf-8"), re.DOTALL)
+    listed = {line for tree in toctrees for line in tree.splitlines() if line and not line.startswith(":")}
+    assert {path.stem for path in (ROOT / "docs").glob("*.md")} - {"index"} <= listed
