@@ -1,4 +1,4 @@
-"""Writes the tables of docs/parameters.md and docs/safety.md from the declarations in the code.
+"""Writes the tables of docs/parameters.md, docs/safety.md and docs/topics.md from the declarations in the code.
 
 `python docs/tables.py` renews them. With `--check` it changes nothing, names each table that differs, and exits with 1.
 A table stands between the lines `<!-- table: NAME -->` and `<!-- end of table -->`. Needs the extra `sim`, not ROS.
@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import argparse
 import re
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 from exo_gravity.core.any_arm import any_arm_table
 from exo_gravity.core.calibration.params import CALIBRATOR
@@ -20,6 +22,9 @@ from exo_gravity.core.param_table import Param
 from exo_gravity.sim.device_params import SIMULATOR
 
 DOCS = Path(__file__).parent
+POLICY = DOCS.parent / "config" / "sros2" / "policy.xml"  # a test compares it with the running nodes
+README = DOCS.parent / "README.md"
+EVERY_NODES = {"/parameter_events", "/rosout"}
 COMMAND = "python docs/tables.py"
 PARAMETERS = {
     "can_bridge": CAN_BRIDGE,
@@ -50,6 +55,28 @@ def fault_table() -> str:
     return markdown(("fault", "meaning", "default limit"), rows)
 
 
+def topic_table() -> str:
+    """Return the Markdown table of the topics: the policy's publishers and subscribers, the README's types.
+
+    Raises KeyError for a topic that the README does not have.
+    """
+    types = dict(re.findall(r"^\| `([\w/]+)` \| ([^|]+?) \|", README.read_text(encoding="utf-8"), re.MULTILINE))
+    types["can_bridge/transition_event"] = "lifecycle_msgs/TransitionEvent"
+    nodes: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for profile in ElementTree.parse(POLICY).iter("profile"):
+        if profile.get("ns") == "/right" or profile.get("node") == "operator":
+            continue  # both arms have the same topics; the operator may read them all
+        for group in profile.iter("topics"):
+            way = "publish" if "publish" in group.attrib else "subscribe"
+            for topic in group:
+                nodes[re.sub("^/(left|right)/", "", str(topic.text)), way].add(f"`{profile.get('node')}`")
+    rows = [
+        (f"`{name}`", types[name], *(", ".join(sorted(nodes[name, way])) for way in ("publish", "subscribe")))
+        for name in sorted({topic for topic, _ in nodes} - EVERY_NODES, key=lambda name: name.lstrip("/"))
+    ]
+    return markdown(("topic", "type", "published by", "subscribed by"), rows)
+
+
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
@@ -58,7 +85,10 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def renewed(text: str) -> str:
     """Return a document's text with every table as the code declares it. Raises KeyError for an unknown table."""
-    tables = {name: parameter_table(params) for name, params in PARAMETERS.items()} | {"faults": fault_table()}
+    tables = {name: parameter_table(params) for name, params in PARAMETERS.items()} | {
+        "faults": fault_table(),
+        "topics": topic_table(),
+    }
     return TABLE.sub(lambda found: f"{found[1]}\n{tables[found[2]]}\n{found[3]}", text)
 
 
