@@ -3,6 +3,7 @@
 # make calibrate-study  20 random simulated devices, calibrated from motors to an arm that holds, offline, 20 minutes
 # make test         all tests
 # make lint         ruff, mypy, ament's flake8 and pep257, shellcheck
+# make docs         these documents as a site, in build/site; a warning is an error
 # make faults       the whole fault matrix on the simulated device, 20 minutes; a table and build/faults.json
 # make mutations    deliberate defects, each of which must turn a row of the fault matrix unsafe; 7 minutes
 # make bench        the laws, the loop and the tools against peers, 12 minutes on a quiet machine; QUICK=1: part of it
@@ -21,7 +22,7 @@ DEMO := imu sim report
 TEST := $(DEMO) validate test
 SETUP := VENV=$(VENV) .ci/setup
 
-.PHONY: demo calibrate-demo calibrate-study test lint faults mutations bench imu-report socketcan pythons constraints clean
+.PHONY: demo calibrate-demo calibrate-study test lint docs faults mutations bench imu-report socketcan pythons constraints clean
 
 demo:
 	@$(SETUP) $(DEMO)
@@ -44,6 +45,11 @@ test:
 lint:
 	@$(SETUP) $(TEST) dev
 	@VENV=$(VENV) .ci/lint
+
+docs:
+	@$(SETUP) docs
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --fresh-env --quiet --conf-dir docs . build/site
+	@echo build/site/index.html
 
 faults:
 	@$(SETUP) $(TEST)

@@ -16,6 +16,7 @@ extras = {
     "calibrate": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11"],
     "validate": ["imufusion>=1.3", "pin>=2.7", "roboticstoolbox-python>=1.1.1", "threadpoolctl>=3.0"],
     "urdf": ["pin>=2.7"],  # law: urdf
+    "docs": ["docutils>=0.21", "furo>=2024.8", "myst-parser>=4.0", "sphinx>=7.4"],
     "test": [
         "example-robot-data>=4.3",
         "hypothesis>=6.100",
