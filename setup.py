@@ -14,7 +14,13 @@ extras = {
     "sim": ["mujoco>=3.2"],
     "report": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11", "scipy>=1.11"],
     "calibrate": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11"],
-    "validate": ["imufusion>=1.3", "pin>=2.7", "roboticstoolbox-python>=1.1.1", "threadpoolctl>=3.0"],
+    "validate": [
+        "imufusion>=1.3",
+        "pin>=2.7",
+        "roboticstoolbox-python>=1.1.1",
+        "scikit-learn>=1.4",
+        "threadpoolctl>=3.0",
+    ],
     "urdf": ["pin>=2.7"],  # law: urdf
     "docs": ["docutils>=0.21", "furo>=2024.8", "myst-parser>=4.0", "sphinx>=7.4"],
     "test": [

@@ -10,11 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from exo_gravity.core.arm import JOINT_COUNT
-from exo_gravity.core.compensator import Compensator
+from exo_gravity.core.compensator import Answer, Compensator
 from exo_gravity.core.compensator_settings import Settings
 from exo_gravity.core.effort import Effort, effort_of
 from exo_gravity.core.joint_motor import JointMotor
@@ -31,6 +32,14 @@ STRENGTH = 60.0  # Nm on any joint, an adult's shoulder
 SETTLING = 3.0  # s at the start of a task that do not count: the torque ramps in, the wearer takes over the rest
 
 Pose = Sequence[float]
+
+
+class Controller(Protocol):
+    """A compensator, or what is used in its place."""
+
+    def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Answer:
+        """Return the torque for joint angles `theta` (4,) rad and `velocity` (4,) rad/s at `now` s."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -111,28 +120,48 @@ class EffortWearer(VirtualWearer):
 
 
 def measure(
-    device: SimulatedDevice, motors: Sequence[JointMotor], settings: Settings | None, task: Task | Sweep, rate: float
+    device: SimulatedDevice,
+    motors: Sequence[JointMotor],
+    controller: Settings | Controller | None,
+    task: Task | Sweep,
+    rate: float,
 ) -> Effort:
-    """Let the wearer perform `task` on `device`, under `settings` (None: motors without torque) at `rate` Hz."""
-    compensator = Compensator(settings) if settings else None
-    device.arm.reset(task.at(0.0)[0])
+    """Let the wearer perform `task` on `device`, under a compensator of these settings, another controller, or none.
+
+    rate: Hz of the control cycles.
+    """
     wearer = EffortWearer(task)
+    _, velocity = run(device, motors, controller, wearer, rate)
+    skip, per = round(SETTLING * rate), round(1.0 / (rate * STEP))
+    efforts = np.array(wearer.efforts)[::per][skip : len(velocity)]
+    joint = task.joint if isinstance(task, Sweep) else None
+    return effort_of(efforts, velocity[skip : skip + len(efforts)], rate, joint)
+
+
+def run(
+    device: SimulatedDevice,
+    motors: Sequence[JointMotor],
+    controller: Settings | Controller | None,
+    wearer: EffortWearer,
+    rate: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the true angles (n, 4) in rad and velocities (n, 4) in rad/s, one for each control cycle; as `measure`."""
+    compensator = Compensator(controller) if isinstance(controller, Settings) else controller
+    device.arm.reset(wearer.task.at(0.0)[0])
     device.start(wearer)
     for motor in motors:
         device.exchange(motor.can_id, motor.command(0.0, 0.0))
         device.exchange(motor.can_id, ENTER)
     torque: Sequence[float] = (0.0,) * JOINT_COUNT
-    speeds = []
-    for _ in range(round(task.duration * rate)):
+    angles, speeds = [], []
+    for _ in range(round(wearer.task.duration * rate)):
         position, velocity = _exchange(device, motors, torque)
         if compensator:
             torque = compensator.step(device.time, position, velocity).effort or (0.0,) * JOINT_COUNT
+        angles.append(device.arm.positions)
         speeds.append(device.arm.velocities)
         device.advance(1.0 / rate)
-    skip, per = round(SETTLING * rate), round(1.0 / (rate * STEP))
-    efforts = np.array(wearer.efforts)[::per][skip : len(speeds)]
-    joint = task.joint if isinstance(task, Sweep) else None
-    return effort_of(efforts, np.array(speeds)[skip : skip + len(efforts)], rate, joint)
+    return np.array(angles), np.array(speeds)
 
 
 def _exchange(

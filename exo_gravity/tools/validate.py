@@ -30,6 +30,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     option("--output", metavar="DIR", default="validation", help="folder for CSV and figures (default: validation)")
     option("--quick", action="store_true", help=f"{QUICK_COUNT:,} random positions instead of {COUNT:,}")
     option("--growth", action="store_true", help="also measure the ANFIS with 2 to 6 inputs (3 minutes)")
+    option("--baselines", action="store_true", help="also train and tabulate laws without a model (3 minutes)")
     return parser.parse_args(args)
 
 
@@ -45,6 +46,8 @@ def _run(options: argparse.Namespace) -> bool:
     written = validation.write(output)
     if options.growth:
         written.append(validation.measure_growth(output))
+    if options.baselines:
+        written += validation.measure_baselines(output)
     print()
     verdicts = list(validation.checks())
     for held, sentence in verdicts:
@@ -57,7 +60,7 @@ def main(args: Sequence[str] | None = None) -> None:
     """Entry point of the executable `validate`."""
     options = _arguments(args)
     try:
-        with extras("validate", "report,validate"):
+        with extras("validate", "report,sim,validate" if options.baselines else "report,validate"):
             held = _run(options)
     except (ExoGravityError, OSError) as error:
         print(f"validate: {error}", file=sys.stderr)

@@ -16,6 +16,7 @@ APT = {
     "matplotlib": "python3-matplotlib",
     "rich": "python3-rich",
     "scipy": "python3-scipy",
+    "sklearn": "python3-sklearn",
     "threadpoolctl": "python3-threadpoolctl",
 }
 

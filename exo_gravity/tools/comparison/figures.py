@@ -12,10 +12,11 @@ import numpy as np
 
 matplotlib.use("Agg")  # draws without a screen
 from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from exo_gravity.tools.comparison.laws import Row, rms
+from exo_gravity.tools.comparison.laws import Baseline, Row, rms
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 
 FLOOR, CEILING = 1e-7, 1.0  # Nm, ends of the colour scale
@@ -75,6 +76,42 @@ def tilt_figure(path: Path, rows: Sequence[Row]) -> None:
     figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(STYLES))
     figure.suptitle("Error against gravload over trunk tilt, random poses; the ANFIS was trained upright")
     _save(figure, path)
+
+
+def baseline_figure(path: Path, rows: Sequence[Baseline]) -> None:
+    """Draw each law's error inside and outside the training box, and each controller's cost for the wearer."""
+    figure, (axis, below) = plt.subplots(2, figsize=(10, 7.5), layout="constrained")
+    _burdens(below, [row for row in rows if not np.isnan(row.effort)])
+    rows = [row for row in rows if not np.isnan(row.inside_rmse)]
+    place = np.arange(len(rows))
+    for shift, part, colour in ((-0.2, "inside", "tab:blue"), (0.2, "outside", "tab:orange")):
+        error, largest = (np.array([getattr(row, f"{part}_{name}") for row in rows]) for name in ("rmse", "largest"))
+        bars = axis.bar(place + shift, error, 0.38, color=colour, label=f"RMSE {part} the training box")
+        axis.bar_label(bars, [f"{value:.1g}" for value in error], fontsize=8)
+        axis.plot(place + shift, largest, "v", color=colour, markeredgecolor="black", label=f"largest error {part}")
+    axis.set_yscale("log")
+    axis.set_xticks(place, [f"{row.law}\n{row.memory / 1e3:,.0f} kB, {1e6 * row.pose_time:,.0f} us" for row in rows])
+    axis.set_ylabel("error against gravload (Nm)")
+    axis.set_ylim(1e-17, 1e3)
+    axis.legend(fontsize=8, ncols=4, loc="upper center")
+    axis.grid(axis="y", alpha=0.3)
+    _save(figure, path)
+
+
+def _burdens(axis: Axes, rows: Sequence[Baseline]) -> None:
+    """Draw the wearer's effort and the sag after letting go."""
+    place = np.arange(len(rows))
+    for shift, values, colour, label in (
+        (-0.2, [row.effort for row in rows], "tab:green", "effort of a reach, RMS in Nm"),
+        (0.2, [np.degrees(row.sag) for row in rows], "tab:red", "largest sag after letting go, in degrees"),
+    ):
+        bars = axis.bar(place + shift, values, 0.38, color=colour, label=label)
+        axis.bar_label(bars, [f"{value:.3g}" if value > 0.01 else "0" for value in values], fontsize=8)
+    axis.set_yscale("log")
+    axis.set_ylim(0.01, 1e3)
+    axis.set_xticks(place, [row.law.replace(" ", "\n", 1) for row in rows])
+    axis.legend(fontsize=8, ncols=2, loc="upper center")
+    axis.grid(axis="y", alpha=0.3)
 
 
 def _save(figure: Figure, path: Path) -> None:

@@ -69,6 +69,26 @@ class Row:
         return self.rmse / self.rms_torque if self.rms_torque > 1e-12 else math.nan
 
 
+@dataclass(frozen=True)
+class Baseline:
+    """A law inside and outside the box where others were trained.
+
+    RMSE and largest error over all joints in Nm. memory: bytes. pose_time, training_time: s. effort: Nm of the wearer,
+    and sag: rad, as in `sim.baselines.Burden`. NaN where there is no such figure.
+    """
+
+    law: str
+    inside_rmse: float = math.nan
+    inside_largest: float = math.nan
+    outside_rmse: float = math.nan
+    outside_largest: float = math.nan
+    memory: float = math.nan
+    pose_time: float = math.nan
+    training_time: float = math.nan
+    effort: float = math.nan
+    sag: float = math.nan
+
+
 Torques = Callable[[Case], np.ndarray]
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from exo_gravity.core.anfis_law import AnfisLaw
 from exo_gravity.tools.anfis.training import Trained
 from exo_gravity.tools.comparison.growth import Growth
-from exo_gravity.tools.comparison.laws import Row
+from exo_gravity.tools.comparison.laws import Baseline, Row
 from exo_gravity.tools.inputs.paper import PAPER_ANALYTICAL, PAPER_ANFIS, PAPER_SECONDS
 
 
@@ -62,7 +62,21 @@ def growth_line(row: Growth | None = None) -> str:
     return "".join(f"{count:>11}" for count in counts) + f"{times}{row.training_rmse:>11.1e}{row.held_out_rmse:>11.1e}"
 
 
-def write_csv(path: Path, rows: Sequence[Row | Growth]) -> None:
+def baseline_line(row: Baseline | None = None) -> str:
+    """Return one line of the table of baselines; without a row, its heading."""
+    if row is None:
+        names = ("RMSE", "largest", "RMSE", "largest", "memory", "one pose", "training", "effort", "sag")
+        inside = f"{'':<22}{'inside, Nm':>22}{'outside, Nm':>22}"
+        return f"{inside}\n{'':<22}" + "".join(f"{name:>11}" for name in names)
+    errors = (row.inside_rmse, row.inside_largest, row.outside_rmse, row.outside_largest)
+    figures = [(error, ".1e", "") for error in errors]
+    figures += [(row.memory / 1e3, ".0f", " kB"), (row.pose_time * 1e6, ".0f", " us"), (row.training_time, ".1f", " s")]
+    figures += [(row.effort, ".2f", " Nm"), (math.degrees(row.sag), ".2f", " deg")]
+    cells = ("-" if math.isnan(value) else f"{value:{style}}{unit}" for value, style, unit in figures)
+    return f"{row.law:<22}" + "".join(f"{cell:>11}" for cell in cells)
+
+
+def write_csv(path: Path, rows: Sequence[Row | Growth | Baseline]) -> None:
     """Write dataclasses as CSV, one column per field (SI units: Nm, s; `limit` in degrees)."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=list(asdict(rows[0])))

@@ -16,9 +16,9 @@ from exo_gravity.core.gravity import gravity_torque, paper_static_torque
 from exo_gravity.tools.anfis.data import GRID, from_gravload
 from exo_gravity.tools.anfis.training import Trained, train_law
 from exo_gravity.tools.comparison import growth
-from exo_gravity.tools.comparison.figures import Error, tilt_figure, workspace_figure
+from exo_gravity.tools.comparison.figures import Error, baseline_figure, tilt_figure, workspace_figure
 from exo_gravity.tools.comparison.laws import TILTS, Row, cases, compare, laws
-from exo_gravity.tools.comparison.tables import growth_line, law_table, paper_table, write_csv
+from exo_gravity.tools.comparison.tables import baseline_line, growth_line, law_table, paper_table, write_csv
 from exo_gravity.tools.inputs.arms import ConfiguredArm, with_cog_at_link_ends
 from exo_gravity.tools.inputs.paper import PAPER_ANFIS
 from exo_gravity.tools.inputs.references import REFERENCES
@@ -129,3 +129,17 @@ class Validation:
             print(growth_line(rows[-1]), flush=True)
         write_csv(output / "growth.csv", rows)
         return "growth.csv"
+
+    def measure_baselines(self, output: Path) -> list[str]:
+        """Print and write what laws without a model are worth; return the names of the files."""
+        from exo_gravity.tools.comparison.baselines import SAMPLES, baselines
+
+        print(f"\nLaws without a model of the arm, from {SAMPLES:,} torques without noise; against gravload")
+        print(baseline_line())
+        rows = []
+        for row in baselines(self.as_configured.configured):
+            rows.append(row)
+            print(baseline_line(row), flush=True)
+        write_csv(output / "baselines.csv", rows)
+        baseline_figure(output / "baselines.png", rows)
+        return ["baselines.csv", "baselines.png"]

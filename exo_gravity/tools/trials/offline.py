@@ -21,12 +21,13 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.recording import Recording
 from exo_gravity.core.trial_script import TRUNK_ACTIONS, TrialScript
 from exo_gravity.core.wearer import Wearer
+from exo_gravity.sim.baselines import Burden, Law, burden
 from exo_gravity.sim.device_params import SIMULATOR, device_of, imu_of, set_faults
 from exo_gravity.sim.effort_study import IDENTIFIED, TASKS, WEARER_EXCESS, effort_settings, study
 from exo_gravity.sim.imu import SimulatedImu, measured_tilt
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial
 from exo_gravity.tools.inputs.arms import named, node_values, read_arm
-from exo_gravity.tools.inputs.parameter_file import Nodes, load
+from exo_gravity.tools.inputs.parameter_file import Nodes, load, packaged_config
 from exo_gravity.tools.trials.trunk_imu import TrunkImu
 
 
@@ -139,3 +140,10 @@ def effort_study(params: Path, body_mass: float) -> tuple[int, Iterator[tuple[st
     friction = ([IDENTIFIED * value for value in simulator[f"friction.{part}"]] for part in ("coulomb", "viscous"))
     settings = effort_settings(base, *friction)
     return len(settings) * len(TASKS), study(lambda: device_of(simulator), arm.motors, settings)
+
+
+def baseline_burden(law: Law | None, feedback: bool) -> Burden:
+    """Return what the feed-forward `law` costs the wearer on the packaged simulator, trunk upright; feedback: a PID."""
+    nodes = load(packaged_config("sim.yaml"))
+    simulator = {**node_values(nodes, "/right/simulator", SIMULATOR), "trunk.pitch": 0.0, "trunk.roll": 0.0}
+    return burden(lambda: device_of(simulator), read_arm(nodes, "/right").motors, law, feedback)

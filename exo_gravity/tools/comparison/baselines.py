@@ -1,0 +1,180 @@
+"""What others use in place of a model: error, memory, time a pose, seconds to train, and what it costs the wearer.
+
+The inputs are the four angles and the trunk's pitch and sideways tilt. Each baseline gets exact torques, without the
+friction and noise of real ones, from a training box: `SHARE` of each joint's range, and tilts up to `TILT`. It is
+judged inside that box and outside, up to the joints' limits and `FAR_TILT`.
+
+The cube map is CyberForce's: torques at the vertices of a grid, interpolated. Outside the box the nearest edge counts.
+"""
+
+from __future__ import annotations
+
+import math
+import pickle
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import RegularGridInterpolator
+from sklearn.ensemble import HistGradientBoostingRegressor
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+from sklearn.multioutput import MultiOutputRegressor
+from sklearn.neural_network import MLPRegressor
+from threadpoolctl import threadpool_limits
+
+from exo_gravity.core.gravity import LAWS, gravity_torque
+from exo_gravity.core.tilt import Tilt
+from exo_gravity.tools.comparison.laws import Baseline, rms
+from exo_gravity.tools.inputs.arms import ConfiguredArm
+from exo_gravity.tools.inputs.references import gravload
+from exo_gravity.tools.trials.offline import baseline_burden
+
+SHARE = 0.7  # of each joint's range, in its middle
+TILT, FAR_TILT = math.radians(10.0), math.radians(30.0)
+SAMPLES = 3_000  # for training
+GAUSSIAN_SAMPLES = 800  # of those: its cost grows with the cube
+VERTICES = 5  # per input: 15,625 in all
+HELD_OUT = 2_000  # positions, inside and outside each
+TIMED = 200  # poses, one at a time
+INPUTS = 6
+SLOWEST = 0.002  # s a pose, half a control cycle: a slower law cannot carry an arm
+
+Model = Callable[[np.ndarray], np.ndarray]  # inputs (n, 6) in -1..1 over the training box -> (n, 4) Nm
+
+
+class Task:
+    """The torques of `configured`, by inputs scaled to -1..1 over the training box.
+
+    held_out: inputs (n, 6) inside and outside the box, each with the torques (n, 4) by the Robotics Toolbox.
+    """
+
+    def __init__(self, configured: ConfiguredArm) -> None:
+        self._configured = configured
+        half = (configured.high - configured.low) / 2.0
+        self.middle = np.append((configured.low + configured.high) / 2.0, (0.0, 0.0))
+        self.half = np.append(SHARE * half, (TILT, TILT))
+        self._edge = np.append(half, (FAR_TILT, FAR_TILT)) / self.half  # the whole workspace
+        reference = gravload(configured.robot)
+        chosen = self.inside(HELD_OUT, 1), self.outside(HELD_OUT, 2)
+        self.held_out = [(inputs, reference(*self.poses(inputs))) for inputs in chosen]
+
+    def poses(self, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the angles (n, 4) in rad and gravity's direction (n, 3)."""
+        state = self.middle + inputs * self.half
+        tilts = (Tilt.of(self._configured.side, pitch, roll) for pitch, roll in state[:, 4:].tolist())
+        return state[:, :4], np.array([tilt.direction for tilt in tilts])
+
+    def torque(self, inputs: np.ndarray) -> np.ndarray:
+        """Return the torques (n, 4) in Nm by the exact law."""
+        return gravity_torque(self._configured.robot, *self.poses(inputs))
+
+    def law(self, model: Model) -> Callable[[Sequence[float]], list[float]]:
+        """Return the model as a law of the angles (4,) in rad, trunk upright."""
+
+        def torque(theta: Sequence[float]) -> list[float]:
+            inputs = (np.append(theta, (0.0, 0.0)) - self.middle) / self.half
+            found: list[float] = model(inputs[None])[0].tolist()
+            return found
+
+        return torque
+
+    def in_the_loop(self, inputs: np.ndarray) -> np.ndarray:
+        """Return the torque (1, 4) of one pose, computed as the compensator does."""
+        *theta, pitch, roll = (self.middle + inputs[0] * self.half).tolist()
+        tilt = Tilt.of(self._configured.side, pitch, roll)
+        return np.array([LAWS["exact"].torque(self._configured.robot, theta, tilt)])
+
+    def inside(self, count: int, seed: int) -> np.ndarray:
+        """Return `count` random inputs (n, 6) within the training box."""
+        return np.random.default_rng(seed).uniform(-1.0, 1.0, (count, INPUTS))
+
+    def outside(self, count: int, seed: int) -> np.ndarray:
+        """Return up to `count` random inputs (n, 6) of the workspace, of which at least one is beyond the box."""
+        drawn = np.random.default_rng(seed).uniform(-self._edge, self._edge, (count, INPUTS))
+        return drawn[np.abs(drawn).max(axis=1) > 1.0]
+
+
+def baselines(configured: ConfiguredArm) -> Iterator[Baseline]:
+    """Train each baseline, let it carry the simulated arm, and yield its figures; those without a law first."""
+    task = Task(configured)
+    inputs = task.inside(SAMPLES, 0)
+    torque = task.torque(inputs)
+    few = slice(GAUSSIAN_SAMPLES)
+    yield Baseline("motors without torque", **baseline_burden(None, False)._asdict())
+    yield Baseline("joint PID", **baseline_burden(None, True)._asdict())
+    exact = _judged("exact law", task, lambda: (task.torque, configured.robot))
+    yield replace(exact, pose_time=_pose_time(task.in_the_loop, inputs[:TIMED]))
+    yield Baseline("exact law and PID", **baseline_burden(task.law(task.torque), True)._asdict())
+    yield _judged("cube map", task, lambda: _cube_map(task))
+    with threadpool_limits(1):
+        yield _judged("neural network", task, lambda: _fitted(_network(), inputs, torque))
+        yield _judged("Gaussian process", task, lambda: _fitted(_gaussian_process(), inputs[few], torque[few]))
+        yield _judged("gradient boosting", task, lambda: _fitted(_boosting(), inputs, torque))
+
+
+def _judged(law: str, task: Task, train: Callable[[], tuple[Model, Any]]) -> Baseline:
+    """Return the figures of the model that `train` returns, with what must be kept of it."""
+    started = time.perf_counter()
+    model, kept = train()
+    seconds = time.perf_counter() - started
+    pose_time = _pose_time(model, task.inside(TIMED, 3))
+    in_use = baseline_burden(task.law(model), False)._asdict() if pose_time < SLOWEST else {}
+    inside, outside = (model(inputs) - expected for inputs, expected in task.held_out)
+    return Baseline(
+        law,
+        inside_rmse=float(rms(inside.ravel())),
+        inside_largest=float(np.abs(inside).max()),
+        outside_rmse=float(rms(outside.ravel())),
+        outside_largest=float(np.abs(outside).max()),
+        memory=len(pickle.dumps(kept)),
+        pose_time=pose_time,
+        training_time=seconds,
+        **in_use,
+    )
+
+
+def _pose_time(model: Model, inputs: np.ndarray) -> float:
+    """Return the median time in s of one pose."""
+    times = []
+    for pose in inputs:
+        started = time.perf_counter()
+        model(pose[None])
+        times.append(time.perf_counter() - started)
+    return float(np.median(times))
+
+
+def _cube_map(task: Task) -> tuple[Model, Any]:
+    axis = np.linspace(-1.0, 1.0, VERTICES)
+    torque = task.torque(np.array(list(product(axis, repeat=INPUTS))))
+    table = RegularGridInterpolator((axis,) * INPUTS, torque.reshape(*(VERTICES,) * INPUTS, 4))
+    return lambda inputs: table(np.clip(inputs, -1.0, 1.0)), torque
+
+
+def _fitted(regressor: Any, inputs: np.ndarray, torque: np.ndarray) -> tuple[Model, Any]:
+    """Return a regressor of scikit-learn, trained on torques in units of their RMS."""
+    scale = rms(torque)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # the iterations are limited, as for any user
+        regressor.fit(inputs, torque / scale)
+    return lambda given: scale * regressor.predict(given), regressor
+
+
+def _network() -> Any:
+    return MLPRegressor(
+        hidden_layer_sizes=(64, 64), activation="tanh", solver="lbfgs", alpha=1e-6, max_iter=1500, random_state=0
+    )
+
+
+def _gaussian_process() -> Any:
+    kernel = ConstantKernel(10.0, (1e-2, 1e5)) * RBF(np.full(INPUTS, 2.0), (0.1, 1e3)) + WhiteKernel(1e-6, (1e-10, 1.0))
+    return GaussianProcessRegressor(kernel, random_state=0)
+
+
+def _boosting() -> Any:
+    return MultiOutputRegressor(HistGradientBoostingRegressor(max_iter=500, learning_rate=0.1, random_state=0))
