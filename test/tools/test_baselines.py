@@ -23,17 +23,18 @@ def study(tmp_path_factory):
             patch.setattr(baselines, name, value)
         few = partial(baselines.MLPRegressor, max_iter=50)
         patch.setattr(baselines, "_network", lambda: few(hidden_layer_sizes=(16,), solver="lbfgs", random_state=0))
-        burden = Burden(1.0, 0.1)
-        patch.setattr(baselines, "baseline_burden", lambda law, feedback: asked.append((law, feedback)) or burden)
+        burden = Burden(1.0, 0.1, 0.2)
+        patch.setattr(baselines, "baseline_burden", lambda *given: asked.append(given) or burden)
         measure = baselines.baselines
         patch.setattr(baselines, "baselines", lambda arm: rows.extend(measure(arm)) or rows)
         patch.setattr("builtins.print", lambda *parts, **_: lines.append(" ".join(map(str, parts))))
         part = type("Part", (), {"configured": configured_arm()})
         written = Validation(part, part).measure_baselines(folder)
     assert written == ["baselines.csv", "baselines.png"]
-    poses = [law((0.1, 0.5, 0.6, 0.7)) for law, _ in asked if law]
-    assert all(np.allclose(torque, poses[0], atol=0.5) for torque in poses)  # a law gets angles in rad
-    assert [feedback for law, feedback in asked][:4] == [False, True, False, True]
+    for pitch in (0.0, 0.1):  # a law gets angles in rad
+        poses = [law((0.1, 0.5, 0.6, 0.7), pitch) for law, *_ in asked if law]
+        assert all(np.allclose(torque, poses[0], atol=0.5) for torque in poses)
+    assert [feedback for _, feedback, _ in asked][:4] == [False, True, False, True]
     return {row.law: row for row in rows}, "\n".join(lines), folder
 
 

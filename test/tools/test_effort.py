@@ -12,7 +12,7 @@ from exo_gravity.core.effort import Effort
 from exo_gravity.sim.effort_study import TASKS
 from exo_gravity.tools import trial
 from exo_gravity.tools.inputs.parameter_file import packaged_config
-from exo_gravity.tools.trials import effort, offline
+from exo_gravity.tools.trials import effort, simulated_effort
 
 SETTINGS = ("nothing", "One-G", "Zero-G 100 %")
 
@@ -26,7 +26,7 @@ def rows():
 
 @pytest.fixture
 def results(monkeypatch):
-    monkeypatch.setattr(offline, "effort_study", lambda params, body_mass: (len(SETTINGS) * len(TASKS), rows()))
+    monkeypatch.setattr(simulated_effort, "effort_study", lambda params, body_mass: (len(SETTINGS) * len(TASKS), rows()))
 
 
 def test_it_prints_what_each_setting_saves_and_writes_a_table_and_a_figure(results, tmp_path):
@@ -43,7 +43,7 @@ def test_it_prints_what_each_setting_saves_and_writes_a_table_and_a_figure(resul
 
 
 def test_the_study_of_the_packaged_file_has_every_setting_and_a_wearer():
-    count, study = offline.effort_study(packaged_config("sim.yaml"), 75.0)
+    count, study = simulated_effort.effort_study(packaged_config("sim.yaml"), 75.0)
     assert count == 14 * len(TASKS)
     setting, task, first = next(study)
     assert (setting, task) == ("nothing", "poses")

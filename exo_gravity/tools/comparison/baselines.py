@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
-from sklearn.ensemble import HistGradientBoostingRegressor
+from sklearn.ensemble import GradientBoostingRegressor
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
@@ -33,7 +33,7 @@ from exo_gravity.core.tilt import Tilt
 from exo_gravity.tools.comparison.laws import Baseline, rms
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.inputs.references import gravload
-from exo_gravity.tools.trials.offline import baseline_burden
+from exo_gravity.tools.trials.simulated_effort import baseline_burden
 
 SHARE = 0.7  # of each joint's range, in its middle
 TILT, FAR_TILT = math.radians(10.0), math.radians(30.0)
@@ -43,8 +43,8 @@ VERTICES = 5  # per input: 15,625 in all
 HELD_OUT = 2_000  # positions, inside and outside each
 TIMED = 200  # poses, one at a time
 INPUTS = 6
-SLOWEST = 0.002  # s a pose, half a control cycle: a slower law cannot carry an arm
 
+Law = Callable[[Sequence[float], float], Sequence[float]]  # angles (4,) in rad, the trunk's pitch in rad -> Nm (4,)
 Model = Callable[[np.ndarray], np.ndarray]  # inputs (n, 6) in -1..1 over the training box -> (n, 4) Nm
 
 
@@ -74,11 +74,11 @@ class Task:
         """Return the torques (n, 4) in Nm by the exact law."""
         return gravity_torque(self._configured.robot, *self.poses(inputs))
 
-    def law(self, model: Model) -> Callable[[Sequence[float]], list[float]]:
-        """Return the model as a law of the angles (4,) in rad, trunk upright."""
+    def law(self, model: Model) -> Law:
+        """Return the model as a law of the angles (4,) and the trunk's pitch, in rad."""
 
-        def torque(theta: Sequence[float]) -> list[float]:
-            inputs = (np.append(theta, (0.0, 0.0)) - self.middle) / self.half
+        def torque(theta: Sequence[float], pitch: float) -> list[float]:
+            inputs = (np.append(theta, (pitch, 0.0)) - self.middle) / self.half
             found: list[float] = model(inputs[None])[0].tolist()
             return found
 
@@ -106,16 +106,22 @@ def baselines(configured: ConfiguredArm) -> Iterator[Baseline]:
     inputs = task.inside(SAMPLES, 0)
     torque = task.torque(inputs)
     few = slice(GAUSSIAN_SAMPLES)
-    yield Baseline("motors without torque", **baseline_burden(None, False)._asdict())
-    yield Baseline("joint PID", **baseline_burden(None, True)._asdict())
-    exact = _judged("exact law", task, lambda: (task.torque, configured.robot))
-    yield replace(exact, pose_time=_pose_time(task.in_the_loop, inputs[:TIMED]))
-    yield Baseline("exact law and PID", **baseline_burden(task.law(task.torque), True)._asdict())
+    exact = task.law(task.torque)
+    yield _in_use("motors without torque", None, feedback=False)
+    yield _in_use("joint PID", None, feedback=True)
+    judged = _judged("exact law", task, lambda: (task.torque, configured.robot))
+    yield replace(judged, pose_time=_pose_time(task.in_the_loop, inputs[:TIMED]))
+    yield _in_use("exact law and PID", exact, feedback=True)
     yield _judged("cube map", task, lambda: _cube_map(task))
     with threadpool_limits(1):
         yield _judged("neural network", task, lambda: _fitted(_network(), inputs, torque))
         yield _judged("Gaussian process", task, lambda: _fitted(_gaussian_process(), inputs[few], torque[few]))
         yield _judged("gradient boosting", task, lambda: _fitted(_boosting(), inputs, torque))
+
+
+def _in_use(name: str, law: Law | None, feedback: bool) -> Baseline:
+    """Return the figures of a controller that has no errors of its own."""
+    return Baseline(name, **baseline_burden(law, feedback, 0.0)._asdict())
 
 
 def _judged(law: str, task: Task, train: Callable[[], tuple[Model, Any]]) -> Baseline:
@@ -124,7 +130,7 @@ def _judged(law: str, task: Task, train: Callable[[], tuple[Model, Any]]) -> Bas
     model, kept = train()
     seconds = time.perf_counter() - started
     pose_time = _pose_time(model, task.inside(TIMED, 3))
-    in_use = baseline_burden(task.law(model), False)._asdict() if pose_time < SLOWEST else {}
+    in_use = baseline_burden(task.law(model), False, pose_time)._asdict()
     inside, outside = (model(inputs) - expected for inputs, expected in task.held_out)
     return Baseline(
         law,
@@ -177,4 +183,5 @@ def _gaussian_process() -> Any:
 
 
 def _boosting() -> Any:
-    return MultiOutputRegressor(HistGradientBoostingRegressor(max_iter=500, learning_rate=0.1, random_state=0))
+    one_joint = GradientBoostingRegressor(n_estimators=300, max_depth=5, subsample=0.5, random_state=0)
+    return MultiOutputRegressor(one_joint)

@@ -102,15 +102,17 @@ def _burdens(axis: Axes, rows: Sequence[Baseline]) -> None:
     """Draw the wearer's effort and the sag after letting go."""
     place = np.arange(len(rows))
     for shift, values, colour, label in (
-        (-0.2, [row.effort for row in rows], "tab:green", "effort of a reach, RMS in Nm"),
-        (0.2, [np.degrees(row.sag) for row in rows], "tab:red", "largest sag after letting go, in degrees"),
+        (-0.27, [row.effort for row in rows], "tab:green", "effort of a reach, RMS in Nm"),
+        (0.0, [np.degrees(row.sag) for row in rows], "tab:red", "largest sag after letting go, in degrees"),
+        (0.27, [np.degrees(row.sag_bowed) for row in rows], "tab:purple", "the same, trunk bowed by 30 degrees"),
     ):
-        bars = axis.bar(place + shift, values, 0.38, color=colour, label=label)
-        axis.bar_label(bars, [f"{value:.3g}" if value > 0.01 else "0" for value in values], fontsize=8)
+        bars = axis.bar(place + shift, values, 0.26, color=colour, label=label)
+        axis.bar_label(bars, [f"{value:.2g}" if value > 0.01 else "0" for value in values], fontsize=8)
     axis.set_yscale("log")
-    axis.set_ylim(0.01, 1e3)
+    axis.set_ylim(0.01, 3e3)
+    axis.set_ylabel("in the simulator")
     axis.set_xticks(place, [row.law.replace(" ", "\n", 1) for row in rows])
-    axis.legend(fontsize=8, ncols=2, loc="upper center")
+    axis.legend(fontsize=8, ncols=3, loc="upper center")
     axis.grid(axis="y", alpha=0.3)
 
 

@@ -73,8 +73,8 @@ class Row:
 class Baseline:
     """A law inside and outside the box where others were trained.
 
-    RMSE and largest error over all joints in Nm. memory: bytes. pose_time, training_time: s. effort: Nm of the wearer,
-    and sag: rad, as in `sim.baselines.Burden`. NaN where there is no such figure.
+    RMSE and largest error over all joints in Nm. memory: bytes. pose_time, training_time: s. effort in Nm, sag and
+    sag_bowed in rad: as in `sim.baselines.Burden`. NaN where there is no such figure.
     """
 
     law: str
@@ -87,6 +87,7 @@ class Baseline:
     training_time: float = math.nan
     effort: float = math.nan
     sag: float = math.nan
+    sag_bowed: float = math.nan
 
 
 Torques = Callable[[Case], np.ndarray]

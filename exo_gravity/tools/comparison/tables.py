@@ -65,13 +65,14 @@ def growth_line(row: Growth | None = None) -> str:
 def baseline_line(row: Baseline | None = None) -> str:
     """Return one line of the table of baselines; without a row, its heading."""
     if row is None:
-        names = ("RMSE", "largest", "RMSE", "largest", "memory", "one pose", "training", "effort", "sag")
+        names = ("RMSE", "largest", "RMSE", "largest", "memory", "one pose", "training", "effort", "sag", "sag bowed")
         inside = f"{'':<22}{'inside, Nm':>22}{'outside, Nm':>22}"
         return f"{inside}\n{'':<22}" + "".join(f"{name:>11}" for name in names)
     errors = (row.inside_rmse, row.inside_largest, row.outside_rmse, row.outside_largest)
     figures = [(error, ".1e", "") for error in errors]
     figures += [(row.memory / 1e3, ".0f", " kB"), (row.pose_time * 1e6, ".0f", " us"), (row.training_time, ".1f", " s")]
-    figures += [(row.effort, ".2f", " Nm"), (math.degrees(row.sag), ".2f", " deg")]
+    figures += [(row.effort, ".2f", " Nm")]
+    figures += [(math.degrees(sag), ".2f", " deg") for sag in (row.sag, row.sag_bowed)]
     cells = ("-" if math.isnan(value) else f"{value:{style}}{unit}" for value, style, unit in figures)
     return f"{row.law:<22}" + "".join(f"{cell:>11}" for cell in cells)
 

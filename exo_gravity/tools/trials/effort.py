@@ -36,7 +36,7 @@ def run(params: Path, output: Path, offline: bool, console: Console) -> int:
     if not offline:
         raise ParameterError("trial", NAME, "used with --offline: the effort of a person cannot be measured yet")
     with extras("trial", "sim"):
-        from exo_gravity.tools.trials.offline import effort_study
+        from exo_gravity.tools.trials.simulated_effort import effort_study
     count, results = effort_study(params, BODY_MASS)
     quiet = not console.is_terminal
     rows: Rows = {}

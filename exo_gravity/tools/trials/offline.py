@@ -1,13 +1,13 @@
 """trial --offline: the simulated arms of a parameter file perform a script without ROS, faster than real time.
 
-It and `trunk_imu` are the only tools that import `sim`: without ROS they cannot start the simulator as a node.
+It, `simulated_effort` and `trunk_imu` are the only tools that import `sim`: without ROS they cannot start the simulator
+as a node.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +16,14 @@ from rich.console import Console
 from rich.progress import Progress
 
 from exo_gravity.bag.content import Bag, Event
-from exo_gravity.core.effort import Effort
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.recording import Recording
 from exo_gravity.core.trial_script import TRUNK_ACTIONS, TrialScript
-from exo_gravity.core.wearer import Wearer
-from exo_gravity.sim.baselines import Burden, Law, burden
 from exo_gravity.sim.device_params import SIMULATOR, device_of, imu_of, set_faults
-from exo_gravity.sim.effort_study import IDENTIFIED, TASKS, WEARER_EXCESS, effort_settings, study
 from exo_gravity.sim.imu import SimulatedImu, measured_tilt
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial
 from exo_gravity.tools.inputs.arms import named, node_values, read_arm
-from exo_gravity.tools.inputs.parameter_file import Nodes, load, packaged_config
+from exo_gravity.tools.inputs.parameter_file import Nodes, load
 from exo_gravity.tools.trials.trunk_imu import TrunkImu
 
 
@@ -116,34 +112,3 @@ def _imu(nodes: Nodes, namespaces: list[str]) -> tuple[dict[str, Any], Sequence[
         if simulator["imu.topic"] and "/imu" in nodes:
             return simulator, nodes["/imu"].get("rotation_trunk_from_imu", [])
     return None
-
-
-def effort_study(params: Path, body_mass: float) -> tuple[int, Iterator[tuple[str, str, Effort]]]:
-    """Return the number of rows of the effort study on the first simulated arm of a parameter file, and its rows.
-
-    body_mass: kg of the wearer if the file configures none. Raises ParameterError.
-    """
-    nodes = load(params)
-    namespace = next((node.removesuffix("/simulator") for node in nodes if node.endswith("/simulator")), None)
-    if namespace is None:
-        raise ParameterError("params", str(params), "a file with a simulator: the effort is simulated")
-    arm = read_arm(nodes, namespace)
-    simulator = dict(node_values(nodes, f"{namespace}/simulator", SIMULATOR))
-    base = arm.settings()
-    if not any(base.wearer_mass):
-        worn = Wearer(body_mass).on_links(base.robot.length)
-        base = replace(base, wearer_mass=worn.mass.tolist(), wearer_cog=worn.cog.tolist())
-    base = replace(base, use_imu=False, max_effort=[motor.peak_effort for motor in arm.motors])
-    simulator["wearer.mass"] = [WEARER_EXCESS * mass for mass in base.wearer_mass]
-    simulator["wearer.cog"] = list(base.wearer_cog)
-    simulator["trunk.pitch"] = simulator["trunk.roll"] = 0.0
-    friction = ([IDENTIFIED * value for value in simulator[f"friction.{part}"]] for part in ("coulomb", "viscous"))
-    settings = effort_settings(base, *friction)
-    return len(settings) * len(TASKS), study(lambda: device_of(simulator), arm.motors, settings)
-
-
-def baseline_burden(law: Law | None, feedback: bool) -> Burden:
-    """Return what the feed-forward `law` costs the wearer on the packaged simulator, trunk upright; feedback: a PID."""
-    nodes = load(packaged_config("sim.yaml"))
-    simulator = {**node_values(nodes, "/right/simulator", SIMULATOR), "trunk.pitch": 0.0, "trunk.roll": 0.0}
-    return burden(lambda: device_of(simulator), read_arm(nodes, "/right").motors, law, feedback)
