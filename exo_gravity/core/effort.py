@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ class Effort(NamedTuple):
 
     rms, peak: (4,) Nm. work: J that the wearer put in, per s. jerk: RMS of the motion over all joints, rad/s^3. felt:
     reflected inertia in kg m^2, Coulomb friction in Nm and viscous friction in Nm s/rad of a sweep's joint, else None.
+    held: RMS of the torque over all joints in Nm while the arm is held still, NaN for a task without holds.
     """
 
     rms: np.ndarray
@@ -22,6 +24,7 @@ class Effort(NamedTuple):
     work: float
     jerk: float
     felt: tuple[float, float, float] | None
+    held: float = math.nan
 
     @property
     def total(self) -> float:
@@ -29,10 +32,17 @@ class Effort(NamedTuple):
         return float(np.linalg.norm(self.rms))
 
 
-def effort_of(torque: np.ndarray, speed: np.ndarray, rate: float, swept: int | None = None) -> Effort:
+def effort_of(
+    torque: np.ndarray,
+    speed: np.ndarray,
+    rate: float,
+    swept: int | None = None,
+    holding: np.ndarray | None = None,
+) -> Effort:
     """Return the effort of a wearer who gave `torque` (n, 4) in Nm at the joints' `speed` (n, 4) in rad/s.
 
-    rate: samples per s. swept: the joint that made a sweep, None for another task.
+    rate: samples per s. swept: the joint that made a sweep, None for another task. holding: (n,) whether the arm is held
+    still, None for a task without holds.
     """
     smooth = _smoothed(speed, rate)
     acceleration = np.gradient(smooth, 1.0 / rate, axis=0)
@@ -43,6 +53,7 @@ def effort_of(torque: np.ndarray, speed: np.ndarray, rate: float, swept: int | N
         float(np.maximum((torque * speed).sum(axis=1), 0.0).mean()),
         float(np.sqrt(np.mean((jerk**2).sum(axis=1)))),
         None if swept is None else _felt(_smoothed(torque, rate), smooth, acceleration, swept),
+        math.nan if holding is None else float(np.sqrt(np.mean((torque[holding] ** 2).sum(axis=1)))),
     )
 
 

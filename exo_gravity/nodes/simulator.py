@@ -27,9 +27,10 @@ from exo_gravity.hardware.motor_bus import open_bus
 from exo_gravity.nodes.declare import bus_of, declare, values_after
 from exo_gravity.nodes.diagnostics import OK, WARN, Diagnostics
 from exo_gravity.nodes.run import run
-from exo_gravity.sim import SimulatedImu, VirtualWearer
+from exo_gravity.sim import SimulatedImu
 from exo_gravity.sim.device import MAX_CATCH_UP
 from exo_gravity.sim.device_params import SIMULATOR, device_of, imu_of, set_faults
+from exo_gravity.sim.effort_script import ScriptedWearer
 from exo_gravity.sim.trunk_motion import TrunkState
 
 TRUNK_SPEED = 0.5  # rad/s at which the trunk moves to a new tilt
@@ -38,9 +39,11 @@ TRUNK_SPEED = 0.5  # rad/s at which the trunk moves to a new tilt
 def script_of(path: str) -> TrialScript:
     """Return the script in a YAML file. Raises ParameterError."""
     try:
-        return TrialScript.parse(yaml.safe_load(Path(path).read_text(encoding="utf-8")))
+        script = TrialScript.parse(yaml.safe_load(Path(path).read_text(encoding="utf-8")))
     except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
         raise ParameterError("trial", path, f"a readable script file ({error})") from None
+    ScriptedWearer(script)  # checks the names of its tasks
+    return script
 
 
 class Simulator(Node):
@@ -58,7 +61,7 @@ class Simulator(Node):
         self._script = script_of(values["trial"]) if values["trial"] else None
         self._delay = values["trial_delay"]
         self._trunk_target = (values["trunk.pitch"], values["trunk.roll"])
-        self._wearer: VirtualWearer | None = None
+        self._wearer: ScriptedWearer | None = None
         self._new_scripts: deque[TrialScript] = deque()  # set by a parameter, started by the device's thread
         self._published_step: int | None = None
         self._diagnostics = Diagnostics(self)
@@ -150,7 +153,7 @@ class Simulator(Node):
 
     def _start_wearer(self, script: TrialScript, delay: float) -> None:
         self._script, self._published_step = script, None
-        self._wearer = VirtualWearer(script)
+        self._wearer = ScriptedWearer(script)
         self._device.start(self._wearer, delay)
 
     def _report(self) -> None:

@@ -19,6 +19,7 @@ import can
 
 from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.gravity import NO_TORQUE, Torque
 from exo_gravity.core.trial_script import TrialScript
 from exo_gravity.core.wire_formats.wire_format import Frame
 from exo_gravity.sim.arm import STEP, SimulatedArm
@@ -206,11 +207,14 @@ class SimulatedDevice:
             for motor in self.motors:
                 motor.unplugged = False
         torque = list(map(SimulatedMotor.torque, self.motors, theta, velocity))
-        if self.truth:
-            self.truth.note(self.time, theta, velocity, torque, self.motors, self._frames)
+        given: Torque = NO_TORQUE
+        step = -1
         if self._trial is not None:
             wearer, start = self._trial
-            torque = list(map(operator.add, torque, wearer.torque(self.time - start, theta, velocity)))
+            given = wearer.torque(self.time - start, theta, velocity)
+            step = -1 if wearer.step is None else wearer.step
             self._follow_trunk(wearer.script, self.time - start)
-        self.arm.step(torque, count)
+        if self.truth:
+            self.truth.note(self.time, theta, velocity, torque, self.motors, self._frames, (given, step))
+        self.arm.step(list(map(operator.add, torque, given)), count)
         self._steps += count

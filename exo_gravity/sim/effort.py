@@ -63,6 +63,10 @@ class Task:
         path = minimum_jerk(self.poses[n - 1] if n else self.poses[0], self.poses[n], since, self.move)
         return [position for position, _ in path], [speed for _, speed in path]
 
+    def holding(self, elapsed: np.ndarray) -> np.ndarray:
+        """Return for each time (n,) in s since the start whether a pose is held."""
+        return (elapsed - SETTLING) % (self.move + self.hold) > self.move
+
 
 @dataclass(frozen=True)
 class Sweep:
@@ -94,11 +98,12 @@ class Sweep:
 
 
 class EffortWearer(VirtualWearer):
-    """Follows a task. efforts: (n, 4) Nm of the wearer, one for each millisecond."""
+    """Follows a task with at most `strength` (4,) Nm. efforts: (n, 4) Nm of the wearer, one for each millisecond."""
 
-    def __init__(self, task: Task | Sweep) -> None:
+    def __init__(self, task: Task | Sweep, strength: Sequence[float] = (STRENGTH,) * JOINT_COUNT) -> None:
         super().__init__(TrialScript.parse({"name": task.name, "steps": [{"hold": task.duration}]}))
         self.task = task
+        self.strength = strength
         self.efforts: list[Torque] = []
         self._carried = [0.0] * JOINT_COUNT
 
@@ -107,10 +112,10 @@ class EffortWearer(VirtualWearer):
         position, speed = self.task.at(elapsed)
         torque = []
         for n in range(JOINT_COUNT):
-            error = position[n] - theta[n]
-            self._carried[n] += INTEGRAL[n] * error * STEP
+            error, most = position[n] - theta[n], self.strength[n]
+            self._carried[n] = max(-most, min(most, self._carried[n] + INTEGRAL[n] * error * STEP))
             pull = STIFFNESS[n] * error + DAMPING[n] * (speed[n] - velocity[n]) + self._carried[n]
-            torque.append(max(-STRENGTH, min(STRENGTH, pull)))
+            torque.append(max(-most, min(most, pull)))
         self.efforts.append(tuple(torque))
         return self.efforts[-1]
 
@@ -132,10 +137,16 @@ def measure(
     """
     wearer = EffortWearer(task)
     _, velocity = run(device, motors, controller, wearer, rate)
-    skip, per = round(SETTLING * rate), round(1.0 / (rate * STEP))
-    efforts = np.array(wearer.efforts)[::per][skip : len(velocity)]
+    per = round(1.0 / (rate * STEP))
+    return task_effort(task, np.array(wearer.efforts)[::per], velocity, rate)
+
+
+def task_effort(task: Task | Sweep, torque: np.ndarray, velocity: np.ndarray, rate: float) -> Effort:
+    """Return the effort of a task from the wearer's torque and the true velocity, (n, 4) each, from its start on."""
+    first, count = round(SETTLING * rate), min(len(torque), len(velocity))
+    holding = task.holding(np.arange(first, count) / rate) if isinstance(task, Task) else None
     joint = task.joint if isinstance(task, Sweep) else None
-    return effort_of(efforts, velocity[skip : skip + len(efforts)], rate, joint)
+    return effort_of(torque[first:count], velocity[first:count], rate, joint, holding)
 
 
 def run(

@@ -18,8 +18,8 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.sim.motor import SimulatedMotor
 
 # time: wall clock in s. position, velocity: of the joints, rad and rad/s. torque: of the motors on the joints, Nm.
-# damping: Nm s/rad, the part of that torque that is proportional to the velocity. frames: received by each motor so
-# far. on: whether each motor is on.
+# damping: Nm s/rad, the part of that torque that is proportional to the velocity. wearer: Nm of the wearer on the
+# joints. frames: received by each motor so far. step: of the wearer's script, -1 before it. on: whether each motor is on.
 RECORD = np.dtype(
     [
         ("time", "<f8"),
@@ -27,11 +27,13 @@ RECORD = np.dtype(
         ("velocity", "<f4", JOINT_COUNT),
         ("torque", "<f4", JOINT_COUNT),
         ("damping", "<f4", JOINT_COUNT),
+        ("wearer", "<f4", JOINT_COUNT),
         ("frames", "<u4", JOINT_COUNT),
+        ("step", "<i4"),
         ("on", "?", JOINT_COUNT),
     ]
 )
-_ROW = struct.Struct(f"<d{4 * JOINT_COUNT}f{JOINT_COUNT}I{JOINT_COUNT}?")
+_ROW = struct.Struct(f"<d{5 * JOINT_COUNT}f{JOINT_COUNT}Ii{JOINT_COUNT}?")
 FLUSH_PERIOD = 0.02  # s
 
 
@@ -59,12 +61,13 @@ class TruthLog:
         torque: Sequence[float],
         motors: Sequence[SimulatedMotor],
         frames: Sequence[int],
+        wearer: tuple[Sequence[float], int],
     ) -> None:
-        """Append the state of the arm at the simulated time `now` (s); sequences are (4,)."""
+        """Append the state of the arm at the simulated time `now` (s); sequences are (4,); wearer: torque and step."""
         stamp = now + self._offset
         damping = [motor.damping for motor in motors]
         entered = [motor.entered for motor in motors]
-        self._rows += _ROW.pack(stamp, *position, *velocity, *torque, *damping, *frames, *entered)
+        self._rows += _ROW.pack(stamp, *position, *velocity, *torque, *damping, *wearer[0], *frames, wearer[1], *entered)
         if abs(stamp - self._flushed) >= FLUSH_PERIOD:
             self._flushed = stamp
             self._file.write(self._rows)
