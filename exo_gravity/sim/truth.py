@@ -67,7 +67,9 @@ class TruthLog:
         stamp = now + self._offset
         damping = [motor.damping for motor in motors]
         entered = [motor.entered for motor in motors]
-        self._rows += _ROW.pack(stamp, *position, *velocity, *torque, *damping, *wearer[0], *frames, wearer[1], *entered)
+        self._rows += _ROW.pack(
+            stamp, *position, *velocity, *torque, *damping, *wearer[0], *frames, wearer[1], *entered
+        )
         if abs(stamp - self._flushed) >= FLUSH_PERIOD:
             self._flushed = stamp
             self._file.write(self._rows)

@@ -29,6 +29,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     option("--params", metavar="FILE", help="parameter file (default: the simulated right arm)")
     option("--output", metavar="DIR", default="trials", help="where to create the trial's folder (%(default)s)")
     option("--offline", action="store_true", help="on the simulated device, without ROS and faster than real time")
+    option("--quick", action="store_true", help="effort: a reach task under four settings")
     option(
         "--max-rate",
         type=non_negative,
@@ -46,9 +47,12 @@ def main(args: Sequence[str] | None = None) -> int:
         with extras("trial", "report"):
             from rich.console import Console
 
-            from exo_gravity.tools.trials import effort, session
-        if options.name == effort.NAME:
-            return effort.run(params, Path(options.output), options.offline, Console(highlight=False))
+            from exo_gravity.tools.trials import session
+        if options.name == "effort":
+            from exo_gravity.tools.reporting.trial_report import report_console
+            from exo_gravity.tools.trials import effort
+
+            return effort.run(params, Path(options.output), options.offline, options.quick, report_console())
         request = session.Session(options.name, params, Path(options.output), options.offline, options.max_rate)
         return session.run(request, Console(highlight=False))
     except ExoGravityError as error:

@@ -26,7 +26,9 @@ def rows():
 
 @pytest.fixture
 def results(monkeypatch):
-    monkeypatch.setattr(simulated_effort, "effort_study", lambda params, body_mass: (len(SETTINGS) * len(TASKS), rows()))
+    monkeypatch.setattr(
+        simulated_effort, "effort_study", lambda params, body_mass: (len(SETTINGS) * len(TASKS), rows())
+    )
 
 
 def test_it_prints_what_each_setting_saves_and_writes_a_table_and_a_figure(results, tmp_path):

@@ -30,7 +30,7 @@ table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabu
 th, td { padding: .15rem .6rem; text-align: right; white-space: nowrap; }
 th { font-weight: 600; vertical-align: bottom; }
 thead { border-bottom: 2px solid #9aa3ab; } tbody { border-bottom: 1px solid #d5dadf; }
-td.joint { text-align: left; } td.joint::before { content: "●"; color: var(--c); margin-right: .4rem; }
+td.joint, td.name { text-align: left; } td.joint::before { content: "●"; color: var(--c); margin-right: .4rem; }
 pre { background: #f4f6f8; padding: .7rem 1rem; overflow-x: auto; font-size: .85rem; }
 """
 
@@ -91,11 +91,16 @@ def page_html(title: str, when: str, failures: Sequence[str], held: str, section
         if failures
         else f'<div class="verdict"><b>{escape(held)}</b></div>'
     )
+    return document_html(title, when, [banner, "\n", *sections, f"\n<footer><p>{LEGEND}</p></footer>{ending}"])
+
+
+def document_html(title: str, when: str, body: Iterable[str]) -> str:
+    """Return a page with its heading. when: the line below the title."""
     return (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><title>{escape(title)}</title>'
-        f"<style>{STYLE}</style></head><body>\n<h1>{escape(title)}</h1><p class='when'>{escape(when)}</p>{banner}\n"
-        f"{''.join(sections)}\n<footer><p>{LEGEND}</p></footer>{ending}</body></html>\n"
+        f"<style>{STYLE}</style></head><body>\n<h1>{escape(title)}</h1><p class='when'>{escape(when)}</p>"
+        f"{''.join(body)}</body></html>\n"
     )
 
 

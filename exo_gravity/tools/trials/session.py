@@ -88,17 +88,25 @@ def _run_in_real_time(
     session: Session, path: Path, script: TrialScript, console: Console, stopped: Stopping
 ) -> tuple[Path, Bag | None, Outcome]:
     folder = _new_folder(session, script)
-    for attempt in range(1, ATTEMPTS + 1):
-        params = prepare(session.params, path, folder, recorded=True)
-        outcome = run_nodes(params, script, folder, console, stopped)
-        if not (outcome.trouble and outcome.busy) or outcome.code == 2 or stopped.is_set() or attempt == ATTEMPTS:
-            break
-        folder.rename(f"{folder}_attempt_{attempt}")
-        again = f"attempt {attempt + 1} of {ATTEMPTS}"
-        console.print(f"this computer was too busy: {outcome.busy}; {again}", markup=False, soft_wrap=True)
+    outcome = run_attempts(session.params, path, script, folder, console, stopped)
     try:
         return folder, read_bag(folder / "bag"), outcome
     except DataError:
         if not outcome.trouble:
             raise
         return folder, None, outcome
+
+
+def run_attempts(
+    params: Path, path: Path, script: TrialScript, folder: Path, console: Console, stopped: Stopping
+) -> Outcome:
+    """Run `script`, the file at `path`, on nodes in the new `folder`; repeat it if this computer was too busy."""
+    for attempt in range(1, ATTEMPTS + 1):
+        trial = prepare(params, path, folder, recorded=True)
+        outcome = run_nodes(trial, script, folder, console, stopped)
+        if not (outcome.trouble and outcome.busy) or outcome.code == 2 or stopped.is_set() or attempt == ATTEMPTS:
+            break
+        folder.rename(f"{folder}_attempt_{attempt}")
+        again = f"attempt {attempt + 1} of {ATTEMPTS}"
+        console.print(f"this computer was too busy: {outcome.busy}; {again}", markup=False, soft_wrap=True)
+    return outcome
