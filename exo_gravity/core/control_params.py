@@ -156,16 +156,13 @@ def _spec_of(
 ) -> MotorSpec:
     """Return a motor with the ranges of its firmware, 0 for the usual ones; raises ParameterError.
 
-    A range that is usual on another board only is refused: it would scale every torque without an error.
+    A range that is usual on V1 and V2 boards is refused for another board: it would scale every torque without an error.
     """
     usual = FORMATS[wire_format].ranged(MOTORS[name])
     for field, given in (("velocity_range", velocity_range), ("torque_range", torque_range)):
-        own, others = getattr(usual, field), {getattr(each.ranged(MOTORS[name]), field) for each in FORMATS.values()}
-        if given != own and given in others:
-            expected = (
-                f"{own:g}, or 0, for an {name} with wire_format = {wire_format}: that is the range of another board"
-            )
-            raise ParameterError(field, given, expected)
+        own = getattr(usual, field)
+        if given == getattr(MOTORS[name], field) != own:
+            raise ParameterError(field, given, f"{own:g} or 0 for an {name} with wire_format = {wire_format}")
     spec = usual.with_ranges(velocity_range or usual.velocity_range, torque_range or usual.torque_range)
     return replace(spec, torque_per_ampere=torque_per_ampere or usual.torque_per_ampere)
 
