@@ -3,6 +3,7 @@
 import math
 import random
 
+import numpy as np
 import pytest
 
 from exo_gravity.core.any_arm import AnyArm, any_arm_settings, any_arm_table
@@ -62,7 +63,16 @@ def test_pitch_and_roll_give_the_same_gravity_as_the_vector():
     assert answer.effort == pytest.approx(Pendulum().torque(POSE, (0.6 * 9.80665, 0.0, -0.8 * 9.80665)), abs=1e-9)
 
 
-def test_random_changes_of_settings_never_step_the_torque():
+def test_a_change_of_settings_fades_in_over_the_transition_time_without_a_step():
+    arm = AnyArm(Pendulum(), settings(max_effort_rate=1000.0))
+    before = steps(arm, 1.0, 1.5)[-1]
+    arm.apply(settings(gain=[2.0, 2.0], transition_time=0.5, max_effort_rate=1000.0))
+    efforts = [before, *steps(arm, 2.5, 0.6)]
+    assert np.allclose(efforts[-1], np.multiply(2.0, before), rtol=0.0, atol=1e-12)
+    assert np.abs(np.diff(efforts, axis=0)).max() <= np.abs(before).max() * PERIOD / 0.5 + 1e-9
+
+
+def test_random_changes_of_settings_never_exceed_the_rate_limit():
     chance, arm, now = random.Random(3), AnyArm(Pendulum(), settings()), 1.0
     last = (0.0, 0.0)
     for n in range(3000):
