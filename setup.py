@@ -13,6 +13,7 @@ extras = {
     "imu": ["pyserial>=3.5", "smbus2>=0.4.2", "vqf>=2.1"],
     "sim": ["mujoco>=3.2"],
     "report": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11", "scipy>=1.11"],
+    "video": ["imageio[pyav]>=2.31", "mujoco>=3.2", "pillow>=10.1"],
     "calibrate": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11"],
     "validate": [
         "imufusion>=1.3",
@@ -61,6 +62,9 @@ setup(
         (f"share/{package_name}/config", glob("config/*.yaml")),
         (f"share/{package_name}/config/trials", glob("config/trials/*.yaml")),
         (f"share/{package_name}/config/sros2", glob("config/sros2/*.xml")),
+        (f"share/{package_name}/config/rviz", glob("config/rviz/*.rviz")),
+        (f"share/{package_name}/config/plotjuggler", glob("config/plotjuggler/*.xml")),
+        (f"share/{package_name}/config/foxglove", glob("config/foxglove/*.json")),
         (f"share/{package_name}/launch", glob("launch/*.py")),
     ],
     python_requires=">=3.10",

@@ -28,13 +28,13 @@ GREEN, AMBER, RED, GREY, BLUE = (
     (0.60, 0.60, 0.60, 1.0),
     (0.20, 0.45, 0.85, 1.0),
 )
-RANGE_RADIUS, TORQUE_RADIUS = 0.11, 0.07  # m
+RANGE_RADIUS, TORQUE_RADIUS = 0.11, 0.075  # m
 TORQUE_SPAN = math.radians(270.0)
 ARC_STEP = math.radians(6.0)
 GRAVITY_FROM, GRAVITY_LENGTH = (0.30, 0.0, 0.10), 0.25  # m, in front of the chest
-STATE_HEIGHT = 0.32  # m above the shoulder
+STATE_HEIGHT = 0.20  # m above the shoulder
 RESTING = 0.05  # rad/s, below which a carried arm counts as held; twice the step of the motors' speed
-LINE_WIDTH, ARROW_WIDTH, TEXT_HEIGHT, SPHERE_SIZE = 0.006, 0.012, 0.035, 0.05  # m
+LIMIT_WIDTH, TORQUE_WIDTH, ARROW_WIDTH, TEXT_HEIGHT, SPHERE_SIZE = 0.004, 0.016, 0.012, 0.035, 0.05  # m
 
 
 class Shape(NamedTuple):
@@ -115,14 +115,14 @@ def arm_shapes(view: ArmView) -> list[Shape]:
         low, high, angle = limits.position_min[n], limits.position_max[n], view.theta[n]
         near = not low + WALL_WIDTH <= angle <= high - WALL_WIDTH
         colour = RED if near else GREY
-        shapes.append(Shape("limits", LINE, _arc(origin, axis, hanging, low, high), LINE_WIDTH / 2, colour))
+        shapes.append(Shape("limits", LINE, _arc(origin, axis, hanging, low, high), LIMIT_WIDTH, colour))
         tip = _arc(origin, axis, hanging, angle, angle)[:1]
-        shapes.append(Shape("limits", LINE, np.vstack((origin, tip)), LINE_WIDTH / 2, colour))
+        shapes.append(Shape("limits", LINE, np.vstack((origin, tip)), LIMIT_WIDTH, colour))
         effort, limit = view.effort[n], limits.max_effort[n]
         share = max(-1.0, min(1.0, effort / limit)) if limit > 0.0 else 0.0
         arc = _arc(origin, axis, hanging, angle, angle + share * TORQUE_SPAN, TORQUE_RADIUS)
         strength = RED if abs(share) >= 1.0 else AMBER if abs(share) > 0.5 else GREEN
-        shapes.append(Shape("torques", LINE, arc, 2 * LINE_WIDTH, strength))
+        shapes.append(Shape("torques", LINE, arc, TORQUE_WIDTH, strength))
         shapes.append(Shape("torques", TEXT, tip, TEXT_HEIGHT, strength, f"{effort + 0.0:.2f} Nm"))
     return shapes + state_shapes(view)
 

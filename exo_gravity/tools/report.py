@@ -14,11 +14,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from exo_gravity.core.errors import DataError
+from exo_gravity.core.errors import DataError, ExoGravityError
 from exo_gravity.core.trial_analysis import MIN_HOLD
 from exo_gravity.core.verdict import HoldCriteria
 from exo_gravity.tools.cli.arguments import non_negative
 from exo_gravity.tools.cli.extras import extras
+from exo_gravity.tools.video import output
 
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
@@ -37,6 +38,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     limit("--max-drift-after-push", 2.0, "DEG", "the same for a hold after a push (%(default)s)")
     limit("--max-rate", math.inf, "DEG/MIN", "drift rate allowed over a whole hold (no limit)")
     limit("--min-hold", MIN_HOLD, "S", "shortest still phase that counts as a hold (%(default)s)")
+    output.add_arguments(parser)
     return parser.parse_args(args)
 
 
@@ -68,6 +70,7 @@ def _run(options: argparse.Namespace) -> int:
 
     from exo_gravity.bag.reader import read_bag
     from exo_gravity.tools.reporting import trial_report
+    from exo_gravity.tools.video import rendered
 
     criteria = HoldCriteria(
         max_stray=math.radians(options.max_drift),
@@ -76,13 +79,16 @@ def _run(options: argparse.Namespace) -> int:
     )
     path, screen = Path(options.bag), Console(stderr=True)
     try:
+        clip = output.requested(options.video, options.video_speed)
         with Progress(console=screen, transient=True, disable=not screen.is_terminal) as progress:
             task = progress.add_task(f"reading {path.name}", total=None)
             bag = read_bag(path, lambda done, size: progress.update(task, completed=done, total=size))
         report = trial_report.analyse(bag, criteria, options.min_hold)
         beside = path.resolve().with_name(f"{path.resolve().stem}_report")
         written = trial_report.write(report, options.output or beside)
-    except (DataError, OSError) as error:
+        if clip:
+            rendered.write(bag, clip, screen)
+    except (ExoGravityError, OSError) as error:
         print(f"report: {error}", file=sys.stderr)
         return 2
     console = trial_report.report_console()

@@ -20,6 +20,7 @@ from exo_gravity.tools.cli.arguments import non_negative
 from exo_gravity.tools.cli.extras import extras
 from exo_gravity.tools.inputs.parameter_file import packaged_config
 from exo_gravity.tools.trials.scripts import packaged_trials
+from exo_gravity.tools.video import output
 
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
@@ -36,6 +37,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
         metavar="DEG/MIN",
         help="drift rate allowed over a hold (default: 0.2 if every hold lasts 30 s, else no limit)",
     )
+    output.add_arguments(parser)
     return parser.parse_args(args)
 
 
@@ -44,6 +46,7 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         options = _arguments(args)
         params = Path(options.params or packaged_config("sim.yaml"))
+        clip = output.requested(options.video, options.video_speed)
         with extras("trial", "report"):
             from rich.console import Console
 
@@ -53,7 +56,7 @@ def main(args: Sequence[str] | None = None) -> int:
             from exo_gravity.tools.trials import effort
 
             return effort.run(params, Path(options.output), options.offline, options.quick, report_console())
-        request = session.Session(options.name, params, Path(options.output), options.offline, options.max_rate)
+        request = session.Session(options.name, params, Path(options.output), options.offline, options.max_rate, clip)
         return session.run(request, Console(highlight=False))
     except ExoGravityError as error:
         print(f"trial: {error}", file=sys.stderr)

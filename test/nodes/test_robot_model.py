@@ -105,7 +105,7 @@ def viewer():
 
 @pytest.fixture
 def nodes(launch, tmp_path):
-    """Both arms without their simulators; the bridges stay inactive, so that the test's joint states are the only ones."""
+    """Both arms without simulators; the bridges stay inactive, so that the only joint states are those of the test."""
     content = yaml.safe_load((CONFIG / "sim_both.yaml").read_text(encoding="utf-8"))
     base = tmp_path / "both.yaml"
     content["/robot_model"] = {"ros__parameters": {"rate": 50.0}}

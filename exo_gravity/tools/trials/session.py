@@ -23,6 +23,8 @@ from exo_gravity.tools.trials.busy import ADVICE
 from exo_gravity.tools.trials.criteria import criteria_for, missing_holds, shortest_hold
 from exo_gravity.tools.trials.real_time import Outcome, run_nodes
 from exo_gravity.tools.trials.scripts import is_guided, prepare, read_script
+from exo_gravity.tools.video import rendered
+from exo_gravity.tools.video.output import Clip, select_backend
 
 ATTEMPTS = 3
 BUSY_CODE = 3
@@ -30,13 +32,17 @@ BUSY_CODE = 3
 
 @dataclass(frozen=True)
 class Session:
-    """What the command line requests; params: the parameter file, max_rate: deg/min or None for the default."""
+    """What the command line requests.
+
+    params: the parameter file. max_rate: deg/min, None for the default. clip: to write after the trial, or None.
+    """
 
     name: str
     params: Path
     output: Path
     offline: bool
     max_rate: float | None
+    clip: Clip | None = None
 
 
 def run(session: Session, console: Console) -> int:
@@ -44,6 +50,8 @@ def run(session: Session, console: Console) -> int:
     path, script = read_script(session.name)
     stopped = stop_on_signals()
     if session.offline:
+        if session.clip:
+            select_backend()  # before the simulated device imports MuJoCo
         folder, bag, outcome = _run_offline(session, path, script, console, stopped)
     else:
         folder, bag, outcome = _run_in_real_time(session, path, script, console, stopped)
@@ -58,6 +66,8 @@ def run(session: Session, console: Console) -> int:
         trial_report.write(report, folder)
         trial_report.print_report(report)
         code = code or report.exit_code
+        if session.clip:
+            rendered.write(bag, session.clip, console)
     contents = "Report and parameters" if session.offline else "Report, recording, log and parameters"
     console.print(f"{contents}: {folder}", markup=False, soft_wrap=True)
     if outcome.trouble and outcome.busy and code != 2:

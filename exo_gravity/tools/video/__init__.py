@@ -1,0 +1,1 @@
+"""Clips of a recording, drawn without a screen."""
