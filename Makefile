@@ -19,7 +19,7 @@
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := imu sim report
-TEST := $(DEMO) validate test
+TEST := $(DEMO) validate video test
 SETUP := VENV=$(VENV) .ci/setup
 
 .PHONY: demo calibrate-demo calibrate-study test lint docs faults mutations bench imu-report socketcan pythons constraints clean

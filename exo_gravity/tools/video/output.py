@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def requested(video: str | None, speed: float) -> Clip | None:
     """Return the clip of the command line, None for none.
 
-    Raises ParameterError for a wrong file or speed, and DataError if a package or OpenGL is missing.
+    Raises ParameterError for a wrong file or speed, and if a package or OpenGL is missing.
     """
     if video is None:
         return None
@@ -60,8 +60,11 @@ def requested(video: str | None, speed: float) -> Clip | None:
     clip = Clip(path, one_float("video_speed", speed, 0.1, MAX_SPEED))
     for module in NEEDED:
         if not find_spec(module):
-            raise DataError(missing(module, "video"))
-    backend()
+            raise ParameterError("video", video, f"left out: {missing(module, 'video')}")
+    try:
+        backend()
+    except DataError as error:
+        raise ParameterError("video", video, f"left out: {error}") from None
     return clip
 
 
