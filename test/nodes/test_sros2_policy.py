@@ -1,6 +1,6 @@
 """config/sros2/policy.xml against the running nodes: what each publishes, subscribes to, serves and calls.
 
-The nodes are those of config/sim_both.yaml, a recorder, and an outer loop for each arm; the bridges are not enabled.
+The nodes are those of config/sim_both.yaml, a recorder, robot_model, and an outer loop for each arm; the bridges are not enabled.
 These tests do not show that DDS enforces the policy, which takes a middleware built with security.
 """
 
@@ -30,7 +30,7 @@ POLICY = CONFIG / "sros2" / "policy.xml"
 RULES = {"topics": ("topic", {"publish", "subscribe"}), "services": ("service", {"reply", "request"})}
 RECORDER_CALLS = ("get_parameters", "list_parameters")  # on every node
 NODES = (
-    "/imu", "/recorder",
+    "/imu", "/recorder", "/robot_model",
     *(
         f"/{arm}/{node}"
         for arm in ("left", "right") for node in ("can_bridge", "compensator", "simulator", "outer_loop")
@@ -67,7 +67,7 @@ def graph_of(node, name):
 
 
 def parameter_file(folder):
-    """Write config/sim_both.yaml with unused ports, a recorder, and bridges that do not start by themselves."""
+    """Write config/sim_both.yaml with unused ports, a recorder, robot_model, and bridges that do not start by themselves."""
     ports = {"left": next(PORTS), "right": next(PORTS)}
     content = yaml.safe_load((CONFIG / "sim_both.yaml").read_text(encoding="utf-8"))
     for name, entry in content.items():
@@ -77,6 +77,7 @@ def parameter_file(folder):
         if name.endswith("/can_bridge"):
             values["autostart"] = False
     content["/recorder"] = {"ros__parameters": {"output": str(folder / "bag")}}
+    content["/robot_model"] = {"ros__parameters": {"rate": 30.0}}
     path = folder / "params.yaml"
     path.write_text(yaml.safe_dump(content), encoding="utf-8")
     return path
@@ -153,14 +154,19 @@ def test_a_node_may_do_exactly_what_it_does(session, node, kind):
     assert read_policy()[node][kind] == session[0][node][kind]
 
 
-@pytest.mark.parametrize("node", [node for node in NODES if node != "/recorder"])
-def test_only_the_recorder_calls_services_of_other_nodes(session, node):
+@pytest.mark.parametrize("node", [node for node in NODES if node not in ("/recorder", "/robot_model")])
+def test_only_the_recorder_and_robot_model_call_services_of_other_nodes(session, node):
     assert session[0][node]["request"] == set() == read_policy()[node]["request"]
 
 
 def test_the_recorder_may_call_exactly_the_services_that_it_calls(session):
     requests = {f"{node}/{service}" for node in session[1] for service in RECORDER_CALLS}
     assert read_policy()["/recorder"]["request"] == requests
+
+
+def test_robot_model_may_read_the_parameters_of_the_arms_and_call_nothing_else(session):
+    requests = {f"/{arm}/{node}/get_parameters" for arm in ("left", "right") for node in ("can_bridge", "compensator")}
+    assert session[0]["/robot_model"]["request"] == requests == read_policy()["/robot_model"]["request"]
 
 
 def test_the_operator_may_call_every_service_and_subscribe_to_every_topic():
