@@ -9,6 +9,8 @@
 # make bench        the laws, the loop and the tools against peers, 12 minutes on a quiet machine; QUICK=1: part of it
 # make imu-report   the trunk's inclination error on recorded motion, here and by VQF and imufusion; TRIALS=FOLDER
 # make socketcan    motor bus and nodes on vcan0; RUN=COMMAND runs the tests through COMMAND, in a virtual machine for example
+# make ros2-launch  the launch file under `ros2 launch`, where ROS 2 and a build of this package are sourced
+# make two-computers  the arm on two computers over better and worse wires, 7 minutes; a table and build/two_computers.json
 # make pythons      for each supported Python found here: set-up from nothing, a short trial, the nodes
 # make constraints  renews the versions in constraints/
 # make clean        removes what these made
@@ -22,7 +24,8 @@ DEMO := imu sim report
 TEST := $(DEMO) validate video test
 SETUP := VENV=$(VENV) .ci/setup
 
-.PHONY: demo calibrate-demo calibrate-study test lint docs faults mutations bench imu-report socketcan pythons constraints clean
+.PHONY: demo calibrate-demo calibrate-study test lint docs faults mutations bench imu-report socketcan pythons \
+	 constraints clean ros2-launch two-computers
 
 demo:
 	@$(SETUP) $(DEMO)
@@ -72,6 +75,15 @@ socketcan:
 	EXO_TEST_CAN_INTERFACE=socketcan EXO_TEST_CAN_CHANNEL=vcan0 PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 \
 		$(RUN) $(BIN)/python -m pytest --noconftest -p no:cacheprovider \
 		test/hardware/test_motor_bus.py test/nodes/socketcan_link.py test/nodes/socketcan_nodes.py
+
+ros2-launch:
+	@$(SETUP) $(TEST)
+	$(BIN)/python -m pytest test/nodes/ros2_launch.py
+
+two-computers:
+	@$(SETUP) $(TEST)
+	@mkdir -p build
+	$(BIN)/python -m test.two_computers --output build/two_computers.json
 
 pythons:
 	.ci/pythons

@@ -55,7 +55,7 @@ setup(
     name=package_name,
     version="0.1.0",
     packages=find_packages(include=[package_name, package_name + ".*"]),
-    package_data={package_name: ["py.typed"], f"{package_name}.nodes": ["fastdds.xml"]},
+    package_data={package_name: ["py.typed"], f"{package_name}.nodes": ["fastdds*.xml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
         (f"share/{package_name}", ["package.xml"]),

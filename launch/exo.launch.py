@@ -11,18 +11,12 @@ The nodes are no `LifecycleNode` actions: with those, `ros2 launch` would be one
 import asyncio
 import os
 import signal
+import sys
 from pathlib import Path
 
-from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
-from launch.actions import (
-    DeclareLaunchArgument,
-    EmitEvent,
-    OpaqueCoroutine,
-    OpaqueFunction,
-    RegisterEventHandler,
-    Shutdown,
-)
-from launch.event_handlers import OnExecutionComplete, OnProcessExit, OnProcessStart, OnShutdown
+from launch import Event, EventHandler, LaunchContext, LaunchDescription, LaunchDescriptionEntity
+from launch.actions import DeclareLaunchArgument, EmitEvent, OpaqueFunction, RegisterEventHandler
+from launch.event_handlers import OnProcessExit, OnProcessStart, OnShutdown
 from launch.events import matches_action
 from launch.events.process import ProcessExited, ProcessStarted, SignalProcess
 from launch.substitutions import LaunchConfiguration
@@ -48,22 +42,32 @@ from exo_gravity.tools.inputs.parameter_file import load, packaged_config
 LONGEST_STOP = DESCENT_TIMEOUT + RECOVERY_TIMEOUT  # s until the last bridge is done; `launch` then ends the others
 
 
+class Recovered(Event):
+    """The recovery of a dead bridge's arm has ended."""
+
+    name = "exo_gravity.Recovered"
+
+    def __init__(self, bridge: str, returncode: int) -> None:
+        self.bridge, self.returncode = bridge, returncode
+
+
 class Stopping:
     """Stops `nodes` in order. Its methods are event handlers, which return the actions that follow."""
 
     def __init__(self, nodes: dict[str, Node]) -> None:
         self._nodes = nodes
-        self._running: set[str] = set()
         self._stages = Stages.of(nodes)
+        self._running: set[str] = set()
         self._is_stopping = False
-        self._troubles: list[str] = []
 
     def handlers(self) -> list[RegisterEventHandler]:
         """Return the actions that register the handlers."""
+        recovered = OpaqueFunction(function=lambda context: self._on_recovered(context.locals.event))
         return [
             RegisterEventHandler(OnProcessStart(on_start=self._on_start)),
             RegisterEventHandler(OnProcessExit(on_exit=self._on_exit)),
             RegisterEventHandler(OnShutdown(on_shutdown=self._on_shutdown)),
+            RegisterEventHandler(EventHandler(matcher=lambda e: isinstance(e, Recovered), entities=recovered)),
         ]
 
     def _name(self, action: object) -> str:
@@ -73,51 +77,51 @@ class Stopping:
     def _on_start(self, event: ProcessStarted, _context: LaunchContext) -> None:
         self._running.update(filter(None, [self._name(event.action)]))
 
-    def _on_exit(self, event: ProcessExited, _context: LaunchContext) -> list[LaunchDescriptionEntity]:
+    def _on_exit(self, event: ProcessExited, context: LaunchContext) -> list[LaunchDescriptionEntity]:
         name = self._name(event.action)
-        if name not in self._stages.bridges or event.returncode in ENDED_WELL:
-            return self._ended(name, event.returncode) if name else []
-        recovery = OpaqueCoroutine(coroutine=self._recover, args=[name], ignore_shutdown=True)
-        done = OnExecutionComplete(
-            target_action=recovery, on_completion=lambda _event, _context: self._ended(name, event.returncode)
-        )
-        return [RegisterEventHandler(done), recovery]
+        if name in self._stages.bridges and event.returncode not in ENDED_WELL:
+            # Not a process action, because `launch` starts none once it is stopping.
+            task = context.asyncio_loop.create_task(_recover(event))
+            task.add_done_callback(lambda _: context.emit_event_sync(Recovered(name, event.returncode)))
+            context.add_completion_future(task)
+            return []
+        return self._ended(name, event.returncode) if name else []
 
-    def _on_shutdown(self, _event: object, _context: LaunchContext) -> list[LaunchDescriptionEntity]:
+    def _on_recovered(self, event: Recovered) -> list[LaunchDescriptionEntity]:
+        return self._ended(event.bridge, event.returncode)
+
+    def _on_shutdown(self, _event: Event, _context: LaunchContext) -> list[LaunchDescriptionEntity]:
         self._is_stopping = True
         return self._stop_next()
 
-    async def _recover(self, _context: LaunchContext, name: str) -> None:
-        """Let the arm of a dead bridge down if its watchdog does not, with the bridge's own executable."""
-        details = self._nodes[name].process_details
-        environment = {**(details["env"] or os.environ), **RECOVERY}
-        process = await asyncio.create_subprocess_exec(*details["cmd"], env=environment, start_new_session=True)
-        try:
-            is_off = await asyncio.wait_for(process.wait(), RECOVERY_TIMEOUT) == 0
-        except asyncio.TimeoutError:
-            process.kill()
-            is_off = False
-        if not is_off:
-            self._troubles.append(f"the motors of {name} may still be powered: cut their supply")
-
     def _ended(self, name: str, code: int) -> list[LaunchDescriptionEntity]:
+        """Note that a node has ended. Raises RuntimeError, which stops everything with exit code 1, if none should."""
         self._running.discard(name)
         if self._is_stopping:
             return self._stop_next()
         if is_observer(name):
             return []
-        self._is_stopping = True
-        self._troubles.insert(0, f"{name} ended with exit code {code}; all nodes were stopped")
-        return [Shutdown(reason=f"{name} ended with exit code {code}")]
+        raise RuntimeError(f"{name} ended with exit code {code}; all nodes stop")
 
     def _stop_next(self) -> list[LaunchDescriptionEntity]:
-        """Return the actions that stop the first stage of which a node runs. Raises RuntimeError: exit code 1."""
+        """Return the actions that stop the first stage of which a node runs."""
         for stage in self._stages:
             if running := [self._nodes[name] for name in stage if name in self._running]:
                 return [EmitEvent(event=_terminate(node)) for node in running]
-        if self._troubles:
-            raise RuntimeError("; ".join(self._troubles))
         return []
+
+
+async def _recover(dead: ProcessExited) -> None:
+    """Let the arm of a dead bridge down if its watchdog does not, with the bridge's own executable."""
+    environment = {**(dead.env or os.environ), **RECOVERY}
+    process = await asyncio.create_subprocess_exec(*dead.cmd, env=environment, start_new_session=True)
+    try:
+        is_off = await asyncio.wait_for(process.wait(), RECOVERY_TIMEOUT) == 0
+    except asyncio.TimeoutError:
+        process.kill()
+        is_off = False
+    if not is_off:
+        print(f"launch: the motors of {dead.process_name} may still be powered: cut their supply", file=sys.stderr)
 
 
 def _terminate(node: Node) -> SignalProcess:

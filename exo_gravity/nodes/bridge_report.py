@@ -37,9 +37,7 @@ def log_limits(node: Node, limits: Limits, traffic: Traffic, rate: float) -> Non
         log.warning(warning)
     opening = open_to_others()
     if opening:
-        log.warning(
-            f"{opening}: other hosts can command this arm; set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST or enforce SROS2"
-        )
+        log.warning(f"{opening}: other hosts can command this arm; unset it, or enforce SROS2")
 
 
 class BridgeReport:

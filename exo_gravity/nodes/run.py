@@ -34,7 +34,8 @@ def keep_to_this_machine() -> None:
     # With ROS's own default, every host on the subnet could publish torques to a worn robot.
     reach = os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     if reach == "LOCALHOST":
-        os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name("fastdds.xml")))
+        profile = "fastdds_peers.xml" if os.environ.get("ROS_STATIC_PEERS") else "fastdds.xml"
+        os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name(profile)))
 
 
 def open_to_others() -> str:

@@ -31,6 +31,14 @@ def test_the_users_settings_are_kept(environment):
     assert "FASTRTPS_DEFAULT_PROFILES_FILE" not in os.environ
 
 
+def test_with_a_named_peer_a_node_does_not_keep_to_the_loopback_interface(environment):
+    environment("ROS_STATIC_PEERS", "10.0.0.2")
+    keep_to_this_machine()
+    assert os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
+    assert os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("fastdds_peers.xml")
+    assert open_to_others() == "ROS_STATIC_PEERS=10.0.0.2"
+
+
 @pytest.mark.parametrize(
     ("settings", "named"),
     [

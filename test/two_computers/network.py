@@ -26,7 +26,7 @@ HOLDER = ("sh", "-c", "echo ready; read _")
 
 @dataclass(frozen=True)
 class Wire:
-    """delay: ms one way. jitter: ms that are added at random, at most; packets keep their order. loss: share each way."""
+    """delay: ms one way. jitter: ms added at random, at most. loss: share each way. Packets keep their order."""
 
     delay: float = 0.0
     jitter: float = 0.0

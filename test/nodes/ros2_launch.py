@@ -1,0 +1,124 @@
+"""The launch file under `ros2 launch`, where ROS 2 is installed: `make ros2-launch`. PyPI carries no `launch`.
+
+Judged by the simulated arm's true motion: the arm is let down before the simulator, and with it the motors, ends.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from ..support.launched_nodes import FAST, LaunchedNodes, children
+from ..support.ros_probe import RosProbe
+from ..support.truth import Truth
+
+LAUNCH_FILE = Path(__file__).parents[2] / "launch" / "exo.launch.py"
+STOP_TIMEOUT = 60.0  # s
+LARGEST_SPEED = 1.0  # rad/s of an arm that is let down
+
+
+class Launched:
+    """`ros2 launch` on the simulated right arm. log: its lines so far."""
+
+    def __init__(self, nodes: LaunchedNodes, *arguments: str) -> None:
+        self.truth = Truth(nodes.truth_path())
+        self.log: list[str] = []
+        command = ["ros2", "launch", str(LAUNCH_FILE), f"params:={nodes.path}", *arguments]
+        pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        self.process = subprocess.Popen(command, text=True, start_new_session=True, **pipes)  # type: ignore[call-overload]
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        for line in self.process.stdout:
+            self.log.append(line.rstrip())
+
+    def ctrl_c(self) -> None:
+        """Send SIGINT to every process, as a terminal does."""
+        os.killpg(self.process.pid, signal.SIGINT)
+
+    def pid(self, node: str) -> int:
+        """Return the ID of a node's process."""
+        for child in children(self.process.pid):
+            if f"__node:={node}".encode() in Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0"):
+                return child
+        raise LookupError(f"{node} does not run")
+
+    def ended(self, node: str) -> int:
+        """Return the line number at which the log states that a node's process has ended."""
+        return next(i for i, line in enumerate(self.log) if f"{node}-" in line and "process has" in line)
+
+    def wait(self) -> int:
+        """Wait for the end; return the exit code."""
+        code = self.process.wait(STOP_TIMEOUT)
+        self._reader.join(STOP_TIMEOUT)
+        return int(code)
+
+    def was_let_down(self) -> bool:
+        """Return whether the motors went off, and the arm was never fast."""
+        return self.truth.motors_are_off() and float(abs(self.truth.since(0.0)["velocity"]).max()) < LARGEST_SPEED
+
+
+@pytest.fixture
+def launched(prepare: Callable[..., LaunchedNodes], probe: RosProbe) -> Iterator[Launched]:
+    """An arm that is carried."""
+    launched = Launched(prepare(truth=True, can_bridge={**FAST, "damping": 5.0}))
+    try:
+        probe.wait_until_carried()
+        yield launched
+    finally:
+        if launched.process.poll() is None:
+            launched.ctrl_c()
+            launched.wait()
+        print("\n".join(launched.log))  # pytest shows it if the test failed
+
+
+def test_ctrl_c_lets_the_arm_down_before_the_other_nodes_stop(launched):
+    launched.ctrl_c()
+    assert launched.wait() == 0
+    assert launched.was_let_down()
+    assert launched.ended("can_bridge") < min(map(launched.ended, ("compensator", "imu", "simulator")))
+
+
+def test_an_interrupt_of_launch_alone_does_the_same(launched):
+    os.kill(launched.process.pid, signal.SIGINT)
+    assert launched.wait() == 0
+    assert launched.was_let_down()
+    assert launched.ended("can_bridge") < min(map(launched.ended, ("compensator", "imu", "simulator")))
+
+
+@pytest.mark.parametrize("node", ["compensator", "imu"])
+def test_when_a_node_dies_the_arm_is_let_down_all_stop_and_the_exit_code_is_1(launched, node):
+    os.kill(launched.pid(node), signal.SIGKILL)
+    assert launched.wait() == 1
+    assert launched.was_let_down()
+    assert launched.ended(node) < launched.ended("can_bridge") < launched.ended("simulator")
+    assert any(f"{node} ended with exit code -9; all nodes stop" in line for line in launched.log)
+
+
+def test_an_arm_whose_bridge_and_watchdog_were_killed_is_let_down(launched):
+    bridge = launched.pid("can_bridge")
+    (watchdog,) = children(bridge)
+    os.kill(watchdog, signal.SIGKILL)
+    os.kill(bridge, signal.SIGKILL)
+    assert launched.wait() == 1
+    assert launched.was_let_down()
+
+
+def test_a_namespace_is_in_front_of_every_node_and_of_the_imus_topics(prepare):
+    probe = RosProbe("/lab/right")
+    launched = Launched(prepare(), "namespace:=lab", "log_level:=warn")
+    try:
+        probe.wait_until_carried()
+        topics = {name for name, _ in probe.node.get_topic_names_and_types()}
+        assert "/lab/imu/data" in topics and "/imu/data" not in topics
+    finally:
+        launched.ctrl_c()
+        assert launched.wait() == 0
+        probe.close()

@@ -1,0 +1,71 @@
+"""One row of the table: an arm on two computers, carried and let go over one wire."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..support.launched_nodes import REAL, Parameters
+from .arm import MOVE, PEERS, TwoComputers, write_parameters
+from .measure import Measured, measure
+from .network import Network, Wire
+
+START_TIMEOUT = 40.0  # s until the arm is carried
+
+
+@dataclass(frozen=True)
+class Result:
+    """start: s from the start of the nodes until the arm was carried, None if it never was.
+
+    outcome: 'carried', or why the arm was not carried to the end of the hold. measured: None without a hold. late:
+    cycles of the bridge that began more than a period late, which no wire can cause.
+    """
+
+    wire: Wire
+    start: float | None
+    outcome: str
+    measured: Measured | None
+    late: int
+
+
+def play(
+    wire: Wire,
+    folder: Path,
+    hold: float,
+    timing: Mapping[str, Parameters] = REAL,
+    peers: Mapping[str, str] = PEERS,
+    patience: float = START_TIMEOUT,
+) -> Result:
+    """Play one case; the files stay in `folder`. hold: s for which the wearer lets go."""
+    params = write_parameters(folder, hold, timing)
+    began = time.monotonic()
+    with Network(wire) as network, TwoComputers(network, params, peers) as arm:
+        carried = released = ended = None
+        if arm.wait_until(lambda: arm.bridge.get("state") in ("active", "fault"), patience):
+            carried = time.monotonic() - began if arm.bridge["state"] == "active" else None
+            if _wait_for(arm, "hold", MOVE + 10.0):
+                released = arm.lines[-1][0]
+                _wait_for(arm, "done", hold + 10.0)
+                ended = arm.lines[-1][0]
+        outcome = "carried" if arm.action == "done" else _reason(arm)
+        late = int(arm.bridge.get("late cycles", 0))
+        arm.stop()
+        (folder / "log.txt").write_text("\n".join(f"{name}: {line}" for name in arm.log for line in arm.log[name]))
+    measured = None
+    if released is not None and ended is not None:
+        truth = next(folder.glob("truth*.bin"))
+        measured = measure(folder / "bag_robot", truth, released, ended)
+    return Result(wire, carried, outcome, measured, late)
+
+
+def _wait_for(arm: TwoComputers, action: str, timeout: float) -> bool:
+    """Wait until the virtual wearer is at `action`, or the bridge has a fault; return whether it is at `action`."""
+    arm.wait_until(lambda: arm.action in (action, "done") or arm.bridge.get("fault", "none") != "none", timeout)
+    return arm.action == action
+
+
+def _reason(arm: TwoComputers) -> str:
+    fault = arm.bridge.get("fault", "none")
+    return str(arm.bridge.get("message", "no report of the bridge") if fault == "none" else f"let down: {fault}")

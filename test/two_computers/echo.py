@@ -1,0 +1,56 @@
+"""Measures a wire with numbered datagrams: `echo ADDRESS` sends them back, `count ADDRESS NUMBER` prints each time."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import sys
+import time
+
+PORT = 5005
+PERIOD = 0.002  # s between two datagrams
+PATIENCE = 1.0  # s without a datagram after which no more are expected
+
+
+def echo(address: str) -> None:
+    """Send every datagram back until the standard input closes or PATIENCE is over after the first one."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind((address, PORT))
+        print("ready", flush=True)
+        while True:
+            data, sender = receiver.recvfrom(100)
+            receiver.settimeout(PATIENCE)
+            receiver.sendto(data, sender)
+
+
+def count(address: str, number: int) -> None:
+    """Print the round-trip times in s of the datagrams that return, by their numbers, as a list of pairs."""
+    sent, back = {}, []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for index in range(number):
+            sent[index] = time.monotonic()
+            sender.sendto(str(index).encode(), (address, PORT))
+            time.sleep(PERIOD)
+            sender.setblocking(False)
+            try:
+                while True:
+                    back.append(_returned(sender, sent))
+            except BlockingIOError:
+                pass
+        sender.settimeout(PATIENCE)
+        try:
+            while True:
+                back.append(_returned(sender, sent))
+        except TimeoutError:
+            print(json.dumps(back))
+
+
+def _returned(sender: socket.socket, sent: dict[int, float]) -> tuple[int, float]:
+    index = int(sender.recv(100))
+    return index, time.monotonic() - sent[index]
+
+
+if __name__ == "__main__":
+    with contextlib.suppress(TimeoutError):
+        echo(sys.argv[2]) if sys.argv[1] == "echo" else count(sys.argv[2], int(sys.argv[3]))

@@ -1,0 +1,57 @@
+"""The wire between the two computers, without ROS: what arrives, how late, and that there is no other way out."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from .network import ADDRESSES, Network, Wire
+
+COUNT = 300
+ECHO = [sys.executable, "-m", "test.two_computers.echo"]
+
+
+def round_trips(wire: Wire) -> list[tuple[int, float]]:
+    """Return number and round-trip time in s of the datagrams that come back of `COUNT`."""
+    with Network(wire) as network:
+        echo = network.start("desk", [*ECHO, "echo", ADDRESSES["desk"]], {})
+        assert echo.stdout is not None and echo.stdout.readline() == "ready\n"
+        counting = network.start("robot", [*ECHO, "count", ADDRESSES["desk"], str(COUNT)], {})
+        output, _ = counting.communicate(timeout=30)
+        echo.kill()
+    return [(number, time) for number, time in json.loads(output)]
+
+
+def test_every_datagram_passes_a_good_wire_in_order():
+    assert [number for number, _ in round_trips(Wire())] == list(range(COUNT))
+
+
+def test_no_datagram_is_earlier_than_the_delay_and_jitter_does_not_reorder_them():
+    numbers, times = zip(*round_trips(Wire(delay=5.0, jitter=8.0)), strict=True)
+    assert numbers == tuple(range(COUNT))
+    assert min(times) >= 0.010  # s, both ways
+    assert max(times) > 0.014  # jitter, both ways
+
+
+def test_the_stated_share_is_lost_each_way():
+    share = len(round_trips(Wire(loss=0.2))) / COUNT
+    assert share == pytest.approx(0.8**2, abs=0.1)  # the seed is fixed; other packets draw from it too
+
+
+def test_a_computer_has_no_interface_but_the_wire():
+    with Network(Wire()) as network:
+        listing = network.start("robot", ["ip", "-json", "link"], {})
+        names = {link["ifname"] for link in json.loads(listing.communicate(timeout=10)[0])}
+        routes = network.start("robot", ["ip", "route"], {}).communicate(timeout=10)[0]
+    assert names == {"lo", "eth0"} and "default" not in routes
+
+
+def test_the_namespaces_end_with_the_network():
+    with Network(Wire()) as network:
+        holders = dict(network._namespaces)
+        assert len(holders) == 3
+    for holder in holders.values():
+        assert subprocess.run(["kill", "-0", str(holder)], stderr=subprocess.DEVNULL).returncode != 0

@@ -1,0 +1,33 @@
+"""An arm whose compensator runs on another computer: carried over a fair wire, never enabled over a slow one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ..support.launched_nodes import SIMULATED
+from .case import play
+from .network import Wire
+
+pytestmark = pytest.mark.real_time
+
+TIMEOUT = 1000.0 * SIMULATED["can_bridge"]["command_timeout"]  # ms
+
+
+def test_an_arm_is_carried_over_a_wire_with_delay_jitter_and_loss(tmp_path: Path):
+    wire = Wire(delay=5.0, jitter=2.0, loss=0.02)
+    result = play(wire, tmp_path, hold=4.0, timing=SIMULATED)
+    assert result.outcome == "carried"
+    assert result.measured is not None
+    assert result.measured.drift < 0.5  # deg
+    assert 2.0 * wire.delay <= result.measured.age[0] < TIMEOUT
+    assert 0.0 < result.measured.missed < 0.2
+    assert "ROS_STATIC_PEERS=10.77.0.2: other hosts can command this arm" in (tmp_path / "log.txt").read_text()
+    assert (tmp_path / "bag_desk").is_dir()
+
+
+def test_an_arm_whose_efforts_are_older_than_the_timeout_is_never_enabled(tmp_path: Path):
+    result = play(Wire(delay=0.6 * TIMEOUT), tmp_path, hold=1.0, timing=SIMULATED, patience=15.0)
+    assert result.start is None
+    assert result.outcome == "checking: waiting for effort commands"
