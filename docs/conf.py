@@ -26,6 +26,7 @@ release = version = ElementTree.parse(ROOT / "package.xml").findtext("version", 
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 include_patterns = ["docs/*.md", "README.md", "CONTRIBUTING.md", "CHANGELOG.rst", "test/data/*/*.md"]
+default_role = "code"  # what docstrings put in single backticks
 root_doc = "docs/index"
 
 html_theme = "furo"
@@ -35,6 +36,7 @@ html_title = f"exo_gravity {version}"
 html_extra_path = ["_static/index.html"]  # from the site's top to docs/index.html
 html_math_renderer = "mathml"
 html_show_sphinx = False
+html_show_copyright = False
 pygments_style = "friendly"
 
 myst_enable_extensions = ["dollarmath"]
@@ -43,7 +45,6 @@ suppress_warnings = ["myst.header"]  # README begins with level 1, as it must; s
 
 autodoc_typehints = "signature"
 autodoc_member_order = "bysource"
-nitpicky = False
 
 
 def show_inline(translator: Any, node: nodes.math) -> None:
