@@ -1,8 +1,13 @@
 from glob import glob
+from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
 package_name = "exo_gravity"
+here = Path(__file__).parent
+# The version, the description and the maintainer are those of package.xml, and nowhere else.
+declared = ElementTree.parse(here / "package.xml").getroot()
 # The one list of executables, each named after its module. The launcher reads the nodes from the entry points.
 nodes = ("can_bridge", "imu", "compensator", "simulator", "recorder", "calibrator", "robot_model")
 tools = ("launcher", "trial", "report", "budget", "validate", "train_anfis", "calibrate", "urdf")
@@ -35,6 +40,7 @@ extras = {
     ],
     # The ament linters are Jazzy's own, with the plugins that Ubuntu's ament_flake8 brings.
     "dev": [
+        "build>=1.2",
         "flake8>=7.0",
         "flake8-builtins>=2.1",
         "flake8-comprehensions>=3.14",
@@ -53,7 +59,7 @@ extras = {
 
 setup(
     name=package_name,
-    version="0.1.0",
+    version=declared.findtext("version"),
     packages=find_packages(include=[package_name, package_name + ".*"]),
     package_data={package_name: ["py.typed"], f"{package_name}.nodes": ["fastdds*.xml"]},
     data_files=[
@@ -71,10 +77,20 @@ setup(
     install_requires=["msgpack>=1.0", "numpy>=1.26", "python-can>=4.3", "PyYAML>=6.0"],
     extras_require=extras,
     zip_safe=False,
-    maintainer="exo_gravity maintainers",
-    maintainer_email="maintainers@exo-gravity.example",
-    description="Feed-forward gravity compensation for a worn upper-body exoskeleton with AK60-6 and AK80-9 motors",
-    license="Apache-2.0",
+    maintainer=declared.findtext("maintainer"),
+    maintainer_email=declared.find("maintainer").get("email"),
+    description=declared.findtext("description"),
+    long_description=(here / "README.md").read_text(encoding="utf-8"),
+    long_description_content_type="text/markdown",
+    license=declared.findtext("license"),
+    classifiers=[
+        "Environment :: Console",
+        "Intended Audience :: Science/Research",
+        "Operating System :: POSIX :: Linux",
+        "Programming Language :: Python :: 3",
+        "Topic :: Scientific/Engineering",
+        "Typing :: Typed",
+    ],
     entry_points={
         "console_scripts": [
             *(f"{name} = exo_gravity.nodes.{name}:main" for name in nodes),
