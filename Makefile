@@ -11,6 +11,7 @@
 # make socketcan    motor bus and nodes on vcan0; RUN=COMMAND runs the tests through COMMAND, in a virtual machine for example
 # make ros2-launch  the launch file under `ros2 launch`, where ROS 2 and a build of this package are sourced
 # make two-computers  the arm on two computers over better and worse wires, 7 minutes; a table and build/two_computers.json
+# make dist         wheel and source distribution in dist/, the wheel installed in an empty environment and tried
 # make pythons      for each supported Python found here: set-up from nothing, a short trial, the nodes
 # make constraints  renews the versions in constraints/
 # make clean        removes what these made
@@ -24,8 +25,8 @@ DEMO := imu sim report
 TEST := $(DEMO) validate video test
 SETUP := VENV=$(VENV) .ci/setup
 
-.PHONY: demo calibrate-demo calibrate-study test lint docs faults mutations bench imu-report socketcan pythons \
-	 constraints clean ros2-launch two-computers
+.PHONY: demo calibrate-demo calibrate-study test lint docs faults mutations bench imu-report socketcan \
+        pythons constraints clean ros2-launch two-computers dist
 
 demo:
 	@$(SETUP) $(DEMO)
@@ -85,6 +86,10 @@ two-computers:
 	@mkdir -p build
 	$(BIN)/python -m test.two_computers --output build/two_computers.json
 
+dist:
+	@$(SETUP) dev
+	VENV=$(VENV) .ci/dist
+
 pythons:
 	.ci/pythons
 
@@ -92,4 +97,4 @@ constraints:
 	.ci/constraints
 
 clean:
-	rm -rf $(VENV) build install log trials exo_gravity.egg-info .mypy_cache .ruff_cache
+	rm -rf $(VENV) build dist install log trials exo_gravity.egg-info .mypy_cache .ruff_cache

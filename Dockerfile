@@ -1,0 +1,35 @@
+# A ROS 2 Jazzy host with this package, for a robot's computer or for trials in simulation.
+#
+#   docker build --tag exo_gravity .
+#   docker run --rm exo_gravity ros2 run exo_gravity trial demo --output /tmp/trials
+#   docker run --rm --network host --cap-add SYS_NICE --ulimit rtprio=98 --ulimit memlock=-1 \
+#       --volume "$PWD/my.yaml:/exo.yaml:ro" exo_gravity ros2 run exo_gravity launcher --params /exo.yaml
+#
+# A CAN interface of the host needs --network host; the interface itself is set up on the host.
+FROM ros:jazzy-ros-base
+
+SHELL ["/bin/bash", "-o", "pipefail", "-c"]
+WORKDIR /workspace
+
+# What rosdep installs changes less often than the sources.
+COPY package.xml src/exo_gravity/package.xml
+# hadolint ignore=DL3008
+RUN apt-get update \
+    && rosdep update --rosdistro jazzy \
+    && rosdep install --from-paths src --ignore-src --rosdistro jazzy --default-yes --dependency-types exec \
+    && apt-get install --yes --no-install-recommends python3-matplotlib python3-pip python3-scipy \
+    && rm -rf /var/lib/apt/lists/*
+
+# From PyPI, because Ubuntu does not have them: the simulator, the reports, orientation filter and I2C. NumPy stays
+# Ubuntu's, against which ROS's messages are compiled.
+COPY constraints/ros.txt constraints.txt
+RUN python3 -m pip install --no-cache-dir --break-system-packages --constraint constraints.txt \
+    mcap mujoco rich rosbags smbus2 vqf
+
+COPY . src/exo_gravity
+RUN source /opt/ros/jazzy/setup.bash && colcon build --packages-select exo_gravity
+
+# For a terminal of its own: source /workspace/install/setup.bash
+COPY --chmod=755 docker/entrypoint.sh /entrypoint.sh
+ENTRYPOINT ["/entrypoint.sh"]
+CMD ["ros2", "run", "exo_gravity", "launcher"]
