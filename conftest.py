@@ -1,8 +1,8 @@
 """Which tests `colcon test` runs: those whose packages are installed, without the ones that need a quiet machine.
 
 A ROS host has what package.xml names; MuJoCo, Pinocchio and others come from PyPI alone. Under colcon, which sets
-COLCON=1, a test file that needs a missing package is therefore left out, and the end of the run counts what was. Outside
-of colcon (`make test`) a missing package is an error.
+COLCON=1, a test file that needs a missing package is therefore left out, and the end of the run lists those packages.
+Elsewhere (`make test`) a missing package is an error.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ left_out: Counter[str] = Counter()
 
 
 def imports(path: Path) -> tuple[str, ...]:
-    """Return the modules that a file of this repository imports, also inside functions; from a module, its names too."""
+    """Return the modules that a file imports, also inside functions; `from a import b` gives a and a.b."""
     package = path.relative_to(ROOT).parent.parts
     found: list[str] = []
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

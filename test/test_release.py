@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -88,7 +89,7 @@ def test_the_changelog_has_the_form_that_catkin_tools_read() -> None:
     title = f"Changelog for package {PACKAGE.findtext('name')}"
     overline = [line for line in lines[:1] if set(line) == {"^"}]
     assert lines[len(overline)] == title
-    underlined = zip(lines, lines[1:], strict=False)
+    underlined = pairwise(lines)
     sections = [name for name, rule in underlined if rule and set(rule) == {"-"} and len(rule) >= len(name)]
     assert sections
     assert all(re.fullmatch(r"Forthcoming|\d+\.\d+\.\d+ \(\d{4}-\d{2}-\d{2}\)", name) for name in sections)
