@@ -41,8 +41,8 @@ def effort_of(
 ) -> Effort:
     """Return the effort of a wearer who gave `torque` (n, 4) in Nm at the joints' `speed` (n, 4) in rad/s.
 
-    rate: samples per s. swept: the joint that made a sweep, None for another task. holding: (n,) whether the arm is held
-    still, None for a task without holds.
+    rate: samples per s. swept: the joint that made a sweep, None for another task. holding: (n,) whether the arm is
+    held still, None for a task without holds.
     """
     smooth = _smoothed(speed, rate)
     acceleration = np.gradient(smooth, 1.0 / rate, axis=0)

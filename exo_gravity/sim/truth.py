@@ -19,7 +19,8 @@ from exo_gravity.sim.motor import SimulatedMotor
 
 # time: wall clock in s. position, velocity: of the joints, rad and rad/s. torque: of the motors on the joints, Nm.
 # damping: Nm s/rad, the part of that torque that is proportional to the velocity. wearer: Nm of the wearer on the
-# joints. frames: received by each motor so far. step: of the wearer's script, -1 before it. on: whether each motor is on.
+# joints. frames: received by each motor so far. step: of the wearer's script, -1 before it. on: whether each motor is
+# on.
 RECORD = np.dtype(
     [
         ("time", "<f8"),

@@ -1,8 +1,8 @@
 """The workspace that a weak arm reaches, against support: Freebal's measure.
 
-A wearer who has only a share of the torque that his own outstretched arm requires moves the arm from a low pose straight
-to each pose of a grid. He reaches it if on the whole way, on every joint, his strength exceeds what compensation leaves
-of the weight, plus friction. The motion is slow: inertia is left out.
+A wearer who has only a share of the torque that his own outstretched arm requires moves the arm from a low pose
+straight to each pose of a grid. He reaches it if on the whole way, on every joint, his strength exceeds what
+compensation leaves of the weight, plus friction. The motion is slow: inertia is left out.
 """
 
 from __future__ import annotations

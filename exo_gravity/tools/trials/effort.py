@@ -1,8 +1,8 @@
 """trial effort: how hard the arm is to move, under every setting of the compensator.
 
 A virtual wearer moves the simulated arm through 13 poses, a reach task and a sine sweep of each joint: on nodes that
-are started anew for each setting, or with --offline without ROS and faster. Tables, a figure, CSV files and an HTML page
-show the effort of each setting.
+are started anew for each setting, or with --offline without ROS and faster. Tables, a figure, CSV files and an HTML
+page show the effort of each setting.
 """
 
 from __future__ import annotations
