@@ -110,7 +110,7 @@ class EffortStudy:
 def _values_of(settings: Settings | None) -> dict[str, Any]:
     """Return the parameters of `compensator` for `settings`; None: no torque."""
     if settings is None:
-        return {"use_imu": False, "max_effort": [0.0] * 4}
+        return {"use_imu": False, "gain": [0.0] * 4}
     values: dict[str, Any] = {name: getattr(settings, name) for name in ("mode", "support", "use_imu", "max_effort")}
     values.update({"wearer.mass": settings.wearer_mass, "wearer.cog": settings.wearer_cog})
     for prefix, owner in GROUPS.items():
