@@ -33,7 +33,8 @@ SETTLING = 0.5  # s of movement before the measurement
 THREAD_PRIORITY = {"nodes": 0, "fifo": 50}  # of the kinds that run the package's nodes
 TICKS = os.sysconf("SC_CLK_TCK")
 
-Watch = Callable[[dict[str, int]], None]
+Windows = list[tuple[float, float]]  # begin and end in s since 1970
+Watch = Callable[[dict[str, int]], Windows | None]
 
 
 @dataclass(frozen=True)
@@ -41,20 +42,21 @@ class LoopRun:
     """One run.
 
     arms: the timing of each. cpu: share of a core by process. stolen: share of a core that the hypervisor gave to
-    others. start: s from launch to carried.
+    others. start: s from launch to carried. windows: the first arm's timing in each of the times that `watch` returned.
     """
 
     arms: list[LoopTiming]
     cpu: dict[str, float]
     stolen: float
     start: float
+    windows: list[LoopTiming]
 
 
 def run_loop(kind: str, rate: float, both_arms: bool, seconds: float, watch: Watch | None = None) -> LoopRun:
     """Run one `kind` of loop: 'nodes', 'fifo', 'python' or 'rclpy'.
 
-    watch: called with the process IDs during the measurement, in place of a wait for `seconds`.
-    Raises RuntimeError if the arm is not carried to the end.
+    watch: called with the process IDs during the measurement, in place of a wait for `seconds`. It may return times
+    that are timed separately too. Raises RuntimeError if the arm is not carried to the end.
     """
     with tempfile.TemporaryDirectory() as folder_name, contextlib.ExitStack() as stack:
         folder = Path(folder_name)
@@ -80,17 +82,21 @@ def run_loop(kind: str, rate: float, both_arms: bool, seconds: float, watch: Wat
         if line := log.find("not permitted"):
             raise RuntimeError(line)
         time.sleep(SETTLING)
-        window_begin, window_end, cpu, stolen = _measure(pids, seconds, watch)
+        times, cpu, stolen = _measure(pids, seconds, watch)
         _check_run(launcher, log)
         stack.close()
         if any(listener.wait() for listener in listeners):
             raise RuntimeError("the listener lost frames: the machine is too busy to measure anything")
-        timings = []
-        for arm, recording in zip(arms, recordings, strict=True):
-            with np.load(recording) as frames:
-                cycles = split_cycles(dict(frames), arm.motors, window_begin, window_end)
-            timings.append(analyse(cycles, arm.motors, arm.law, 1.0 / rate))
-        return LoopRun(timings, cpu, stolen, start)
+        whole = [_timings(arm, recording, times[:1], rate)[0] for arm, recording in zip(arms, recordings, strict=True)]
+        return LoopRun(whole, cpu, stolen, start, _timings(arms[0], recordings[0], times[1:], rate))
+
+
+def _timings(arm: DirectArm, recording: Path, times: Windows, rate: float) -> list[LoopTiming]:
+    """Return the timing of an arm in each of `times`."""
+    with np.load(recording) as frames:
+        content = dict(frames)
+    cycles = [split_cycles(content, arm.motors, begin, end) for begin, end in times]
+    return [analyse(part, arm.motors, arm.law, 1.0 / rate) for part in cycles]
 
 
 def write_parameters(
@@ -127,16 +133,17 @@ def _check_run(launcher: Launcher, log: NodeLog) -> None:
         raise RuntimeError(f"the arm was let down during the run: {line}")
 
 
-def _measure(pids: dict[str, int], seconds: float, watch: Watch | None) -> tuple[float, float, dict[str, float], float]:
-    """Let `seconds` pass; return begin and end (s since 1970), each process's share of a core, and the stolen share."""
+def _measure(pids: dict[str, int], seconds: float, watch: Watch | None) -> tuple[Windows, dict[str, float], float]:
+    """Let `seconds` pass; return that time and those of `watch`, each process's share of a core, the stolen share."""
     before, stolen, begin = {name: _cpu_time(pid) for name, pid in pids.items()}, _stolen_time(), time.time()
+    windows: Windows = []
     if watch:
-        watch(pids)
+        windows = watch(pids) or []
     else:
         time.sleep(seconds)
     end = time.time()
     shares = {name: (_cpu_time(pid) - before[name]) / (end - begin) for name, pid in pids.items()}
-    return begin, end, shares, (_stolen_time() - stolen) / (end - begin)
+    return [(begin, end), *windows], shares, (_stolen_time() - stolen) / (end - begin)
 
 
 def _peer_commands(kind: str, params: Path, namespace: str, rate: float) -> list[tuple[str, ...]]:

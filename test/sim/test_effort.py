@@ -16,6 +16,7 @@ from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedM
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.effort import Sweep, Task, measure
 from exo_gravity.sim.effort_study import MIDDLE, REACH, effort_settings
+from exo_gravity.sim.perturbed_arm import perturbed_arm
 
 from ..support.terms_run import COULOMB, MOTORS_OF_ARM
 
@@ -68,20 +69,10 @@ def test_a_sweep_in_exact_zero_g_feels_the_inertia_and_friction_of_the_simulated
 
 
 def perturbed(seed: int) -> tuple[SimulatedDevice, list[float], list[float]]:
-    """Return a device that differs from the controller's model, and the friction that was identified on it.
-
-    Seed 0 is the packaged simulator, with a wearer 3 % heavier than configured.
-    """
-    if seed == 0:
-        return make_device(), list(COULOMB), [0.02, 0.05, 0.02, 0.02]
-    rng = np.random.default_rng(seed)
-    mass, cog = DEFAULT_LINKS.mass * rng.uniform(0.95, 1.05, 4), DEFAULT_LINKS.cog * rng.uniform(0.95, 1.0, 4)
-    friction = (np.array(COULOMB) * rng.uniform(0.7, 1.3, 4)).tolist()
-    viscous = (np.array((0.02, 0.05, 0.02, 0.02)) * rng.uniform(0.7, 1.3, 4)).tolist()
-    links = ArmModel(DEFAULT_LINKS.length, cog, mass)
-    identified = rng.uniform(0.8, 1.0)
-    device = make_device(rng.uniform(0.95, 1.05), links, friction, viscous)
-    return device, [identified * value for value in friction], [identified * value for value in viscous]
+    """Return a device that differs from the controller's model, and the friction that was identified on it."""
+    arm = perturbed_arm(seed, MASS, COG)
+    motors = [SimulatedMotor(motor) for motor in MOTORS_OF_ARM]
+    return SimulatedDevice(SimulatedArm(arm.config), motors), arm.coulomb, arm.viscous
 
 
 @pytest.mark.parametrize("seed", range(6))
