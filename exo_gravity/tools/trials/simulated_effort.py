@@ -19,7 +19,7 @@ from exo_gravity.sim.baselines import Burden, Feedforward, Law, burden
 from exo_gravity.sim.device_params import SIMULATOR, device_of
 from exo_gravity.sim.effort import Sweep, Task
 from exo_gravity.sim.effort_script import effort_script, efforts_of_truth
-from exo_gravity.sim.effort_study import IDENTIFIED, REACH, TASKS, WEARER_EXCESS, effort_settings, study
+from exo_gravity.sim.effort_study import IDENTIFIED, RATE, REACH, TASKS, WEARER_EXCESS, effort_settings, study
 from exo_gravity.sim.weak_wearer import STRENGTHS, grid_of, reached_share, weak_strength
 from exo_gravity.tools.inputs.arms import node_values, read_arm
 from exo_gravity.tools.inputs.parameter_file import Nodes, load, packaged_config
@@ -93,8 +93,8 @@ class EffortStudy:
         bridge, compensator, simulator = (
             {**self.nodes[f"{self.namespace}/{node}"]} for node in ("can_bridge", "compensator", "simulator")
         )
-        # The duration of the sign check varies, and a wearer's arm would make it longer.
-        bridge.update(max_effort=[motor.peak_effort for motor in self.motors], sign_check_torque=0.0)
+        # The duration of the sign check varies, and a wearer's arm would make it longer. The rate is the offline study's.
+        bridge.update(max_effort=[motor.peak_effort for motor in self.motors], sign_check_torque=0.0, rate=RATE)
         compensator.update(_values_of(self.settings[setting]))
         simulator.update({name: self.simulator[name] for name in ("wearer.mass", "wearer.cog")})
         simulator.update({"trunk.pitch": 0.0, "trunk.roll": 0.0, "imu.topic": ""})
