@@ -33,7 +33,7 @@ class EffortStudy:
     """One simulated arm with a wearer in it, and what is compared on it.
 
     nodes: of the parameter file. simulator: its values. settings: of the compensator by name, None for motors without
-    torque. limits: lower and upper joint limits.
+    torque. supports: those without terms, for the workspace of a weak arm.
     """
 
     namespace: str
@@ -41,6 +41,7 @@ class EffortStudy:
     simulator: Mapping[str, Any]
     motors: tuple[JointMotor, ...]
     settings: dict[str, Settings | None]
+    supports: dict[str, Settings | None]
     tasks: tuple[Task | Sweep, ...]
 
     @classmethod
@@ -65,9 +66,10 @@ class EffortStudy:
         simulator["trunk.pitch"] = simulator["trunk.roll"] = 0.0
         friction = ([IDENTIFIED * value for value in simulator[f"friction.{part}"]] for part in ("coulomb", "viscous"))
         settings = effort_settings(base, *friction)
+        supports = {name: value for name, value in settings.items() if not name.startswith("+")}
         if quick:
             settings = {name: settings[name] for name in QUICK_SETTINGS}
-        return cls(namespace, nodes, simulator, arm.motors, settings, (REACH,) if quick else TASKS)
+        return cls(namespace, nodes, simulator, arm.motors, settings, supports, (REACH,) if quick else TASKS)
 
     def offline(self) -> tuple[int, Iterator[tuple[str, str, Effort]]]:
         """Return the number of rows, and setting, task and effort of each, without nodes."""
@@ -78,10 +80,11 @@ class EffortStudy:
         """Yield setting, strength of a weak wearer as a share, and the share of the workspace that he reaches."""
         arm = read_arm(self.nodes, self.namespace)
         grid, config = grid_of(arm.low.tolist(), arm.high.tolist()), device_of(self.simulator).arm.config
-        some = next(settings for settings in self.settings.values() if settings)
-        for name, settings in self.settings.items():
-            for share in STRENGTHS if not name.startswith("+") else ():
-                yield name, share, reached_share(config, settings, weak_strength(some, grid, share), grid)
+        wearer = self.supports["One-G"]
+        assert wearer is not None
+        for name, settings in self.supports.items():
+            for share in STRENGTHS:
+                yield name, share, reached_share(config, settings, weak_strength(wearer, grid, share), grid)
 
     @property
     def script(self) -> dict[str, Any]:
