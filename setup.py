@@ -9,7 +9,7 @@ here = Path(__file__).parent
 # The version, the description and the maintainer are those of package.xml, and nowhere else.
 declared = ElementTree.parse(here / "package.xml").getroot()
 # The one list of executables, each named after its module. The launcher reads the nodes from the entry points.
-nodes = ("can_bridge", "imu", "compensator", "simulator", "recorder", "calibrator", "robot_model")
+nodes = ("can_bridge", "imu", "compensator", "simulator", "recorder", "calibrator", "robot_model", "panel")
 tools = ("launcher", "trial", "report", "budget", "validate", "train_anfis", "calibrate", "urdf")
 
 extras = {
@@ -20,6 +20,7 @@ extras = {
     "report": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11", "scipy>=1.11"],
     "video": ["imageio[pyav]>=2.31", "mujoco>=3.2", "pillow>=10.1"],
     "calibrate": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11"],
+    "panel": ["starlette>=0.40", "uvicorn>=0.30", "websockets>=13.0"],
     "validate": [
         "imufusion>=1.3",
         "pin>=2.7",
@@ -61,7 +62,11 @@ setup(
     name=package_name,
     version=declared.findtext("version"),
     packages=find_packages(include=[package_name, package_name + ".*"]),
-    package_data={package_name: ["py.typed"], f"{package_name}.nodes": ["fastdds*.xml"]},
+    package_data={
+        package_name: ["py.typed"],
+        f"{package_name}.nodes": ["fastdds*.xml"],
+        f"{package_name}.panel": ["strings.json", "static/*", "static/vendor/*"],
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
         (f"share/{package_name}", ["package.xml"]),

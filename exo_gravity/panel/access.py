@@ -51,11 +51,9 @@ class Access:
         """Return whether a request with this header `Host` may be answered."""
         return not self.is_open or is_loopback(urlsplit(f"//{host}").hostname or "")
 
-    def allows(self, session: str, bearer: str = "") -> bool:
-        """Return whether a request with this session, or this token in `Authorization`, may see anything."""
-        if self.is_open:
-            return True
-        return any(_equal(session, known) for known in self._sessions) or bool(bearer and self.is_token(bearer, ""))
+    def allows(self, session: str) -> bool:
+        """Return whether a request with this session may see anything."""
+        return self.is_open or any([_equal(session, known) for known in self._sessions])
 
     def is_token(self, given: str, address: str) -> bool:
         """Return whether `given` is the token, in constant time. A wrong one counts against `address`."""

@@ -1,13 +1,13 @@
 """What a page may ask for: each request is checked here before anything is done.
 
-    {"do": "let_down"}                                   all arms; every page may, at any time
-    {"do": "let_down", "arm": "right"}                   one arm
-    {"do": "enable", "arm": "right"}                     the rest: only the page that holds control
-    {"do": "clear_fault", "arm": "right"}
-    {"do": "set", "arm": "right", "values": {"support": 0.3}}
-    {"do": "take"}, {"do": "release"}                    control; take: every page
-    {"do": "record"}, {"do": "stop_recording"}, {"do": "save"}
-    {"do": "trial", "name": "demo"}, {"do": "stop_trial"}
+{"do": "let_down"}                                   all arms; every page may, at any time
+{"do": "let_down", "arm": "right"}                   one arm
+{"do": "enable", "arm": "right"}                     the rest: only the page that holds control
+{"do": "clear_fault", "arm": "right"}
+{"do": "set", "arm": "right", "values": {"support": 0.3}}
+{"do": "take"}, {"do": "release"}                    control; take: every page
+{"do": "record"}, {"do": "stop_recording"}, {"do": "save"}
+{"do": "trial", "name": "demo"}, {"do": "stop_trial"}
 """
 
 from __future__ import annotations

@@ -93,6 +93,10 @@ class Control:
         if secret == self._holder:
             self._holder = ""
 
+    def release_all(self) -> None:
+        """Leave control to whoever takes it next."""
+        self._holder = ""
+
     def is_gone(self) -> bool:
         """Return whether a page holds control that is gone."""
         holder = self.holder

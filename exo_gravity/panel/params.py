@@ -8,12 +8,13 @@ from exo_gravity.core.param_table import Param
 LANGUAGES = ("en", "de")
 # fmt: off
 PANEL = (
-    Param("host", "127.0.0.1", "address at which the page is served; other than loopback only with a token", fixed=True),
+    Param("host", "127.0.0.1", "address of the page; other than loopback only with a token", fixed=True),
     Param("port", 8080, "TCP port of the page", (1, 65535), fixed=True),
     Param("token", "", "secret that opens the page; empty: none on loopback, elsewhere a random one in the log",
           fixed=True),
     Param("dead_man", False, "let the arms down when the page that holds control has been gone for 2 s", fixed=True),
     Param("language", "en", "language of the page until its user chooses another", choices=LANGUAGES, fixed=True),
+    Param("trials", "", "folder with trial scripts; empty: those of the package", fixed=True),
     Param("output", "recordings", "folder for recordings, trials and saved parameters", fixed=True),
 )
 # fmt: on

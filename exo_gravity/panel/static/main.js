@@ -1,0 +1,159 @@
+// The page: takes the state, shows it, and sends what its user asks for. Let down comes first.
+
+import { ArmCard } from "./arm.js";
+import { ask, close as closeAsk } from "./ask.js";
+import { connect, letDown, link, request, watch } from "./link.js";
+import { Plots } from "./plots.js";
+import { Picture } from "./picture.js";
+import { Sections } from "./sections.js";
+import { loadTexts, number, t, write } from "./texts.js";
+
+const byId = (id) => document.getElementById(id);
+const cards = new Map();
+let state = null;
+let setup = null;
+let mayAlarm = false; // once the page has been connected
+
+// Let down
+
+const button = byId("let-down");
+let pressed = 0;
+
+async function down(arm) {
+  closeAsk(false);
+  const problem = await letDown(arm);
+  if (problem === "") return say(t("let_down_sent"));
+  byId("alarm").dataset.down = "failed";
+  write(byId("alarm"), t("let_down_failed", problem ?? t("unsent")));
+}
+
+function pressDown() {
+  if (performance.now() - pressed < 300) return; // the click that follows the same touch
+  pressed = performance.now();
+  delete byId("alarm").dataset.down;
+  down();
+}
+
+button.addEventListener("pointerdown", pressDown);
+button.addEventListener("click", pressDown);
+// The space bar lets down, whatever has the focus; Enter presses buttons.
+document.addEventListener(
+  "keydown",
+  (event) => {
+    if (event.code !== "Space") return;
+    event.preventDefault();
+    event.stopPropagation();
+    if (!event.repeat) pressDown();
+  },
+  true,
+);
+document.addEventListener("keyup", (event) => event.code === "Space" && event.preventDefault(), true);
+
+// What the arms' cards ask for
+
+const say = (text) => write(byId("message"), text);
+
+async function send(body) {
+  const problem = await request(body);
+  say(problem === null ? t("unsent") : problem ? t("refused", problem) : "");
+  return problem === "";
+}
+
+const percent = (card) => number(100 * card.support, 1);
+const actions = {
+  send,
+  down,
+  async enable(card) {
+    const text = `${t("enable_ask")} ${t(`enable_mode.${card.mode}`, percent(card))}`;
+    if (await ask(t("enable_arm", card.armText()), text, t("enable"))) send({ do: "enable", arm: card.name });
+  },
+  async mode(card, mode) {
+    const risky = mode === "zero_g" && card.mode !== "zero_g";
+    if (risky && !(await ask(t("mode.zero_g"), t("zero_g_ask", percent(card)), t("mode.zero_g")))) return;
+    send({ do: "set", arm: card.name, values: { mode } });
+  },
+};
+
+const sections = new Sections(send, cards);
+const plots = new Plots(byId("plots"));
+const picture = new Picture(byId("picture"), byId("views"));
+
+// What arrives
+
+function onSetup(message) {
+  setup = message;
+  for (const [name, arm] of Object.entries(message.arms ?? {})) {
+    if (!cards.has(name)) {
+      cards.set(name, new ArmCard(name, actions));
+      byId("arms").append(cards.get(name).root);
+    }
+    cards.get(name).configure(arm);
+  }
+  plots.configure(message.arms ?? {});
+  picture.configure(message.scene);
+  sections.configure(message);
+}
+
+function onState(message) {
+  state = message;
+  show();
+  if (!document.hidden) {
+    plots.add(message.arms);
+    picture.pose(message.arms, message.tilt, setup?.arms ?? {});
+  }
+}
+
+function show() {
+  if (!setup || !state) return;
+  const operates = link.alive && state.control?.page === link.number;
+  for (const [name, card] of cards) if (state.arms[name]) card.show(state.arms[name], operates, link.alive);
+  byId("no-arm").hidden = cards.size > 0;
+  showConnection();
+  showControl(operates);
+  sections.show(state, operates);
+  const tilt = state.tilt;
+  write(byId("tilt"), tilt ? t("tilt", number((tilt.pitch * 180) / Math.PI, 1), number((tilt.roll * 180) / Math.PI, 1)) : t("tilt_none"));
+}
+
+function showConnection() {
+  mayAlarm ||= link.alive;
+  const words = link.alive ? t("connected") : t("connecting");
+  write(byId("connection"), setup?.dead_man ? `${words}. ${t("dead_man_on")}` : words);
+  if (byId("alarm").dataset.down) return;
+  const lost = setup?.dead_man ? t("lost_dead_man") : t("lost");
+  write(byId("alarm"), link.alive || !mayAlarm ? "" : link.full ? t("full") : lost);
+}
+
+function showControl(operates) {
+  const holder = state.control;
+  const text = !holder ? t("control_none") : operates ? t("control_yours", holder.page) : holder.gone ? t("control_gone", holder.page, holder.address) : t("control_other", holder.page, holder.address, link.number);
+  write(byId("control-text"), text);
+  byId("take").hidden = operates || !link.alive;
+  byId("release").hidden = !operates;
+}
+
+byId("take").addEventListener("click", async () => {
+  const holder = state?.control;
+  const free = !holder || holder.gone;
+  if (free || (await ask(t("take"), t("take_ask", holder.page, holder.address), t("take")))) send({ do: "take" });
+});
+byId("release").addEventListener("click", () => send({ do: "release" }));
+
+const useLanguage = await loadTexts(() => {
+  for (const card of cards.values()) {
+    card.translate();
+    if (card.setup) card.configure(card.setup);
+  }
+  plots.translate();
+  show();
+});
+let chosen = false;
+connect({
+  setup(message) {
+    if (!chosen) useLanguage(message.language);
+    chosen = true;
+    onSetup(message);
+  },
+  state: onState,
+});
+watch(show);

@@ -1,0 +1,148 @@
+// The arms in 3D from the robot description: gravity, torques against their limits, joint limits; the trunk tilts.
+//
+// It is drawn when a state arrives, not sixty times a second. Without WebGL a sentence replaces it.
+
+import { t } from "./texts.js";
+
+const VIEWS = { oblique: [1.5, -0.9, 0.35], front: [1.9, 0, 0], side: [0, -1.9, 0] };
+const CENTRE = [0, 0, -0.25];
+
+export class Picture {
+  constructor(place, views) {
+    this.place = place;
+    this.view = "oblique";
+    this.description = "";
+    for (const button of views.querySelectorAll("button"))
+      button.addEventListener("click", () => {
+        this.view = button.dataset.view;
+        for (const other of views.querySelectorAll("button")) other.setAttribute("aria-pressed", String(other === button));
+        this.look();
+      });
+  }
+
+  async configure(scene) {
+    const description = JSON.stringify(scene ?? null);
+    if (!scene || description === this.description) return;
+    this.description = description;
+    if (!this.three) {
+      try {
+        this.three = await import("./vendor/three.module.min.js");
+        this.start();
+      } catch {
+        this.three = null;
+      }
+    }
+    if (!this.renderer) {
+      this.place.textContent = t("picture_none");
+      return;
+    }
+    this.build(scene);
+  }
+
+  start() {
+    const T = this.three;
+    this.renderer = new T.WebGLRenderer({ antialias: true });
+    const canvas = this.renderer.domElement;
+    canvas.setAttribute("role", "img");
+    canvas.setAttribute("aria-label", t("picture_of"));
+    this.place.replaceChildren(canvas);
+    this.camera = new T.PerspectiveCamera(40, 1, 0.05, 20);
+    this.camera.up.set(0, 0, 1);
+    this.scene = new T.Scene();
+    this.scene.background = new T.Color("#f3f5f7");
+    this.scene.add(new T.HemisphereLight("#ffffff", "#8a94a0", 2.5));
+    const gravity = new T.ArrowHelper(new T.Vector3(0, 0, -1), new T.Vector3(0, 0.75, 0), 0.35, 0x0a4f9e, 0.09, 0.05);
+    this.scene.add(gravity);
+    this.look();
+  }
+
+  look() {
+    if (!this.renderer) return;
+    this.camera.position.set(...VIEWS[this.view].map((value, n) => value + CENTRE[n]));
+    this.camera.lookAt(...CENTRE);
+    this.render();
+  }
+
+  build(scene) {
+    const T = this.three;
+    if (this.trunk) dispose(this.trunk);
+    const frames = Object.fromEntries(Object.keys(scene.links).map((name) => [name, new T.Group()]));
+    for (const [name, shapes] of Object.entries(scene.links)) for (const shape of shapes) frames[name].add(this.shape(shape));
+    this.joints = {};
+    for (const joint of scene.joints) {
+      const child = frames[joint.child];
+      child.position.set(...joint.xyz);
+      child.rotation.set(...joint.rpy, "ZYX");
+      frames[joint.parent].add(child);
+      if (joint.axis) this.joints[joint.name] = this.joint(joint, frames);
+    }
+    this.trunk = frames[scene.joints[0]?.parent] ?? new T.Group();
+    this.scene.add(this.trunk);
+    this.render();
+  }
+
+  // A joint turns its child, and has a bar for its torque and an arc from limit to limit.
+  joint(joint, frames) {
+    const T = this.three;
+    const axis = new T.Vector3(...joint.axis);
+    const bar = new T.Mesh(new T.CylinderGeometry(0.014, 0.014, 1, 12), new T.MeshLambertMaterial({ color: 0xa61218 }));
+    const turn = new T.Quaternion().setFromUnitVectors(new T.Vector3(0, 1, 0), axis);
+    bar.quaternion.copy(turn);
+    const arc = new T.Mesh(new T.TorusGeometry(0.07, 0.004, 6, 40, joint.upper - joint.lower), new T.MeshLambertMaterial({ color: 0x7a4b00 }));
+    arc.quaternion.copy(new T.Quaternion().setFromUnitVectors(new T.Vector3(0, 0, 1), axis));
+    arc.rotateZ(joint.lower);
+    const fixed = new T.Group();
+    fixed.position.set(...joint.xyz);
+    fixed.add(arc, bar);
+    frames[joint.parent].add(fixed);
+    return { child: frames[joint.child], axis, bar, start: new T.Quaternion().copy(frames[joint.child].quaternion) };
+  }
+
+  shape({ kind, size, keys, xyz, rpy, rgba }) {
+    const T = this.three;
+    const value = (key) => size[keys.indexOf(key)];
+    const geometry = kind === "box" ? new T.BoxGeometry(...size) : kind === "cylinder" ? new T.CylinderGeometry(value("radius"), value("radius"), value("length"), 24).rotateX(Math.PI / 2) : new T.SphereGeometry(value("radius"), 20, 14);
+    const material = new T.MeshLambertMaterial({ color: new T.Color(rgba[0], rgba[1], rgba[2]), transparent: rgba[3] < 1, opacity: rgba[3] });
+    const mesh = new T.Mesh(geometry, material);
+    mesh.position.set(...xyz);
+    mesh.rotation.set(...rpy, "ZYX");
+    return mesh;
+  }
+
+  pose(arms, tilt, setups) {
+    if (!this.renderer || !this.joints) return;
+    const T = this.three;
+    for (const [arm, state] of Object.entries(arms))
+      (state.joints ?? []).forEach((joint, n) => {
+        const part = this.joints[joint.name];
+        if (!part) return;
+        part.child.quaternion.copy(part.start).multiply(new T.Quaternion().setFromAxisAngle(part.axis, joint.position));
+        const share = (joint.effort ?? 0) / (setups[arm]?.max_effort?.[n] || 1);
+        part.bar.scale.y = Math.max(0.001, 0.25 * Math.abs(share));
+        part.bar.position.copy(part.axis).multiplyScalar(0.125 * share);
+      });
+    // pitch: forward, about y; roll: to the right, about x
+    if (tilt) this.trunk.rotation.set(tilt.roll, tilt.pitch, 0, "ZYX");
+    this.render();
+  }
+
+  render() {
+    const { clientWidth: width, clientHeight: height } = this.place;
+    if (!width || !height) return;
+    if (this.width !== width || this.height !== height) {
+      [this.width, this.height] = [width, height];
+      this.renderer.setSize(width, height, false);
+      this.camera.aspect = width / height;
+      this.camera.updateProjectionMatrix();
+    }
+    this.renderer.render(this.scene, this.camera);
+  }
+}
+
+function dispose(root) {
+  root.traverse((part) => {
+    part.geometry?.dispose();
+    part.material?.dispose();
+  });
+  root.removeFromParent();
+}

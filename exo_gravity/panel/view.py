@@ -1,0 +1,106 @@
+"""What the page shows of one arm: its state in full, ten times a second, and what changes rarely."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from exo_gravity.panel.params import SETTABLE
+
+SILENT = 1.5  # s without diagnostics or joint states after which the last ones are not shown any more
+OF_BRIDGE = {
+    "state": "state",
+    "fault": "fault",
+    "limits": "limits acting",
+    "rate": "rate (Hz)",
+    "answered": "age of efforts (ms)",
+    "late": "late cycles",
+    "incomplete": "incomplete cycles",
+}
+
+
+@dataclass
+class Joints:
+    """The newest message with joint values. time: monotonic s of its arrival."""
+
+    time: float = -math.inf
+    names: Sequence[str] = ()
+    position: Sequence[float] = ()
+    velocity: Sequence[float] = ()
+    effort: Sequence[float] = ()
+
+
+@dataclass
+class Status:
+    """The newest diagnostics of one node. level: 0 OK, 1 warning, 2 error. time: monotonic s of its arrival."""
+
+    level: int = 0
+    message: str = ""
+    values: Mapping[str, str] = field(default_factory=dict)
+    time: float = -math.inf
+
+
+def arm_state(now: float, joints: Joints, commands: Joints, bridge: Status, compensator: Status) -> dict[str, Any]:
+    """Return the state of one arm for the page. Old values are left out: their key is null or missing."""
+    state: dict[str, Any] = {"bridge": _bridge(now, bridge), "compensator": None, "joints": None, "age": None}
+    if now - compensator.time < SILENT:
+        keys = ("support", "mode", "law", "budget", "mass carried (kg)")
+        values = {key.split(" (")[0]: compensator.values.get(key) for key in keys}
+        state["compensator"] = {"level": compensator.level, "message": compensator.message, **values}
+    if now - joints.time < SILENT:
+        temperature = {name: bridge.values.get(f"{name} temperature (degC)") for name in joints.names}
+        state["age"] = round(1000 * (now - joints.time), 1)  # ms
+        state["joints"] = [
+            {
+                "name": name,
+                "position": _rounded(joints.position, n),
+                "velocity": _rounded(joints.velocity, n),
+                "effort": _rounded(joints.effort, n),
+                "command": _command(now, name, commands),
+                "temperature": _number(temperature[name]) if state["bridge"] else None,
+            }
+            for n, name in enumerate(joints.names)
+        ]
+    return state
+
+
+def _bridge(now: float, bridge: Status) -> dict[str, Any] | None:
+    if now - bridge.time >= SILENT:
+        return None
+    values = {key: bridge.values.get(name, "") for key, name in OF_BRIDGE.items()}
+    return {"level": bridge.level, "message": bridge.message, **values}
+
+
+def _command(now: float, name: str, commands: Joints) -> float | None:
+    if name not in commands.names or now - commands.time >= SILENT:
+        return None
+    return _rounded(commands.effort, list(commands.names).index(name))
+
+
+def _rounded(values: Sequence[float], index: int) -> float | None:
+    return round(values[index], 4) if index < len(values) and math.isfinite(values[index]) else None
+
+
+def _number(text: str | None) -> float | None:
+    try:
+        value = float(text) if text is not None else math.nan
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+def arm_setup(bridge: Mapping[str, Any], compensator: Mapping[str, Any], support_limit: float | None) -> dict[str, Any]:
+    """Return limits and settings of one arm for the page, from the parameters of its two nodes.
+
+    support_limit: the largest support within the motors' rated torque, None if it is not known.
+    """
+    limits = {name: bridge.get(name) for name in ("joint_names", "position_min", "position_max", "max_temperature")}
+    efforts = [values["max_effort"] for values in (bridge, compensator) if values.get("max_effort")]
+    return {
+        **limits,
+        "max_effort": [min(column) for column in zip(*efforts, strict=True)] if efforts else None,
+        "settings": {name: compensator.get(name) for name in SETTABLE},
+        "support_limit": support_limit,
+    }
