@@ -12,7 +12,7 @@ import ipaddress
 import secrets
 from collections import deque
 from collections.abc import Callable
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 MIN_TOKEN = 12  # characters of a token that the user chooses
 ATTEMPTS, ATTEMPT_WINDOW = 5, 60.0  # wrong tokens of one address, and of all addresses ten times as many, in s
@@ -49,7 +49,7 @@ class Access:
 
     def allows_host(self, host: str) -> bool:
         """Return whether a request with this header `Host` may be answered."""
-        return not self.is_open or is_loopback(urlsplit(f"//{host}").hostname or "")
+        return not self.is_open or is_loopback(_split(f"//{host}").hostname or "")
 
     def allows(self, session: str) -> bool:
         """Return whether a request with this session may see anything."""
@@ -81,8 +81,15 @@ class Access:
 
 def is_same_origin(origin: str, host: str) -> bool:
     """Return whether the page at `origin` (a header's value) came from the server that `host` names."""
-    parts = urlsplit(origin)
+    parts = _split(origin)
     return parts.scheme in ("http", "https") and parts.netloc.lower() == host.lower() != ""
+
+
+def _split(address: str) -> SplitResult:
+    try:
+        return urlsplit(address)
+    except ValueError:  # an unclosed [
+        return SplitResult("", "", "", "", "")
 
 
 def _equal(one: str, other: str) -> bool:

@@ -124,7 +124,8 @@ class PanelServer:
 
     def publish_setup(self, setup: Mapping[str, Any]) -> None:
         """Send what changes rarely to all pages, and to those that open later."""
-        self._on_loop(self._send_setup, json.dumps({"type": "setup", **setup}))
+        self._setup = json.dumps({"type": "setup", **setup})
+        self._on_loop(self._send_setup, self._setup)
 
     def _on_loop(self, function: Callable[..., None], *args: Any) -> None:
         if self._loop is not None:
@@ -156,7 +157,6 @@ class PanelServer:
             page.put("state", text)
 
     def _send_setup(self, text: str) -> None:
-        self._setup = text
         for page, _ in self._pages.values():
             page.put("setup", text)
 

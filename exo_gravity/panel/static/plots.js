@@ -17,6 +17,7 @@ export class Plots {
     this.place = place;
     this.arms = new Map(); // name -> {times, figures}
     this.limits = {};
+    this.width = 0;
     this.observer = new ResizeObserver(() => this.resize());
     this.observer.observe(place);
   }
@@ -75,6 +76,8 @@ export class Plots {
   }
 
   resize() {
+    if (this.place.clientWidth === this.width) return; // only the height has changed, by the plots themselves
+    this.width = this.place.clientWidth;
     for (const { figures } of this.arms.values())
       for (const { plot, element } of figures) plot.setSize({ width: Math.max(200, element.clientWidth), height: 160 });
   }

@@ -1,0 +1,98 @@
+"""The token and the sessions that it opens; which host and origin a request may name."""
+
+import pytest
+
+from exo_gravity.panel.access import ATTEMPT_WINDOW, ATTEMPTS, SESSIONS, Access, is_loopback, is_same_origin
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.mark.parametrize(
+    ("host", "expected"),
+    [
+        ("127.0.0.1", True),
+        ("127.8.9.1", True),
+        ("::1", True),
+        ("localhost", True),
+        ("0.0.0.0", False),
+        ("192.168.1.4", False),
+        ("127.0.0.1.example.org", False),
+        ("", False),
+    ],
+)
+def test_only_loopback_addresses_are_loopback(host, expected):
+    assert is_loopback(host) is expected
+
+
+def test_on_loopback_no_token_is_needed_and_elsewhere_a_random_one_is_made():
+    assert Access("127.0.0.1", "", Clock()).is_open
+    one, other = (Access("0.0.0.0", "", Clock()) for _ in range(2))
+    assert not one.is_open
+    assert len(one.token) >= 32
+    assert one.token != other.token
+    assert not Access("127.0.0.1", "given", Clock()).is_open
+
+
+def test_without_a_token_only_a_loopback_name_may_be_asked_for():
+    access = Access("127.0.0.1", "", Clock())
+    for host in ("127.0.0.1:8080", "localhost:8080", "[::1]:8080"):
+        assert access.allows_host(host)
+    for host in ("panel.example.org:8080", "", "127.0.0.1.example.org", "[bad"):
+        assert not access.allows_host(host)
+    assert Access("0.0.0.0", "secret", Clock()).allows_host("panel.example.org")
+
+
+def test_a_session_is_opened_by_the_token_alone():
+    access = Access("0.0.0.0", "secret", Clock())
+    session = access.open_session()
+    assert access.allows(session)
+    for wrong in ("", "secret", session[:-1], session + "x", "ä"):
+        assert not access.allows(wrong)
+
+
+def test_wrong_tokens_block_their_address_for_a_while_and_no_other():
+    clock = Clock()
+    access = Access("0.0.0.0", "secret", clock)
+    for _ in range(ATTEMPTS):
+        assert not access.is_token("wrong", "10.0.0.1")
+    assert not access.is_token("secret", "10.0.0.1")
+    assert access.is_token("secret", "10.0.0.2")
+    clock.now += ATTEMPT_WINDOW + 1.0
+    assert access.is_token("secret", "10.0.0.1")
+
+
+def test_wrong_tokens_from_many_addresses_block_all():
+    access = Access("0.0.0.0", "secret", Clock())
+    for n in range(10 * ATTEMPTS):
+        access.is_token("wrong", f"10.0.1.{n}")
+    assert not access.is_token("secret", "10.0.0.1")
+
+
+def test_sessions_do_not_grow_without_end():
+    access = Access("0.0.0.0", "secret", Clock())
+    first = access.open_session()
+    for _ in range(SESSIONS):
+        access.open_session()
+    assert not access.allows(first)
+
+
+@pytest.mark.parametrize(
+    ("origin", "host", "expected"),
+    [
+        ("http://127.0.0.1:8080", "127.0.0.1:8080", True),
+        ("https://panel.example.org", "panel.example.org", True),
+        ("http://127.0.0.1:8081", "127.0.0.1:8080", False),
+        ("http://evil.example.org", "127.0.0.1:8080", False),
+        ("http://127.0.0.1:8080.evil.example.org", "127.0.0.1:8080", False),
+        ("null", "127.0.0.1:8080", False),
+        ("", "", False),
+        ("file://127.0.0.1:8080", "127.0.0.1:8080", False),
+    ],
+)
+def test_only_the_panels_own_page_has_its_origin(origin, host, expected):
+    assert is_same_origin(origin, host) is expected

@@ -1,0 +1,167 @@
+"""The panel's web server with two arms that a test plays: everything but ROS and the device is real."""
+
+from __future__ import annotations
+
+import math
+import socket
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR
+from exo_gravity.core.param_table import values_of
+from exo_gravity.panel.access import Access
+from exo_gravity.panel.control import Control
+from exo_gravity.panel.desk import Desk
+from exo_gravity.panel.facts import Facts
+from exo_gravity.panel.server import PanelServer
+from exo_gravity.panel.view import Joints, Status, arm_state
+
+LEAVES = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
+BUS = {"can.interface": "virtual", "can.channel": "stage"}
+PERIOD = 0.1  # s between two states
+
+
+def free_port() -> int:
+    """Return a TCP port that no one uses."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return int(server.getsockname()[1])
+
+
+@dataclass
+class PlayedArms:
+    """`Arms` of the desk. calls: what was asked for, in order. problem: the answer to each call."""
+
+    names: tuple[str, ...] = ("right", "left")
+    states: dict[str, str] = field(default_factory=dict)
+    faults: dict[str, str] = field(default_factory=dict)
+    settings: dict[str, dict[str, Any]] = field(default_factory=dict)
+    calls: list[tuple[str, ...]] = field(default_factory=list)
+    problem: str = ""
+
+    def __post_init__(self) -> None:
+        self.states = {name: "disabled" for name in self.names}
+        for name in self.names:
+            given = {"side": name, "joint_names": [f"{name}_{leaf}" for leaf in LEAVES], "wearer.body_mass": 75.0}
+            self.settings[name] = values_of(COMPENSATOR, {**given, "support": 0.05})
+
+    async def let_down(self, arm: str) -> str:
+        return self._change("let_down", arm, "letting down" if self.states[arm] == "active" else self.states[arm])
+
+    async def enable(self, arm: str) -> str:
+        return self._change("enable", arm, "active")
+
+    async def clear_fault(self, arm: str) -> str:
+        if not self.problem:
+            self.faults.pop(arm, None)
+        return self._change("clear_fault", arm, "disabled")
+
+    async def set(self, arm: str, values: Mapping[str, Any]) -> str:
+        self.calls.append(("set", arm, str(dict(values))))
+        if not self.problem:
+            self.settings[arm].update(values)
+        return self.problem
+
+    def fail(self, arm: str, code: str) -> None:
+        """Latch a fault."""
+        self.faults[arm], self.states[arm] = code, "fault"
+
+    def _change(self, call: str, arm: str, state: str) -> str:
+        self.calls.append((call, arm))
+        if not self.problem:
+            self.states[arm] = state
+        return self.problem
+
+    def state(self, name: str, now: float) -> dict[str, Any]:
+        """Return the state of one arm as the node makes it."""
+        names = [f"{name}_{leaf}" for leaf in LEAVES]
+        position = [0.3 * math.sin(0.5 * now + n) for n in range(4)]
+        effort = [0.8 * math.sin(0.5 * now + n) for n in range(4)]
+        joints = Joints(now, names, position, [0.0] * 4, effort)
+        state, fault = self.states[name], self.faults.get(name, "none")
+        values = {"state": state, "fault": fault, "rate (Hz)": "250.0", "age of efforts (ms)": "4.1"}
+        values |= {"limits acting": "none", **{f"{joint} temperature (degC)": "31" for joint in names}}
+        message = f"fault: {fault}: {name} elbow" if fault != "none" else state
+        support = self.settings[name]["support"]
+        of_compensator = {"support": str(support), "mode": self.settings[name]["mode"], "mass carried (kg)": "1.854"}
+        bridge = Status(2 if fault != "none" else 0, message, values, now)
+        return arm_state(now, joints, joints, bridge, Status(0, "compensating", of_compensator, now))
+
+
+@dataclass
+class PlayedFiles:
+    """`Files` of the desk."""
+
+    trials: tuple[str, ...] = ("demo", "two_poses")
+    calls: list[str] = field(default_factory=list)
+    content: dict[str, Any] = field(
+        default_factory=lambda: {
+            "recording": {"on": False, "foreign": False, "folder": "", "seconds": 0},
+            "trial": {"phase": "none"},
+            "saved": "",
+        }
+    )
+
+    async def record(self) -> str:
+        self.content["recording"] = {"on": True, "foreign": False, "folder": "recordings/r", "seconds": 1}
+        return self._noted("record")
+
+    async def stop_recording(self) -> str:
+        self.content["recording"] = {"on": False, "foreign": False, "folder": "", "seconds": 0}
+        return self._noted("stop_recording")
+
+    async def trial(self, name: str) -> str:
+        return self._noted(f"trial {name}")
+
+    async def stop_trial(self) -> str:
+        return self._noted("stop_trial")
+
+    async def save(self) -> str:
+        return self._noted("save")
+
+    def _noted(self, call: str) -> str:
+        self.calls.append(call)
+        return ""
+
+
+class Stage:
+    """A running panel at `url`. notes: what it wrote to the log. reports: trial reports by name."""
+
+    def __init__(self, host: str = "127.0.0.1", token: str = "", dead_man: bool = False, arms: Any = None) -> None:
+        self.arms = arms or PlayedArms()
+        self.files, self.notes = PlayedFiles(), list[str]()
+        self.reports: dict[str, Path] = {}
+        self.access = Access(host, token, time.monotonic)
+        self.control = Control(time.monotonic)
+        desk = Desk(self.arms, self.files, self.control, self.notes.append, dead_man, time.monotonic)
+        self.port = free_port()
+        self.url = f"http://127.0.0.1:{self.port}/"
+        self.server = PanelServer(host, self.port, self.access, desk, self.reports.get, dict)
+        self.facts = Facts({"language": "en", "dead_man": dead_man, "trials": list(self.files.trials)})
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._play, daemon=True)
+        self.server.start()
+        self._thread.start()
+
+    def close(self) -> None:
+        self._stopping.set()
+        self._thread.join()
+        self.server.stop()
+        self.facts.close()
+
+    def _play(self) -> None:
+        self.facts.discover(self.arms.names)
+        while not self._stopping.wait(PERIOD):
+            for arm in self.arms.names:
+                names = {"joint_names": self.arms.settings[arm]["joint_names"]}
+                self.facts.note(f"/{arm}/can_bridge", values_of(CAN_BRIDGE, {**BUS, **names}, "can.options"))
+                self.facts.note(f"/{arm}/compensator", self.arms.settings[arm])
+            news = self.facts.news()
+            if news is not None:
+                self.server.publish_setup(news)
+            now = time.monotonic()
+            arms = {arm: self.arms.state(arm, now) for arm in self.arms.names}
+            self.server.publish({"arms": arms, "tilt": {"pitch": 0.2, "roll": -0.1}, **self.files.content})
