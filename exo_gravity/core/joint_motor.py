@@ -76,13 +76,14 @@ class JointMotor:
 
         Raises ParameterError on NaN or infinity.
         """
+        spec = self.spec
         torque = self.direction * effort / self.torque_scale
-        kd = min(damping / self.torque_scale, self.spec.kd_max)
+        kd = min(damping / self.torque_scale, spec.kd_max)
         if kd:  # no code is exactly 0 rad/s: the nearest one would push with kd times its velocity
-            torque -= kd * standstill(self.spec)
-        if math.isfinite(torque) and abs(torque) > self.spec.torque_range:
-            torque = math.copysign(self.spec.torque_range, torque)
-        return self.wire_format.pack_command(self.spec, 0.0, 0.0, 0.0, kd, torque)
+            torque -= kd * standstill(spec)
+        if math.isfinite(torque) and abs(torque) > spec.torque_range:
+            torque = math.copysign(spec.torque_range, torque)
+        return self.wire_format.pack_command(spec, 0.0, 0.0, 0.0, kd, torque)
 
     def joint_reply(self, data: bytes | bytearray) -> MotorReply:
         """Return the content of a reply or status frame in the joint's rad, rad/s and Nm. Raises FrameError."""

@@ -168,7 +168,7 @@ class BusScan:
 
     def _drain(self) -> None:
         for _ in range(MAX_STALE_FRAMES):
-            if self._port.receive(0.0) is None:
+            if self._port.waiting() is None:
                 break
 
     def _ask(self, can_id: int, is_alone: bool = True) -> tuple[list[Answer], list[Frame]]:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import can
 from can.interfaces.socketcan import SocketcanBus
@@ -19,6 +20,17 @@ from exo_gravity.core.wire_formats.wire_format import EXTENDED, ID_BITS, Frame
 
 REOPEN_AFTER = 0.02  # s of failures in a row after which the bus is opened again
 REOPEN_PERIOD = 0.1  # s between two attempts
+
+
+def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:
+    """Open a python-can bus of any kind. Raises BusError that names the bus and the reason."""
+    try:
+        bus = can.Bus(interface=interface, channel=channel, **options)
+        if bus.channel_info == can.BusABC.channel_info:  # some backends leave it "unknown"
+            bus.channel_info = f"{interface} {channel}"
+        return bus
+    except Exception as error:  # backends raise errors of every type
+        raise BusError(f"CAN bus {interface} {channel} {dict(options)} cannot be opened: {error}") from error
 
 
 class CanPort:
@@ -56,6 +68,15 @@ class CanPort:
         except Exception as error:
             raise self._failure(error) from error
 
+    def waiting(self) -> can.Message | None:
+        """Return the next frame that has already arrived, or None. Raises BusError.
+
+        An slcan adapter acknowledges each frame with a line of its own, for which python-can returns None.
+        """
+        while (message := self.receive(0.0)) is None and self._has_lines():
+            pass
+        return message
+
     def confirm(self) -> None:
         """Note that the bus works: its last failure, if any, was not the first of a row."""
         self._failing_since = None
@@ -65,6 +86,14 @@ class CanPort:
         self._is_closing = True
         if self._is_open:
             _close(self._bus)
+
+    def _has_lines(self) -> bool:
+        """Return whether the serial port of an slcan adapter has received more; False for every other bus."""
+        serial_port = getattr(self._bus, "serialPortOrig", None)
+        try:
+            return serial_port is not None and serial_port.in_waiting > 0
+        except OSError as error:
+            raise self._failure(error) from error
 
     def _open_bus(self) -> can.BusABC:
         if not self._is_open:

@@ -16,9 +16,8 @@ import contextlib
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import chain
-from typing import Any
 
 import can
 
@@ -28,8 +27,10 @@ from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.joint_motor import JointMotor
 from exo_gravity.core.limits import UNKNOWN, JointSample
 from exo_gravity.core.wire_formats.wire_format import REPLY, Frame
-from exo_gravity.hardware.can_port import CanPort
+from exo_gravity.hardware.can_port import CanPort, open_bus
 from exo_gravity.hardware.frame_filter import FOREIGN_COMMAND, FrameFilter
+
+__all__ = ["MotorBus", "open_bus"]
 
 MAX_STALE_FRAMES = 256  # frames read before each cycle: the capacity of udp_multicast, more than any cycle produces
 EXIT_PERIOD = 0.5  # s between two EXIT frames to motors that are off, in case one was lost,
@@ -40,14 +41,6 @@ LISTEN_TIME = 0.12  # s before the first frame
 SETTLING_TIME = 0.02  # s of it in which late replies to the previous owner may still arrive
 CORRECTION_PERIOD = 0.001  # s between two corrections of a motor: two correcting hosts must not fill the bus
 CONTEST_TIME = 0.5  # s after a foreign command in which another one is expected
-
-
-def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:
-    """Open a python-can bus of any kind. Raises BusError that names the bus and the reason."""
-    try:
-        return can.Bus(interface=interface, channel=channel, **options)
-    except Exception as error:  # backends raise errors of every type
-        raise BusError(f"CAN bus {interface} {channel} {dict(options)} cannot be opened: {error}") from error
 
 
 class MotorBus:
@@ -215,7 +208,7 @@ class MotorBus:
     def _drain(self) -> None:
         """Read replies that arrived after their cycle, so that they do not count for this one."""
         for _ in range(MAX_STALE_FRAMES):
-            message = self._port.receive(0.0)
+            message = self._port.waiting()
             if message is None:
                 return
             self._take(message)

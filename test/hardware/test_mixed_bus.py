@@ -1,0 +1,173 @@
+"""Motors of V1, V2 and V3 boards on one bus: who is sent what, what counts as a reply, and who may still be on."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import can
+import pytest
+
+from exo_gravity.core.arm import ArmModel
+from exo_gravity.core.drive import NOTHING, OFF, Drive
+from exo_gravity.core.errors import BusError
+from exo_gravity.core.motors import ENTER, EXIT, MotorReply
+from exo_gravity.core.wire_formats import MIT, MIT_V3, WireFormat
+from exo_gravity.core.wire_formats.wire_format import EXTENDED, ID_BITS
+from exo_gravity.hardware.motor_bus import MotorBus
+from exo_gravity.sim import ArmConfig, Firmware, SimulatedDevice
+
+from ..support.simulated_device import joints_of, make_device
+
+MIXED = (MIT, MIT_V3, MIT_V3, MIT)
+V3 = (MIT_V3,) * 4
+ON = Drive((0.0, 0.5, 0.4, 0.0), NOTHING, True)
+LINKS = ArmConfig().links
+WEIGHTLESS = ArmModel(LINKS.length, LINKS.cog, LINKS.mass, gravity=0.0)
+CHANNELS = itertools.count()
+Wires = tuple[can.BusABC, can.BusABC, can.BusABC]  # the motor bus's end, the device's, the test's
+
+
+def in_1_s() -> float:
+    return time.monotonic() + 1.0
+
+
+@pytest.fixture
+def wires() -> Iterator[Wires]:
+    channel = f"mixed-{next(CHANNELS)}"
+    ends = [can.Bus(interface="virtual", channel=channel) for _ in range(3)]
+    yield ends[0], ends[1], ends[2]
+    for end in ends:
+        end.shutdown()
+
+
+@pytest.fixture
+def start(wires: Wires) -> Iterator[Callable[..., SimulatedDevice]]:
+    """A function that runs a weightless arm with boards of the given formats on the bus."""
+    stop, threads = threading.Event(), []
+
+    def start(formats: tuple[WireFormat, ...]) -> SimulatedDevice:
+        config = ArmConfig(links=WEIGHTLESS, coulomb_friction=(5.0,) * 4)
+        device = make_device(Firmware(status_rate=100.0), config=config, formats=formats)
+        device.arm.reset((0.1, 0.2, 0.3, 0.4))
+        threads.append(threading.Thread(target=device.run, args=(wires[1], stop.is_set)))
+        threads[-1].start()
+        return device
+
+    yield start
+    stop.set()
+    for thread in threads:
+        thread.join()
+
+
+def sent(bus: can.BusABC) -> list[tuple[int, bytes]]:
+    """Return the commands on the bus so far, V3 boards' with `EXTENDED` in their ID."""
+    frames = []
+    while (message := bus.recv(0.0)) is not None:
+        frame_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
+        is_status = message.is_extended_id and message.arbitration_id >> 8 == 0x29
+        if not is_status and message.data[0] != message.arbitration_id:
+            frames.append((frame_id, bytes(message.data)))
+    return frames
+
+
+@pytest.mark.parametrize("formats", [MIXED, V3], ids=["mixed", "v3"])
+def test_every_motor_is_read_and_a_v3_board_is_sent_only_exit_frames_while_the_arm_is_off(
+    wires, start, formats
+) -> None:
+    start(formats)
+    bus = MotorBus(wires[0], joints_of(formats))
+    bus.listen()
+    sent(wires[2])
+    for _ in range(3):
+        assert bus.exchange(OFF, in_1_s())
+    for sample, angle in zip(bus.samples, (0.1, 0.2, 0.3, 0.4), strict=True):
+        assert sample.position == pytest.approx(angle, abs=0.01)
+        assert (sample.temperature, sample.error) == (30, 0)
+    frames = [frame for frame in sent(wires[2]) if frame[0] >= EXTENDED]
+    exits = {joint.can_id: list(joint.exit) for joint in joints_of(formats) if joint.wire_format is MIT_V3}
+    for can_id, exit_frames in exits.items():
+        received = [frame for frame in frames if frame[0] & 0xFF == can_id]
+        assert received == exit_frames * (len(received) // len(exit_frames)) != []
+    assert not bus.ignored
+
+
+def test_motors_of_both_formats_apply_their_torque_and_are_switched_off(wires, start) -> None:
+    device, joints = start(MIXED), joints_of(MIXED)
+    bus = MotorBus(wires[0], joints)
+    for _ in range(3):
+        assert bus.exchange(ON, in_1_s())
+    assert [motor.entered for motor in device.motors] == [True] * 4
+    assert [sample.effort for sample in bus.samples] == pytest.approx(ON.effort, abs=0.02)
+    assert bus.may_be_powered
+    sent(wires[2])
+    bus.exchange(OFF, in_1_s())
+    off = sent(wires[2])
+    for joint in joints:
+        assert set(joint.exit) <= set(off)
+    assert bus.exchange(OFF, in_1_s())
+    assert not bus.may_be_powered and not device.powered
+
+
+def test_a_v3_board_that_still_reports_torque_counts_as_powered(wires) -> None:
+    bus = MotorBus(wires[0], joints_of(V3))
+    bus.exchange(ON, time.monotonic())
+    bus.exchange(OFF, time.monotonic())
+
+    def report(torque: float) -> None:
+        for joint in joints_of(V3):
+            data = MIT_V3.pack_reply(joint.spec, MotorReply(joint.can_id, 0.0, 0.0, torque, 30, 0))
+            status_id = MIT_V3.status_id(joint.can_id) & ID_BITS
+            wires[2].send(can.Message(arbitration_id=status_id, data=data, is_extended_id=True))
+        bus.exchange(OFF, time.monotonic())
+
+    report(1.0)
+    assert bus.may_be_powered
+    report(0.0)
+    assert not bus.may_be_powered
+
+
+@pytest.mark.parametrize("mode", [0, 1, 5, 8])
+def test_a_foreign_command_to_a_v3_board_is_counted_and_opposed(wires, mode) -> None:
+    joints = joints_of(MIXED)
+    bus = MotorBus(wires[0], joints)
+    bus.exchange(ON, time.monotonic())
+    sent(wires[2])
+    wires[2].send(can.Message(arbitration_id=mode << 8 | 2, data=bytes(8), is_extended_id=True))
+    bus.receive_until(in_1_s(), lambda: bus.foreign_commands > 0)
+    assert bus.foreign_commands == 1 and "commands motor 2" in bus.foreign_command
+    assert sent(wires[2]) == [(joints[1].command_id, joints[1].command(0.5, 0.0))]
+    assert bus.is_contested
+
+
+def test_status_frames_are_not_taken_for_another_host_but_its_commands_are(wires, start) -> None:
+    start(MIXED)
+    bus = MotorBus(wires[0], joints_of(MIXED))
+    bus.listen()
+    message = can.Message(arbitration_id=0x803, data=bytes(8), is_extended_id=True)
+    task = wires[2].send_periodic(message, 0.01)
+    with pytest.raises(BusError, match="is in use: another sender commands motor 3"):
+        while True:  # on a busy computer the other host may be silent for longer than this listens
+            bus.listen()
+    task.stop()
+
+
+def test_a_motor_without_a_frame_for_its_zero_refuses_set_zero_for_the_whole_arm(wires) -> None:
+    bus = MotorBus(wires[0], joints_of(MIXED))
+    with pytest.raises(BusError, match="set_zero: motor 2 has a board without such a frame"):
+        bus.set_zero()
+    assert sent(wires[2]) == []
+
+
+def test_an_exit_that_was_not_ours_is_undone_on_both_kinds_of_board(wires) -> None:
+    joints = joints_of(MIXED)
+    bus = MotorBus(wires[0], joints)
+    bus.exchange(ON, time.monotonic())
+    sent(wires[2])
+    wires[2].send(can.Message(arbitration_id=1, data=EXIT, is_extended_id=False))
+    wires[2].send(can.Message(arbitration_id=0x102, data=bytes(4), is_extended_id=True))
+    bus.receive_until(in_1_s(), lambda: bus.foreign_commands == 2)
+    first, second = (1, joints[0].command(0.0, 0.0)), (joints[1].command_id, joints[1].command(0.5, 0.0))
+    assert sent(wires[2]) == [first, (1, ENTER), first, second, second]
