@@ -156,7 +156,7 @@ def _spec_of(
 ) -> MotorSpec:
     """Return a motor with the ranges of its firmware, 0 for the usual ones; raises ParameterError.
 
-    A range that is usual on V1 and V2 boards is refused for another board: it would scale every torque without an error.
+    A range that is usual on V1 and V2 boards is refused for another: it would scale every torque without an error.
     """
     usual = FORMATS[wire_format].ranged(MOTORS[name])
     for field, given in (("velocity_range", velocity_range), ("torque_range", torque_range)):

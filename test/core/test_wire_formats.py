@@ -1,4 +1,4 @@
-"""Every wire format: its frames survive a round trip, its scaling is that of the manual, and no frame has two meanings."""
+"""Every wire format: its frames survive a round trip, its scaling is the manual's, and no frame has two meanings."""
 
 from __future__ import annotations
 

@@ -74,9 +74,7 @@ def sent(bus: can.BusABC) -> list[tuple[int, bytes]]:
 
 
 @pytest.mark.parametrize("formats", [MIXED, V3], ids=["mixed", "v3"])
-def test_every_motor_is_read_and_a_v3_board_is_sent_only_exit_frames_while_the_arm_is_off(
-    wires, start, formats
-) -> None:
+def test_every_motor_is_read_and_while_off_a_v3_board_is_sent_only_its_exit(wires, start, formats) -> None:
     start(formats)
     bus = MotorBus(wires[0], joints_of(formats))
     bus.listen()
