@@ -1,0 +1,80 @@
+"""The simulated V3 board: what it obeys, what it reports, and when."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+
+import pytest
+
+from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.motors import ENTER, EXIT, MOTORS
+from exo_gravity.core.wire_formats import MIT, MIT_V3
+from exo_gravity.sim import Firmware, SimulatedMotor, SimulatedV3Motor, simulated_motor
+from exo_gravity.sim.v3_motor import StatusTimer
+
+from ..support.simulated_device import make_device
+
+SPEC = MIT_V3.ranged(MOTORS["AK60-6"])
+JOINT = JointMotor(SPEC, 3, direction=-1, zero=0.2, torque_scale=0.8, wire_format=MIT_V3)
+COMMAND_ID, CURRENT_ID = (frame_id for frame_id, _ in JOINT.exit)
+
+
+def reported(motor: SimulatedV3Motor, position: float = 0.5, velocity: float = 0.0):
+    """Return what the joint reads from the status frame; None without one."""
+    frame = motor.status(position, velocity)
+    assert frame is None or frame[0] == MIT_V3.status_id(3)
+    return frame and JOINT.joint_reply(frame[1])
+
+
+def test_the_first_command_switches_it_on_and_its_status_shows_angle_speed_and_torque():
+    motor = simulated_motor(JOINT)
+    assert isinstance(motor, SimulatedV3Motor) and not motor.entered
+    assert motor.receive(JOINT.command(1.5, 0.0), 0.5, 0.0, 0.0, COMMAND_ID) is None
+    assert motor.entered and motor.torque(0.5, 0.0) == pytest.approx(1.5, abs=0.01)
+    reply = reported(motor, 0.5, 1.0)
+    assert reply[1:4] == (pytest.approx(0.5, abs=0.001), pytest.approx(1.0, abs=0.01), pytest.approx(1.5, abs=0.01))
+    assert (reply.temperature, reply.error) == (30, 0)
+
+
+def test_its_exit_frames_switch_it_off_and_a_current_drives_it():
+    motor = SimulatedV3Motor(JOINT)
+    motor.receive(JOINT.command(1.5, 5.0), 0.5, 0.0, 0.0, COMMAND_ID)
+    for frame_id, data in JOINT.exit:
+        motor.receive(data, 0.5, 0.0, 0.0, frame_id)
+    assert not motor.entered and motor.torque(0.5, 3.0) == 0.0
+    assert reported(motor).torque == 0.0
+    motor.receive((2000).to_bytes(4, "big", signed=True), 0.5, 0.0, 0.0, CURRENT_ID)
+    assert motor.torque(0.5, 0.0) == pytest.approx(-0.8 * 2.0 * 3.0 / 7.4)
+
+
+def test_without_power_it_reports_nothing_and_forgets_its_command():
+    motor = SimulatedV3Motor(JOINT)
+    motor.receive(JOINT.command(1.5, 0.0), 0.5, 0.0, 0.0, COMMAND_ID)
+    motor.unplugged = True
+    assert reported(motor) is None and motor.torque(0.5, 0.0) == 0.0
+    motor.receive(JOINT.command(1.5, 0.0), 0.5, 0.0, 0.0, COMMAND_ID)
+    motor.unplugged = False
+    assert reported(motor).torque == 0.0 and not motor.entered
+
+
+def test_on_a_device_it_ignores_frames_of_v1_boards_and_sends_no_reply():
+    device = make_device(formats=(MIT, MIT_V3, MIT_V3, MIT))
+    assert device.exchange(2, ENTER) is None and device.exchange(2, EXIT) is None
+    assert not device.powered
+    assert device.exchange(1, ENTER) is not None
+    motor = replace(JOINT, can_id=2)
+    assert device.exchange(motor.command_id, motor.command(0.0, 0.0)) is None
+    assert [each.entered for each in device.motors] == [True, True, False, False]
+    assert device.status(0) is None and device.status(1) is not None
+    device.bus_silent = True
+    assert device.status(1) is None
+
+
+def test_status_frames_come_at_their_rate_and_missed_ones_are_not_made_up():
+    motors = [simulated_motor(JOINT, Firmware(status_rate=100.0)), SimulatedMotor(JointMotor(MOTORS["AK60-6"], 1))]
+    timer = StatusTimer(motors, 0.0, random.Random(1))
+    sent = [joint for step in range(1000) for joint in timer.due(step * 0.001)]
+    assert sent == [0] * len(sent) and len(sent) == pytest.approx(100, abs=1)
+    assert len(list(timer.due(11.0))) <= 2
+    assert 11.0 < timer.next <= 11.01
