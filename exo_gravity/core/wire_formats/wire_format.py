@@ -17,20 +17,22 @@ REPLY, COMMAND, OTHER = "reply", "command", "other"
 
 
 class WireFormat(Protocol):
-    """The frames of one kind of board.
-
-    name: value of the parameter `wire_format`. replies: whether a motor replies to each command, and only then; if not,
-    it sends its state on a timer of its own. is_extended: whether its IDs have 29 bits.
-    """
+    """The frames of one kind of board."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """The value of the parameter `wire_format`."""
+        ...
 
     @property
-    def replies(self) -> bool: ...
+    def replies(self) -> bool:
+        """Whether a motor replies to each command, and only then; if not, it sends its state on its own timer."""
+        ...
 
     @property
-    def is_extended(self) -> bool: ...
+    def is_extended(self) -> bool:
+        """Whether its IDs have 29 bits."""
+        ...
 
     def ranged(self, spec: MotorSpec) -> MotorSpec:
         """Return the motor with the usual ranges of this format."""

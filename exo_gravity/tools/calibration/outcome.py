@@ -12,7 +12,7 @@ from exo_gravity.tools.inputs.arms import ConfiguredArm
 if TYPE_CHECKING:
     from exo_gravity.core.calibration.identification import Identified, Observation
 
-Value = bool | int | float | str | list[int] | list[float]
+Value = bool | int | float | str | list[int] | list[float] | list[str]
 
 
 class Change(NamedTuple):
