@@ -75,7 +75,8 @@ socketcan:
 	@$(SETUP) $(TEST)
 	EXO_TEST_CAN_INTERFACE=socketcan EXO_TEST_CAN_CHANNEL=vcan0 PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 \
 		$(RUN) $(BIN)/python -m pytest --noconftest -p no:cacheprovider \
-		test/hardware/test_motor_bus.py test/nodes/socketcan_link.py test/nodes/socketcan_nodes.py
+		test/hardware/test_motor_bus.py test/hardware/test_mixed_bus.py \
+		test/nodes/socketcan_link.py test/nodes/socketcan_nodes.py
 
 ros2-launch:
 	@$(SETUP) $(TEST)

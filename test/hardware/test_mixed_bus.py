@@ -1,8 +1,12 @@
-"""Motors of V1, V2 and V3 boards on one bus: who is sent what, what counts as a reply, and who may still be on."""
+"""Motors of V1, V2 and V3 boards on one bus: who is sent what, what counts as a reply, and who may still be on.
+
+Runs on python-can's virtual bus, or on the one that EXO_TEST_CAN_INTERFACE and EXO_TEST_CAN_CHANNEL name.
+"""
 
 from __future__ import annotations
 
 import itertools
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -26,7 +30,8 @@ V3 = (MIT_V3,) * 4
 ON = Drive((0.0, 0.5, 0.4, 0.0), NOTHING, True)
 LINKS = ArmConfig().links
 WEIGHTLESS = ArmModel(LINKS.length, LINKS.cog, LINKS.mass, gravity=0.0)
-CHANNELS = itertools.count()
+INTERFACE = os.environ.get("EXO_TEST_CAN_INTERFACE", "virtual")
+CHANNELS = (os.environ.get("EXO_TEST_CAN_CHANNEL", f"test_mixed_bus_{n}") for n in itertools.count())
 Wires = tuple[can.BusABC, can.BusABC, can.BusABC]  # the motor bus's end, the device's, the test's
 
 
@@ -36,8 +41,8 @@ def in_1_s() -> float:
 
 @pytest.fixture
 def wires() -> Iterator[Wires]:
-    channel = f"mixed-{next(CHANNELS)}"
-    ends = [can.Bus(interface="virtual", channel=channel) for _ in range(3)]
+    channel = next(CHANNELS)
+    ends = [can.Bus(interface=INTERFACE, channel=channel) for _ in range(3)]
     yield ends[0], ends[1], ends[2]
     for end in ends:
         end.shutdown()
