@@ -21,8 +21,9 @@ class MujocoArm:
                 link.remove(element)
         settings = ElementTree.SubElement(robot, "mujoco")
         # Fused links would lose their names, not their masses. Some descriptions have inertias that no body can have.
-        bounds: dict[str, str] = {"boundmass": "1e-14", "boundinertia": "1e-14"}  # MuJoCo refuses links without mass
-        ElementTree.SubElement(settings, "compiler", fusestatic="false", balanceinertia="true", **bounds)
+        # MuJoCo refuses moving links without mass.
+        fixes = {"fusestatic": "false", "balanceinertia": "true", "boundmass": "1e-14", "boundinertia": "1e-14"}
+        ElementTree.SubElement(settings, "compiler", fixes)
         self._model = mujoco.MjModel.from_xml_string(ElementTree.tostring(robot, encoding="unicode"))
         self._data = mujoco.MjData(self._model)
         joints = [self._model.joint(name) for name in joint_names]
@@ -30,7 +31,10 @@ class MujocoArm:
         self._speeds = [int(joint.dofadr[0]) for joint in joints]
 
     def torque(self, theta: Sequence[float], gravity: Sequence[float]) -> np.ndarray:
-        """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad; gravity: (3,) m/s^2 in the root."""
+        """Return the torque (n,) in Nm that holds the arm.
+
+        theta: (n,) rad. gravity: (3,) m/s^2 in the axes of the root link.
+        """
         self._model.opt.gravity = gravity
         self._data.qpos[:] = 0.0
         self._data.qpos[self._positions] = theta
