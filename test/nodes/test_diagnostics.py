@@ -1,11 +1,19 @@
 """Readable values on /diagnostics, and the aggregator's configuration."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
+import rclpy
 import yaml
 
-from exo_gravity.nodes.diagnostics import milliseconds, row
+from exo_gravity.core.drive import State
+from exo_gravity.core.limits import JointSample, Limits
+from exo_gravity.core.safety import SafetyMachine
+from exo_gravity.core.wire import load as bus_load
+from exo_gravity.nodes import bridge_report
+from exo_gravity.nodes.bridge_report import BridgeReport
+from exo_gravity.nodes.diagnostics import OK, WARN, Diagnostics, milliseconds, row
 from exo_gravity.tools.inputs.parameter_file import load
 
 from ..support import CONFIG
@@ -37,3 +45,51 @@ def test_the_aggregator_shows_each_reporting_node_once(file):
     for node in load(CONFIG / file):
         if node.split("/")[-1] in REPORTING:
             assert sum(any(node.lstrip("/").startswith(prefix) for prefix in group) for group in prefixes) == 1, node
+
+
+@pytest.fixture
+def node():
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node("can_bridge", namespace="/right", context=context)
+    yield node
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)
+
+
+def carrying(effort, cycles=0):
+    """Return what a bridge reports on: an arm that is carried at rest, the elbow with `effort` Nm."""
+    safety = SafetyMachine(Limits(("a", "b", "c", "elbow")), 0.004)
+    safety.state = State.ACTIVE
+    samples = [JointSample(0.5, 2.0, torque, 40, 0, 0.0) for torque in (0.0, 0.0, 0.0, effort)]
+    counts = dict.fromkeys(("late", "incomplete", "cycle_errors"), 0)
+    return SimpleNamespace(safety=safety, samples=samples, ignored={}, failure=None, cycles=cycles, **counts)
+
+
+def test_a_motor_that_stays_above_its_rated_torque_is_named_with_load_and_power(node, monkeypatch):
+    reports = []
+    monkeypatch.setattr(Diagnostics, "report", lambda _, *report: reports.append(report))
+    now = 1000.0
+    monkeypatch.setattr(bridge_report, "time", SimpleNamespace(monotonic=lambda: now))
+    report = BridgeReport(node, ("a", "b", "c", "elbow"), bus_load(250.0, 4), 0.004, (3.0, 9.0, 3.0, 3.0))
+    for cycles in range(0, 250 * 120, 25):
+        report.send(carrying(6.0, cycles), "none", -math.inf)
+        now += 0.1
+    assert reports[20][:2] == (OK, "active")
+    level, message, values = reports[-1]
+    assert (level, message) == (WARN, "active, above rated torque for too long: elbow")
+    assert values["elbow power (W)"] == "12" and values["elbow torque (Nm)"] == "6"
+    assert 180 < int(values["elbow RMS of rated torque (%)"]) < 200 and values["a RMS of rated torque (%)"] == "0"
+    assert values["rate (Hz)"] == "250.0" and values["age of efforts (ms)"] == "none"
+
+
+def test_a_loop_below_its_rate_is_reported(node, monkeypatch):
+    reports = []
+    monkeypatch.setattr(Diagnostics, "report", lambda _, *report: reports.append(report))
+    now = 1000.0
+    monkeypatch.setattr(bridge_report, "time", SimpleNamespace(monotonic=lambda: now))
+    report = BridgeReport(node, ("a", "b", "c", "elbow"), bus_load(250.0, 4), 0.004, (3.0, 9.0, 3.0, 3.0))
+    for cycles in range(0, 20 * 30, 20):
+        report.send(carrying(1.0, cycles), "none", now)
+        now += 0.1
+    assert reports[-1][:2] == (WARN, "active, slower than 225 Hz")

@@ -31,7 +31,7 @@ class MujocoArm:
         self._speeds = [int(joint.dofadr[0]) for joint in joints]
 
     def torque(self, theta: Sequence[float], gravity: Sequence[float]) -> np.ndarray:
-        """Return the torque (n,) in Nm that holds the arm.
+        """Return what holds the arm at `theta`, (n,) in Nm.
 
         theta: (n,) rad. gravity: (3,) m/s^2 in the axes of the root link.
         """
