@@ -15,7 +15,7 @@ from exo_gravity.core.faults import FaultCode
 ROOT = Path(__file__).parents[1]
 TABLES = ROOT / "docs" / "tables.py"
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-NODES = ("can_bridge", "compensator", "imu", "simulator", "recorder", "calibrator")
+NODES = ("can_bridge", "compensator", "imu", "simulator", "recorder", "robot_model", "calibrator")
 EXAMPLE = re.compile(r"```python\n(.*?)```\s*```text\n(.*?)```", re.DOTALL)
 FOLDERS = "bench|config|docs|examples|exo_gravity|launch|test|core|hardware|sim|bag|nodes|tools"
 

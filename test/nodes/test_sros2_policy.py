@@ -1,6 +1,7 @@
 """config/sros2/policy.xml against the running nodes: what each publishes, subscribes to, serves and calls.
 
-The nodes are those of config/sim_both.yaml, a recorder, robot_model, and an outer loop for each arm; the bridges are not enabled.
+The nodes are those of config/sim_both.yaml, a recorder, robot_model, and an outer loop for each arm; the bridges are
+not enabled.
 These tests do not show that DDS enforces the policy, which takes a middleware built with security.
 """
 
@@ -67,7 +68,7 @@ def graph_of(node, name):
 
 
 def parameter_file(folder):
-    """Write config/sim_both.yaml with unused ports, a recorder, robot_model, and bridges that do not start by themselves."""
+    """Write config/sim_both.yaml with unused ports, recorder and robot_model; bridges do not start by themselves."""
     ports = {"left": next(PORTS), "right": next(PORTS)}
     content = yaml.safe_load((CONFIG / "sim_both.yaml").read_text(encoding="utf-8"))
     for name, entry in content.items():
