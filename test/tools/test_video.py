@@ -27,7 +27,7 @@ COLOURFUL = 60  # difference of two channels from which a pixel is not grey
 @pytest.fixture
 def drawable(monkeypatch):
     """A machine that can draw, whatever this one can."""
-    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.setattr(output, "find_library", lambda name: name)
 
 
 def test_without_the_option_there_is_no_clip():
@@ -60,13 +60,15 @@ def test_egl_is_preferred_to_osmesa_and_mujoco_gl_to_both(monkeypatch, installed
     monkeypatch.setattr(output, "find_library", lambda name: name if name in installed else None)
     monkeypatch.setenv("MUJOCO_GL", "disabled")
     assert backend() == expected
-    monkeypatch.setenv("MUJOCO_GL", "glfw")
-    assert backend() == "glfw"
+    for name in ("osmesa", "glfw"):
+        monkeypatch.setenv("MUJOCO_GL", name)
+        assert backend() == name
 
 
-def test_without_opengl_the_error_names_the_packages(tmp_path, monkeypatch):
+@pytest.mark.parametrize("chosen", ["disabled", "egl", "osmesa"])
+def test_without_opengl_the_error_names_the_packages(tmp_path, monkeypatch, chosen):
     monkeypatch.setattr(output, "find_library", lambda name: None)
-    monkeypatch.setenv("MUJOCO_GL", "disabled")
+    monkeypatch.setenv("MUJOCO_GL", chosen)
     with pytest.raises(ParameterError, match="apt install libegl1"):
         requested(str(tmp_path / "clip.gif"), 1.0)
 

@@ -21,7 +21,7 @@ MAX_SPEED = 100.0
 # The libraries by which MuJoCo draws without a screen, and its name for each.
 BACKENDS = {"EGL": "egl", "OSMesa": "osmesa"}
 NO_GRAPHICS = (
-    "no OpenGL that draws without a screen (EGL, OSMesa) is installed: apt install libegl1 libgl1-mesa-dri, or "
+    "no OpenGL that draws without a screen is installed (EGL, OSMesa, or what MUJOCO_GL names): apt install libegl1 libgl1-mesa-dri, or "
     "apt install libosmesa6"
 )
 
@@ -74,12 +74,14 @@ def backend() -> str:
     Raises DataError if no library for it is found.
     """
     chosen = os.environ.get("MUJOCO_GL", "disabled")
-    if chosen != "disabled" or not sys.platform.startswith("linux"):
-        return "" if chosen == "disabled" else chosen
-    found = next((name for library, name in BACKENDS.items() if find_library(library)), "")
-    if not found:
-        raise DataError(NO_GRAPHICS)
-    return found
+    if chosen == "disabled" and not sys.platform.startswith("linux"):
+        return ""
+    if chosen not in ("disabled", *BACKENDS.values()):
+        return chosen
+    for library, name in BACKENDS.items():
+        if chosen in ("disabled", name) and find_library(library):
+            return name
+    raise DataError(NO_GRAPHICS)
 
 
 def select_backend() -> None:
