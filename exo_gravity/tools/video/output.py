@@ -21,8 +21,8 @@ MAX_SPEED = 100.0
 # The libraries by which MuJoCo draws without a screen, and its name for each.
 BACKENDS = {"EGL": "egl", "OSMesa": "osmesa"}
 NO_GRAPHICS = (
-    "no OpenGL that draws without a screen is installed (EGL, OSMesa, or what MUJOCO_GL names): apt install libegl1 libgl1-mesa-dri, or "
-    "apt install libosmesa6"
+    "no OpenGL that draws without a screen is installed (EGL, OSMesa, or what MUJOCO_GL names): "
+    "apt install libegl1 libgl1-mesa-dri, or apt install libosmesa6"
 )
 
 
