@@ -58,6 +58,7 @@ class Stopping:
         self._nodes = nodes
         self._stages = Stages.of(nodes)
         self._running: set[str] = set()
+        self._terminated: set[str] = set()
         self._is_stopping = False
 
     def handlers(self) -> list[RegisterEventHandler]:
@@ -105,10 +106,10 @@ class Stopping:
 
     def _stop_next(self) -> list[LaunchDescriptionEntity]:
         """Return the actions that stop the first stage of which a node runs."""
-        for stage in self._stages:
-            if running := [self._nodes[name] for name in stage if name in self._running]:
-                return [EmitEvent(event=_terminate(node)) for node in running]
-        return []
+        stage = next((running for names in self._stages if (running := self._running.intersection(names))), set())
+        fresh = stage - self._terminated  # a second SIGTERM would end a node that is closing
+        self._terminated |= fresh
+        return [EmitEvent(event=_terminate(self._nodes[name])) for name in sorted(fresh)]
 
 
 async def _recover(dead: ProcessExited) -> None:
