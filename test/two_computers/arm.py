@@ -18,8 +18,10 @@ from .network import ADDRESSES, ROOT, Network
 
 POSE = [0.1, 0.8, 0.7, 0.6]  # rad
 MOVE = 2.0  # s
-PARTS = {"robot": ("/imu", "/right/can_bridge", "/right/simulator", "/robot/recorder")}
-PARTS["desk"] = ("/right/compensator", "/recorder")
+PARTS: dict[str, tuple[str, ...]] = {
+    "robot": ("/imu", "/right/can_bridge", "/right/simulator", "/robot/recorder"),
+    "desk": ("/right/compensator", "/recorder"),
+}
 PEERS = {"robot": ADDRESSES["desk"], "desk": ADDRESSES["robot"]}
 STOP_TIMEOUT = 60.0  # s
 

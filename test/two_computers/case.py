@@ -63,9 +63,13 @@ def play(
 
 
 def _wait_for(arm: TwoComputers, action: str, timeout: float) -> bool:
-    """Wait until the virtual wearer is at `action`, or the bridge has a fault; return whether it is at `action`."""
-    arm.wait_until(lambda: arm.action in (action, "done") or arm.bridge.get("fault", "none") != "none", timeout)
-    return arm.action == action
+    """Wait until the virtual wearer is at `action`; return whether it is, and the bridge has no fault."""
+
+    def has_fault() -> bool:
+        return bool(arm.bridge.get("fault", "none") != "none")
+
+    arm.wait_until(lambda: arm.action in (action, "done") or has_fault(), timeout)
+    return arm.action == action and not has_fault()
 
 
 def _reason(arm: TwoComputers) -> str:

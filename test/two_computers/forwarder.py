@@ -18,6 +18,7 @@ import sys
 import time
 from collections import deque
 from pathlib import Path
+from typing import Any
 
 from test.two_computers.network import Wire
 
@@ -92,7 +93,7 @@ def main(first: str, second: str, *words: str) -> None:
     print("ready", flush=True)
     while True:
         wait = min(direction.due for direction in directions) - time.monotonic()
-        ready = select.select([*by_socket, sys.stdin], [], [], max(0.0, wait) if wait < 1.0 else 1.0)[0]
+        ready: list[Any] = select.select([*by_socket, sys.stdin], [], [], max(0.0, wait) if wait < 1.0 else 1.0)[0]
         if sys.stdin in ready:
             break
         now = time.monotonic()

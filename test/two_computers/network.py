@@ -71,8 +71,7 @@ class Network:
         for name in ADDRESSES:
             self._hold(name, [*self._enter("wire"), "unshare", "--net"])
         for name, address in ADDRESSES.items():
-            holder = str(self._namespaces[name])
-            self._ip("wire", f"link add {name} type veth peer name eth0 netns {holder}")
+            self._ip("wire", f"link add {name} type veth peer name eth0 netns {self._namespaces[name]}")
             self._ip("wire", f"link set {name} up")
             for command in (
                 "link set lo up",
@@ -82,9 +81,9 @@ class Network:
             ):
                 self._ip(name, command)
         words = [f"{key}={value}" for key, value in asdict(self._wire).items()]
-        command = [sys.executable, "-m", "test.two_computers.forwarder", *ADDRESSES, *words]
+        forwarder = [sys.executable, "-m", "test.two_computers.forwarder", *ADDRESSES, *words]
         environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-        self._forwarder = self._wait_until_ready(self._popen([*self._enter("wire"), *command], environment))
+        self._forwarder = self._wait_until_ready(self._popen([*self._enter("wire"), *forwarder], environment))
 
     def _hold(self, name: str, unshare: Sequence[str]) -> None:
         self._namespaces[name] = self._wait_until_ready(self._popen([*unshare, *HOLDER])).pid
@@ -105,7 +104,7 @@ class Network:
     def _wait_until_ready(self, process: subprocess.Popen[str]) -> subprocess.Popen[str]:
         assert process.stdout is not None
         if process.stdout.readline() != "ready\n":
-            raise RuntimeError(f"{process.args}: ended with exit code {process.wait()}")
+            raise RuntimeError(f"{process.args!r}: ended with exit code {process.wait()}")
         return process
 
     def _end(self) -> None:
