@@ -26,6 +26,7 @@ from exo_gravity.hardware.scheduling import favour
 
 NEEDED_CHECK_PERIOD = 0.1  # s
 CLOSE_TIMEOUT = 5  # s for the middleware to close
+PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
 SWITCH_INTERVAL = 2e-4  # s that a thread may wait for the interpreter's lock; Python's default is 5 ms
 
 
@@ -33,9 +34,12 @@ def keep_to_this_machine() -> None:
     """Set middleware defaults that the user's environment leaves open; call it before `rclpy.init`."""
     # With ROS's own default, every host on the subnet could publish torques to a worn robot.
     reach = os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    if reach == "LOCALHOST":
-        profile = "fastdds_peers.xml" if os.environ.get("ROS_STATIC_PEERS") else "fastdds.xml"
-        os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name(profile)))
+    if reach != "LOCALHOST":
+        return
+    loopback = str(Path(__file__).with_name("fastdds.xml"))
+    profile = os.environ.setdefault(PROFILES, loopback)
+    if os.environ.get("ROS_STATIC_PEERS") and profile == loopback:  # over which no peer could be reached
+        os.environ[PROFILES] = str(Path(__file__).with_name("fastdds_peers.xml"))
 
 
 def open_to_others() -> str:

@@ -1,12 +1,15 @@
 """Which hosts a node communicates with, as set before it starts."""
 
 import os
+from pathlib import Path
 
 import pytest
 
+from exo_gravity.nodes import run
 from exo_gravity.nodes.run import keep_to_this_machine, open_to_others
 
 NAMES = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS", "ROS_DISCOVERY_SERVER")
+LOOPBACK = str(Path(run.__file__).with_name("fastdds.xml"))
 SECURITY = {"ROS_SECURITY_ENABLE": "true", "ROS_SECURITY_STRATEGY": "Enforce"}
 
 
@@ -31,12 +34,22 @@ def test_the_users_settings_are_kept(environment):
     assert "FASTRTPS_DEFAULT_PROFILES_FILE" not in os.environ
 
 
-def test_with_a_named_peer_a_node_does_not_keep_to_the_loopback_interface(environment):
+@pytest.mark.parametrize("exported", ["", LOOPBACK])
+def test_with_a_named_peer_a_node_does_not_keep_to_the_loopback_interface(environment, exported):
     environment("ROS_STATIC_PEERS", "10.0.0.2")
+    if exported:  # as docs/security.md recommends for other programs
+        environment("FASTRTPS_DEFAULT_PROFILES_FILE", exported)
     keep_to_this_machine()
     assert os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
     assert os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("fastdds_peers.xml")
     assert open_to_others() == "ROS_STATIC_PEERS=10.0.0.2"
+
+
+def test_with_a_named_peer_the_users_own_profile_is_kept(environment):
+    environment("ROS_STATIC_PEERS", "10.0.0.2")
+    environment("FASTRTPS_DEFAULT_PROFILES_FILE", "own.xml")
+    keep_to_this_machine()
+    assert os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] == "own.xml"
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from ..support.launched_nodes import SIMULATED
+from .arm import PEERS
 from .case import play
 from .network import Wire
 
@@ -31,3 +32,10 @@ def test_an_arm_whose_efforts_are_older_than_the_timeout_is_never_enabled(tmp_pa
     result = play(Wire(delay=0.6 * TIMEOUT), tmp_path, hold=1.0, timing=SIMULATED, patience=15.0)
     assert result.start is None
     assert result.outcome == "checking: waiting for effort commands"
+
+
+def test_a_robot_that_names_no_peer_is_not_commanded_by_a_desk_that_names_it(tmp_path: Path):
+    peers = {**PEERS, "robot": ""}
+    result = play(Wire(), tmp_path, hold=1.0, timing=SIMULATED, peers=peers, patience=15.0)
+    assert result.outcome == "checking: waiting for effort commands"
+    assert "other hosts can command" not in (tmp_path / "log.txt").read_text()
