@@ -10,7 +10,7 @@
 # make imu-report   the trunk's inclination error on recorded motion, here and by VQF and imufusion; TRIALS=FOLDER
 # make socketcan    motor bus and nodes on vcan0; RUN=COMMAND runs the tests through COMMAND, in a virtual machine for example
 # make ros2-launch  the launch file under `ros2 launch`, where ROS 2 and a build of this package are sourced
-# make two-computers  the arm on two computers over better and worse wires, 7 minutes; a table and build/two_computers.json
+# make two-computers  the arm on two computers over better and worse wires, 6 minutes; a table and build/two_computers.json
 # make dist         wheel and source distribution in dist/, the wheel installed in an empty environment and tried
 # make pythons      for each supported Python found here: set-up from nothing, a short trial, the nodes
 # make constraints  renews the versions in constraints/

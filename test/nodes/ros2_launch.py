@@ -30,8 +30,9 @@ class Launched:
         self.truth = Truth(nodes.truth_path())
         self.log: list[str] = []
         command = ["ros2", "launch", str(LAUNCH_FILE), f"params:={nodes.path}", *arguments]
-        pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-        self.process = subprocess.Popen(command, text=True, start_new_session=True, **pipes)  # type: ignore[call-overload]
+        self.process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+        )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
@@ -68,7 +69,8 @@ class Launched:
 @pytest.fixture
 def launched(prepare: Callable[..., LaunchedNodes], probe: RosProbe) -> Iterator[Launched]:
     """An arm that is carried."""
-    launched = Launched(prepare(truth=True, can_bridge={**FAST, "damping": 5.0}))
+    nodes = prepare(truth=True, can_bridge={**FAST, "damping": 5.0})
+    launched = Launched(nodes)
     try:
         probe.wait_until_carried()
         yield launched
@@ -76,6 +78,7 @@ def launched(prepare: Callable[..., LaunchedNodes], probe: RosProbe) -> Iterator
         if launched.process.poll() is None:
             launched.ctrl_c()
             launched.wait()
+        nodes.stop()
         print("\n".join(launched.log))  # pytest shows it if the test failed
 
 

@@ -8,8 +8,10 @@ process of its own (forwarder.py). Without root, a user namespace permits all of
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -108,11 +110,14 @@ class Network:
         return process
 
     def _end(self) -> None:
-        for process in reversed(self._processes):
-            if process.stdin is not None and not process.stdin.closed:
-                process.stdin.close()
-            try:
-                process.wait(START_TIMEOUT)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+        """End every process in the namespaces, also those that were left behind, and with them the namespaces."""
+        holders = set(self._namespaces.values())
+        spaces = {os.readlink(f"/proc/{holder}/ns/net") for holder in holders}
+        for process in Path("/proc").glob("[0-9]*"):
+            with contextlib.suppress(OSError):
+                if int(process.name) not in holders and os.readlink(process / "ns/net") in spaces:
+                    os.kill(int(process.name), signal.SIGKILL)
+        for started in self._processes:
+            if started.stdin is not None and not started.stdin.closed:
+                started.stdin.close()
+            started.wait(START_TIMEOUT)
