@@ -14,7 +14,7 @@ from exo_gravity.hardware.owned_bus import recover
 from exo_gravity.nodes.declare import bus_of, declare
 from exo_gravity.nodes.run import keep_to_this_machine
 
-# Set by whoever starts the executable for this: time in s for the watchdog of the dead bridge to let the arm down.
+# Set by launcher and launch file: the time in s for the watchdog of the dead bridge to let the arm down.
 RECOVER = "EXO_GRAVITY_RECOVER"
 
 
