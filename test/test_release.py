@@ -102,3 +102,15 @@ def test_a_workflow_runs_commands_that_exist_by_actions_of_one_version(path: Pat
     assert set(re.findall(r"run: make (\S+)", text)) <= targets
     assert all((ROOT / script).exists() for script in re.findall(r"run: (\.ci/\S+)", text))
     assert all(re.fullmatch(r"v\d+\.\d+\.\d+", version) for version in re.findall(r"uses: \S+@(\S+)", text))
+
+
+def test_every_extra_is_explained() -> None:
+    module = ast.parse((ROOT / "setup.py").read_text(encoding="utf-8"))
+    extras = next(
+        ast.literal_eval(node.value)
+        for node in module.body
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "extras"
+    )
+    table = re.search(r"\| extra \|.*\n\|[-|]+\n((?:\|.*\n)+)", (ROOT / "docs" / "installation.md").read_text("utf-8"))
+    assert table
+    assert {name for row in table[1].splitlines() for name in re.findall(r"`(\w+)`", row.split("|")[1])} == set(extras)
