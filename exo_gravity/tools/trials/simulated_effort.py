@@ -96,7 +96,7 @@ class EffortStudy:
         bridge, compensator, simulator = (
             {**self.nodes[f"{self.namespace}/{node}"]} for node in ("can_bridge", "compensator", "simulator")
         )
-        # The duration of the sign check varies, and a wearer's arm would make it longer. The rate is the offline study's.
+        # The duration of the sign check varies, and a wearer's arm would make it longer. The rate is as offline.
         bridge.update(max_effort=[motor.peak_effort for motor in self.motors], sign_check_torque=0.0, rate=RATE)
         compensator.update(_values_of(self.settings[setting]))
         simulator.update({name: self.simulator[name] for name in ("wearer.mass", "wearer.cog")})
