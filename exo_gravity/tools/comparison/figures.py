@@ -20,6 +20,7 @@ from exo_gravity.tools.comparison.laws import Baseline, Row, rms
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 
 FLOOR, CEILING = 1e-7, 1.0  # Nm, ends of the colour scale
+LEAST = 0.01  # Nm or degrees, below which a bar of the baselines counts as 0
 GRID = (56, 56, 7)  # positions of joints 2, 3, 4 in the workspace figure
 # Overlapping lines stay visible, because the wider ones are drawn first.
 STYLES: dict[str, dict[str, Any]] = {
@@ -90,7 +91,7 @@ def baseline_figure(path: Path, rows: Sequence[Baseline]) -> None:
         axis.bar_label(bars, [f"{value:.1g}" for value in error], fontsize=8)
         axis.plot(place + shift, largest, "v", color=colour, markeredgecolor="black", label=f"largest error {part}")
     axis.set_yscale("log")
-    axis.set_xticks(place, [f"{row.law}\n{row.memory / 1e3:,.0f} kB, {1e6 * row.pose_time:,.0f} us" for row in rows])
+    axis.set_xticks(place, [f"{row.law}\n{row.memory / 1e3:,.0f} kB, {1e6 * row.pose_time:,.0f} µs" for row in rows])
     axis.set_ylabel("error against gravload (Nm)")
     axis.set_ylim(1e-17, 1e3)
     axis.legend(fontsize=8, ncols=4, loc="upper center")
@@ -106,10 +107,12 @@ def _burdens(axis: Axes, rows: Sequence[Baseline]) -> None:
         (0.0, [np.degrees(row.sag) for row in rows], "tab:red", "largest sag after letting go, in degrees"),
         (0.27, [np.degrees(row.sag_bowed) for row in rows], "tab:purple", "the same, trunk bowed by 30 degrees"),
     ):
-        bars = axis.bar(place + shift, values, 0.26, color=colour, label=label)
-        axis.bar_label(bars, [f"{value:.2g}" if value > 0.01 else "0" for value in values], fontsize=8)
+        bars = axis.bar(place + shift, np.maximum(values, LEAST), 0.26, color=colour, label=label)
+        axis.bar_label(
+            bars, [f"{value:.{int(value < 10.0)}f}" if value > LEAST else "0" for value in values], fontsize=8
+        )
     axis.set_yscale("log")
-    axis.set_ylim(0.01, 3e3)
+    axis.set_ylim(LEAST, 3e3)
     axis.set_ylabel("in the simulator")
     axis.set_xticks(place, [row.law.replace(" ", "\n", 1) for row in rows])
     axis.legend(fontsize=8, ncols=3, loc="upper center")
