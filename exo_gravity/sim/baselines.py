@@ -44,8 +44,11 @@ class Burden(NamedTuple):
 
 @dataclass(frozen=True)
 class Feedforward:
-    """What a controller consists of. law: None for none. feedback: with a PID on each joint. pose_time: s that the law
-    takes for one pose; until then the torque of an earlier pose stays."""
+    """What a controller consists of.
+
+    law: None for none. feedback: with a PID on each joint. pose_time: s that the law takes for one pose; until then the
+    torque of an earlier pose stays.
+    """
 
     law: Law | None
     feedback: bool

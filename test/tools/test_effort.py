@@ -16,6 +16,7 @@ from exo_gravity.sim.effort_study import TASKS
 from exo_gravity.tools import trial
 from exo_gravity.tools.inputs.parameter_file import load, packaged_config
 from exo_gravity.tools.trials import effort, simulated_effort
+from exo_gravity.tools.trials.real_time import Outcome
 from exo_gravity.tools.trials.simulated_effort import EffortStudy
 
 from ..support.ports import own_ports
@@ -79,6 +80,15 @@ def test_a_weak_arm_reaches_more_of_the_workspace_with_more_support():
         shares = [reached[name, share] for name in order]
         assert shares == sorted(shares) and shares[-1] > 0.9 > 0.1 > shares[1]
         assert reached["Zero-G 0 %", share] == reached["One-G", share]
+
+
+def test_a_study_on_a_busy_computer_ends_with_exit_code_3_and_what_it_has(monkeypatch, tmp_path):
+    outcomes = [Outcome("", 0, ""), Outcome("let down", 1, "simulator was not run for 90 ms")]
+    monkeypatch.setattr(effort, "run_attempts", lambda *arguments: outcomes.pop(0))
+    console = Console(record=True, width=200)
+    assert effort.run(SIMULATED, tmp_path, offline=False, quick=True, console=console) == 3
+    text = console.export_text()
+    assert "setting 2 of 4: One-G" in text and "One-G: this computer was too busy: simulator was not run" in text
 
 
 @pytest.mark.real_time

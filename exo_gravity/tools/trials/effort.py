@@ -20,7 +20,8 @@ from exo_gravity.tools.launcher import stop_on_signals
 from exo_gravity.tools.reporting import effort_table
 from exo_gravity.tools.reporting.effort_page import write_page
 from exo_gravity.tools.reporting.effort_table import EffortResults
-from exo_gravity.tools.trials.session import run_attempts
+from exo_gravity.tools.trials.busy import ADVICE
+from exo_gravity.tools.trials.session import BUSY_CODE, run_attempts
 
 with extras("trial", "sim"):
     from exo_gravity.tools.trials.simulated_effort import EffortStudy
@@ -40,26 +41,29 @@ def run(params: Path, output: Path, offline: bool, quick: bool, console: Console
     results = EffortResults({}, {})
     for setting, share, reached in study.workspaces():
         results.workspaces[setting, share] = reached
-    trouble = _offline(study, results, console) if offline else _on_nodes(study, results, folder, console)
+    trouble, code = "", 0
+    if offline:
+        _offline(study, results, console)
+    else:
+        trouble, code = _on_nodes(study, results, folder, console)
     if results.efforts:
         how = "simulated offline" if offline else "on nodes, from the simulated arm's true motion"
         _write(results, folder, when, how, console)
     if trouble:
         console.print(f"trial: {trouble}", markup=False, soft_wrap=True)
-    return int(bool(trouble))
+    return code
 
 
-def _offline(study: EffortStudy, results: EffortResults, console: Console) -> str:
-    """Add the efforts of all settings; return ''."""
+def _offline(study: EffortStudy, results: EffortResults, console: Console) -> None:
+    """Add the efforts of all settings."""
     count, rows = study.offline()
     quiet = not console.is_terminal
     for setting, task, effort in track(rows, "effort", count, console=console, transient=True, disable=quiet):
         results.efforts[setting, task] = effort
-    return ""
 
 
-def _on_nodes(study: EffortStudy, results: EffortResults, folder: Path, console: Console) -> str:
-    """Run the nodes once for each setting, and add its efforts; return why it ended early, or ''."""
+def _on_nodes(study: EffortStudy, results: EffortResults, folder: Path, console: Console) -> tuple[str, int]:
+    """Run the nodes once for each setting, and add its efforts; return why it ended early, or '', and the exit code."""
     stopped = stop_on_signals()
     path, script = folder / "script.yaml", TrialScript.parse(study.script)
     path.write_text(yaml.safe_dump(study.script, default_flow_style=None, width=120), encoding="utf-8")
@@ -75,8 +79,10 @@ def _on_nodes(study: EffortStudy, results: EffortResults, folder: Path, console:
         truth.unlink(missing_ok=True)  # 8 MB a minute
         results.efforts.update({(setting, task): effort for task, effort in found.items()})
         if outcome.trouble:
-            return f"{setting}: {outcome.trouble}"
-    return ""
+            busy = outcome.busy and outcome.code != 2
+            why = f"this computer was too busy: {outcome.busy}. {ADVICE}" if busy else outcome.trouble
+            return f"{setting}: {why}", BUSY_CODE if busy else outcome.code
+    return "", 0
 
 
 def _write(results: EffortResults, folder: Path, when: datetime, how: str, console: Console) -> None:
