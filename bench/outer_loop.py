@@ -2,7 +2,7 @@
 
     python -m bench.outer_loop NAMESPACE TURNS SECONDS
 
-Every term is computed, but gives less than a code of a command frame: so the commands stay those of the law, by which
+Every term is computed, but its torque vanishes in the sum: so the commands stay those of the law, by which
 `bench.timing` finds the answer to each reply. It prints {"on": [[begin, end], ...], "off": [...]} in s since 1970.
 """
 
@@ -23,7 +23,7 @@ from exo_gravity.core.terms.coupling import JOINTS
 
 RATE = 500.0  # Hz
 SETTLING = 1.5  # s after a change of parameters: ramp_time of the terms, and some more
-NONE, FAINT = [0.0] * 4, [1e-9] * 4
+NONE, FAINT = [0.0] * 4, [1e-18] * 4
 OFF: dict[str, Any] = {
     "friction.share": 0.0,
     "inertia.share": 0.0,
@@ -35,10 +35,10 @@ OFF: dict[str, Any] = {
 }
 ON: dict[str, Any] = {
     "friction.share": 0.4,  # of a friction of 0, which is the default
-    "inertia.share": 1e-9,
+    "inertia.share": 1e-18,
     "damping.viscosity": FAINT,
     "spring.stiffness": FAINT,
-    "coupling.stiffness": 1e-9,
+    "coupling.stiffness": 1e-18,
     "limits.stiffness": FAINT,
     "assist.max_effort": [1.0] * 4,
 }
