@@ -72,17 +72,19 @@ def effort_figure(results: EffortResults) -> Figure:
 
 def _efforts(axis: Axes, results: EffortResults, task: str) -> None:
     """Draw the RMS effort of each setting in a task, by joint."""
-    names = [name for name in results.settings if (name, task) in results.efforts]
+    names = results.settings  # those without this task too, because the panels share an axis
     places, left = np.arange(len(names))[::-1], np.zeros(len(names))
-    squares = np.array([results.efforts[name, task].rms ** 2 for name in names])
-    totals = np.array([results.efforts[name, task].total for name in names])
+    missing = np.full(4, np.nan)
+    found = [results.efforts.get((name, task)) for name in names]
+    squares = np.array([effort.rms**2 if effort else missing for effort in found])
+    totals = np.sqrt(squares.sum(axis=1))
     for joint, colour in enumerate(JOINT_COLOURS):
         share = squares[:, joint] / totals  # the lengths add up to the root of the sum of squares
         axis.barh(places, share, left=left, color=colour, label=JOINTS[joint])
         left += share
-    for place, total in zip(places, totals, strict=True):
+    for place, total in zip(places[~np.isnan(totals)], totals[~np.isnan(totals)], strict=True):
         axis.annotate(f"{total:.2f}", (total, place), (3, 0), textcoords="offset points", va="center", fontsize=8)
-    if ZERO_G in names:
+    if (ZERO_G, task) in results.efforts:
         half = 0.5 * results.efforts[ZERO_G, task].total
         axis.axvline(half, color=FAINT, ls="--", lw=1.0, label="half of Zero-G")
     axis.set_yticks(places, names)
