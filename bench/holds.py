@@ -1,4 +1,4 @@
-"""python -m bench.holds: does the arm creep or swing in 13 holds with the terms `friction` and `inertia`?
+"""python -m bench.holds: whether the arm creeps or swings in 13 holds with the terms `friction` and `inertia`.
 
 The packaged simulator and five perturbed ones, as they are after a calibration. The wearer has 45 kg: a heavier arm
 needs more than the peak torque of the flexion motor in some of these poses. No ROS is used. Exit code 1 if a joint
