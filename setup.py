@@ -31,7 +31,6 @@ extras = {
     "urdf": ["pin>=2.7"],  # law: urdf
     "docs": ["docutils>=0.21", "furo>=2024.8", "myst-parser>=4.0", "sphinx>=7.4"],
     "test": [
-        "example-robot-data>=4.3",
         "hypothesis>=6.100",
         "mcap-ros2-support>=0.5",
         "pytest>=8.0",

@@ -1,6 +1,5 @@
 """Torques of arms from their URDF: against MuJoCo, and against the exact law on the exoskeleton's own description."""
 
-from importlib.metadata import distribution
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +16,14 @@ from exo_gravity.tools.urdf import urdf_of
 
 from ..support.urdf_oracle import MujocoArm
 
-EXAMPLES = "cmeel.prefix/share/example-robot-data/robots"
-KUKA = "xacro/kuka_description/kuka_kr16/urdf/kr16_2.urdf"
+PUBLISHED = Path(__file__).parents[1] / "data" / "arms"
+KUKA = Path(rtbdata.__path__[0], "xacro/kuka_description/kuka_kr16/urdf/kr16_2.urdf")
 ARMS = {
     # The UR5 as a table arm; the Panda with two prismatic fingers, which stay at 0; the Kinova with continuous joints.
-    "ur5": ("ur_description/urdf/ur5_robot.urdf",
+    "ur5": (PUBLISHED / "ur5.urdf",
             [f"{part}_joint" for part in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")]),
-    "panda": ("panda_description/urdf/panda.urdf", [f"panda_joint{n}" for n in range(1, 8)]),
-    "kinova": ("kinova_description/robots/kinova.urdf", [f"j2s6s200_joint_{n}" for n in range(1, 7)]),
+    "panda": (PUBLISHED / "panda.urdf", [f"panda_joint{n}" for n in range(1, 8)]),
+    "kinova": (PUBLISHED / "kinova.urdf", [f"j2s6s200_joint_{n}" for n in range(1, 7)]),
     "kr16": (KUKA, [f"joint_a{n}" for n in range(1, 7)]),
 }  # fmt: skip
 POSES = 200
@@ -37,12 +36,6 @@ ONE_LINK = """<robot name="one">
 </robot>"""
 
 
-def description(path: str) -> str:
-    if path == KUKA:
-        return Path(rtbdata.__path__[0], path).read_text(encoding="utf-8")
-    return distribution("example-robot-data").locate_file(f"{EXAMPLES}/{path}").read_text(encoding="utf-8")
-
-
 def random_gravity(random: np.random.Generator) -> np.ndarray:
     gravity = random.normal(size=3)
     return 9.80665 * gravity / np.linalg.norm(gravity)
@@ -51,7 +44,7 @@ def random_gravity(random: np.random.Generator) -> np.ndarray:
 @pytest.mark.parametrize("name", ARMS)
 def test_the_torques_of_published_arms_equal_mujocos_in_any_pose_under_any_tilt(name):
     path, joints = ARMS[name]
-    text, random = description(path), np.random.default_rng(1)
+    text, random = path.read_text(encoding="utf-8"), np.random.default_rng(1)
     arm, mujoco = UrdfArm(text, joints), MujocoArm(text, joints)
     largest = 0.0
     for _ in range(POSES):
@@ -64,7 +57,7 @@ def test_the_torques_of_published_arms_equal_mujocos_in_any_pose_under_any_tilt(
 
 def test_the_joints_may_come_in_any_order():
     path, joints = ARMS["kinova"]
-    text, random = description(path), np.random.default_rng(2)
+    text, random = path.read_text(encoding="utf-8"), np.random.default_rng(2)
     order = random.permutation(len(joints))
     theta, gravity = random.uniform(-3.0, 3.0, len(joints)), random_gravity(random)
     mixed, ordered = UrdfArm(text, [joints[n] for n in order]), UrdfArm(text, joints)
