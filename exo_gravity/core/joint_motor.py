@@ -81,8 +81,9 @@ class JointMotor:
         kd = min(damping / self.torque_scale, spec.kd_max)
         if kd:  # no code is exactly 0 rad/s: the nearest one would push with kd times its velocity
             torque -= kd * standstill(spec)
-        if math.isfinite(torque) and abs(torque) > spec.torque_range:
-            torque = math.copysign(spec.torque_range, torque)
+        most = spec.torque_range
+        if not -most <= torque <= most and math.isfinite(torque):
+            torque = math.copysign(most, torque)
         return self.wire_format.pack_command(spec, 0.0, 0.0, 0.0, kd, torque)
 
     def joint_reply(self, data: bytes | bytearray) -> MotorReply:

@@ -132,7 +132,7 @@ def pack_command(spec: MotorSpec, position: float, velocity: float, kp: float, k
     )
     data = word.to_bytes(8, "big")
     # With all other fields at their maximum, the top torque codes spell ENTER, EXIT or SET_ZERO. Send the code below.
-    return data if data not in SPECIAL_FRAMES else data[:7] + b"\xfb"
+    return data if data[0] != 0xFF or data not in SPECIAL_FRAMES else data[:7] + b"\xfb"
 
 
 def unpack_command(spec: MotorSpec, data: bytes | bytearray) -> MotorCommand:
