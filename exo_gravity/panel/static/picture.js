@@ -3,18 +3,17 @@
 // It is drawn at most ten times a second, and only when the browser is ready for a picture: drawing must never delay a
 // press. Without WebGL a sentence replaces it.
 
+import { Painter } from "./painter.js";
 import { t } from "./texts.js";
 
 const VIEWS = { oblique: [1.5, -0.9, 0.35], front: [1.9, 0, 0], side: [0, -1.9, 0] };
-const REST = 4; // pauses for this many times as long as the last picture took
 const CENTRE = [0, 0, -0.25];
 
 export class Picture {
   constructor(place, views) {
     this.place = place;
     this.view = "oblique";
-    this.cost = 25; // ms of the last picture
-    this.waiting = false;
+    this.painter = new Painter(() => this.draw());
     this.description = "";
     for (const button of views.querySelectorAll("button"))
       button.addEventListener("click", () => {
@@ -131,21 +130,10 @@ export class Picture {
   }
 
   render() {
-    if (this.waiting) return;
-    this.waiting = true;
-    const rest = Math.max(0, this.cost * REST);
-    setTimeout(() => requestAnimationFrame(() => this.draw()), rest);
+    this.painter.request();
   }
 
   draw() {
-    this.waiting = false;
-    const start = performance.now();
-    this.drawNow();
-    this.renderer.getContext().finish(); // else a slow computer queues pictures
-    this.cost = performance.now() - start;
-  }
-
-  drawNow() {
     const { clientWidth: width, clientHeight: height } = this.place;
     if (!width || !height) return;
     if (this.width !== width || this.height !== height) {
@@ -155,6 +143,7 @@ export class Picture {
       this.camera.updateProjectionMatrix();
     }
     this.renderer.render(this.scene, this.camera);
+    this.renderer.getContext().finish(); // else a slow computer queues pictures
   }
 }
 

@@ -1,6 +1,7 @@
 // The last 30 seconds of each arm: angles, torques with their limits, temperatures, rate and age. uPlot draws.
 
 import { jointText } from "./arm.js";
+import { Painter } from "./painter.js";
 import { degrees, t } from "./texts.js";
 
 const LENGTH = 300; // states, ten a second
@@ -18,6 +19,10 @@ export class Plots {
     this.arms = new Map(); // name -> {times, figures}
     this.limits = {};
     this.width = 0;
+    this.painter = new Painter(() => this.draw());
+    this.visible = new IntersectionObserver((entries) => {
+      for (const entry of entries) entry.target.dataset.visible = entry.isIntersecting ? "yes" : "";
+    });
     this.observer = new ResizeObserver(() => this.resize());
     this.observer.observe(place);
   }
@@ -38,6 +43,12 @@ export class Plots {
       rows.push([Number.isFinite(rate) ? rate : null, Number.isFinite(age) ? age : null]);
       figures.forEach((figure, n) => push(figure, now, rows[n]));
     }
+    this.painter.request();
+  }
+
+  draw() {
+    for (const { figures } of this.arms.values())
+      for (const { plot, data, element } of figures) if (element.dataset.visible) plot.setData(data);
   }
 
   create(name, joints) {
@@ -54,6 +65,7 @@ export class Plots {
     const canvas = document.createElement("div");
     element.append(caption, canvas);
     this.place.append(element);
+    this.visible.observe(element);
     const series = names.map((_, n) => ({ stroke: COLOURS[n], dash: DASHES[n], width: 2 }));
     const options = {
       width: Math.max(200, element.clientWidth),
@@ -92,11 +104,10 @@ function title({ arm, kind, unit, names }) {
 }
 
 function push(figure, now, values) {
-  const { data, plot } = figure;
+  const { data } = figure;
   data[0].push(now);
   values.forEach((value, n) => data[n + 1].push(value));
   if (data[0].length > LENGTH) for (const column of data) column.shift();
-  plot.setData(data);
 }
 
 // Each joint's torque limit, a thin line in its colour.

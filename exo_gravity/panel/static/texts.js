@@ -2,6 +2,7 @@
 
 let texts = {};
 let column = 0;
+const formats = {}; // by language and digits: making one is slow
 let changed = () => {};
 
 export async function loadTexts(onChange) {
@@ -44,7 +45,9 @@ export function t(key, ...values) {
 
 export function number(value, digits) {
   if (value === null || value === undefined) return "–";
-  return value.toLocaleString(document.documentElement.lang, { minimumFractionDigits: digits, maximumFractionDigits: digits });
+  const key = `${document.documentElement.lang}${digits}`;
+  formats[key] ??= new Intl.NumberFormat(document.documentElement.lang, { minimumFractionDigits: digits, maximumFractionDigits: digits });
+  return formats[key].format(value);
 }
 
 export const degrees = (radians) => (radians * 180) / Math.PI;
