@@ -12,6 +12,8 @@
 # make ros2-launch  the launch file under `ros2 launch`, where ROS 2 and a build of this package are sourced
 # make two-computers  the arm on two computers over better and worse wires, 6 minutes; a table and build/two_computers.json
 # make dist         wheel and source distribution in dist/, the wheel installed in an empty environment and tried
+# make panel        the simulated right arm and the operator's page, until Ctrl-C
+# make test-panel   the operator's page in a real browser; PRESSES=50 also measures from press to torque on the bus
 # make pythons      for each supported Python found here: set-up from nothing, a short trial, the nodes
 # make constraints  renews the versions in constraints/
 # make clean        removes what these made
@@ -22,11 +24,11 @@
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := imu sim report
-TEST := $(DEMO) validate video test
+TEST := $(DEMO) panel validate video test
 SETUP := VENV=$(VENV) .ci/setup
 
 .PHONY: demo calibrate-demo calibrate-study test lint docs faults mutations bench imu-report socketcan \
-        pythons constraints clean ros2-launch two-computers dist
+        pythons constraints clean ros2-launch two-computers dist panel test-panel
 
 demo:
 	@$(SETUP) $(DEMO)
@@ -90,6 +92,17 @@ two-computers:
 dist:
 	@$(SETUP) dev
 	VENV=$(VENV) .ci/dist
+
+panel:
+	@$(SETUP) $(DEMO) panel
+	$(BIN)/launcher --panel
+
+test-panel:
+	@$(SETUP) $(TEST)
+	@command -v chromium chromium-browser >/dev/null || ! test -w /var/lib/dpkg || \
+		(apt-get update && apt-get install --yes chromium) >build/chromium.log 2>&1 || true
+	$(BIN)/python -m pytest test/panel
+	$(if $(PRESSES),$(BIN)/python -m bench.panel press $(PRESSES))
 
 pythons:
 	.ci/pythons

@@ -19,6 +19,7 @@ from exo_gravity.core.calibration.params import CALIBRATOR
 from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR, IMU, RECORDER, ROBOT_MODEL
 from exo_gravity.core.faults import FaultCode
 from exo_gravity.core.param_table import Param
+from exo_gravity.panel.params import PANEL
 from exo_gravity.sim.device_params import SIMULATOR
 
 DOCS = Path(__file__).parent
@@ -34,6 +35,7 @@ PARAMETERS = {
     "simulator": SIMULATOR,
     "recorder": RECORDER,
     "robot_model": ROBOT_MODEL,
+    "panel": PANEL,
     "calibrator": [param for param in CALIBRATOR if param.name.startswith("tour.")],
 }
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end of table -->)", re.DOTALL)

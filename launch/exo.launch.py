@@ -153,6 +153,8 @@ def _start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     params, namespace = Path(argument("params")).resolve(), argument("namespace").strip("/")
     namespace = f"/{namespace}" if namespace else ""
     content = load(params)
+    if argument("panel") == "true":
+        content.setdefault("/panel", {})
     check_buses(content)
     path = in_namespace(params, namespace)
     names = chosen(content, argument("only").split())
@@ -166,6 +168,7 @@ def generate_launch_description() -> LaunchDescription:
         ("params", str(packaged_config("exo.yaml")), "parameter file: one top-level key per node"),
         ("namespace", "", "namespace in front of every node of the file, and of the topics /imu/..."),
         ("only", "", "start only the nodes whose full names match one of these shell patterns"),
+        ("panel", "false", "true: also start the operator's panel, where the file has none"),
         ("log_level", "info", "debug, info, warn, error or fatal, for every node"),
     )
     declared = [DeclareLaunchArgument(name, default_value=value, description=text) for name, value, text in arguments]

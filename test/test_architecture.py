@@ -13,8 +13,9 @@ MAY_IMPORT = {
     "core": {"core"},
     "hardware": {"core", "hardware"},
     "sim": {"core", "sim"},
-    "nodes": {"core", "hardware", "sim", "bag", "nodes"},
+    "nodes": {"core", "hardware", "sim", "bag", "panel", "nodes"},
     "bag": {"core", "bag"},
+    "panel": {"core", "panel"},
     "tools": {"core", "bag", "tools"},
 }
 # `trial --offline` runs without ROS, so it starts no nodes and uses the simulated device directly. `calibrate motors`

@@ -15,9 +15,9 @@ from exo_gravity.core.faults import FaultCode
 ROOT = Path(__file__).parents[1]
 TABLES = ROOT / "docs" / "tables.py"
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-NODES = ("can_bridge", "compensator", "imu", "simulator", "recorder", "robot_model", "calibrator")
+NODES = ("can_bridge", "compensator", "imu", "simulator", "recorder", "robot_model", "calibrator", "panel")
 EXAMPLE = re.compile(r"```python\n(.*?)```\s*```text\n(.*?)```", re.DOTALL)
-FOLDERS = "bench|config|docs|examples|exo_gravity|launch|test|core|hardware|sim|bag|nodes|tools"
+FOLDERS = "bench|config|docs|examples|exo_gravity|launch|test|core|hardware|sim|bag|panel|nodes|tools"
 
 
 def name(path: Path) -> str:

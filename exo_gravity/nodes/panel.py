@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -45,7 +46,9 @@ class Panel(Node):
 
     def __init__(self) -> None:
         super().__init__("panel", automatically_declare_parameters_from_overrides=True)
-        values = declare(self, PANEL)
+        # The token is not kept as a parameter, which any node could read and a recording would hold.
+        values = declare(self, [replace(param, fixed=param.name != "token") for param in PANEL])
+        self.undeclare_parameter("token")
         self.failure: Exception | None = None  # ends the node, see run()
         self._notes = self.create_publisher(DiagnosticArray, "/diagnostics", 50)
         self._noted = 0

@@ -81,7 +81,7 @@ class PanelServer:
         self._desk = desk
         self._report = report
         self._pages: dict[str, tuple[LivePage, WebSocket]] = {}  # by secret
-        self._setup = json.dumps({"type": "setup"})
+        self._setup = ""  # none yet
         self._number = 0  # of the newest state
         self._loop: asyncio.AbstractEventLoop | None = None
         routes = [
@@ -163,10 +163,10 @@ class PanelServer:
     async def _on_live(self, connection: WebSocket) -> None:
         await connection.accept()
         control = self._desk.control
-        with suppress(WebSocketDisconnect, TimeoutError, asyncio.TimeoutError, ValueError, TypeError):
+        with suppress(WebSocketDisconnect, asyncio.TimeoutError, ValueError, KeyError):
             hello = await asyncio.wait_for(connection.receive_json(), HELLO_TIMEOUT)
             address = connection.client.host if connection.client else "unknown"
-            opened = control.open(str(hello["page"]) if isinstance(hello, dict) else "", address)
+            opened = control.open(_given(hello, "page", str), address)
             if opened is None:
                 await connection.close(FULL)
                 return
@@ -178,12 +178,13 @@ class PanelServer:
         live = LivePage()
         self._pages[secret] = live, connection
         live.put("page", json.dumps({"type": "page", "page": secret, "number": page.number}))
-        live.put("setup", self._setup)
+        if self._setup:
+            live.put("setup", self._setup)
         sender = asyncio.create_task(live.send(connection))
         try:
             while True:
-                if "seen" in await connection.receive_json():
-                    self._desk.control.confirm(secret)
+                _given(await connection.receive_json(), "seen", int)
+                self._desk.control.confirm(secret)
         finally:
             sender.cancel()
             if self._pages.get(secret, (None,))[0] is live:
@@ -207,6 +208,13 @@ class PanelServer:
     async def _on_report(self, request: Request) -> Response:
         path = self._report(request.path_params["name"])
         return FileResponse(path) if path else PlainTextResponse("404: no such report", 404)
+
+
+def _given(message: Any, key: str, kind: type) -> Any:
+    """Return the value of `key` in a page's message. Raises ValueError if the page sends something else."""
+    if not isinstance(message, dict) or type(message.get(key)) is not kind:
+        raise ValueError(f"{key} must be given")
+    return message[key]
 
 
 def _listen(host: str, port: int) -> socket.socket:

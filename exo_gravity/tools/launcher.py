@@ -58,12 +58,14 @@ class Launcher:
     """The processes of one parameter file.
 
     on_line is called with each line that a node prints. only: shell patterns of the nodes to start; () starts all.
-    Raises ParameterError.
+    more: nodes to start beside those of the file, with their default parameters. Raises ParameterError.
     """
 
-    def __init__(self, params: str | Path, on_line: OnLine = print_line, only: Sequence[str] = ()) -> None:
+    def __init__(
+        self, params: str | Path, on_line: OnLine = print_line, only: Sequence[str] = (), more: Sequence[str] = ()
+    ) -> None:
         self._path = Path(params).resolve()
-        nodes = load(self._path)
+        nodes = {**{node: {} for node in more}, **load(self._path)}
         check_buses(nodes)
         self._commands = {node: self._command(node) for node in chosen(nodes, only)}
         self._processes: dict[str, subprocess.Popen[str]] = {}
@@ -225,6 +227,8 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
         default=(),
         help="start only the nodes whose full names match a shell pattern: '*/can_bridge' /imu",
     )
+    switch = {"nargs": "?", "const": "true", "default": "false", "choices": ("true", "false")}
+    parser.add_argument("--panel", **switch, help="also start the operator's panel, where the file has none")
     return parser.parse_args(args)
 
 
@@ -234,7 +238,8 @@ def main(args: Sequence[str] | None = None) -> None:
     require_ros("launcher")
     stopping = stop_on_signals()
     try:
-        launcher = Launcher(options.params or packaged_config("sim.yaml"), only=options.only)
+        more = ("/panel",) if options.panel == "true" else ()
+        launcher = Launcher(options.params or packaged_config("sim.yaml"), only=options.only, more=more)
         dead = launcher.run(stopping)
     except ExoGravityError as error:
         print(f"launcher: {error}", file=sys.stderr)

@@ -1,7 +1,7 @@
 """config/sros2/policy.xml against the running nodes: what each publishes, subscribes to, serves and calls.
 
-The nodes are those of config/sim_both.yaml, a recorder, robot_model, and an outer loop for each arm; the bridges are
-not enabled.
+The nodes are those of config/sim_both.yaml, a recorder, robot_model, the panel, and an outer loop for each arm; the
+bridges are not enabled.
 These tests do not show that DDS enforces the policy, which takes a middleware built with security.
 """
 
@@ -26,12 +26,13 @@ from exo_gravity.tools.launcher import Launcher
 
 from ..support import CONFIG
 from ..support.launched_nodes import PORTS
+from ..support.ports import free_port
 
 POLICY = CONFIG / "sros2" / "policy.xml"
 RULES = {"topics": ("topic", {"publish", "subscribe"}), "services": ("service", {"reply", "request"})}
 RECORDER_CALLS = ("get_parameters", "list_parameters")  # on every node
 NODES = (
-    "/imu", "/recorder", "/robot_model",
+    "/imu", "/panel", "/recorder", "/robot_model",
     *(
         f"/{arm}/{node}"
         for arm in ("left", "right") for node in ("can_bridge", "compensator", "simulator", "outer_loop")
@@ -79,6 +80,7 @@ def parameter_file(folder):
             values["autostart"] = False
     content["/recorder"] = {"ros__parameters": {"output": str(folder / "bag")}}
     content["/robot_model"] = {"ros__parameters": {"rate": 30.0}}
+    content["/panel"] = {"ros__parameters": {"port": free_port(), "output": str(folder)}}
     path = folder / "params.yaml"
     path.write_text(yaml.safe_dump(content), encoding="utf-8")
     return path
@@ -155,14 +157,18 @@ def test_a_node_may_do_exactly_what_it_does(session, node, kind):
     assert read_policy()[node][kind] == session[0][node][kind]
 
 
-@pytest.mark.parametrize("node", [node for node in NODES if node not in ("/recorder", "/robot_model")])
-def test_only_the_recorder_and_robot_model_call_services_of_other_nodes(session, node):
+@pytest.mark.parametrize("node", [node for node in NODES if node not in ("/panel", "/recorder", "/robot_model")])
+def test_only_the_recorder_the_panel_and_robot_model_call_services_of_other_nodes(session, node):
     assert session[0][node]["request"] == set() == read_policy()[node]["request"]
 
 
 def test_the_recorder_may_call_exactly_the_services_that_it_calls(session):
     requests = {f"{node}/{service}" for node in session[1] for service in RECORDER_CALLS}
     assert read_policy()["/recorder"]["request"] == requests
+
+
+def test_the_panel_may_call_exactly_the_services_that_it_calls(session):
+    assert read_policy()["/panel"]["request"] == session[0]["/panel"]["request"]
 
 
 def test_robot_model_may_read_the_parameters_of_the_arms_and_call_nothing_else(session):

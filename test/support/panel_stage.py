@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-import socket
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,15 +19,11 @@ from exo_gravity.panel.facts import Facts
 from exo_gravity.panel.server import PanelServer
 from exo_gravity.panel.view import Joints, Status, arm_state
 
+from .ports import free_port
+
 LEAVES = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
 BUS = {"can.interface": "virtual", "can.channel": "stage"}
 PERIOD = 0.1  # s between two states
-
-
-def free_port() -> int:
-    """Return a TCP port that no one uses."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return int(server.getsockname()[1])
 
 
 @dataclass
@@ -128,15 +123,24 @@ class PlayedFiles:
 
 
 class Stage:
-    """A running panel at `url`. notes: what it wrote to the log. reports: trial reports by name."""
+    """A running panel at `url`. notes: what it wrote to the log. reports: trial reports by name.
 
-    def __init__(self, host: str = "127.0.0.1", token: str = "", dead_man: bool = False, arms: Any = None) -> None:
-        self.arms = arms or PlayedArms()
+    clock: of the panel's rules, in s; a test that sets it does not depend on how busy the machine is.
+    """
+
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        token: str = "",
+        dead_man: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.arms = PlayedArms()
         self.files, self.notes = PlayedFiles(), list[str]()
         self.reports: dict[str, Path] = {}
-        self.access = Access(host, token, time.monotonic)
-        self.control = Control(time.monotonic)
-        desk = Desk(self.arms, self.files, self.control, self.notes.append, dead_man, time.monotonic)
+        self.access = Access(host, token, clock)
+        self.control = Control(clock)
+        desk = Desk(self.arms, self.files, self.control, self.notes.append, dead_man, clock)
         self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}/"
         self.server = PanelServer(host, self.port, self.access, desk, self.reports.get, dict)

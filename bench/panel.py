@@ -1,0 +1,148 @@
+"""The operator's panel beside the simulated device: from press to torque, processor, and the loop's late cycles.
+
+    python -m bench.panel press [N]     N presses of the space bar in a real browser, 50 by default, about 5 s each
+    python -m bench.panel load          both arms at 250 Hz, 40 s without the panel and 40 s with an open page
+
+`press` takes the time from the key's event in the browser to the first CAN frame that fades: it has damping,
+which an active arm never has. Needs chromium, and the extras panel, sim, imu and test.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import yaml
+
+from exo_gravity.core.motors import MOTORS, SPECIAL_FRAMES, unpack_command
+from test.support.bus_listener import CAN_IDS, BusListener, Frame
+from test.support.launched_nodes import REAL, LaunchedNodes
+from test.support.panel_browser import chromium, enable, open_page, wait_for_state
+from test.support.ports import free_port
+from test.support.ros_probe import RosProbe
+
+SPECS = [MOTORS[name] for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6")]
+PHASE = 40.0  # s
+LONGEST = 0.15  # s, p99 from press to fading torque
+LARGEST_SHARE = 0.15  # of a core
+NOTE_PRESSES = """window.presses = [];
+addEventListener("keydown", (e) => presses.push(performance.timeOrigin + e.timeStamp), true);"""
+
+
+def with_panel(nodes: LaunchedNodes) -> str:
+    """Add the panel to the nodes' parameter file, and return its address."""
+    port = free_port()
+    content = yaml.safe_load(nodes.path.read_text())
+    content["/panel"] = {"ros__parameters": {"port": port, "output": str(nodes.folder / "out")}}
+    nodes.path.write_text(yaml.safe_dump(content))
+    return f"http://127.0.0.1:{port}/"
+
+
+def first_fading(frames: list[Frame], since: float) -> float | None:
+    """Return the time of the first frame after `since` with damping, None if there is none."""
+    for frame in frames:
+        if frame.time < since or frame.can_id not in CAN_IDS or frame.data in SPECIAL_FRAMES:
+            continue
+        if unpack_command(SPECS[frame.can_id - 1], frame.data).kd > 0.0:
+            return frame.time
+    return None
+
+
+def press(count: int) -> int:
+    """Measure from press to fading torque."""
+    delays: list[float] = []
+    with tempfile.TemporaryDirectory() as folder, chromium() as browser:
+        nodes = LaunchedNodes(Path(folder))
+        url = with_panel(nodes)
+        nodes.start()
+        listener, probe = BusListener(nodes.bus), RosProbe()
+        try:
+            probe.wait_until_carried()
+            page = open_page(browser, url)
+            page.evaluate(NOTE_PRESSES)
+            for n in range(count):
+                wait_for_state(page, "active")
+                listener.frames.clear()
+                page.keyboard.press("Space")
+                wait_for_state(page, "letting down")
+                pressed = page.evaluate("presses.at(-1)") / 1000.0
+                faded = first_fading(list(listener.frames), pressed)
+                if faded is None:
+                    print(f"press {n}: no frame fades", file=sys.stderr)
+                    return 1
+                delays.append(faded - pressed)
+                if n + 1 < count:
+                    enable(page)
+        finally:
+            probe.close()
+            nodes.stop()
+            listener.close()
+    delays.sort()
+    p99 = delays[min(len(delays) - 1, int(0.99 * len(delays)))]
+    shown = f"median {1000 * statistics.median(delays):.1f} ms, p99 {1000 * p99:.1f} ms, max {1000 * delays[-1]:.1f} ms"
+    print(f"{count} presses, from the key to the first fading torque on the bus: {shown}")
+    return int(p99 > LONGEST)
+
+
+def processor_time(pid: int) -> float:
+    """Return the processor time of a process in s, all threads."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / 100.0
+
+
+def load() -> int:
+    """Measure the panel's share of a core with one page open, and late cycles without and with the panel."""
+    with tempfile.TemporaryDirectory() as folder:
+        counts = [_phase(Path(folder, name), name == "with") for name in ("without", "with")]
+    for name, (late, incomplete, share) in zip(("without panel", "with panel and page"), counts, strict=True):
+        shown = f", panel {100 * share:.1f} % of a core" if share else ""
+        print(f"{name}: {late} late and {incomplete} incomplete cycles of both arms in {PHASE:g} s{shown}")
+    return int(counts[1][2] > LARGEST_SHARE)
+
+
+def _phase(folder: Path, panel: bool) -> tuple[int, int, float]:
+    folder.mkdir()
+    nodes = LaunchedNodes(folder, base="sim_both.yaml", timing=REAL)
+    url = with_panel(nodes) if panel else ""
+    nodes.start()
+    probe = RosProbe()
+    try:
+        probe.wait_until_carried()
+        if not panel:
+            return (*_cycles(probe), 0.0)
+        with chromium() as browser:
+            page = open_page(browser, url)
+            page.locator("#plots").scroll_into_view_if_needed()
+            pid = nodes.pid("/panel")
+            before = processor_time(pid)
+            late, incomplete = _cycles(probe)
+            return late, incomplete, (processor_time(pid) - before) / PHASE
+    finally:
+        probe.close()
+        nodes.stop()
+
+
+def _cycles(probe: RosProbe) -> tuple[int, int]:
+    def counts() -> tuple[int, ...]:
+        bridges = [probe.statuses[f"/{side}/can_bridge"] for side in ("right", "left")]
+        values = [{pair.key: pair.value for pair in bridge.values} for bridge in bridges]
+        return tuple(sum(int(value[key]) for value in values) for key in ("late cycles", "incomplete cycles"))
+
+    probe.wait_for_report()
+    before = counts()
+    time.sleep(PHASE)
+    probe.wait_for_report()
+    return counts()[0] - before[0], counts()[1] - before[1]
+
+
+if __name__ == "__main__":
+    what = sys.argv[1] if len(sys.argv) > 1 else ""
+    if what == "press":
+        raise SystemExit(press(int(sys.argv[2]) if len(sys.argv) > 2 else 50))
+    if what == "load":
+        raise SystemExit(load())
+    print(__doc__)
+    raise SystemExit(2)

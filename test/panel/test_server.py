@@ -1,0 +1,215 @@
+"""The web server over real connections: what it refuses, and what it sends."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from ..support.panel_stage import Stage
+
+TOKEN = "a token for this test"
+
+
+@pytest.fixture
+def stages() -> Iterator[Callable[..., Stage]]:
+    """A function that starts a panel, which ends with the test."""
+    started: list[Stage] = []
+
+    def start(**options: Any) -> Stage:
+        started.append(Stage(**options))
+        return started[-1]
+
+    yield start
+    for stage in started:
+        stage.close()
+
+
+@pytest.fixture
+def stage(stages) -> Stage:
+    """A panel on loopback."""
+    return stages()
+
+
+@contextmanager
+def live(stage: Stage, page: str = "", **headers: str) -> Iterator[ClientConnection]:
+    """Open a live connection as a page does."""
+    origin: Any = headers.pop("origin", stage.url.rstrip("/"))
+    address = stage.url.replace("http", "ws") + "live"
+    with connect(address, origin=origin or None, additional_headers=headers) as connection:
+        connection.send(json.dumps({"page": page}))
+        yield connection
+
+
+def first(connection: ClientConnection, kind: str) -> dict[str, Any]:
+    """Return the first message of this type."""
+    while (message := json.loads(connection.recv(timeout=20)))["type"] != kind:
+        pass
+    return message
+
+
+def act(stage: Stage, page: str = "", body: Any = None, **headers: str) -> httpx.Response:
+    given = {"origin": stage.url.rstrip("/"), "x-panel-page": page, **headers}
+    return httpx.post(stage.url + "action", json=body or {"do": "let_down"}, headers=given)
+
+
+def test_on_loopback_the_page_and_its_files_need_no_token_and_nothing_from_elsewhere(stage):
+    page = httpx.get(stage.url)
+    assert page.status_code == 200
+    assert "http" not in page.text.replace("http-equiv", "")
+    assert "'unsafe" not in page.headers["content-security-policy"]
+    assert "frame-ancestors 'none'" in page.headers["content-security-policy"]
+    assert page.headers["cache-control"] == "no-store"
+    for path in ("static/main.js", "static/vendor/three.module.min.js", "static/vendor/three.LICENSE", "strings"):
+        assert httpx.get(stage.url + path).status_code == 200
+    for path in (
+        "static/../server.py",
+        "static/%2e%2e/server.py",
+        "report/../../x",
+        "report/none",
+        "docs",
+        "openapi.json",
+    ):
+        assert httpx.get(stage.url + path).status_code == 404
+
+
+@pytest.mark.parametrize("host", ["panel.example.org", "evil.example.org:80", "[bad", "10.0.0.1"])
+def test_a_foreign_name_for_this_machine_is_refused(stage, host):
+    assert httpx.get(stage.url, headers={"host": host}).status_code == 403
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example.org", "null", "", "http://127.0.0.1:1"])
+def test_another_pages_requests_are_refused_even_to_let_down(stage, origin):
+    assert act(stage, origin=origin).status_code == 403
+    with pytest.raises(InvalidStatus), live(stage, origin=origin):
+        pass
+    assert stage.arms.calls == []
+
+
+def test_without_the_token_nothing_is_served_and_with_it_everything(stages):
+    stage = stages(token=TOKEN)
+    for path in ("", "static/main.js", "strings", "parameters", "report/x"):
+        answer = httpx.get(stage.url + path)
+        assert answer.status_code == 401
+        assert "main.js" not in answer.text
+    assert act(stage).status_code == 401
+    with pytest.raises(InvalidStatus), live(stage):
+        pass
+    assert stage.arms.calls == []
+    origin = {"origin": stage.url.rstrip("/")}
+    with httpx.Client() as client:
+        assert client.post(stage.url + "login", data={"token": "wrong"}, headers=origin).status_code == 401
+        opened = client.post(stage.url + "login", data={"token": TOKEN}, headers=origin)
+        assert opened.status_code == 303
+        assert {"httponly", "samesite=strict"} <= set(opened.headers["set-cookie"].lower().replace(" ", "").split(";"))
+        assert TOKEN not in opened.headers["set-cookie"]
+        assert client.get(stage.url).status_code == 200
+        cookie = {"cookie": "; ".join(f"{name}={value}" for name, value in client.cookies.items())}
+    assert act(stage, **cookie).status_code == 200
+    with live(stage, **cookie) as connection:
+        assert first(connection, "page")["number"] == 1
+
+
+def test_the_address_with_the_token_opens_the_page_and_leaves_the_address(stages):
+    stage = stages(token=TOKEN)
+    opened = httpx.get(stage.url, params={"token": TOKEN})
+    assert (opened.status_code, opened.headers["location"]) == (303, "/")
+    assert httpx.get(stage.url, params={"token": "wrong"}).status_code == 401
+    assert httpx.get(stage.url, headers={"authorization": f"Bearer {TOKEN}"}).status_code == 200
+
+
+def test_the_right_token_is_refused_after_many_wrong_ones(stages):
+    stage = stages(token=TOKEN)
+    for _ in range(6):
+        httpx.get(stage.url, params={"token": "wrong"})
+    assert httpx.get(stage.url, params={"token": TOKEN}).status_code == 401
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0"])
+def test_beyond_loopback_a_random_token_is_needed(stages, host):
+    stage = stages(host=host)
+    assert httpx.get(stage.url).status_code == 401
+    assert httpx.get(stage.url, params={"token": stage.access.token}).status_code == 303
+
+
+def test_every_page_gets_setup_and_state_and_a_reloaded_page_stays_the_same(stage):
+    with live(stage) as connection:
+        page = first(connection, "page")
+        setup = first(connection, "setup")
+        assert set(setup["arms"]) == {"right", "left"}
+        assert setup["language"] == "en"
+        state = first(connection, "state")
+        assert len(state["arms"]["right"]["joints"]) == 4
+        assert state["control"]["page"] == page["number"]
+    with live(stage, page["page"]) as connection:
+        assert first(connection, "page") == page
+
+
+def test_a_copied_page_replaces_the_first(stage):
+    with live(stage) as one:
+        secret = first(one, "page")["page"]
+        with live(stage, secret) as other:
+            first(other, "state")
+            with pytest.raises(ConnectionClosed) as closed:
+                while True:
+                    one.recv(timeout=20)
+    assert closed.value.rcvd is not None and closed.value.rcvd.code == 4001
+
+
+@pytest.mark.parametrize("hello", ["", "[]", "{", "{}", '{"page": 3}', "x" * 5000])
+def test_a_live_connection_with_nonsense_ends_without_harm(stage, hello):
+    with connect(stage.url.replace("http", "ws") + "live", origin=stage.url.rstrip("/")) as connection:
+        connection.send(hello)
+        with pytest.raises(ConnectionClosed):
+            connection.recv(timeout=20)
+    assert act(stage).status_code == 200
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[1", b"\xff", b'{"do": "let_down"' + b" " * 5000 + b"}"])
+def test_a_request_that_is_not_json_or_too_long_is_refused(stage, content):
+    headers = {"origin": stage.url.rstrip("/")}
+    assert httpx.post(stage.url + "action", content=content, headers=headers).status_code in (400, 413)
+    assert stage.arms.calls == []
+
+
+def test_the_operator_enables_and_a_watching_page_lets_down(stage):
+    with live(stage) as one, live(stage) as other:
+        operator, watcher = (first(connection, "page")["page"] for connection in (one, other))
+        assert act(stage, watcher, {"do": "enable", "arm": "right"}).status_code == 403
+        assert act(stage, operator, {"do": "enable", "arm": "right"}).status_code == 200
+        assert act(stage, watcher).status_code == 200
+    assert stage.arms.calls == [("enable", "right"), ("let_down", "right"), ("let_down", "left")]
+    assert stage.notes[-1].startswith("127.0.0.1 page 2: let down")
+
+
+def test_a_report_may_hold_styles_but_no_scripts(stage, tmp_path: Path):
+    stage.reports["demo_1"] = tmp_path / "report.html"
+    stage.reports["demo_1"].write_text("<p>held</p>")
+    answer = httpx.get(stage.url + "report/demo_1")
+    assert answer.status_code == 200
+    assert "script-src" not in answer.headers["content-security-policy"]
+    assert "default-src 'none'" in answer.headers["content-security-policy"]
+
+
+def test_with_dead_man_a_page_that_stops_confirming_lets_the_arms_down(stages):
+    now = [0.0]
+    stage = stages(dead_man=True, clock=lambda: now[0])
+    with live(stage) as connection:
+        holder = stage.control.page(first(connection, "page")["page"])
+        for _ in range(4):  # 4 s, confirmed in time
+            now[0] += 1.0
+            while holder.seen < now[0]:
+                connection.send(json.dumps({"seen": first(connection, "state")["number"]}))
+        first(connection, "state")
+        assert stage.arms.calls == []
+        now[0] += 2.1  # the connection stays open, but the page is frozen
+        while len(stage.arms.calls) < 2:
+            first(connection, "state")
+    assert stage.arms.calls == [("let_down", "right"), ("let_down", "left")]

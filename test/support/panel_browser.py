@@ -1,0 +1,49 @@
+"""A headless Chromium that drives the panel's page.
+
+Debian's chromium is used, because Playwright's own browsers come from elsewhere. Without it the tests are skipped.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+from playwright.sync_api import Browser, Page, sync_playwright
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+NEEDS_CHROMIUM = pytest.mark.skipif(not CHROMIUM, reason="no browser: install chromium (apt-get install chromium)")
+# As root, and without a graphics card.
+FLAGS = ["--no-sandbox", "--enable-unsafe-swiftshader", "--force-color-profile=srgb"]
+PATIENCE = 60_000.0  # ms; a busy machine draws slowly
+
+
+@contextmanager
+def chromium() -> Iterator[Browser]:
+    """Run the browser."""
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS, timeout=PATIENCE)
+        yield browser
+        browser.close()
+
+
+def open_page(browser: Browser, url: str, width: int = 1100, height: int = 900) -> Page:
+    """Open the panel in a window of its own, and wait until it shows an arm."""
+    page = browser.new_context(viewport={"width": width, "height": height}).new_page()
+    page.set_default_timeout(PATIENCE)
+    page.goto(url)
+    page.wait_for_selector(".arm .badge[data-state]")
+    return page
+
+
+def wait_for_state(page: Page, state: str, arm: str = "right") -> None:
+    """Wait until the page shows the arm in this state."""
+    page.wait_for_selector(f'.arm[data-arm="{arm}"] .badge[data-state="{state}"]')
+
+
+def enable(page: Page, arm: str = "right") -> None:
+    """Enable the arm as its operator does."""
+    wait_for_state(page, "disabled", arm)
+    page.click(f'.arm[data-arm="{arm}"] .enable')
+    page.click("#ask-yes")
