@@ -25,6 +25,7 @@ from test.support.ports import free_port
 from test.support.ros_probe import RosProbe
 
 SPECS = [MOTORS[name] for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6")]
+COMMANDS = (0x7F, 0x80, 0xFF)  # first byte: commands hold the position 0; see hardware/motor_bus.py
 PHASE = 40.0  # s
 LONGEST = 0.15  # s, p99 from press to fading torque
 LARGEST_SHARE = 0.15  # of a core
@@ -41,14 +42,17 @@ def with_panel(nodes: LaunchedNodes) -> str:
     return f"http://127.0.0.1:{port}/"
 
 
-def first_fading(frames: list[Frame], since: float) -> float | None:
-    """Return the time of the first frame after `since` with damping, None if there is none."""
+def first_fading(frames: list[Frame], since: float) -> float:
+    """Return the time of the first frame with damping. Raises ValueError if there is none, or one before `since`."""
     for frame in frames:
-        if frame.time < since or frame.can_id not in CAN_IDS or frame.data in SPECIAL_FRAMES:
+        is_ours = frame.can_id in CAN_IDS and frame.data[0] in COMMANDS  # a reply carries the motor's ID as well
+        if not is_ours or frame.data in SPECIAL_FRAMES:
             continue
         if unpack_command(SPECS[frame.can_id - 1], frame.data).kd > 0.0:
+            if frame.time < since:
+                raise ValueError(f"a frame with damping {1000 * (since - frame.time):.1f} ms before the press")
             return frame.time
-    return None
+    raise ValueError("no frame with damping")
 
 
 def press(count: int) -> int:
@@ -69,11 +73,7 @@ def press(count: int) -> int:
                 page.keyboard.press("Space")
                 wait_for_state(page, "letting down")
                 pressed = page.evaluate("presses.at(-1)") / 1000.0
-                faded = first_fading(list(listener.frames), pressed)
-                if faded is None:
-                    print(f"press {n}: no frame fades", file=sys.stderr)
-                    return 1
-                delays.append(faded - pressed)
+                delays.append(first_fading(list(listener.frames), pressed) - pressed)
                 if n + 1 < count:
                     enable(page)
         finally:

@@ -20,6 +20,7 @@ from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.client import Client
 from rclpy.node import Node
 
+from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.nodes.declare import declare
 from exo_gravity.nodes.diagnostics import OK
 from exo_gravity.nodes.hot_path import HotPath
@@ -32,7 +33,6 @@ from exo_gravity.panel.control import Control
 from exo_gravity.panel.desk import Desk
 from exo_gravity.panel.facts import Facts
 from exo_gravity.panel.params import PANEL
-from exo_gravity.panel.server import PanelServer
 from exo_gravity.panel.studio import Studio, scripts_folder
 from exo_gravity.panel.view import SILENT
 
@@ -64,6 +64,11 @@ class Panel(Node):
         self._facts = Facts({**own, "trials": list(self._studio.trials)})
         access = Access(values["host"], values["token"], time.monotonic)
         desk = Desk(self._arms, self._studio, Control(time.monotonic), self._note, values["dead_man"], time.monotonic)
+        try:
+            from exo_gravity.panel.server import PanelServer
+        except ModuleNotFoundError as error:
+            missing = f"the Python package {error.name} is not installed: pip install 'exo_gravity[panel]'"
+            raise ExoGravityError(missing) from None
         self._server = PanelServer(values["host"], values["port"], access, desk, self._studio.report, self.parameters)
         self._server.start()
         self.create_timer(STATE_PERIOD, self._send_state)

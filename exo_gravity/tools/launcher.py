@@ -227,8 +227,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
         default=(),
         help="start only the nodes whose full names match a shell pattern: '*/can_bridge' /imu",
     )
-    switch = {"nargs": "?", "const": "true", "default": "false", "choices": ("true", "false")}
-    parser.add_argument("--panel", **switch, help="also start the operator's panel, where the file has none")
+    parser.add_argument("--panel", action="store_true", help="also start the operator's panel, where the file has none")
     return parser.parse_args(args)
 
 
@@ -238,7 +237,7 @@ def main(args: Sequence[str] | None = None) -> None:
     require_ros("launcher")
     stopping = stop_on_signals()
     try:
-        more = ("/panel",) if options.panel == "true" else ()
+        more = ["/panel"] if options.panel else []
         launcher = Launcher(options.params or packaged_config("sim.yaml"), only=options.only, more=more)
         dead = launcher.run(stopping)
     except ExoGravityError as error:

@@ -1,0 +1,109 @@
+"""The panel as a process beside the simulated device, driven by a real browser."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from rcl_interfaces.srv import ListParameters
+
+from ..support.launched_nodes import LaunchedNodes
+from ..support.ports import free_port
+from ..support.ros_probe import RosProbe
+
+pytest.importorskip("playwright", reason="no browser driver: install the extra test")
+
+from playwright.sync_api import Page
+
+from ..support.panel_browser import NEEDS_CHROMIUM, chromium, enable, open_page, wait_for_state
+
+pytestmark = [NEEDS_CHROMIUM, pytest.mark.real_time, pytest.mark.timeout(240)]
+
+
+class Clinic:
+    """The nodes with a panel, a probe, and the page."""
+
+    def __init__(self, folder: Path, page: Page, nodes: LaunchedNodes, probe: RosProbe) -> None:
+        self.folder, self.page, self.nodes, self.probe = folder, page, nodes, probe
+
+    def notes(self) -> str:
+        """Return what the panel has logged."""
+        return "\n".join(line for line in self.nodes.log if line.startswith("/panel"))
+
+
+def with_panel(nodes: LaunchedNodes, **parameters: Any) -> str:
+    """Add the panel to the parameter file of nodes that have not started; return its address."""
+    port = free_port()
+    content = yaml.safe_load(nodes.path.read_text())
+    content["/panel"] = {"ros__parameters": {"port": port, "output": str(nodes.folder / "out"), **parameters}}
+    nodes.path.write_text(yaml.safe_dump(content))
+    return f"http://127.0.0.1:{port}/"
+
+
+@pytest.fixture
+def clinic(tmp_path: Path) -> Iterator[Clinic]:
+    """The right arm, carried, and the open page."""
+    nodes = LaunchedNodes(tmp_path, compensator={"wearer": {"body_mass": 60.0}, "support": 0.0})
+    url = with_panel(nodes)
+    nodes.start()
+    probe = RosProbe()
+    try:
+        probe.wait_until_carried()
+        with chromium() as browser:
+            yield Clinic(tmp_path, open_page(browser, url), nodes, probe)
+    finally:
+        probe.close()
+        nodes.stop()
+        print("\n".join(nodes.log))
+
+
+def test_a_session_from_support_to_a_fault_and_back_with_a_recording(clinic):
+    page, probe = clinic.page, clinic.probe
+    wait_for_state(page, "active")
+    page.click("#record")
+    page.wait_for_selector("#record-stop:enabled")
+    page.click('[data-mode="zero_g"]')
+    page.click("#ask-yes")
+    probe.wait_until(lambda: probe.diagnostic("compensator", "mode") == "zero_g")
+    page.focus(".support input")
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowRight")
+    probe.wait_until(lambda: float(probe.diagnostic("compensator", "support") or 0.0) == pytest.approx(0.01))
+
+    assert probe.set_parameters("simulator", fault__temperature=[30.0, 95.0, 30.0, 30.0]).successful
+    wait_for_state(page, "fault")
+    assert "cooled" in page.inner_text(".remedy")
+    assert probe.fault == "over_temperature"
+    assert probe.set_parameters("simulator", fault__temperature=[30.0] * 4).successful
+    page.click(".clear")
+    enable(page)
+    wait_for_state(page, "active")
+    page.keyboard.press("Space")
+    wait_for_state(page, "disabled")
+
+    page.click("#record-stop")
+    page.wait_for_selector("#record:enabled")
+    (recording,) = (clinic.folder / "out").glob("recording_*")
+    assert list((recording / "bag").glob("*.mcap"))
+    assert b"page 1: clear fault right: done" in b"".join(f.read_bytes() for f in (recording / "bag").glob("*.mcap"))
+    page.click("#save")
+    page.wait_for_selector("#saved:has-text('params.yaml')")
+    (saved,) = (clinic.folder / "out").glob("parameters_*/params.yaml")
+    assert yaml.safe_load(saved.read_text())["/right/compensator"]["ros__parameters"]["mode"] == "zero_g"
+    for what in ("record", "set right mode = zero_g", "clear fault right", "enable right", "let down", "save"):
+        assert f"127.0.0.1 page 1: {what}: done" in clinic.notes()
+    assert "token" not in probe.call(ListParameters, "/panel/list_parameters", ListParameters.Request()).result.names
+
+
+def test_killing_the_panel_changes_nothing_about_the_arm(clinic):
+    probe = clinic.probe
+    wait_for_state(clinic.page, "active")
+    clinic.nodes.process("/panel").kill()
+    wait_for_state(clinic.page, "silent")
+    seen = len(probe.joint_states)
+    probe.wait_until(lambda: len(probe.joint_states) > seen + 300)  # 3 s
+    assert probe.state == "active"
+    assert not clinic.nodes.have_ended
