@@ -19,13 +19,18 @@ import yaml
 
 from exo_gravity.core.motors import MOTORS, SPECIAL_FRAMES, unpack_command
 from test.support.bus_listener import CAN_IDS, BusListener, Frame
-from test.support.launched_nodes import REAL, LaunchedNodes
+from test.support.launched_nodes import LaunchedNodes
 from test.support.panel_browser import chromium, enable, open_page, wait_for_state
 from test.support.ports import free_port
 from test.support.ros_probe import RosProbe
 
 SPECS = [MOTORS[name] for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6")]
 COMMANDS = (0x7F, 0x80, 0xFF)  # first byte: commands hold the position 0; see hardware/motor_bus.py
+# The real device's rate, with time-outs that leave room for simulators and browser on the same computer.
+TIMING = {
+    "can_bridge": {"rate": 250.0, "command_timeout": 0.1, "reply_timeout": 0.1},
+    "compensator": {"tilt_timeout": 0.5},
+}
 PHASE = 40.0  # s
 LONGEST = 0.15  # s, p99 from press to fading torque
 LARGEST_SHARE = 0.15  # of a core
@@ -105,12 +110,12 @@ def load() -> int:
 
 def _phase(folder: Path, panel: bool) -> tuple[int, int, float]:
     folder.mkdir()
-    nodes = LaunchedNodes(folder, base="sim_both.yaml", timing=REAL)
+    nodes = LaunchedNodes(folder, base="sim_both.yaml", timing=TIMING)
     url = with_panel(nodes) if panel else ""
     nodes.start()
     probe = RosProbe()
     try:
-        probe.wait_until_carried()
+        probe.wait_until(lambda: {"/right/can_bridge", "/left/can_bridge"} <= set(probe.statuses))
         if not panel:
             return (*_cycles(probe), 0.0)
         with chromium() as browser:

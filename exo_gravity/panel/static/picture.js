@@ -6,8 +6,8 @@
 import { Painter } from "./painter.js";
 import { t } from "./texts.js";
 
-const VIEWS = { oblique: [1.25, -0.75, 0.3], front: [1.6, 0, 0], side: [0, -1.6, 0] };
-const CENTRE = [0, 0, -0.2];
+const VIEWS = { oblique: [1.5, -0.9, 0.35], front: [1.85, 0, 0], side: [0, -1.85, 0] };
+const CENTRE = [0, 0, -0.27];
 
 export class Picture {
   constructor(place, views) {

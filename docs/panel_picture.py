@@ -1,0 +1,40 @@
+"""Draws docs/panel.png and docs/panel_de.png: the page with two played arms, in a headless browser.
+
+`python docs/panel_picture.py`; needs chromium and the extras panel and test.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+DOCS = Path(__file__).parent
+sys.path.insert(0, str(DOCS.parent))
+
+from test.support.panel_browser import chromium, open_page, wait_for_state
+from test.support.panel_stage import Stage
+
+
+def main() -> None:
+    """Draw both pictures."""
+    stage = Stage()
+    stage.arms.states["right"] = "active"
+    stage.arms.fail("left", "over_temperature")
+    try:
+        with chromium() as browser:
+            for name, language, size in (("panel", "en", (1100, 1000)), ("panel_de", "de", (768, 1024))):
+                page = open_page(browser, stage.url, *size)
+                page.select_option("#language", language)
+                wait_for_state(page, "fault", "left")
+                page.wait_for_selector("[data-arm=right] .mark:not([hidden])", state="attached")
+                if language == "de":
+                    page.locator("#picture").scroll_into_view_if_needed()
+                    page.wait_for_timeout(8000)
+                page.screenshot(path=DOCS / f"{name}.png")
+                page.context.close()
+    finally:
+        stage.close()
+
+
+if __name__ == "__main__":
+    main()
