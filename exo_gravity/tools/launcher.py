@@ -220,13 +220,8 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
         f"executable can_bridge in the namespace /right, /imu starts imu. Executables: {', '.join(node_names())}.",
     )
     parser.add_argument("--params", metavar="FILE", help="ROS 2 parameter file (default: the packaged sim.yaml)")
-    parser.add_argument(
-        "--only",
-        metavar="PATTERN",
-        nargs="+",
-        default=(),
-        help="start only the nodes whose full names match a shell pattern: '*/can_bridge' /imu",
-    )
+    only = "start only the nodes whose full names match a shell pattern: '*/can_bridge' /imu"
+    parser.add_argument("--only", metavar="PATTERN", nargs="+", default=(), help=only)
     parser.add_argument("--panel", action="store_true", help="also start the operator's panel, where the file has none")
     return parser.parse_args(args)
 

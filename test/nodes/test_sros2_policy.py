@@ -107,8 +107,9 @@ def spin(executor, ending):
 
 
 def lasting_rules(rules_of):
-    """Return the rules of each node, without the recorder's requests: its clients exist for a moment only."""
-    return {node: {**rules_of(node), **({"request": set()} if node == "/recorder" else {})} for node in NODES}
+    """Return the rules of each node, without the requests of clients that exist for a moment only."""
+    brief = ("/recorder", "/left/compensator", "/right/compensator")
+    return {node: {**rules_of(node), **({"request": set()} if node in brief else {})} for node in NODES}
 
 
 def nodes_with_recorded_parameters(bag):
@@ -157,9 +158,14 @@ def test_a_node_may_do_exactly_what_it_does(session, node, kind):
     assert read_policy()[node][kind] == session[0][node][kind]
 
 
-@pytest.mark.parametrize("node", [node for node in NODES if node not in ("/panel", "/recorder", "/robot_model")])
-def test_only_the_recorder_the_panel_and_robot_model_call_services_of_other_nodes(session, node):
+@pytest.mark.parametrize("node", [node for node in NODES if node.endswith(("can_bridge", "simulator", "loop", "imu"))])
+def test_these_nodes_call_no_services_of_other_nodes(session, node):
     assert session[0][node]["request"] == set() == read_policy()[node]["request"]
+
+
+@pytest.mark.parametrize("arm", ["left", "right"])
+def test_a_compensator_may_read_the_parameters_of_its_own_bridge_for_the_budget(arm):
+    assert read_policy()[f"/{arm}/compensator"]["request"] == {f"/{arm}/can_bridge/get_parameters"}
 
 
 def test_the_recorder_may_call_exactly_the_services_that_it_calls(session):

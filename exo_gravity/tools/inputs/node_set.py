@@ -25,7 +25,7 @@ SUPERVISED = {"EXO_GRAVITY_SUPERVISED": "1", "PYTHONUNBUFFERED": "1"}  # a node 
 # Starts can_bridge for one purpose: to let down an arm that was left behind, after that time for its watchdog.
 RECOVERY = {"EXO_GRAVITY_RECOVER": f"{WATCHDOG_TIMEOUT:g}"}
 ENDED_WELL = (0, 2)  # exit codes of a node that ended by itself: stopped, or with wrong parameters or no bus
-OBSERVERS = ("/recorder", "/robot_model")
+OBSERVERS = ("/recorder", "/robot_model", "/panel")
 ABSOLUTE_TOPICS = ("/imu/data", "/imu/data_raw", "/imu/pitch_yaw")  # those that a namespace must be added to
 
 
