@@ -8,7 +8,7 @@ Acceleration that is measured late gives more energy than it takes back. Two bou
   On simulated arms with torques 10 ms late the excess was 0.76 J at most, with a TANK of 0.5 J.
 
 At standstill there is no torque: 12-bit velocities alternate between two codes, and the acceleration that this feigns
-moved the shoulder's rotation against its friction, by 0.3 to 0.9 degrees a minute.
+moved the shoulder's rotation against its friction, by up to 1 degree a minute.
 """
 
 from __future__ import annotations
