@@ -11,8 +11,8 @@ from pathlib import Path
 DOCS = Path(__file__).parent
 sys.path.insert(0, str(DOCS.parent))
 
-from test.support.panel_browser import chromium, open_page, wait_for_state
-from test.support.panel_stage import Stage
+from test.support.panel_browser import chromium, open_page, wait_for_state  # noqa: E402
+from test.support.panel_stage import Stage  # noqa: E402
 
 
 def main() -> None:
