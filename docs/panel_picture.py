@@ -1,18 +1,16 @@
 """Draws docs/panel.png and docs/panel_de.png: the page with two played arms, in a headless browser.
 
-`python docs/panel_picture.py`; needs chromium and the extras panel and test.
+`python -m docs.panel_picture`; needs chromium and the extras panel and test.
 """
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
-DOCS = Path(__file__).parent
-sys.path.insert(0, str(DOCS.parent))
+from test.support.panel_browser import chromium, open_page, wait_for_state
+from test.support.panel_stage import Stage
 
-from test.support.panel_browser import chromium, open_page, wait_for_state  # noqa: E402
-from test.support.panel_stage import Stage  # noqa: E402
+DOCS = Path(__file__).parent
 
 
 def main() -> None:

@@ -150,7 +150,7 @@ class Panel(Node):
 
     def parameters(self) -> dict[str, dict[str, Any]]:
         """Return the parameters of every node by full name."""
-        return {name: dict(parameters.values) for name, parameters in sorted(list(self._parameters.items()))}
+        return {name: dict(parameters.values) for name, parameters in sorted(self._parameters.copy().items())}
 
     def states(self) -> dict[str, str | None]:
         """Return the state of each arm; None if its bridge is silent."""

@@ -53,7 +53,7 @@ class Access:
 
     def allows(self, session: str) -> bool:
         """Return whether a request with this session may see anything."""
-        return self.is_open or any([_equal(session, known) for known in self._sessions])
+        return self.is_open or any(_equal(session, known) for known in tuple(self._sessions))
 
     def is_token(self, given: str, address: str) -> bool:
         """Return whether `given` is the token, in constant time. A wrong one counts against `address`."""

@@ -38,7 +38,7 @@ class PlayedArms:
     problem: str = ""
 
     def __post_init__(self) -> None:
-        self.states = {name: "disabled" for name in self.names}
+        self.states = dict.fromkeys(self.names, "disabled")
         for name in self.names:
             given = {"side": name, "joint_names": [f"{name}_{leaf}" for leaf in LEAVES], "wearer.body_mass": 75.0}
             self.settings[name] = values_of(COMPENSATOR, {**given, "support": 0.05})
