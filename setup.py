@@ -31,8 +31,11 @@ extras = {
     "urdf": ["pin>=2.7"],  # law: urdf
     "docs": ["docutils>=0.21", "furo>=2024.8", "myst-parser>=4.0", "sphinx>=7.4"],
     "test": [
+        "axe-playwright-python>=0.1.4",
+        "httpx>=0.27",
         "hypothesis>=6.100",
         "mcap-ros2-support>=0.5",
+        "playwright>=1.49",
         "pytest>=8.0",
         "pytest-rerunfailures>=14.0",
         "pytest-timeout>=2.3",
