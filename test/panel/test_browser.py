@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -149,6 +150,24 @@ def test_the_support_slides_and_shows_the_motors_limit(visit, stage):
         page.wait_for_timeout(100)
     assert stage.arms.settings["right"]["support"] == pytest.approx(0.15)
     assert "More than rated torque" in page.inner_text('[data-arm="right"] .limit')
+
+
+def test_the_slider_shows_the_support_in_force_from_the_start_and_a_slip_does_not_jump(visit, stage):
+    page = visit()
+    page.wait_for_selector('[data-arm="right"] .support input:enabled')
+    assert page.input_value('[data-arm="right"] .support input') == "5"
+    page.focus('[data-arm="right"] .support input')
+    page.keyboard.press("ArrowRight")
+    wait_for_call(page, stage, ("set", "right", "{'support': 0.055}"))
+    page.keyboard.press("End")
+    for _ in range(600):
+        if stage.arms.settings["right"]["support"] > 0.2:
+            break
+        page.wait_for_timeout(100)
+    page.keyboard.press("Home")
+    supports = [float(call[2].split(": ")[1].rstrip("}")) for call in stage.arms.calls if call[0] == "set"]
+    assert supports[0] == 0.055
+    assert max(abs(b - a) for a, b in pairwise(supports)) <= 0.0201
 
 
 def test_zero_g_asks_first(visit, stage):

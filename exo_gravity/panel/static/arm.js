@@ -3,7 +3,9 @@
 import { degrees, has, number, t, translate, write } from "./texts.js";
 
 const SIGNS = { disabled: "○", checking: "◔", "proving signs": "◑", "ramping in": "◕", active: "●", "letting down": "▼", fault: "✖", silent: "?" };
-const SEND_PERIOD = 200; // ms between two values of a slider that moves
+const STEP_PERIOD = 200; // ms between two steps of the support
+const LARGEST_STEP = 2; // % of support at once: a slip on the slider must not throw the arm
+const SETTLING = 2000; // ms after the last step until the parameters in force are known again
 const CARRIED = ["proving signs", "ramping in", "active"];
 
 export class ArmCard {
@@ -18,14 +20,16 @@ export class ArmCard {
     this.root.setAttribute("aria-labelledby", `head-${name}`);
     this.find(".scroll").setAttribute("aria-labelledby", `head-${name}`);
     this.slider = this.find("input");
-    this.sent = 0;
+    this.slider.disabled = true; // until the support in force is known
+    this.timer = null;
+    this.stepped = NaN; // %, the last step that was taken
+    this.moved = -Infinity; // ms, when its user moved the slider or the last step was sent
     this.find(".enable").addEventListener("click", () => actions.enable(this));
     this.find(".clear").addEventListener("click", () => actions.send({ do: "clear_fault", arm: name }));
     this.find(".down").addEventListener("click", () => actions.down(name));
     for (const button of this.root.querySelectorAll("[data-mode]"))
       button.addEventListener("click", () => actions.mode(this, button.dataset.mode));
     this.slider.addEventListener("input", () => this.slide());
-    this.slider.addEventListener("change", () => this.send());
     this.translate();
   }
 
@@ -44,7 +48,7 @@ export class ArmCard {
   }
 
   get support() {
-    return this.setup?.settings?.support ?? 0;
+    return this.setup?.settings?.support ?? NaN;
   }
 
   get mode() {
@@ -54,37 +58,56 @@ export class ArmCard {
   // Limits and settings, which change rarely.
   configure(setup) {
     this.setup = setup;
-    if (performance.now() - this.sent > 1000) this.slider.value = 100 * this.support;
+    this.follow();
     for (const button of this.root.querySelectorAll("[data-mode]"))
       button.setAttribute("aria-pressed", String(button.dataset.mode === this.mode));
     this.showSupport();
   }
 
-  slide() {
+  // Shows the support in force, unless its user is about to change it.
+  follow() {
+    if (this.timer || performance.now() - this.moved < SETTLING) return;
+    this.stepped = 100 * this.support;
+    if (isFinite(this.stepped)) this.slider.value = this.stepped;
     this.showSupport();
-    clearTimeout(this.timer);
-    const wait = SEND_PERIOD - (performance.now() - this.sent);
-    if (wait <= 0) this.send();
-    else this.timer = setTimeout(() => this.send(), wait);
   }
 
-  send() {
-    clearTimeout(this.timer);
-    const support = Number(this.slider.value) / 100;
-    if (performance.now() - this.sent < 1000 && support === this.lastSent) return;
-    this.sent = performance.now();
-    this.lastSent = support;
-    this.actions.send({ do: "set", arm: this.name, values: { support } });
+  slide() {
+    this.moved = performance.now();
+    this.showSupport();
+    this.timer ??= setInterval(() => this.step(), STEP_PERIOD);
+  }
+
+  // Sends the next step towards the slider's value.
+  async step() {
+    const left = Number(this.slider.value) - this.stepped;
+    if (!(Math.abs(left) > 0.05) || this.slider.disabled || this.isSending) {
+      if (!this.isSending) this.stop();
+      return;
+    }
+    this.isSending = true;
+    const next = this.stepped + Math.max(-LARGEST_STEP, Math.min(LARGEST_STEP, left));
+    const done = await this.actions.send({ do: "set", arm: this.name, values: { support: Math.round(10 * next) / 1000 } });
+    this.isSending = false;
+    this.moved = performance.now();
+    if (done) this.stepped = next;
+    else this.stop();
+  }
+
+  stop() {
+    clearInterval(this.timer);
+    this.timer = null;
   }
 
   showSupport() {
     const value = Number(this.slider.value);
     const limit = this.setup?.support_limit;
+    const now = this.stepped;
     const known = limit !== null && limit !== undefined;
     const mark = this.find(".mark");
     mark.hidden = !known;
     if (known) mark.style.left = `${100 * limit}%`;
-    write(this.find("output"), `${number(value, 1)} %`);
+    write(this.find("output"), Math.abs(now - value) > 0.05 ? `${number(value, 1)} % (${t("support_now", number(now, 1))})` : `${number(value, 1)} %`);
     this.slider.setAttribute("aria-valuetext", `${number(value, 1)} %`);
     const parts = [known ? t("support_limit", number(Math.floor(1000 * limit) / 10, 1)) : t("support_unknown")];
     if (known && value / 100 > limit) parts.push(t("support_over"));
@@ -109,7 +132,9 @@ export class ArmCard {
     this.root.classList.toggle("stale", !alive);
     this.find(".enable").disabled = !operates || name !== "disabled";
     this.find(".clear").disabled = !operates || name !== "fault";
-    for (const control of [this.slider, ...this.root.querySelectorAll("[data-mode]")]) control.disabled = !operates || !other;
+    for (const control of [this.slider, ...this.root.querySelectorAll("[data-mode]")]) control.disabled = !operates || !other || !isFinite(this.stepped);
+    if (this.setup?.settings) this.follow();
+    this.showSupport();
     this.showJoints(alive ? state.joints : null);
     const rates = bridge ? `${t("rate")}: ${bridge.rate} Hz. ${t("age")}: ${bridge.answered} ms.` : "";
     write(this.find(".rates"), bridge?.limits && bridge.limits !== "none" ? `${rates} ${t("limits", bridge.limits)}` : rates);
