@@ -53,7 +53,7 @@ class Panel(Node):
         self._notes = self.create_publisher(DiagnosticArray, "/diagnostics", 50)
         self._noted = 0
         self._arms = ArmClients(self)
-        self._parameters: dict[str, NodeParameters] = {}
+        self._of_nodes: dict[str, NodeParameters] = {}
         self._tilt: tuple[float, Vector3Stamped] | None = None
         self._tilts = HotPath(self, Vector3Stamped, TILT, self._on_tilt, NEWEST)
         self.create_subscription(ParameterEvent, "/parameter_events", self._on_parameter_event, 50)
@@ -124,33 +124,33 @@ class Panel(Node):
         nodes = {f"{space.rstrip('/')}/{name}" for name, space in found if not name.startswith("_")}
         nodes.discard(self.get_fully_qualified_name())
         self._arms.discover(nodes)
-        for name in nodes - set(self._parameters):
-            self._parameters[name] = NodeParameters(self, name, self._on_change(name))
+        for name in nodes - set(self._of_nodes):
+            self._of_nodes[name] = NodeParameters(self, name, self._on_change(name))
             if name.endswith("/simulator") and name not in self._wearers:
                 service = f"{name}/set_parameters_atomically"
                 self._wearers[name] = self.create_client(SetParametersAtomically, service)
-        for name in set(self._parameters) - nodes:
-            self._parameters.pop(name).destroy()
-        for parameters in self._parameters.values():
+        for name in set(self._of_nodes) - nodes:
+            self._of_nodes.pop(name).destroy()
+        for parameters in self._of_nodes.values():
             parameters.update()
         self._facts.discover(self._arms.names)
 
     def _on_change(self, node: str) -> Callable[[], None]:
         def changed() -> None:
-            if node in self._parameters:
-                self._facts.note(node, self._parameters[node].values)
+            if node in self._of_nodes:
+                self._facts.note(node, self._of_nodes[node].values)
 
         return changed
 
     def _on_parameter_event(self, event: ParameterEvent) -> None:
-        if event.node in self._parameters:
-            self._parameters[event.node].refresh()
+        if event.node in self._of_nodes:
+            self._of_nodes[event.node].refresh()
 
     # What a trial needs (`Device` of exo_gravity.panel.studio); called on the web server's thread
 
     def parameters(self) -> dict[str, dict[str, Any]]:
         """Return the parameters of every node by full name."""
-        return {name: dict(parameters.values) for name, parameters in sorted(self._parameters.copy().items())}
+        return {name: dict(parameters.values) for name, parameters in sorted(self._of_nodes.copy().items())}
 
     def states(self) -> dict[str, str | None]:
         """Return the state of each arm; None if its bridge is silent."""
