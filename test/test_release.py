@@ -27,6 +27,10 @@ INDIRECT = {"lifecycle_msgs", "python3-msgpack"}
 PYTEST_TIMEOUT = "python3-pytest-timeout"
 # From PyPI alone, by an extra of setup.py; a tool that misses one names it.
 EXTRAS = {
+    "PIL",
+    "axe_playwright_python",
+    "httpx",
+    "imageio",
     "imufusion",
     "matplotlib",
     "mcap",
@@ -34,14 +38,19 @@ EXTRAS = {
     "mpl_toolkits",
     "mujoco",
     "pinocchio",
+    "playwright",
     "rich",
     "roboticstoolbox",
     "rosbags",
     "scipy",
+    "sklearn",
     "smbus2",
     "spatialmath",
+    "starlette",
     "threadpoolctl",
+    "uvicorn",
     "vqf",
+    "websockets",
 }
 
 
@@ -55,7 +64,7 @@ def third_parties(*folders: str) -> set[str]:
                     roots |= {alias.name.partition(".")[0] for alias in node.names}
                 elif isinstance(node, ast.ImportFrom) and not node.level:
                     roots.add(str(node.module).partition(".")[0])
-    return roots - set(sys.stdlib_module_names) - {"exo_gravity", "bench", "_typeshed"}
+    return roots - set(sys.stdlib_module_names) - {"exo_gravity", "bench", "test", "_typeshed"}
 
 
 def declared(kind: str) -> set[str]:

@@ -91,7 +91,7 @@ MUTATIONS = (
         "a second bridge takes the bus",
         ("second can_bridge on the bus",),
         (
-            Edit(BUS_LOCK, "if not self._is_acquired():", "if False:"),
+            Edit(BUS_LOCK, "if not self._is_acquired(patience):", "if False:"),
             Edit("exo_gravity/hardware/owned_bus.py", "bus.listen()", "pass"),
         ),
     ),

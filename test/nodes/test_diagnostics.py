@@ -10,7 +10,7 @@ import yaml
 from exo_gravity.core.drive import State
 from exo_gravity.core.limits import JointSample, Limits
 from exo_gravity.core.safety import SafetyMachine
-from exo_gravity.core.wire import load as bus_load
+from exo_gravity.core.wire import Traffic
 from exo_gravity.nodes import bridge_report
 from exo_gravity.nodes.bridge_report import BridgeReport
 from exo_gravity.nodes.diagnostics import OK, WARN, Diagnostics, milliseconds, row
@@ -71,7 +71,7 @@ def test_a_motor_that_stays_above_its_rated_torque_is_named_with_load_and_power(
     monkeypatch.setattr(Diagnostics, "report", lambda _, *report: reports.append(report))
     now = 1000.0
     monkeypatch.setattr(bridge_report, "time", SimpleNamespace(monotonic=lambda: now))
-    report = BridgeReport(node, ("a", "b", "c", "elbow"), bus_load(250.0, 4), 0.004, (3.0, 9.0, 3.0, 3.0))
+    report = BridgeReport(node, ("a", "b", "c", "elbow"), Traffic(4), 0.004, (3.0, 9.0, 3.0, 3.0))
     for cycles in range(0, 250 * 120, 25):
         report.send(carrying(6.0, cycles), "none", -math.inf)
         now += 0.1
@@ -88,7 +88,7 @@ def test_a_loop_below_its_rate_is_reported(node, monkeypatch):
     monkeypatch.setattr(Diagnostics, "report", lambda _, *report: reports.append(report))
     now = 1000.0
     monkeypatch.setattr(bridge_report, "time", SimpleNamespace(monotonic=lambda: now))
-    report = BridgeReport(node, ("a", "b", "c", "elbow"), bus_load(250.0, 4), 0.004, (3.0, 9.0, 3.0, 3.0))
+    report = BridgeReport(node, ("a", "b", "c", "elbow"), Traffic(4), 0.004, (3.0, 9.0, 3.0, 3.0))
     for cycles in range(0, 20 * 30, 20):
         report.send(carrying(1.0, cycles), "none", now)
         now += 0.1
