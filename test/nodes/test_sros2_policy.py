@@ -62,7 +62,10 @@ def graph_of(node, name):
         node.get_client_names_and_types_by_node,
     )
     try:
-        found = [{item for item, _ in query(leaf, namespace or "/")} for query in queries]
+        found = [
+            {item for item, _ in query(leaf, namespace or "/") if not item.startswith("/observer/")}
+            for query in queries
+        ]
     except NodeNameNonExistentError:
         return NOTHING
     return dict(zip(NOTHING, found, strict=True))
