@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterator
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -14,45 +10,12 @@ from ..support.panel_stage import Stage
 
 pytest.importorskip("playwright", reason="no browser driver: install the extra test")
 
-from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Page
 
-from ..support.panel_browser import NEEDS_CHROMIUM, chromium, enable, open_page, wait_for_state
+from ..support.panel_browser import NEEDS_CHROMIUM, enable, wait_for_state
 
 pytestmark = [NEEDS_CHROMIUM, pytest.mark.timeout(300)]
 BOTH_DOWN = [("let_down", "right"), ("let_down", "left")]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    """A headless Chromium."""
-    with chromium() as browser:
-        yield browser
-
-
-@pytest.fixture
-def stage() -> Iterator[Stage]:
-    """A panel with two arms that are off."""
-    stage = Stage()
-    yield stage
-    stage.close()
-
-
-@pytest.fixture
-def visit(browser: Browser, stage: Stage) -> Iterator[Callable[..., Page]]:
-    """A function that opens the page; an error in a script fails the test."""
-    pages, errors = list[Page](), list[str]()
-
-    def visit(**options: Any) -> Page:
-        page = open_page(browser, stage.url, **options)
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        pages.append(page)
-        return page
-
-    yield visit
-    for page in pages:
-        page.context.close()
-    assert errors == []
 
 
 def wait_for_call(page: Page, stage: Stage, call: tuple[str, ...]) -> None:
@@ -62,16 +25,6 @@ def wait_for_call(page: Page, stage: Stage, call: tuple[str, ...]) -> None:
             return
         page.wait_for_timeout(100)
     raise AssertionError(stage.arms.calls)
-
-
-def serious(page: Page) -> list[str]:
-    """Return the serious findings of axe."""
-    findings = Axe().run(page).response["violations"]
-    return [
-        f"{finding['id']}: {[node['html'][:120] for node in finding['nodes']]}"
-        for finding in findings
-        if finding["impact"] in ("serious", "critical")
-    ]
 
 
 def test_enable_asks_once_and_says_what_will_happen(visit, stage):
@@ -217,74 +170,6 @@ def test_without_a_connection_the_page_shows_no_old_state(visit, stage):
     assert page.locator('[data-arm="right"] tbody tr').count() == 0
     page.keyboard.press("Space")
     page.wait_for_selector("#alarm:has-text('NOT confirmed')")
-
-
-def test_the_page_is_german_when_its_user_wants_it(visit, stage):
-    page = visit()
-    page.select_option("#language", "de")
-    assert page.inner_text("#let-down") == "Absenken"
-    assert page.get_attribute("html", "lang") == "de"
-    texts = page.inner_text("body")
-    assert not re.search(r"\b(Let down|Enable|Clear fault|Wearer|Recording)\b", texts)
-    page.reload()
-    page.wait_for_selector("#let-down:has-text('Absenken')")
-
-
-def test_the_keyboard_alone_reaches_everything(visit, stage):
-    page = visit()
-    reached = set()
-    for _ in range(80):
-        page.keyboard.press("Tab")
-        name = "document.activeElement.id || document.activeElement.className || document.activeElement.name"
-        reached.add(page.evaluate(name))
-    assert {"language", "release", "operate enable", "down", "trial-start", "record", "save", "let-down"} <= reached
-    assert {"body_mass", "sex", "upper_arm"} <= reached
-    page.focus('[data-arm="right"] .enable')
-    page.keyboard.press("Enter")
-    page.wait_for_selector("#ask:visible")
-    page.keyboard.press("Tab")
-    page.keyboard.press("Enter")
-    wait_for_state(page, "active")
-
-
-@pytest.mark.parametrize(("width", "height"), [(768, 1024), (640, 450), (1280, 800)], ids=["tablet", "200 %", "desk"])
-@pytest.mark.parametrize("language", ["en", "de"])
-def test_let_down_is_always_in_sight_and_nothing_is_cut_off(visit, stage, width, height, language):
-    page = visit(width=width, height=height)  # 200 % of 1280 by 900 is 640 by 450
-    page.select_option("#language", language)
-    for position in ("0", "document.body.scrollHeight / 2", "document.body.scrollHeight"):
-        page.evaluate(f"scrollTo(0, {position})")
-        box = page.locator("#let-down").bounding_box()
-        assert box is not None
-        assert box["y"] >= 0 and box["y"] + box["height"] <= height
-        assert box["height"] >= 44 and box["width"] >= 300
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
-
-
-@pytest.mark.parametrize("state", ["off", "fault", "asking", "german", "login"])
-def test_axe_has_no_serious_findings(browser, visit, stage, state, tmp_path: Path):
-    if state == "login":
-        locked = Stage(token="a token for this test")
-        try:
-            page = browser.new_page()
-            page.goto(locked.url)
-            assert serious(page) == []
-            page.fill("input", "a token for this test")
-            page.click("button")
-            page.wait_for_selector(".arm .badge[data-state]")
-            page.close()
-        finally:
-            locked.close()
-        return
-    page = visit()
-    if state == "fault":
-        stage.arms.fail("right", "motor_silent")
-        wait_for_state(page, "fault")
-    elif state == "asking":
-        page.click('[data-arm="right"] .enable')
-    elif state == "german":
-        page.select_option("#language", "de")
-    assert serious(page) == []
 
 
 def test_recording_trial_wearer_and_parameters_are_asked_for(visit, stage):
