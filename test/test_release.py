@@ -41,6 +41,7 @@ EXTRAS = {
     "playwright",
     "rich",
     "roboticstoolbox",
+    "rtbdata",
     "rosbags",
     "scipy",
     "sklearn",
