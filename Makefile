@@ -45,8 +45,9 @@ calibrate-study:
 # The nodes' tests need a quiet machine, and run two at a time; the others share its cores.
 test:
 	@$(SETUP) $(TEST)
-	$(BIN)/python -m pytest -m "not real_time" -n auto
-	$(BIN)/python -m pytest -m real_time -n 2
+	$(BIN)/python -m pytest --ignore test/panel -m "not real_time" -n auto
+	$(BIN)/python -m pytest --ignore test/panel -m real_time -n 2
+	@$(MAKE) --no-print-directory test-panel
 
 lint:
 	@$(SETUP) $(TEST) dev
@@ -99,9 +100,11 @@ panel:
 
 test-panel:
 	@$(SETUP) $(TEST)
+	@mkdir -p build
 	@command -v chromium chromium-browser >/dev/null || ! test -w /var/lib/dpkg || \
 		(apt-get update && apt-get install --yes chromium) >build/chromium.log 2>&1 || true
-	$(BIN)/python -m pytest test/panel
+	$(BIN)/python -m pytest test/panel -m "not real_time" -n 2
+	$(BIN)/python -m pytest test/panel -m real_time
 	$(if $(PRESSES),$(BIN)/python -m bench.panel press $(PRESSES))
 
 pythons:
