@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import can
@@ -68,6 +68,7 @@ def motors(adapter: FakeSlcan, tmp_path: Path) -> Iterator[MotorBus]:
         return open_bus("slcan", str(tmp_path / "ttyACM0"), OPTIONS)
 
     bus = MotorBus(reopen(), joints_of(MIXED), reopen=reopen)
+    wait_until(lambda: adapter.is_open)  # python-can does not wait for it
     yield bus
     bus.close()
 
@@ -110,14 +111,15 @@ def test_an_acknowledgement_does_not_hide_a_late_reply(adapter, motors, channel,
         for spec, can_id in zip(SPECS, (1, 4), strict=False):
             data = pack_reply(spec, can_id, 0.0, 0.0, 0.0)
             other.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
-        wait_for_lines(motors)
+        port = motors._port._bus.serialPortOrig
+        wait_until(lambda: port.in_waiting >= 36)  # both replies, of 18 characters each
         assert not motors.exchange(OFF, time.monotonic())
     assert [sample.time > 0.0 for sample in motors.samples] == [True, False, False, True]
     assert not motors._answered
 
 
-def wait_for_lines(motors: MotorBus) -> None:
-    """Wait until the serial port has received both replies, of 18 characters each."""
-    port, end = motors._port._bus.serialPortOrig, time.monotonic() + 10.0
-    while port.in_waiting < 36 and time.monotonic() < end:
+def wait_until(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 10.0
+    while not condition():
+        assert time.monotonic() < end
         time.sleep(0.001)

@@ -26,14 +26,17 @@ OK, REFUSED = b"\r", b"\a"
 
 
 class FakeSlcan:
-    """The adapter, plugged in at `path` until `close`; `bus` is its wire. kbit_s: bit rate that was set."""
+    """The adapter, plugged in at `path` until `close`; `bus` is its wire.
+
+    kbit_s: bit rate that was set. is_open: whether O was received.
+    """
 
     def __init__(self, path: Path, bus: can.BusABC) -> None:
         self.kbit_s = 0
         self.acknowledges = True
         self._path = path
         self._bus = bus
-        self._is_open = False
+        self.is_open = False
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self.plug_in()
@@ -45,7 +48,7 @@ class FakeSlcan:
         with contextlib.suppress(FileNotFoundError):
             self._path.unlink()
         self._path.symlink_to(os.ttyname(self._slave))
-        self._is_open = False
+        self.is_open = False
         self._stop.clear()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -71,7 +74,7 @@ class FakeSlcan:
                 for line in lines:
                     self._write(self._obey(line.decode()))
             message = self._bus.recv(0.0005)
-            if message is not None and self._is_open and not message.is_error_frame and not message.is_fd:
+            if message is not None and self.is_open and not message.is_error_frame and not message.is_fd:
                 self._write(_line(message))
 
     def _write(self, data: bytes) -> None:
@@ -79,11 +82,11 @@ class FakeSlcan:
             os.write(self._master, data)
 
     def _obey(self, line: str) -> bytes:
-        if line in BITRATES and not self._is_open:
+        if line in BITRATES and not self.is_open:
             self.kbit_s = BITRATES[line]
         elif line in ("O", "L", "C"):
-            self._is_open = line != "C"
-        elif line[:1] in ("t", "T") and self._is_open:
+            self.is_open = line != "C"
+        elif line[:1] in ("t", "T") and self.is_open:
             digits = 3 if line[0] == "t" else 8
             data = bytes.fromhex(line[digits + 2 :])
             if len(data) != int(line[digits + 1]):
