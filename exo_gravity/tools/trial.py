@@ -52,6 +52,8 @@ def main(args: Sequence[str] | None = None) -> int:
 
             from exo_gravity.tools.trials import session
         if options.name == "effort":
+            if clip:
+                raise ParameterError("--video", options.video, "left out: effort plays many short trials")
             from exo_gravity.tools.reporting.trial_report import report_console
             from exo_gravity.tools.trials import effort
 
