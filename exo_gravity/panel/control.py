@@ -94,7 +94,7 @@ class Control:
             self._holder = ""
 
     def release_all(self) -> None:
-        """Leave control to whoever takes it next."""
+        """Leave control free for the next page that takes it."""
         self._holder = ""
 
     def is_gone(self) -> bool:

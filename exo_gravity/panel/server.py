@@ -1,6 +1,6 @@
 """The web server: the page and its files, its actions, and the live connection that carries the state to every page.
 
-It runs uvicorn on a thread of its own. `publish` may be called from any thread. A page that is slow or asleep gets the
+It runs uvicorn on a separate thread. `publish` may be called from any thread. A page that is slow or asleep gets the
 newest state only, so that nothing queues up.
 
     GET  /               the page            GET /static/...   its files       GET /strings     its texts

@@ -1,4 +1,4 @@
-"""How hard an arm is to move: a virtual wearer moves it along paths by an impedance of his own, and his torque counts.
+"""How hard an arm is to move: a virtual wearer moves it along paths with an impedance controller, whose torque counts.
 
 The wearer's passive arm is in the exoskeleton. Without help he carries both and overcomes their friction and inertia.
 Stiffness and damping are of the order of a human arm's; an integrator takes over what weight is left, as a person does.

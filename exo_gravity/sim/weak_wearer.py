@@ -1,6 +1,6 @@
 """The workspace that a weak arm reaches, against support: Freebal's measure.
 
-A wearer who has only a share of the torque that his own outstretched arm requires moves the arm from a low pose
+A wearer who has only a share of the torque that the outstretched arm requires moves the arm from a low pose
 straight to each pose of a grid. He reaches it if on the whole way, on every joint, his strength exceeds what
 compensation leaves of the weight, plus friction. The motion is slow: inertia is left out.
 """
@@ -31,7 +31,7 @@ def grid_of(low: Sequence[float], high: Sequence[float]) -> np.ndarray:
 
 
 def weak_strength(settings: Settings, grid: np.ndarray, share: float) -> np.ndarray:
-    """Return the strength (4,) in Nm of a weak wearer: `share` of the largest torque of his own arm over `grid`."""
+    """Return the strength (4,) in Nm of a weak wearer: `share` of the largest torque of the arm over `grid`."""
     own = ArmModel(settings.robot.length, settings.wearer_cog, settings.wearer_mass)
     return np.maximum(LEAST, share * np.abs(gravity_torque(own, grid)).max(axis=0))
 

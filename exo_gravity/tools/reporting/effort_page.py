@@ -20,7 +20,7 @@ CAPTION = (
     "The wearer's torque in each task by joint (top, parts add up to the root of the sum of squares), the inertia and "
     "friction that he feels in the sweeps, and the share of the workspace that a weak arm reaches."
 )
-LEGEND = """A virtual wearer moves the simulated arm by an impedance of his own. <b>Saved</b> compares with motors
+LEGEND = """A virtual wearer, an impedance controller, moves the simulated arm. <b>Saved</b> compares with motors
 without torque. <b>In holds</b> is the RMS torque while a pose is held. <b>Reflected inertia</b> and friction are what a
 sine sweep of one joint feels."""
 
