@@ -79,6 +79,7 @@ def press(count: int) -> int:
                 wait_for_state(page, "letting down")
                 pressed = page.evaluate("presses.at(-1)") / 1000.0
                 delays.append(first_fading(list(listener.frames), pressed) - pressed)
+                print(f"{n + 1}: {1000 * delays[-1]:.1f} ms", flush=True)
                 if n + 1 < count:
                     enable(page)
         finally:
