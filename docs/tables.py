@@ -74,7 +74,7 @@ def topic_table() -> str:
                 nodes[re.sub("^/(left|right)/", "", str(topic.text)), way].add(f"`{profile.get('node')}`")
     rows = [
         (f"`{name}`", types[name], *(", ".join(sorted(nodes[name, way])) for way in ("publish", "subscribe")))
-        for name in sorted({topic for topic, _ in nodes} - EVERY_NODES, key=lambda name: name.lstrip("/"))
+        for name in sorted({topic for topic, _ in nodes} - EVERY_NODES, key=lambda name: (name.lstrip("/"), name))
     ]
     return markdown(("topic", "type", "published by", "subscribed by"), rows)
 
