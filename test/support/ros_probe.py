@@ -6,7 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import rclpy
@@ -14,6 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters, SetParametersAtomically
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.parameter import Parameter, parameter_value_to_python
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -22,6 +23,8 @@ from std_srvs.srv import SetBool, Trigger
 from exo_gravity.nodes.run import keep_to_this_machine
 
 keep_to_this_machine()
+
+InvalidHandle = rclpy_implementation.InvalidHandle
 
 
 class Timeout(AssertionError):
@@ -65,7 +68,8 @@ class RosProbe:
 
     def _spin(self) -> None:
         while not self._closing:
-            self.executor.spin_once(timeout_sec=0.1)
+            with suppress(InvalidHandle):  # a test has just destroyed a publisher
+                self.executor.spin_once(timeout_sec=0.1)
             with self._news:
                 self._news.notify_all()
 
