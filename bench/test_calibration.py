@@ -14,12 +14,11 @@ import pytest
 
 from exo_gravity.core.calibration.motion import Station
 from exo_gravity.core.calibration.params import as_text
-from exo_gravity.core.trial_script import TrialScript
-from exo_gravity.sim.virtual_wearer import VirtualWearer
 from exo_gravity.tools import calibrate
 from exo_gravity.tools.calibration import gravity
 from exo_gravity.tools.calibration.live import LiveTour
 from exo_gravity.tools.inputs.parameter_file import packaged_config
+from test.support.tour_run import Hand
 
 from .calibration.device import draw
 from .calibration.tour import Player, run_tour
@@ -27,21 +26,6 @@ from .calibration.verdict import verdict
 from .calibration.way import go
 
 Torque = Callable[[float, Player], Sequence[float] | None]
-NOTHING = (0.0,) * 4
-
-
-class Hand(VirtualWearer):
-    """Puts the torque that `torque(time, player)` returns, (4,) Nm, on the joints."""
-
-    def __init__(self, torque: Torque, player: Player) -> None:
-        super().__init__(TrialScript.parse({"name": "hand", "steps": [{"hold": 3600.0}]}))
-        self._torque, self._player = torque, player
-
-    def idle(self, time: float, duration: float) -> bool:
-        return False
-
-    def torque(self, time: float, theta: Sequence[float], velocity: Sequence[float]) -> tuple[float, ...]:
-        return tuple(self._torque(time, self._player) or NOTHING)
 
 
 def slip(time: float, player: Player) -> Sequence[float]:
@@ -68,7 +52,7 @@ def gravity_with(folder: Path, trouble: Torque | None, changes: Mapping[str, Any
 
     def prepare(player: Player) -> None:
         if trouble:
-            player.device.start(Hand(trouble, player))
+            player.device.start(Hand(lambda time, _: trouble(time, player), player.device))
 
     def run(options: argparse.Namespace, nodes: Mapping[str, Any], say: object) -> LiveTour:
         nodes["/right/calibrator"]["ros__parameters"].update(changes)
