@@ -20,7 +20,7 @@ from exo_gravity.core.effort_limiter import EffortLimiter
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.gravity import Torque
 from exo_gravity.core.param_table import Param, param_of
-from exo_gravity.core.tilt_input import STILL, TiltInput
+from exo_gravity.core.tilt_input import Tilted
 from exo_gravity.core.transition import Transition
 
 LAW = "urdf"
@@ -88,14 +88,14 @@ def any_arm_settings(values: Mapping[str, Any], model: GravityModel) -> AnyArmSe
     return AnyArmSettings(tuple(values["gain"]), max_effort=tuple(limits), **{name: values[name] for name in others})
 
 
-class AnyArm:
+class AnyArm(Tilted):
     """The compensator of `model`'s n joints. Its methods are those of `core.compensator.Compensator`."""
 
     def __init__(self, model: GravityModel, settings: AnyArmSettings) -> None:
         self.settings = settings
         self._model = model
         self._count = len(settings.gain)
-        self._tilt = TiltInput("left", settings.tilt_timeout)
+        super().__init__("left", settings.tilt_timeout)
         self._limiter = EffortLimiter(self._count)
         self._transition = Transition()
         self._pending: AnyArmSettings | None = None
@@ -103,20 +103,6 @@ class AnyArm:
     def apply(self, settings: AnyArmSettings) -> None:
         """Use new settings from the next `step` on; the torque moves to them without a step."""
         self._pending = settings
-
-    def set_tilt(self, now: float, pitch: float, roll: float, age: float = 0.0) -> None:
-        """Set the pitch and roll of the root link; see `TiltInput.set_tilt`."""
-        self._tilt.set_tilt(now, pitch, roll, age)
-
-    def set_gravity(
-        self, now: float, gravity: Sequence[float], angular_velocity: Sequence[float] = STILL, age: float = 0.0
-    ) -> None:
-        """Set gravity's direction in the root link's axes; see `TiltInput.set_gravity`."""
-        self._tilt.set_gravity(now, gravity, angular_velocity, age)
-
-    def tilt_age(self, now: float) -> float:
-        """Return the age of the newest tilt in s."""
-        return self._tilt.age(now)
 
     def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Answer:
         """Return the torque for joint angles `theta` (n,) rad at `now` s on a monotonic clock."""

@@ -22,7 +22,7 @@ from exo_gravity.core.gravity import LAWS, NO_TORQUE, Torque
 from exo_gravity.core.terms.coupling import JOINTS
 from exo_gravity.core.terms.terms import Terms
 from exo_gravity.core.tilt import Tilt
-from exo_gravity.core.tilt_input import STILL, TiltInput
+from exo_gravity.core.tilt_input import Tilted
 from exo_gravity.core.transition import Transition
 from exo_gravity.core.turning import turning_torque
 
@@ -43,7 +43,7 @@ class Answer(NamedTuple):
     fallback: str = ""
 
 
-class Compensator:
+class Compensator(Tilted):
     """The control law and its state: ramp, rate limit, and the remainder of the last change of settings.
 
     names: of the joints (4,), for the outer loop's input. terms: what is added to gravity compensation.
@@ -52,7 +52,7 @@ class Compensator:
     def __init__(self, settings: Settings, names: Sequence[str] = JOINTS) -> None:
         self.settings = settings
         self.terms = Terms(names, settings.terms, settings.moving)
-        self._tilt = TiltInput(settings.side, settings.tilt_timeout)
+        super().__init__(settings.side, settings.tilt_timeout)
         self._motion = FeltMotion()
         self._limiter = EffortLimiter(JOINT_COUNT)
         self._transition = Transition()  # of the last change of law or settings
@@ -67,20 +67,6 @@ class Compensator:
             raise ParameterError("side", settings.side, f"{self.settings.side}, because the side cannot change")
         self._pending = settings
         self.terms.apply(settings.terms, settings.moving)
-
-    def set_tilt(self, now: float, pitch: float, roll: float, age: float = 0.0) -> None:
-        """Set the trunk's pitch and roll; see `TiltInput.set_tilt`."""
-        self._tilt.set_tilt(now, pitch, roll, age)
-
-    def set_gravity(
-        self, now: float, gravity: Sequence[float], angular_velocity: Sequence[float] = STILL, age: float = 0.0
-    ) -> None:
-        """Set gravity's direction in the trunk's axes; see `TiltInput.set_gravity`."""
-        self._tilt.set_gravity(now, gravity, angular_velocity, age)
-
-    def tilt_age(self, now: float) -> float:
-        """Return the age of the newest tilt in s."""
-        return self._tilt.age(now)
 
     def set_motion(
         self, now: float, specific_force: Sequence[float], angular_velocity: Sequence[float], age: float = 0.0
