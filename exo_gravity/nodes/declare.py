@@ -21,7 +21,7 @@ def declare(node: Node, table: Sequence[Param], free_prefix: str = "") -> dict[s
     `free_prefix` are left as given. Raises ParameterError for an impossible value, and for a name that is not in the
     table.
     """
-    given = {name: _plain(parameter.value) for name, parameter in node.get_parameters_by_prefix("").items()}
+    given = {name: plain(parameter.value) for name, parameter in node.get_parameters_by_prefix("").items()}
     values = values_of(table, given, free_prefix)
     for param in table:
         if node.has_parameter(param.name):
@@ -34,7 +34,7 @@ def values_after(node: Node, table: Sequence[Param], changes: Sequence[Parameter
     """Return the values of the table by name as they would be after `changes`, or raise ParameterError."""
     values = {param.name: node.get_parameter(param.name).value for param in table}
     values.update({change.name: change.value for change in changes})
-    return values_of(table, {name: _plain(value) for name, value in values.items()})
+    return values_of(table, {name: plain(value) for name, value in values.items()})
 
 
 def with_floats(node: Node, table: Sequence[Param], changes: Sequence[Parameter]) -> list[Parameter]:
@@ -82,5 +82,6 @@ def _first(default: Any) -> Any:
     return next(iter(default), None) if isinstance(default, list) else default
 
 
-def _plain(value: Any) -> Any:
-    return list(value) if hasattr(value, "tolist") else value
+def plain(value: Any) -> Any:
+    """Return a parameter's value with arrays as lists."""
+    return list(value) if isinstance(value, list | tuple) or hasattr(value, "tolist") else value

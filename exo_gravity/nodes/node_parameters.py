@@ -12,6 +12,8 @@ from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 from rclpy.task import Future
 
+from exo_gravity.nodes.declare import plain
+
 TIMEOUT = 5.0  # s after which a request to a node that has died is repeated
 
 
@@ -55,9 +57,5 @@ class NodeParameters:
     def _on_values(self, names: list[str], future: Future) -> None:
         self._asked = -math.inf
         values = map(parameter_value_to_python, future.result().values)
-        self.values = {name: _plain(value) for name, value in zip(names, values, strict=False) if value is not None}
+        self.values = {name: plain(value) for name, value in zip(names, values, strict=False) if value is not None}
         self._on_change()
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, list | tuple) or hasattr(value, "tolist") else value

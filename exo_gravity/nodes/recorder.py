@@ -30,7 +30,7 @@ from std_msgs.msg import String
 from exo_gravity.bag.topics import ASSIST, LOSSES, PARAMETERS, STATES, leaf
 from exo_gravity.bag.writer import BagWriter, offered_qos
 from exo_gravity.core.control_params import RECORDER
-from exo_gravity.nodes.declare import declare
+from exo_gravity.nodes.declare import declare, plain
 from exo_gravity.nodes.drain import Drain
 from exo_gravity.nodes.live_line import ARM_TOPICS, LiveLine
 from exo_gravity.nodes.run import run
@@ -210,7 +210,7 @@ class Snapshot:
         self._call(self._get, GetParameters.Request(names=self._names), self._on_values)
 
     def _on_values(self, response: GetParameters.Response) -> None:
-        values = (_plain(parameter_value_to_python(value)) for value in response.values)
+        values = (plain(parameter_value_to_python(value)) for value in response.values)
         # ROS's parameter files have neither empty lists nor unset values.
         given = {name: value for name, value in zip(self._names, values, strict=True) if value not in (None, [])}
         self._recorder.write_parameters(self._node, given)
@@ -222,10 +222,6 @@ def type_name(msgtype: type) -> str:
     """Return 'sensor_msgs/msg/JointState' for that class."""
     package, kind, *_ = msgtype.__module__.split(".")
     return f"{package}/{kind}/{msgtype.__name__}"
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, list | tuple) or hasattr(value, "tolist") else value
 
 
 def main() -> None:
