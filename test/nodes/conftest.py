@@ -7,10 +7,23 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import rclpy
+from rclpy.node import Node
 
 from ..support.bus_listener import BusListener
 from ..support.launched_nodes import LaunchedNodes
 from ..support.ros_probe import RosProbe
+
+
+@pytest.fixture
+def node() -> Iterator[Node]:
+    """A node in the namespace /right, in a separate context, which ends with the test."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node("listener", namespace="/right", context=context)
+    yield node
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ import math
 from types import SimpleNamespace
 
 import pytest
-import rclpy
 import yaml
 
 from exo_gravity.core.drive import State
@@ -47,16 +46,6 @@ def test_the_aggregator_shows_each_reporting_node_once(file):
             assert sum(any(node.lstrip("/").startswith(prefix) for prefix in group) for group in prefixes) == 1, node
 
 
-@pytest.fixture
-def node():
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    node = rclpy.create_node("can_bridge", namespace="/right", context=context)
-    yield node
-    node.destroy_node()
-    rclpy.try_shutdown(context=context)
-
-
 def carrying(effort, cycles=0):
     """Return what a bridge reports on: an arm that is carried at rest, the elbow with `effort` Nm."""
     safety = SafetyMachine(Limits(("a", "b", "c", "elbow")), 0.004)
@@ -66,15 +55,28 @@ def carrying(effort, cycles=0):
     return SimpleNamespace(safety=safety, samples=samples, ignored={}, failure=None, cycles=cycles, **counts)
 
 
-def test_a_motor_that_stays_above_its_rated_torque_is_named_with_load_and_power(node, monkeypatch):
-    reports = []
+@pytest.fixture
+def sent(node, monkeypatch):
+    """A function that lets a bridge report on `loop(n)`, `count` times, 0.1 s apart; it returns the reports.
+
+    answered: when the answered joint states were measured, s; None for always now.
+    """
+    reports, clock = [], SimpleNamespace(now=1000.0)
     monkeypatch.setattr(Diagnostics, "report", lambda _, *report: reports.append(report))
-    now = 1000.0
-    monkeypatch.setattr(bridge_report, "time", SimpleNamespace(monotonic=lambda: now))
-    report = BridgeReport(node, ("a", "b", "c", "elbow"), Traffic(4), 0.004, (3.0, 9.0, 3.0, 3.0))
-    for cycles in range(0, 250 * 120, 25):
-        report.send(carrying(6.0, cycles), "none", -math.inf)
-        now += 0.1
+    monkeypatch.setattr(bridge_report, "time", SimpleNamespace(monotonic=lambda: clock.now))
+
+    def sent(loop, count, answered=None):
+        report = BridgeReport(node, ("a", "b", "c", "elbow"), Traffic(4), 0.004, (3.0, 9.0, 3.0, 3.0))
+        for n in range(count):
+            report.send(loop(n), "none", clock.now if answered is None else answered)
+            clock.now += 0.1
+        return reports
+
+    return sent
+
+
+def test_a_motor_that_stays_above_its_rated_torque_is_named_with_load_and_power(sent):
+    reports = sent(lambda n: carrying(6.0, 25 * n), 1200, answered=-math.inf)
     assert reports[20][:2] == (OK, "active")
     level, message, values = reports[-1]
     assert (level, message) == (WARN, "active, above rated torque for too long: elbow")
@@ -83,13 +85,6 @@ def test_a_motor_that_stays_above_its_rated_torque_is_named_with_load_and_power(
     assert values["rate (Hz)"] == "250.0" and values["age of efforts (ms)"] == "none"
 
 
-def test_a_loop_below_its_rate_is_reported(node, monkeypatch):
-    reports = []
-    monkeypatch.setattr(Diagnostics, "report", lambda _, *report: reports.append(report))
-    now = 1000.0
-    monkeypatch.setattr(bridge_report, "time", SimpleNamespace(monotonic=lambda: now))
-    report = BridgeReport(node, ("a", "b", "c", "elbow"), Traffic(4), 0.004, (3.0, 9.0, 3.0, 3.0))
-    for cycles in range(0, 20 * 30, 20):
-        report.send(carrying(1.0, cycles), "none", now)
-        now += 0.1
+def test_a_loop_below_its_rate_is_reported(sent):
+    reports = sent(lambda n: carrying(1.0, 20 * n), 30)
     assert reports[-1][:2] == (WARN, "active, slower than 225 Hz")

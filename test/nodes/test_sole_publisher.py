@@ -5,8 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-import pytest
-import rclpy
 from rclpy.node import Node
 from std_msgs.msg import String
 
@@ -14,16 +12,6 @@ from exo_gravity.nodes import sole_publisher
 from exo_gravity.nodes.sole_publisher import SolePublisher
 
 UNNUMBERED = {"publication_sequence_number": None}
-
-
-@pytest.fixture
-def node():
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    node = rclpy.create_node("listener", namespace="/right", context=context)
-    yield node
-    node.destroy_node()
-    rclpy.try_shutdown(context=context)
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
