@@ -44,7 +44,7 @@ def imports(path: Path) -> tuple[str, ...]:
 
 @cache
 def file_of(module: str) -> Path | None:
-    """Return the file of a module of this repository, None if it is none."""
+    """Return the file of a module, None if the module is not in this repository."""
     path = ROOT.joinpath(*module.split("."))
     candidates = (path.with_suffix(".py"), path / "__init__.py")
     return next((candidate for candidate in candidates if candidate.is_file()), None)

@@ -1,4 +1,4 @@
-"""The operator's panel beside the simulated device: from press to torque, processor, and the loop's late cycles.
+"""Measures the operator's panel on the simulated device: delay from press to torque, processor load, late cycles.
 
     python -m bench.panel press [N]     N presses of the space bar in a real browser, 50 by default, about 5 s each
     python -m bench.panel load          both arms at 250 Hz, 40 s without the panel and 40 s with an open page
@@ -48,7 +48,7 @@ def with_panel(nodes: LaunchedNodes) -> str:
 
 
 def first_fading(frames: list[Frame], since: float) -> float:
-    """Return the time of the first frame with damping. Raises ValueError if there is none, or one before `since`."""
+    """Return the time of the first frame with damping. Raises ValueError if there is none after `since`."""
     for frame in frames:
         is_ours = frame.can_id in CAN_IDS and frame.data[0] in COMMANDS  # a reply carries the motor's ID as well
         if not is_ours or frame.data in SPECIAL_FRAMES:

@@ -54,7 +54,7 @@ def show_inline(translator: Any, node: nodes.math) -> None:
 
 
 def show_block(translator: Any, node: nodes.math_block) -> None:
-    """Write a formula on a line of its own."""
+    """Write a display formula."""
     translator.body.append(f'<div class="math">{tex2mathml(node.astext(), as_block=True)}</div>\n')
     raise nodes.SkipNode
 

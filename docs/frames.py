@@ -18,7 +18,7 @@ ALPHA = (-np.pi / 2, np.pi / 2, 0.0, 0.0)
 OFFSET = (0.0, -np.pi / 2, 0.0, 0.0)
 HANGING = (0.0, 0.0, 0.0, 0.0)
 RAISED = (0.0, 1.1, 0.6, 0.9)
-BESIDE = {"x": np.array((0.0, 0.04, 0.0)), "z": np.array((0.0, -0.03, 0.0))}  # m from the arrow to its name
+LABEL_OFFSET = {"x": np.array((0.0, 0.04, 0.0)), "z": np.array((0.0, -0.03, 0.0))}  # m from the arrow to its name
 COLOURS = {"x": "#D55E00", "z": "#0072B2"}  # Okabe and Ito (2008)
 # Columns: the base axes x0 (left), y0 (forward) and z0 (down) of a left arm in the picture's axes, in which z is up.
 BASE = np.array(((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)))
@@ -55,7 +55,11 @@ def draw_arm(axes: Axes3D, theta: Sequence[float], title: str) -> None:
             arrow = 0.12 * pose[:3, column]
             axes.quiver(*origin, *arrow, color=COLOURS[name], arrow_length_ratio=0.25, lw=1.6)
             axes.text(
-                *(origin + 1.25 * arrow + BESIDE[name]), f"${name}_{n}$", color=COLOURS[name], ha="center", va="center"
+                *(origin + 1.25 * arrow + LABEL_OFFSET[name]),
+                f"${name}_{n}$",
+                color=COLOURS[name],
+                ha="center",
+                va="center",
             )
     axes.quiver(0.0, -0.24, 0.0, 0.0, 0.0, -0.2, color="0.5", lw=2.5, arrow_length_ratio=0.2)
     axes.text(0.0, -0.24, -0.25, "gravity", color="0.4", ha="center")

@@ -19,7 +19,7 @@ from exo_gravity.sim.trunk_motion import TrunkState, Walk
 INERTIAL, DEFAULT = LAWS[:2]
 IMU = ImuConfig(MOUNTING)
 WALK = {"walk": 15.0}
-PLACES = {"0.15 m beside the shoulder": (0.0, -0.15, 0.0), "on the back": (-0.12, 0.2, -0.1)}  # m
+PLACES = {"0.15 m to the side of the shoulder": (0.0, -0.15, 0.0), "on the back": (-0.12, 0.2, -0.1)}  # m
 VIBRATIONS = (8.0, 15.0, 25.0)  # Hz
 VIBRATION = 0.1 * STANDARD_GRAVITY  # m/s^2, vertical
 

@@ -4,8 +4,8 @@ When a node ends on which the arm depends, or on Ctrl-C, all stop, with SIGTERM:
 others while they let the arms down, then the others, the recorders last. A terminal sends Ctrl-C to every node at once;
 so all but the bridges ignore SIGINT. If `ros2 launch` itself is killed, each node stops with its standard input.
 
-The nodes are no `LifecycleNode` actions: with those, `ros2 launch` would be one more DDS participant beside a worn arm.
-`can_bridge` activates itself (`autostart`); `ros2 lifecycle` works as with any lifecycle node.
+The nodes are no `LifecycleNode` actions: with those, `ros2 launch` would be one more DDS participant while an arm
+is worn. `can_bridge` activates itself (`autostart`); `ros2 lifecycle` works as with any lifecycle node.
 """
 
 import asyncio

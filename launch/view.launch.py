@@ -1,4 +1,4 @@
-"""RViz beside arms that run: `ros2 launch exo_gravity view.launch.py params:=FILE`.
+"""Opens RViz for running arms: `ros2 launch exo_gravity view.launch.py params:=FILE`.
 
 Starts robot_model, robot_state_publisher and RViz, and no arm. `rviz:=false` leaves RViz out, for other viewers.
 """

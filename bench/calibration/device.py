@@ -19,7 +19,7 @@ from exo_gravity.tools.inputs.parameter_file import packaged_config
 
 BRIDGE, SIMULATOR = "/right/can_bridge", "/right/simulator"
 SPREAD = 0.3  # of masses, centres of gravity and torque scales
-BESIDE = 0.015  # m, the largest offset of a centre of gravity from its link
+LARGEST_OFFSET = 0.015  # m, the largest offset of a centre of gravity from its link
 COULOMB = (0.1, 0.4)  # Nm
 VISCOUS = (0.02, 0.1)  # Nm s/rad
 DAMPING = 3.4  # Nm s/rad: what the weakest motor can apply; the bridge takes a lack of it for a lack of torque
@@ -62,7 +62,7 @@ def draw(seed: int, folder: Path) -> Device:
     nominal, low, high = DEFAULT_LINKS, 1.0 - SPREAD, 1.0 + SPREAD
     mass = nominal.mass * rng.uniform(low, high, 4)
     cog = np.minimum(nominal.cog * rng.uniform(low, high, 4), nominal.length)
-    beside = rng.uniform(-BESIDE, BESIDE, (2, 4))
+    offset = rng.uniform(-LARGEST_OFFSET, LARGEST_OFFSET, (2, 4))
     bridge, simulator = (content[node]["ros__parameters"] for node in (BRIDGE, SIMULATOR))
     can_id = [int(i) for i in rng.choice(np.arange(1, MAX_CAN_ID + 1), 4, replace=False)]
     direction = [int(d) for d in rng.choice((1, -1), 4)]
@@ -79,11 +79,11 @@ def draw(seed: int, folder: Path) -> Device:
     simulator.update(
         can_id=can_id, direction=direction, zero=zero, torque_scale=scale, current_noise=CURRENT_NOISE,
         friction=_friction(rng), trunk={"pitch": stand[0], "roll": stand[1]},
-        robot={"mass": mass.tolist(), "cog": cog.tolist(), "cog_y": beside[0].tolist(), "cog_z": beside[1].tolist()},
+        robot={"mass": mass.tolist(), "cog": cog.tolist(), "cog_y": offset[0].tolist(), "cog_z": offset[1].tolist()},
     )  # fmt: skip
     params = folder / "0.yaml"
     params.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-    links = ArmModel(nominal.length, cog, mass, off_axis=off_axis_of(mass, *beside))
+    links = ArmModel(nominal.length, cog, mass, off_axis=off_axis_of(mass, *offset))
     other_pitch = stand[0] - math.copysign(rng.uniform(*LEANT), stand[0])  # to the side where there is more room
     leant = (other_pitch, float(rng.uniform(STAND[0][1], STAND[1][1])))
     return Device(seed, params, links, can_id, direction, zero, scale, quaternion, leant)

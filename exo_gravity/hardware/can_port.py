@@ -71,7 +71,7 @@ class CanPort:
     def waiting(self) -> can.Message | None:
         """Return the next frame that has already arrived, or None. Raises BusError.
 
-        An slcan adapter acknowledges each frame with a line of its own, for which python-can returns None.
+        An slcan adapter acknowledges each frame with a separate line, for which python-can returns None.
         """
         while (message := self.receive(0.0)) is None and self._has_lines():
             pass

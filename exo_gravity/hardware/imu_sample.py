@@ -63,7 +63,7 @@ class Ranges(NamedTuple):
     def acceleration(self, values: Sequence[float] | None, last: Floats3 | None) -> tuple[Floats3, bool]:
         """Return the acceleration, and whether an axis is saturated; raises ParameterError if it is impossible.
 
-        last: the acceleration before it; None if there is none.
+        last: the acceleration before it, None at first.
         """
         acceleration = three_floats("linear_acceleration", values)
         largest = max(map(abs, acceleration))

@@ -1,8 +1,8 @@
 """panel: a web page on the machine that carries the arms: see them, set the support, let them down.
 
 It is a ROS client like any other: it uses the topics, services and parameters that `ros2` can use, and nothing depends
-on it. The web server (exo_gravity/panel/server.py) has a thread of its own; this node's executor collects the state of
-the arms and sends it to the pages ten times a second.
+on it. The web server (exo_gravity/panel/server.py) runs on a separate thread; this node's executor collects the state
+of the arms and sends it to the pages ten times a second.
 """
 
 from __future__ import annotations

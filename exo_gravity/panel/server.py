@@ -66,7 +66,7 @@ class LivePage:
 class PanelServer:
     """Serves the panel at `host` and `port`.
 
-    report: returns the report of a trial by name, None if there is none. parameters: returns those in force by node.
+    report: returns the report of a trial by name, or None. parameters: returns those in force by node.
     """
 
     def __init__(

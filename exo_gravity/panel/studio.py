@@ -1,4 +1,4 @@
-"""Recordings, trials and saved parameters, each in a folder of its own below `output`.
+"""Recordings, trials and saved parameters, each in a new folder below `output`.
 
 A recording is made by the package's `recorder`, a process. A trial records, lets a simulated device's virtual wearer or
 a person perform the script, and reports the recording. It starts with every arm active and ends early when one is not.

@@ -1,7 +1,7 @@
 """A trunk IMU: the motion of the trunk -> gyroscope and accelerometer in the IMU's axes, with sensor errors.
 
 The trunk's orientation in the world is Ry(pitch) Rx(roll) (`core.tilt`; heading is irrelevant). The accelerometer
-measures specific force, the acceleration of its own place less gravity: at rest +g upward (REP-145).
+measures specific force, the acceleration of its location less gravity: at rest +g upward (REP-145).
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ class Launcher:
     """The processes of one parameter file.
 
     on_line is called with each line that a node prints. only: shell patterns of the nodes to start; () starts all.
-    more: nodes to start beside those of the file, with their default parameters. Raises ParameterError.
+    more: nodes to start in addition to those of the file, with their default parameters. Raises ParameterError.
     """
 
     def __init__(

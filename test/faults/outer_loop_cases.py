@@ -29,7 +29,7 @@ OTHER_EFFORTS = (0.0, 0.0, 0.0, 0.5)  # Nm
 
 
 class AssistedRig(Rig):
-    """A process of its own assists the arm by `EFFORTS`."""
+    """A separate process assists the arm by `EFFORTS`."""
 
     simulator: ClassVar[Parameters] = UPRIGHT
 

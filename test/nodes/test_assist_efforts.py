@@ -42,7 +42,7 @@ class Rig:
         self.executor.add_node(self.user)
         self._of_node.add_node(self.node)
         self._closing = False
-        # On a thread of its own, so that neither node keeps the other from sending.
+        # On a separate thread, so that neither node keeps the other from sending.
         self._thread = threading.Thread(target=self._spin)
         self._thread.start()
         self.joint_states = self.user.create_publisher(JointState, "joint_states", 1)

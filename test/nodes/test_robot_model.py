@@ -1,4 +1,4 @@
-"""The node `robot_model` beside the real compensators and bridges of both arms, whose joint states the test sends."""
+"""The node `robot_model` with the real compensators and bridges of both arms, whose joint states the test sends."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The panel as a process beside the simulated device, driven by a real browser."""
+"""The panel as a process with the simulated device, driven by a real browser."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The arm on a moving base, against MuJoCo's inverse dynamics of the same arm on a trunk that has joints of its own."""
+"""The arm on a moving base, against MuJoCo's inverse dynamics of the same arm on a trunk that has joints."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ def chromium() -> Iterator[Browser]:
 
 
 def open_page(browser: Browser, url: str, width: int = 1100, height: int = 900) -> Page:
-    """Open the panel in a window of its own, and wait until it shows an arm."""
+    """Open the panel in a new window, and wait until it shows an arm."""
     page = browser.new_context(viewport={"width": width, "height": height}).new_page()
     page.set_default_timeout(PATIENCE)
     page.goto(url)

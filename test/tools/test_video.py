@@ -1,4 +1,4 @@
-"""Clips: what the command line accepts, and the frames of an offline trial, drawn in a process of their own.
+"""Clips: what the command line accepts, and the frames of an offline trial, drawn in a separate process.
 
 MuJoCo chooses how it draws when it is imported, which other tests have done in this process.
 """

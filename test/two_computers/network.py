@@ -3,7 +3,7 @@
     robot eth0 -- veth -- [ forwarder ] -- veth -- eth0 desk
 
 No namespace has another interface, so that nothing leaves this machine. The kernel may lack netem: the forwarder is a
-process of its own (forwarder.py). Without root, a user namespace permits all of this.
+separate process (forwarder.py). Without root, a user namespace permits all of this.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the chips on I2C share: they are set up by registers, and queue their samples in a FIFO of their own.
+"""What the chips on I2C share: they are set up by registers, and queue their samples in a FIFO.
 
 A FIFO that overflows is emptied: its oldest bytes are gone, and with them where a sample begins.
 """

@@ -120,7 +120,7 @@ def baselines(configured: ConfiguredArm) -> Iterator[Baseline]:
 
 
 def _in_use(name: str, law: Law | None, feedback: bool) -> Baseline:
-    """Return the figures of a controller that has no errors of its own."""
+    """Return the figures of a controller without a law, which has no model errors."""
     return Baseline(name, **baseline_burden(law, feedback, 0.0)._asdict())
 
 

@@ -94,7 +94,7 @@ def _efforts(axis: Axes, results: EffortResults, task: str) -> None:
 
 
 def _felt(axis: Axes, results: EffortResults) -> None:
-    """Draw the reflected inertia of each joint under each setting, with its Coulomb friction beside it."""
+    """Draw the reflected inertia of each joint under each setting, and its Coulomb friction."""
     names = [name for name in results.settings if (name, "sweep 1") in results.efforts]
     place = np.arange(len(names))
     for joint, colour in enumerate(JOINT_COLOURS):

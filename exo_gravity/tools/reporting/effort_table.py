@@ -1,4 +1,4 @@
-"""The numbers of `trial effort`: tables on the terminal, CSV files, and what others have measured beside them."""
+"""The numbers of `trial effort`: tables on the terminal, CSV files, and a comparison with what others have measured."""
 
 from __future__ import annotations
 
