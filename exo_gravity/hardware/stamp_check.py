@@ -1,15 +1,19 @@
 """The clock of the stamps: a slow one makes every turn too small; a second publisher halves the time between samples.
 
 A sensor's rate is steady. So after a start the time between two stamps must stay a multiple of what it has been, which
-must be near the given rate. A clock that is a little slow from the start shows in the age of its stamps, by which the
-compensator withdraws.
+must be near the given rate. What it has been is a mean without the times far from the median: a busy computer loses
+samples, or stamps one late, so that the next seems early. A clock that is a little slow from the start shows in the age
+of its stamps, by which the compensator withdraws.
 """
 
 from __future__ import annotations
 
+from statistics import fmean, median
+
 from exo_gravity.core.errors import ParameterError
 
 LEARN_TIME = 0.8  # s; less than the time to settle
+MAX_DEVIATION = 0.5  # share of the median; more is a lost or a late sample
 RATE_BOUNDS = (0.85, 1.18)  # share of the given rate
 AVERAGE_TIME = 0.1  # s
 MAX_CHANGE = 0.03  # share by which the period may change
@@ -28,7 +32,8 @@ class StampCheck:
         self._period = self._given
         self._is_learning = True
         self._share, self._jitter = 1.0, 0.0  # of the periods: mean, and mean deviation from it
-        self._age, self._periods, self._count = 0.0, 0, 0  # s, periods and samples since the start
+        self._age = 0.0  # s since the start
+        self._learned: list[float] = []  # the times between two stamps since the start, s
 
     def check(self, time: float, dt: float) -> None:
         """Check the stamp `time` (s), `dt` s after the last one. Raises ParameterError."""
@@ -39,8 +44,8 @@ class StampCheck:
         self._share += k * (share - self._share)
         if self._is_learning:
             self._age += dt
-            self._periods += periods if dt else 0
-            self._count += dt > 0.0
+            if dt > 0.0:
+                self._learned.append(dt)
             if self._age >= LEARN_TIME:
                 self._learn()
         elif abs(self._share - 1.0) > MAX_CHANGE + JITTER * self._jitter:
@@ -49,9 +54,11 @@ class StampCheck:
 
     def _learn(self) -> None:
         """Take the period from the stamps since the start. Raises ParameterError if it is not the given one."""
-        rate = self._periods / self._age
+        middle = median(self._learned)
+        period = fmean([dt for dt in self._learned if abs(dt - middle) <= MAX_DEVIATION * middle] or [middle])
+        count_rate = len(self._learned) / self._age
         low, high = RATE_BOUNDS
-        if not low <= rate * self._given <= high:
-            expected = f"about the {self._count / self._age:.0f} Hz of the stamps, unless a second IMU publishes"
+        if not low <= self._given / period <= high or count_rate * self._given > high:
+            expected = f"about the {count_rate:.0f} Hz of the stamps, unless a second IMU publishes"
             raise ParameterError("rate", round(1.0 / self._given, 1), expected)
-        self._period, self._share, self._is_learning = 1.0 / rate, 1.0, False
+        self._period, self._share, self._is_learning = period, 1.0, False
