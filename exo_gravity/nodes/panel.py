@@ -63,7 +63,8 @@ class Panel(Node):
         own = {name: values[name] for name in ("language", "dead_man")}
         self._facts = Facts({**own, "trials": list(self._studio.trials)})
         access = Access(values["host"], values["token"], time.monotonic)
-        desk = Desk(self._arms, self._studio, Control(time.monotonic), self._note, values["dead_man"], time.monotonic)
+        control = Control(time.monotonic, values["dead_man"])
+        desk = Desk(self._arms, self._studio, control, self._note, time.monotonic)
         try:
             from exo_gravity.panel.server import PanelServer
         except ModuleNotFoundError as error:

@@ -34,9 +34,14 @@ class Page:
 
 
 class Control:
-    """The pages, and which of them holds control. clock: monotonic s."""
+    """The pages, and which of them holds control.
 
-    def __init__(self, clock: Callable[[], float]) -> None:
+    clock: monotonic s. dead_man: whether the arms are let down when the page that holds control is gone; until they
+    are, only a page that takes control replaces it.
+    """
+
+    def __init__(self, clock: Callable[[], float], dead_man: bool = False) -> None:
+        self.dead_man = dead_man
         self._clock = clock
         self._pages: dict[str, Page] = {}
         self._numbers = 0
@@ -54,7 +59,8 @@ class Control:
     def open(self, secret: str, address: str) -> tuple[str, Page] | None:
         """Return secret and page of a new connection; None if there are too many pages.
 
-        A known secret is the same page, reloaded. A page holds control from the start if no other does.
+        A known secret is the same page, reloaded. A page holds control from the start if no other does, or if the other
+        is gone and there is no `dead_man`.
         """
         self._forget()
         page = self._pages.get(secret)
@@ -64,7 +70,7 @@ class Control:
             secret = secrets.token_urlsafe(24)
             self._numbers += 1
             page = self._pages[secret] = Page(self._numbers, address, self._clock(), credited=self._clock())
-        if self.holder is None or self.is_gone():
+        if self.holder is None or (self.is_gone() and not self.dead_man):
             self._holder = secret
         page.connected, page.seen = True, self._clock()
         return secret, page
@@ -119,6 +125,7 @@ class Control:
         """Drop pages that are long gone, and any that is closed if there are too many."""
         now, full = self._clock(), len(self._pages) >= MAX_PAGES
         for secret, page in list(self._pages.items()):
-            if not page.connected and (full or now - page.seen > FORGOTTEN):
+            awaited = self.dead_man and secret == self._holder  # by Desk.watch
+            if not page.connected and not awaited and (full or now - page.seen > FORGOTTEN):
                 del self._pages[secret]
                 self.release(secret)

@@ -69,7 +69,7 @@ class Outcome(NamedTuple):
 class Desk:
     """Performs requests.
 
-    note: called with a sentence for the log and the recording. dead_man: whether `watch` acts. clock: monotonic s.
+    note: called with a sentence for the log and the recording. clock: monotonic s.
     """
 
     def __init__(
@@ -78,14 +78,12 @@ class Desk:
         files: Files,
         control: Control,
         note: Callable[[str], None],
-        dead_man: bool,
         clock: Callable[[], float],
     ) -> None:
         self.control = control
         self._arms = arms
         self._files = files
         self._note = note
-        self._dead_man = dead_man
         self._clock = clock
         self._attempted = -RETRY  # monotonic s, by `watch`
 
@@ -145,8 +143,12 @@ class Desk:
         return "; ".join(f"{arm}: {problem}" for arm, problem in zip(arms, problems, strict=True) if problem)
 
     async def watch(self) -> None:
-        """Let all arms down if the page that holds control is gone; call it often. Retries until it worked."""
-        if not self._dead_man or not self.control.is_gone() or self._clock() - self._attempted < RETRY:
+        """With `dead_man`, let all arms down if the page that holds control is gone; retry until it worked.
+
+        Call it often.
+        """
+        waits = self._clock() - self._attempted < RETRY
+        if not self.control.dead_man or not self.control.is_gone() or waits:
             return
         self._attempted = self._clock()
         holder = self.control.holder

@@ -75,6 +75,18 @@ def test_a_new_page_holds_control_if_the_operators_page_is_gone(control, clock):
     assert control.holds(opened(control))
 
 
+def test_with_dead_man_the_page_that_holds_control_is_not_forgotten(clock):
+    control = Control(clock, dead_man=True)
+    operator = opened(control)
+    control.close(operator)
+    for _ in range(MAX_PAGES - 1):
+        opened(control)
+    assert control.open("", "127.0.0.1") is None
+    clock.now += FORGOTTEN + 1.0
+    control.open("", "127.0.0.1")
+    assert control.is_gone()
+
+
 def test_a_watching_page_that_is_gone_does_not_count(control, clock):
     operator, _ = opened(control), opened(control)
     clock.now += GONE + 0.1

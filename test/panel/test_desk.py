@@ -20,8 +20,8 @@ class Office:
     def __init__(self, dead_man: bool = False) -> None:
         self.now = 100.0
         self.arms, self.files, self.notes = PlayedArms(), PlayedFiles(), list[str]()
-        self.control = Control(lambda: self.now)
-        self.desk = Desk(self.arms, self.files, self.control, self.notes.append, dead_man, lambda: self.now)
+        self.control = Control(lambda: self.now, dead_man)
+        self.desk = Desk(self.arms, self.files, self.control, self.notes.append, lambda: self.now)
         self.first, self.second = (self.control.open("", f"10.0.0.{n}")[0] for n in (1, 2))
 
     def ask(self, secret: str, **body: object) -> Outcome:
@@ -121,6 +121,24 @@ def test_with_dead_man_the_arms_are_let_down_once_when_the_operators_page_is_gon
     office.now += 10.0
     office.watch()
     assert office.arms.calls == DOWN
+
+
+def test_with_dead_man_a_page_that_opens_meanwhile_does_not_keep_the_arms_up():
+    office = Office(dead_man=True)
+    office.now += GONE + 0.05
+    office.control.open("", "10.0.0.3")
+    office.watch()
+    assert office.arms.calls == DOWN
+
+
+def test_with_dead_man_a_page_that_takes_control_replaces_the_one_that_is_gone():
+    office = Office(dead_man=True)
+    office.now += GONE - 0.1
+    office.control.confirm(office.second)
+    assert office.ask(office.second, do="take").status == 200
+    office.now += 0.2
+    office.watch()
+    assert office.arms.calls == []
 
 
 def test_with_dead_man_letting_down_is_repeated_until_it_works():

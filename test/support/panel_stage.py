@@ -139,8 +139,8 @@ class Stage:
         self.files, self.notes = PlayedFiles(), list[str]()
         self.reports: dict[str, Path] = {}
         self.access = Access(host, token, clock)
-        self.control = Control(clock)
-        desk = Desk(self.arms, self.files, self.control, self.notes.append, dead_man, clock)
+        self.control = Control(clock, dead_man)
+        desk = Desk(self.arms, self.files, self.control, self.notes.append, clock)
         self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}/"
         self.server = PanelServer(host, self.port, self.access, desk, self.reports.get, dict)
