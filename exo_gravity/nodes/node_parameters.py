@@ -20,12 +20,14 @@ TIMEOUT = 5.0  # s after which a request to a node that has died is repeated
 class NodeParameters:
     """The parameters of the node with the full name `name`, in `values` once they are known.
 
+    is_present: whether the node has its parameter services; a node that has died can stay in ROS's list of names.
     on_change: called on the executor's thread when they were read.
     """
 
     def __init__(self, node: Node, name: str, on_change: Callable[[], None]) -> None:
         self.name = name
         self.values: dict[str, Any] = {}
+        self.is_present = False
         self._node = node
         self._on_change = on_change
         self._list = node.create_client(ListParameters, f"{name}/list_parameters")
@@ -38,9 +40,13 @@ class NodeParameters:
 
     def update(self) -> None:
         """Read the parameters if they may have changed and the node answers. Call it on the executor's thread."""
+        self.is_present = self._list.service_is_ready()
+        if not self.is_present:
+            self._is_due = True  # it may return with other values
+            return
         now = time.monotonic()
         is_waiting = now - self._asked < TIMEOUT
-        if (self._is_due or math.isfinite(self._asked)) and not is_waiting and self._list.service_is_ready():
+        if (self._is_due or math.isfinite(self._asked)) and not is_waiting:
             self._is_due, self._asked = False, now
             self._list.call_async(ListParameters.Request()).add_done_callback(self._on_names)
 

@@ -151,7 +151,8 @@ class Panel(Node):
 
     def parameters(self) -> dict[str, dict[str, Any]]:
         """Return the parameters of every node by full name."""
-        return {name: dict(parameters.values) for name, parameters in sorted(self._of_nodes.copy().items())}
+        of_nodes = sorted(self._of_nodes.copy().items())
+        return {name: dict(parameters.values) for name, parameters in of_nodes if parameters.is_present}
 
     def states(self) -> dict[str, str | None]:
         """Return the state of each arm; None if its bridge is silent."""
