@@ -7,6 +7,8 @@ a person perform the script, and reports the recording. It starts with every arm
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import itertools
 import os
 import subprocess
 import sys
@@ -96,7 +98,6 @@ class Studio:
 
     async def save(self) -> str:
         """Write the parameters in force as YAML, from which `launcher` starts."""
-        folder = self._output / f"parameters_{datetime.now():%Y%m%d_%H%M%S}"
         content = {
             node: {"ros__parameters": nested(values)}
             for node, values in self._device.parameters().items()
@@ -106,10 +107,10 @@ class Studio:
             return "no node has been found yet"
         text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
         try:
-            folder.mkdir(parents=True)
+            folder = self._new_folder("parameters")
             (folder / "params.yaml").write_text(text, encoding="utf-8")
         except OSError as error:
-            return f"{folder}: {error.strerror}"
+            return f"{self._output}: {error.strerror}"
         self._saved = str(folder / "params.yaml")
         return ""
 
@@ -180,17 +181,26 @@ class Studio:
         lines = errors.decode(errors="replace").strip().splitlines()
         return "" if process.returncode in (0, 1) and not lines else (lines[-1] if lines else "the report failed")
 
+    def _new_folder(self, name: str) -> Path:
+        """Create and return a folder with a new name. Raises OSError."""
+        stem = f"{name}_{datetime.now():%Y%m%d_%H%M%S}"
+        for number in itertools.count(1):
+            folder = self._output / (stem if number == 1 else f"{stem}_{number}")
+            with contextlib.suppress(FileExistsError):
+                folder.mkdir(parents=True)
+                break
+        return folder
+
     async def _start_recorder(self, name: str) -> str:
         if self._recorder is not None and self._recorder.poll() is None:
             return "a recording is running already"
         if "/recorder" in self._device.parameters():
             return "another recorder is running already"
-        folder = self._output / f"{name}_{datetime.now():%Y%m%d_%H%M%S}"
         try:
-            folder.mkdir(parents=True)
+            folder = self._new_folder(name)
             log = (folder / "recorder.log").open("wb")
         except OSError as error:
-            return f"{folder}: {error.strerror}"
+            return f"{self._output}: {error.strerror}"
         remaps = ("-r", "__node:=recorder", "-r", "__ns:=/", "--enclave", "/recorder")
         command = _python("exo_gravity.nodes.recorder", "--ros-args", *remaps, "-p", f"output:={folder / 'bag'}")
         # It watches its standard input, and ends the recording well if the panel dies.
