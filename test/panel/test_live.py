@@ -19,7 +19,7 @@ from ..support.ros_probe import RosProbe
 
 pytest.importorskip("playwright", reason="no browser driver: install the extra test")
 
-from playwright.sync_api import Page
+from playwright.sync_api import Browser, Page
 
 from ..support.panel_browser import NEEDS_CHROMIUM, chromium, enable, open_page, wait_for_state
 
@@ -46,6 +46,14 @@ def with_panel(nodes: LaunchedNodes, **parameters: Any) -> str:
     return f"http://127.0.0.1:{port}/"
 
 
+def carried_on_page(nodes: LaunchedNodes, probe: RosProbe, browser: Browser, url: str) -> Page:
+    """Return the open page of an arm that is carried."""
+    probe.wait_until(lambda: any("the panel is at" in line for line in nodes.log))
+    page = open_page(browser, url)
+    probe.wait_until_carried()  # last: a browser that starts can stall the simulated device
+    return page
+
+
 def panel_diagnostics(bag: Path) -> list[str]:
     """Return the messages of the panel in a recording."""
     types = get_typestore(Stores.ROS2_JAZZY)
@@ -55,16 +63,16 @@ def panel_diagnostics(bag: Path) -> list[str]:
 
 
 @pytest.fixture
-def clinic(tmp_path: Path) -> Iterator[Clinic]:
-    """The right arm, carried, and the open page."""
+def clinic(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Clinic]:
+    """The right arm, carried, and the open page. Its parameter, if any: the panel's parameters."""
     nodes = LaunchedNodes(tmp_path, compensator={"wearer": {"body_mass": 60.0}, "support": 0.0})
-    url = with_panel(nodes)
+    url = with_panel(nodes, **getattr(request, "param", {}))
     nodes.start()
     probe = RosProbe()
     try:
-        probe.wait_until_carried()
-        with chromium() as browser:
-            yield Clinic(tmp_path, open_page(browser, url), nodes, probe)
+        with chromium(gives_way=True) as browser:
+            page = carried_on_page(nodes, probe, browser, url)
+            yield Clinic(tmp_path, page, nodes, probe)
     finally:
         probe.close()
         nodes.stop()
@@ -119,6 +127,15 @@ def test_killing_the_panel_changes_nothing_about_the_arm(clinic):
     assert not clinic.nodes.have_ended
 
 
+@pytest.mark.parametrize("clinic", [{"dead_man": True}], indirect=True, ids=["dead_man"])
+def test_with_dead_man_closing_the_page_lets_the_arm_down(clinic):
+    wait_for_state(clinic.page, "active")
+    clinic.page.context.close()
+    clinic.probe.wait_until(lambda: clinic.probe.state == "disabled")
+    assert clinic.probe.fault == "none"
+    assert "127.0.0.1 page 1 has been gone for 2 s: let down: done" in clinic.notes()
+
+
 def test_a_trial_is_followed_recorded_and_reported(tmp_path: Path):
     scripts = tmp_path / "scripts"
     scripts.mkdir()
@@ -129,9 +146,8 @@ def test_a_trial_is_followed_recorded_and_reported(tmp_path: Path):
     nodes.start()
     probe = RosProbe()
     try:
-        probe.wait_until_carried()
-        with chromium() as browser:
-            page = open_page(browser, url)
+        with chromium(gives_way=True) as browser:
+            page = carried_on_page(nodes, probe, browser, url)
             wait_for_state(page, "active")
             page.click("#trial-start")
             page.wait_for_selector("#trial-step:has-text('Hands off')")

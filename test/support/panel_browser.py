@@ -6,8 +6,10 @@ Debian's chromium is used, because Playwright's own browsers come from elsewhere
 from __future__ import annotations
 
 import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
@@ -20,10 +22,17 @@ PATIENCE = 60_000.0  # ms; a busy machine draws slowly
 
 
 @contextmanager
-def chromium() -> Iterator[Browser]:
-    """Run the browser."""
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS, timeout=PATIENCE)
+def chromium(gives_way: bool = False) -> Iterator[Browser]:
+    """Run the browser.
+
+    gives_way: whether it only uses the processor time that others leave. Drawing without a graphics card can stall the
+    simulated device on two processors. A nice value does not help: as root, Chromium gives itself higher priorities.
+    """
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
+        program = Path(folder, "chromium")
+        program.write_text(f'#!/bin/sh\nexec {"chrt --idle 0 " if gives_way else ""}{CHROMIUM} "$@"\n')
+        program.chmod(0o755)
+        browser = playwright.chromium.launch(executable_path=program, args=FLAGS, timeout=PATIENCE)
         yield browser
         browser.close()
 
