@@ -2,6 +2,7 @@
 
     python -m bench.panel press [N]     N presses of the space bar in a real browser, 50 by default, about 5 s each
     python -m bench.panel load          both arms at 250 Hz, 40 s without the panel and 40 s with an open page
+    python -m bench.panel memory [N]    both arms at 100 Hz and an open page for N minutes, 60 by default
 
 `press` takes the time from the call that sends the key to the browser until the first CAN frame that fades: it has
 damping, which an active arm never has. Needs chromium, and the extras panel, sim, imu and test.
@@ -18,6 +19,7 @@ from pathlib import Path
 import yaml
 
 from exo_gravity.core.motors import MOTORS, SPECIAL_FRAMES, unpack_command
+from test.faults.soak import resident
 from test.support.bus_listener import CAN_IDS, BusListener, Frame
 from test.support.launched_nodes import LaunchedNodes
 from test.support.panel_browser import chromium, enable, open_page, wait_for_state
@@ -34,6 +36,8 @@ TIMING = {
 PHASE = 40.0  # s
 LONGEST = 0.15  # s, p99 from press to fading torque
 LARGEST_SHARE = 0.15  # of a core
+WARM_UP = 5  # min until memory counts: caches and plots fill
+MAX_GROWTH = 5.0  # MB, of the node and of the tab, from then until the end
 
 
 def with_panel(nodes: LaunchedNodes) -> str:
@@ -141,11 +145,41 @@ def _cycles(probe: RosProbe) -> tuple[int, int]:
     return counts()[0] - before[0], counts()[1] - before[1]
 
 
+def memory(minutes: int) -> int:
+    """Measure the memory of the node and of an open page, once a minute."""
+    seen: list[tuple[float, float]] = []  # MB
+    with tempfile.TemporaryDirectory() as folder, chromium(gives_way=True) as browser:
+        nodes = LaunchedNodes(Path(folder), base="sim_both.yaml")
+        url = with_panel(nodes)
+        nodes.start()
+        probe = RosProbe()
+        try:
+            probe.wait_until(lambda: any("the panel is at" in line for line in nodes.log))
+            page = open_page(browser, url)
+            page.locator("#plots").scroll_into_view_if_needed()
+            tab = page.context.new_cdp_session(page)
+            for minute in range(minutes + 1):
+                page.wait_for_timeout(60_000.0 if minute else 0.0)
+                tab.send("HeapProfiler.collectGarbage")
+                heap = tab.send("Runtime.getHeapUsage")["usedSize"] / 1e6
+                seen.append((resident(nodes.pid("/panel")), heap))
+                print(f"{minute} min: node {seen[-1][0]:.1f} MB, tab {heap:.1f} MB", flush=True)
+        finally:
+            probe.close()
+            nodes.stop()
+    late = seen[WARM_UP:] or seen
+    growth = [last - first for first, last in zip(late[0], late[-1], strict=True)]
+    print(f"growth after the first {WARM_UP} min: node {growth[0]:.1f} MB, tab {growth[1]:.1f} MB")
+    return int(max(growth) > MAX_GROWTH)
+
+
 if __name__ == "__main__":
     what = sys.argv[1] if len(sys.argv) > 1 else ""
     if what == "press":
         raise SystemExit(press(int(sys.argv[2]) if len(sys.argv) > 2 else 50))
     if what == "load":
         raise SystemExit(load())
+    if what == "memory":
+        raise SystemExit(memory(int(sys.argv[2]) if len(sys.argv) > 2 else 60))
     print(__doc__)
     raise SystemExit(2)

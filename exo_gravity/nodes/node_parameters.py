@@ -40,7 +40,7 @@ class NodeParameters:
 
     def update(self) -> None:
         """Read the parameters if they may have changed and the node answers. Call it on the executor's thread."""
-        self.is_present = self._list.service_is_ready()
+        self.is_present = self._list.service_is_ready() and self._get.service_is_ready()
         if not self.is_present:
             self._is_due = True  # it may return with other values
             return

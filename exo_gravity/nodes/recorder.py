@@ -11,28 +11,26 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from rcl_interfaces.msg import ParameterEvent
-from rcl_interfaces.srv import GetParameters, ListParameters
-from rclpy.client import Client
 from rclpy.node import Node
-from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
-from rclpy.task import Future
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
 from exo_gravity.bag.topics import ASSIST, LOSSES, PARAMETERS, STATES, leaf
 from exo_gravity.bag.writer import BagWriter, offered_qos
 from exo_gravity.core.control_params import RECORDER
-from exo_gravity.nodes.declare import declare, plain
+from exo_gravity.nodes.declare import declare
 from exo_gravity.nodes.drain import Drain
 from exo_gravity.nodes.live_line import ARM_TOPICS, LiveLine
+from exo_gravity.nodes.node_parameters import NodeParameters
 from exo_gravity.nodes.run import run
 
 SHARED_TOPICS = {
@@ -46,7 +44,7 @@ OF_ARMS = {**ARM_TOPICS, ASSIST: JointState}
 REPEATER = "robot_model"  # its joint states are those of the arms once more
 DRAIN_PERIOD = 0.05  # s between two writes of what has arrived
 DISCOVERY_PERIOD = 0.5  # s between two searches for new topics and nodes
-LIVE_PERIOD = 0.1  # s between two lines of live state
+LIVE_PERIOD = 0.1  # s between two lines of live state, and two looks for the answers of new nodes
 DEPTH = 1000  # queued messages per topic: two seconds at 500 Hz
 LOSS_REPORT_PERIOD = 5.0  # s between two warnings of lost messages
 # After the launcher's death a bridge lets its arm down: this is recorded while joint states arrive.
@@ -67,10 +65,12 @@ class Recorder(Node):
         self._last_states, self._orphaned = -math.inf, math.inf  # monotonic s
         self._reported = (0, 0)  # lost messages
         self._drains: list[Drain] = []
-        self._snapshots: set[str] = set()
+        self._nodes: set[str] = set()
+        self._unwritten: dict[str, NodeParameters] = {}  # of nodes whose parameters are not in the recording yet
         self._live = LiveLine() if values["live"] else None
         self.create_timer(DRAIN_PERIOD, self._drain)
         self.create_timer(DISCOVERY_PERIOD, self._discover)
+        self.create_timer(LIVE_PERIOD, self._request_parameters)
         if self._live:
             self.create_timer(LIVE_PERIOD, self._print_live_line)
         self.create_timer(LOSS_REPORT_PERIOD, self._report_losses)
@@ -116,7 +116,7 @@ class Recorder(Node):
         self.failure = self._writer.error
 
     def _discover(self) -> None:
-        """Subscribe to new topics, and request the parameters of new nodes."""
+        """Subscribe to new topics, and note new nodes."""
         known = {drain.topic for drain in self._drains}
         for topic, types in self.get_topic_names_and_types():
             msgtype = SHARED_TOPICS.get(topic) or OF_ARMS.get(leaf(topic))
@@ -124,9 +124,14 @@ class Recorder(Node):
                 self._guarded(topic, self._subscribe, topic, msgtype)
         for name, namespace in self.get_node_names_and_namespaces():
             node = f"{namespace.rstrip('/')}/{name}"
-            if node not in self._snapshots and node != self.get_fully_qualified_name() and not name.startswith("_"):
-                self._snapshots.add(node)
-                self._guarded(node, Snapshot, self, node)
+            if node not in self._nodes and node != self.get_fully_qualified_name() and not name.startswith("_"):
+                self._nodes.add(node)
+                on_change = partial(self._guarded, node, self._write_parameters, node)
+                self._unwritten[node] = NodeParameters(self, node, on_change)
+
+    def _request_parameters(self) -> None:
+        for node, parameters in list(self._unwritten.items()):
+            self._guarded(node, parameters.update)
 
     def _guarded(self, name: str, function: Callable[..., Any], *args: Any) -> Any:
         """Return the function's result; None after an exception, which is logged once for each `name`."""
@@ -171,51 +176,17 @@ class Recorder(Node):
         # Other topics have several publishers, each with its own numbers.
         self._drains.append(Drain(self, msgtype, topic, qos, counts_lost=msgtype in (JointState, Imu, Vector3Stamped)))
 
-    def write_parameters(self, node: str, values: dict[str, Any]) -> None:
-        """Write the parameters of a node."""
+    def _write_parameters(self, node: str) -> None:
+        parameters = self._unwritten.pop(node)
+        # ROS's parameter files have no empty lists.
+        values = {name: value for name, value in parameters.values.items() if value != []}
         text = yaml.safe_dump({node: {"ros__parameters": values}}, default_flow_style=None, width=120)
         self._write_text(PARAMETERS, text)
+        parameters.destroy()
 
     def _write_text(self, topic: str, text: str) -> None:
         now = self.get_clock().now().nanoseconds
         self._writer.write([(topic, now, serialize_message(String(data=text)))])
-
-    def on_snapshot(self, node: str, future: Future, function: Callable[[Any], None]) -> None:
-        """Pass the response of a node's parameter service to `function`."""
-        self._guarded(f"parameters of {node}", lambda: function(future.result()))
-
-
-class Snapshot:
-    """Requests all parameters of one node, by the services that `ros2 param dump` uses."""
-
-    def __init__(self, recorder: Recorder, node: str) -> None:
-        self._recorder = recorder
-        self._node = node
-        self._names: list[str] = []
-        self._list = recorder.create_client(ListParameters, f"{node}/list_parameters")
-        self._get = recorder.create_client(GetParameters, f"{node}/get_parameters")
-        self._timer = recorder.create_timer(LIVE_PERIOD, self._request)
-
-    def _request(self) -> None:
-        if self._list.service_is_ready() and self._get.service_is_ready():
-            self._recorder.destroy_timer(self._timer)
-            self._call(self._list, ListParameters.Request(), self._on_names)
-
-    def _call(self, client: Client, request: Any, on_response: Callable[[Any], None]) -> None:
-        future = client.call_async(request)
-        future.add_done_callback(lambda done: self._recorder.on_snapshot(self._node, done, on_response))
-
-    def _on_names(self, response: ListParameters.Response) -> None:
-        self._names = list(response.result.names)
-        self._call(self._get, GetParameters.Request(names=self._names), self._on_values)
-
-    def _on_values(self, response: GetParameters.Response) -> None:
-        values = (plain(parameter_value_to_python(value)) for value in response.values)
-        # ROS's parameter files have neither empty lists nor unset values.
-        given = {name: value for name, value in zip(self._names, values, strict=True) if value not in (None, [])}
-        self._recorder.write_parameters(self._node, given)
-        for client in (self._list, self._get):
-            self._recorder.destroy_client(client)
 
 
 def type_name(msgtype: type) -> str:
