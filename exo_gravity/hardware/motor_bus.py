@@ -155,14 +155,14 @@ class MotorBus:
         """
         for _ in range(2):
             self._is_confirming = True
-            for motor in self._motors:
-                for frame in ((motor.command_id, motor.command(0.0, 0.0)), *motor.exit):
+            for joint, motor in enumerate(self._motors):
+                for frame in (*self._zero_command(joint), *motor.exit):
                     try:
                         self._send(frame)
                     except BusError:
                         self.ignored["unsent"] += 1
-            self._powered = False
-            end = time.monotonic() + LAST_REPLIES
+            self._powered, self._exit_sent = False, time.monotonic()
+            end = self._exit_sent + LAST_REPLIES
             with contextlib.suppress(BusError):
                 self.receive_until(end, lambda: not self._unconfirmed)
         if not self._unconfirmed:
@@ -184,9 +184,18 @@ class MotorBus:
     def _switch_off(self) -> None:
         period = UNCONFIRMED_EXIT_PERIOD if self._unconfirmed else EXIT_PERIOD
         if self._powered or time.monotonic() - self._exit_sent > period:
-            self._send_each([motor.exit for motor in self._motors])
+            for joint, motor in enumerate(self._motors):
+                unasked = () if joint in self._asked else self._zero_command(joint)
+                self._send_each([(*unasked, *motor.exit)])
             self._exit_sent = time.monotonic()
         self._powered = False
+
+    def _zero_command(self, joint: int) -> tuple[Frame, ...]:
+        """Return a command without torque and gains; none for a V3 board that is off, which it would switch on."""
+        if joint not in self._asked and joint not in self._unconfirmed and self._exit_sent > -math.inf:
+            return ()
+        motor = self._motors[joint]
+        return ((motor.command_id, motor.command(0.0, 0.0)),)
 
     def _send_commands(self, drive: Drive) -> None:
         for joint, motor in enumerate(self._motors):

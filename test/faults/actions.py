@@ -1,4 +1,4 @@
-"""How faults are caused: signals to processes, faults of the simulated device, foreign messages and frames."""
+"""How faults are caused: signals to processes, faults of the simulated device, and foreign messages."""
 
 from __future__ import annotations
 
@@ -8,27 +8,21 @@ import resource
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import can
 import yaml
 from geometry_msgs.msg import Vector3Stamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from sensor_msgs.msg import Imu, JointState
 
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.motors import MOTORS
-
 from ..support.launched_nodes import executable
-from ..support.load import start_frames, start_spin
+from ..support.load import start_spin
 from .fault_case import Action
 from .rig import Rig
 
-FRAME_RATE = 3000  # random frames per second beside our 2,000: what two cores can receive in five Python processes
-MOTOR_2 = JointMotor(MOTORS["AK80-9"], 2, direction=-1)  # as in sim.yaml
 START_LIMIT = 15.0  # s for a process that must refuse its parameters
 FILE_SIZE_LIMIT = 50_000  # bytes
 
@@ -146,30 +140,6 @@ def trunk_imu(x: float, w: float) -> Callable[[Rig], Imu]:
         return message
 
     return make
-
-
-def random_frames(count: int, ids: Iterable[int]) -> Action:
-    def inject(rig: Rig) -> None:
-        sender = start_frames(rig.nodes[0].bus, count, FRAME_RATE, ids)
-        rig.probe.wait_until(lambda: sender.poll() is not None, 2 * count / FRAME_RATE + 30.0)
-        assert sender.returncode == 0
-
-    return inject
-
-
-def foreign_frames(data: bytes, rate: float = 1.0, seconds: float = 0.0) -> Action:
-    """Send `data` to motor 2 as another host would: once, or `rate` a second for `seconds` s."""
-
-    def inject(rig: Rig) -> float:
-        message = can.Message(arbitration_id=MOTOR_2.can_id, data=data, is_extended_id=False)
-        with can.Bus(**rig.nodes[0].bus) as bus:
-            wall, start = time.time(), time.monotonic()
-            for number in range(1 + int(rate * seconds)):
-                time.sleep(max(0.0, start + number / rate - time.monotonic()))
-                bus.send(message)
-        return wall
-
-    return inject
 
 
 def overload_processors(rig: Rig) -> None:

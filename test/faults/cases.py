@@ -13,17 +13,14 @@ from sensor_msgs.msg import Imu, JointState
 from exo_gravity.core.motors import EXIT, SET_ZERO
 
 from .actions import (
-    MOTOR_2,
     deactivate,
     enable,
-    foreign_frames,
     has_refused,
     in_turn,
     kill_bridge_beside_frozen_watchdog,
     overload_processors,
     pause,
     publish,
-    random_frames,
     raw_imu,
     record_on_a_full_disk,
     send_signal,
@@ -38,7 +35,22 @@ from .actions import (
     trunk_imu,
 )
 from .command_cases import CLOCK, EFFORT_COMMANDS
+from .device_faults import (
+    CONNECT,
+    CUT_OFF,
+    END_SILENCE,
+    ERROR,
+    J2,
+    JUMP,
+    NO_ERROR,
+    NO_JUMP,
+    RESTART,
+    RESTARTED,
+    SHORT_RESTART,
+    SILENCE,
+)
 from .fault_case import ALL_JOINTS, PROCESS_REACTION, FaultCase
+from .frames import MOTOR_2, foreign_frames, random_frames
 from .outer_loop_cases import OUTER_LOOP
 from .rig import Rig
 from .rigs import (
@@ -54,10 +66,10 @@ from .rigs import (
     WallRig,
     WearerRig,
 )
+from .v3_cases import V3_BOARDS
 
 STATES, EFFORTS, TILT, RAW_IMU = "/right/joint_states", "/right/effort_commands", "/imu/pitch_yaw", "/imu/data_raw"
 TRUNK_IMU = "/imu/data"
-MOTOR_TURN = 0.698  # rad of joint 2 for one turn of its rotor
 RECOVERY = 6.0  # s in which the launcher brings down an arm that has lost its bridge and its watchdog
 HELD = ("active",)
 OFF = ("disabled", "stopped", "inactive")
@@ -68,16 +80,6 @@ KILL, STOP, CONTINUE, TERMINATE, INTERRUPT = (
     signal.SIGTERM,
     signal.SIGINT,
 )
-J2 = [False, True, False, False]
-NONE = [False] * 4
-CUT_OFF, CONNECT = simulator(fault__cut_off=J2), simulator(fault__cut_off=NONE)
-# The device counts the time from the moment at which the motor loses its power.
-RESTART = simulator(fault__unplugged_time=0.03, fault__unplugged=J2)
-SHORT_RESTART = simulator(fault__unplugged_time=0.015, fault__unplugged=J2)
-RESTARTED = simulator(fault__unplugged_time=0.0, fault__unplugged=NONE)
-SILENCE, END_SILENCE = simulator(fault__bus_silent=True), simulator(fault__bus_silent=False)
-ERROR, NO_ERROR = simulator(fault__error=[0, 5, 0, 0]), simulator(fault__error=[0] * 4)
-JUMP, NO_JUMP = (simulator(fault__encoder_error=[0.0, error, 0.0, 0.0]) for error in (MOTOR_TURN, 0.0))
 
 
 def refused_on_the_wrong_angle(rig: Rig) -> None:
@@ -238,4 +240,4 @@ ARMS = (
         PROCESS_REACTION),
 )
 # fmt: on
-CASES = (*HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *OUTER_LOOP, *CLOCK, *ARMS)
+CASES = (*HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *OUTER_LOOP, *CLOCK, *ARMS, *V3_BOARDS)

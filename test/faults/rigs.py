@@ -170,6 +170,13 @@ class BowRig(Rig):
     pose = (0.0, 0.4, 1.0, 1.8)
 
 
+class V3Rig(Rig):
+    """The motors have V3 boards."""
+
+    bridge: ClassVar[Parameters] = {"wire_format": ["mit_v3"] * 4}
+    simulator = bridge
+
+
 class WallRig(Rig):
     """The elbow's upper limit is within reach of a push, and far from the mechanical stop."""
 

@@ -32,9 +32,11 @@ from exo_gravity.core.motors import EXIT
 
 from ..support import CONFIG
 from ..support.launched_nodes import LaunchedNodes, Parameters
-from .actions import enable, foreign_frames, in_turn, pause, publish, send_signal, states_at, tilt
-from .cases import CONTINUE, EFFORTS, END_SILENCE, ERROR, NO_ERROR, SILENCE, STATES, STOP, TILT
+from .actions import enable, in_turn, pause, publish, send_signal, states_at, tilt
+from .cases import CONTINUE, EFFORTS, STATES, STOP, TILT
+from .device_faults import END_SILENCE, ERROR, NO_ERROR, SILENCE
 from .fault_case import ALL_JOINTS, PROCESS_REACTION, FaultCase
+from .frames import foreign_frames
 from .rigs import BothArmsRig, WearerRig
 from .runner import Result, RigPool
 

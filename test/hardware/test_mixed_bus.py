@@ -80,7 +80,7 @@ def sent(bus: can.BusABC) -> list[tuple[int, bytes]]:
 
 
 @pytest.mark.parametrize("formats", [MIXED, V3], ids=["mixed", "v3"])
-def test_every_motor_is_read_and_while_off_a_v3_board_is_sent_only_its_exit(wires, start, formats) -> None:
+def test_every_motor_is_read_and_a_v3_board_that_is_off_is_sent_nothing_but_its_exit(wires, start, formats) -> None:
     start(formats)
     bus = MotorBus(wires[0], joints_of(formats))
     bus.listen()
@@ -90,11 +90,16 @@ def test_every_motor_is_read_and_while_off_a_v3_board_is_sent_only_its_exit(wire
     for sample, angle in zip(bus.samples, (0.1, 0.2, 0.3, 0.4), strict=True):
         assert sample.position == pytest.approx(angle, abs=0.01)
         assert (sample.temperature, sample.error) == (30, 0)
-    frames = [frame for frame in sent(wires[2]) if frame[0] >= EXTENDED]
-    exits = {joint.can_id: list(joint.exit) for joint in joints_of(formats) if joint.wire_format is MIT_V3}
-    for can_id, exit_frames in exits.items():
-        received = [frame for frame in frames if frame[0] & 0xFF == can_id]
-        assert received == exit_frames * (len(received) // len(exit_frames)) != []
+    frames, boards = sent(wires[2]), [joint for joint in joints_of(formats) if joint.wire_format is MIT_V3]
+    end = in_1_s()
+    while time.monotonic() < end and not all(frames.count(*joint.exit) > 1 for joint in boards):
+        bus.exchange(OFF, in_1_s())
+        frames += sent(wires[2])
+    for joint in boards:  # a command would switch it on
+        first, *later = [frame for frame in frames if frame[0] >= EXTENDED and frame[0] & 0xFF == joint.can_id]
+        assert first == (joint.command_id, joint.command(0.0, 0.0))
+        assert later == list(joint.exit) * len(later)
+        assert len(later) > 1
     assert not bus.ignored
 
 

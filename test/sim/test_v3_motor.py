@@ -17,7 +17,7 @@ from ..support.simulated_device import make_device
 
 SPEC = MIT_V3.ranged(MOTORS["AK60-6"])
 JOINT = JointMotor(SPEC, 3, direction=-1, zero=0.2, torque_scale=0.8, wire_format=MIT_V3)
-COMMAND_ID, CURRENT_ID = (frame_id for frame_id, _ in JOINT.exit)
+COMMAND_ID, CURRENT_ID = JOINT.command_id, JOINT.exit[0][0]
 
 
 def reported(motor: SimulatedV3Motor, position: float = 0.5, velocity: float = 0.0):
@@ -37,7 +37,7 @@ def test_the_first_command_switches_it_on_and_its_status_shows_angle_speed_and_t
     assert (reply.temperature, reply.error) == (30, 0)
 
 
-def test_its_exit_frames_switch_it_off_and_a_current_drives_it():
+def test_its_exit_frame_switches_it_off_and_a_current_drives_it():
     motor = SimulatedV3Motor(JOINT)
     motor.receive(JOINT.command(1.5, 5.0), 0.5, 0.0, 0.0, COMMAND_ID)
     for frame_id, data in JOINT.exit:

@@ -10,8 +10,8 @@ ID, big-endian integers:
     position 0.1 deg 16 | speed 10 electrical rpm 16 | current 0.01 A 16 | board temperature degC 8 | error 8
 
 Speed and current are the motor's: pole pairs and gear ratio lead to the output's speed, `torque_per_ampere` to its
-torque. No frame switches a motor on: its first command does. To switch it off it gets a command without gains and
-torque, whose torque is only nearly 0, and then the current 0 A (control mode 1), which is exactly 0.
+torque. No frame switches a motor on: its first command does. The current 0 A (control mode 1) switches it off. A
+command without gains and torque comes before it (`MotorBus`), but is not enough: no 12-bit code is exactly 0 Nm.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from exo_gravity.core.wire_formats.wire_format import COMMAND, EXTENDED, ID_BITS
 MODE_CURRENT, MODE_MIT, LAST_MODE = 1, 8, 15
 STATUS = 0x29
 NO_CURRENT = bytes(4)  # int32, mA
-NOTHING = bytes.fromhex("000000 8000 800800")  # no gains; the codes nearest to 0 rad, 0 rad/s and 0 Nm
 
 POSITION_RANGE = 12.56  # rad
 RANGES = {"AK60-6": (60.0, 12.0), "AK80-9": (65.0, 18.0)}  # rad/s, Nm
@@ -106,8 +105,8 @@ class MitV3:
         return ()
 
     def exit(self, motor_id: int) -> tuple[Frame, ...]:
-        """Return a command without gains and torque, and the current 0 A."""
-        return (self.command_id(motor_id), NOTHING), (EXTENDED | MODE_CURRENT << 8 | motor_id, NO_CURRENT)
+        """Return the current 0 A."""
+        return ((EXTENDED | MODE_CURRENT << 8 | motor_id, NO_CURRENT),)
 
     def set_zero(self, motor_id: int) -> tuple[Frame, ...]:
         """Return no frame."""
