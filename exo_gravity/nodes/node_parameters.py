@@ -33,6 +33,7 @@ class NodeParameters:
         self._list = node.create_client(ListParameters, f"{name}/list_parameters")
         self._get = node.create_client(GetParameters, f"{name}/get_parameters")
         self._is_due, self._asked = True, -math.inf  # asked: monotonic s of a request without an answer yet
+        self._is_destroyed = False
 
     def refresh(self) -> None:
         """Read the parameters again, at the next `update`."""
@@ -51,16 +52,21 @@ class NodeParameters:
             self._list.call_async(ListParameters.Request()).add_done_callback(self._on_names)
 
     def destroy(self) -> None:
-        """Remove the clients."""
+        """Remove the clients; answers that are still on their way are ignored."""
+        self._is_destroyed = True
         self._node.destroy_client(self._list)
         self._node.destroy_client(self._get)
 
     def _on_names(self, future: Future) -> None:
+        if self._is_destroyed:
+            return
         names = list(future.result().result.names)
         asked = self._get.call_async(GetParameters.Request(names=names))
         asked.add_done_callback(lambda done: self._on_values(names, done))
 
     def _on_values(self, names: list[str], future: Future) -> None:
+        if self._is_destroyed:
+            return
         self._asked = -math.inf
         values = map(parameter_value_to_python, future.result().values)
         self.values = {name: plain(value) for name, value in zip(names, values, strict=False) if value is not None}

@@ -126,8 +126,11 @@ class Recorder(Node):
             node = f"{namespace.rstrip('/')}/{name}"
             if node not in self._nodes and node != self.get_fully_qualified_name() and not name.startswith("_"):
                 self._nodes.add(node)
-                on_change = partial(self._guarded, node, self._write_parameters, node)
-                self._unwritten[node] = NodeParameters(self, node, on_change)
+                self._guarded(node, self._add_node, node)
+
+    def _add_node(self, node: str) -> None:
+        write = partial(self._guarded, node, self._write_parameters, node)
+        self._unwritten[node] = NodeParameters(self, node, write)
 
     def _request_parameters(self) -> None:
         for node, parameters in list(self._unwritten.items()):

@@ -20,7 +20,7 @@ from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedM
 from ..support.ports import own_ports
 
 MOTORS_OF_ARM = tuple(JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1))
-LIMITS = Limits(("a", "b", "c", "d"), (-1.6,) * 4, (3.1,) * 4, (6.0,) * 4, (3.0, 9.0, 3.0, 3.0), fade_time=0.5)
+LIMITS = Limits(("a", "b", "c", "d"), (-1.6,) * 4, (3.1,) * 4, (6.0,) * 4, (3.0, 9.0, 3.0, 3.0))
 PERIOD = 0.004
 POSE = (0.0, 0.6, 0.3, 0.3)
 SAFE_SPEED = 1.0  # rad/s

@@ -5,6 +5,7 @@ import time
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 
+from exo_gravity.nodes import node_parameters
 from exo_gravity.nodes.node_parameters import NodeParameters
 
 
@@ -37,3 +38,27 @@ def test_a_name_without_services_is_not_present(node):
     parameters.update()
     assert not parameters.is_present
     ghost.destroy_node()
+
+
+def test_answers_after_the_first_are_ignored_once_it_is_destroyed(node, monkeypatch):
+    monkeypatch.setattr(node_parameters, "TIMEOUT", 0.0)  # every update asks again
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    other = rclpy.create_node("other", namespace="/right", context=node.context)
+    parameters = NodeParameters(node, "/right/other", lambda: parameters.destroy())
+    deadline = time.monotonic() + 30.0
+    while not parameters.is_present:
+        assert time.monotonic() < deadline
+        parameters.update()
+        time.sleep(0.01)
+    for _ in range(5):
+        parameters.update()
+    executor.add_node(other)  # which answers all requests now
+    while not parameters.values:
+        assert time.monotonic() < deadline
+        executor.spin_once(timeout_sec=0.05)
+    for _ in range(50):
+        executor.spin_once(timeout_sec=0.01)
+    assert "use_sim_time" in parameters.values
+    executor.shutdown()
+    other.destroy_node()
