@@ -2,7 +2,7 @@
 
     python -m bench.panel press [N]     N presses of the space bar in a real browser, 50 by default, about 5 s each
     python -m bench.panel load          both arms at 250 Hz, 40 s without the panel and 40 s with an open page
-    python -m bench.panel memory [N]    both arms at 100 Hz and an open page for N minutes, 60 by default
+    python -m bench.panel memory [N]    both arms at 50 Hz and an open page for N minutes, 60 by default
 
 `press` takes the time from the call that sends the key to the browser until the first CAN frame that fades: it has
 damping, which an active arm never has. Needs chromium, and the extras panel, sim, imu and test.
@@ -33,6 +33,7 @@ TIMING = {
     "can_bridge": {"rate": 250.0, "command_timeout": 0.1, "reply_timeout": 0.1},
     "compensator": {"tilt_timeout": 0.5},
 }
+SLOW = {**TIMING, "can_bridge": {**TIMING["can_bridge"], "rate": 50.0}}
 PHASE = 40.0  # s
 LONGEST = 0.15  # s, p99 from press to fading torque
 LARGEST_SHARE = 0.15  # of a core
@@ -149,7 +150,7 @@ def memory(minutes: int) -> int:
     """Measure the memory of the node and of an open page, once a minute."""
     seen: list[tuple[float, float]] = []  # MB
     with tempfile.TemporaryDirectory() as folder, chromium(gives_way=True) as browser:
-        nodes = LaunchedNodes(Path(folder), base="sim_both.yaml")
+        nodes = LaunchedNodes(Path(folder), base="sim_both.yaml", timing=SLOW)
         url = with_panel(nodes)
         nodes.start()
         probe = RosProbe()
