@@ -32,8 +32,8 @@ from exo_gravity.panel.access import Access, is_loopback
 from exo_gravity.panel.control import Control
 from exo_gravity.panel.desk import Desk
 from exo_gravity.panel.facts import Facts
-from exo_gravity.panel.params import PANEL
-from exo_gravity.panel.studio import Studio, scripts_folder
+from exo_gravity.panel.params import PANEL, scripts_folder
+from exo_gravity.panel.studio import Studio
 from exo_gravity.panel.view import SILENT
 
 STATE_PERIOD = 0.1  # s between two states that the pages get

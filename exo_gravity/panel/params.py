@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import sys
+from pathlib import Path
+
 from exo_gravity.core.control_params import COMPENSATOR
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.param_table import Param
 
 LANGUAGES = ("en", "de")
@@ -24,3 +29,17 @@ SETTABLE = {
     for param in COMPENSATOR
     if param.name in ("support", "mode", "wearer.body_mass", "wearer.sex", "wearer.segment_length")
 }
+
+
+def scripts_folder(given: str) -> Path | None:
+    """Return the folder of trial scripts: `given`, or that of the package in a checkout, an environment or a workspace.
+
+    Raises ParameterError if `given` is not a folder.
+    """
+    if given:
+        if not Path(given).is_dir():
+            raise ParameterError("trials", given, "a folder")
+        return Path(given)
+    shares = [Path(p, "share/exo_gravity") for p in os.environ.get("AMENT_PREFIX_PATH", "").split(":") if p]
+    roots = (Path(__file__).parents[2], *shares, Path(sys.prefix, "share/exo_gravity"))
+    return next((folder for root in roots if (folder := root / "config" / "trials").is_dir()), None)

@@ -226,20 +226,6 @@ class Studio:
         return "" if code == 0 else f"the recorder ended with exit code {code}: see {self._folder}/recorder.log"
 
 
-def scripts_folder(given: str) -> Path | None:
-    """Return the folder of trial scripts: `given`, or that of the package in a checkout, an environment or a workspace.
-
-    Raises ParameterError if `given` is not a folder.
-    """
-    if given:
-        if not Path(given).is_dir():
-            raise ParameterError("trials", given, "a folder")
-        return Path(given)
-    shares = [Path(p, "share/exo_gravity") for p in os.environ.get("AMENT_PREFIX_PATH", "").split(":") if p]
-    roots = (Path(__file__).parents[2], *shares, Path(sys.prefix, "share/exo_gravity"))
-    return next((folder for root in roots if (folder := root / "config" / "trials").is_dir()), None)
-
-
 def nested(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return dotted names as the nested mappings of a parameter file, without empty lists, which ROS cannot read."""
     content: dict[str, Any] = {}
