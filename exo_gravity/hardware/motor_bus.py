@@ -185,8 +185,8 @@ class MotorBus:
         period = UNCONFIRMED_EXIT_PERIOD if self._unconfirmed else EXIT_PERIOD
         if self._powered or time.monotonic() - self._exit_sent > period:
             for joint, motor in enumerate(self._motors):
-                unasked = () if joint in self._asked else self._zero_command(joint)
-                self._send_each([(*unasked, *motor.exit)])
+                zero = () if joint in self._asked else self._zero_command(joint)
+                self._send_each((zero, motor.exit))
             self._exit_sent = time.monotonic()
         self._powered = False
 
@@ -194,8 +194,7 @@ class MotorBus:
         """Return a command without torque and gains; none for a V3 board that is off, which it would switch on."""
         if joint not in self._asked and joint not in self._unconfirmed and self._exit_sent > -math.inf:
             return ()
-        motor = self._motors[joint]
-        return ((motor.command_id, motor.command(0.0, 0.0)),)
+        return ((self._ids[joint], self._motors[joint].command(0.0, 0.0)),)
 
     def _send_commands(self, drive: Drive) -> None:
         for joint, motor in enumerate(self._motors):
