@@ -51,7 +51,7 @@ def with_panel(nodes: LaunchedNodes) -> str:
 
 
 def first_fading(frames: list[Frame], since: float) -> float:
-    """Return the time of the first frame with damping. Raises ValueError if there is none after `since`."""
+    """Return the time of the first frame with damping. Raises ValueError unless it comes after `since`."""
     for frame in frames:
         is_ours = frame.can_id in CAN_IDS and frame.data[0] in COMMANDS  # a reply carries the motor's ID as well
         if not is_ours or frame.data in SPECIAL_FRAMES:

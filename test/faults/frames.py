@@ -15,7 +15,7 @@ from ..support.load import start_frames
 from .fault_case import Action
 from .rig import Rig
 
-RATE = 3000  # random frames per second besides our 2,000: what two cores can receive in five Python processes
+RATE = 3000  # random frames per second; with our own 2,000, as many as five Python processes on two cores receive
 MOTOR_2 = JointMotor(MOTORS["AK80-9"], 2, direction=-1)  # as in sim.yaml
 
 
