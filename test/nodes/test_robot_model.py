@@ -33,6 +33,10 @@ def names(side):
     return [f"{side}_{part}" for part in PARTS]
 
 
+def texts(markers):
+    return {marker.text for marker in markers.values() if marker.type == Marker.TEXT_VIEW_FACING}
+
+
 class Viewer:
     """A node that sends the joint states of both arms and the tilt, and keeps the newest of what robot_model sends."""
 
@@ -123,9 +127,8 @@ def test_a_viewer_gets_the_description_the_joint_states_of_both_arms_and_markers
         assert [effort[name] for name in names(side)] == list(EFFORT)
     groups = {"gravity"} | {f"{side}/{kind}" for side in READINGS for kind in ("limits", "torques", "states")}
     viewer.wait_until(lambda: {group for group, _ in viewer.markers} == groups)
+    viewer.wait_until(lambda: {"1.50 Nm", "right: inactive", "left: inactive"} <= texts(viewer.markers))
     assert {marker.header.frame_id for marker in viewer.markers.values()} == {ROOT}
-    texts = {marker.text for marker in viewer.markers.values() if marker.type == Marker.TEXT_VIEW_FACING}
-    assert {"1.50 Nm", "right: inactive", "left: inactive"} <= texts
     arrow = viewer.markers["gravity", 0]
     forward, down = (getattr(arrow.points[1], axis) - getattr(arrow.points[0], axis) for axis in "xz")
     assert forward > 0 > down and forward / -down == pytest.approx(0.5463, abs=1e-3)  # tan of the pitch
