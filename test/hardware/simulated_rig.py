@@ -30,12 +30,15 @@ _PORTS = own_ports(30_000)
 
 
 class SimulatedRig:
-    """An arm in `POSE` on a bus of its own. interface: 'virtual', or 'udp_multicast' to share it with processes.
+    """An arm on a bus of its own, at rest in `pose` at first.
 
-    top_speed: rad/s, the largest true speed of a joint so far.
+    interface: 'virtual', or 'udp_multicast' to share it with processes. carried: its motors are on and hold it, as if a
+    dead process had left them. top_speed: rad/s, the largest true speed of a joint so far.
     """
 
-    def __init__(self, interface: str = "virtual", friction: float = 0.1) -> None:
+    def __init__(
+        self, interface: str = "virtual", friction: float = 0.1, pose: Sequence[float] = POSE, carried: bool = False
+    ) -> None:
         sys.setswitchinterval(2e-4)  # as in nodes/run.py: with Python's 5 ms the threads here would delay each other
         port = next(_PORTS)
         options: dict[str, Any] = {}
@@ -46,8 +49,10 @@ class SimulatedRig:
         config = ArmConfig(coulomb_friction=(friction,) * 4)
         self.charge = Charge((interface, channel, options), MOTORS_OF_ARM, LIMITS, PERIOD)
         self.device = SimulatedDevice(SimulatedArm(config), [SimulatedMotor(joint) for joint in MOTORS_OF_ARM])
-        self.device.arm.reset(POSE)
-        self.carrying = tuple(gravity_torque(config.links, POSE))  # Nm that hold the arm
+        self.device.arm.reset(pose)
+        self.carrying = tuple(gravity_torque(config.links, pose))  # Nm that hold the arm
+        if carried:
+            self._switch_on()
         self.top_speed = 0.0
         self._stop = threading.Event()
         self._bus = self.charge.open()
@@ -61,9 +66,8 @@ class SimulatedRig:
         """Open another end of the bus."""
         return self.charge.open()
 
-    def switch_on(self, effort: Sequence[float]) -> None:
-        """Switch the motors on without a frame on the bus, as if a dead process had left them."""
-        for joint, torque in zip(MOTORS_OF_ARM, effort, strict=True):
+    def _switch_on(self) -> None:
+        for joint, torque in zip(MOTORS_OF_ARM, self.carrying, strict=True):
             self.device.exchange(joint.can_id, joint.command(torque, 0.0))
             self.device.exchange(joint.can_id, ENTER)
 

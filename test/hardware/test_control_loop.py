@@ -64,7 +64,6 @@ class Carried:
         self.rig = rig
         self.bus = FailingBus(rig)
         self.drives: list[Drive] = []
-        rig.switch_on(rig.carrying)
         self.motors = MotorBus(self.bus, MOTORS_OF_ARM, powered=True, note=self.drives.append, reopen=self.bus.reopen)
         self.motors.exchange(Drive(rig.carrying, NOTHING, True), time.monotonic() + 1.0)
         self.safety = SafetyMachine(LIMITS, PERIOD, peaks_of(MOTORS_OF_ARM))
@@ -89,7 +88,7 @@ def carry(make_rig: Callable[..., SimulatedRig]) -> Iterator[Callable[..., Carri
     arms: list[Carried] = []
 
     def carry(interface: str = "virtual", **options: Callable[..., object]) -> Carried:
-        arms.append(Carried(make_rig(interface=interface), **options))
+        arms.append(Carried(make_rig(interface=interface, carried=True), **options))
         time.sleep(0.2)
         assert arms[-1].safety.state is State.ACTIVE
         return arms[-1]
@@ -265,8 +264,7 @@ def test_our_own_frames_are_never_foreign(carry, interface):
 
 
 def test_a_foreign_command_refuses_the_start(make_rig):
-    rig = make_rig()
-    rig.device.arm.reset((0.0,) * 4)
+    rig = make_rig(pose=NOTHING)
     safety = SafetyMachine(LIMITS, PERIOD)
     loop = ControlLoop(MotorBus(rig.open(), MOTORS_OF_ARM), safety, PERIOD)
     loop.start()

@@ -21,8 +21,7 @@ def commands(listener, can_id):
 
 
 def test_the_arm_is_lowered_from_the_noted_torques_and_its_motors_are_switched_off(make_rig):
-    rig = make_rig()
-    rig.switch_on(rig.carrying)
+    rig = make_rig(carried=True)
     with rig.open() as listener:
         notes = []
         assert let_down(rig.charge, Drive(rig.carrying, NOTHING, True), notes.append)
@@ -35,8 +34,7 @@ def test_the_arm_is_lowered_from_the_noted_torques_and_its_motors_are_switched_o
 
 
 def test_the_noted_damping_is_kept(make_rig):
-    rig = make_rig()
-    rig.switch_on(rig.carrying)
+    rig = make_rig(carried=True)
     with rig.open() as listener:
         assert let_down(rig.charge, Drive(rig.carrying, (5.0,) * 4, True))
         damping = [command.kd for command in commands(listener, 2)[:50] if command]
@@ -45,16 +43,14 @@ def test_the_noted_damping_is_kept(make_rig):
 
 def test_a_motor_that_has_lost_its_power_is_not_pushed_by_the_noted_torque(make_rig):
     """The operator cut the supply: the motors are off, and the arm hangs."""
-    rig = make_rig()
-    rig.device.arm.reset((0.0,) * 4)
+    rig = make_rig(pose=NOTHING)
     assert let_down(rig.charge, Drive((0.0, 6.0, 2.0, 1.0), NOTHING, True))
     assert rig.top_speed < 0.01
     assert rig.motors_on == [False] * 4
 
 
 def test_a_motor_that_does_not_reply_may_still_be_powered(make_rig):
-    rig = make_rig()
-    rig.switch_on(rig.carrying)
+    rig = make_rig(carried=True)
     rig.device.bus_silent = True
     log, notes = [], []
     assert not let_down(rig.charge, Drive(rig.carrying, NOTHING, True), notes.append, log.append, is_endless=False)
@@ -64,8 +60,7 @@ def test_a_motor_that_does_not_reply_may_still_be_powered(make_rig):
 
 
 def test_a_bus_that_cannot_be_opened_is_tried_again_and_the_log_is_honest(make_rig, monkeypatch):
-    rig = make_rig()
-    rig.switch_on(rig.carrying)
+    rig = make_rig(carried=True)
     failures = iter([BusError("CAN bus can0 cannot be opened"), BusError("CAN bus can0 cannot be opened")])
 
     def open_late(*address):

@@ -64,7 +64,7 @@ def is_running(pid: int) -> bool:
 
 @pytest.fixture
 def rig(make_rig: Callable[..., SimulatedRig]) -> SimulatedRig:
-    return make_rig(interface="udp_multicast")
+    return make_rig(interface="udp_multicast", carried=True)
 
 
 @pytest.fixture
@@ -72,7 +72,6 @@ def carry(rig: SimulatedRig, tmp_path: Path) -> Iterator[Callable[..., Carrier]]
     carriers: list[Carrier] = []
 
     def carry(**options: int) -> Carrier:
-        rig.switch_on(rig.carrying)  # or the arm would fall until the process has started
         carriers.append(Carrier(rig, tmp_path, **options))
         assert carriers[-1].watchdog, carriers[-1].log()
         assert rig.motors_on == [True] * 4

@@ -33,8 +33,7 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedRi
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setattr(bus_lock, "ATTEMPT_TIME", 0.1)
     monkeypatch.setattr(owned_bus, "Watchdog", NoWatchdog)
-    rig = SimulatedRig(friction=0.5)  # more than the pushes of the switch-on check
-    rig.device.arm.reset((0.0,) * 4)
+    rig = SimulatedRig(friction=0.5, pose=NOTHING)  # more friction than the pushes of the switch-on check
     yield rig
     rig.close()
 

@@ -107,7 +107,7 @@ def test_a_sensor_that_is_unplugged_is_named_and_comes_back_by_itself(rig):
     rig.sensor.plug()
     before = len(rig.received)
     rig.wait_until(lambda: len(rig.received) > before, rig.send)
-    assert rig.device.problem == "" and rig.device.failure is None and rig.device.values["opened"] == 2
+    assert rig.device.problem == "" and rig.device.failure is None and rig.device.values["opened"] >= 2
 
 
 def test_a_sensor_that_is_missing_at_the_start_is_waited_for(rig):
@@ -184,4 +184,4 @@ def test_the_node_publishes_the_tilt_of_a_sensor_that_it_reads_itself_and_report
     assert node_rig.status.level == DiagnosticStatus.ERROR
     node_rig.sensor.plug()
     node_rig.wait_until(lambda: node_rig.status.message == "publishing", node_rig.send)
-    assert {pair.key: pair.value for pair in node_rig.status.values}["opened"] == "2"
+    assert int({pair.key: pair.value for pair in node_rig.status.values}["opened"]) >= 2

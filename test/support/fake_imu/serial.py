@@ -46,9 +46,10 @@ class FakeSerialSensor:
         assert self._theirs is not None
         expected = self._waiting() + len(data)
         self.send(data)
-        end = time.monotonic() + 5.0
+        end = time.monotonic() + 20.0
         while self._waiting() < expected:
-            assert time.monotonic() < end
+            assert time.monotonic() < end, f"{self._waiting()} of {expected} bytes"
+            time.sleep(1e-4)
 
     def _waiting(self) -> int:
         assert self._theirs is not None
