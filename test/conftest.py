@@ -2,7 +2,7 @@
 
 Nodes let the arm down when the machine stands still for longer than their time-outs, as they must. A test of running
 nodes (marker `real_time`) then shows nothing about them. A stall clock therefore runs beside these tests: a test that
-fails while the clock stood still fails with `Stalled` and runs again.
+fails while the clock stood still, or in which nodes were late, fails with `Stalled` and runs again, at most twice.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from .support.launched_nodes import LaunchedNodes, prefer
 from .support.stall_clock import StallClock
 
 MOST_WORKERS = 2  # which the nodes of a test leave to others on two processors
@@ -32,6 +33,7 @@ def stall_clock() -> Iterator[StallClock]:
         pytest.fail(
             f"at most {MOST_WORKERS} tests marked real_time may run at once: use `-m real_time -n {MOST_WORKERS}`"
         )
+    prefer(os.getpid())  # to nodes that start
     clock = StallClock()
     yield clock
     clock.close()
@@ -50,10 +52,13 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Iterator[None]:
     if not isinstance(clock, StallClock):
         return (yield)
     clock.longest_gap()
+    LaunchedNodes.late.clear()
     try:
         return (yield)
     except Exception as error:
         gap = clock.longest_gap()
         if gap > STALL:
             raise Stalled(f"the machine stood still for {gap:.3f} s: {error}") from error
+        if LaunchedNodes.late:
+            raise Stalled(f"{LaunchedNodes.late[0]}: {error}") from error
         raise

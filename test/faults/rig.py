@@ -21,7 +21,7 @@ import yaml
 
 from exo_gravity.tools.inputs.parameter_file import load
 
-from ..support.launched_nodes import GENTLE, REAL, SIMULATED, LaunchedNodes, Parameters, children, full_name
+from ..support.launched_nodes import GENTLE, REAL, SIMULATED, LaunchedNodes, Parameters, children, full_name, prefer
 from ..support.ros_probe import RosProbe
 from ..support.truth import Truth
 
@@ -30,7 +30,6 @@ HOME = [0.0, 0.05, 0.05, 0.05]  # rad, hanging and within the limits
 HELP_TIME = 20.0  # s for which the wearer holds it there
 NEAR = 0.15  # rad from the pose, in which the arm need not be moved again
 CARRY_LIMIT = 60.0  # s for the nodes to start and bring the arm to a stage
-AUTOGROUP_NICE = -15
 SIMULATOR = ("simulator",)
 CARRYING = ("active", "ramping in", "proving signs")
 
@@ -203,15 +202,3 @@ def kill_watchdogs(bridges: Collection[int]) -> None:
             command = path.read_bytes().split(b"\0")
             if any(b".watchdog" in part for part in command) and arguments.intersection(command):
                 os.kill(int(path.parent.name), signal.SIGKILL)
-
-
-def prefer(pid: int) -> None:
-    """Let a process and its descendants run before other sessions' processes, if permitted.
-
-    With Linux's autogroups a process's own nice value counts only within its session, and each node is a session.
-    """
-    with contextlib.suppress(OSError):
-        Path(f"/proc/{pid}/autogroup").write_text(str(AUTOGROUP_NICE))
-    with contextlib.suppress(FileNotFoundError):
-        for child in children(pid):
-            prefer(child)

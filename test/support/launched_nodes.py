@@ -11,7 +11,7 @@ import sys
 import threading
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import yaml
 
@@ -24,6 +24,8 @@ Parameters = Mapping[str, Any]
 
 PORTS = own_ports(20_000)
 GROUP = "239.74.163.2"
+AUTOGROUP_NICE = -15
+LATE = ("stalled for ", "fault: command_stale", "fault: motor_silent")
 NO_IMU: Parameters = {"use_imu": False}  # for the compensator, which then starts without waiting for a tilt
 FAST: Parameters = {"sign_check_torque": 0.0, "ramp_time": 0.5, "fade_time": 0.5, "damping": 1.5}
 GENTLE: Parameters = {**FAST, "ramp_time": 1.0, "fade_time": 2.0, "damping": 5.0}
@@ -45,7 +47,12 @@ class LaunchedNodes:
     by default; the left arm's bus has the next one. timing: rate and time-outs by node, `SIMULATED` or `REAL`. changes:
     of the parameters, by node, for both arms; they come last, after `FAST` for the bridge. truth: whether simulators
     log the arm's true motion, at `truth_path`. The attribute `ended_node` is what `Launcher.run` returned.
+
+    Nodes that have started run before other processes, if permitted: others that start would keep them waiting.
+    late: what nodes logged that had to wait nevertheless, until the test run empties it.
     """
+
+    late: ClassVar[list[str]] = []
 
     def __init__(
         self,
@@ -81,6 +88,7 @@ class LaunchedNodes:
         self.path = folder / f"params_{port}_{'_'.join(without)}.yaml"
         self.path.write_text(yaml.safe_dump(content))
         self.log: list[str] = []
+        self._preferred: set[str] = set()
         self.stopping = threading.Event()
         self.ended_node: tuple[str, int] | None = None
         self._thread: threading.Thread | None = None
@@ -90,10 +98,18 @@ class LaunchedNodes:
         return self._thread is not None
 
     def start(self) -> LaunchedNodes:
-        self.launcher = Launcher(self.path, on_line=lambda node, line: self.log.append(f"{node}: {line}"))
+        self.launcher = Launcher(self.path, on_line=self._on_line)
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
         return self
+
+    def _on_line(self, node: str, line: str) -> None:
+        self.log.append(f"{node}: {line}")
+        if node not in self._preferred:
+            self._preferred.add(node)
+            prefer(self.pid(node))
+        if any(sign in line for sign in LATE):
+            self.late.append(self.log[-1])
 
     def _run(self) -> None:
         self.ended_node = self.launcher.run(self.stopping)
@@ -183,6 +199,18 @@ def full_name(node: str) -> str:
     if node.startswith("/"):
         return node
     return "/imu" if node == "imu" else f"/right/{node}"
+
+
+def prefer(pid: int) -> None:
+    """Let a process and its descendants run before other sessions' processes, if permitted.
+
+    With Linux's autogroups a process's own nice value counts only within its session, and each node is a session.
+    """
+    with contextlib.suppress(OSError):
+        Path(f"/proc/{pid}/autogroup").write_text(str(AUTOGROUP_NICE))
+    with contextlib.suppress(FileNotFoundError):
+        for child in children(pid):
+            prefer(child)
 
 
 def children(pid: int) -> list[int]:
