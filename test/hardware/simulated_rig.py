@@ -30,7 +30,7 @@ _PORTS = own_ports(30_000)
 
 
 class SimulatedRig:
-    """An arm on a bus of its own, at rest in `pose` at first.
+    """An arm on a bus of its own. It starts at rest in `pose`.
 
     interface: 'virtual', or 'udp_multicast' to share it with processes. carried: its motors are on and hold it, as if a
     dead process had left them. top_speed: rad/s, the largest true speed of a joint so far.
