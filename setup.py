@@ -8,8 +8,9 @@ package_name = "exo_gravity"
 here = Path(__file__).parent
 # The version, the description and the maintainer are those of package.xml, and nowhere else.
 declared = ElementTree.parse(here / "package.xml").getroot()
-# The one list of executables, each named after its module. The launcher reads the nodes from the entry points.
-nodes = ("can_bridge", "imu", "compensator", "simulator", "recorder", "calibrator", "robot_model", "panel")
+# The one list of executables. The launcher reads the nodes from the entry points. A large node is a folder.
+nodes = ("can_bridge", "compensator", "imu", "panel", "recorder", "robot_model")
+small_nodes = ("calibrator", "simulator")
 tools = ("launcher", "trial", "report", "budget", "validate", "train_anfis", "calibrate", "urdf")
 
 extras = {
@@ -66,7 +67,7 @@ setup(
     packages=find_packages(include=[package_name, package_name + ".*"]),
     package_data={
         package_name: ["py.typed"],
-        f"{package_name}.nodes": ["fastdds*.xml"],
+        f"{package_name}.nodes.ros": ["fastdds*.xml"],
         f"{package_name}.panel": ["strings.json", "static/*", "static/vendor/*"],
     },
     data_files=[
@@ -100,7 +101,8 @@ setup(
     ],
     entry_points={
         "console_scripts": [
-            *(f"{name} = exo_gravity.nodes.{name}:main" for name in nodes),
+            *(f"{name} = exo_gravity.nodes.{name}.node:main" for name in nodes),
+            *(f"{name} = exo_gravity.nodes.{name}:main" for name in small_nodes),
             *(f"{name} = exo_gravity.tools.{name}:main" for name in tools),
         ]
     },

@@ -11,9 +11,9 @@ import signal
 import sys
 import time
 
-from exo_gravity.core.drive import NOTHING, Drive
-from exo_gravity.core.limits import UNKNOWN
-from exo_gravity.core.wire import REPLY_SHARE
+from exo_gravity.core.motors.bus_load import REPLY_SHARE
+from exo_gravity.core.safety.drive import NOTHING, Drive
+from exo_gravity.core.safety.limits import UNKNOWN
 from exo_gravity.hardware.scheduling import favour
 
 from .direct_arm import DirectArm, run_paced

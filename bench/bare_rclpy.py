@@ -21,11 +21,11 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
-from exo_gravity.core.drive import NOTHING, Drive
-from exo_gravity.core.limits import UNKNOWN
-from exo_gravity.core.wire import REPLY_SHARE
+from exo_gravity.core.motors.bus_load import REPLY_SHARE
+from exo_gravity.core.safety.drive import NOTHING, Drive
+from exo_gravity.core.safety.limits import UNKNOWN
 from exo_gravity.hardware.scheduling import favour
-from exo_gravity.nodes.run import keep_to_this_machine
+from exo_gravity.nodes.ros.run import keep_to_this_machine
 
 from .direct_arm import DirectArm, run_paced
 

@@ -12,8 +12,8 @@ import sys
 
 import numpy as np
 
-from exo_gravity.core.compensator_settings import Settings
-from exo_gravity.core.wearer import Wearer
+from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.effort_study import POSES, RATE, effort_settings
 from exo_gravity.sim.holds import hold

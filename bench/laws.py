@@ -8,9 +8,9 @@ import numpy as np
 
 from exo_gravity.core import gravity_torque
 from exo_gravity.core.control_params import COMPENSATOR, settings_of
-from exo_gravity.core.gravity import LAWS
-from exo_gravity.core.param_table import values_of
-from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.model.gravity import LAWS
+from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.params import values_of
 from exo_gravity.tools.inputs.references import pinocchio_model, toolbox_robot
 
 from .table import Row, race

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from exo_gravity.core.start_gate import CALM
+from exo_gravity.core.safety.gate import CALM
 
 from .loop import THREAD_PRIORITY, LoopRun, run_loop
 from .table import Row

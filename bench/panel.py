@@ -18,7 +18,7 @@ from pathlib import Path
 
 import yaml
 
-from exo_gravity.core.motors import MOTORS, SPECIAL_FRAMES, unpack_command
+from exo_gravity.core.motors.specs import MOTORS, SPECIAL_FRAMES, unpack_command
 from test.faults.soak import resident
 from test.support.bus_listener import CAN_IDS, BusListener, Frame
 from test.support.launched_nodes import LaunchedNodes
@@ -27,7 +27,7 @@ from test.support.ports import free_port
 from test.support.ros_probe import RosProbe
 
 SPECS = [MOTORS[name] for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6")]
-COMMANDS = (0x7F, 0x80, 0xFF)  # first byte: commands hold the position 0; see hardware/motor_bus.py
+COMMANDS = (0x7F, 0x80, 0xFF)  # first byte: commands hold the position 0; see hardware/can/motor_bus.py
 # The real device's rate, with time-outs that leave room for simulators and browser on the same computer.
 TIMING = {
     "can_bridge": {"rate": 250.0, "command_timeout": 0.1, "reply_timeout": 0.1},

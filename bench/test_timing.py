@@ -7,8 +7,8 @@ from collections.abc import Container, Sequence
 import numpy as np
 import pytest
 
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.motors import ENTER, MOTORS, pack_reply
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import ENTER, MOTORS, pack_reply
 
 from .timing import LoopTiming, analyse, split_cycles
 

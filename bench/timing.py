@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.motors import SPECIAL_FRAMES
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import SPECIAL_FRAMES
 
 DISTINCT = 8  # cycles before, from whose answers an answer must differ
 GIVE_UP = 0.1  # s after which an answer counts as lost

@@ -11,13 +11,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.compensator_settings import Settings
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.limits import Limits
-from exo_gravity.core.motors import MOTORS
-from exo_gravity.core.recording import Recording
-from exo_gravity.core.trial_script import TrialScript
-from exo_gravity.core.wearer import Wearer
+from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.model.wearer import Wearer
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import MOTORS
+from exo_gravity.core.safety.limits import Limits
+from exo_gravity.core.trial.recording import Recording
+from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial
 

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from exo_gravity.core.any_arm import any_arm_table
 from exo_gravity.core.calibration.params import CALIBRATOR
+from exo_gravity.core.compensation.any_arm import any_arm_table
 from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR, IMU, RECORDER, ROBOT_MODEL
-from exo_gravity.core.faults import FaultCode
-from exo_gravity.core.param_table import Param
+from exo_gravity.core.params import Param
+from exo_gravity.core.safety.faults import FaultCode
 from exo_gravity.panel.params import PANEL
 from exo_gravity.sim.device_params import SIMULATOR
 

@@ -3,7 +3,7 @@
 from math import radians
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
-from exo_gravity.core.wearer import Wearer
+from exo_gravity.core.model.wearer import Wearer
 
 JOINTS = ("rotation", "abduction", "flexion", "elbow")
 POSE = [radians(angle) for angle in (0, 30, 40, 30)]

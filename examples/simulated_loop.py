@@ -3,8 +3,8 @@
 from math import degrees
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.motors import ENTER, EXIT, MOTORS
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
 
 PERIOD = 0.004  # s

@@ -8,14 +8,14 @@ from dataclasses import replace
 from math import degrees, dist
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.compensator import Compensator
-from exo_gravity.core.compensator_settings import Settings
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.motors import ENTER, MOTORS
-from exo_gravity.core.terms.friction import Friction
-from exo_gravity.core.terms.settings import TermSettings
-from exo_gravity.core.terms.spring import PosePath, Spring
-from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.core.compensation.compensator import Compensator
+from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.compensation.terms.friction import Friction
+from exo_gravity.core.compensation.terms.settings import TermSettings
+from exo_gravity.core.compensation.terms.spring import PosePath, Spring
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import ENTER, MOTORS
+from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
 
 PERIOD = 0.004  # s

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from exo_gravity.core.arm import ArmModel
-from exo_gravity.core.joint_motor import MAX_CAN_ID
-from exo_gravity.core.moments import moments_of, off_axis_of
-from exo_gravity.core.motors import MOTORS
+from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.model.moments import moments_of, off_axis_of
+from exo_gravity.core.motors.joint_motor import MAX_CAN_ID
+from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.tools.inputs.parameter_file import packaged_config
 

@@ -12,8 +12,8 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from exo_gravity.core.arm import ArmModel
-from exo_gravity.core.gravity import gravity_torque
+from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.sim import SimulatedDevice
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu
 from exo_gravity.tools.inputs.arms import ConfiguredArm

@@ -20,8 +20,8 @@ import numpy as np
 import yaml
 
 from exo_gravity.core.calibration.identification import Identified
-from exo_gravity.core.gravity import gravity_torque
-from exo_gravity.core.tilt import rotation_matrix
+from exo_gravity.core.model.gravity import gravity_torque
+from exo_gravity.core.model.tilt import rotation_matrix
 from exo_gravity.sim.device_params import SIMULATOR, device_of
 from exo_gravity.tools import calibrate
 from exo_gravity.tools.calibration import demo, gravity, motors, scale

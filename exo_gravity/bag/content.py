@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from exo_gravity.core.recording import Recording
+from exo_gravity.core.trial.recording import Recording
 
 
 class Event(NamedTuple):

@@ -11,9 +11,9 @@ from typing import Any
 
 from exo_gravity.bag.content import Event
 from exo_gravity.bag.topics import DIAGNOSTICS, LOSSES, PARAMETER_EVENTS, STEPS, arm_of, leaf
-from exo_gravity.core.drive import State
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.recording import ScriptedStep, Span
+from exo_gravity.core.safety.drive import State
+from exo_gravity.core.trial.recording import ScriptedStep, Span
 
 CARRIED = (State.RAMPING_IN.value, State.ACTIVE.value)
 STATE_GAP = 1.0  # s; can_bridge reports its state twice a second, except while it ends

@@ -21,7 +21,7 @@ from exo_gravity.bag.mcap import Batch
 from exo_gravity.bag.storage import Storage
 from exo_gravity.bag.topics import COMMANDS, JOINT_STATE, STATES, arm_of, is_wanted, leaf
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.recording import Recording
+from exo_gravity.core.trial.recording import Recording
 
 MAX_COMMAND_AGE = 200_000_000  # ns; an older command is no longer in force
 MAX_CLOCK_OFFSET = 1_000_000_000  # ns between stamp and arrival

@@ -1,8 +1,8 @@
 """The mathematics: standard library and NumPy only. No ROS, no input or output, no clock (time is an argument)."""
 
-from exo_gravity.core.arm import STANDARD_GRAVITY, ArmModel
-from exo_gravity.core.gravity import LAWS, gravity_torque, paper_mobile_torque, paper_static_torque
-from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.model.arm import STANDARD_GRAVITY, ArmModel
+from exo_gravity.core.model.gravity import LAWS, gravity_torque, paper_mobile_torque, paper_static_torque
+from exo_gravity.core.model.tilt import Tilt
 
 __all__ = [
     "LAWS",

@@ -6,21 +6,29 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from exo_gravity.core.anfis_law import AnfisLaw
-from exo_gravity.core.arm import MAX_GAIN, MAX_GRAVITY, MAX_LENGTH, MAX_MASS, MAX_MOMENT, STANDARD_GRAVITY, ArmModel
-from exo_gravity.core.command_fade import COMMAND_PARAMETERS
-from exo_gravity.core.compensator_settings import Settings
+from exo_gravity.core.compensation.command_fade import COMMAND_PARAMETERS
+from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.compensation.terms.settings import term_parameters, term_settings_of
+from exo_gravity.core.compensation.terms.spring import PosePath
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.joint_motor import MAX_CAN_ID, TORQUE_SCALE_BOUNDS, JointMotor
-from exo_gravity.core.limits import Limits
-from exo_gravity.core.motors import MOTORS, WIRE_RANGE_BOUNDS, MotorSpec
-from exo_gravity.core.param_table import Param, param_of, params_of
-from exo_gravity.core.terms.settings import term_parameters, term_settings_of
-from exo_gravity.core.terms.spring import PosePath
-from exo_gravity.core.tilt import SIDES
-from exo_gravity.core.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
-from exo_gravity.core.wire import BITRATE, MAX_STATUS_RATE, Traffic
-from exo_gravity.core.wire_formats import FORMATS
+from exo_gravity.core.model.anfis_law import AnfisLaw
+from exo_gravity.core.model.arm import (
+    MAX_GAIN,
+    MAX_GRAVITY,
+    MAX_LENGTH,
+    MAX_MASS,
+    MAX_MOMENT,
+    STANDARD_GRAVITY,
+    ArmModel,
+)
+from exo_gravity.core.model.tilt import SIDES
+from exo_gravity.core.model.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
+from exo_gravity.core.motors.bus_load import BITRATE, MAX_STATUS_RATE, Traffic
+from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, TORQUE_SCALE_BOUNDS, JointMotor
+from exo_gravity.core.motors.specs import MOTORS, WIRE_RANGE_BOUNDS, MotorSpec
+from exo_gravity.core.motors.wire_formats import FORMATS
+from exo_gravity.core.params import Param, param_of, params_of
+from exo_gravity.core.safety.limits import Limits
 
 GYROSCOPE_RANGE, GYROSCOPE_RANGES = 34.9, (1.0, 200.0)  # rad/s; 2000 deg/s
 ACCELEROMETER_RANGE, ACCELEROMETER_RANGES = 156.9, (15.0, 4000.0)  # m/s^2; 16 g

@@ -5,7 +5,7 @@ thread between two cycles. The loop is paced by absolute monotonic deadlines, so
 
 An exception anywhere lets the arm down: one in `get_efforts` counts as withdrawn efforts, one of the bus as a silent
 bus, one in the state machine as a fault. If the state machine keeps failing, the watchdog takes over from the last
-noted drive; without a watchdog, this thread lowers the arm (hardware/last_resort.py).
+noted drive; without a watchdog, this thread lowers the arm (hardware/ownership/last_resort.py).
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from concurrent.futures import Future
 from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
 
-from exo_gravity.core.drive import CARRYING, OFF, State
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.faults import FaultCode
-from exo_gravity.core.limits import JointSample
-from exo_gravity.core.safety import SafetyMachine
-from exo_gravity.core.wire import REPLY_SHARE
-from exo_gravity.hardware import last_resort
-from exo_gravity.hardware.motor_bus import MotorBus
+from exo_gravity.core.motors.bus_load import REPLY_SHARE
+from exo_gravity.core.safety.drive import CARRYING, OFF, State
+from exo_gravity.core.safety.faults import FaultCode
+from exo_gravity.core.safety.limits import JointSample
+from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.ownership import last_resort
 
 EFFORT_WAIT = 0.5  # share of a cycle's idle time for which the loop may wait for late efforts
 SMOOTHING = 0.02  # per cycle, of the measured work time

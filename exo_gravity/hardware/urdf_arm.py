@@ -22,7 +22,7 @@ TURNING = ("revolute", "continuous")
 class UrdfArm:
     """The arm that `joint_names` (n,) move in the URDF `text`; the URDF's other joints are fixed at 0.
 
-    A `core.any_arm.GravityModel`: max_effort (n,) Nm are the joints' effort limits in the URDF, 0 where it has none;
+    A `GravityModel`: max_effort (n,) Nm are the joints' effort limits in the URDF, 0 where it has none;
     mass in kg is that of all links that they move. Raises ParameterError if the text is not a URDF, its links have no
     mass, Pinocchio is missing, or a joint is missing or does not turn.
     """

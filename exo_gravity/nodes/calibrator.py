@@ -23,17 +23,17 @@ from sensor_msgs.msg import JointState
 
 from exo_gravity.core.calibration.params import CALIBRATOR, tour_of
 from exo_gravity.core.calibration.tour import Measured
-from exo_gravity.core.drive import State
+from exo_gravity.core.compensation.tilt_input import TiltInput
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.gravity import Torque
-from exo_gravity.core.tilt_input import TiltInput
-from exo_gravity.nodes.conversions import by_name
-from exo_gravity.nodes.declare import declare
-from exo_gravity.nodes.diagnostics import ERROR, OK, WARN, Diagnostics
-from exo_gravity.nodes.hot_path import HotPath
-from exo_gravity.nodes.run import run
-from exo_gravity.nodes.sole_publisher import SolePublisher
-from exo_gravity.nodes.tilt_subscription import NEWEST, TiltSubscription
+from exo_gravity.core.model.gravity import Torque
+from exo_gravity.core.safety.drive import State
+from exo_gravity.nodes.ros.conversions import by_name
+from exo_gravity.nodes.ros.declare import declare
+from exo_gravity.nodes.ros.diagnostics import ERROR, OK, WARN, Diagnostics
+from exo_gravity.nodes.ros.hot_path import HotPath
+from exo_gravity.nodes.ros.run import run
+from exo_gravity.nodes.ros.sole_publisher import SolePublisher
+from exo_gravity.nodes.ros.tilt_subscription import NEWEST, TiltSubscription
 
 REPORT_PERIOD = 0.1  # s
 PLAN_PERIOD = 0.05  # s

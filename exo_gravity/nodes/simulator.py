@@ -22,11 +22,11 @@ from std_msgs.msg import String
 
 from exo_gravity.core.control_params import OPTIONS
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.trial_script import TrialScript
-from exo_gravity.hardware.motor_bus import open_bus
-from exo_gravity.nodes.declare import bus_of, declare, values_after
-from exo_gravity.nodes.diagnostics import OK, WARN, Diagnostics
-from exo_gravity.nodes.run import run
+from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.hardware.can.motor_bus import open_bus
+from exo_gravity.nodes.ros.declare import bus_of, declare, values_after
+from exo_gravity.nodes.ros.diagnostics import OK, WARN, Diagnostics
+from exo_gravity.nodes.ros.run import run
 from exo_gravity.sim import SimulatedImu
 from exo_gravity.sim.device import MAX_CATCH_UP
 from exo_gravity.sim.device_params import SIMULATOR, device_of, imu_of, set_faults

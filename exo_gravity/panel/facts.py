@@ -1,6 +1,6 @@
 """What changes rarely: limits, settings, the picture of the arms, and the largest support that the motors allow.
 
-A budget (`core.budget`) takes about 0.2 s of arithmetic, and depends on the wearer but not on the support. It runs on a
+A torque budget takes about 0.2 s of arithmetic, and depends on the wearer but not on the support. It runs on a
 thread that pauses after each millisecond, so that the web server answers meanwhile.
 """
 
@@ -12,12 +12,12 @@ from collections.abc import Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
-from exo_gravity.core.arm_description import described
-from exo_gravity.core.budget import USUAL_TILT, Workspace, budget, largest_support, motor_torques
 from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR, OPTIONS, robot_of, wearer_of
 from exo_gravity.core.errors import ExoGravityError
-from exo_gravity.core.param_table import values_of
-from exo_gravity.core.urdf import urdf
+from exo_gravity.core.model.budget import USUAL_TILT, Workspace, budget, largest_support, motor_torques
+from exo_gravity.core.params import values_of
+from exo_gravity.core.view.arm_description import described
+from exo_gravity.core.view.urdf import urdf
 from exo_gravity.panel.scene import scene_of
 from exo_gravity.panel.view import arm_setup
 

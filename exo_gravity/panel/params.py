@@ -8,7 +8,7 @@ from pathlib import Path
 
 from exo_gravity.core.control_params import COMPENSATOR
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.param_table import Param
+from exo_gravity.core.params import Param
 
 LANGUAGES = ("en", "de")
 # fmt: off

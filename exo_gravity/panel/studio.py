@@ -20,9 +20,9 @@ from typing import Any, Protocol
 
 import yaml
 
-from exo_gravity.core.drive import State
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.core.safety.drive import State
+from exo_gravity.core.trial.script import TrialScript
 
 LEAD = 5.0  # s for a person to get ready
 GRACE = 0.5  # s recorded after the last step
@@ -202,7 +202,7 @@ class Studio:
         except OSError as error:
             return f"{self._output}: {error.strerror}"
         remaps = ("-r", "__node:=recorder", "-r", "__ns:=/", "--enclave", "/recorder")
-        command = _python("exo_gravity.nodes.recorder", "--ros-args", *remaps, "-p", f"output:={folder / 'bag'}")
+        command = _python("exo_gravity.nodes.recorder.node", "--ros-args", *remaps, "-p", f"output:={folder / 'bag'}")
         # It watches its standard input, and ends the recording well if the panel dies.
         environment = {**os.environ, "EXO_GRAVITY_SUPERVISED": "1"}
         with log:

@@ -3,7 +3,7 @@
 Standard Denavit-Hartenberg, Table 1 of the paper: a = link lengths, alpha = (-pi/2, +pi/2, 0, 0), d = 0, joint offsets
 (0, -pi/2, 0, 0), z0 along gravity when the trunk is upright. Joint n turns about z_{n-1}; the centre of gravity of
 link n lies at d_n along x_n, and beside the link at `cog_y` along y_n and `cog_z` along z_n. The model is built from
-these and not from the laws of `core.gravity`, so that it can contradict them.
+these and not from the laws of `core.model.gravity`, so that it can contradict them.
 
 MuJoCo models dry friction as a soft constraint, which creeps. Measured on a 0.3 m link with 0.15 Nm of friction and
 0.05 Nm of imbalance: 18 degrees per minute with MuJoCo's defaults, 0.002 with the stiffness below.
@@ -20,10 +20,10 @@ os.environ.setdefault("MUJOCO_GL", "disabled")  # nothing is rendered: skips MuJ
 import mujoco
 import numpy as np
 
-from exo_gravity.core.arm import JOINT_COUNT, MAX_LENGTH, MAX_MASS, ArmModel, four_floats
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.moments import MAX_OFFSET
-from exo_gravity.core.param_table import check_owned, owned
+from exo_gravity.core.model.arm import JOINT_COUNT, MAX_LENGTH, MAX_MASS, ArmModel, four_floats
+from exo_gravity.core.model.moments import MAX_OFFSET
+from exo_gravity.core.params import check_owned, owned
 from exo_gravity.sim.base_motion import apply_rotation
 
 STEP = 0.001  # s

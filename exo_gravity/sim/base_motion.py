@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.sim.trunk_motion import TrunkState, Vector
 
 

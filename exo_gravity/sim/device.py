@@ -17,11 +17,11 @@ from collections.abc import Callable, Sequence
 
 import can
 
-from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.gravity import NO_TORQUE, Torque
-from exo_gravity.core.trial_script import TrialScript
-from exo_gravity.core.wire_formats.wire_format import Frame
+from exo_gravity.core.model.arm import JOINT_COUNT
+from exo_gravity.core.model.gravity import NO_TORQUE, Torque
+from exo_gravity.core.motors.wire_formats.wire_format import Frame
+from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim.arm import STEP, SimulatedArm
 from exo_gravity.sim.base_motion import felt_in_base
 from exo_gravity.sim.can_link import CanLink

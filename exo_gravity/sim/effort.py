@@ -2,7 +2,7 @@
 
 The wearer's passive arm is in the exoskeleton. Without help he carries both and overcomes their friction and inertia.
 Stiffness and damping are of the order of a human arm's; an integrator takes over what weight is left, as a person does.
-The controller is `core.compensator` with one exchange of CAN frames a cycle; there is no safety machine.
+The controller is `core.compensation.compensator` with one exchange of CAN frames a cycle; there is no safety machine.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from typing import Protocol
 
 import numpy as np
 
-from exo_gravity.core.arm import JOINT_COUNT
-from exo_gravity.core.compensator import Answer, Compensator
-from exo_gravity.core.compensator_settings import Settings
+from exo_gravity.core.compensation.compensator import Answer, Compensator
+from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.effort import Effort, effort_of
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.motors import ENTER
-from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.core.model.arm import JOINT_COUNT
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import ENTER
+from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim.arm import STEP
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.virtual_wearer import Torque, VirtualWearer, minimum_jerk

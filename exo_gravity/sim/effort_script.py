@@ -14,8 +14,8 @@ import numpy as np
 
 from exo_gravity.core.effort import Effort
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.gravity import Torque
-from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.core.model.gravity import Torque
+from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim.arm import STEP
 from exo_gravity.sim.effort import EffortWearer, Sweep, Task, task_effort
 from exo_gravity.sim.effort_study import RATE, TASKS

@@ -9,18 +9,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
-from exo_gravity.core.compensator_settings import Settings
+from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.compensation.terms.coupling import Coupling
+from exo_gravity.core.compensation.terms.damping import Damping
+from exo_gravity.core.compensation.terms.friction import Friction
+from exo_gravity.core.compensation.terms.inertia import Inertia
+from exo_gravity.core.compensation.terms.link_inertia import LinkInertia
+from exo_gravity.core.compensation.terms.settings import TermSettings
+from exo_gravity.core.compensation.terms.soft_limits import SoftLimits
+from exo_gravity.core.compensation.terms.spring import Spring
+from exo_gravity.core.compensation.terms.term import DELAY
 from exo_gravity.core.effort import Effort
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.terms.coupling import Coupling
-from exo_gravity.core.terms.damping import Damping
-from exo_gravity.core.terms.friction import Friction
-from exo_gravity.core.terms.inertia import Inertia
-from exo_gravity.core.terms.link_inertia import LinkInertia
-from exo_gravity.core.terms.settings import TermSettings
-from exo_gravity.core.terms.soft_limits import SoftLimits
-from exo_gravity.core.terms.spring import Spring
-from exo_gravity.core.terms.term import DELAY
+from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.effort import Sweep, Task, measure
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.compensator_settings import Settings
-from exo_gravity.core.joint_motor import JointMotor
+from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.sim.baselines import LettingGo
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.effort import SETTLING, run

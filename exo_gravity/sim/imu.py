@@ -1,6 +1,6 @@
 """A trunk IMU: the motion of the trunk -> gyroscope and accelerometer in the IMU's axes, with sensor errors.
 
-The trunk's orientation in the world is Ry(pitch) Rx(roll) (`core.tilt`; heading is irrelevant). The accelerometer
+The trunk's orientation in the world is Ry(pitch) Rx(roll) (`core.model.tilt`; heading is irrelevant). The accelerometer
 measures specific force, the acceleration of its location less gravity: at rest +g upward (REP-145).
 """
 
@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from exo_gravity.core.arm import MAX_GRAVITY, STANDARD_GRAVITY, one_float
-from exo_gravity.core.param_table import check_owned, owned
-from exo_gravity.core.tilt import gravity_in_trunk, pitch_roll, rotation_matrix
+from exo_gravity.core.model.arm import MAX_GRAVITY, STANDARD_GRAVITY, one_float
+from exo_gravity.core.model.tilt import gravity_in_trunk, pitch_roll, rotation_matrix
+from exo_gravity.core.params import check_owned, owned
 from exo_gravity.sim.trunk_motion import TrunkState
 
 AVERAGED_SAMPLES = 100  # of one measured tilt

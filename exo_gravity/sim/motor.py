@@ -1,4 +1,4 @@
-"""An AK motor that answers real frames: MIT mode of V1 and V2 boards, as described in `core.motors`.
+"""An AK motor that answers real frames: MIT mode of V1 and V2 boards, as described in `core.motors.specs`.
 
 What the firmware does (CubeMars driver manual V1.0.15; Ben Katz's drive, from which it is derived):
 - It replies to commands and never sends anything else.
@@ -13,13 +13,13 @@ import math
 import random
 from dataclasses import dataclass, replace
 
-from exo_gravity.core.arm import one_float
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.motors import ENTER, EXIT, SET_ZERO, MotorCommand, pack_reply, unpack_command
-from exo_gravity.core.param_table import owned
-from exo_gravity.core.wire import MAX_STATUS_RATE
-from exo_gravity.core.wire_formats.mit import MASTER_ID
+from exo_gravity.core.model.arm import one_float
+from exo_gravity.core.motors.bus_load import MAX_STATUS_RATE
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import ENTER, EXIT, SET_ZERO, MotorCommand, pack_reply, unpack_command
+from exo_gravity.core.motors.wire_formats.mit import MASTER_ID
+from exo_gravity.core.params import owned
 
 _NO_COMMAND = MotorCommand(0.0, 0.0, 0.0, 0.0, 0.0)
 

@@ -18,16 +18,16 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from exo_gravity.core.arm import JOINT_COUNT
-from exo_gravity.core.compensator import Compensator
-from exo_gravity.core.compensator_settings import Settings
-from exo_gravity.core.drive import Drive, State
+from exo_gravity.core.compensation.compensator import Compensator
+from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.joint_motor import JointMotor, peaks_of
-from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
-from exo_gravity.core.recording import Recording, ScriptedStep
-from exo_gravity.core.safety import SafetyMachine
-from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.core.model.arm import JOINT_COUNT
+from exo_gravity.core.motors.joint_motor import JointMotor, peaks_of
+from exo_gravity.core.safety.drive import Drive, State
+from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
+from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.core.trial.recording import Recording, ScriptedStep
+from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.effort_script import ScriptedWearer
 from exo_gravity.sim.trunk_motion import TrunkState

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from exo_gravity.core.arm import ArmModel
+from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig
 
 PACKAGED = 0  # the seed of the packaged simulator

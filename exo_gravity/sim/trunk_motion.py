@@ -1,7 +1,7 @@
 """How the trunk of a wearer moves: bowing, leaning, walking and sitting down hard.
 
 Each motion gives the trunk's tilt and the acceleration of the shoulder at any time. Trunk axes and the signs of pitch
-and roll as in `core.tilt`; the heading stays constant. Bowing and leaning turn the trunk about the hips. Walking is
+and roll as in model/tilt.py; the heading stays constant. Bowing and leaning turn the trunk about the hips. Walking is
 modelled as sines at the frequencies of steps and strides, fading in and out over a second.
 """
 
@@ -11,9 +11,9 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-from exo_gravity.core.arm import STANDARD_GRAVITY
-from exo_gravity.core.trial_script import Step
-from exo_gravity.core.vector3 import acceleration_of
+from exo_gravity.core.model.arm import STANDARD_GRAVITY
+from exo_gravity.core.model.vector3 import acceleration_of
+from exo_gravity.core.trial.script import Step
 
 Vector = tuple[float, float, float]
 NONE: Vector = (0.0, 0.0, 0.0)

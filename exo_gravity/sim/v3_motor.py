@@ -1,6 +1,6 @@
 """A simulated motor with a V3 board: MIT mode with 29-bit IDs, and status frames on its own timer.
 
-What the board does (CubeMars driver manual V3.0.0; frames in core/wire_formats/mit_v3.py):
+What the board does (CubeMars driver manual V3.0.0; frames in core/motors/wire_formats/mit_v3.py):
 - A command in MIT mode switches the motor on and stays in force until the next one. A current is a command too; 0 A
   switches the motor off. Other control modes are ignored here.
 - It replies to nothing. It sends its state `status_rate` times a second, on or off.
@@ -13,11 +13,11 @@ import math
 import random
 from collections.abc import Iterator, Sequence
 
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.motors import MotorCommand, MotorReply
-from exo_gravity.core.wire_formats import MIT_V3
-from exo_gravity.core.wire_formats.mit_v3 import MODE_CURRENT
-from exo_gravity.core.wire_formats.wire_format import EXTENDED, Frame
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import MotorCommand, MotorReply
+from exo_gravity.core.motors.wire_formats import MIT_V3
+from exo_gravity.core.motors.wire_formats.mit_v3 import MODE_CURRENT
+from exo_gravity.core.motors.wire_formats.wire_format import EXTENDED, Frame
 from exo_gravity.sim.motor import Firmware, SimulatedMotor, clamp
 
 

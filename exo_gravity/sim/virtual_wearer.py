@@ -11,9 +11,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from exo_gravity.core.arm import JOINT_COUNT, four_floats, one_float
-from exo_gravity.core.gravity import NO_TORQUE, Torque
-from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.core.model.arm import JOINT_COUNT, four_floats, one_float
+from exo_gravity.core.model.gravity import NO_TORQUE, Torque
+from exo_gravity.core.trial.script import TrialScript
 
 Path = list[tuple[float, float]]  # of each joint: position in rad, velocity in rad/s
 _MOVING = 0.75  # share of a move's duration in which the hand moves; then it holds the arm still

@@ -12,9 +12,9 @@ from itertools import product
 
 import numpy as np
 
-from exo_gravity.core.arm import ArmModel
-from exo_gravity.core.compensator_settings import Settings
-from exo_gravity.core.gravity import gravity_torque
+from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.sim.arm import ArmConfig
 
 STRENGTHS = (0.25, 0.35, 0.5)  # of the torque that the wearer's own arm requires, outstretched

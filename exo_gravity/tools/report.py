@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from exo_gravity.core.errors import DataError, ExoGravityError
-from exo_gravity.core.trial_analysis import MIN_HOLD
-from exo_gravity.core.verdict import HoldCriteria
+from exo_gravity.core.trial.analysis import MIN_HOLD
+from exo_gravity.core.trial.verdict import HoldCriteria
 from exo_gravity.tools.cli.arguments import non_negative
 from exo_gravity.tools.cli.extras import extras
 from exo_gravity.tools.video import output

@@ -6,10 +6,10 @@ import random
 import numpy as np
 import pytest
 
-from exo_gravity.core.any_arm import AnyArm, any_arm_settings, any_arm_table
-from exo_gravity.core.effort_limiter import LONGEST_STEP, RAMP_TIME
+from exo_gravity.core.compensation.any_arm import AnyArm, any_arm_settings, any_arm_table
+from exo_gravity.core.compensation.limiter import LONGEST_STEP, RAMP_TIME
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.param_table import values_of
+from exo_gravity.core.params import values_of
 
 PERIOD = 0.004  # s
 POSE = (0.4, -0.7)

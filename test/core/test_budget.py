@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.budget import FAMILY, Workspace, budget, motor_for, motor_torques, overload, torque_at
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.gravity import gravity_torque
-from exo_gravity.core.tilt import Tilt
-from exo_gravity.core.wearer import Wearer
+from exo_gravity.core.model.budget import FAMILY, Workspace, budget, motor_for, motor_torques, overload, torque_at
+from exo_gravity.core.model.gravity import gravity_torque
+from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.model.wearer import Wearer
 
 LINKS = (0.05, 0.13, 0.30, 0.30)
 ROBOT = ArmModel(LINKS, (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))

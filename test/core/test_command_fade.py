@@ -2,7 +2,7 @@
 
 import pytest
 
-from exo_gravity.core.command_fade import CommandFade, Output
+from exo_gravity.core.compensation.command_fade import CommandFade, Output
 
 EFFORT = (2.0, -4.0)
 

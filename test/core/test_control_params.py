@@ -6,11 +6,11 @@ import random
 import numpy as np
 import pytest
 
-from exo_gravity.core.compensator import Compensator
+from exo_gravity.core.compensation.compensator import Compensator
+from exo_gravity.core.compensation.limiter import LONGEST_STEP
 from exo_gravity.core.control_params import COMPENSATOR, settings_of
-from exo_gravity.core.effort_limiter import LONGEST_STEP
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.param_table import values_of
+from exo_gravity.core.params import values_of
 
 LIVE = [param for param in COMPENSATOR if not param.fixed]
 WRONG = (-0.1, math.nan, math.inf, 900.0, "", "heavy", True, None, [], [0.1] * 3, [0.1] * 5, [0.1, math.nan, 0.1, 0.1])

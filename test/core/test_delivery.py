@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from exo_gravity.core.delivery import DeliveryMonitor, SwitchOnCheck
-from exo_gravity.core.drive import Drive
-from exo_gravity.core.limits import JointSample
+from exo_gravity.core.safety.delivery import DeliveryMonitor, SwitchOnCheck
+from exo_gravity.core.safety.drive import Drive
+from exo_gravity.core.safety.limits import JointSample
 
 from ..support.safety_run import LIMITS, PERIOD
 

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.limits import Limits
+from exo_gravity.core.safety.limits import Limits
 
 from ..support.safety_run import LIMITS, PERIOD, SafetyRun, reading
 

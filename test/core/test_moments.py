@@ -7,7 +7,7 @@ import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.moments import MOMENTS, load_moments, moments_of, off_axis_of, regressor
+from exo_gravity.core.model.moments import MOMENTS, load_moments, moments_of, off_axis_of, regressor
 from exo_gravity.tools.inputs.references import ALPHA, OFFSET
 
 ROUNDING = 1e-12  # Nm

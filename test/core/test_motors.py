@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from exo_gravity.core.errors import FrameError, ParameterError
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.motors import MOTORS, SPECIAL_FRAMES, pack_command, pack_reply, unpack_command, unpack_reply
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import MOTORS, SPECIAL_FRAMES, pack_command, pack_reply, unpack_command, unpack_reply
 
 AK60, AK80 = MOTORS["AK60-6"], MOTORS["AK80-9"]
 SPECS = pytest.mark.parametrize("spec", MOTORS.values(), ids=MOTORS)

@@ -9,8 +9,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from exo_gravity.core.errors import FrameError, ParameterError
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.motors import MOTORS, SPECIAL_FRAMES, pack_command, pack_reply, unpack_command, unpack_reply
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import MOTORS, SPECIAL_FRAMES, pack_command, pack_reply, unpack_command, unpack_reply
 
 COMMAND, REPLY = ("position", "velocity", "kp", "kd", "torque"), ("position", "velocity", "torque")
 SPECIAL_NUDGE = 3  # codes by which the torque is reduced at most if the command would spell a special frame

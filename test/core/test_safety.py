@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from exo_gravity.core.drive import OFF, State
-from exo_gravity.core.faults import FaultCode
+from exo_gravity.core.safety.drive import OFF, State
+from exo_gravity.core.safety.faults import FaultCode
 
 from ..support.safety_run import EFFORT, LIMITS, PERIOD, SafetyRun
 

@@ -7,8 +7,8 @@ import math
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exo_gravity.core.drive import CARRYING, OFF, State
-from exo_gravity.core.faults import Fault, FaultCode
+from exo_gravity.core.safety.drive import CARRYING, OFF, State
+from exo_gravity.core.safety.faults import Fault, FaultCode
 
 from ..support.safety_run import LIMITS, PERIOD, SafetyRun
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import pytest
 
-from exo_gravity.core.delivery import TEST_TORQUE
-from exo_gravity.core.drive import OFF, State
+from exo_gravity.core.safety.delivery import TEST_TORQUE
+from exo_gravity.core.safety.drive import OFF, State
 
 from ..support.safety_run import EFFORT, LIMITS, PERIOD, SafetyRun
 

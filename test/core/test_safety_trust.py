@@ -7,8 +7,8 @@ import random
 
 import pytest
 
-from exo_gravity.core.drive import State
-from exo_gravity.core.faults import FaultCode
+from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.faults import FaultCode
 
 from ..support.safety_run import SafetyRun
 

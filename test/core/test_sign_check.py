@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import pytest
 
-from exo_gravity.core.faults import Fault
-from exo_gravity.core.limits import JointSample
-from exo_gravity.core.sign_check import MAX_DISTURBED, MIN_PUSH, SignCheck
+from exo_gravity.core.safety.faults import Fault
+from exo_gravity.core.safety.limits import JointSample
+from exo_gravity.core.safety.sign_check import MAX_DISTURBED, MIN_PUSH, SignCheck
 
 PERIOD = 0.004  # s
 NAMES = ("a", "b", "c", "d")

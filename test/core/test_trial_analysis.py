@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.recording import Recording, ScriptedStep
-from exo_gravity.core.trial_analysis import analyse
+from exo_gravity.core.trial.analysis import analyse
+from exo_gravity.core.trial.recording import Recording, ScriptedStep
 
 from ..support.synthetic_recording import (
     HANGING,

@@ -3,7 +3,7 @@
 import pytest
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.trial_script import Step, TrialScript
+from exo_gravity.core.trial.script import Step, TrialScript
 
 GOOD = {
     "name": "short",

@@ -6,8 +6,8 @@ import pytest
 
 from exo_gravity.core.control_params import CAN_BRIDGE, limits_of, motors_of
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.param_table import values_of
-from exo_gravity.core.validation import check_bridge
+from exo_gravity.core.params import values_of
+from exo_gravity.core.safety.checks import check_bridge
 
 
 def check(**given):

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from exo_gravity.core.recording import ScriptedStep
-from exo_gravity.core.trial_analysis import analyse
-from exo_gravity.core.verdict import HoldCriteria, failures
+from exo_gravity.core.trial.analysis import analyse
+from exo_gravity.core.trial.recording import ScriptedStep
+from exo_gravity.core.trial.verdict import HoldCriteria, failures
 
 from ..support.synthetic_recording import (
     HANGING,

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from exo_gravity.core import wire
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors import MOTORS, pack_command, pack_reply
-from exo_gravity.core.wire import (
+from exo_gravity.core.motors import bus_load as wire
+from exo_gravity.core.motors.bus_load import (
     BITRATE,
     TYPICAL_COMMAND,
     TYPICAL_REPLY,
@@ -16,6 +15,7 @@ from exo_gravity.core.wire import (
     stuffed_bits,
     worst_frame_bits,
 )
+from exo_gravity.core.motors.specs import MOTORS, pack_command, pack_reply
 
 SPEC = MOTORS["AK60-6"]
 

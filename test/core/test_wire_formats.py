@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 
 from exo_gravity.core.control_params import CAN_BRIDGE, motors_of, traffic_of
 from exo_gravity.core.errors import FrameError, ParameterError
-from exo_gravity.core.joint_motor import MAX_CAN_ID, JointMotor
-from exo_gravity.core.motors import MOTORS, MotorReply, MotorSpec
-from exo_gravity.core.param_table import values_of
-from exo_gravity.core.wire import Traffic, stuffed_bits, worst_frame_bits
-from exo_gravity.core.wire_formats import FORMATS, MIT, MIT_V3, WireFormat
-from exo_gravity.core.wire_formats.wire_format import COMMAND, EXTENDED, ID_BITS, OTHER, REPLY
+from exo_gravity.core.motors.bus_load import Traffic, stuffed_bits, worst_frame_bits
+from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, JointMotor
+from exo_gravity.core.motors.specs import MOTORS, MotorReply, MotorSpec
+from exo_gravity.core.motors.wire_formats import FORMATS, MIT, MIT_V3, WireFormat
+from exo_gravity.core.motors.wire_formats.wire_format import COMMAND, EXTENDED, ID_BITS, OTHER, REPLY
+from exo_gravity.core.params import values_of
 
 seeded = settings(max_examples=150, derandomize=True, database=None, deadline=None)
 IDS = frozenset((1, 2, 3, 126))

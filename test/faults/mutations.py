@@ -22,9 +22,9 @@ from ..support import ROOT
 
 COPIED = ("exo_gravity", "test", "config")
 ROW_LIMIT = 240.0  # s for each row, with the start of its nodes
-SAFETY, DESCENT, LIMITS = (f"exo_gravity/core/{name}.py" for name in ("safety", "descent", "limits"))
-ASSIST = "exo_gravity/core/terms/assist.py"
-BUS_LOCK, WATCHDOG = "exo_gravity/hardware/bus_lock.py", "exo_gravity/hardware/watchdog_process.py"
+SAFETY, DESCENT, LIMITS = (f"exo_gravity/core/safety/{name}.py" for name in ("machine", "descent", "limits"))
+ASSIST = "exo_gravity/core/compensation/terms/assist.py"
+BUS_LOCK, WATCHDOG = "exo_gravity/hardware/ownership/bus_lock.py", "exo_gravity/hardware/ownership/watchdog_process.py"
 
 
 class Edit(NamedTuple):
@@ -92,7 +92,7 @@ MUTATIONS = (
         ("second can_bridge on the bus",),
         (
             Edit(BUS_LOCK, "if not self._is_acquired(patience):", "if False:"),
-            Edit("exo_gravity/hardware/owned_bus.py", "bus.listen()", "pass"),
+            Edit("exo_gravity/hardware/ownership/owned_bus.py", "bus.listen()", "pass"),
         ),
     ),
     Mutation(
@@ -108,7 +108,7 @@ MUTATIONS = (
     Mutation(
         "a second commander is ignored",
         ("second publisher of efforts",),
-        (Edit("exo_gravity/nodes/effort_exchange.py", "if self._commander.is_another(info):", "if False:"),),
+        (Edit("exo_gravity/nodes/can_bridge/effort_exchange.py", "if self._commander.is_another(info):", "if False:"),),
     ),
     Mutation(
         "stale efforts are accepted",

@@ -15,7 +15,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.wearer import Wearer
+from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.tools.inputs.parameter_file import load
 
 from ..support import CONFIG

@@ -28,7 +28,7 @@ from rich.console import Console
 from sensor_msgs.msg import JointState
 
 from exo_gravity.bag.reader import read_bag
-from exo_gravity.core.motors import EXIT
+from exo_gravity.core.motors.specs import EXIT
 
 from ..support import CONFIG
 from ..support.launched_nodes import LaunchedNodes, Parameters

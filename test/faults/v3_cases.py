@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import signal
 
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.motors import MOTORS
-from exo_gravity.core.wire_formats import MIT_V3
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import MOTORS
+from exo_gravity.core.motors.wire_formats import MIT_V3
 
 from .actions import enable, in_turn, pause, send_signal
 from .device_faults import CONNECT, CUT_OFF, END_SILENCE, ERROR, NO_ERROR, SILENCE

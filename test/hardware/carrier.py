@@ -13,11 +13,11 @@ import threading
 import time
 from pathlib import Path
 
-from exo_gravity.core.drive import NOTHING, OFF, Drive
 from exo_gravity.core.errors import BusError
-from exo_gravity.hardware.handover import Charge
-from exo_gravity.hardware.motor_bus import MotorBus
-from exo_gravity.hardware.owned_bus import OwnedBus
+from exo_gravity.core.safety.drive import NOTHING, OFF, Drive
+from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.ownership.handover import Charge
+from exo_gravity.hardware.ownership.owned_bus import OwnedBus
 
 
 def log(text: str) -> None:

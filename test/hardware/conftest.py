@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from exo_gravity.hardware import owned_bus
+from exo_gravity.hardware.ownership import owned_bus
 
 from .simulated_rig import NoWatchdog, SimulatedRig
 

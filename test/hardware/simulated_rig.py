@@ -10,11 +10,11 @@ from typing import Any
 
 import can
 
-from exo_gravity.core.gravity import gravity_torque
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.limits import Limits
-from exo_gravity.core.motors import ENTER, MOTORS
-from exo_gravity.hardware.handover import Charge
+from exo_gravity.core.model.gravity import gravity_torque
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import ENTER, MOTORS
+from exo_gravity.core.safety.limits import Limits
+from exo_gravity.hardware.ownership.handover import Charge
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 
 from ..support.ports import own_ports
@@ -39,7 +39,7 @@ class SimulatedRig:
     def __init__(
         self, interface: str = "virtual", friction: float = 0.1, pose: Sequence[float] = POSE, carried: bool = False
     ) -> None:
-        sys.setswitchinterval(2e-4)  # as in nodes/run.py: with Python's 5 ms the threads here would delay each other
+        sys.setswitchinterval(2e-4)  # as in nodes/ros/run.py: with 5 ms the threads here would delay each other
         port = next(_PORTS)
         options: dict[str, Any] = {}
         if interface == "udp_multicast":

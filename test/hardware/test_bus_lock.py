@@ -6,12 +6,12 @@ import time
 
 import pytest
 
-from exo_gravity.core.drive import OFF, Drive
 from exo_gravity.core.errors import BusError
-from exo_gravity.hardware import bus_lock
-from exo_gravity.hardware.bus_lock import BusLock, lock_file
-from exo_gravity.hardware.motor_bus import MotorBus
-from exo_gravity.hardware.owned_bus import OwnedBus
+from exo_gravity.core.safety.drive import OFF, Drive
+from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.ownership import bus_lock
+from exo_gravity.hardware.ownership.bus_lock import BusLock, lock_file
+from exo_gravity.hardware.ownership.owned_bus import OwnedBus
 
 from .simulated_rig import MOTORS_OF_ARM
 

@@ -13,10 +13,10 @@ import can
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors import ENTER, SET_ZERO, unpack_command
-from exo_gravity.core.wire_formats import MIT, MIT_V3
-from exo_gravity.hardware.bus_lock import Address, BusLock
-from exo_gravity.hardware.bus_scan import NOTHING, BusScan
+from exo_gravity.core.motors.specs import ENTER, SET_ZERO, unpack_command
+from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
+from exo_gravity.hardware.can.bus_scan import NOTHING, BusScan
+from exo_gravity.hardware.ownership.bus_lock import Address, BusLock
 from exo_gravity.sim import Firmware, SimulatedDevice
 
 from ..support.simulated_device import SPECS, frame, make_device

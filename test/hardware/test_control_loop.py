@@ -9,14 +9,15 @@ from collections.abc import Callable, Iterator
 import can
 import pytest
 
-from exo_gravity.core.drive import NOTHING, Drive, State
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.joint_motor import peaks_of
-from exo_gravity.core.motors import EXIT
-from exo_gravity.core.safety import SafetyMachine
-from exo_gravity.hardware import control_loop, last_resort
+from exo_gravity.core.motors.joint_motor import peaks_of
+from exo_gravity.core.motors.specs import EXIT
+from exo_gravity.core.safety.drive import NOTHING, Drive, State
+from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.hardware import control_loop
+from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop, EffortCommand
-from exo_gravity.hardware.motor_bus import MotorBus
+from exo_gravity.hardware.ownership import last_resort
 
 from .simulated_rig import LIMITS, MOTORS_OF_ARM, PERIOD, SimulatedRig, wait_until
 

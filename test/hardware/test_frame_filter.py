@@ -5,9 +5,9 @@ from __future__ import annotations
 import can
 import pytest
 
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.motors import MOTORS
-from exo_gravity.hardware.frame_filter import FOREIGN_COMMAND, FrameFilter
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import MOTORS
+from exo_gravity.hardware.can.frame_filter import FOREIGN_COMMAND, FrameFilter
 
 from ..support.simulated_device import frame
 

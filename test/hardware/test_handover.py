@@ -4,11 +4,11 @@ import itertools
 
 import pytest
 
-from exo_gravity.core.drive import NOTHING, Drive
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors import ENTER, EXIT, MOTORS, unpack_command
-from exo_gravity.hardware import handover
-from exo_gravity.hardware.handover import Charge, let_down
+from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, unpack_command
+from exo_gravity.core.safety.drive import NOTHING, Drive
+from exo_gravity.hardware.ownership import handover
+from exo_gravity.hardware.ownership.handover import Charge, let_down
 
 from .simulated_rig import LIMITS, MOTORS_OF_ARM, PERIOD
 

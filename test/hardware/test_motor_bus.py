@@ -11,12 +11,12 @@ from itertools import count
 import can
 import pytest
 
-from exo_gravity.core.arm import ArmModel
-from exo_gravity.core.drive import NOTHING, OFF, Drive
 from exo_gravity.core.errors import BusError, ParameterError
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.motors import ENTER, EXIT, MOTORS, SET_ZERO, pack_reply, unpack_command
-from exo_gravity.hardware.motor_bus import MotorBus, open_bus
+from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, SET_ZERO, pack_reply, unpack_command
+from exo_gravity.core.safety.drive import NOTHING, OFF, Drive
+from exo_gravity.hardware.can.motor_bus import MotorBus, open_bus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 
 AK60 = MOTORS["AK60-6"]

@@ -16,13 +16,13 @@ from collections import Counter
 import can
 import pytest
 
-from exo_gravity.core.arm import ArmModel
-from exo_gravity.core.drive import OFF
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.limits import JointSample, Limits
-from exo_gravity.core.motors import ENTER, EXIT, MOTORS, SET_ZERO
-from exo_gravity.hardware.frame_filter import TRIAL
-from exo_gravity.hardware.motor_bus import MotorBus
+from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, SET_ZERO
+from exo_gravity.core.safety.drive import OFF
+from exo_gravity.core.safety.limits import JointSample, Limits
+from exo_gravity.hardware.can.frame_filter import TRIAL
+from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 
 MOUNTED = (("AK60-6", 1, 0.0), ("AK80-9", -1, 0.4), ("AK60-6", 1, -0.2), ("AK60-6", 1, 0.0))

@@ -11,12 +11,12 @@ from pathlib import Path
 import can
 import pytest
 
-from exo_gravity.core.arm import ArmModel
-from exo_gravity.core.drive import NOTHING, OFF, Drive
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors import pack_reply
-from exo_gravity.core.wire_formats import MIT, MIT_V3
-from exo_gravity.hardware.motor_bus import MotorBus, open_bus
+from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.motors.specs import pack_reply
+from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
+from exo_gravity.core.safety.drive import NOTHING, OFF, Drive
+from exo_gravity.hardware.can.motor_bus import MotorBus, open_bus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedDevice
 
 from ..support.fake_slcan import FakeSlcan

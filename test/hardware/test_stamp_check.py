@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.hardware.stamp_check import LEARN_TIME, StampCheck
+from exo_gravity.hardware.trunk.stamp_check import LEARN_TIME, StampCheck
 
 RATE = 100.0  # Hz, given
 

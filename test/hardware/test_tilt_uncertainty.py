@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from exo_gravity.hardware.orientation_filter import OrientationFilter
-from exo_gravity.hardware.tilt_uncertainty import BASE, DECAY_TIME, OVERSHOOT, TiltUncertainty
+from exo_gravity.hardware.trunk.orientation_filter import OrientationFilter
+from exo_gravity.hardware.trunk.tilt_uncertainty import BASE, DECAY_TIME, OVERSHOOT, TiltUncertainty
 
 G = 9.80665
 RANGE = 34.9  # rad/s

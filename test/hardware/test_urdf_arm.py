@@ -8,7 +8,7 @@ import rtbdata
 
 from exo_gravity.core import gravity_torque
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.tools.inputs.arms import configured_arm
 from exo_gravity.tools.inputs.parameter_file import packaged_config

@@ -15,9 +15,9 @@ from pathlib import Path
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.hardware.bus_lock import BusLock
-from exo_gravity.hardware.owned_bus import OwnedBus
-from exo_gravity.hardware.watchdog import Watchdog
+from exo_gravity.hardware.ownership.bus_lock import BusLock
+from exo_gravity.hardware.ownership.owned_bus import OwnedBus
+from exo_gravity.hardware.ownership.watchdog import Watchdog
 
 from .simulated_rig import SimulatedRig, wait_until
 

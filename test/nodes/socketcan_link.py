@@ -7,11 +7,11 @@ import time
 
 import pytest
 
-from exo_gravity.core.drive import NOTHING, OFF, Drive
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.motors import EXIT, MOTORS
-from exo_gravity.hardware.motor_bus import MotorBus, open_bus
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import EXIT, MOTORS
+from exo_gravity.core.safety.drive import NOTHING, OFF, Drive
+from exo_gravity.hardware.can.motor_bus import MotorBus, open_bus
 
 VCAN = ("socketcan", "vcan0")
 AK60 = MOTORS["AK60-6"]

@@ -14,8 +14,8 @@ import can
 import pytest
 import yaml
 
-from exo_gravity.core.motors import ENTER, EXIT, MOTORS, unpack_command, unpack_reply
-from exo_gravity.hardware.motor_bus import open_bus
+from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, unpack_command, unpack_reply
+from exo_gravity.hardware.can.motor_bus import open_bus
 from exo_gravity.tools import launcher
 from exo_gravity.tools.launcher import Launcher
 

@@ -16,8 +16,8 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.nodes.compensator import CompensatorNode
-from exo_gravity.nodes.run import keep_to_this_machine
+from exo_gravity.nodes.compensator.node import CompensatorNode
+from exo_gravity.nodes.ros.run import keep_to_this_machine
 
 from ..support.joint_state_feeder import PARTS, POSE
 

@@ -12,15 +12,16 @@ import pytest
 import rclpy
 from rclpy.lifecycle import TransitionCallbackReturn
 
-from exo_gravity.core.drive import NOTHING, State
 from exo_gravity.core.errors import BusError
-from exo_gravity.hardware import bus_lock, owned_bus
-from exo_gravity.hardware.bus_lock import BusLock
+from exo_gravity.core.safety.drive import NOTHING, State
 from exo_gravity.hardware.control_loop import EffortCommand
-from exo_gravity.nodes import bridge_services, can_bridge
-from exo_gravity.nodes.bridge_report import BridgeReport
-from exo_gravity.nodes.can_bridge import CanBridge
-from exo_gravity.nodes.effort_exchange import EffortExchange
+from exo_gravity.hardware.ownership import bus_lock, owned_bus
+from exo_gravity.hardware.ownership.bus_lock import BusLock
+from exo_gravity.nodes.can_bridge import node as can_bridge
+from exo_gravity.nodes.can_bridge import services as bridge_services
+from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
+from exo_gravity.nodes.can_bridge.node import CanBridge
+from exo_gravity.nodes.can_bridge.report import BridgeReport
 
 from ..hardware.simulated_rig import NoWatchdog, SimulatedRig, wait_until
 

@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import rclpy
 
 from exo_gravity.core import ArmModel
-from exo_gravity.nodes.budget_watch import WITHIN, BudgetWatch
+from exo_gravity.nodes.compensator.budget_watch import WITHIN, BudgetWatch
 
 ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
 

@@ -18,11 +18,11 @@ from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from sensor_msgs.msg import Imu, JointState
 
 from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core.compensation.limiter import LONGEST_STEP
 from exo_gravity.core.control_params import CAN_BRIDGE
-from exo_gravity.core.effort_limiter import LONGEST_STEP
-from exo_gravity.core.tilt import Tilt
-from exo_gravity.core.wearer import Wearer
-from exo_gravity.nodes.conversions import to_nanoseconds, to_time
+from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.model.wearer import Wearer
+from exo_gravity.nodes.ros.conversions import to_nanoseconds, to_time
 
 from ..support.joint_state_feeder import PARTS, POSE, JointStateFeeder
 from ..support.launched_nodes import NO_IMU

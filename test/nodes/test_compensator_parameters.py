@@ -9,7 +9,7 @@ import pytest
 from rcl_interfaces.srv import DescribeParameters, SetParametersAtomically
 
 from exo_gravity.core.control_params import COMPENSATOR
-from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.core.trial.script import TrialScript
 
 from ..support.launched_nodes import NO_IMU, LaunchedNodes
 from ..support.random_parameters import parameter_message

@@ -6,13 +6,13 @@ from types import SimpleNamespace
 import pytest
 import yaml
 
-from exo_gravity.core.drive import State
-from exo_gravity.core.limits import JointSample, Limits
-from exo_gravity.core.safety import SafetyMachine
-from exo_gravity.core.wire import Traffic
-from exo_gravity.nodes import bridge_report
-from exo_gravity.nodes.bridge_report import BridgeReport
-from exo_gravity.nodes.diagnostics import OK, WARN, Diagnostics, milliseconds, row
+from exo_gravity.core.motors.bus_load import Traffic
+from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.limits import JointSample, Limits
+from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.nodes.can_bridge import report as bridge_report
+from exo_gravity.nodes.can_bridge.report import BridgeReport
+from exo_gravity.nodes.ros.diagnostics import OK, WARN, Diagnostics, milliseconds, row
 from exo_gravity.tools.inputs.parameter_file import load
 
 from ..support import CONFIG

@@ -9,9 +9,9 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 
-from exo_gravity.nodes import hot_path
-from exo_gravity.nodes.hot_path import HotPath
-from exo_gravity.nodes.run import keep_to_this_machine
+from exo_gravity.nodes.ros import hot_path
+from exo_gravity.nodes.ros.hot_path import HotPath
+from exo_gravity.nodes.ros.run import keep_to_this_machine
 
 keep_to_this_machine()
 

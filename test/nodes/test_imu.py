@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 
 from exo_gravity.hardware import ImuSample, TrunkEstimator
-from exo_gravity.nodes.conversions import to_nanoseconds, to_time
+from exo_gravity.nodes.ros.conversions import to_nanoseconds, to_time
 
 from ..support.handheld_imu import read_recording
 
@@ -25,7 +25,7 @@ G = 9.80665
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 MOUNTING = Rotation.from_euler("xyz", (math.pi / 2, 0.0, math.pi / 2))  # trunk from IMU: its x points left, its y up
 AHEAD = 25  # samples in flight: fewer than the node queues, so that none is lost
-NODE = [sys.executable, "-c", "from exo_gravity.nodes.imu import main; main()", "--ros-args"]
+NODE = [sys.executable, "-c", "from exo_gravity.nodes.imu.node import main; main()", "--ros-args"]
 
 
 class ImuNode:

@@ -12,10 +12,10 @@ from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import Imu
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.nodes.conversions import to_nanoseconds
-from exo_gravity.nodes.imu import ImuNode
-from exo_gravity.nodes.imu_device import ImuDevice
-from exo_gravity.nodes.run import keep_to_this_machine
+from exo_gravity.nodes.imu.device import ImuDevice
+from exo_gravity.nodes.imu.node import ImuNode
+from exo_gravity.nodes.ros.conversions import to_nanoseconds
+from exo_gravity.nodes.ros.run import keep_to_this_machine
 
 from ..support.fake_imu.chip import G
 from ..support.fake_imu.serial import FakeSerialSensor, rvc_packet

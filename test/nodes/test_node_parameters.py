@@ -5,8 +5,8 @@ import time
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 
-from exo_gravity.nodes import node_parameters
-from exo_gravity.nodes.node_parameters import NodeParameters
+from exo_gravity.nodes.ros import node_parameters
+from exo_gravity.nodes.ros.node_parameters import NodeParameters
 
 
 def test_a_node_that_has_gone_and_returned_is_read_anew(node):

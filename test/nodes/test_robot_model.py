@@ -18,7 +18,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from visualization_msgs.msg import Marker, MarkerArray
 
-from exo_gravity.core.urdf import ROOT
+from exo_gravity.core.view.urdf import ROOT
 from exo_gravity.tools.urdf import urdf_of
 
 from ..support import CONFIG

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from exo_gravity.nodes import run
-from exo_gravity.nodes.run import keep_to_this_machine, open_to_others
+from exo_gravity.nodes.ros import run
+from exo_gravity.nodes.ros.run import keep_to_this_machine, open_to_others
 
 NAMES = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS", "ROS_DISCOVERY_SERVER")
 LOOPBACK = str(Path(run.__file__).with_name("fastdds.xml"))

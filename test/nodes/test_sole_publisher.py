@@ -8,8 +8,8 @@ from collections.abc import Callable
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from exo_gravity.nodes import sole_publisher
-from exo_gravity.nodes.sole_publisher import SolePublisher
+from exo_gravity.nodes.ros import sole_publisher
+from exo_gravity.nodes.ros.sole_publisher import SolePublisher
 
 UNNUMBERED = {"publication_sequence_number": None}
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from exo_gravity.core.motors import ENTER
-from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.core.motors.specs import ENTER
+from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.tools.trials.offline import simulated_trials
 
 from ..support.launched_nodes import NO_IMU, executable

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 import exo_gravity.panel
-from exo_gravity.core.drive import State
-from exo_gravity.core.faults import FaultCode
-from exo_gravity.core.trial_script import TIMED, TURNS
+from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.faults import FaultCode
+from exo_gravity.core.trial.script import TIMED, TURNS
 
 FOLDER = Path(exo_gravity.panel.__file__).parent
 CONTENT = json.loads((FOLDER / "strings.json").read_text(encoding="utf-8"))

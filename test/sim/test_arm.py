@@ -8,7 +8,7 @@ import pytest
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.moments import off_axis_of
+from exo_gravity.core.model.moments import off_axis_of
 from exo_gravity.sim import STEP, ArmConfig, SimulatedArm
 
 UPRIGHT = (0.0, 0.0, 1.0)

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import _mjcf
 from exo_gravity.sim.base_motion import felt_in_base, in_base, rotation_in_base

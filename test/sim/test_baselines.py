@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import Tilt, gravity_torque
-from exo_gravity.core.joint_motor import peaks_of
+from exo_gravity.core.motors.joint_motor import peaks_of
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.baselines import HELD, INTEGRAL, STIFFNESS, Controlled, Feedforward, burden

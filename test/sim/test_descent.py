@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import Tilt, gravity_torque
-from exo_gravity.core.drive import OFF, State
-from exo_gravity.core.joint_motor import JointMotor, peaks_of
-from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
-from exo_gravity.core.motors import ENTER, EXIT, MOTORS
-from exo_gravity.core.safety import SafetyMachine
-from exo_gravity.core.wearer import Wearer
+from exo_gravity.core.model.wearer import Wearer
+from exo_gravity.core.motors.joint_motor import JointMotor, peaks_of
+from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
+from exo_gravity.core.safety.drive import OFF, State
+from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
+from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 
 MOTORS_OF_ARM = [JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1)]

@@ -13,7 +13,7 @@ import can
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors import ENTER, unpack_reply
+from exo_gravity.core.motors.specs import ENTER, unpack_reply
 from exo_gravity.sim import Firmware, can_link
 from exo_gravity.sim import device as device_module
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import VirtualWearer
 
 from ..support.simulated_device import make_device

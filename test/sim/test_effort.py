@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.compensator_settings import Settings
-from exo_gravity.core.terms.link_inertia import LinkInertia
-from exo_gravity.core.wearer import Wearer
+from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.compensation.terms.link_inertia import LinkInertia
+from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.effort import Sweep, Task, measure

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.effort import measure
 from exo_gravity.sim.effort_script import ScriptedWearer, effort_script, efforts_of_truth

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from exo_gravity.core.compensator_settings import Settings
-from exo_gravity.core.wearer import Wearer
+from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.effort_study import POSES, RATE, effort_settings

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.motors import ENTER, EXIT, MOTORS, SET_ZERO, pack_command, unpack_reply
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, SET_ZERO, pack_command, unpack_reply
 from exo_gravity.sim import Firmware, SimulatedMotor
 
 SPEC = MOTORS["AK60-6"]

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.compensator_settings import Settings
+from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.limits import Limits
-from exo_gravity.core.motors import ENTER, EXIT, MOTORS, unpack_command
-from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, unpack_command
+from exo_gravity.core.safety.limits import Limits
+from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import ArmConfig, ImuConfig, SimulatedArm, SimulatedDevice, SimulatedImu, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.imu import measured_tilt

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.motors import ENTER, EXIT, MOTORS
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.truth import RECORD, TruthLog
 
@@ -18,8 +18,8 @@ from ..support.truth import Truth
 JOINTS = [JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1)]
 ADVANCE = """
 import sys, time
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.motors import MOTORS
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.truth import TruthLog
 device = SimulatedDevice(SimulatedArm(), [SimulatedMotor(JointMotor(MOTORS["AK60-6"], n)) for n in (1, 2, 3, 4)])

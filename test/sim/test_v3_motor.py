@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import pytest
 
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.motors import ENTER, EXIT, MOTORS
-from exo_gravity.core.wire_formats import MIT, MIT_V3
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
+from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
 from exo_gravity.sim import Firmware, SimulatedMotor, SimulatedV3Motor, simulated_motor
 from exo_gravity.sim.v3_motor import StatusTimer
 

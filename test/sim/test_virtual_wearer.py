@@ -7,7 +7,7 @@ import pytest
 
 from exo_gravity.core import gravity_torque
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import STEP, ArmConfig, Hand, SimulatedArm, VirtualWearer
 
 POSE = (-0.6, 0.9, 0.8, 0.7)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR
-from exo_gravity.core.param_table import values_of
+from exo_gravity.core.params import values_of
 from exo_gravity.panel.access import Access
 from exo_gravity.panel.control import Control
 from exo_gravity.panel.desk import Desk

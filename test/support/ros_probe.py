@@ -20,7 +20,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from exo_gravity.nodes.run import keep_to_this_machine
+from exo_gravity.nodes.ros.run import keep_to_this_machine
 
 keep_to_this_machine()
 

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from exo_gravity.core.drive import OFF, State
-from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
-from exo_gravity.core.safety import SafetyMachine
+from exo_gravity.core.safety.drive import OFF, State
+from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
+from exo_gravity.core.safety.machine import SafetyMachine
 
 PERIOD = 0.004  # s
 LIMITS = Limits(

@@ -7,9 +7,9 @@ from typing import Any
 
 import can
 
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.motors import MOTORS, pack_command
-from exo_gravity.core.wire_formats import MIT, WireFormat
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import MOTORS, pack_command
+from exo_gravity.core.motors.wire_formats import MIT, WireFormat
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, simulated_motor
 
 SPECS = [MOTORS[name] for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6")]

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 from exo_gravity.bag.content import Bag
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.recording import Recording, ScriptedStep
+from exo_gravity.core.trial.recording import Recording, ScriptedStep
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 JOINT_STATE = "sensor_msgs/msg/JointState"

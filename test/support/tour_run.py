@@ -14,15 +14,15 @@ from exo_gravity.core.calibration.guess import TorqueGuess
 from exo_gravity.core.calibration.poses import BestPoses, Itinerary
 from exo_gravity.core.calibration.tour import Tour
 from exo_gravity.core.calibration.tracking import MassMatrix
-from exo_gravity.core.drive import Drive, State
-from exo_gravity.core.gravity import Torque
-from exo_gravity.core.joint_motor import JointMotor, peaks_of
-from exo_gravity.core.limits import UNKNOWN, JointSample, Limits
-from exo_gravity.core.moments import load_moments, moments_of
-from exo_gravity.core.motors import ENTER, EXIT, MOTORS
-from exo_gravity.core.safety import SafetyMachine
-from exo_gravity.core.tilt import Tilt
-from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.core.model.gravity import Torque
+from exo_gravity.core.model.moments import load_moments, moments_of
+from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.motors.joint_motor import JointMotor, peaks_of
+from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
+from exo_gravity.core.safety.drive import Drive, State
+from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
+from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.virtual_wearer import VirtualWearer

@@ -17,10 +17,10 @@ import yaml
 from rich.console import Console
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.wire_formats import MIT, MIT_V3, WireFormat
-from exo_gravity.hardware.bus_lock import BusLock
-from exo_gravity.hardware.bus_scan import BusScan
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.wire_formats import MIT, MIT_V3, WireFormat
+from exo_gravity.hardware.can.bus_scan import BusScan
+from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice, simulated_motor
 from exo_gravity.tools.calibrate import main
 from exo_gravity.tools.calibration.motors import run

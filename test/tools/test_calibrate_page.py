@@ -11,11 +11,11 @@ from html import escape
 import numpy as np
 import pytest
 
-from exo_gravity.core.arm import ArmModel
 from exo_gravity.core.calibration.identification import Observation, identify
-from exo_gravity.core.gravity import gravity_torque
-from exo_gravity.core.moments import load_moments, regressor
-from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.model.gravity import gravity_torque
+from exo_gravity.core.model.moments import load_moments, regressor
+from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.tools.calibration.outcome import Change, Curve, Outcome
 from exo_gravity.tools.calibration.page import page_of
 from exo_gravity.tools.calibration.torque_table import torque_table

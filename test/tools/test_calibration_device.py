@@ -11,7 +11,7 @@ import pytest
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.calibration.friction import friction_stations
 from exo_gravity.core.calibration.poses import BestPoses, FixedStations
-from exo_gravity.core.recording import Recording
+from exo_gravity.core.trial.recording import Recording
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.tools import calibrate

@@ -15,10 +15,10 @@ from exo_gravity.core.calibration.params import CALIBRATOR, tour_of
 from exo_gravity.core.calibration.tour import Measured
 from exo_gravity.core.control_params import wearer_of
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.moments import load_moments, moments_of, regressor
-from exo_gravity.core.param_table import values_of
-from exo_gravity.core.recording import Recording
-from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.model.moments import load_moments, moments_of, regressor
+from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.params import values_of
+from exo_gravity.core.trial.recording import Recording
 from exo_gravity.tools.calibration import friction, gravity, live, recorded, scale, wearer
 from exo_gravity.tools.inputs.arms import configured_arm
 from exo_gravity.tools.inputs.parameter_file import load, packaged_config

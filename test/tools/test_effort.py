@@ -11,7 +11,7 @@ from rich.console import Console
 
 from exo_gravity.core.control_params import COMPENSATOR, settings_of
 from exo_gravity.core.effort import Effort
-from exo_gravity.core.param_table import values_of
+from exo_gravity.core.params import values_of
 from exo_gravity.sim.effort_study import TASKS
 from exo_gravity.tools import trial
 from exo_gravity.tools.inputs.parameter_file import load, packaged_config

@@ -33,7 +33,9 @@ def refused(tmp_path, capsys):
 
 
 def test_the_node_names_are_the_modules_with_an_entry_point():
-    modules = {path.stem for path in NODES.glob("*.py") if "\ndef main(" in path.read_text(encoding="utf-8")}
+    files = [*NODES.glob("*.py"), *NODES.glob("*/node.py")]
+    with_main = [path for path in files if "\ndef main(" in path.read_text(encoding="utf-8")]
+    modules = {path.parent.name if path.stem == "node" else path.stem for path in with_main}
     assert set(node_names()) == modules >= {"can_bridge", "imu", "compensator", "simulator", "recorder"}
 
 

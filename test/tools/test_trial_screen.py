@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from exo_gravity.core.trial_script import Step, TrialScript
+from exo_gravity.core.trial.script import Step, TrialScript
 from exo_gravity.tools.trials.live import LEAD, Progress, describe
 from exo_gravity.tools.trials.real_time import follow
 

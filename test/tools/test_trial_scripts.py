@@ -14,7 +14,7 @@ import yaml
 from exo_gravity.bag.content import Bag
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.tools.reporting import trial_report
 from exo_gravity.tools.trials.criteria import criteria_for, missing_holds, shortest_hold
 from exo_gravity.tools.trials.scripts import is_guided, read_script

@@ -14,7 +14,7 @@ import numpy as np
 from exo_gravity.core.calibration.motion import MAX_SPEED, Station
 from exo_gravity.core.calibration.poses import measurable
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.limits import Limits
+from exo_gravity.core.safety.limits import Limits
 
 SPEEDS = (0.02, 0.05, 0.1, 0.18, MAX_SPEED)  # rad/s
 SWEEP_TIME = 1.2  # s of a sweep's half at steady speed

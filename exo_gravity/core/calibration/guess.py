@@ -10,10 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from exo_gravity.core.arm import JOINT_COUNT, ArmModel, Vector
-from exo_gravity.core.gravity import LAWS, Torque
-from exo_gravity.core.moments import regressor
-from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.model.arm import JOINT_COUNT, ArmModel, Vector
+from exo_gravity.core.model.gravity import LAWS, Torque
+from exo_gravity.core.model.moments import regressor
+from exo_gravity.core.model.tilt import Tilt
 
 UNSURE = 0.4  # of a moment: masses and torque scales that are each off by 30 %
 UNSURE_MOMENT = 0.02  # kg m, in addition: off-axis moments of which the file knows nothing
@@ -23,7 +23,7 @@ UNEXPLAINED = 0.05  # Nm: standard deviation of what no moment explains
 class TorqueGuess:
     """The commanded torque that holds the arm, as far as it is known.
 
-    length: (4,) m. moments: (8,) kg m, as in `core.moments`, with the load. tilt: of the trunk or the stand.
+    length: (4,) m. moments: (8,) kg m, as in `core.model.moments`, with the load. tilt: of the trunk or the stand.
     """
 
     def __init__(self, length: Vector, moments: Vector, tilt: Tilt, gravity: float) -> None:

@@ -2,7 +2,7 @@
 
 The commanded effort that holds the arm in a pose is, without friction, which averages out over both directions,
 
-    effort = torque(moments + load) / scale + offset          torque: `core.moments.regressor` times the moments
+    effort = torque(moments + load) / scale + offset          torque: `core.model.moments.regressor` times the moments
 
 A pose that does not fit the others (a hand on the arm, a slipping joint) is left out. A result that no arm can have is
 refused, with the pose that is missing. Held poses do not tell a common factor of all scales and moments without a known
@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm import STANDARD_GRAVITY, Vector
 from exo_gravity.core.calibration.identification_check import (
     check_fit,
     check_motors,
@@ -43,7 +42,8 @@ from exo_gravity.core.calibration.pose_fit import (
     without_each_pose,
     without_outliers,
 )
-from exo_gravity.core.moments import load_moments, regressor
+from exo_gravity.core.model.arm import STANDARD_GRAVITY, Vector
+from exo_gravity.core.model.moments import load_moments, regressor
 
 __all__ = ["Identified", "Observation", "identify", "next_pose"]
 

@@ -16,9 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm import STANDARD_GRAVITY
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.tilt import angle_between
+from exo_gravity.core.model.arm import STANDARD_GRAVITY
+from exo_gravity.core.model.tilt import angle_between
 
 BLOCK = 0.25  # s
 STILL_RATE = 0.06  # rad/s; a person who stands still sways at 0.02

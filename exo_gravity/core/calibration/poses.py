@@ -8,12 +8,12 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.calibration.guess import TorqueGuess
 from exo_gravity.core.calibration.identification import next_pose
 from exo_gravity.core.calibration.motion import Station, durations
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.limits import WALL_WIDTH, Limits
+from exo_gravity.core.model.arm import JOINT_COUNT
+from exo_gravity.core.safety.limits import WALL_WIDTH, Limits
 
 CANDIDATES = 800
 MOST_UPWARDS = 0.3  # sine of the largest angle above the horizontal, of links 3 and 4

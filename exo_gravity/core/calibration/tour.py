@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.calibration.guess import TorqueGuess
 from exo_gravity.core.calibration.identification import Observation
 from exo_gravity.core.calibration.motion import LEAD, Line, Station
@@ -22,9 +21,10 @@ from exo_gravity.core.calibration.tracking import MassMatrix, Tracker
 from exo_gravity.core.calibration.visit import FOLLOWED, Visit
 from exo_gravity.core.calibration.watch import Watch
 from exo_gravity.core.errors import ExoGravityError
-from exo_gravity.core.gravity import Torque
-from exo_gravity.core.limits import Limits
-from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.model.arm import JOINT_COUNT
+from exo_gravity.core.model.gravity import Torque
+from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.safety.limits import Limits
 
 SETTLING = 0.1  # s at rest after the way to a pose
 # rad behind the reference, from which on it slows down, and at which it stops and waits for the arm.

@@ -8,7 +8,7 @@ import numpy as np
 
 from exo_gravity.core.calibration.average import Average, Sweep, average
 from exo_gravity.core.calibration.motion import WINDOW, Line, Station
-from exo_gravity.core.gravity import Torque
+from exo_gravity.core.model.gravity import Torque
 
 FOLLOWED = 0.5  # of the way of the reference, that each joint must follow in a sweep that counts
 MAX_FAILURES = 3  # pairs of sweeps in which a joint may stick: each shows the controller more of its friction

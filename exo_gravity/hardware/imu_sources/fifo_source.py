@@ -10,8 +10,8 @@ import struct
 from collections.abc import Callable
 from typing import Any, ClassVar
 
-from exo_gravity.core.arm import STANDARD_GRAVITY
 from exo_gravity.core.errors import DeviceError
+from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.hardware.imu_sources.i2c import Registers
 from exo_gravity.hardware.imu_sources.sampled_source import Axes, Measurement, SampledSource
 from exo_gravity.hardware.imu_sources.source import Clock

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.linalg import qr, solve_triangular
 
-from exo_gravity.core.anfis import Anfis, grades
+from exo_gravity.core.model.anfis import Anfis, grades
 
 OnEvaluation = Callable[[int, float], None]  # (number of the evaluation, RMSE)
 

@@ -16,12 +16,12 @@ from rosbags.typesys import Stores, get_typestore
 
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.bag.storage import Storage
-from exo_gravity.core.anfis_law import INPUTS, UPRIGHT, scaled
-from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.recording import Recording
-from exo_gravity.core.tilt import Tilt
-from exo_gravity.core.trial_analysis import analyse
+from exo_gravity.core.model.anfis_law import INPUTS, UPRIGHT, scaled
+from exo_gravity.core.model.arm import JOINT_COUNT
+from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.trial.analysis import analyse
+from exo_gravity.core.trial.recording import Recording
 from exo_gravity.tools.anfis.data import Samples
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 

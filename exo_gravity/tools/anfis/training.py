@@ -17,10 +17,10 @@ from rich.progress import Progress
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
-from exo_gravity.core.anfis import Anfis
-from exo_gravity.core.anfis_law import JOINTS, AnfisLaw, scaled
-from exo_gravity.core.arm import ArmModel
 from exo_gravity.core.errors import DataError
+from exo_gravity.core.model.anfis import Anfis
+from exo_gravity.core.model.anfis_law import JOINTS, AnfisLaw, scaled
+from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.tools.anfis.data import Samples
 from exo_gravity.tools.anfis.projection import OnEvaluation, Projection
 

@@ -16,8 +16,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from exo_gravity.core.recording import Recording, ScriptedStep
-from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.core.trial.recording import Recording, ScriptedStep
+from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.tools import calibrate
 from exo_gravity.tools.calibration.outcome import Change
 from exo_gravity.tools.calibration.yaml_file import write_changes

@@ -10,8 +10,8 @@ import numpy as np
 from exo_gravity.core.calibration.identification import Identified, Observation, identify, next_pose
 from exo_gravity.core.calibration.poses import candidates
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.joint_motor import TORQUE_SCALE_BOUNDS
-from exo_gravity.core.moments import MOMENTS, moments_of
+from exo_gravity.core.model.moments import MOMENTS, moments_of
+from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS
 from exo_gravity.tools.calibration.live import Say, refusals_of, run_tour, tour_parameters
 from exo_gravity.tools.calibration.outcome import Change, Outcome
 from exo_gravity.tools.inputs.arms import ConfiguredArm

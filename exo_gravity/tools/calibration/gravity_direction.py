@@ -65,6 +65,6 @@ def _turn_in_trunk(side: str, turn: np.ndarray) -> np.ndarray:
 
 
 def _in_trunk(side: str, direction: np.ndarray) -> np.ndarray:
-    """Return a direction in an arm's base frame in the trunk's axes, as in `core.tilt`."""
+    """Return a direction in an arm's base frame in the trunk's axes, as in `core.model.tilt`."""
     outward, forward, down = direction
     return np.array((forward, outward if side == "left" else -outward, -down))

@@ -8,9 +8,9 @@ from collections.abc import Iterable, Sequence
 
 from rich.table import Table
 
-from exo_gravity.core.joint_motor import MAX_CAN_ID
-from exo_gravity.core.motors import MOTOR_ERRORS
-from exo_gravity.hardware.bus_scan import Answer, BusScan
+from exo_gravity.core.motors.joint_motor import MAX_CAN_ID
+from exo_gravity.core.motors.specs import MOTOR_ERRORS
+from exo_gravity.hardware.can.bus_scan import Answer, BusScan
 
 MAX_SILENCE = 0.15  # s: some replies in a row may be late on a busy computer
 

@@ -17,12 +17,12 @@ from statistics import fmean
 
 from rich.table import Table
 
-from exo_gravity.core.arm import JOINT_COUNT
 from exo_gravity.core.control_params import OPTIONS
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.motors import MOTOR_ERRORS
-from exo_gravity.hardware.bus_scan import Answer, BusScan
+from exo_gravity.core.model.arm import JOINT_COUNT
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import MOTOR_ERRORS
+from exo_gravity.hardware.can.bus_scan import Answer, BusScan
 from exo_gravity.tools.calibration.motor_watch import Watch, motor_table
 from exo_gravity.tools.calibration.outcome import Change, Outcome
 from exo_gravity.tools.inputs.arms import ConfiguredArm

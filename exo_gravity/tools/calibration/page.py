@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from exo_gravity.core.calibration.identification import Identified
-from exo_gravity.core.moments import MOMENTS
+from exo_gravity.core.model.moments import MOMENTS
 from exo_gravity.tools.calibration.figures import friction_figure, prediction_figure, remainder_figure
 from exo_gravity.tools.calibration.outcome import Change, Outcome
 from exo_gravity.tools.calibration.torque_table import SMALL_FRICTION, TorqueTable, torque_table

@@ -21,8 +21,8 @@ from exo_gravity.bag.storage import Storage
 from exo_gravity.core.calibration.average import BINS, Sweep, average
 from exo_gravity.core.calibration.identification import Observation
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.recording import Recording, in_blocks, still_spans
-from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.trial.recording import Recording, in_blocks, still_spans
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 
 TILT_TOPIC, TILT_TYPE = "/imu/pitch_yaw", "geometry_msgs/msg/Vector3Stamped"

@@ -11,8 +11,8 @@ import argparse
 from typing import Any
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.gravity import gravity_torque
-from exo_gravity.core.moments import load_moments
+from exo_gravity.core.model.gravity import gravity_torque
+from exo_gravity.core.model.moments import load_moments
 from exo_gravity.tools.calibration.gravity import solve
 from exo_gravity.tools.calibration.live import LiveTour, Say, is_simulated, refusals_of, run_tour, tour_parameters
 from exo_gravity.tools.calibration.outcome import Outcome

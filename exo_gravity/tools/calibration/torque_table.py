@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.gravity import gravity_torque
-from exo_gravity.core.moments import load_moments, regressor
+from exo_gravity.core.model.gravity import gravity_torque
+from exo_gravity.core.model.moments import load_moments, regressor
 from exo_gravity.tools.calibration.outcome import Outcome
 
 SMALL_FRICTION = 0.2  # of the friction that was measured: a well-run-in gear

@@ -15,8 +15,8 @@ import numpy as np
 from exo_gravity.core.calibration.identification import Observation
 from exo_gravity.core.control_params import wearer_of
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.moments import moments_of, regressor
-from exo_gravity.core.wearer import Wearer
+from exo_gravity.core.model.moments import moments_of, regressor
+from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.tools.calibration.live import Say, is_simulated, refusals_of, run_tour, tour_parameters
 from exo_gravity.tools.calibration.outcome import Change, Outcome
 from exo_gravity.tools.inputs.arms import ConfiguredArm

@@ -28,8 +28,8 @@ from sklearn.multioutput import MultiOutputRegressor
 from sklearn.neural_network import MLPRegressor
 from threadpoolctl import threadpool_limits
 
-from exo_gravity.core.gravity import LAWS, gravity_torque
-from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.model.gravity import LAWS, gravity_torque
+from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.tools.comparison.laws import Baseline, rms
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.inputs.references import gravload

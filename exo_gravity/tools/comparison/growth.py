@@ -15,9 +15,9 @@ from itertools import product
 
 import numpy as np
 
-from exo_gravity.core.anfis import Anfis
-from exo_gravity.core.gravity import gravity_torque
-from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.model.anfis import Anfis
+from exo_gravity.core.model.gravity import gravity_torque
+from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.tools.anfis.training import train
 from exo_gravity.tools.comparison.laws import rms
 from exo_gravity.tools.inputs.arms import ConfiguredArm

@@ -14,10 +14,10 @@ from itertools import product
 
 import numpy as np
 
-from exo_gravity.core.anfis_law import AnfisLaw
-from exo_gravity.core.arm import ArmModel
-from exo_gravity.core.gravity import gravity_torque, paper_mobile_torque, paper_static_torque
-from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.model.anfis_law import AnfisLaw
+from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.model.gravity import gravity_torque, paper_mobile_torque, paper_static_torque
+from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.tools.anfis.data import GRID
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 
@@ -29,7 +29,7 @@ class Case:
     """Poses theta (n, 4) rad of an arm, each with a trunk tilt.
 
     cog: which centres of gravity. positions: 'workspace' or 'random'. limit: of the tilt, degrees. direction (n, 3);
-    axis_angle, beta, phi (n,) rad: as in `core.tilt.Tilt`.
+    axis_angle, beta, phi (n,) rad: as in `core.model.tilt.Tilt`.
     """
 
     cog: str

@@ -1,8 +1,8 @@
 """The two references: gravity torques by independent libraries, from the same masses and Table 1 of the paper.
 
 The Robotics Toolbox's `gravload` runs a recursive Newton-Euler algorithm over the Denavit-Hartenberg parameters;
-Pinocchio's `computeGeneralizedGravity` runs one over spatial inertias. They share no code with `core.gravity` or with
-each other.
+Pinocchio's `computeGeneralizedGravity` runs one over spatial inertias. They share no code with `core.model.gravity` or
+with each other.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm import JOINT_COUNT, ArmModel
 from exo_gravity.core.errors import DataError
+from exo_gravity.core.model.arm import JOINT_COUNT, ArmModel
 
 # Table 1 of the paper, standard Denavit-Hartenberg; a is the link's length, d is 0.
 ALPHA = (-math.pi / 2, math.pi / 2, 0.0, 0.0)

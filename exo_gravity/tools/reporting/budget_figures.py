@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 
-from exo_gravity.core.budget import torque_at
+from exo_gravity.core.model.budget import torque_at
 from exo_gravity.tools.reporting.budget_table import JOINTS, ArmBudget
 from exo_gravity.tools.reporting.colours import ALONE_COLOUR, CARRYING_COLOUR, INK, PEAK_COLOUR, RATED_COLOUR
 

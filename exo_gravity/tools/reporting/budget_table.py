@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from exo_gravity.core.arm import ArmModel
-from exo_gravity.core.budget import (
+from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.model.budget import (
     FAMILY,
     JointBudget,
     Workspace,
@@ -19,7 +19,7 @@ from exo_gravity.core.budget import (
     motor_torques,
     rounded_down,
 )
-from exo_gravity.core.wearer import LinkLoad, Wearer
+from exo_gravity.core.model.wearer import LinkLoad, Wearer
 from exo_gravity.tools.inputs.arms import ConfiguredArm, named
 
 JOINTS = ("shoulder rotation", "shoulder abduction", "shoulder flexion", "elbow flexion")

@@ -8,8 +8,8 @@ from html import escape
 from itertools import groupby
 from typing import Any
 
-from exo_gravity.core.recording import Recording
-from exo_gravity.core.trial_analysis import TrialAnalysis
+from exo_gravity.core.trial.analysis import TrialAnalysis
+from exo_gravity.core.trial.recording import Recording
 from exo_gravity.tools.reporting.colours import JOINT_COLOURS
 from exo_gravity.tools.reporting.table import Row, hold_rows, joint_labels, motion_rows, per_minute, shown
 

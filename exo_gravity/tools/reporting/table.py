@@ -13,8 +13,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from exo_gravity.core.recording import Recording
-from exo_gravity.core.trial_analysis import Hold, Motion, TrialAnalysis
+from exo_gravity.core.trial.analysis import Hold, Motion, TrialAnalysis
+from exo_gravity.core.trial.recording import Recording
 
 Row = dict[str, Any]
 Numbers = TypeVar("Numbers", float, np.ndarray)

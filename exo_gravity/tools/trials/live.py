@@ -16,8 +16,8 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
-from exo_gravity.core.drive import State
-from exo_gravity.core.trial_script import TRUNK_ACTIONS, Step, TrialScript
+from exo_gravity.core.safety.drive import State
+from exo_gravity.core.trial.script import TRUNK_ACTIONS, Step, TrialScript
 
 SETTLING = 0.5  # s between letting go and the position from which drift is measured
 LEAD = 5.0  # s for a person to get ready when the arm is carried

@@ -17,8 +17,8 @@ from rich.progress import Progress
 
 from exo_gravity.bag.content import Bag, Event
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.recording import Recording
-from exo_gravity.core.trial_script import TRUNK_ACTIONS, TrialScript
+from exo_gravity.core.trial.recording import Recording
+from exo_gravity.core.trial.script import TRUNK_ACTIONS, TrialScript
 from exo_gravity.sim.device_params import SIMULATOR, device_of, imu_of, set_faults
 from exo_gravity.sim.imu import SimulatedImu, measured_tilt
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial

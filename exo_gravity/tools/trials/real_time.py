@@ -12,7 +12,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.tools.inputs.parameter_file import load
 from exo_gravity.tools.launcher import Launcher, Stopping
 from exo_gravity.tools.trials.busy import fault_of, too_busy

@@ -7,7 +7,7 @@ from pathlib import Path
 import yaml
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.trial_script import TrialScript
+from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.tools.inputs.parameter_file import load, packaged_config
 
 RECORDER = "/recorder"

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from exo_gravity.core.compensator_settings import Settings
+from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.compensation.terms.settings import GROUPS
 from exo_gravity.core.effort import Effort
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.joint_motor import JointMotor
-from exo_gravity.core.param_table import params_of
-from exo_gravity.core.terms.settings import GROUPS
-from exo_gravity.core.trial_script import TrialScript
-from exo_gravity.core.wearer import Wearer
+from exo_gravity.core.model.wearer import Wearer
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.params import params_of
+from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim.baselines import Burden, Feedforward, Law, burden
 from exo_gravity.sim.device_params import SIMULATOR, device_of
 from exo_gravity.sim.effort import Sweep, Task

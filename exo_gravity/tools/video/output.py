@@ -11,8 +11,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
-from exo_gravity.core.arm import one_float
 from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.model.arm import one_float
 from exo_gravity.tools.cli.extras import missing
 
 FRAME_RATE = {".mp4": 25, ".gif": 10}  # frames per second

@@ -1,4 +1,4 @@
-"""The arms of a robot description drawn by MuJoCo without a screen, with the shapes of `core.scene` around them."""
+"""The arms of a robot description drawn by MuJoCo without a screen, with `core.view.scene` around them."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from exo_gravity.core.arm_description import ArmDescription
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.scene import ARROW, LINE, SPHERE, Shape
-from exo_gravity.core.urdf import joint_names, urdf
+from exo_gravity.core.view.arm_description import ArmDescription
+from exo_gravity.core.view.scene import ARROW, LINE, SPHERE, Shape
+from exo_gravity.core.view.urdf import joint_names, urdf
 
 MAX_SHAPES = 4000
 AZIMUTH = {"left": 215.0, "right": 145.0}  # deg, of the camera: in front, on the arm's side

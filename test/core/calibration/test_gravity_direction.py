@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.calibration.identification import identify
-from exo_gravity.core.tilt import SIDES, Tilt, gravity_in_trunk, rotation_matrix
+from exo_gravity.core.model.tilt import SIDES, Tilt, gravity_in_trunk, rotation_matrix
 from exo_gravity.tools.calibration import gravity, gravity_direction
 from exo_gravity.tools.calibration.gravity_direction import turned
 from exo_gravity.tools.inputs.arms import configured_arm

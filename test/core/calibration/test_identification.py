@@ -11,7 +11,7 @@ from exo_gravity.core import ArmModel, Tilt
 from exo_gravity.core.calibration.identification import Observation, identify
 from exo_gravity.core.calibration.pose_choice import TYPICAL_MOMENTS
 from exo_gravity.core.calibration.pose_fit import COMMON
-from exo_gravity.core.moments import MOMENTS, load_moments, moments_of, off_axis_of, regressor
+from exo_gravity.core.model.moments import MOMENTS, load_moments, moments_of, off_axis_of, regressor
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
 
 from ...support.random_device import CANDIDATES, CODE, LEANING, LENGTH, UPRIGHT, WEIGHT, Device, best

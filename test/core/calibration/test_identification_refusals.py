@@ -10,7 +10,7 @@ from exo_gravity.core.calibration.identification_check import check_physical
 from exo_gravity.core.calibration.pose_choice import TYPICAL_MOMENTS, missing_pose
 from exo_gravity.core.calibration.pose_fit import COUNT
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.moments import regressor
+from exo_gravity.core.model.moments import regressor
 
 from ...support.random_device import LEANING, LENGTH, Device, best
 

@@ -9,7 +9,7 @@ import pytest
 
 from exo_gravity.core.calibration.imu_mounting import ImuRecord, mounting, six_rests
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.tilt import rotation_matrix
+from exo_gravity.core.model.tilt import rotation_matrix
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu
 
 from ...support.imu_records import RATE, record, rests

@@ -17,12 +17,12 @@ from exo_gravity.core.calibration.params import as_text, stations_of
 from exo_gravity.core.calibration.poses import BestPoses, FixedStations, Progress, candidates, measurable
 from exo_gravity.core.calibration.tour import Tour
 from exo_gravity.core.calibration.tracking import MassMatrix
-from exo_gravity.core.drive import State
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.faults import FaultCode
-from exo_gravity.core.limits import Limits
-from exo_gravity.core.moments import moments_of
-from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.model.moments import moments_of
+from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.faults import FaultCode
+from exo_gravity.core.safety.limits import Limits
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS
 

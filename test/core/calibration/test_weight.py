@@ -7,9 +7,9 @@ import numpy as np
 from exo_gravity.core.calibration.guess import TorqueGuess
 from exo_gravity.core.calibration.poses import BestPoses, Progress
 from exo_gravity.core.calibration.tracking import MassMatrix
-from exo_gravity.core.limits import Limits
-from exo_gravity.core.moments import load_moments, moments_of
-from exo_gravity.core.tilt import Tilt
+from exo_gravity.core.model.moments import load_moments, moments_of
+from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.safety.limits import Limits
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exo_gravity.core.terms.assist import FADE, RAMP, RECOVERY, Assist, AssistInput
+from exo_gravity.core.compensation.terms.assist import FADE, RAMP, RECOVERY, Assist, AssistInput
 
 NAMES = ["rotation", "abduction", "flexion", "elbow"]
 ASSIST = Assist((1.0, 2.0, 1.0, 1.0))

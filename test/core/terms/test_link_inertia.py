@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel
+from exo_gravity.core.compensation.terms.link_inertia import LinkInertia
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.terms.link_inertia import LinkInertia
 from exo_gravity.tools.inputs.references import OFFSET, pinocchio_model
 
 from ..test_gravity_oracles import random_arm

@@ -10,18 +10,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from exo_gravity.core.compensation.terms.coupling import Coupling
+from exo_gravity.core.compensation.terms.damping import Damping
+from exo_gravity.core.compensation.terms.friction import MAX_SPEED, MOVING, STILL, Friction
+from exo_gravity.core.compensation.terms.inertia import TANK, EnergyTank, Inertia
+from exo_gravity.core.compensation.terms.settings import TermSettings, term_parameters, term_settings_of
+from exo_gravity.core.compensation.terms.shaper import LONGEST_STEP, Shaper, Shaping
+from exo_gravity.core.compensation.terms.soft_limits import SoftLimits
+from exo_gravity.core.compensation.terms.spring import PosePath, Spring
+from exo_gravity.core.compensation.terms.term import TermState
+from exo_gravity.core.compensation.terms.terms import Terms
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.param_table import values_of
-from exo_gravity.core.terms.coupling import Coupling
-from exo_gravity.core.terms.damping import Damping
-from exo_gravity.core.terms.friction import MAX_SPEED, MOVING, STILL, Friction
-from exo_gravity.core.terms.inertia import TANK, EnergyTank, Inertia
-from exo_gravity.core.terms.settings import TermSettings, term_parameters, term_settings_of
-from exo_gravity.core.terms.shaper import LONGEST_STEP, Shaper, Shaping
-from exo_gravity.core.terms.soft_limits import SoftLimits
-from exo_gravity.core.terms.spring import PosePath, Spring
-from exo_gravity.core.terms.term import TermState
-from exo_gravity.core.terms.terms import Terms
+from exo_gravity.core.params import values_of
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")

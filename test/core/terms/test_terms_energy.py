@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.terms.coupling import Coupling
-from exo_gravity.core.terms.damping import Damping
-from exo_gravity.core.terms.friction import Friction
-from exo_gravity.core.terms.inertia import TANK, Inertia
-from exo_gravity.core.terms.link_inertia import LinkInertia
-from exo_gravity.core.terms.settings import TermSettings
-from exo_gravity.core.terms.soft_limits import SoftLimits
-from exo_gravity.core.terms.spring import Spring
-from exo_gravity.core.terms.term import DELAY
+from exo_gravity.core.compensation.terms.coupling import Coupling
+from exo_gravity.core.compensation.terms.damping import Damping
+from exo_gravity.core.compensation.terms.friction import Friction
+from exo_gravity.core.compensation.terms.inertia import TANK, Inertia
+from exo_gravity.core.compensation.terms.link_inertia import LinkInertia
+from exo_gravity.core.compensation.terms.settings import TermSettings
+from exo_gravity.core.compensation.terms.soft_limits import SoftLimits
+from exo_gravity.core.compensation.terms.spring import Spring
+from exo_gravity.core.compensation.terms.term import DELAY
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
 

@@ -1,0 +1,1 @@
+"""From joint angles and tilt to the efforts that hold the arm."""

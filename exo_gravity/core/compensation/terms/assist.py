@@ -1,0 +1,162 @@
+"""The outer loop's input: efforts from the user's own node, added to gravity compensation only while they are sound.
+
+    off        `max_effort` is 0
+    waiting    no messages yet, or they stopped; no torque
+    refused    the last ones were wrong; no torque until they have been sound for RECOVERY
+    assisting  the efforts are followed: clamped to `max_effort`, limited to `max_effort_rate`, ramped in over RAMP
+
+Messages may come at 10 to 500 Hz. An effort is valid for 1.5 observed periods after its stamp, and for MIN_VALID at
+least, so that a single late message costs nothing. Then, or at once when a message is wrong, the torque fades in FADE.
+So it is zero 100 ms after the first missing message was due: at 500 Hz 100 ms after the last one, at 10 Hz 200 ms. Only
+the compensator's `max_effort_rate` can make that longer, for an effort above 2.5 Nm at its default.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+
+from exo_gravity.core.compensation.terms.term import clamp
+from exo_gravity.core.model.arm import JOINT_COUNT
+from exo_gravity.core.model.gravity import NO_TORQUE, Torque
+from exo_gravity.core.params import check_owned, owned
+from exo_gravity.core.safety.limits import MAX_COMMAND
+
+SLOWEST, FASTEST = 0.1, 0.001  # s between two messages; faster ones are a flood
+MIN_VALID = 0.05  # s from its stamp for which an effort is valid at any rate
+PERIODS = 1.5  # observed periods for which it is valid
+SMOOTHING = 0.2  # share of a new interval in the observed period
+MAX_LEAD = 0.02  # s that a stamp may be ahead
+FADE = 0.05  # s from full assistance to none
+RAMP = 0.5  # s from none to full
+RECOVERY = 0.5  # s without a wrong message, after which efforts are believed again
+
+
+@dataclass(frozen=True)
+class Assist:
+    """Parameters of the group `assist`. Raises ParameterError."""
+
+    max_effort: Sequence[float] = owned(
+        (0.0,) * JOINT_COUNT, "largest torque from assist_efforts; 0: ignored", (0.0, 10.0), "Nm"
+    )
+    max_effort_rate: float = owned(10.0, "fastest change of that torque", (0.5, 50.0), "Nm/s")
+
+    def __post_init__(self) -> None:
+        check_owned(self)
+
+    @property
+    def on(self) -> bool:
+        """Whether efforts are used at all."""
+        return any(self.max_effort)
+
+
+class AssistInput:
+    """Follows one stream of efforts. Every time is in s on the caller's monotonic clock.
+
+    reason: why there is no full assistance, or ''.
+    """
+
+    def __init__(self, names: Sequence[str], assist: Assist | None = None) -> None:
+        self.assist = assist or Assist()
+        self.reason = "no assist_efforts yet"
+        self._names = list(names)
+        self._target = NO_TORQUE  # the newest efforts, clamped
+        self._held = list(NO_TORQUE)  # follows the target at the permitted rate
+        self._gain = 0.0
+        self._period = SLOWEST
+        self._stamp = self._arrival = -math.inf
+        self._refused = -math.inf
+        self._publisher: Hashable = None
+        self._last = -math.inf  # the last call of `torque`
+
+    @property
+    def state(self) -> str:
+        """'off', 'waiting', 'refused' or 'assisting', as of the last call of `torque`."""
+        if self.idle:
+            return "off"
+        if not self.reason:
+            return "assisting"
+        return "refused" if self._last - self._refused < RECOVERY else "waiting"
+
+    @property
+    def idle(self) -> bool:
+        """Whether `torque` returns nothing, and will until the next message."""
+        return self._gain <= 0.0 and not self.assist.on
+
+    @property
+    def report(self) -> str:
+        """The state, and the reason if there is one."""
+        return f"{self.state}: {self.reason}" if self.state in ("waiting", "refused") else self.state
+
+    @property
+    def valid(self) -> float:
+        """Time in s from its stamp for which an effort is valid, by the observed period."""
+        return max(MIN_VALID, PERIODS * self._period)
+
+    def receive(
+        self, now: float, names: Sequence[str], efforts: Sequence[float], stamp: float, publisher: Hashable = None
+    ) -> None:
+        """Take a message that arrived at `now`: `efforts` in Nm of the joints `names`, computed at `stamp`.
+
+        publisher: anything that differs from one sender to another.
+        """
+        interval, self._arrival = now - self._arrival, now
+        if interval < SLOWEST * PERIODS:
+            self._period += SMOOTHING * (min(interval, SLOWEST) - self._period)
+        problem = self._problem(now, names, efforts, stamp, publisher, interval)
+        self._publisher = publisher
+        if problem:
+            self._refused, self.reason = now, problem
+            return
+        self._stamp = stamp
+        order = efforts if list(names) == self._names else [efforts[names.index(name)] for name in self._names]
+        self._target = tuple(clamp(float(tau), most) for tau, most in zip(order, self.assist.max_effort, strict=True))
+
+    def _problem(
+        self,
+        now: float,
+        names: Sequence[str],
+        efforts: Sequence[float],
+        stamp: float,
+        publisher: Hashable,
+        interval: float,
+    ) -> str:
+        """Return what is wrong with a message, without a measured value; '' if nothing is."""
+        if sorted(names) != sorted(self._names) or len(efforts) != len(names):
+            return f"assist_efforts must name {', '.join(self._names)}, each once, with one effort each"
+        if not all(-MAX_COMMAND <= tau <= MAX_COMMAND for tau in efforts):
+            return f"assist_efforts must be numbers within {MAX_COMMAND:g} Nm"
+        if publisher != self._publisher and interval < SLOWEST * PERIODS:
+            return "more than one publisher of assist_efforts"
+        if self._period < FASTEST:
+            return f"assist_efforts come more often than {1 / FASTEST:g} times a second"
+        if not now - self.valid <= stamp <= now + MAX_LEAD:
+            return "assist_efforts are late by their stamp, or their clock differs"
+        return ""
+
+    def torque(self, now: float) -> Torque:
+        """Return the torque (4,) in Nm at `now`; call it in every cycle."""
+        dt = min(max(0.0, now - self._last), FADE)
+        self._last = now
+        sound = self._is_sound(now)
+        self._gain = min(1.0, self._gain + dt / RAMP) if sound else max(0.0, self._gain - dt / FADE)
+        if self._gain <= 0.0:
+            return NO_TORQUE
+        step = self.assist.max_effort_rate * dt
+        for joint, (last, target) in enumerate(zip(self._held, self._target, strict=True)):
+            self._held[joint] = max(last - step, min(last + step, target))
+        gain = self._gain
+        return tuple([gain * tau for tau in self._held])
+
+    def _is_sound(self, now: float) -> bool:
+        """Return whether the newest efforts are to be followed at `now`; note why not."""
+        if now - self._refused < RECOVERY:
+            return False  # `reason` says what was wrong
+        if not self.assist.on:
+            self.reason = "assist.max_effort is 0"
+        elif now - self._stamp > self.valid:
+            self.reason = "no assist_efforts yet" if self._stamp == -math.inf else "assist_efforts stopped"
+        else:
+            self.reason = ""
+        return not self.reason

@@ -1,0 +1,193 @@
+"""The arm model: four links, each with a length, and their masses and centres of gravity or their first moments.
+
+Table 1 of the paper (standard Denavit-Hartenberg): a = `length`, alpha = (-pi/2, +pi/2, 0, 0), d = 0, joint offsets
+(0, -pi/2, 0, 0), z0 along gravity when the trunk is upright. Joint order everywhere: shoulder rotation about the
+vertical, shoulder abduction, shoulder flexion, elbow flexion. At theta = (any, 0, 0, 0) the arm hangs straight down.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+
+from exo_gravity.core.errors import ParameterError
+
+Vector = Sequence[float] | np.ndarray  # numbers in joint order, or the components of a vector
+
+JOINT_COUNT = 4
+STANDARD_GRAVITY = 9.80665  # m/s^2, ISO 80000-3; the paper rounds to 9.8
+
+# These bounds catch wrong units (grams for kilograms, millimetres for metres), not unusual designs.
+MAX_LENGTH = 1.0  # m
+MAX_MASS = 20.0  # kg per link; the whole arm of a 150 kg person weighs about 8 kg
+MAX_TOTAL_MASS = 40.0  # kg, all links together
+MAX_MOMENT = 10.0  # kg m; it takes 98 Nm to hold, several times a motor's peak torque
+MAX_GAIN = 2.0
+MAX_GRAVITY = 25.0  # m/s^2
+
+ONES = (1.0,) * JOINT_COUNT
+ZEROS = (0.0,) * JOINT_COUNT
+UNKNOWN = np.full(JOINT_COUNT, np.nan)  # masses and centres of gravity of an arm given by its moments
+UNKNOWN.setflags(write=False)
+
+
+def four_floats(name: str, values: Vector, low: float, high: float, unit: str = "") -> np.ndarray:
+    """Return `values` as a read-only array (4,), or raise ParameterError unless they are 4 numbers in [low, high]."""
+    expected = f"{JOINT_COUNT} numbers from {low:g} to {high:g}{' ' + unit if unit else ''}"
+    try:
+        array = np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        raise ParameterError(name, values, expected) from None
+    # NaN fails both comparisons, so this check rejects it too.
+    if array.shape != (JOINT_COUNT,) or not np.all((array >= low) & (array <= high)):
+        raise ParameterError(name, values, expected)
+    array.setflags(write=False)
+    return array
+
+
+def one_float(name: str, value: float, low: float, high: float, unit: str = "") -> float:
+    """Return `value` as a float, or raise ParameterError unless it is one number in [low, high]."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not low <= number <= high:
+        raise ParameterError(name, value, f"a number from {low:g} to {high:g}{' ' + unit if unit else ''}")
+    return number
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class ArmModel:
+    """Lengths, centres of gravity, masses and gains of a 4-joint arm.
+
+    length: (4,) m, link lengths l_n (the a_n of Table 1).
+    cog: (4,) m, distance d_n of link n's centre of gravity from joint n along the link, 0 <= d_n <= l_n.
+    mass: (4,) kg, link masses m_n.
+    gain: (4,), the paper's c_n, which scales the torque of joint n; 0..2, 1 by default.
+    gravity: m/s^2.
+    off_axis: (W, Z, Y3, Y4) kg m, first moments across the links, see `core.model.moments`; 0 by default.
+
+    Immutable. Raises ParameterError that names the invalid value. Two derived values, in plain floats for the control
+    loop: `first_moment`, M1..M4 in kg m, is the mass of link n times d_n plus all mass beyond link n times l_n;
+    `scale` is c_n times gravity. `from_moments` makes an arm whose masses are not known: `by_moments` is then True, and
+    `cog` and `mass` are NaN.
+    """
+
+    length: np.ndarray
+    cog: np.ndarray
+    mass: np.ndarray
+    gain: np.ndarray
+    gravity: float
+    off_axis: tuple[float, ...]
+    first_moment: tuple[float, ...] = field(init=False, repr=False)
+    scale: tuple[float, ...] = field(init=False, repr=False)
+    by_moments: bool = field(init=False, repr=False)
+
+    def __init__(
+        self,
+        length: Vector,
+        cog: Vector,
+        mass: Vector,
+        gain: Vector = ONES,
+        gravity: float = STANDARD_GRAVITY,
+        off_axis: Vector = ZEROS,
+    ) -> None:
+        lengths = four_floats("length", length, 0.0, MAX_LENGTH, "m")
+        cogs = four_floats("cog", cog, 0.0, MAX_LENGTH, "m")
+        if np.any(cogs > lengths):
+            raise ParameterError("cog", cog, f"within its link, at most length = {lengths.tolist()} m")
+        masses = four_floats("mass", mass, 0.0, MAX_MASS, "kg")
+        self._set(lengths, cogs, masses, moments_along(lengths, cogs, masses), gain, gravity, off_axis)
+
+    @classmethod
+    def from_moments(
+        cls,
+        length: Vector,
+        first_moment: Vector,
+        off_axis: Vector = ZEROS,
+        gain: Vector = ONES,
+        gravity: float = STANDARD_GRAVITY,
+    ) -> ArmModel:
+        """Return the arm with links of `length` (4,) m that is given by its moments, (4,) kg m each.
+
+        first_moment: M1..M4, 0..MAX_MOMENT. The other arguments are those of the constructor. Raises ParameterError.
+        """
+        lengths = four_floats("length", length, 0.0, MAX_LENGTH, "m")
+        moment = four_floats("first_moment", first_moment, 0.0, MAX_MOMENT, "kg m")
+        arm = cls.__new__(cls)
+        arm._set(lengths, UNKNOWN, UNKNOWN, moment, gain, gravity, off_axis)
+        return arm
+
+    def _set(
+        self,
+        length: np.ndarray,
+        cog: np.ndarray,
+        mass: np.ndarray,
+        moment: np.ndarray,
+        gain: Vector,
+        gravity: float,
+        off_axis: Vector,
+    ) -> None:
+        gains = four_floats("gain", gain, 0.0, MAX_GAIN)
+        gravity = one_float("gravity", gravity, 0.0, MAX_GRAVITY, "m/s^2")
+        across = tuple(four_floats("off_axis", off_axis, -MAX_MOMENT, MAX_MOMENT, "kg m").tolist())
+        scale = tuple((gains * gravity).tolist())
+        values = (length, cog, mass, gains, gravity, across, tuple(moment.tolist()), scale, mass is UNKNOWN)
+        for own_field, value in zip(fields(self), values, strict=True):
+            object.__setattr__(self, own_field.name, value)
+
+    def __repr__(self) -> str:
+        own = ("length", "first_moment") if self.by_moments else ("length", "cog", "mass")
+        shown = (f"{name}={getattr(self, name)!r}" for name in (*own, "off_axis", "gain", "gravity"))
+        return f"{type(self).__name__}({', '.join(shown)})"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ArmModel) and self._key() == other._key()
+
+    def __hash__(self) -> int:
+        return hash(self._key())
+
+    def _key(self) -> tuple[object, ...]:
+        arrays = (self.length, self.gain) if self.by_moments else (self.length, self.gain, self.cog, self.mass)
+        return (*(tuple(a.tolist()) for a in arrays), self.first_moment, self.off_axis, self.gravity)
+
+    @property
+    def total_mass(self) -> float:
+        """Mass of the four links in kg; of an arm given by its moments, the least mass that can have them."""
+        if not self.by_moments:
+            return float(self.mass.sum())
+        moment = np.array(self.first_moment)
+        return float(np.max(np.divide(moment, self.length, out=np.zeros(JOINT_COUNT), where=self.length > 0)))
+
+    def check_masses(self, what: str) -> None:
+        """Raise ParameterError unless masses are known and all centres of gravity lie on the links, as `what` needs."""
+        if self.by_moments:
+            raise ParameterError("robot.first_moment", self.first_moment, f"0 for {what}, which needs mass and cog")
+        if any(self.off_axis):
+            raise ParameterError("robot.off_axis", self.off_axis, f"0 for {what}, which knows no moments across links")
+
+    def with_wearer(self, mass: Vector, cog: Vector, support: float = 1.0) -> ArmModel:
+        """Return this arm plus a share `support` (0..1) of the wearer's arm: 0 is One-G, 1 is full Zero-G.
+
+        mass: (4,) kg and cog: (4,) m of the wearer's segments on each link. Masses add up, and so do first moments.
+        """
+        carried = four_floats("wearer.mass", mass, 0.0, MAX_MASS, "kg") * one_float("support", support, 0.0, 1.0)
+        distance = four_floats("wearer.cog", cog, 0.0, MAX_LENGTH, "m")
+        if np.any(distance > self.length):
+            raise ParameterError("wearer.cog", cog, f"within its link, at most length = {self.length.tolist()} m")
+        if self.by_moments:
+            moment = np.add(self.first_moment, moments_along(self.length, distance, carried))
+            return ArmModel.from_moments(self.length, moment, self.off_axis, self.gain, self.gravity)
+        total = self.mass + carried
+        moment = self.mass * self.cog + carried * distance
+        combined = np.divide(moment, total, out=self.cog.copy(), where=total > 0)
+        return ArmModel(self.length, np.minimum(combined, self.length), total, self.gain, self.gravity, self.off_axis)
+
+
+def moments_along(length: np.ndarray, cog: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    """Return the first moments M1..M4 (4,) in kg m: mass n times cog n, plus all mass beyond link n times length n."""
+    beyond = np.append(np.cumsum(mass[::-1])[-2::-1], 0.0)
+    return np.asarray(mass * cog + beyond * length)

@@ -1,0 +1,242 @@
+"""The torque budget: the gravity torque on each motor over the whole workspace, compared with the motor's limits.
+
+The workspace is every pose within the joint limits at every trunk tilt up to a bound. Gravity's torque is linear in the
+masses (M1..M4 of `gravity.py`), hence in the support s of the wearer's arm: tau = tau_robot + s tau_wearer. The largest
+s that keeps a joint within its limit in a pose, |tau_robot + s tau_wearer| <= limit, is therefore a quotient.
+
+Shares of the workspace are estimated from uniform random poses. The search for a worst pose starts from the worst of
+these and improves one coordinate after another until nothing gets worse.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.arm import JOINT_COUNT, ArmModel, Vector, four_floats, one_float
+from exo_gravity.core.model.gravity import gravity_torque
+from exo_gravity.core.motors.specs import MOTORS
+
+Cost = Callable[[np.ndarray], np.ndarray]  # points (n, 6) -> (n,)
+
+USUAL_TILT = 20.0  # deg of trunk pitch and roll, in both directions, that a budget covers by default
+SAMPLES = 50_000  # random poses, which give shares to within 0.5 %
+STARTS = 5  # poses from which the worst one is sought, because a search can end in a local maximum
+CHUNK = 2_000  # poses, about 1 ms of computation
+TOLERANCE = 1e-3  # Nm, or support; smaller differences are irrelevant to a motor
+STEPS = np.array(sorted(np.linspace(-1.0, 1.0, 21), key=abs))  # 0 comes first, so that the search stays put at a tie
+
+# Rated and peak torque in Nm. Source for motors other than the two that the package drives: the maker's product pages
+# of February 2024, collected in gatech-epic-power/epically-powerful (actuation/motor_data.py); AK10-9 is V2.0.
+FAMILY = {
+    **{spec.name: (spec.rated_torque, spec.peak_torque) for spec in MOTORS.values()},
+    "AK70-10": (10.0, 24.8),
+    "AK10-9": (18.0, 48.0),
+    "AK80-64": (48.0, 120.0),
+}
+
+
+def motor_for(torque: float) -> str | None:
+    """Return the motor with the smallest rated torque that covers `torque` Nm, or None if no motor does."""
+    return min((name for name in FAMILY if FAMILY[name][0] >= torque), key=lambda name: FAMILY[name][0], default=None)
+
+
+def motor_torques(motors: Sequence[str], torque_scale: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return rated and peak torque (4,) in Nm of `motors` whose real torque is `torque_scale` times the command."""
+    # A motor that gives less than commanded already reaches its rated current when its rated torque is commanded.
+    scale = np.minimum(four_floats("torque_scale", torque_scale, 0.2, 2.0), 1.0)
+    rated, peak = (np.array([FAMILY[motor][which] for motor in motors]) for which in (0, 1))
+    return scale * rated, scale * peak
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Joint limits (4,) in rad, and the largest trunk pitch and roll in either direction in rad (up to pi/2)."""
+
+    position_min: Vector
+    position_max: Vector
+    max_tilt: float
+
+    def __post_init__(self) -> None:
+        low = four_floats("position_min", self.position_min, -3.15, 3.15, "rad")
+        high = four_floats("position_max", self.position_max, -3.15, 3.15, "rad")
+        if np.any(low >= high):
+            raise ParameterError("position_max", self.position_max, f"above position_min = {low.tolist()} rad")
+        object.__setattr__(self, "position_min", tuple(low.tolist()))
+        object.__setattr__(self, "position_max", tuple(high.tolist()))
+        object.__setattr__(self, "max_tilt", one_float("max_tilt", self.max_tilt, 0.0, np.pi / 2, "rad"))
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest point (6,): four joint angles, then pitch and roll of the trunk, in rad."""
+        tilt = np.repeat(self.max_tilt, 2)
+        return np.append(self.position_min, -tilt), np.append(self.position_max, tilt)
+
+    def points(self, count: int = SAMPLES) -> np.ndarray:
+        """Return random points (count, 6), uniform over the workspace and the same in every call."""
+        return np.random.default_rng(0).uniform(*self.bounds, (count, JOINT_COUNT + 2))
+
+
+@dataclass(frozen=True)
+class JointBudget:
+    """The torque that one joint needs at a given support, and the largest support it allows.
+
+    rated, peak: Nm, of its motor. torque: Nm, the largest needed in the workspace. worst: (6,) rad, the pose and the
+    trunk's pitch and roll at which it is needed. within_rated, within_peak: shares 0..1 of the workspace in which the
+    motor stays within its rated and peak torque. support: the largest support 0..1 at which the joint stays within
+    rated torque everywhere; None if the robot alone needs more.
+    """
+
+    rated: float
+    peak: float
+    torque: float
+    worst: np.ndarray
+    within_rated: float
+    within_peak: float
+    support: float | None
+
+    @property
+    def overloaded(self) -> bool:
+        """Whether the joint needs more than rated torque in some pose."""
+        return self.torque > self.rated
+
+
+def largest_support(joints: Sequence[JointBudget]) -> float | None:
+    """Return the largest support 0..1 that keeps all joints within rated torque, rounded down; None if none does."""
+    supports = [joint.support for joint in joints if joint.support is not None]
+    return rounded_down(min(supports)) if len(supports) == len(joints) else None
+
+
+def rounded_down(share: float) -> float:
+    """Return a share rounded down to a thousandth, so that the rounded value is still within the limit."""
+    return math.floor(1000 * share + 1e-9) / 1000
+
+
+def overload(names: Sequence[str], joints: Sequence[JointBudget]) -> str:
+    """Return which joints are overloaded and which support would fit, in a sentence; '' if no joint is overloaded."""
+    needs = [
+        f"{name} needs {joint.torque:.1f} Nm in its worst pose (rated {joint.rated:.3g}, peak {joint.peak:.3g})"
+        for name, joint in zip(names, joints, strict=True)
+        if joint.overloaded
+    ]
+    if not needs:
+        return ""
+    fits = largest_support(joints)
+    remedy = "the robot alone needs too much" if fits is None else f"the largest support that fits is {fits:g}"
+    return f"motors overloaded: {', '.join(needs)}; {remedy}"
+
+
+def torque_at(arm: ArmModel, points: np.ndarray) -> np.ndarray:
+    """Return the exact torque (n, 4) in Nm at points (n, 6): joint angles, then pitch and roll of the trunk, in rad."""
+    pitch, roll = points[:, JOINT_COUNT], points[:, JOINT_COUNT + 1]
+    # This is `Tilt.of` for arrays and the left arm. A workspace has both signs of roll, so it covers the right arm too.
+    level = np.cos(pitch)
+    directions = np.stack((-np.sin(roll) * level, np.sin(pitch), np.cos(roll) * level), axis=1)
+    return gravity_torque(arm, points[:, :JOINT_COUNT], directions)
+
+
+def budget(
+    robot: ArmModel,
+    load: tuple[Vector, Vector],
+    support: float,
+    workspace: Workspace,
+    rated: Vector,
+    peak: Vector,
+    pause: Callable[[], None] = lambda: None,
+) -> tuple[JointBudget, ...]:
+    """Return the budget of each joint of `robot` when it carries a share `support` (0..1) of a wearer's arm.
+
+    load: mass (4,) in kg and centre of gravity (4,) in m of the wearer's arm on each link, e.g. a `LinkLoad`.
+    rated, peak: (4,) Nm at the joints. pause: called about 500 times, before each chunk of about a millisecond of
+    computation. Raises ParameterError if the load does not fit the robot.
+    """
+    torques = partial(_torques, robot, robot.with_wearer(*load), pause)
+    points = workspace.points()
+    starts = np.vstack((points[: SAMPLES // 5] * (1, 1, 1, 1, 0, 0), points))  # those with an upright trunk first
+    at_starts = torques(starts)
+
+    def of_joint(joint: int) -> JointBudget:
+        def need(own: np.ndarray, with_all: np.ndarray) -> np.ndarray:
+            torque: np.ndarray = np.abs(own + support * (with_all - own))
+            return torque[:, joint]
+
+        def shortage(own: np.ndarray, with_all: np.ndarray) -> np.ndarray:
+            return -_support(own[:, joint], with_all[:, joint], rated[joint])
+
+        needs = need(*at_starts)
+        worst, torque = _worst(lambda at: need(*torques(at)), workspace, starts, needs)
+        _, short = _worst(lambda at: shortage(*torques(at)), workspace, starts, shortage(*at_starts))
+
+        def share_within(limit: float) -> float:
+            # The search can find an overloaded pose that no sample shows. Then the share must not be 1.
+            return min(float(np.mean(needs[-len(points) :] <= limit)), 0.9999 if torque > limit else 1.0)
+
+        return JointBudget(
+            rated=float(rated[joint]),
+            peak=float(peak[joint]),
+            torque=torque,
+            worst=worst,
+            within_rated=share_within(rated[joint]),
+            within_peak=share_within(peak[joint]),
+            support=None if short > 0.0 else -short,
+        )
+
+    return tuple(map(of_joint, range(JOINT_COUNT)))
+
+
+def _torques(
+    robot: ArmModel, full: ArmModel, pause: Callable[[], None], points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the torques (n, 4) in Nm of `robot` and of `full`, the robot with the wearer's arm, at points (n, 6)."""
+    chunks = []
+    for chunk in np.array_split(points, len(points) // CHUNK + 1):
+        pause()
+        chunks.append((torque_at(robot, chunk), torque_at(full, chunk)))
+    own, with_all = map(np.concatenate, zip(*chunks, strict=True))
+    return own, with_all
+
+
+def _support(own: np.ndarray, with_all: np.ndarray, limit: float) -> np.ndarray:
+    """Return the largest support (n,), at most 1, with |own + support (with_all - own)| <= limit; negative if none."""
+    added = with_all - own
+    room = limit - np.sign(added) * own  # in the direction of the wearer's torque
+    support = np.divide(room, np.abs(added), out=np.ones_like(room), where=np.abs(added) > 1e-9)
+    return np.where(np.abs(own) > limit, -1.0, np.minimum(support, 1.0))
+
+
+def _worst(cost: Cost, workspace: Workspace, starts: np.ndarray, costs: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the point (6,) with the largest cost, and that cost.
+
+    Among equal points it prefers upright ones and sets as many coordinates as possible to 0. costs: (m,), of `starts`
+    (m, 6).
+    """
+    low, high = workspace.bounds
+    chosen = sorted({*np.argsort(costs)[-STARTS:].tolist(), int(np.argmax(costs[: SAMPLES // 5]))})
+    points, values = _climb(cost, starts[chosen], low, high)
+    best, largest = points[np.argmax(values >= values.max() - TOLERANCE)], float(values.max())
+    for axis in range(len(best)):
+        simpler = best.copy()
+        simpler[axis] = np.clip(0.0, low[axis], high[axis])
+        if cost(simpler[None])[0] >= largest - TOLERANCE:
+            best = simpler
+    return best, largest
+
+
+def _climb(cost: Cost, points: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Climb from each of the points (n, 6) along one coordinate at a time; return the maxima and their costs."""
+    width = (high - low) / 8
+    values = cost(points)
+    while np.any(width > 1e-4):
+        for axis in range(points.shape[1]):
+            lines = np.repeat(points[:, None], len(STEPS), axis=1)
+            lines[:, :, axis] = np.clip(lines[:, :, axis] + STEPS * width[axis], low[axis], high[axis])
+            costs = cost(lines.reshape(-1, points.shape[1])).reshape(len(points), len(STEPS))
+            chosen = np.arange(len(points)), np.argmax(costs, axis=1)
+            points, values = lines[chosen], costs[chosen]
+        width = width / 4
+    return points, values

@@ -1,0 +1,184 @@
+"""The gravity laws: joint angles -> the torque that each motor must give to hold the arm against gravity.
+
+`exact` is the closed form of Newton-Euler for gravity alone, valid for any centre of gravity, on its link or beside it,
+and any trunk tilt. `paper_static` is EQ2-EQ5 and `paper_mobile` is EQ1m-EQ4m of the paper, word for word. They agree
+with `exact` only if every centre of gravity is at the far end of its link (d_n = l_n) and the trunk is upright.
+
+Each formula is written once, for a module `xp`: `math` for one pose in plain floats (control loop), `numpy` for whole
+arrays (analysis). Symbols: t1..t4 joint angles in rad, M1..M4 first moments along the links and W, Z, Y3, Y4 across
+them in kg m (`core.model.moments`), g gravity in m/s^2; l, d and m1..m4 as in the paper.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from types import ModuleType
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.arm import JOINT_COUNT, ArmModel
+from exo_gravity.core.model.tilt import Tilt
+
+Torque = tuple[float, ...]  # (4,) Nm in joint order
+NO_TORQUE: Torque = (0.0, 0.0, 0.0, 0.0)
+Values = Iterable[Any]  # plain floats if xp is `math`, arrays (n,) if it is `numpy`
+BLOCK = 4096  # poses computed at once, so that intermediate arrays fit the processor's cache
+
+
+def _exact(xp: ModuleType, arm: ArmModel, theta: Values, direction: Values) -> tuple[Any, ...]:
+    """Return the closed form of Newton-Euler; `direction` is gravity's unit vector in the arm's base frame."""
+    t1, t2, t3, t4 = theta
+    gx, gy, gz = direction
+    (M1, M2, M3, M4), (W, Z, Y3, Y4) = arm.first_moment, arm.off_axis
+    s1, c1, s2, c2, s3, c3 = xp.sin(t1), xp.cos(t1), xp.sin(t2), xp.cos(t2), xp.sin(t3), xp.cos(t3)
+    s34, c34 = xp.sin(t3 + t4), xp.cos(t3 + t4)
+    # Gravity along the axes that rotate with joint 1: A across the shoulder, B forward.
+    A = gx * c1 + gy * s1
+    B = gy * c1 - gx * s1
+    R = A * s2 + gz * c2
+    # First moments of link 4 and of links 3 and 4 together, along link 2 and across it.
+    along4, across4 = M4 * c34 - Y4 * s34, M4 * s34 + Y4 * c34
+    along, across = M3 * c3 - Y3 * s3 + along4, M3 * s3 + Y3 * c3 + across4
+    return (
+        (W + across) * A - (M1 + (M2 + along) * s2 - Z * c2) * B,
+        (M2 + along) * (gz * s2 - A * c2) - Z * R,
+        across * R - along * B,
+        across4 * R - along4 * B,
+    )
+
+
+def _paper_static(xp: ModuleType, arm: ArmModel, theta: Values) -> tuple[Any, ...]:
+    """EQ2-EQ5; theta_1 is the angle between joint 1's axis and gravity."""
+    t1, t2, t3, t4 = theta
+    (_, l2, l3, l4), (d1, d2, d3, d4), (m1, m2, m3, m4) = (a.tolist() for a in (arm.length, arm.cog, arm.mass))
+    return (
+        (d1 * (m1 + m2 + m3 + m4) + l2 * (m2 + m3 + m4) * xp.sin(t2) + l3 * (m3 + m4) * xp.cos(t3)
+         + l4 * m4 * xp.cos(t3 + t4)) * xp.sin(t1),
+        (d2 * (m2 + m3 + m4) + l3 * (m3 + m4) * xp.cos(t3) + l4 * m4 * xp.cos(t3 + t4)) * xp.sin(t2),
+        (d3 * (m3 + m4) * xp.sin(t3) + l4 * m4 * xp.sin(t3 + t4)) * xp.cos(t2),
+        d4 * m4 * xp.sin(t3 + t4) * xp.cos(t2),
+    )  # fmt: skip
+
+
+def _paper_mobile(xp: ModuleType, arm: ArmModel, theta: Values, beta: Any, phi: Any) -> tuple[Any, ...]:
+    """EQ1m-EQ4m: EQ2-EQ5 at theta_2 + phi and theta_3 + beta, times cos(phi) cos(beta).
+
+    Joints 2 to 4 have the additional factor cos(theta_1).
+    """
+    t1, t2, t3, t4 = theta
+    tau1, tau2, tau3, tau4 = _paper_static(xp, arm, (t1, t2 + phi, t3 + beta, t4))
+    upright = xp.cos(phi) * xp.cos(beta)
+    axis = xp.cos(t1) * upright
+    return tau1 * upright, tau2 * axis, tau3 * axis, tau4 * axis
+
+
+def gravity_torque(arm: ArmModel, theta: ArrayLike, direction: ArrayLike = (0.0, 0.0, 1.0)) -> np.ndarray:
+    """Return the torque in Nm that holds `arm` against gravity by the exact law, in the shape of `theta`.
+
+    theta: (4,) or (n, 4) rad. direction: (3,) or (n, 3), unit vector of gravity in the arm's base frame; (0, 0, 1) if
+    the trunk is upright. Raises ParameterError if a shape is wrong, a number is not finite, or a direction is not a
+    unit vector.
+    """
+    poses = _poses(theta)
+    down = np.asarray(direction, dtype=float)
+    if down.shape not in ((3,), (*poses.shape[:-1], 3)):
+        raise ParameterError("direction", down, f"of shape (3,) or {(*poses.shape[:-1], 3)}")
+    if not np.allclose(np.linalg.norm(down, axis=-1), 1.0, atol=1e-6, rtol=0):
+        raise ParameterError("direction", down, "a unit vector")
+    return _in_blocks(_exact, arm, poses, down)
+
+
+def paper_static_torque(arm: ArmModel, theta: ArrayLike) -> np.ndarray:
+    """Return the torque of EQ2-EQ5 in Nm, in the shape of `theta`.
+
+    theta: (4,) or (n, 4) rad. Here theta_1 is the angle between joint 1's axis and gravity (0 for an upright wearer),
+    not joint 1's encoder angle. Raises ParameterError if the shape is wrong, a number is not finite, or the arm is
+    given by its moments or has moments across its links.
+    """
+    arm.check_masses("paper_static")
+    return _in_blocks(_paper_static, arm, _poses(theta))
+
+
+def paper_mobile_torque(arm: ArmModel, theta: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> np.ndarray:
+    """Return the torque of EQ1m-EQ4m in Nm, in the shape of `theta`.
+
+    theta: (4,) or (n, 4) rad, with theta_1 as in `paper_static_torque`. pitch, yaw: the paper's beta and phi in rad, a
+    number or (n,) each. `Tilt` computes beta, phi and theta_1 for a trunk. Raises ParameterError as above.
+    """
+    arm.check_masses("paper_mobile")
+    poses = _poses(theta)
+    beta, phi = (np.asarray(angle, dtype=float) for angle in (pitch, yaw))
+    for name, angle in (("pitch", beta), ("yaw", phi)):
+        if angle.shape not in ((), poses.shape[:-1]) or not np.all(np.isfinite(angle)):
+            raise ParameterError(name, angle, f"a finite number or an array of shape {poses.shape[:-1]}")
+    tilt = np.stack(np.broadcast_arrays(beta, phi), axis=-1)
+    return _in_blocks(lambda xp, arm, angles, tilt: _paper_mobile(xp, arm, angles, *tilt), arm, poses, tilt)
+
+
+def _poses(theta: ArrayLike) -> np.ndarray:
+    poses = np.asarray(theta, dtype=float)
+    if poses.ndim not in (1, 2) or poses.shape[-1] != JOINT_COUNT:
+        raise ParameterError("theta", poses, f"of shape (4,) or (n, 4), not {poses.shape}")
+    if not np.all(np.isfinite(poses)):
+        raise ParameterError("theta", poses, "finite angles in rad")
+    return poses
+
+
+def _in_blocks(
+    formula: Callable[..., tuple[Any, ...]], arm: ArmModel, theta: np.ndarray, *inputs: np.ndarray
+) -> np.ndarray:
+    """Return the scaled torque by `formula` in the shape of `theta`; inputs: (k,) for all poses, or (n, k)."""
+    scale = arm.gain * arm.gravity
+    poses = np.atleast_2d(theta)
+    rows = [np.atleast_2d(values) for values in inputs]
+    torque = np.empty_like(poses)
+    for begin in range(0, len(poses), BLOCK):
+        part = slice(begin, begin + BLOCK)
+        columns = [(row if len(row) == 1 else row[part]).T for row in rows]
+        for joint, tau in enumerate(formula(np, arm, poses[part].T.copy(), *columns)):
+            np.multiply(tau, scale[joint], out=torque[part, joint])
+    return torque.reshape(theta.shape)
+
+
+class Law(Protocol):
+    """A law as the control loop uses it: one pose in plain floats."""
+
+    def torque(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
+        """Return the torque (4,) in Nm that holds `arm` at `theta` (4,) rad."""
+        ...
+
+    def outside(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> str:
+        """Return why the law does not apply to this arm, pose or tilt, in a sentence; '' if it does.
+
+        The sentence contains no measured value, so it stays the same as long as the reason does.
+        """
+        ...
+
+
+class ClosedForm(NamedTuple):
+    """A law given by a formula that applies everywhere: `unscaled(arm, theta, tilt)` returns torque / (c_n g)."""
+
+    unscaled: Callable[[ArmModel, Sequence[float], Tilt], Torque]
+
+    def torque(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
+        """Return the torque (4,) in Nm."""
+        a, b, c, d = arm.scale
+        tau, felt = self.unscaled(arm, theta, tilt), tilt.magnitude
+        return felt * a * tau[0], felt * b * tau[1], felt * c * tau[2], felt * d * tau[3]
+
+    def outside(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> str:
+        """Return '': a closed form applies everywhere."""
+        return ""
+
+
+LAWS: dict[str, Law] = {
+    "exact": ClosedForm(lambda arm, t, tilt: _exact(math, arm, t, tilt.direction)),
+    "paper_static": ClosedForm(lambda arm, t, tilt: _paper_static(math, arm, (tilt.axis_angle, *t[1:]))),
+    "paper_mobile": ClosedForm(
+        lambda arm, t, tilt: _paper_mobile(math, arm, (tilt.axis_angle, *t[1:]), tilt.beta, tilt.phi)
+    ),
+}

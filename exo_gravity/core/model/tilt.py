@@ -1,0 +1,124 @@
+"""Trunk tilt: orientation of the trunk -> pitch and roll -> direction of gravity in each arm's base frame.
+
+Trunk axes (REP-103): x forward, y left, z up. The trunk rolls by r about x, then pitches by p about y, both fixed axes:
+p > 0 bows forward, r > 0 leans to the right. The heading does not affect gravity. Base frame of the left arm in trunk
+axes: x0 left, y0 forward, z0 down. The right arm is its mirror image: its gravity is the left arm's at roll -r.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.arm import Vector, one_float
+
+SIDES = ("left", "right")
+
+
+class Tilt(NamedTuple):
+    """The trunk's tilt in one arm's base frame; create it with `Tilt.of` or `Tilt.of_gravity`.
+
+    pitch, roll: the trunk's, in rad (REP-103). direction: (3,) unit vector of gravity in the arm's base frame.
+    axis_angle: angle between joint 1's axis and gravity in rad, 0..pi; the paper's theta_1. beta, phi: the paper's tilt
+    angles, which its mobile law adds to theta_3 and theta_2. magnitude: of gravity as the arm feels it, as a share of
+    its own; the laws multiply their torque by it.
+    """
+
+    pitch: float
+    roll: float
+    direction: tuple[float, float, float]
+    axis_angle: float
+    beta: float
+    phi: float
+    magnitude: float = 1.0
+
+    @property
+    def gravity_in_trunk(self) -> tuple[float, float, float]:
+        """Unit vector of gravity (3,) in the trunk's axes, if this is the tilt of the left arm."""
+        x, y, z = self.direction
+        return y, x, -z
+
+    @classmethod
+    def of(cls, side: str, pitch: float = 0.0, roll: float = 0.0) -> Tilt:
+        """Return the tilt of the `side` ('left' or 'right') arm for a trunk at `pitch` and `roll` in rad."""
+        if side not in SIDES:
+            raise ParameterError("side", side, f"one of {', '.join(SIDES)}")
+        pitch = one_float("pitch", pitch, -math.pi, math.pi, "rad")
+        roll = one_float("roll", roll, -math.pi, math.pi, "rad")
+        outward = roll if side == "left" else -roll
+        forward, right, down = _gravity(pitch, outward)
+        direction = (-right, forward, down)
+        return cls(pitch, roll, direction, math.acos(max(-1.0, min(1.0, down))), -pitch, outward)
+
+    @classmethod
+    def of_gravity(cls, side: str, gravity_in_trunk: Vector) -> Tilt:
+        """Return the tilt of the `side` arm for gravity's direction in the trunk's axes, a vector (3,) of any length.
+
+        It has no singularity: a trunk that bows past 90 degrees, or lies, has a direction like any other. Raises
+        ParameterError.
+        """
+        if side not in SIDES:
+            raise ParameterError("side", side, f"one of {', '.join(SIDES)}")
+        x, y, z = map(float, gravity_in_trunk)
+        pitch, roll = pitch_roll((x, y, z))
+        norm = math.hypot(x, y, z)
+        x, y, z = x / norm, (y if side == "left" else -y) / norm, z / norm
+        return cls(
+            pitch, roll, (y, x, -z), math.acos(max(-1.0, min(1.0, -z))), -pitch, roll if side == "left" else -roll
+        )
+
+
+def _gravity(pitch: float, roll: float) -> tuple[float, float, float]:
+    """Return the components of gravity's unit vector along forward, right and down."""
+    return math.sin(pitch), math.sin(roll) * math.cos(pitch), math.cos(roll) * math.cos(pitch)
+
+
+def gravity_in_trunk(pitch: float, roll: float) -> np.ndarray:
+    """Return the unit vector of gravity, (3,), in the trunk's axes (x forward, y left, z up)."""
+    forward, right, down = _gravity(pitch, roll)
+    return np.array((forward, -right, -down))
+
+
+def pitch_roll(gravity_in_trunk: Vector) -> tuple[float, float]:
+    """Return the trunk's pitch (-pi/2..pi/2) and roll (-pi..pi) in rad for a gravity vector (3,) in its axes."""
+    x, y, z = map(float, gravity_in_trunk)
+    norm = math.hypot(x, y, z)
+    if not 0.0 < norm < math.inf:
+        raise ParameterError("gravity_in_trunk", gravity_in_trunk, "a finite, non-zero vector")
+    return math.atan2(x, math.hypot(y, z)), math.atan2(-y, -z)
+
+
+def angle_between(a: Vector, b: Vector) -> float:
+    """Return the angle in rad, 0..pi, between two unit vectors (3,); accurate for small and large angles."""
+    return 2.0 * math.atan2(math.dist(a, b), math.dist(a, [-component for component in b]))
+
+
+def rotation_matrix(quaternion: Vector | None, name: str = "quaternion") -> np.ndarray:
+    """Return the rotation matrix (3, 3) of a unit quaternion (x, y, z, w), ROS order.
+
+    Raises ParameterError that names `name` unless its norm is within 1 % of 1, which allows for rounding in drivers.
+    """
+    q = np.asarray(quaternion, dtype=float)
+    norm = float(np.linalg.norm(q)) if q.shape == (4,) else math.nan
+    if not abs(norm - 1.0) < 0.01:
+        raise ParameterError(name, quaternion, "a unit quaternion (x, y, z, w)")
+    x, y, z, w = q / norm
+    return np.array(
+        (
+            (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+            (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+            (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+        )
+    )
+
+
+def gravity_from_orientation(quaternion: Vector, rotation_trunk_from_imu: np.ndarray) -> np.ndarray:
+    """Return gravity's unit vector (3,) in the trunk's axes from an IMU's orientation.
+
+    quaternion: (x, y, z, w), world from IMU, world z up (REP-145). rotation_trunk_from_imu: (3, 3).
+    """
+    down_in_imu = -rotation_matrix(quaternion, "orientation")[2]  # the last row is the world's z axis in the IMU frame
+    return np.asarray(rotation_trunk_from_imu @ down_in_imu)

@@ -1,0 +1,101 @@
+"""The wearer's arm: body mass and segment lengths -> the mass that each link of the robot carries.
+
+Body segment tables give a segment's mass as a share of body mass, and its centre of gravity as a share of the segment's
+length from the proximal joint. Mass and centre always come from the same table:
+
+    de_leva   P. de Leva, J. Biomech. 29 (1996): scans of young adults; the hand ends at the third metacarpal
+    winter    D. A. Winter, Biomechanics and Motor Control of Human Movement: cadavers, same values for both sexes
+
+Link 3 carries the upper arm and link 4 the forearm and hand; the robot's joints 3 and 4 turn about the wearer's
+shoulder and elbow. A table is an average: a person's arm can differ from it by more than 10 %.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.arm import Vector, four_floats, one_float
+
+
+class Segment(NamedTuple):
+    """mass: share of body mass. cog: centre of gravity from the proximal joint, as a share of the segment's length."""
+
+    mass: float
+    cog: float
+
+
+SEX = ("female", "male")
+_WINTER = (Segment(0.028, 0.436), Segment(0.016, 0.430), Segment(0.006, 0.506))
+# Table -> sex -> upper arm, forearm, hand.
+TABLES = {
+    "de_leva": {
+        "female": (Segment(0.0255, 0.5754), Segment(0.0138, 0.4559), Segment(0.0056, 0.7474)),
+        "male": (Segment(0.0271, 0.5772), Segment(0.0162, 0.4574), Segment(0.0061, 0.7900)),
+    },
+    "winter": {"female": _WINTER, "male": _WINTER},
+}
+# m, rounded values of an adult man: shoulder to elbow, elbow to wrist, wrist to third knuckle. Prefer measured lengths.
+TYPICAL_LENGTH = (0.28, 0.27, 0.086)
+
+
+class LinkLoad(NamedTuple):
+    """The wearer's mass on each link of the robot: mass (4,) kg; cog (4,) m from joint n along link n."""
+
+    mass: np.ndarray
+    cog: np.ndarray
+
+
+@dataclass(frozen=True)
+class Wearer:
+    """The body data that determine the weight of a wearer's arm.
+
+    body_mass: kg. sex: 'female' or 'male'. table: 'de_leva' or 'winter'. segment_length: (3,) m, upper arm, forearm,
+    hand (wrist to third knuckle). Raises ParameterError that names the invalid value.
+    """
+
+    body_mass: float
+    sex: str = "male"
+    table: str = "de_leva"
+    segment_length: Sequence[float] = TYPICAL_LENGTH
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "body_mass", one_float("body_mass", self.body_mass, 10.0, 300.0, "kg"))
+        for name, value, choices in (("sex", self.sex, SEX), ("table", self.table, tuple(TABLES))):
+            if value not in choices:
+                raise ParameterError(name, value, f"one of {', '.join(choices)}")
+        try:
+            upper_arm, forearm, hand = (float(length) for length in self.segment_length)
+        except (TypeError, ValueError):
+            raise ParameterError("segment_length", self.segment_length, "3 lengths in m") from None
+        lengths = four_floats("segment_length", (upper_arm, forearm, hand, 0.0), 0.0, 0.6, "m")[:3]
+        object.__setattr__(self, "segment_length", tuple(lengths.tolist()))
+
+    def on_links(self, link_length: Vector) -> LinkLoad:
+        """Return the load of this wearer's arm on a robot with links of `link_length` (4,) m.
+
+        Raises ParameterError if the centre of gravity of a segment lies beyond the link that must carry it.
+        """
+        upper_arm, forearm, hand = self.segments
+        elbow_to_wrist = self.segment_length[1]
+        lower = forearm[0] + hand[0]
+        moment = forearm[0] * forearm[1] + hand[0] * (elbow_to_wrist + hand[1])  # about the elbow
+        cog = (0.0, 0.0, upper_arm[1], moment / lower)
+        for link, what in ((2, "the upper arm"), (3, "the forearm and hand")):
+            if cog[link] > link_length[link]:
+                beyond = f"the centre of gravity of {what} is at {cog[link]:.3f} m, beyond link {link + 1}"
+                raise ParameterError("link_length", [*map(float, link_length)], f"long enough for the wearer: {beyond}")
+        return LinkLoad(np.array((0.0, 0.0, upper_arm[0], lower)), np.array(cog))
+
+    @property
+    def segments(self) -> tuple[tuple[float, float], ...]:
+        """Mass in kg and centre of gravity in m from the proximal joint of the upper arm, forearm and hand."""
+        table = TABLES[self.table][self.sex]
+        return tuple(
+            (self.body_mass * segment.mass, length * segment.cog)
+            for segment, length in zip(table, self.segment_length, strict=True)
+        )

@@ -1,0 +1,12 @@
+"""The AK60-6 and AK80-9 motors: their limits, their frames, and the load that these put on the bus."""
+
+from exo_gravity.core.motors.specs import (
+    MOTORS,
+    MotorSpec,
+    pack_command,
+    pack_reply,
+    unpack_command,
+    unpack_reply,
+)
+
+__all__ = ["MOTORS", "MotorSpec", "pack_command", "pack_reply", "unpack_command", "unpack_reply"]

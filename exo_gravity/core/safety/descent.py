@@ -1,0 +1,150 @@
+"""The way down: lowers an arm at a bounded speed until nothing holds it, so that switching its motors off is safe.
+
+Each joint has a torque s, which starts as the last one applied, and a damping k, which the motor itself applies. With v
+the joint's velocity and V the permitted speed:
+
+    |v| <= V:  s fades to zero within `fade_time`; once s is zero, k fades to zero, too
+    |v| >  V:  s grows against the motion, s' = -SPEED_GAIN (v - sign(v) V), at most to the motor's peak torque; k grows
+
+So s lowers a heavy link, and k a light one, at V and a little more. No model of the arm is needed: masses, tilt and
+friction may be anything. V halves whenever the joint swings back, so that a frictionless arm comes to rest, and
+recovers slowly. A joint is down when s and k are zero: it hangs, or lies on something.
+
+A motor that cannot be reached keeps applying its torque, so s and k of a silent joint are held. When it replies again,
+s continues from the torque that it reports.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from exo_gravity.core.safety.limits import JointSample, Limits
+
+REST_TIME = 2.0  # s at rest with nothing holding the arm, until it counts as down
+LONGEST_REST = 6.0  # s with nothing holding the arm, after which it is down even if the wearer moves it
+LONGEST_SILENCE = 5.0  # s for which the way down waits for a silent motor
+
+DESCENT_SPEED = 0.35  # rad/s; a horizontal arm is down within 10 s
+MIN_SPEED = 0.04  # rad/s; two codes of the velocity
+SPEED_RECOVERY = 5.0  # s, time constant
+SWING_SPEED = 0.05  # rad/s; slower motion has no direction
+SPEED_GAIN = 20.0  # Nm/rad; with full damping, inertias of 0.005 to 1 kg m^2 do not oscillate
+MIN_FADE_RATE = 0.5  # Nm/s
+MAX_DAMPING = 5.0  # Nm s/rad, the range of kd on the wire
+DAMPING_RISE = 0.2  # s; damping that starts at once would be a torque step
+DAMPING_GROWTH = 0.05  # s in which damping doubles at twice the permitted speed
+DAMPING_GAIN = 5.0  # Nm/rad; lets zero damping grow
+DAMPING_FADE = 0.4  # s, time constant
+MIN_DAMPING = 0.01  # Nm s/rad; smaller values become zero
+
+
+class JointDescent:
+    """One joint on its way down: `effort` in Nm and `damping` in Nm s/rad are to be applied now.
+
+    effort, damping: what the motor applies when the descent starts. brake: Nm, the largest torque against the motion.
+    limits: of the arm; `damping` is reached first, within DAMPING_RISE.
+    """
+
+    def __init__(self, effort: float, damping: float, brake: float, limits: Limits) -> None:
+        self.effort = max(-brake, min(brake, effort))
+        self.damping = damping
+        self._full_damping = limits.damping
+        self._fade_time = limits.fade_time
+        self._brake = brake
+        self._max_rate = limits.max_effort_rate
+        self._fade_rate = self._rate_to_fade(effort)
+        self._is_rising = True  # the damping has not yet reached full_damping
+        self._speed = DESCENT_SPEED
+        self._direction = 0.0
+
+    @property
+    def is_down(self) -> bool:
+        """Whether neither torque nor damping holds the joint."""
+        return self.effort == 0.0 and self.damping == 0.0
+
+    def restart(self, effort: float) -> None:
+        """Continue from `effort` (Nm), which the motor is found to apply after a silence, without damping."""
+        self.effort = max(-self._brake, min(self._brake, effort))
+        self.damping = 0.0
+        self._fade_rate = self._rate_to_fade(effort)
+        self._is_rising = True
+
+    def step(self, dt: float, velocity: float) -> None:
+        """Advance by `dt` s with the joint's `velocity` in rad/s; NaN counts as 0."""
+        if not math.isfinite(velocity):
+            velocity = 0.0
+        self._limit_swing(dt, velocity)
+        excess = velocity - max(-self._speed, min(self._speed, velocity))
+        if excess:
+            most = self._max_rate * dt
+            change = max(-most, min(most, -SPEED_GAIN * excess * dt))
+            self.effort = max(-self._brake, min(self._brake, self.effort + change))
+        else:
+            fade = self._fade_rate * dt
+            self.effort -= max(-fade, min(fade, self.effort))
+        self._step_damping(dt, abs(excess))
+
+    def _rate_to_fade(self, effort: float) -> float:
+        return min(self._max_rate, max(MIN_FADE_RATE, abs(effort) / self._fade_time))
+
+    def _limit_swing(self, dt: float, velocity: float) -> None:
+        self._speed += (DESCENT_SPEED - self._speed) * dt / SPEED_RECOVERY
+        if abs(velocity) > SWING_SPEED:
+            if velocity * self._direction < 0.0:
+                self._speed = max(MIN_SPEED, 0.5 * self._speed)
+            self._direction = math.copysign(1.0, velocity)
+
+    def _step_damping(self, dt: float, excess: float) -> None:
+        if self._is_rising:
+            self.damping = min(self._full_damping, self.damping + self._full_damping / DAMPING_RISE * dt)
+            self._is_rising = self.damping < self._full_damping
+        elif excess:
+            growth = 1.0 + excess / self._speed * dt / DAMPING_GROWTH
+            self.damping = min(MAX_DAMPING, self.damping * growth + DAMPING_GAIN * excess * dt)
+        elif self.effort == 0.0:
+            self.damping *= math.exp(-dt / DAMPING_FADE)
+            if self.damping < MIN_DAMPING:
+                self.damping = 0.0
+
+
+class ArmDescent:
+    """The four joints of an arm on their way down, from `effort` (4,) Nm and `damping` (4,) Nm s/rad.
+
+    peak: (4,) Nm, the largest torque of each motor against the motion.
+    """
+
+    def __init__(
+        self, now: float, effort: Sequence[float], damping: Sequence[float], peak: Sequence[float], limits: Limits
+    ) -> None:
+        self._joints = tuple(JointDescent(*joint, limits) for joint in zip(effort, damping, peak, strict=True))
+        self._silent: Sequence[bool] = (False,) * len(self._joints)
+        self._start = now
+        self._held = now  # when something last held the arm, s
+
+    @property
+    def effort(self) -> tuple[float, ...]:
+        """Torque (4,) in Nm to apply now."""
+        return tuple(joint.effort for joint in self._joints)
+
+    @property
+    def damping(self) -> tuple[float, ...]:
+        """Damping (4,) in Nm s/rad to apply now."""
+        return tuple(joint.damping for joint in self._joints)
+
+    def step(self, now: float, dt: float, samples: Sequence[JointSample], silent: Sequence[bool]) -> None:
+        """Advance by `dt` s to `now` (s) with the newest readings; silent: (4,) whose motor does not reply."""
+        for joint, sample, is_silent, was_silent in zip(self._joints, samples, silent, self._silent, strict=True):
+            if was_silent and not is_silent:
+                joint.restart(sample.effort)
+            elif not is_silent:
+                joint.step(dt, sample.velocity)
+        self._silent = tuple(silent)
+        if not all(joint.is_down for joint, is_silent in zip(self._joints, silent, strict=True) if not is_silent):
+            self._held = now
+
+    def is_down(self, now: float, rest_since: float) -> bool:
+        """Return whether the arm is down at `now` (s), as far as its motors reply; at rest since `rest_since` (s)."""
+        free = now - self._held
+        is_down = free >= LONGEST_REST or (free >= REST_TIME and now - rest_since >= REST_TIME)
+        return is_down and (not any(self._silent) or now - self._start >= LONGEST_SILENCE)

@@ -1,0 +1,190 @@
+"""The limits of a worn arm: which motor readings are a fault, and how an effort is limited before it reaches a motor.
+
+`find_fault` checks the motors' readings. `shape` limits the requested efforts, in this order: soft wall before a joint
+limit, clamp to the permitted torque (derated when hot), rate limit. docs/safety.md compares the defaults with those of
+other systems.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.arm import JOINT_COUNT
+from exo_gravity.core.motors.specs import MOTOR_ERRORS, MOTORS
+from exo_gravity.core.params import check_owned, owned
+from exo_gravity.core.safety.drive import NOTHING
+from exo_gravity.core.safety.faults import Fault, FaultCode
+
+MAX_COMMAND = 40.0  # Nm: no arm needs half of it, so a larger effort command is wrong
+PEAK_TORQUE = max(spec.peak_torque for spec in MOTORS.values())  # Nm
+# The soft wall before a joint limit. These figures make it passive, for inertias of 0.005 to 0.3 kg m^2 and any rate:
+# behind the rate limit a spring alone would throw the arm back. The motor applies the damping without delay.
+WALL_WIDTH = 0.1  # rad before a joint limit, as in crisp_controllers
+WALL_STIFFNESS = 25.0  # Nm/rad
+WALL_TORQUE = 5.0  # Nm, largest
+WALL_DAMPING = 5.0  # Nm s/rad, from WALL_EDGE on
+WALL_EDGE = 0.02  # rad into the wall over which the damping rises
+WALL_RELEASE = 0.03  # rad/s out of the wall, from which on the spring no longer pushes
+OVERSHOOT = 0.1  # rad past a joint limit that is not yet a fault, because mechanical stops are not infinitely stiff
+DERATING = 10.0  # degC below max_temperature over which the permitted torque falls to half
+JUMP = 0.05  # rad that two readings may differ by in addition to what max_velocity allows
+
+
+class JointSample(NamedTuple):
+    """The newest reading of one joint: rad, rad/s, Nm, degC, error code, and its time on the caller's clock in s."""
+
+    position: float
+    velocity: float
+    effort: float
+    temperature: int | None
+    error: int | None
+    time: float
+
+
+UNKNOWN = JointSample(math.nan, math.nan, math.nan, None, None, -math.inf)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The limits that the worn arm must never exceed: one entry per joint (4,), or one number for all joints.
+
+    All fields except `joint_names` are parameters of `can_bridge`. The zero of a motor with a single encoder may be off
+    by whole turns of the rotor (60 degrees of an AK60-6's output, 40 of an AK80-9's): the defaults of `home_tolerance`
+    are below half of that. Raises ParameterError that names the invalid value.
+    """
+
+    joint_names: tuple[str, ...]
+    position_min: Sequence[float] = owned((-1.65, -0.17, -0.78, -0.17), "lower joint limits", (-3.15, 3.15), "rad")
+    position_max: Sequence[float] = owned((1.65, 3.14, 2.53, 3.14), "upper joint limits", (-3.15, 3.15), "rad")
+    max_velocity: Sequence[float] = owned((5.0, 5.0, 5.0, 6.0), "joint speed that trips a fault", (0.1, 20.0), "rad/s")
+    max_effort: Sequence[float] = owned(
+        (3.0, 9.0, 3.0, 3.0), "torque limit, by default the motors' rated torque", (0.0, PEAK_TORQUE), "Nm"
+    )
+    max_effort_rate: float = owned(50.0, "fastest change of torque", (1.0, 1000.0), "Nm/s")
+    max_temperature: float = owned(80.0, "motor temperature that trips a fault", (30.0, 120.0), "degC")
+    command_timeout: float = owned(0.05, "age of effort commands that trips a fault", (0.01, 0.1), "s")
+    reply_timeout: float = owned(0.05, "time without a reply from a motor that trips a fault", (0.01, 0.1), "s")
+    ramp_time: float = owned(1.0, "time from zero to full torque when the arm is enabled", (0.5, 30.0), "s")
+    fade_time: float = owned(2.0, "time from full to zero torque when the arm is let down", (0.5, 30.0), "s")
+    damping: float = owned(5.0, "motor-side damping (kd) while the arm is let down", (0.5, 5.0), "Nm s/rad")
+    home: Sequence[float] = owned((0.0, 0.0, 0.0, 0.0), "pose of the hanging arm", (-3.15, 3.15), "rad")
+    home_tolerance: Sequence[float] = owned(
+        (0.5, 0.34, 0.5, 0.5), "largest distance from home at the first start", (0.01, 6.3), "rad"
+    )
+    sign_check_torque: float = owned(1.5, "largest test torque of the sign check; 0 skips the check", (0.0, 3.0), "Nm")
+
+    def __post_init__(self) -> None:
+        if len(set(self.joint_names)) != JOINT_COUNT or not all(self.joint_names):
+            raise ParameterError("joint_names", list(self.joint_names), "4 different names")
+        check_owned(self)
+        if any(high - low < 4 * WALL_WIDTH for low, high in zip(self.position_min, self.position_max, strict=True)):
+            expected = f"at least {4 * WALL_WIDTH} rad above position_min = {list(self.position_min)}"
+            raise ParameterError("position_max", list(self.position_max), expected)
+
+    def is_silent(self, now: float, joint: JointSample) -> bool:
+        """Return whether the motor counts as silent: its reading `joint` is older than `reply_timeout` at `now` (s)."""
+        return not now - joint.time <= self.reply_timeout
+
+    def find_fault(
+        self, now: float, joints: Sequence[JointSample], before: Sequence[JointSample], overshoot: float = OVERSHOOT
+    ) -> Fault | None:
+        """Return the first fault in the readings `joints` at `now` (s), or None.
+
+        before: the previous readings. overshoot: rad past a joint limit that is not yet a fault.
+        """
+        for i, (joint, last) in enumerate(zip(joints, before, strict=True)):
+            name, fastest = self.joint_names[i], self.max_velocity[i]
+            low, high = self.position_min[i], self.position_max[i]
+            if self.is_silent(now, joint):
+                reason = f"{name}: no reply for more than {self.reply_timeout * 1000:.0f} ms"
+                return Fault(FaultCode.MOTOR_SILENT, reason)
+            if joint.error:
+                text = MOTOR_ERRORS.get(joint.error, "unknown")
+                return Fault(FaultCode.MOTOR_ERROR, f"{name}: the motor reports error {joint.error} ({text})")
+            if joint.temperature is not None and joint.temperature >= self.max_temperature:
+                limit = f"the limit is {self.max_temperature:g}"
+                return Fault(FaultCode.OVER_TEMPERATURE, f"{name}: {joint.temperature} degC, {limit}")
+            if not abs(joint.velocity) <= fastest:
+                return Fault(FaultCode.OVER_SPEED, f"{name}: {joint.velocity:.2f} rad/s, the limit is {fastest:g}")
+            if not low - overshoot <= joint.position <= high + overshoot:
+                reason = f"{name}: {joint.position:.3f} rad, the limits are {low:g} to {high:g}"
+                return Fault(FaultCode.OUTSIDE_LIMITS, reason)
+            if self.is_jump(i, joint, last):
+                reason = f"{name}: from {last.position:.3f} to {joint.position:.3f} rad in one step"
+                return Fault(FaultCode.POSITION_JUMP, reason)
+        return None
+
+    def is_jump(self, i: int, joint: JointSample, last: JointSample) -> bool:
+        """Return whether joint `i` moved farther than it can since its `last` reading; False if that is UNKNOWN."""
+        return abs(joint.position - last.position) > JUMP + self.max_velocity[i] * (joint.time - last.time)
+
+    def find_wrong_zero(self, joints: Sequence[JointSample]) -> Fault | None:
+        """Return the fault of the first joint that is not near `home`, where the arm must hang, or None."""
+        columns = (self.joint_names, joints, self.home, self.home_tolerance)
+        for name, joint, home, tolerance in zip(*columns, strict=True):
+            if not abs(joint.position - home) <= tolerance:
+                reason = (
+                    f"{name}: {joint.position:.3f} rad at the start, must be within {tolerance:g} of home = {home:g}: "
+                    "let the arm hang, or correct the parameter zero"
+                )
+                return Fault(FaultCode.IMPLAUSIBLE_ZERO, reason)
+        return None
+
+    def shape(
+        self, effort: Sequence[float], share: float, joints: Sequence[JointSample], before: Sequence[float], dt: float
+    ) -> tuple[tuple[float, ...], set[str]]:
+        """Return the limited torque (4,) in Nm, and the names of the limits that acted.
+
+        effort: (4,) Nm, requested. share: 0..1, the ramp's factor on effort and soft wall. before: (4,) Nm, applied
+        `dt` s ago. Raises ParameterError if an effort is NaN or beyond MAX_COMMAND.
+        """
+        step = self.max_effort_rate * dt
+        shaped, acted = [], set()
+        for i, (name, joint) in enumerate(zip(self.joint_names, joints, strict=True)):
+            if not abs(effort[i]) <= MAX_COMMAND:
+                raise ParameterError(f"effort of {name}", effort[i], f"from -{MAX_COMMAND:g} to {MAX_COMMAND:g} Nm")
+            depth = self._depth(i, joint.position)
+            permitted = self.max_effort[i] * self._derating(joint.temperature)
+            wall = _wall_torque(depth, joint.velocity) if depth else 0.0
+            wanted = share * (effort[i] + wall)
+            clamped = max(-permitted, min(permitted, wanted))
+            limited = max(before[i] - step, min(before[i] + step, clamped))
+            shaped.append(limited)
+            if depth != 0.0:
+                acted.add(f"soft wall ({name})")
+            if permitted < self.max_effort[i]:
+                acted.add(f"derating ({name})")
+            if clamped != wanted:
+                acted.add(f"max_effort ({name})")
+            if limited != clamped:
+                acted.add(f"max_effort_rate ({name})")
+        return tuple(shaped), acted
+
+    def wall_damping(self, joints: Sequence[JointSample]) -> tuple[float, ...]:
+        """Return the damping (4,) in Nm s/rad of the soft walls at the joints' positions."""
+        depths = [self._depth(i, joint.position) for i, joint in enumerate(joints)]
+        if not any(depths):  # as in nearly every cycle
+            return NOTHING
+        return tuple(WALL_DAMPING * min(1.0, abs(depth) / WALL_EDGE) for depth in depths)
+
+    def _depth(self, i: int, position: float) -> float:
+        """Return how deep joint `i` is in a soft wall, in rad: > 0 beyond the upper edge, < 0 beyond the lower one."""
+        above = position - self.position_max[i] + WALL_WIDTH
+        below = self.position_min[i] + WALL_WIDTH - position
+        return above if above > 0.0 else -max(0.0, below)
+
+    def _derating(self, temperature: int | None) -> float:
+        if temperature is None or temperature <= self.max_temperature - DERATING:
+            return 1.0
+        return max(0.5, 0.5 + 0.5 * (self.max_temperature - temperature) / DERATING)
+
+
+def _wall_torque(depth: float, velocity: float) -> float:
+    """Return the torque in Nm of a soft wall at `depth` (rad), none while the joint leaves it (`velocity`, rad/s)."""
+    if math.copysign(velocity, velocity * depth) < -WALL_RELEASE:
+        return 0.0
+    return -max(-WALL_TORQUE, min(WALL_TORQUE, WALL_STIFFNESS * depth))

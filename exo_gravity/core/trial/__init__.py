@@ -1,0 +1,1 @@
+"""A trial: its script, what was recorded, the analysis and the verdict."""

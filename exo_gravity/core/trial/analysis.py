@@ -1,0 +1,231 @@
+"""The analysis of a trial: the holds of a recording, the drift in each, and the response to pushes.
+
+Drift is the slope of Huber's M-estimator (Huber 1964) fitted to means over parts of the hold. Averaging resolves less
+than one position code, and a brief touch of the arm has little weight. The standard uncertainty combines the scatter
+with one code over the length of the hold, because a reading that changed once may have been about to change at the
+start.
+
+SI units throughout: rad, rad/s, Nm, s. Arrays (4,) are in the order of the recording's joints.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from exo_gravity.core.model.arm import JOINT_COUNT
+from exo_gravity.core.trial.recording import (
+    MARGIN,
+    Blocks,
+    Recording,
+    Span,
+    in_blocks,
+    position_resolution,
+    still_spans,
+)
+from exo_gravity.core.trial.script import TRUNK_ACTIONS
+
+MIN_HOLD = 2.0  # s
+WINDOW = 10.0  # s, over which `Hold.stray` is judged
+POSE_TIME = 0.5  # s before and after a motion, over which its first and last pose are averaged
+PUSH_OFFSET = 0.35  # rad (20 degrees); a motion that ends farther away is a move to another pose
+HUBER = 1.345  # standard deviations; gives 95 % efficiency on normal noise
+MAX_PARTS = 30  # parts of a hold, to whose means the slope is fitted
+
+
+@dataclass(frozen=True, eq=False)
+class Hold:
+    """A span from `start` to `end` (s) in which the arm was left alone and still; each array is (4,).
+
+    pose: rad, mean. drift: rad, from the first part of the hold to its last. drift_rate and its standard uncertainty:
+    rad/s. stray: rad, the largest range within any 10 s. velocity_rms: rad/s as measured, which is half a velocity code
+    for a motor at rest. torque_rms: Nm, measured. torque_error: Nm, RMS of commanded minus measured. after: the kind of
+    the motion before it, or 'start'.
+    """
+
+    start: float
+    end: float
+    pose: np.ndarray
+    drift: np.ndarray
+    drift_rate: np.ndarray
+    drift_rate_uncertainty: np.ndarray
+    stray: np.ndarray
+    velocity_rms: np.ndarray
+    torque_rms: np.ndarray
+    torque_error: np.ndarray
+    after: str
+
+    @property
+    def duration(self) -> float:
+        """Length in s."""
+        return self.end - self.start
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A motion between two holds, or after the last one.
+
+    kind: 'push', 'move', an action of the trunk ('bow', 'lean', 'walk', 'sit'), 'slip' (the arm moved during a hold of
+    the script), 'gap' (nothing was recorded) or 'let down' (the arm was not carried throughout: the motors let it down
+    after a fault or at the end). Without a script, a motion that ends within 20 degrees of its start counts as a push.
+    peak: (4,) rad, signed, largest distance from the pose before. residual: (4,) rad, pose after minus pose before; NaN
+    if the arm was not still again. until_still: s from the first movement, NaN likewise. speed: (4,) rad/s, peak.
+    """
+
+    kind: str
+    start: float
+    end: float
+    peak: np.ndarray
+    residual: np.ndarray
+    until_still: float
+    speed: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Release:
+    """A scripted hold from release on, for as long as the arm was carried.
+
+    after: the script's action before it. offset: (4,) rad, at its end. still: whether the arm was still at its end.
+    """
+
+    start: float
+    end: float
+    after: str
+    offset: np.ndarray
+    still: bool
+
+
+@dataclass(frozen=True, eq=False)
+class TrialAnalysis:
+    """The result of `analyse`."""
+
+    holds: tuple[Hold, ...]
+    motions: tuple[Motion, ...]
+    releases: tuple[Release, ...]
+
+
+def analyse(recording: Recording, min_hold: float = MIN_HOLD) -> TrialAnalysis:
+    """Return the holds of at least `min_hold` s, the motions between them and, with a script, the releases."""
+    blocks = in_blocks(recording)
+    resolution = np.array([position_resolution(column) for column in recording.position.T])
+    shortest = max(min_hold, 4 * blocks.length) - 1e-6  # a slope requires three whole blocks
+    spans = [(start, end) for start, end in still_spans(recording, blocks) if end - start >= shortest]
+    motions = tuple(_motion(recording, blocks, *ends) for ends in pairwise(spans))
+    kinds = ["start", *(motion.kind for motion in motions)]
+    holds = tuple(_hold(recording, blocks, resolution, span, kind) for span, kind in zip(spans, kinds, strict=False))
+    motions += tuple(_last_motions(recording, blocks, spans[-1])) if spans else ()
+    return TrialAnalysis(holds, motions, tuple(_releases(recording, blocks)))
+
+
+def _last_motions(recording: Recording, blocks: Blocks, last: Span) -> Iterator[Motion]:
+    """Yield the motions after the `last` hold: one while the arm was carried, and the let-down."""
+    recorded = float(recording.time[-1])
+    released = recording.carried[-1][1] if recording.carried else recorded
+    end = min([released, *(step.end for step in recording.steps[-1:])])
+    if end - last[1] > MIN_HOLD:
+        yield _motion(recording, blocks, last, (end, end))
+    # A virtual wearer continues with the next step even if the arm is not carried. That is not part of the let-down.
+    down = min([recorded, *(step.start for step in recording.steps if step.start > released)])
+    if down - released > blocks.length:
+        yield _motion(recording, blocks, (last[0], released), (down, down))
+
+
+def _hold(recording: Recording, blocks: Blocks, resolution: np.ndarray, span: Span, after: str) -> Hold:
+    within = blocks.between(*span)
+    samples = slice(*blocks.sample[[within.start, within.stop]])
+    mean = blocks.mean[within]
+    parts = np.array_split(np.arange(len(mean)), min(len(mean), MAX_PARTS))
+    part_time = np.array([blocks.time[within][part].mean() for part in parts])
+    part_mean = np.array([mean[part].mean(axis=0) for part in parts])
+    rate, scatter = robust_slope(part_time, part_mean, resolution)
+    width = min(len(mean), max(1, round(WINDOW / blocks.length)))
+    windows = np.lib.stride_tricks.sliding_window_view(mean, width, axis=0)
+    effort, command = recording.effort[samples], recording.command[samples]
+    return Hold(
+        *span,
+        pose=mean.mean(axis=0),
+        drift=part_mean[-1] - part_mean[0],
+        drift_rate=rate,
+        drift_rate_uncertainty=np.hypot(scatter, resolution / (span[1] - span[0])),
+        stray=(windows.max(axis=-1) - windows.min(axis=-1)).max(axis=0),
+        velocity_rms=_rms(recording.velocity[samples]),
+        torque_rms=_rms(effort),
+        torque_error=_rms(command - effort),
+        after=after,
+    )
+
+
+def robust_slope(x: np.ndarray, y: np.ndarray, resolution: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the slope (k,) of y (m, k) over x (m,), m > 2, and its standard uncertainty (k,) from the scatter.
+
+    This is Huber's M-estimator by reweighted least squares. resolution: (k,); half of it is the smallest scale used.
+    """
+    weight = np.ones_like(y)
+    for _ in range(30):
+        total = weight.sum(axis=0)
+        dx = x[:, None] - (weight * x[:, None]).sum(axis=0) / total
+        dy = y - (weight * y).sum(axis=0) / total
+        spread = (weight * dx * dx).sum(axis=0)
+        slope = (weight * dx * dy).sum(axis=0) / spread
+        residual = np.abs(dy - slope * dx)
+        scale = np.maximum(1.4826 * np.median(residual, axis=0), resolution / 2) + 1e-12
+        weight = np.minimum(1.0, HUBER * scale / np.maximum(residual, 1e-12))
+    return slope, np.sqrt((weight * residual**2).sum(axis=0) / (len(x) - 2) / spread)
+
+
+def _motion(recording: Recording, blocks: Blocks, left: Span, right: Span) -> Motion:
+    """Return the motion from the end of span `left` to the start of `right`, which is empty if no hold followed."""
+    before = blocks.mean[blocks.between(max(left[0], left[1] - POSE_TIME), left[1])].mean(axis=0)
+    after = blocks.mean[blocks.between(right[0], min(right[1], right[0] + POSE_TIME))].mean(axis=0)
+    within = blocks.between(left[1], right[0])
+    samples = slice(*blocks.sample[[within.start, within.stop]])
+    away = recording.position[samples] - before
+    away = away if len(away) else np.zeros((1, JOINT_COUNT))
+    settled = right[1] > right[0]
+    residual = after - before
+    return Motion(
+        kind=_kind(recording, left[1], right[0], bool(blocks.empty[within].any()), residual),
+        start=left[1],
+        end=right[0],
+        peak=away[np.abs(away).argmax(axis=0), np.arange(JOINT_COUNT)],
+        residual=residual if settled else np.full(JOINT_COUNT, math.nan),
+        until_still=max(0.0, right[0] - left[1] - MARGIN) if settled else math.nan,
+        speed=np.abs(recording.velocity[samples]).max(axis=0, initial=0.0),
+    )
+
+
+def _kind(recording: Recording, start: float, end: float, empty: bool, residual: np.ndarray) -> str:
+    actions = {step.action for step in recording.steps if step.start < end - 1e-6 and step.end > start + 1e-6}
+    if tuple(recording.while_carried(start, end)) != ((start, end),):
+        return "let down"
+    if empty:
+        return "gap"
+    if not recording.steps:
+        return "push" if np.all(np.abs(residual) < PUSH_OFFSET) else "move"
+    return next((action for action in ("move", "push", *TRUNK_ACTIONS) if action in actions), "slip")
+
+
+def _releases(recording: Recording, blocks: Blocks) -> Iterator[Release]:
+    after = "start"
+    for step in recording.steps:
+        parts = recording.while_carried(step.start, min(step.end, float(recording.time[-1])))
+        start, end = next(parts, (step.start, step.start))
+        # A hold that was cut short shows the hand that has just let go, not the arm.
+        if step.action == "hold" and end - start >= min(MIN_HOLD, step.end - step.start):
+            within = blocks.between(start, end)
+            offset = blocks.mean[within.stop - 1] - blocks.mean[within.start]
+            yield Release(start, end, after, offset, bool(blocks.still[within.stop - 1]))
+        after = step.action
+
+
+def _rms(values: np.ndarray) -> np.ndarray:
+    """Return the root mean square (4,) of the finite values among (n, 4); NaN for a joint that has none."""
+    known = np.isfinite(values)
+    squares = np.square(values, where=known, out=np.zeros(values.shape))
+    with np.errstate(invalid="ignore"):
+        rms: np.ndarray = np.sqrt(squares.sum(axis=0) / known.sum(axis=0))
+    return rms

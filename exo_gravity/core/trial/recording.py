@@ -1,0 +1,132 @@
+"""The recorded arrays of one arm, and the time spans in which it was carried, left alone and still.
+
+Stillness is judged from position only. Motors report velocity in steps of 22 to 24 mrad/s without a code for 0, so a
+motor at rest reports half a step. Position has steps of 0.38 mrad, and `STILL_SPEED` over two blocks is ten of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from exo_gravity.core.errors import DataError
+from exo_gravity.core.model.arm import JOINT_COUNT
+
+BLOCK = 0.1  # s, the time resolution of the analysis
+STILL_SPEED = 0.02  # rad/s, or 69 degrees per minute: an arm that moves faster is not held
+MARGIN = 0.2  # s cut off at both ends of a still span, where a smooth motion can be slower than STILL_SPEED
+
+Span = tuple[float, float]  # start and end in s
+
+
+class ScriptedStep(NamedTuple):
+    """A step of the trial script: its action ('move', 'hold' or 'push'), and when it started and ended, in s."""
+
+    action: str
+    start: float
+    end: float
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """The recording of one arm. Raises DataError if shapes differ, time decreases or a position is not finite.
+
+    name: of the arm. time: (n,) s. position, velocity, effort (measured), command (requested effort): (n, 4), NaN where
+    unknown, except for position. steps: the script's steps, empty if they were not recorded. carried: the spans in
+    which the motors carried the arm, in order; outside of them the arm is off or being let down. None if these were
+    not recorded: the arm then counts as carried throughout.
+    """
+
+    name: str
+    joint_names: tuple[str, ...]
+    time: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    effort: np.ndarray
+    command: np.ndarray
+    steps: tuple[ScriptedStep, ...] = ()
+    carried: tuple[Span, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.joint_names) != JOINT_COUNT:
+            raise DataError(f"{self.name}: joints = {', '.join(self.joint_names)}: must be {JOINT_COUNT} joints")
+        shape = (len(self.time), JOINT_COUNT)
+        for field in ("position", "velocity", "effort", "command"):
+            if getattr(self, field).shape != shape:
+                raise DataError(f"{self.name}: shape of {field} = {getattr(self, field).shape}: must be {shape}")
+        if len(self.time) < 2:
+            raise DataError(f"{self.name}: {len(self.time)} samples: must be at least 2")
+        if np.any(np.diff(self.time) < 0):
+            raise DataError(f"{self.name}: time decreases between two samples: must be in ascending order")
+        if not np.all(np.isfinite(self.position)):
+            raise DataError(f"{self.name}: position has NaN or infinite values: must be finite")
+
+    def while_carried(self, start: float, end: float) -> Iterator[Span]:
+        """Yield the parts of the span from `start` to `end` (s) in which the arm was carried."""
+        for first, last in ((start, end),) if self.carried is None else self.carried:
+            if max(start, first) < min(end, last):
+                yield max(start, first), min(end, last)
+
+
+class Blocks(NamedTuple):
+    """The recording in blocks of 0.1 s.
+
+    time: (m + 1,) s, the start of each block and the end of the last. sample: (m + 1,), the first sample of each block
+    and the end. mean: (m, 4), mean position. still: (m,), whether the arm was still. empty: (m,), whether the block has
+    no samples.
+    """
+
+    time: np.ndarray
+    sample: np.ndarray
+    mean: np.ndarray
+    still: np.ndarray
+    empty: np.ndarray
+
+    @property
+    def length(self) -> float:
+        """Length of a block in s."""
+        return float(self.time[1] - self.time[0])
+
+    def between(self, start: float, end: float) -> slice:
+        """Return the slice of the blocks within [start, end], at least one block."""
+        first = min(int(np.searchsorted(self.time, start - 1e-6)), len(self.still) - 1)
+        return slice(first, max(first + 1, int(np.searchsorted(self.time, end + 1e-6, "right")) - 1))
+
+
+def in_blocks(recording: Recording) -> Blocks:
+    """Return the recording in blocks of 0.1 s, or of three samples if its rate is below 30 Hz."""
+    time, position = recording.time, recording.position
+    length = max(BLOCK, 3.0 * float(np.median(np.diff(time))))
+    count = int((time[-1] - time[0]) / length) + 1
+    starts = time[0] + length * np.arange(count + 1)
+    sample = np.searchsorted(time, starts)
+    sample[-1] = len(time)
+    filled = np.diff(sample)
+    # For an empty block, reduceat returns the next sample.
+    first = np.minimum(sample[:-1], len(time) - 1)
+    mean = np.add.reduceat(position, first, axis=0, dtype=float) / np.maximum(filled, 1)[:, None]
+    low, high = (extreme.reduceat(position, first, axis=0) for extreme in (np.minimum, np.maximum))
+    low[1:], high[1:] = np.minimum(low[1:], low[:-1]), np.maximum(high[1:], high[:-1])
+    still = np.all(high - low < STILL_SPEED * 2 * length, axis=1) & (filled > 0)
+    return Blocks(starts, sample, mean, still, filled == 0)
+
+
+def still_spans(recording: Recording, blocks: Blocks) -> Iterator[Span]:
+    """Yield every span in which the arm was carried, still and, if there is a script, in one of its holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], blocks.still, [False])).astype(np.int8)))
+    windows = [(step.start, step.end) for step in recording.steps if step.action == "hold"]
+    for first, beyond in zip(edges[::2], edges[1::2], strict=True):
+        # A block counts as still if it is still together with the block before it.
+        start, end = blocks.time[max(first - 1, 0)] + MARGIN, blocks.time[beyond] - MARGIN
+        for low, high in windows if recording.steps else ((start, end),):
+            yield from recording.while_carried(float(max(start, low)), float(min(end, high)))
+
+
+def position_resolution(values: np.ndarray) -> float:
+    """Return the smallest step in rad between two samples, which is one position code; 0 if no step occurred."""
+    steps = np.abs(np.diff(values))
+    return float(steps.min(initial=math.inf, where=steps > 1e-6)) if steps.max() > 1e-6 else 0.0

@@ -1,0 +1,113 @@
+"""The script of a trial: a list of timed steps for the wearer.
+
+    name: demo
+    steps:
+      - {move: [0.0, 0.5, 0.6, 0.5], over: 2.0}      bring the arm to this pose (rad), then let go
+      - {hold: 10.0}                                 leave it alone
+      - {push: [0.0, 2.0, 1.5, 1.0], over: 0.4}      push it with these joint torques (Nm)
+      - {bow: 0.5, over: 3.0}                        bow to this pitch of the trunk (rad), and leave the arm alone
+      - {lean: 0.3, over: 3.0}                       lean to this roll of the trunk (rad, to the right)
+      - {walk: 60.0}                                 walk
+      - {sit: 2.0}                                   sit down hard, and wait for the rest of the time
+      - {task: reach, over: 15.0}                    perform a task of `trial effort`: the virtual wearer only
+
+A human wearer reads the steps from the screen; the simulator's virtual wearer executes them.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import accumulate
+from typing import Any
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.arm import four_floats, one_float
+
+MAX_DURATION = 3600.0  # s
+TIMED = {"hold": 0.1, "walk": 2.0, "sit": 1.0}  # steps that have only a duration, and the shortest of each in s
+TURNS = {"bow": 1.6, "lean": 0.8}  # steps that turn the trunk, and the largest angle of each in rad
+TRUNK_ACTIONS = ("bow", "lean", "walk", "sit")
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step: an `action` and its `value`.
+
+    'move': the pose (4,) in rad; 'push': the torque (4,) in Nm; 'bow', 'lean': the angle (1,) in rad; 'hold', 'walk',
+    'sit', 'task': (). name: of a 'task'.
+    """
+
+    action: str
+    duration: float
+    value: tuple[float, ...] = ()
+    name: str = ""
+
+    @classmethod
+    def parse(cls, entry: Any, where: str) -> Step:
+        """Return the step described by a mapping from YAML; `where` is its name in a ParameterError."""
+        keys = set(entry) if isinstance(entry, Mapping) else set()
+        for action, shortest in TIMED.items():
+            if keys == {action}:
+                return cls(action, one_float(f"{where}.{action}", entry[action], shortest, MAX_DURATION, "s"))
+        for action, bound in TURNS.items():
+            if keys == {action, "over"}:
+                angle = one_float(f"{where}.{action}", entry[action], -bound, bound, "rad")
+                return cls(action, _over(entry, where), (angle,))
+        for action, bound, unit in (("move", 3.5, "rad"), ("push", 20.0, "Nm")):
+            if keys == {action, "over"}:
+                value = four_floats(f"{where}.{action}", entry[action], -bound, bound, unit)
+                return cls(action, _over(entry, where), tuple(value.tolist()))
+        if keys == {"task", "over"}:
+            return cls("task", _over(entry, where), name=str(entry["task"]))
+        expected = (
+            "{move: [4 rad], over: s}, {hold: s}, {push: [4 Nm], over: s}, {bow: rad, over: s}, {lean: rad, over: s}, "
+            "{walk: s}, {sit: s} or {task: name, over: s}"
+        )
+        raise ParameterError(where, entry, expected)
+
+
+def _over(entry: Mapping[str, Any], where: str) -> float:
+    return one_float(f"{where}.over", entry["over"], 0.1, 60.0, "s")
+
+
+@dataclass(frozen=True)
+class TrialScript:
+    """A named list of steps."""
+
+    name: str
+    steps: tuple[Step, ...]
+
+    @classmethod
+    def parse(cls, content: Any) -> TrialScript:
+        """Return the script described by YAML content. Raises ParameterError that names the invalid entry."""
+        if not isinstance(content, Mapping) or set(content) != {"name", "steps"}:
+            raise ParameterError("script", content, "a mapping with the keys name and steps only")
+        steps = content["steps"]
+        if not isinstance(steps, list) or not steps:
+            raise ParameterError("steps", steps, "a list of at least one step")
+        return cls(str(content["name"]), tuple(Step.parse(entry, f"steps[{i}]") for i, entry in enumerate(steps)))
+
+    @property
+    def duration(self) -> float:
+        """Total length of all steps in s."""
+        return sum(step.duration for step in self.steps)
+
+    @property
+    def pose_count(self) -> int:
+        """Number of poses to which the arm is moved."""
+        return sum(step.action == "move" for step in self.steps)
+
+    def at(self, elapsed: float) -> tuple[int, float]:
+        """Return the index of the active step `elapsed` s after the start, and the time since that step began.
+
+        After the last step the index is len(steps).
+        """
+        index = bisect_right(self._ends, elapsed)
+        return index, elapsed - (self._ends[index - 1] if index else 0.0)
+
+    @cached_property
+    def _ends(self) -> tuple[float, ...]:
+        return tuple(accumulate(step.duration for step in self.steps))

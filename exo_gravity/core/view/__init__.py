@@ -1,0 +1,1 @@
+"""What viewers show: the robot description and the shapes around it."""

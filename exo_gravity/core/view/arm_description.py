@@ -1,0 +1,74 @@
+"""What a robot description and a picture of an arm need to know about it, read from the nodes' parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from exo_gravity.core.control_params import LIMIT_PARAMETERS, limits_of, robot_of
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.arm import JOINT_COUNT, ZEROS, ArmModel, Vector
+from exo_gravity.core.model.tilt import SIDES
+from exo_gravity.core.safety.limits import Limits
+
+Point = tuple[float, float, float]
+
+HALF_BREADTH = 0.15  # m from the middle of the trunk to the axis of joint 1, if `shoulder` is not given
+# The parameters that `described` reads.
+OF_COMPENSATOR = (
+    "side", "link_length", "gain", "gravity", "robot.mass", "robot.cog", "robot.first_moment", "robot.off_axis",
+    "shoulder_from_imu", "friction.viscous", "friction.coulomb",
+)  # fmt: skip
+OF_BRIDGE = ("joint_names", *(param.name for param in LIMIT_PARAMETERS))
+
+
+@dataclass(frozen=True, eq=False)
+class ArmDescription:
+    """What a description states about one arm.
+
+    side: 'left' or 'right'. robot: the arm without a wearer. mass: (4,) kg, used if `robot` is given by its moments.
+    limits: names, position, speed and torque limits of the joints. damping (4,) Nm s/rad, friction (4,) Nm: of the
+    joints, 0 for unknown. shoulder: (3,) m, the arm's base in the trunk's axes; zeros for unknown.
+    """
+
+    side: str
+    robot: ArmModel
+    mass: Vector
+    limits: Limits
+    damping: Vector = ZEROS
+    friction: Vector = ZEROS
+    shoulder: Vector = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if self.side not in SIDES:
+            raise ParameterError("side", self.side, f"one of {', '.join(SIDES)}")
+
+    @property
+    def outward(self) -> float:
+        """1 if the arm is on the trunk's +y side (left), -1 otherwise."""
+        return 1.0 if self.side == "left" else -1.0
+
+    @property
+    def base(self) -> Point:
+        """Origin of joint 1 in the trunk's axes, m."""
+        x, y, z = map(float, self.shoulder)
+        return (x, y, z) if any((x, y, z)) else (0.0, self.outward * HALF_BREADTH, 0.0)
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Names of the links (4,), and of the frame at the far end of link 4."""
+        return (*(f"{self.side}_link_{n}" for n in range(1, JOINT_COUNT + 1)), f"{self.side}_end")
+
+
+def described(compensator: Mapping[str, Any], can_bridge: Mapping[str, Any]) -> ArmDescription:
+    """Return the arm that the parameters of its two nodes describe, or raise ParameterError."""
+    return ArmDescription(
+        compensator["side"],
+        robot_of(compensator),
+        compensator["robot.mass"],
+        limits_of(can_bridge),
+        compensator["friction.viscous"],
+        compensator["friction.coulomb"],
+        compensator["shoulder_from_imu"],
+    )

@@ -1,0 +1,156 @@
+"""What a viewer shows around the arms: gravity, the torque and the limits of each joint, and the state of each arm.
+
+Every shape is given in the trunk's axes, so that a viewer needs no transforms for it. A joint's range is an arc around
+its axis, and its torque a second, smaller arc, which spans `TORQUE_SPAN` at the joint's torque limit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from exo_gravity.core.model.arm import JOINT_COUNT, Vector
+from exo_gravity.core.safety.drive import CARRYING, State
+from exo_gravity.core.safety.limits import WALL_WIDTH
+from exo_gravity.core.view.arm_description import ArmDescription
+from exo_gravity.core.view.urdf import axes, ends
+
+Colour = tuple[float, float, float, float]
+
+ARROW, LINE, TEXT, SPHERE = "arrow", "line", "text", "sphere"
+GREEN, AMBER, RED, GREY, BLUE = (
+    (0.20, 0.70, 0.30, 1.0),
+    (0.95, 0.65, 0.10, 1.0),
+    (0.85, 0.15, 0.15, 1.0),
+    (0.60, 0.60, 0.60, 1.0),
+    (0.20, 0.45, 0.85, 1.0),
+)
+RANGE_RADIUS, TORQUE_RADIUS = 0.11, 0.075  # m
+TORQUE_SPAN = math.radians(270.0)
+ARC_STEP = math.radians(6.0)
+GRAVITY_FROM, GRAVITY_LENGTH = (0.30, 0.0, 0.10), 0.25  # m, in front of the chest
+STATE_HEIGHT = 0.20  # m above the shoulder
+RESTING = 0.05  # rad/s, below which a carried arm counts as held; twice the step of the motors' speed
+LIMIT_WIDTH, TORQUE_WIDTH, ARROW_WIDTH, TEXT_HEIGHT, SPHERE_SIZE = 0.004, 0.016, 0.012, 0.035, 0.05  # m
+
+
+class Shape(NamedTuple):
+    """One thing to draw.
+
+    group: 'gravity', 'torques', 'limits' or 'states'. kind: ARROW from the first point to the second, LINE through the
+    points, TEXT or SPHERE at the first point. points: (n, 3) m. size: m, width of a line, height of a text, diameter.
+    """
+
+    group: str
+    kind: str
+    points: np.ndarray
+    size: float
+    colour: Colour
+    text: str = ""
+
+
+class ArmPose(NamedTuple):
+    """Where an arm is, in the trunk's axes.
+
+    origins: (5, 3) m, the four joints and the far end. axes: (4, 3), about which the joints turn. hanging: (4, 3), unit
+    vectors along the links at angle 0 of their joint.
+    """
+
+    origins: np.ndarray
+    axes: np.ndarray
+    hanging: np.ndarray
+
+
+class ArmView(NamedTuple):
+    """What is known of one arm now: theta (4,) rad, velocity (4,) rad/s, effort (4,) Nm as the motors report it.
+
+    state: of its bridge, '' if not known. message: of its bridge.
+    """
+
+    arm: ArmDescription
+    theta: Sequence[float]
+    velocity: Sequence[float]
+    effort: Sequence[float]
+    state: str
+    message: str = ""
+
+
+def arm_pose(arm: ArmDescription, theta: Sequence[float]) -> ArmPose:
+    """Return where `arm` is at `theta` (4,) rad."""
+    rotation, origins = np.eye(3), [np.array(arm.base)]
+    turned, hanging = [], []
+    along = ((0.0, arm.outward, 0.0), *((0.0, 0.0, -1.0),) * 3)
+    for axis, direction, end, angle in zip(axes(arm), along, ends(arm), theta, strict=True):
+        turned.append(rotation @ axis)
+        hanging.append(rotation @ direction)
+        rotation = rotation @ rotation_about(np.array(axis), angle)
+        origins.append(origins[-1] + rotation @ end)
+    return ArmPose(np.array(origins), np.array(turned), np.array(hanging))
+
+
+def rotation_about(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Return the rotation matrix (3, 3) by `angle` rad about the unit vector `axis` (3,), by Rodrigues' formula."""
+    x, y, z = axis
+    cross = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+    return np.asarray(np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross)
+
+
+def gravity_shapes(gravity: Vector | None) -> list[Shape]:
+    """Return the arrow of gravity for its unit vector (3,) in the trunk's axes; None: the tilt is not known."""
+    if gravity is None:
+        return [Shape("gravity", TEXT, np.array([GRAVITY_FROM]), TEXT_HEIGHT, RED, "no tilt")]
+    points = np.array((GRAVITY_FROM, np.add(GRAVITY_FROM, np.multiply(GRAVITY_LENGTH, gravity))))
+    return [Shape("gravity", ARROW, points, ARROW_WIDTH, BLUE)]
+
+
+def arm_shapes(view: ArmView) -> list[Shape]:
+    """Return what is drawn around one arm."""
+    pose, limits = arm_pose(view.arm, view.theta), view.arm.limits
+    shapes = []
+    for n in range(JOINT_COUNT):
+        origin, axis, hanging = pose.origins[n], pose.axes[n], pose.hanging[n]
+        low, high, angle = limits.position_min[n], limits.position_max[n], view.theta[n]
+        near = not low + WALL_WIDTH <= angle <= high - WALL_WIDTH
+        colour = RED if near else GREY
+        shapes.append(Shape("limits", LINE, _arc(origin, axis, hanging, low, high), LIMIT_WIDTH, colour))
+        tip = _arc(origin, axis, hanging, angle, angle)[:1]
+        shapes.append(Shape("limits", LINE, np.vstack((origin, tip)), LIMIT_WIDTH, colour))
+        effort, limit = view.effort[n], limits.max_effort[n]
+        share = max(-1.0, min(1.0, effort / limit)) if limit > 0.0 else 0.0
+        arc = _arc(origin, axis, hanging, angle, angle + share * TORQUE_SPAN, TORQUE_RADIUS)
+        strength = RED if abs(share) >= 1.0 else AMBER if abs(share) > 0.5 else GREEN
+        shapes.append(Shape("torques", LINE, arc, TORQUE_WIDTH, strength))
+        shapes.append(Shape("torques", TEXT, tip, TEXT_HEIGHT, strength, f"{effort + 0.0:.2f} Nm"))
+    return shapes + state_shapes(view)
+
+
+def state_shapes(view: ArmView) -> list[Shape]:
+    """Return the sphere and the text that show what the arm's bridge does."""
+    above = np.array([np.add(view.arm.base, (0.0, 0.0, STATE_HEIGHT))])
+    colour, state = state_of(view)
+    text = Shape(
+        "states", TEXT, above + np.array((0.0, 0.0, SPHERE_SIZE)), TEXT_HEIGHT, colour, f"{view.arm.side}: {state}"
+    )
+    return [Shape("states", SPHERE, above, SPHERE_SIZE, colour), text]
+
+
+def state_of(view: ArmView) -> tuple[Colour, str]:
+    """Return the colour and the words for what the arm's bridge does: 'active, holding' or the latched fault."""
+    if view.state == State.ACTIVE.value:
+        return GREEN, "active, holding" if max(map(abs, view.velocity)) < RESTING else "active, moving"
+    if view.state == State.FAULT.value:
+        return RED, view.message or view.state
+    powered = view.state in {state.value for state in (*CARRYING, State.LETTING_DOWN)}
+    return (AMBER if powered else GREY), view.state or view.message or "no state"
+
+
+def _arc(
+    origin: np.ndarray, axis: np.ndarray, zero: np.ndarray, start: float, end: float, radius: float = RANGE_RADIUS
+) -> np.ndarray:
+    """Return points (n, 3) on the arc around `axis` from angle `start` to `end` rad, counted from `zero`."""
+    count = 2 + int(abs(end - start) / ARC_STEP)
+    angles = np.linspace(start, end, count)[:, None]
+    return np.asarray(origin + radius * (np.cos(angles) * zero + np.sin(angles) * np.cross(axis, zero)))

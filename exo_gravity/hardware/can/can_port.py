@@ -1,0 +1,133 @@
+"""A python-can bus that survives its adapter: every error becomes a BusError, and a failed bus is opened again.
+
+Backends raise more than `can.CanError`: slcan raises ValueError on a garbled line. A USB adapter that is plugged in
+again is a new device, which only a newly opened bus can reach. Opening may block, so a helper thread does it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import can
+from can.interfaces.socketcan import SocketcanBus
+
+from exo_gravity.core.errors import BusError
+from exo_gravity.core.motors.wire_formats.wire_format import EXTENDED, ID_BITS, Frame
+
+REOPEN_AFTER = 0.02  # s of failures in a row after which the bus is opened again
+REOPEN_PERIOD = 0.1  # s between two attempts
+
+
+def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:
+    """Open a python-can bus of any kind. Raises BusError that names the bus and the reason."""
+    try:
+        bus = can.Bus(interface=interface, channel=channel, **options)
+        if bus.channel_info == can.BusABC.channel_info:  # some backends leave it "unknown"
+            bus.channel_info = f"{interface} {channel}"
+        return bus
+    except Exception as error:  # backends raise errors of every type
+        raise BusError(f"CAN bus {interface} {channel} {dict(options)} cannot be opened: {error}") from error
+
+
+class CanPort:
+    """Sends and receives classic CAN frames. Not thread-safe: one thread owns it.
+
+    reopen: opens the bus again and raises BusError if it cannot; None if a failed bus must stay failed.
+    name: of the bus. marks_echoes: whether `is_rx` is false only for frames that this port sent.
+    """
+
+    def __init__(self, bus: can.BusABC, reopen: Callable[[], can.BusABC] | None = None) -> None:
+        self._bus = bus
+        self.name = str(bus.channel_info)
+        self.marks_echoes = not isinstance(bus, SocketcanBus)
+        self._reopen = reopen
+        self._failing_since: float | None = None
+        self._error = ""
+        self._is_open = True
+        self._is_closing = False
+        self._reopened: can.BusABC | None = None
+
+    def send(self, frame: Frame) -> None:
+        """Send one frame. Raises BusError."""
+        frame_id, data = frame
+        bus = self._open_bus()
+        try:
+            bus.send(can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED))
+        except Exception as error:
+            raise self._failure(error) from error
+
+    def receive(self, timeout: float) -> can.Message | None:
+        """Return the next frame, or None if there is none within `timeout` s. Raises BusError."""
+        bus = self._open_bus()
+        try:
+            return bus.recv(timeout)
+        except Exception as error:
+            raise self._failure(error) from error
+
+    def waiting(self) -> can.Message | None:
+        """Return the next frame that has already arrived, or None. Raises BusError.
+
+        An slcan adapter acknowledges each frame with a separate line, for which python-can returns None.
+        """
+        while (message := self.receive(0.0)) is None and self._has_lines():
+            pass
+        return message
+
+    def confirm(self) -> None:
+        """Note that the bus works: its last failure, if any, was not the first of a row."""
+        self._failing_since = None
+
+    def close(self) -> None:
+        """Close the bus. Never raises."""
+        self._is_closing = True
+        if self._is_open:
+            _close(self._bus)
+
+    def _has_lines(self) -> bool:
+        """Return whether the serial port of an slcan adapter has received more; False for every other bus."""
+        serial_port = getattr(self._bus, "serialPortOrig", None)
+        try:
+            return serial_port is not None and serial_port.in_waiting > 0
+        except OSError as error:
+            raise self._failure(error) from error
+
+    def _open_bus(self) -> can.BusABC:
+        if not self._is_open:
+            if self._reopened is None:
+                raise BusError(f"CAN bus {self.name}: {self._error}; opening it again")
+            self._bus, self._reopened = self._reopened, None
+            self._is_open = True
+            self._failing_since = None
+        return self._bus
+
+    def _failure(self, error: Exception) -> BusError:
+        now = time.monotonic()
+        self._error = f"{error}" if isinstance(error, (can.CanError, OSError)) else f"{type(error).__name__}: {error}"
+        if self._failing_since is None:
+            self._failing_since = now
+        elif self._reopen is not None and now - self._failing_since > REOPEN_AFTER:
+            self._is_open = False
+            threading.Thread(target=self._open_again, args=(self._reopen,), name="reopen", daemon=True).start()
+        return BusError(f"CAN bus {self.name}: {self._error}")
+
+    def _open_again(self, reopen: Callable[[], can.BusABC]) -> None:
+        _close(self._bus)
+        while not self._is_closing:
+            try:
+                bus = reopen()
+            except BusError:
+                time.sleep(REOPEN_PERIOD)
+                continue
+            if self._is_closing:
+                _close(bus)
+            self._reopened = bus
+            return
+
+
+def _close(bus: can.BusABC) -> None:
+    with contextlib.suppress(Exception):
+        bus.shutdown()

@@ -1,0 +1,1 @@
+"""The trunk's tilt from its IMU."""

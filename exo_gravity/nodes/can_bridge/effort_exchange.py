@@ -1,0 +1,102 @@
+"""Joint states out, effort commands in: which effort command answers which joint state, and how old that state is.
+
+Efforts carry the stamp of the joint state that they answer. The exchange remembers when, on the monotonic clock, each
+stamped state was measured: so the age of an answer does not depend on the wall clock, and an unknown stamp is refused.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.safety.faults import FaultCode
+from exo_gravity.core.safety.limits import JointSample, Limits
+from exo_gravity.hardware.control_loop import NO_COMMAND, ControlLoop, EffortCommand
+from exo_gravity.nodes.ros.conversions import by_name, to_nanoseconds
+from exo_gravity.nodes.ros.hot_path import HotPath
+from exo_gravity.nodes.ros.sole_publisher import SolePublisher
+
+# The control thread reads them once a cycle; the depth lets it notice a second commander. Not reliable: an old effort
+# sent again is useless, and acknowledging each one wakes a thread in both nodes (measured: 2 % of a core).
+EFFORTS = QoSProfile(depth=8, reliability=ReliabilityPolicy.BEST_EFFORT)
+REMEMBERED = 256  # stamps of joint states: more than command_timeout covers at any rate
+
+
+class EffortExchange:
+    """The topics `joint_states` and `effort_commands` of `node`, used on the control thread.
+
+    get_loop returns the present control loop, None while the node is inactive. refusal: why the last message was
+    refused, or "none".
+    """
+
+    def __init__(
+        self, node: Node, names: Sequence[str], limits: Limits, get_loop: Callable[[], ControlLoop | None]
+    ) -> None:
+        self.refusal = "none"
+        self._names = names
+        self._limits = limits
+        self._get_loop = get_loop
+        self._clock = node.get_clock()
+        self._command = NO_COMMAND  # the newest from the compensator
+        self._measured = -math.inf  # monotonic s, when the last published joint state was measured
+        self._published: OrderedDict[int, float] = OrderedDict()
+        self._commander = SolePublisher(node, "effort_commands")
+        self._publisher = node.create_publisher(JointState, "joint_states", 1)
+        self._joint_states = JointState(name=names)  # one message, reused
+        self._efforts = HotPath(node, JointState, "effort_commands", self._on_efforts, EFFORTS)
+
+    @property
+    def answered(self) -> float:
+        """Monotonic time in s at which the joint states were measured that the newest efforts answer."""
+        return self._command.answered
+
+    def forget(self) -> None:
+        """Forget the newest efforts, before a control loop starts."""
+        self._command = NO_COMMAND
+
+    def get_efforts(self, latest: float) -> EffortCommand:
+        """Return the newest efforts; wait until `latest` (monotonic s) for the answer to the last joint state."""
+        self._efforts.poll()
+        if self._command.answered < self._measured:
+            self._efforts.poll(latest - time.monotonic())
+        return self._command
+
+    def publish(self, now: float, joints: Sequence[JointSample]) -> None:
+        """Publish a joint state if every motor has replied recently: an unknown angle is never sent as a number."""
+        if any(self._limits.is_silent(now, joint) for joint in joints):
+            return
+        message = self._joint_states
+        message.position, message.velocity, message.effort, *_ = zip(*joints, strict=True)
+        message.header.stamp = self._clock.now().to_msg()
+        self._measured = min(joint.time for joint in joints)
+        self._published[to_nanoseconds(message.header.stamp)] = self._measured
+        if len(self._published) > REMEMBERED:
+            self._published.popitem(last=False)
+        self._publisher.publish(message)
+
+    def _on_efforts(self, message: JointState, info: dict[str, Any]) -> None:
+        loop = self._get_loop()
+        if loop is None:
+            return
+        answered = self._published.get(to_nanoseconds(message.header.stamp))
+        if self._commander.is_another(info):
+            self.refusal = "a second publisher of effort_commands"
+            self._command = EffortCommand(None, time.monotonic())  # fails the start gate
+            loop.trip_if_carried(FaultCode.SECOND_COMMANDER, "more than one publisher of effort_commands")
+        elif answered is None:
+            self.refusal = f"stamp {to_nanoseconds(message.header.stamp)} ns answers no joint state of this bridge"
+        else:
+            try:
+                effort = by_name(message, "effort", self._names) if message.effort else None
+            except ParameterError as error:
+                effort, self.refusal = None, str(error)
+                loop.trip(FaultCode.COMMAND_IMPOSSIBLE, f"effort_commands: {error.name} must be {error.expected}")
+            self._command = EffortCommand(effort, answered)

@@ -1,0 +1,184 @@
+"""compensator: joint states and trunk tilt in, effort commands out, at the rate at which joint states arrive.
+
+It answers each joint state at once, with the joint state's stamp, so that `can_bridge` can tell how old the reading is.
+Where there is no safe answer it withdraws: it sends a command without efforts, and puts the reason on /diagnostics. To
+`can_bridge` silence means the same, a little later. An effort controller of ros2_control needs more
+(nodes/compensator/command_interface.py).
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from typing import Any
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+
+from exo_gravity.core.compensation.compensator import Answer
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.rate import Rate
+from exo_gravity.hardware.scheduling import request_real_time
+from exo_gravity.nodes.compensator.any_arm import AnyUrdfArm, is_any_arm
+from exo_gravity.nodes.compensator.command_interface import interface_of
+from exo_gravity.nodes.compensator.exo_arm import ExoArm
+from exo_gravity.nodes.ros.declare import values_after, with_floats
+from exo_gravity.nodes.ros.diagnostics import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row
+from exo_gravity.nodes.ros.hot_path import HotPath
+from exo_gravity.nodes.ros.run import run
+from exo_gravity.nodes.ros.sole_publisher import DISTRUST, SolePublisher
+from exo_gravity.nodes.ros.tilt_subscription import NEWEST, TiltSubscription
+
+SILENCE = 0.5  # s without joint states until diagnostics report it
+REPORT_PERIOD = 0.5  # s
+MAX_CHANGES = 16  # answers whose reason is new, waiting for the report
+
+
+class CompensatorNode(Node):
+    """The ROS shell around the control of an `ExoArm`, or of an `AnyUrdfArm` with the law `urdf`."""
+
+    def __init__(self) -> None:
+        super().__init__("compensator", automatically_declare_parameters_from_overrides=True)
+        self._lock = threading.Lock()  # guards the control: joint states arrive on another thread
+        self._arm = AnyUrdfArm(self) if is_any_arm(self) else ExoArm(self, self._lock)
+        self._control, values = self._arm.control, self._arm.values
+        self._names = values["joint_names"]
+        self._interface = interface_of(self, self._names, values)
+        self._diagnostics = Diagnostics(self)
+        self._answer = Answer(None)
+        self._changes: deque[Answer] = deque(maxlen=MAX_CHANGES)
+        self._last_answer = -math.inf
+        self._answers = 0
+        self._rate = Rate()
+        self._refusal = "none"
+        topic = self._interface.topic
+        self._source = SolePublisher(self, topic)
+        # Which input had a second publisher, as a sentence, and when (monotonic s).
+        self._intruder, self._intruded = "", -math.inf
+        self._joint_states = HotPath(self, JointState, topic, self._on_joint_states, NEWEST)
+        if values["use_imu"]:
+            TiltSubscription(self, self._control, self._lock, self._refused, self._withdraw, self._arm.on_motion)
+        self.add_pre_set_parameters_callback(lambda changes: with_floats(self, self._arm.table, changes))
+        self.add_on_set_parameters_callback(self._check_parameters)
+        self.add_post_set_parameters_callback(self._apply_parameters)
+        # Only the executor's thread reports: diagnostics and budget are not for two threads.
+        self._changed = self.create_guard_condition(self._report_changes)
+        self.create_timer(REPORT_PERIOD, self._report_current)
+        self._log(self._control.settings)
+        self._arm.start()
+        self._interface.start()
+        self._joint_states.start()
+        for refused in request_real_time(values["thread_priority"], values["lock_memory"]):
+            self.get_logger().warning(refused)
+
+    @property
+    def failure(self) -> Exception | None:
+        """The exception that ended the thread of the joint states, of the assistance, or of a fade."""
+        return self._joint_states.failure or self._arm.failure or self._interface.failure
+
+    def close(self) -> None:
+        """Stop answering joint states."""
+        self._joint_states.stop()
+        self._interface.stop()
+        self._arm.stop()
+
+    def _on_joint_states(self, message: JointState, info: dict[str, Any]) -> None:
+        now = time.monotonic()
+        try:
+            if self._source.is_another(info):
+                self._withdraw(self._interface.topic)
+            theta, velocity = self._interface.read(message)
+            if self._interface.problem:  # no step: the torque must ramp in from zero
+                answer = Answer(None, self._interface.problem)
+            else:
+                with self._lock:
+                    answer = self._control.step(now, theta, velocity)
+        except ParameterError as error:
+            answer = Answer(None, self._refused(self._interface.topic, error))
+        if now - self._intruded < DISTRUST:
+            answer = Answer(None, self._intruder)
+        self._interface.send(now, message, answer)
+        self._answers += answer.effort is not None
+        changed = answer.reason != self._answer.reason
+        self._answer, self._last_answer = answer, now
+        if changed:
+            self._changes.append(answer)
+            self._changed.trigger()
+
+    def _withdraw(self, topic: str) -> None:
+        """Withdraw for a while: a second publisher sends on `topic`."""
+        self._intruder, self._intruded = f"more than one publisher of {topic}", time.monotonic()
+
+    def _refused(self, topic: str, error: ParameterError) -> str:
+        """Note an impossible message. Its value goes to /diagnostics only: a hostile sender could fill the log."""
+        self._refusal = f"{topic}: {error}"
+        return f"{topic}: {error.name} must be {error.expected}"
+
+    def _check_parameters(self, changes: list[Parameter]) -> SetParametersResult:
+        try:
+            self._arm.read(values_after(self, self._arm.table, changes))
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _apply_parameters(self, _changes: list[Parameter]) -> None:
+        try:
+            settings: Any = self._arm.read(values_after(self, self._arm.table))
+        except ParameterError as error:  # checked just before: only a file can have changed since
+            self.get_logger().error(f"parameters not applied: {error}")
+            return
+        with self._lock:
+            self._control.apply(settings)
+        self._log(settings)
+
+    def _log(self, settings: Any) -> None:
+        self.get_logger().info(self._arm.sentence(settings))
+
+    def _values(self, now: float, answer: Answer) -> dict[str, object]:
+        """Return the current values for /diagnostics."""
+        return {
+            **self._interface.values,
+            "limits acting": ", ".join(f"max_effort ({self._names[joint]})" for joint in answer.clamped) or "none",
+            "rate (Hz)": row([self._rate.update(now, self._answers)], 1),
+            "age of joint states (ms)": milliseconds(now - self._last_answer),
+            "age of tilt (ms)": milliseconds(self._control.tilt_age(now)),
+            "answers": self._answers,
+            "joint states missed": self._source.missed,
+            "effort (Nm)": row(answer.effort) if answer.effort else "none",
+            **self._arm.report(answer),
+            "last refused message": self._refusal,
+        }
+
+    def _report_changes(self) -> None:
+        while self._changes:
+            self._report(self._changes.popleft())
+
+    def _report_current(self) -> None:
+        self._arm.update()
+        self._report_changes()
+        self._report(self._answer)
+
+    def _report(self, answer: Answer) -> None:
+        now = time.monotonic()
+        self._diagnostics.report(*self._headline(now, answer), self._values(now, answer))
+
+    def _headline(self, now: float, answer: Answer) -> tuple[bytes, str]:
+        if self._interface.problem:
+            return ERROR, self._interface.problem
+        if now - self._last_answer > SILENCE:
+            return STALE if self._answers else WARN, f"waiting for {self._interface.topic}"
+        if answer.effort is None:
+            return ERROR, f"withdrawn: {answer.reason}"
+        warnings = [warning for warning in (self._arm.concern(answer),) if warning]
+        if answer.clamped:
+            warnings.append(f"gravity exceeds max_effort: {', '.join(self._names[joint] for joint in answer.clamped)}")
+        return (WARN, "; ".join(warnings)) if warnings else (OK, "compensating")
+
+
+def main() -> None:
+    """Entry point of the executable `compensator`."""
+    raise SystemExit(run(CompensatorNode, priority=15))

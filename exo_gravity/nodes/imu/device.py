@@ -1,0 +1,117 @@
+"""An IMU that the `imu` node reads itself: a thread polls it and passes each sample on as a message.
+
+The messages also go out on the topic that a driver would use, so that recordings and `calibrate imu` have them.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from geometry_msgs.msg import Vector3
+from rclpy.node import Node
+from sensor_msgs.msg import Imu
+
+from exo_gravity.hardware.imu_sources import Reopening, open_source
+from exo_gravity.hardware.trunk.imu_sample import ImuSample
+from exo_gravity.nodes.ros.conversions import to_time
+from exo_gravity.nodes.ros.hot_path import Callback
+
+POLLS_A_SAMPLE = 2.0
+MIN_PERIOD = 0.002  # s between two polls
+DEPTH = 50
+
+
+class ImuDevice:
+    """Calls `callback(message, info)` for each sample on a thread after `start`, as `HotPath` does for a topic."""
+
+    def __init__(self, node: Node, values: Mapping[str, Any], topic: str, callback: Callback) -> None:
+        """Open the device that the parameter values name; if it is missing, it is looked for again and again.
+
+        topic: gets the messages too. Raises ParameterError if a parameter does not suit the device.
+        """
+        self.failure: Exception | None = None  # ends the thread
+        self._node = node
+        self._callback = callback
+        self._publisher = node.create_publisher(Imu, topic, DEPTH)
+        self._period = max(MIN_PERIOD, 1.0 / (POLLS_A_SAMPLE * values["rate"]))
+        clock = node.get_clock()
+        self._reopening = Reopening(
+            lambda self_test: open_source(values, lambda: clock.now().nanoseconds * 1e-9, self_test)
+        )
+        self._number = 0  # of the last message
+        self._lost = 0  # samples, as last told
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=values["source"], daemon=True)
+        self._poll()
+
+    @property
+    def problem(self) -> str:
+        """Why there are no samples; '' while there are."""
+        return self._reopening.problem
+
+    @property
+    def values(self) -> dict[str, object]:
+        """What is known of the device, for /diagnostics."""
+        source = self._reopening.source
+        if source is None:
+            return {"device": "closed", "opened": self._reopening.openings}
+        return {
+            "device": source.name,
+            "opened": self._reopening.openings,
+            "lost samples": f"{source.lost} {source.loss}".rstrip(),
+            "temperature (degC)": "unknown" if source.temperature is None else f"{source.temperature:.1f}",
+        }
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread and close the device."""
+        self._stopping.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+        self._reopening.close()
+
+    def _run(self) -> None:
+        try:
+            while not self._stopping.wait(self._period):
+                self._poll()
+        except Exception as error:
+            self.failure = error
+
+    def _poll(self) -> None:
+        for sample in self._reopening.read(time.monotonic()):
+            message = message_of(sample)
+            self._publisher.publish(message)
+            self._number += 1
+            self._callback(message, {"publication_sequence_number": self._number})
+        source = self._reopening.source
+        lost = source.lost if source else 0
+        if source and lost > self._lost:
+            self._node.get_logger().warning(f"{source.name}: {lost - self._lost} samples lost: {source.loss}")
+        self._lost = lost
+
+
+def message_of(sample: ImuSample) -> Imu:
+    """Return the sample's message, in the IMU's axes; what was not measured has the covariance -1 (REP-145)."""
+    message = Imu()
+    message.header.stamp, message.header.frame_id = to_time(round(sample.time * 1e9)), "imu"
+    if sample.orientation is None:
+        message.orientation_covariance[0] = -1.0
+    else:
+        q = message.orientation
+        q.x, q.y, q.z, q.w = sample.orientation
+    _fill(message.angular_velocity, message.angular_velocity_covariance, sample.angular_velocity)
+    _fill(message.linear_acceleration, message.linear_acceleration_covariance, sample.acceleration)
+    return message
+
+
+def _fill(vector: Vector3, covariance: Any, values: Any) -> None:
+    if values is None:
+        covariance[0] = -1.0
+    else:
+        vector.x, vector.y, vector.z = values

@@ -1,0 +1,168 @@
+"""imu: samples of an IMU in, from a driver's topic or a device, the trunk's pitch and roll out, one for each sample.
+
+While samples are missing, impossible, frozen, not yet settled or from two publishers, it publishes nothing: the tilt
+grows old, the compensator withdraws, and `can_bridge` latches the fault. The reason is logged once, and stays on
+/diagnostics while it lasts.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import Vector3, Vector3Stamped
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Imu
+
+from exo_gravity.core.control_params import IMU
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.rate import Rate
+from exo_gravity.hardware.trunk.trunk_estimator import ImuSample, TrunkEstimator, TrunkOrientation
+from exo_gravity.nodes.imu.device import ImuDevice
+from exo_gravity.nodes.ros.conversions import to_nanoseconds
+from exo_gravity.nodes.ros.declare import declare
+from exo_gravity.nodes.ros.diagnostics import ERROR, OK, WARN, Diagnostics, milliseconds, row
+from exo_gravity.nodes.ros.hot_path import HotPath
+from exo_gravity.nodes.ros.run import run
+from exo_gravity.nodes.ros.sole_publisher import DISTRUST, SolePublisher
+
+PITCH_YAW, DATA = "/imu/pitch_yaw", "/imu/data"
+# The fusion integrates every sample. A queue of depth 1 would lose samples whenever the node is delayed.
+DEPTH = 50
+WATCH_PERIOD = 0.1  # s
+UNKNOWN_HEADING = math.pi**2  # rad^2, its variance
+
+
+class ImuNode(Node):
+    """The ROS shell around `hardware.trunk.trunk_estimator.TrunkEstimator`."""
+
+    def __init__(self) -> None:
+        super().__init__("imu", automatically_declare_parameters_from_overrides=True)
+        values = declare(self, IMU)
+        self._topic = self.resolve_topic_name(values["input_topic"])
+        if self._topic in (PITCH_YAW, DATA):
+            raise ParameterError("input_topic", values["input_topic"], "a topic that this node does not publish")
+        self._estimator = TrunkEstimator(
+            values["rotation_trunk_from_imu"],
+            values["rate"],
+            values["gyroscope_range"],
+            values["accelerometer_range"],
+        )
+        self._timeout = values["timeout"]
+        self._arrived = time.monotonic()
+        self._driver = SolePublisher(self, self._topic)
+        self._intruded = -math.inf  # monotonic s, when a second publisher was seen
+        self._received = self._published = self._refused = 0
+        self._rate = Rate()
+        self._refusal: ParameterError | None = None  # since the last report
+        self._last_refusal = "none"
+        self._diagnostics = Diagnostics(self)
+        self._pitch_yaw = self.create_publisher(Vector3Stamped, PITCH_YAW, DEPTH)
+        self._data = self.create_publisher(Imu, DATA, DEPTH)
+        self._device = None if values["source"] == "topic" else ImuDevice(self, values, self._topic, self._on_imu)
+        self._samples = self._device or HotPath(
+            self, Imu, self._topic, self._on_imu, QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        )
+        self.create_timer(WATCH_PERIOD, self._report)
+        self._samples.start()
+
+    @property
+    def failure(self) -> Exception | None:
+        """The exception that ended the thread of the samples."""
+        return self._samples.failure
+
+    def close(self) -> None:
+        """Stop taking samples."""
+        self._samples.stop()
+
+    def _on_imu(self, message: Imu, info: dict[str, Any]) -> None:
+        self._arrived = time.monotonic()
+        self._received += 1
+        if self._driver.is_another(info):
+            self._intruded = self._arrived
+        if self._is_intruded(self._arrived):  # the estimator starts anew after the gap
+            self._refused += 1
+            return
+        try:
+            orientation = self._estimator.update(sample_of(message))
+        except ParameterError as error:
+            self._refused += 1
+            self._refusal, self._last_refusal = error, str(error)
+            return
+        if orientation is not None:
+            self._published += 1
+            self._publish(message, orientation)
+
+    def _is_intruded(self, now: float) -> bool:
+        return now - self._intruded < DISTRUST
+
+    def _publish(self, message: Imu, orientation: TrunkOrientation) -> None:
+        tilt = Vector3Stamped()
+        tilt.header.stamp, tilt.header.frame_id = message.header.stamp, "trunk"
+        tilt.vector.x, tilt.vector.y = orientation.roll, orientation.pitch
+        self._pitch_yaw.publish(tilt)
+        data = Imu(header=tilt.header)
+        q, rate, acceleration = data.orientation, data.angular_velocity, data.linear_acceleration
+        q.x, q.y, q.z, q.w = orientation.orientation.tolist()
+        variance = orientation.uncertainty**2
+        data.orientation_covariance = np.diag((variance, variance, UNKNOWN_HEADING)).ravel()
+        # In the trunk's axes. A covariance of zeros means unknown, one of -1 means not reported (REP-145).
+        rotation = self._estimator.rotation
+        rate.x, rate.y, rate.z = (rotation @ _vector(message.angular_velocity)).tolist()
+        acceleration.x, acceleration.y, acceleration.z = (rotation @ _vector(message.linear_acceleration)).tolist()
+        data.angular_velocity_covariance[0] = min(message.angular_velocity_covariance[0], 0.0)
+        data.linear_acceleration_covariance[0] = min(message.linear_acceleration_covariance[0], 0.0)
+        self._data.publish(data)
+
+    def _report(self) -> None:
+        now = time.monotonic()
+        age, refusal, self._refusal = now - self._arrived, self._refusal, None
+        values = {
+            "rate (Hz)": f"{self._rate.update(now, self._received):.0f}",
+            "age of samples (ms)": milliseconds(age),
+            "received": self._received,
+            "missed": self._driver.missed,
+            "published": self._published,
+            "refused": self._refused,
+            "last refusal": self._last_refusal,
+            "gyroscope bias (rad/s)": row(self._estimator.gyroscope_bias, 4),
+        }
+        if self._device:
+            values |= self._device.values
+        if self._device and self._device.problem:
+            self._diagnostics.report(ERROR, self._device.problem, values)
+        elif not self._received:
+            self._diagnostics.report(WARN, f"waiting for {self._topic}", values)
+        elif age > self._timeout:
+            self._diagnostics.report(ERROR, f"no samples on {self._topic}", values)
+        elif self._is_intruded(now):
+            self._diagnostics.report(ERROR, f"more than one publisher of {self._topic}", values)
+        elif refusal:
+            self._diagnostics.report(ERROR, f"refused: {refusal.name} must be {refusal.expected}", values)
+        elif self._estimator.settling:
+            self._diagnostics.report(WARN, f"settling: {self._estimator.settling}", values)
+        else:
+            self._diagnostics.report(OK, "publishing", values)
+
+
+def sample_of(message: Imu) -> ImuSample:
+    """Return the message's sample; a quantity whose covariance says 'not reported' (-1, REP-145) becomes None."""
+    q = message.orientation
+    return ImuSample(
+        to_nanoseconds(message.header.stamp) * 1e-9,
+        None if message.angular_velocity_covariance[0] == -1.0 else _vector(message.angular_velocity),
+        None if message.linear_acceleration_covariance[0] == -1.0 else _vector(message.linear_acceleration),
+        None if message.orientation_covariance[0] == -1.0 else (q.x, q.y, q.z, q.w),
+    )
+
+
+def _vector(message: Vector3) -> tuple[float, float, float]:
+    return message.x, message.y, message.z
+
+
+def main() -> None:
+    """Entry point of the executable `imu`."""
+    raise SystemExit(run(ImuNode, priority=5))

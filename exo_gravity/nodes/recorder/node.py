@@ -1,0 +1,203 @@
+"""recorder: writes a trial to a standard rosbag2 recording (MCAP), with the parameters of every node.
+
+Twice a second it looks for new topics, and records those of all arms, the IMU, diagnostics and parameter changes, each
+with the quality of service that its publisher offers and its time of arrival. Two topics exist in the recording only,
+both std_msgs/String: `/recorder/parameters`, ROS 2 parameter YAML of each node at the start, and `/recorder/losses`,
+how many messages were lost, if any were. A topic that fails is reported, and the others are recorded.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import yaml
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Vector3Stamped
+from rcl_interfaces.msg import ParameterEvent
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import Imu, JointState
+from std_msgs.msg import String
+
+from exo_gravity.bag.topics import ASSIST, LOSSES, PARAMETERS, STATES, leaf
+from exo_gravity.bag.writer import BagWriter, offered_qos
+from exo_gravity.core.control_params import RECORDER
+from exo_gravity.nodes.recorder.live_line import ARM_TOPICS, LiveLine
+from exo_gravity.nodes.ros.declare import declare
+from exo_gravity.nodes.ros.drain import Drain
+from exo_gravity.nodes.ros.node_parameters import NodeParameters
+from exo_gravity.nodes.ros.run import run
+
+SHARED_TOPICS = {
+    "/imu/pitch_yaw": Vector3Stamped,
+    "/imu/data": Imu,
+    "/imu/data_raw": Imu,
+    "/diagnostics": DiagnosticArray,
+    "/parameter_events": ParameterEvent,
+}
+OF_ARMS = {**ARM_TOPICS, ASSIST: JointState}
+REPEATER = "robot_model"  # its joint states are those of the arms once more
+DRAIN_PERIOD = 0.05  # s between two writes of what has arrived
+DISCOVERY_PERIOD = 0.5  # s between two searches for new topics and nodes
+LIVE_PERIOD = 0.1  # s between two lines of live state, and two looks for the answers of new nodes
+DEPTH = 1000  # queued messages per topic: two seconds at 500 Hz
+LOSS_REPORT_PERIOD = 5.0  # s between two warnings of lost messages
+# After the launcher's death a bridge lets its arm down: this is recorded while joint states arrive.
+SILENCE = 0.5  # s without joint states, after which the arms are down
+DESCENT_TIMEOUT = 40.0  # s
+
+
+class Recorder(Node):
+    """Subscribes, and passes messages to `BagWriter`, whose thread waits for the disk."""
+
+    def __init__(self) -> None:
+        super().__init__("recorder", automatically_declare_parameters_from_overrides=True)
+        values = declare(self, RECORDER)
+        self.failure: Exception | None = None  # ends the node, see run()
+        self._writer = BagWriter(values["output"])
+        self._writer.add_topic(PARAMETERS, "std_msgs/msg/String", offered_qos(True, True, 1))
+        self._failed: set[str] = set()  # topics and nodes whose failure was reported
+        self._last_states, self._orphaned = -math.inf, math.inf  # monotonic s
+        self._reported = (0, 0)  # lost messages
+        self._drains: list[Drain] = []
+        self._nodes: set[str] = set()
+        self._unwritten: dict[str, NodeParameters] = {}  # of nodes whose parameters are not in the recording yet
+        self._live = LiveLine() if values["live"] else None
+        self.create_timer(DRAIN_PERIOD, self._drain)
+        self.create_timer(DISCOVERY_PERIOD, self._discover)
+        self.create_timer(LIVE_PERIOD, self._request_parameters)
+        if self._live:
+            self.create_timer(LIVE_PERIOD, self._print_live_line)
+        self.create_timer(LOSS_REPORT_PERIOD, self._report_losses)
+        self._discover()
+        self.get_logger().info(f"recording to {self._writer.path}")
+
+    @property
+    def needed(self) -> bool:
+        """Whether an arm may still be on its way down. The node's owner asks only once its launcher has died."""
+        now = time.monotonic()
+        self._orphaned = min(self._orphaned, now)
+        return now - self._last_states < SILENCE and now - self._orphaned < DESCENT_TIMEOUT
+
+    def close(self) -> None:
+        """Write what has arrived, and close the recording."""
+        try:
+            self._drain()
+            self._report_losses()
+            if any(self._losses()):
+                missed, unwritten = self._losses()
+                self._writer.add_topic(LOSSES, "std_msgs/msg/String", offered_qos(True, True, 1))
+                self._write_text(LOSSES, f"{missed} did not arrive, {unwritten} were not written")
+        finally:
+            self._writer.close()
+        if self._writer.error:
+            self.get_logger().error(str(self._writer.error))
+        else:
+            self.get_logger().info(f"{self._writer.count} messages in {self._writer.path}")
+
+    def _drain(self) -> None:
+        messages = []
+        for drain in self._drains:
+            taken = self._guarded(drain.topic, drain.take) or []
+            messages += [(drain.topic, stamp, data) for stamp, data in taken]
+            if not taken:
+                continue
+            if leaf(drain.topic) == STATES:
+                self._last_states = time.monotonic()
+            if self._live:
+                self._guarded(drain.topic, self._live.note, drain.topic, [data for _, data in taken])
+        messages.sort(key=lambda message: message[1])
+        self._writer.write(messages)
+        self.failure = self._writer.error
+
+    def _discover(self) -> None:
+        """Subscribe to new topics, and note new nodes."""
+        known = {drain.topic for drain in self._drains}
+        for topic, types in self.get_topic_names_and_types():
+            msgtype = SHARED_TOPICS.get(topic) or OF_ARMS.get(leaf(topic))
+            if msgtype and topic not in known and type_name(msgtype) in types:
+                self._guarded(topic, self._subscribe, topic, msgtype)
+        for name, namespace in self.get_node_names_and_namespaces():
+            node = f"{namespace.rstrip('/')}/{name}"
+            if node not in self._nodes and node != self.get_fully_qualified_name() and not name.startswith("_"):
+                self._nodes.add(node)
+                self._guarded(node, self._add_node, node)
+
+    def _add_node(self, node: str) -> None:
+        write = partial(self._guarded, node, self._write_parameters, node)
+        self._unwritten[node] = NodeParameters(self, node, write)
+
+    def _request_parameters(self) -> None:
+        for node, parameters in list(self._unwritten.items()):
+            self._guarded(node, parameters.update)
+
+    def _guarded(self, name: str, function: Callable[..., Any], *args: Any) -> Any:
+        """Return the function's result; None after an exception, which is logged once for each `name`."""
+        try:
+            return function(*args)
+        except Exception as error:
+            if name not in self._failed:
+                self._failed.add(name)
+                self.get_logger().error(f"{name}: {type(error).__name__}: {error}; the rest is recorded")
+            return None
+
+    def _losses(self) -> tuple[int, int]:
+        """Return how many messages of joints and IMU did not arrive, and how many were not written."""
+        return sum(drain.lost for drain in self._drains), self._writer.lost
+
+    def _report_losses(self) -> None:
+        lost = self._losses()
+        if lost != self._reported:
+            self._reported = lost
+            self.get_logger().warning(f"messages lost so far: {lost[0]} did not arrive, {lost[1]} were not written")
+
+    def _print_live_line(self) -> None:
+        counts = {"messages": self._writer.count, "lost": sum(self._losses())}
+        if self._live:
+            self._guarded("live state", self._live.write, counts)
+
+    def _subscribe(self, topic: str, msgtype: type) -> None:
+        publishers = self.get_publishers_info_by_topic(topic)
+        offered = [publisher.qos_profile for publisher in publishers if publisher.node_name != REPEATER]
+        if not offered:
+            return  # a subscriber without a publisher; try again later
+        reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
+        latched = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
+        # A recorder must not make the control loops' publishers wait for acknowledgements.
+        acknowledged = reliable and msgtype is not JointState
+        qos = QoSProfile(
+            depth=DEPTH,
+            reliability=ReliabilityPolicy.RELIABLE if acknowledged else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        )
+        self._writer.add_topic(topic, type_name(msgtype), offered_qos(reliable, latched, offered[0].depth or 1))
+        # Other topics have several publishers, each with its own numbers.
+        self._drains.append(Drain(self, msgtype, topic, qos, counts_lost=msgtype in (JointState, Imu, Vector3Stamped)))
+
+    def _write_parameters(self, node: str) -> None:
+        parameters = self._unwritten.pop(node)
+        # ROS's parameter files have no empty lists.
+        values = {name: value for name, value in parameters.values.items() if value != []}
+        text = yaml.safe_dump({node: {"ros__parameters": values}}, default_flow_style=None, width=120)
+        self._write_text(PARAMETERS, text)
+        parameters.destroy()
+
+    def _write_text(self, topic: str, text: str) -> None:
+        now = self.get_clock().now().nanoseconds
+        self._writer.write([(topic, now, serialize_message(String(data=text)))])
+
+
+def type_name(msgtype: type) -> str:
+    """Return 'sensor_msgs/msg/JointState' for that class."""
+    package, kind, *_ = msgtype.__module__.split(".")
+    return f"{package}/{kind}/{msgtype.__name__}"
+
+
+def main() -> None:
+    """Entry point of the executable `recorder`."""
+    raise SystemExit(run(Recorder))

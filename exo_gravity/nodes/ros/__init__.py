@@ -1,0 +1,1 @@
+"""What the nodes share of ROS: parameters, topics, diagnostics, start and stop."""
