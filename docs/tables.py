@@ -14,11 +14,15 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+from exo_gravity.bag.content import RECORDER
 from exo_gravity.core.calibration.params import CALIBRATOR
 from exo_gravity.core.compensation.any_arm import any_arm_table
-from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR, IMU, RECORDER, ROBOT_MODEL
+from exo_gravity.core.compensation.params import COMPENSATOR
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.faults import FaultCode
+from exo_gravity.core.safety.params import CAN_BRIDGE
+from exo_gravity.core.trunk.params import IMU
+from exo_gravity.core.view.arm_description import ROBOT_MODEL
 from exo_gravity.panel.params import PANEL
 from exo_gravity.sim.device_params import SIMULATOR
 

@@ -18,14 +18,15 @@ import yaml
 
 from exo_gravity.core.calibration.params import CALIBRATOR, tour_of
 from exo_gravity.core.calibration.tour import Tour
-from exo_gravity.core.control_params import CAN_BRIDGE, limits_of, motors_of
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.motors.joint_motor import JointMotor, peaks_of
+from exo_gravity.core.motors.params import motors_of
 from exo_gravity.core.motors.specs import ENTER, EXIT
 from exo_gravity.core.safety.drive import Drive, State
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.core.safety.params import CAN_BRIDGE, limits_of
 from exo_gravity.sim import SimulatedDevice
 from exo_gravity.sim.device_params import SIMULATOR, device_of, imu_of
 from exo_gravity.sim.imu import SimulatedImu, measured_tilt

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from exo_gravity.core.params import Param
 from exo_gravity.core.trial.recording import Recording
 
 
@@ -33,3 +34,12 @@ class Bag:
     notes: tuple[str, ...]
     problems: tuple[str, ...]
     is_partial: bool = False
+
+
+# The parameters of `recorder`.
+# fmt: off
+RECORDER = (
+    Param("output", "", "new folder for the recording", fixed=True, required=True),
+    Param("live", False, "print the latest state as one line of JSON, ten times a second", fixed=True),
+)
+# fmt: on

@@ -136,3 +136,18 @@ def values_of(table: Sequence[Param], given: Mapping[str, Any], free_prefix: str
         if name not in names and name not in ROS_PARAMETERS and not name.startswith(prefixes):
             raise ParameterError(name, value, f"one of {', '.join(sorted(names))}")
     return {param.name: param.check(given.get(param.name, param.default)) for param in table}
+
+
+# Shared by several nodes.
+JOINT_NAMES = Param(
+    "joint_names",
+    ["right_shoulder_rotation", "right_shoulder_abduction", "right_shoulder_flexion", "right_elbow_flexion"],
+    "the four joints from the shoulder to the elbow, as in joint_states",
+    fixed=True,
+)
+# fmt: off
+REAL_TIME_PARAMETERS = (
+    Param("thread_priority", 0, "SCHED_FIFO priority of the control loop's threads; 0 for none", (0, 99), fixed=True),
+    Param("lock_memory", False, "lock the process's memory (mlockall) if permitted", fixed=True),
+)
+# fmt: on

@@ -20,8 +20,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import Imu
 from std_msgs.msg import String
 
-from exo_gravity.core.control_params import OPTIONS
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.params import OPTIONS
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.hardware.can.motor_bus import open_bus
 from exo_gravity.nodes.ros.declare import bus_of, declare, values_after

@@ -12,10 +12,12 @@ from collections.abc import Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
-from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR, OPTIONS, robot_of, wearer_of
+from exo_gravity.core.compensation.params import COMPENSATOR, robot_of, wearer_of
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.model.budget import USUAL_TILT, Workspace, budget, largest_support, motor_torques
+from exo_gravity.core.motors.params import OPTIONS
 from exo_gravity.core.params import values_of
+from exo_gravity.core.safety.params import CAN_BRIDGE
 from exo_gravity.core.view.arm_description import described
 from exo_gravity.core.view.urdf import urdf
 from exo_gravity.panel.scene import scene_of

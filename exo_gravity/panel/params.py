@@ -6,7 +6,7 @@ import os
 import sys
 from pathlib import Path
 
-from exo_gravity.core.control_params import COMPENSATOR
+from exo_gravity.core.compensation.params import COMPENSATOR
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import Param
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from exo_gravity.core.control_params import CAN_BRIDGE, limits_of, motors_of
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.params import motors_of
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.checks import check_bridge
+from exo_gravity.core.safety.params import CAN_BRIDGE, limits_of
 
 
 def check(**given):

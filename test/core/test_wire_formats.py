@@ -9,14 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exo_gravity.core.control_params import CAN_BRIDGE, motors_of, traffic_of
 from exo_gravity.core.errors import FrameError, ParameterError
 from exo_gravity.core.motors.bus_load import Traffic, stuffed_bits, worst_frame_bits
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, JointMotor
+from exo_gravity.core.motors.params import motors_of, traffic_of
 from exo_gravity.core.motors.specs import MOTORS, MotorReply, MotorSpec
 from exo_gravity.core.motors.wire_formats import FORMATS, MIT, MIT_V3, WireFormat
 from exo_gravity.core.motors.wire_formats.wire_format import COMMAND, EXTENDED, ID_BITS, OTHER, REPLY
 from exo_gravity.core.params import values_of
+from exo_gravity.core.safety.params import CAN_BRIDGE
 
 seeded = settings(max_examples=150, derandomize=True, database=None, deadline=None)
 IDS = frozenset((1, 2, 3, 126))

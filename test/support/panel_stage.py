@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR
+from exo_gravity.core.compensation.params import COMPENSATOR
 from exo_gravity.core.params import values_of
+from exo_gravity.core.safety.params import CAN_BRIDGE
 from exo_gravity.panel.access import Access
 from exo_gravity.panel.control import Control
 from exo_gravity.panel.desk import Desk

@@ -13,7 +13,7 @@ from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.calibration.identification import Observation
 from exo_gravity.core.calibration.params import CALIBRATOR, tour_of
 from exo_gravity.core.calibration.tour import Measured
-from exo_gravity.core.control_params import wearer_of
+from exo_gravity.core.compensation.params import wearer_of
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.moments import load_moments, moments_of, regressor
 from exo_gravity.core.model.tilt import Tilt

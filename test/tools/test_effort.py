@@ -9,7 +9,7 @@ import pytest
 import yaml
 from rich.console import Console
 
-from exo_gravity.core.control_params import COMPENSATOR, settings_of
+from exo_gravity.core.compensation.params import COMPENSATOR, settings_of
 from exo_gravity.core.effort import Effort
 from exo_gravity.core.params import values_of
 from exo_gravity.sim.effort_study import TASKS

@@ -14,13 +14,14 @@ from exo_gravity.core.calibration.guess import TorqueGuess
 from exo_gravity.core.calibration.motion import MAX_SPEED, Station
 from exo_gravity.core.calibration.poses import BestPoses, FixedStations, Itinerary, measurable
 from exo_gravity.core.calibration.tour import Tour
-from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR, LIMIT_PARAMETERS, limits_of, settings_of
+from exo_gravity.core.compensation.params import COMPENSATOR, settings_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import JOINT_COUNT, MAX_LENGTH, MAX_MASS, one_float
 from exo_gravity.core.model.moments import load_moments, moments_of
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.limits import Limits
+from exo_gravity.core.safety.params import CAN_BRIDGE, LIMIT_PARAMETERS, limits_of
 
 _SHARED = {param.name for param in COMPENSATOR}
 # fmt: off

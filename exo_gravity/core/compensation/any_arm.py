@@ -17,11 +17,10 @@ from exo_gravity.core.compensation.limiter import EffortLimiter
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.tilt_input import Tilted
 from exo_gravity.core.compensation.transition import Transition
-from exo_gravity.core.control_params import REAL_TIME_PARAMETERS
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import MAX_GAIN, MAX_GRAVITY, STANDARD_GRAVITY
 from exo_gravity.core.model.gravity import Torque
-from exo_gravity.core.params import Param, param_of
+from exo_gravity.core.params import REAL_TIME_PARAMETERS, Param, param_of
 
 LAW = "urdf"
 MAX_JOINTS = 32

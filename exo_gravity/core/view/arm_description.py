@@ -6,11 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from exo_gravity.core.control_params import LIMIT_PARAMETERS, limits_of, robot_of
+from exo_gravity.core.compensation.params import robot_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import JOINT_COUNT, ZEROS, ArmModel, Vector
 from exo_gravity.core.model.tilt import SIDES
+from exo_gravity.core.params import Param
 from exo_gravity.core.safety.limits import Limits
+from exo_gravity.core.safety.params import LIMIT_PARAMETERS, limits_of
 
 Point = tuple[float, float, float]
 
@@ -72,3 +74,13 @@ def described(compensator: Mapping[str, Any], can_bridge: Mapping[str, Any]) -> 
         compensator["friction.coulomb"],
         compensator["shoulder_from_imu"],
     )
+
+
+# The parameters of `robot_model`.
+# fmt: off
+ROBOT_MODEL = (
+    Param("rate", 30.0, "joint states of all arms per second", (1.0, 100.0), "Hz", fixed=True),
+    Param("meshes", "", "address of a folder with LINK.stl for each link, as package://NAME/FOLDER; empty: tubes",
+          fixed=True),
+)
+# fmt: on

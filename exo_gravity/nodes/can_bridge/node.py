@@ -13,13 +13,14 @@ from collections.abc import Callable
 
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
-from exo_gravity.core.control_params import CAN_BRIDGE, OPTIONS, limits_of, motors_of, traffic_of
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.model.budget import motor_torques
 from exo_gravity.core.motors.joint_motor import peaks_of
+from exo_gravity.core.motors.params import OPTIONS, motors_of, traffic_of
 from exo_gravity.core.safety.checks import check_bridge
 from exo_gravity.core.safety.faults import FaultCode
 from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.core.safety.params import CAN_BRIDGE, limits_of
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.ownership.handover import Charge

@@ -7,8 +7,9 @@ import os
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
-from exo_gravity.core.control_params import CAN_BRIDGE, OPTIONS, limits_of, motors_of
 from exo_gravity.core.errors import ExoGravityError
+from exo_gravity.core.motors.params import OPTIONS, motors_of
+from exo_gravity.core.safety.params import CAN_BRIDGE, limits_of
 from exo_gravity.hardware.ownership.handover import Charge
 from exo_gravity.hardware.ownership.owned_bus import recover
 from exo_gravity.nodes.ros.declare import bus_of, declare

@@ -21,7 +21,7 @@ from exo_gravity.core.compensation.any_arm import (
     any_arm_table,
 )
 from exo_gravity.core.compensation.compensator import Answer
-from exo_gravity.core.control_params import COMPENSATOR
+from exo_gravity.core.compensation.params import COMPENSATOR
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.nodes.ros.declare import declare

@@ -20,11 +20,11 @@ from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.control_params import CAN_BRIDGE
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.budget import Workspace, budget, motor_torques, overload
 from exo_gravity.core.params import values_of
+from exo_gravity.core.safety.params import CAN_BRIDGE
 
 WITHIN = "within rated torque everywhere"
 PAUSE = 0.005  # s, about 500 times per budget

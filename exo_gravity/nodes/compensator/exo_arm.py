@@ -11,9 +11,9 @@ from typing import Any, TypeVar
 from rclpy.node import Node
 
 from exo_gravity.core.compensation.compensator import Answer, Compensator
+from exo_gravity.core.compensation.params import COMPENSATOR, settings_of
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.spring import PosePath
-from exo_gravity.core.control_params import COMPENSATOR, settings_of
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.anfis_law import AnfisLaw
 from exo_gravity.core.model.arm import ArmModel

@@ -17,9 +17,9 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
-from exo_gravity.core.control_params import IMU
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.rate import Rate
+from exo_gravity.core.trunk.params import IMU
 from exo_gravity.hardware.trunk.trunk_estimator import ImuSample, TrunkEstimator, TrunkOrientation
 from exo_gravity.nodes.imu.device import ImuDevice
 from exo_gravity.nodes.ros.conversions import to_nanoseconds

@@ -23,9 +23,9 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
 
-from exo_gravity.core.control_params import ROBOT_MODEL
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.tilt import gravity_in_trunk
+from exo_gravity.core.view.arm_description import ROBOT_MODEL
 from exo_gravity.core.view.scene import ArmView, arm_shapes, gravity_shapes
 from exo_gravity.core.view.urdf import joint_names, urdf
 from exo_gravity.nodes.robot_model.markers import marker_array

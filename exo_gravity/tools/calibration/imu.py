@@ -19,8 +19,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from exo_gravity.bag.storage import Storage
 from exo_gravity.core.calibration.imu_mounting import AccelerometerFit, ImuRecord, Mounting, mounting, six_rests
-from exo_gravity.core.control_params import IMU
 from exo_gravity.core.errors import DataError
+from exo_gravity.core.trunk.params import IMU
 from exo_gravity.tools.calibration.outcome import Change, Outcome
 from exo_gravity.tools.inputs.arms import ConfiguredArm, node_values
 from exo_gravity.tools.inputs.parameter_file import load

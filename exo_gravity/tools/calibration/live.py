@@ -21,8 +21,8 @@ import yaml
 
 from exo_gravity.core.calibration.identification import Observation
 from exo_gravity.core.calibration.tour import Measured
-from exo_gravity.core.control_params import LIMIT_PARAMETERS
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.safety.params import LIMIT_PARAMETERS
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.launcher import Launcher, Stopping, stop_on_signals
 

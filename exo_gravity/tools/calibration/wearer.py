@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from exo_gravity.core.calibration.identification import Observation
-from exo_gravity.core.control_params import wearer_of
+from exo_gravity.core.compensation.params import wearer_of
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.moments import moments_of, regressor
 from exo_gravity.core.model.wearer import Wearer

@@ -15,15 +15,17 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.compensation.any_arm import LAW as URDF_LAW
+from exo_gravity.core.compensation.params import COMPENSATOR, settings_of
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.spring import PosePath
-from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR, OPTIONS, limits_of, motors_of, settings_of
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.anfis_law import AnfisLaw
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.params import OPTIONS, motors_of
 from exo_gravity.core.params import Param, values_of
 from exo_gravity.core.safety.limits import Limits
+from exo_gravity.core.safety.params import CAN_BRIDGE, limits_of
 from exo_gravity.tools.inputs.parameter_file import Nodes, load, packaged_config
 
 

@@ -15,10 +15,11 @@ import yaml
 from PIL import Image, ImageDraw, ImageFont
 
 from exo_gravity.bag.content import Bag
-from exo_gravity.core.control_params import CAN_BRIDGE, COMPENSATOR
+from exo_gravity.core.compensation.params import COMPENSATOR
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.params import CAN_BRIDGE
 from exo_gravity.core.trial.recording import Recording
 from exo_gravity.core.view.arm_description import ArmDescription, described
 from exo_gravity.core.view.scene import AMBER, GREEN, GREY, RED, ArmView, Shape, arm_shapes

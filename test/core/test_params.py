@@ -8,7 +8,7 @@ import pytest
 
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.limiter import LONGEST_STEP
-from exo_gravity.core.control_params import COMPENSATOR, settings_of
+from exo_gravity.core.compensation.params import COMPENSATOR, settings_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import values_of
 

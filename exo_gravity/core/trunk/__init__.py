@@ -1,0 +1,1 @@
+"""The mathematics of the trunk's IMU."""

@@ -1,0 +1,29 @@
+"""The parameters of `imu`."""
+
+from __future__ import annotations
+
+from exo_gravity.core.params import Param
+
+GYROSCOPE_RANGE, GYROSCOPE_RANGES = 34.9, (1.0, 200.0)  # rad/s; 2000 deg/s
+ACCELEROMETER_RANGE, ACCELEROMETER_RANGES = 156.9, (15.0, 4000.0)  # m/s^2; 16 g
+# fmt: off
+IMU_SOURCES = ("topic", "mpu6050", "icm20948", "lsm6dsox", "witmotion", "bno085")
+IMU = (
+    Param("source", "topic", "the IMU: a driver's topic, a chip on I2C, or a sensor on a serial port", fixed=True,
+          choices=IMU_SOURCES),
+    Param("input_topic", "/imu/data_raw", "topic of the IMU driver's sensor_msgs/Imu", fixed=True),
+    Param("i2c.bus", 1, "number n of the bus /dev/i2c-n", (0, 255), fixed=True),
+    Param("i2c.address", 0, "address of the chip; 0: the usual one of its boards", (0, 0x77), fixed=True),
+    Param("serial.port", "", "the sensor's port, best a name in /dev/serial/by-id", fixed=True),
+    Param("serial.baud", 115200, "the sensor's baud rate", (4800, 921600), fixed=True),
+    # No rotation would be a safe default. Four zeros are not a rotation, so the node rejects them.
+    Param("rotation_trunk_from_imu", [0.0] * 4, "mounting of the IMU, unit quaternion x, y, z, w; required",
+          (-1.0, 1.0), fixed=True),
+    Param("rate", 100.0, "sample rate of the IMU, within 15 %", (20.0, 2000.0), "Hz", fixed=True),
+    Param("gyroscope_range", GYROSCOPE_RANGE, "rate at which the gyroscope saturates", GYROSCOPE_RANGES, "rad/s",
+          fixed=True),
+    Param("accelerometer_range", ACCELEROMETER_RANGE, "acceleration at which the accelerometer saturates",
+          ACCELEROMETER_RANGES, "m/s^2", fixed=True),
+    Param("timeout", 0.1, "time without IMU data that counts as an error", (0.02, 1.0), "s", fixed=True),
+)
+# fmt: on
