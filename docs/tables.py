@@ -42,13 +42,15 @@ PARAMETERS = {
     "panel": PANEL,
     "calibrator": [param for param in CALIBRATOR if param.name.startswith("tour.")],
 }
+HEAD = ("parameter", "default", "unit", "range", "change", "meaning")
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 
 
 def parameter_table(params: Sequence[Param]) -> str:
     """Return the Markdown table of one node's parameters."""
-    head = ("parameter", "default", "unit", "range", "change", "meaning")
-    return markdown(head, ((f"`{p.name}`", _default(p), p.unit, _range(p), _change(p), p.description) for p in params))
+    usual, expert = ([p for p in params if p.expert is wanted] for wanted in (False, True))
+    text = markdown(HEAD, map(_row, usual))
+    return f"{text}\nFor experts:\n\n{markdown(HEAD, map(_row, expert))}" if expert else text
 
 
 def fault_table() -> str:
@@ -102,6 +104,10 @@ def stale_tables(text: str) -> list[str]:
     """Return the names of the tables in a document that differ from the declarations."""
     pairs = zip(TABLE.finditer(text), TABLE.finditer(renewed(text)), strict=True)
     return [old[2] for old, new in pairs if old[0] != new[0]]
+
+
+def _row(p: Param) -> tuple[str, ...]:
+    return f"`{p.name}`", _default(p), p.unit, _range(p), _change(p), p.description
 
 
 def _default(param: Param) -> str:

@@ -12,12 +12,20 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import four_floats, one_float
+from exo_gravity.core.numbers import four_floats, one_float
 
 # ROS declares these on every node, and `ros2 param dump` writes them to files.
 ROS_PARAMETERS = ("use_sim_time", "start_type_description_service")
 ROS_QOS_PREFIX = "qos_overrides."
 KINDS = {float: "number", int: "whole number", str: "string", bool: "true or false"}
+# Parameters that are gone, by the node that had them, and what replaces each.
+GONE: dict[str, str] = {
+    # can_bridge
+    # compensator
+    # imu
+    # calibrator
+    # simulator
+}
 
 
 @dataclass(frozen=True)
@@ -25,7 +33,8 @@ class Param:
     """One parameter. The type of `default` is the parameter's type.
 
     unit: '' for none. bounds: lowest and highest value, also for each number in a list. fixed: read-only while the
-    node runs. required: the user must give a non-empty value.
+    node runs. required: the user must give a non-empty value. expert: only an expert changes it; the documents list it
+    apart, and the panel does not show it.
     """
 
     name: str
@@ -36,6 +45,7 @@ class Param:
     choices: tuple[str, ...] = ()
     fixed: bool = False
     required: bool = False
+    expert: bool = False
 
     def check(self, value: Any) -> Any:
         """Return `value` in this parameter's type; an integer is converted if the type is float.
@@ -90,10 +100,13 @@ def owned(
     bounds: tuple[float, float] | None = None,
     unit: str = "",
     choices: tuple[str, ...] = (),
+    expert: bool = False,
 ) -> Any:
     """Return a dataclass field that owns a parameter; a tuple as default makes it a list with one entry per joint."""
     plain = list(default) if isinstance(default, tuple) else default
-    return field(default=default, metadata={"param": Param("", plain, description, bounds, unit, choices)})
+    return field(
+        default=default, metadata={"param": Param("", plain, description, bounds, unit, choices, expert=expert)}
+    )
 
 
 def param_of(owner: type, name: str, fixed: bool = False) -> Param:
@@ -134,7 +147,8 @@ def values_of(table: Sequence[Param], given: Mapping[str, Any], free_prefix: str
     prefixes = (ROS_QOS_PREFIX, free_prefix) if free_prefix else (ROS_QOS_PREFIX,)
     for name, value in given.items():
         if name not in names and name not in ROS_PARAMETERS and not name.startswith(prefixes):
-            raise ParameterError(name, value, f"one of {', '.join(sorted(names))}")
+            gone = f"left out, because it is gone: {GONE[name]}" if name in GONE else ""
+            raise ParameterError(name, value, gone or f"one of {', '.join(sorted(names))}")
     return {param.name: param.check(given.get(param.name, param.default)) for param in table}
 
 

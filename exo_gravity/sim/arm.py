@@ -21,8 +21,9 @@ import mujoco
 import numpy as np
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import JOINT_COUNT, MAX_LENGTH, MAX_MASS, ArmModel, four_floats
+from exo_gravity.core.model.arm import MAX_LENGTH, MAX_MASS, ArmModel
 from exo_gravity.core.model.moments import MAX_OFFSET
+from exo_gravity.core.numbers import JOINT_COUNT, four_floats
 from exo_gravity.core.params import check_owned, owned
 from exo_gravity.sim.base_motion import apply_rotation
 

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.compensation.compensator import Answer
-from exo_gravity.core.model.arm import JOINT_COUNT
 from exo_gravity.core.model.gravity import NO_TORQUE, Torque
 from exo_gravity.core.motors.joint_motor import JointMotor, peaks_of
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.sim.arm import STEP
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.effort import SETTLING, EffortWearer, Task, measure, run

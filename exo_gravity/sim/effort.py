@@ -17,9 +17,9 @@ import numpy as np
 from exo_gravity.core.compensation.compensator import Answer, Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.effort import Effort, effort_of
-from exo_gravity.core.model.arm import JOINT_COUNT
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim.arm import STEP
 from exo_gravity.sim.device import SimulatedDevice

@@ -21,8 +21,8 @@ import numpy as np
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.arm import JOINT_COUNT
 from exo_gravity.core.motors.joint_motor import JointMotor, peaks_of
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import Drive, State
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine

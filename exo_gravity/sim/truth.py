@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import JOINT_COUNT
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.sim.motor import SimulatedMotor
 
 # time: wall clock in s. position, velocity: of the joints, rad and rad/s. torque: of the motors on the joints, Nm.

@@ -11,8 +11,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from exo_gravity.core.model.arm import JOINT_COUNT, four_floats, one_float
 from exo_gravity.core.model.gravity import NO_TORQUE, Torque
+from exo_gravity.core.numbers import JOINT_COUNT, four_floats, one_float
 from exo_gravity.core.trial.script import TrialScript
 
 Path = list[tuple[float, float]]  # of each joint: position in rad, velocity in rad/s

@@ -10,8 +10,8 @@ import numpy as np
 from exo_gravity.core import ArmModel, Tilt
 from exo_gravity.core.calibration.identification import Observation, next_pose
 from exo_gravity.core.calibration.pose_choice import TYPICAL_MOMENTS
-from exo_gravity.core.model.arm import Vector
 from exo_gravity.core.model.moments import load_moments, moments_of, off_axis_of, regressor
+from exo_gravity.core.numbers import Vector
 
 LENGTH = (0.05, 0.13, 0.30, 0.30)
 LEANING = Tilt.of("right", 0.30, 0.25).direction  # the stand, so that joint 1 carries something

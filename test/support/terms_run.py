@@ -12,9 +12,9 @@ import numpy as np
 from exo_gravity.core import LAWS, ArmModel, Tilt
 from exo_gravity.core.compensation.terms.settings import TermSettings
 from exo_gravity.core.compensation.terms.terms import Terms
-from exo_gravity.core.model.arm import Vector
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, MOTORS
+from exo_gravity.core.numbers import Vector
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 

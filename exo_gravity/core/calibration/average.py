@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.model.arm import JOINT_COUNT
+from exo_gravity.core.numbers import JOINT_COUNT
 
 BINS = 4  # of each sweep: neighbouring samples share the slow oscillations of the controller
 RESOLUTION = 0.002  # Nm: standard error that is left of the 12-bit torque command (7.3 mNm per code) after averaging

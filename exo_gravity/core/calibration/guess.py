@@ -10,10 +10,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from exo_gravity.core.model.arm import JOINT_COUNT, ArmModel, Vector
+from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import LAWS, Torque
 from exo_gravity.core.model.moments import regressor
 from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.numbers import JOINT_COUNT, Vector
 
 UNSURE = 0.4  # of a moment: masses and torque scales that are each off by 30 %
 UNSURE_MOMENT = 0.02  # kg m, in addition: off-axis moments of which the file knows nothing

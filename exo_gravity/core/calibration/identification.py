@@ -42,8 +42,9 @@ from exo_gravity.core.calibration.pose_fit import (
     without_each_pose,
     without_outliers,
 )
-from exo_gravity.core.model.arm import STANDARD_GRAVITY, Vector
+from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.model.moments import load_moments, regressor
+from exo_gravity.core.numbers import Vector
 
 __all__ = ["Identified", "Observation", "identify", "next_pose"]
 

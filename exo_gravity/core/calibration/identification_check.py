@@ -11,8 +11,8 @@ import numpy as np
 from exo_gravity.core.calibration.pose_choice import TYPICAL_MOMENTS, missing_pose
 from exo_gravity.core.calibration.pose_fit import ANGLE, COUNT, DISTURBED, FACTOR, OFFSET, SCALE, TILT
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.arm import JOINT_COUNT
 from exo_gravity.core.model.moments import MOMENTS
+from exo_gravity.core.numbers import JOINT_COUNT
 
 if TYPE_CHECKING:
     from exo_gravity.core.calibration.identification import Observation

@@ -16,9 +16,10 @@ from exo_gravity.core.calibration.poses import BestPoses, FixedStations, Itinera
 from exo_gravity.core.calibration.tour import Tour
 from exo_gravity.core.compensation.params import COMPENSATOR, settings_of
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import JOINT_COUNT, MAX_LENGTH, MAX_MASS, one_float
+from exo_gravity.core.model.arm import MAX_LENGTH, MAX_MASS
 from exo_gravity.core.model.moments import load_moments, moments_of
 from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.numbers import JOINT_COUNT, one_float
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.params import CAN_BRIDGE, LIMIT_PARAMETERS, limits_of

@@ -10,8 +10,9 @@ import numpy as np
 
 from exo_gravity.core.calibration.pose_fit import COUNT, MOMENT, NATURAL, NOTHING_KNOWN, Rows
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import STANDARD_GRAVITY, Vector
+from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.model.moments import MOMENTS, regressor
+from exo_gravity.core.numbers import Vector
 
 # kg m, of a robot arm with the motors of this package; only the share of noise and scale in a pose depends on it.
 TYPICAL_MOMENTS = (0.08, 0.15, 0.2, 0.026, 0.0, 0.0, 0.0, 0.0)

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.arm import JOINT_COUNT
 from exo_gravity.core.model.moments import MOMENTS, regressor
+from exo_gravity.core.numbers import JOINT_COUNT
 
 MOMENT = slice(0, 8)
 SCALE = slice(8, 12)

@@ -12,7 +12,7 @@ from exo_gravity.core.calibration.guess import TorqueGuess
 from exo_gravity.core.calibration.identification import next_pose
 from exo_gravity.core.calibration.motion import Station, durations
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.arm import JOINT_COUNT
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.limits import WALL_WIDTH, Limits
 
 CANDIDATES = 800

@@ -21,9 +21,9 @@ from exo_gravity.core.calibration.tracking import MassMatrix, Tracker
 from exo_gravity.core.calibration.visit import FOLLOWED, Visit
 from exo_gravity.core.calibration.watch import Watch
 from exo_gravity.core.errors import ExoGravityError
-from exo_gravity.core.model.arm import JOINT_COUNT
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.limits import Limits
 
 SETTLING = 0.1  # s at rest after the way to a pose

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from exo_gravity.core.model.arm import JOINT_COUNT, Vector
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.model.moments import load_moments
+from exo_gravity.core.numbers import JOINT_COUNT, Vector
 
 ROTOR = (0.0015, 0.005, 0.0015, 0.0015)  # kg m^2 at the output: an AK80-9 at joint 2, else a little more than an AK60-6
 # kg m^2 added to each joint: with it a 1 kg weight on link 4 at 100 Hz is carried without sticking (measured).

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from exo_gravity.core.model.arm import JOINT_COUNT
 from exo_gravity.core.model.tilt import Tilt, angle_between
+from exo_gravity.core.numbers import JOINT_COUNT
 
 MAX_ERROR = 0.12  # rad between a joint and the slow reference
 FASTEST = 1.0  # rad/s of a joint; a light joint that leaves its friction reaches 0.5

@@ -19,9 +19,10 @@ import numpy as np
 
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.anfis import Anfis
-from exo_gravity.core.model.arm import ArmModel, Vector
+from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.numbers import Vector
 
 INPUTS = ("theta_2", "theta_3", "theta_4")
 JOINTS = ("2", "3", "4")

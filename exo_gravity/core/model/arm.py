@@ -7,17 +7,13 @@ vertical, shoulder abduction, shoulder flexion, elbow flexion. At theta = (any, 
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 
 import numpy as np
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats, one_float
 
-Vector = Sequence[float] | np.ndarray  # numbers in joint order, or the components of a vector
-
-JOINT_COUNT = 4
 STANDARD_GRAVITY = 9.80665  # m/s^2, ISO 80000-3; the paper rounds to 9.8
 
 # These bounds catch wrong units (grams for kilograms, millimetres for metres), not unusual designs.
@@ -32,31 +28,6 @@ ONES = (1.0,) * JOINT_COUNT
 ZEROS = (0.0,) * JOINT_COUNT
 UNKNOWN = np.full(JOINT_COUNT, np.nan)  # masses and centres of gravity of an arm given by its moments
 UNKNOWN.setflags(write=False)
-
-
-def four_floats(name: str, values: Vector, low: float, high: float, unit: str = "") -> np.ndarray:
-    """Return `values` as a read-only array (4,), or raise ParameterError unless they are 4 numbers in [low, high]."""
-    expected = f"{JOINT_COUNT} numbers from {low:g} to {high:g}{' ' + unit if unit else ''}"
-    try:
-        array = np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        raise ParameterError(name, values, expected) from None
-    # NaN fails both comparisons, so this check rejects it too.
-    if array.shape != (JOINT_COUNT,) or not np.all((array >= low) & (array <= high)):
-        raise ParameterError(name, values, expected)
-    array.setflags(write=False)
-    return array
-
-
-def one_float(name: str, value: float, low: float, high: float, unit: str = "") -> float:
-    """Return `value` as a float, or raise ParameterError unless it is one number in [low, high]."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not low <= number <= high:
-        raise ParameterError(name, value, f"a number from {low:g} to {high:g}{' ' + unit if unit else ''}")
-    return number
 
 
 @dataclass(frozen=True, eq=False, init=False)

@@ -18,9 +18,10 @@ from functools import partial
 import numpy as np
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import JOINT_COUNT, ArmModel, Vector, four_floats, one_float
+from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.motors.specs import MOTORS
+from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats, one_float
 
 Cost = Callable[[np.ndarray], np.ndarray]  # points (n, 6) -> (n,)
 

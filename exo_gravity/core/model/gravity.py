@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import JOINT_COUNT, ArmModel
+from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.numbers import JOINT_COUNT
 
 Torque = tuple[float, ...]  # (4,) Nm in joint order
 NO_TORQUE: Torque = (0.0, 0.0, 0.0, 0.0)

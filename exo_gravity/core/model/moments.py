@@ -16,17 +16,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from exo_gravity.core.model.arm import (
-    JOINT_COUNT,
-    MAX_LENGTH,
-    MAX_MASS,
-    STANDARD_GRAVITY,
-    ArmModel,
-    Vector,
-    four_floats,
-    one_float,
-)
+from exo_gravity.core.model.arm import MAX_LENGTH, MAX_MASS, STANDARD_GRAVITY, ArmModel
 from exo_gravity.core.model.gravity import gravity_torque
+from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats, one_float
 
 MOMENTS = ("M1", "M2", "M3", "M4", "W", "Z", "Y3", "Y4")
 MAX_OFFSET = 0.1  # m of a centre of gravity from its link

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import Vector
+from exo_gravity.core.numbers import Vector
 
 Floats3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import Vector, one_float
+from exo_gravity.core.numbers import Vector, one_float
 
 SIDES = ("left", "right")
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import Vector, four_floats, one_float
+from exo_gravity.core.numbers import Vector, four_floats, one_float
 
 
 class Segment(NamedTuple):

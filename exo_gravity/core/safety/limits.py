@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import JOINT_COUNT
 from exo_gravity.core.motors.specs import MOTOR_ERRORS, MOTORS
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import check_owned, owned
 from exo_gravity.core.safety.drive import NOTHING
 from exo_gravity.core.safety.faults import Fault, FaultCode

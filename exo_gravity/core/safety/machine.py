@@ -26,8 +26,8 @@ import math
 from collections.abc import Sequence
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import JOINT_COUNT
 from exo_gravity.core.motors.joint_motor import Peaks
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DAMPING_RISE, ArmDescent
 from exo_gravity.core.safety.drive import CARRYING, NOTHING, OFF, Drive, State

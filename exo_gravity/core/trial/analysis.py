@@ -17,7 +17,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from exo_gravity.core.model.arm import JOINT_COUNT
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.trial.recording import (
     MARGIN,
     Blocks,

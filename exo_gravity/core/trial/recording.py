@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.arm import JOINT_COUNT
+from exo_gravity.core.numbers import JOINT_COUNT
 
 BLOCK = 0.1  # s, the time resolution of the analysis
 STILL_SPEED = 0.02  # rad/s, or 69 degrees per minute: an arm that moves faster is not held

@@ -24,7 +24,7 @@ from itertools import accumulate
 from typing import Any
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import four_floats, one_float
+from exo_gravity.core.numbers import four_floats, one_float
 
 MAX_DURATION = 3600.0  # s
 TIMED = {"hold": 0.1, "walk": 2.0, "sit": 1.0}  # steps that have only a duration, and the shortest of each in s

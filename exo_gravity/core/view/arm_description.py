@@ -8,8 +8,9 @@ from typing import Any
 
 from exo_gravity.core.compensation.params import robot_of
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import JOINT_COUNT, ZEROS, ArmModel, Vector
+from exo_gravity.core.model.arm import ZEROS, ArmModel
 from exo_gravity.core.model.tilt import SIDES
+from exo_gravity.core.numbers import JOINT_COUNT, Vector
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.params import LIMIT_PARAMETERS, limits_of

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.model.arm import JOINT_COUNT, Vector
+from exo_gravity.core.numbers import JOINT_COUNT, Vector
 from exo_gravity.core.safety.drive import CARRYING, State
 from exo_gravity.core.safety.limits import WALL_WIDTH
 from exo_gravity.core.view.arm_description import ArmDescription

@@ -20,7 +20,7 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import JOINT_COUNT
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.view.arm_description import ArmDescription, Point
 from exo_gravity.core.view.urdf_shapes import add_link_shapes, add_material, add_mesh, add_trunk_shapes, numbers
 

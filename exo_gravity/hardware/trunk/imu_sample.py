@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import STANDARD_GRAVITY, one_float
+from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.model.quaternion import Floats3
+from exo_gravity.core.numbers import one_float
 
 GYROSCOPE_RANGE = math.radians(2000.0)  # rad/s, the usual widest range of a MEMS gyroscope
 ACCELEROMETER_RANGE = 16.0 * STANDARD_GRAVITY  # m/s^2

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import one_float
 from exo_gravity.core.model.quaternion import product, up_in_body
 from exo_gravity.core.model.tilt import pitch_roll, rotation_matrix
+from exo_gravity.core.numbers import one_float
 from exo_gravity.hardware.trunk.freeze_check import FreezeCheck
 from exo_gravity.hardware.trunk.imu_sample import ACCELEROMETER_RANGE, GYROSCOPE_RANGE, ImuSample, Ranges
 from exo_gravity.hardware.trunk.orientation_filter import VQF

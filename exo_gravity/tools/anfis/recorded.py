@@ -18,8 +18,8 @@ from exo_gravity.bag.reader import read_bag
 from exo_gravity.bag.storage import Storage
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.anfis_law import INPUTS, UPRIGHT, scaled
-from exo_gravity.core.model.arm import JOINT_COUNT
 from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.trial.analysis import analyse
 from exo_gravity.core.trial.recording import Recording
 from exo_gravity.tools.anfis.data import Samples

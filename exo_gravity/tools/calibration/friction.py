@@ -12,7 +12,7 @@ from exo_gravity.core.calibration.friction import Friction, fit_friction, fricti
 from exo_gravity.core.calibration.params import as_text
 from exo_gravity.core.calibration.tour import Measured
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.arm import JOINT_COUNT
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.tools.calibration.live import Say, refusals_of, run_tour, tour_parameters
 from exo_gravity.tools.calibration.outcome import Change, Curve, Outcome
 from exo_gravity.tools.inputs.arms import ConfiguredArm

@@ -18,10 +18,10 @@ from statistics import fmean
 from rich.table import Table
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import JOINT_COUNT
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.params import OPTIONS
 from exo_gravity.core.motors.specs import MOTOR_ERRORS
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.hardware.can.bus_scan import Answer, BusScan
 from exo_gravity.tools.calibration.motor_watch import Watch, motor_table
 from exo_gravity.tools.calibration.outcome import Change, Outcome

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.arm import JOINT_COUNT, ArmModel
+from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.numbers import JOINT_COUNT
 
 # Table 1 of the paper, standard Denavit-Hartenberg; a is the link's length, d is 0.
 ALPHA = (-math.pi / 2, math.pi / 2, 0.0, 0.0)

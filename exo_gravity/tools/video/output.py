@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.model.arm import one_float
+from exo_gravity.core.numbers import one_float
 from exo_gravity.tools.cli.extras import missing
 
 FRAME_RATE = {".mp4": 25, ".gif": 10}  # frames per second

@@ -18,8 +18,8 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
 from exo_gravity.core.compensation.terms.term import clamp
-from exo_gravity.core.model.arm import JOINT_COUNT
 from exo_gravity.core.model.gravity import NO_TORQUE, Torque
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import check_owned, owned
 from exo_gravity.core.safety.limits import MAX_COMMAND
 

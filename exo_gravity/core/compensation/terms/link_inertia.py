@@ -19,8 +19,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from exo_gravity.core.model.arm import JOINT_COUNT, ArmModel
+from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import Torque
+from exo_gravity.core.numbers import JOINT_COUNT
 
 ROTORS = (8.8e-4, 4.9e-3, 8.8e-4, 8.8e-4)  # kg m^2 at the output: AK60-6 and AK80-9, published motor tables
 NO_ACCELERATION = (0.0,) * JOINT_COUNT

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 from exo_gravity.core.compensation.terms.term import LATE, TermState, check_stiffness, clamp
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.model.arm import JOINT_COUNT
 from exo_gravity.core.model.gravity import Torque
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import check_owned, owned
 
 MAX_PATH_SPEED = 2.0  # rad/s between two poses of a path
