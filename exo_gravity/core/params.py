@@ -104,7 +104,8 @@ def owned(
 ) -> Any:
     """Return a dataclass field that owns a parameter; a tuple as default makes it a list with one entry per joint."""
     plain = list(default) if isinstance(default, tuple) else default
-    return field(
+    param = Param("", plain, description, bounds, unit, choices, expert=expert)
+    return field(default=default, metadata={"param": param})
         default=default, metadata={"param": Param("", plain, description, bounds, unit, choices, expert=expert)}
     )
 
