@@ -106,8 +106,6 @@ def owned(
     plain = list(default) if isinstance(default, tuple) else default
     param = Param("", plain, description, bounds, unit, choices, expert=expert)
     return field(default=default, metadata={"param": param})
-        default=default, metadata={"param": Param("", plain, description, bounds, unit, choices, expert=expert)}
-    )
 
 
 def param_of(owner: type, name: str, fixed: bool = False) -> Param:
