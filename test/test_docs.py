@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from exo_gravity.core.safety.faults import FaultCode
+from exo_gravity.core.safety.drive import FaultCode
 
 ROOT = Path(__file__).parents[1]
 TABLES = ROOT / "docs" / "tables.py"

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from exo_gravity.core.safety.delivery import DeliveryMonitor, SwitchOnCheck
+from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.drive import Drive
+from exo_gravity.core.safety.gate import SwitchOnCheck
 from exo_gravity.core.safety.limits import JointSample
 
 from ..support.safety_run import LIMITS, PERIOD

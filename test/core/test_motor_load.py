@@ -4,8 +4,8 @@ import math
 
 import pytest
 
+from exo_gravity.core.safety.delivery import THERMAL_TIME, MotorLoad
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample
-from exo_gravity.core.safety.motor_load import THERMAL_TIME, MotorLoad
 
 
 def sample(effort: float, velocity: float = 0.0) -> JointSample:

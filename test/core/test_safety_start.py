@@ -7,10 +7,11 @@ from collections.abc import Sequence
 
 import pytest
 
-from exo_gravity.core.safety.delivery import TEST_TORQUE
 from exo_gravity.core.safety.drive import OFF, State
+from exo_gravity.core.safety.gate import TEST_TORQUE
+from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
 
-from ..support.safety_run import EFFORT, LIMITS, PERIOD, SafetyRun
+from ..support.safety_run import EFFORT, PERIOD, SafetyRun
 
 
 def test_a_new_machine_keeps_the_motors_off():
@@ -27,7 +28,7 @@ def test_torque_ramps_in_over_the_ramp_time_without_a_step():
     assert arm.drive.effort[1] == pytest.approx(-2.0, abs=0.15)
     arm.cycle(1.0)
     assert arm.drive.effort == pytest.approx(EFFORT)
-    assert max(arm.steps) <= LIMITS.max_effort_rate * PERIOD * 1.0001
+    assert max(arm.steps) <= MAX_EFFORT_RATE * PERIOD * 1.0001
 
 
 @pytest.mark.parametrize(
@@ -80,17 +81,17 @@ def test_a_fault_during_the_checks_is_latched(change, code):
 
 def test_an_arm_away_from_home_is_refused_until_it_has_been_carried_once():
     arm = SafetyRun()
-    arm.changes[1].update(position=0.5 + math.radians(40.0))  # a turn of an AK80-9's motor
+    arm.changes[1].update(position=math.radians(40.0))  # a turn of an AK80-9's motor
     arm.enable()
     arm.cycle(1.0)
     assert arm.fault_code == "implausible_zero"
-    assert "b: 1.198 rad at the start" in arm.machine.fault.reason
+    assert "b: 0.698 rad at the start" in arm.machine.fault.reason
 
     arm = SafetyRun().until_active()
     arm.machine.disable(arm.now)
     arm.cycle(8.0)
     for step in range(31):  # moved by hand
-        arm.changes[1].update(position=0.5 + 0.02 * step)
+        arm.changes[1].update(position=0.02 * step)
         arm.cycle(0.02)
     arm.enable()
     arm.cycle(3.0)
@@ -115,7 +116,7 @@ class YieldingArm(SafetyRun):
     def __init__(self, mobility: Sequence[float]) -> None:
         super().__init__(sign_check_torque=1.5)
         self.mobility = mobility
-        self.position = [0.5] * 4
+        self.position = [0.0] * 4
         self.largest_effort = [0.0] * 4
 
     def cycle(self, seconds: float = PERIOD) -> YieldingArm:
@@ -137,8 +138,8 @@ def test_each_joints_sign_is_checked_once_and_gently_before_the_arm_is_carried()
     assert arm.machine.state is State.PROVING
     arm.cycle(14.0)
     assert arm.machine.state is State.ACTIVE
-    assert all(0.45 < position < 0.56 for position in arm.position)
-    assert max(arm.steps) <= LIMITS.max_effort_rate * PERIOD * 1.0001
+    assert all(-0.05 < position < 0.06 for position in arm.position)
+    assert max(arm.steps) <= MAX_EFFORT_RATE * PERIOD * 1.0001
     arm.machine.disable(arm.now)
     arm.cycle(8.0)
     arm.largest_effort = [0.0] * 4

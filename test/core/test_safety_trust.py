@@ -7,15 +7,14 @@ import random
 
 import pytest
 
-from exo_gravity.core.safety.drive import State
-from exo_gravity.core.safety.faults import FaultCode
+from exo_gravity.core.safety.drive import FaultCode, State
 
 from ..support.safety_run import SafetyRun
 
 
 def assert_a_wrong_angle_is_refused(arm):
     """The encoder of an arm that is off is wrong by a turn of the motor: the arm is not carried."""
-    arm.changes[1].update(position=0.5 + math.radians(40.0))  # one turn of an AK80-9's motor
+    arm.changes[1].update(position=math.radians(40.0))  # one turn of an AK80-9's motor
     arm.cycle()
     arm.enable().cycle(1.0)
     assert arm.fault_code == "implausible_zero"

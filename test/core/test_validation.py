@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.params import motors_of
+from exo_gravity.core.motors.joint_motor import motors_of
 from exo_gravity.core.params import values_of
-from exo_gravity.core.safety.checks import check_bridge
-from exo_gravity.core.safety.params import CAN_BRIDGE, limits_of
+from exo_gravity.core.safety.params import CAN_BRIDGE, check_bridge, limits_of
 
 
 def check(**given):
@@ -22,7 +21,6 @@ def check(**given):
         {},
         {"max_effort": [9.0, 18.0, 9.0, 9.0]},  # peak torque
         {"max_effort": [6.75, 18.0, 9.0, 9.0], "torque_scale": [0.75, 1.0, 1.0, 1.0]},
-        {"home_tolerance": [0.523, 0.349, 0.523, 0.523]},
         {"rate": 40.0},
         {"rate": 25.0, "command_timeout": 0.08, "reply_timeout": 0.1},
         {"rate": 200.0, "command_timeout": 0.01},
@@ -41,8 +39,6 @@ def test_consistent_parameters_are_accepted(given):
         ),
         ({"max_effort": [3.0, 18.0, 3.0, 3.0], "torque_scale": [1.0, 0.9, 1.0, 1.0]}, "peak torque, [9.0, 16.2, 9.0"),
         ({"max_effort": [6.0, 9.0, 3.0, 3.0], "torque_range": [5.0, 18.0, 15.0, 15.0]}, "peak torque, [5.0, 18.0, 9.0"),
-        ({"home_tolerance": [6.3] * 4}, "at most half a turn of each motor's rotor, [0.523, 0.349, 0.523, 0.523] rad"),
-        ({"home_tolerance": [0.5, 0.36, 0.5, 0.5]}, "home_tolerance = [0.5, 0.36, 0.5, 0.5]: must be"),
         ({"rate": 39.0}, "rate = 39.0: must be at least 40 Hz: command_timeout = 0.05 s must span 2 periods"),
         ({"rate": 30.0, "command_timeout": 0.1}, "at least 40 Hz: reply_timeout = 0.05 s must span 2 periods"),
         (

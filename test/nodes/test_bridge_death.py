@@ -12,7 +12,7 @@ import pytest
 
 from exo_gravity.tools import launcher
 
-from ..support.launched_nodes import GENTLE, NO_IMU, LaunchedNodes, children, executable
+from ..support.launched_nodes import NO_IMU, LaunchedNodes, children, executable
 from ..support.ros_probe import RosProbe
 
 pytestmark = pytest.mark.real_time
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.real_time
 @pytest.fixture
 def nodes(launch: Callable[..., LaunchedNodes], probe: RosProbe) -> Iterator[LaunchedNodes]:
     """Nodes that carry an arm without an IMU."""
-    nodes = launch(without=("imu",), compensator=NO_IMU, can_bridge=GENTLE)
+    nodes = launch(without=("imu",), compensator=NO_IMU)
     probe.wait_until_carried()
     yield nodes
 

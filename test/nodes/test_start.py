@@ -26,7 +26,12 @@ BAD_PARAMETERS = [
     ("can_bridge", {"rate": 1100.0}, "rate = 1100.0", "at most 1033 Hz"),
     ("can_bridge", {"rate": 20.0}, "rate = 20.0", "must span 2 periods"),
     ("can_bridge", {"max_effort": [18.0] * 4}, "max_effort = [18.0", "peak torque"),
-    ("can_bridge", {"home_tolerance": [6.3] * 4}, "home_tolerance = [6.3", "half a turn of each motor's rotor"),
+    (
+        "can_bridge",
+        {"home_tolerance": [0.2] * 4},
+        "home_tolerance = [0.2",
+        "left out, because it is gone",
+    ),
     ("compensator", {"gravity": 25.0}, "gain times gravity = [25.0", "twice the Earth's"),
     ("compensator", {"robot": {"mass": [0.6, 0.5, 0.6]}}, "robot.mass = [0.6, 0.5, 0.6]", "4 numbers"),
     ("compensator", {"robot": {"mass": [0.6, -0.5, 0.6, 0.2]}}, "robot.mass", "from 0 to 20"),

@@ -1,6 +1,6 @@
 """The state machine between the requested efforts and the motors. Pure: time is an argument.
 
-    DISABLED --enable--> CHECKING --all well--> PROVING --motors on, signs right--> RAMPING_IN --ramp_time--> ACTIVE
+    DISABLED --enable--> CHECKING --all well--> PROVING --motors on, signs right--> RAMPING_IN --RAMP_TIME--> ACTIVE
         ^                 |    |                   |                                    |                       |
         |         disable |    | fault             |     disable, fault                 |                       |
         +-----------------+    v                   v                                    v                       |
@@ -8,9 +8,9 @@
         +-------------------------------------------+ down: FAULT after a fault, else DISABLED
 
 - DISABLED, CHECKING, FAULT: the motors are off. Zero commands poll their positions.
-- CHECKING waits for the start gate (gate.py). If zeros are not trusted, the arm must hang at `Limits.home`.
-- PROVING: each motor must show in its replies that it is on (delivery.py). If signs are not trusted, each joint
-  is pushed gently, and must move the right way (sign_check.py).
+- CHECKING waits for the start gate (gate.py). If zeros are not trusted, the arm must hang.
+- PROVING: each motor must show in its replies that it is on. If signs are not trusted, each joint is pushed gently, and
+  must move the right way (gate.py).
 - LETTING_DOWN lowers each joint at a bounded speed (descent.py). The motors are switched off once nothing holds
   the arm and nothing moves it. A motor that cannot be reached stays in this state's care: if it replies again, however
   late, its joint is lowered from the torque that it then applies.
@@ -29,12 +29,12 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import Peaks
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.delivery import DeliveryMonitor
-from exo_gravity.core.safety.descent import DAMPING_RISE, ArmDescent
-from exo_gravity.core.safety.drive import CARRYING, NOTHING, OFF, Drive, State
-from exo_gravity.core.safety.faults import DOUBTFUL, Fault, FaultCode
+from exo_gravity.core.safety.descent import DAMPING, DAMPING_RISE, ArmDescent, RestTracker
+from exo_gravity.core.safety.drive import CARRYING, DOUBTFUL, NOTHING, OFF, Drive, Fault, FaultCode, State
 from exo_gravity.core.safety.gate import Proving, StartGate
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
-from exo_gravity.core.safety.rest import RestTracker
+
+RAMP_TIME = 1.0  # s from no torque to full torque: the wearer feels his arm become light, and nothing jolts
 
 
 class SafetyMachine:
@@ -59,7 +59,7 @@ class SafetyMachine:
         self._since = 0.0
         self._now = -math.inf
         self._sent = OFF  # last sent to the motors
-        self._descent = ArmDescent(0.0, NOTHING, NOTHING, self._peaks.effort, limits)
+        self._descent = ArmDescent(0.0, NOTHING, NOTHING, self._peaks.effort)
         self._rest = RestTracker()
         self._before: Sequence[JointSample] = (UNKNOWN,) * 4
         self._silent: Sequence[bool] = (True,) * 4
@@ -145,7 +145,7 @@ class SafetyMachine:
             except ParameterError as error:
                 self.trip(FaultCode.COMMAND_IMPOSSIBLE, str(error), now)
         if self.state is State.PROVING:
-            damping = self.limits.damping * min(1.0, (now - self._since) / DAMPING_RISE)
+            damping = DAMPING * min(1.0, (now - self._since) / DAMPING_RISE)
             return Drive(self._proving.effort, (damping,) * 4, True)
         if self.state is State.LETTING_DOWN:
             return self._descend(now, joints, dt)
@@ -196,14 +196,14 @@ class SafetyMachine:
     def _carry(self, now: float, joints: Sequence[JointSample], effort: Sequence[float], dt: float) -> Drive:
         ramp = 1.0
         if self.state is State.RAMPING_IN:
-            ramp = (now - self._since) / self.limits.ramp_time
+            ramp = (now - self._since) / RAMP_TIME
             if ramp >= 1.0:
                 ramp = 1.0
                 self._enter(State.ACTIVE, now)
         shaped, acted = self.limits.shape(effort, ramp, joints, self._sent.effort, dt)
         self.acted.update(dict.fromkeys(acted, now))
         # Damping rises at once, since the soft wall already rises with the position, and falls over DAMPING_RISE.
-        fall = self.limits.damping / DAMPING_RISE * dt
+        fall = DAMPING / DAMPING_RISE * dt
         walls = zip(self.limits.wall_damping(joints), self._sent.damping, strict=True)
         return Drive(shaped, tuple(max(wall, last - fall) for wall, last in walls), True)
 
@@ -242,7 +242,7 @@ class SafetyMachine:
 
     def _let_down(self, now: float) -> None:
         applied = self._delivery.applied(self._sent, self._silent)
-        self._descent = ArmDescent(now, *applied, self._peaks.effort, self.limits)
+        self._descent = ArmDescent(now, *applied, self._peaks.effort)
         self._enter(State.LETTING_DOWN, now)
 
     def _enter(self, state: State, now: float) -> None:
