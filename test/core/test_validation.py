@@ -1,12 +1,17 @@
-"""Parameters of a bridge that are possible alone, but not together."""
+"""Parameters of a bridge: impossible alone, impossible together, and gone."""
 
 from __future__ import annotations
+
+import math
+import re
 
 import pytest
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import motors_of
-from exo_gravity.core.params import values_of
+from exo_gravity.core.motors.specs import MOTORS
+from exo_gravity.core.params import GONE, values_of
+from exo_gravity.core.safety.limits import HOME_TOLERANCE
 from exo_gravity.core.safety.params import CAN_BRIDGE, check_bridge, limits_of
 
 
@@ -33,6 +38,13 @@ def test_consistent_parameters_are_accepted(given):
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [
+        ({"max_efort": [3.0, 9.0, 3.0, 3.0]}, "max_efort = [3.0, 9.0, 3.0, 3.0]: must be one of"),
+        ({"can_id": [1, 2, 2, 4]}, "can_id = [1, 2, 2, 4]: must be 4 different IDs"),
+        ({"motor": ["AK60-6", "AK80-9", "AK60-6", "AK10-9"]}, "4 strings, one of AK60-6, AK80-9"),
+        (
+            {"rate": 401.0, "wire_format": ["mit", "mit", "mit_v3", "mit"]},
+            "at most 400 Hz: each cycle waits for a status",
+        ),
         (
             {"max_effort": [18.0] * 4},
             "max_effort = [18.0, 18.0, 18.0, 18.0]: must be at most the motors' peak torque, [9.0,",
@@ -47,7 +59,28 @@ def test_consistent_parameters_are_accepted(given):
         ),
     ],
 )
-def test_contradicting_parameters_are_refused_with_both_values(given, sentence):
+def test_impossible_and_contradicting_parameters_are_refused_with_their_values(given, sentence):
     with pytest.raises(ParameterError) as caught:
         check(**given)
     assert sentence in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("max_effort_rate", "max_temperature", "ramp_time", "fade_time", "damping", "home", "home_tolerance"),
+        *("status_rate", "lock_memory"),
+    ],
+)
+def test_a_parameter_that_is_gone_is_refused_with_what_replaces_it(name):
+    with pytest.raises(
+        ParameterError, match=rf"{name} = 1.0: must be left out, because it is gone: {re.escape(GONE[name])}"
+    ):
+        check(**{name: 1.0})
+
+
+def test_a_joint_that_is_off_by_a_turn_of_its_rotor_is_never_near_its_zero():
+    for motor, tolerance in HOME_TOLERANCE.items():
+        assert tolerance < math.pi / MOTORS[motor].gear_ratio
+    values = values_of(CAN_BRIDGE, {"can.interface": "virtual", "can.channel": "arm", "motor": ["AK80-9"] * 4})
+    assert limits_of(values).home_tolerance == (0.34,) * 4
