@@ -113,7 +113,7 @@ class WireFormat:
 
 @dataclass(frozen=True)
 class V3Format(WireFormat):
-    """The frames of V3 boards."""
+    """The frames of V3 boards; the methods are those of `WireFormat`."""
 
     name: str = "mit_v3"
     replies: bool = False
@@ -125,7 +125,6 @@ class V3Format(WireFormat):
         return replace(spec, position_range=V3_POSITION_RANGE, velocity_range=velocity_range, torque_range=torque_range)
 
     def command_id(self, motor_id: int) -> int:
-        """Return the 29-bit ID of commands in MIT mode."""
         return EXTENDED | MODE_MIT << 8 | motor_id
 
     def status_id(self, motor_id: int) -> int:
@@ -135,12 +134,10 @@ class V3Format(WireFormat):
     def pack_command(
         self, spec: MotorSpec, position: float, velocity: float, kp: float, kd: float, torque: float
     ) -> bytes:
-        """Return the 8 bytes of a command. Raises ParameterError on NaN, infinity or a value outside the range."""
         p, v, stiffness, damping, t = specs.command_codes(spec, position, velocity, kp, kd, torque)
         return (stiffness << 52 | damping << 40 | p << 24 | v << 12 | t).to_bytes(8, "big")
 
     def unpack_command(self, spec: MotorSpec, data: bytes | bytearray) -> MotorCommand:
-        """Return the content of a command. Raises FrameError unless it is 8 bytes."""
         if len(data) != 8:
             raise FrameError(data, "8 bytes")
         word = int.from_bytes(data, "big")
@@ -148,7 +145,6 @@ class V3Format(WireFormat):
         return specs.command_of_codes(spec, *codes)
 
     def pack_reply(self, spec: MotorSpec, reply: MotorReply) -> bytes:
-        """Return the 8 bytes of a status frame. Raises ParameterError on NaN or a value that does not fit."""
         numbers = []
         for name, value, step in zip(("position", "velocity", "torque"), reply[1:4], _steps(spec), strict=True):
             limit = 0x7FFF * step
@@ -158,7 +154,6 @@ class V3Format(WireFormat):
         return _STATUS.pack(*numbers, max(-128, min(127, reply.temperature or 0)), reply.error or 0)
 
     def unpack_reply(self, spec: MotorSpec, motor_id: int, data: bytes | bytearray) -> MotorReply:
-        """Return the content of a status frame. Raises FrameError unless it is 8 bytes."""
         if len(data) != 8:
             raise FrameError(data, "a status frame of 8 bytes")
         position, speed, current, temperature, error = _STATUS.unpack(data)
@@ -167,15 +162,12 @@ class V3Format(WireFormat):
         return MotorReply(motor_id, *reply, temperature, error)
 
     def enter(self, motor_id: int) -> tuple[Frame, ...]:
-        """Return no frame."""
-        return ()
+        return ()  # a command does it
 
     def exit(self, motor_id: int) -> tuple[Frame, ...]:
-        """Return the current 0 A."""
         return ((EXTENDED | MODE_CURRENT << 8 | motor_id, NO_CURRENT),)
 
     def set_zero(self, motor_id: int) -> tuple[Frame, ...]:
-        """Return no frame."""
         return ()
 
     def classify(self, frame_id: int, data: bytes | bytearray, motor_ids: frozenset[int]) -> tuple[str, int]:

@@ -1,8 +1,8 @@
 """The start gate: what must hold before the motors of an arm are switched on, and before they carry it.
 
 `StartGate` waits until, for CALM seconds, every motor has replied without a fault, at rest and within its limits, and
-fresh efforts have arrived. `Proving` then checks that the motors are on (`SwitchOnCheck`), and that their signs are
-right (`SignCheck`).
+fresh efforts have arrived. `SwitchOnCheck` then checks that the motors are on, and `SignCheck` that their signs are
+right.
 """
 
 from __future__ import annotations
@@ -79,51 +79,9 @@ class StartGate:
         limits = self._limits
         columns = (limits.joint_names, joints, limits.position_min, limits.position_max)
         for name, joint, low, high in zip(*columns, strict=True):
-            excess = joint.position - max(low, min(high, joint.position))
-            if excess:
+            if excess := joint.position - max(low, min(high, joint.position)):
                 return f"{name} to be moved by {-excess:+.2f} rad, within its limits {low:g} to {high:g}"
         return ""
-
-
-class Proving:
-    """The checks with the motors on: each one must show that it is on, and if `signs` is true, its sign is checked.
-
-    effort: (4,) Nm to apply now. done: whether all joints have passed. hint: what the wearer should do, or ''.
-    """
-
-    def __init__(self, limits: Limits, signs: bool) -> None:
-        push = [min(limits.sign_check_torque, most) if signs else 0.0 for most in limits.max_effort]
-        self._switch_on = SwitchOnCheck(limits)
-        self._signs = SignCheck(limits.joint_names, push)
-
-    @property
-    def effort(self) -> tuple[float, ...]:
-        """Torque (4,) in Nm to apply now."""
-        return tuple((self._signs if self._switch_on.done else self._switch_on).effort)
-
-    @property
-    def switched_on(self) -> bool:
-        """Whether all motors have shown that they are on."""
-        return self._switch_on.done
-
-    @property
-    def done(self) -> bool:
-        """Whether all joints have passed."""
-        return self._switch_on.done and self._signs.done
-
-    @property
-    def hint(self) -> str:
-        """What the wearer should do, or ''."""
-        return self._signs.hint
-
-    def step(self, dt: float, joints: Sequence[JointSample], damping: Sequence[float]) -> Fault | None:
-        """Advance by `dt` s with the newest readings, and the damping (4,) in Nm s/rad that the motors apply.
-
-        Returns the fault that they show, if any.
-        """
-        if self._switch_on.done:
-            return self._signs.step(dt, joints)
-        return self._switch_on.step(dt, joints, damping)
 
 
 class SwitchOnCheck:
@@ -204,10 +162,6 @@ class SignCheck:
         self._names = names
         self._torque = torque
         self._joint = -1
-        self._disturbed = 0
-        self._sign = 1  # of the push; 0 once both pushes have passed
-        self._start = math.inf  # where the joint was before the push, rad
-        self._still_time = self._waited = 0.0
         self._next_joint()
 
     def step(self, dt: float, joints: Sequence[JointSample]) -> Fault | None:
@@ -233,7 +187,8 @@ class SignCheck:
             if moved < 0.0:
                 reason = f"{push:.2f} Nm moved it backwards: torque or encoder is reversed"
                 return self._fault(FaultCode.WRONG_SIGN, reason)
-            self._turn(position)
+            self._sign = {1: -1, -1: 0}[self._sign]  # the push the other way, or the end of this joint
+            self._start, self._waited = position, 0.0
         elif abs(push) >= most and self._waited > PUSH_TIMEOUT:
             return self._fault(FaultCode.SIGN_UNPROVEN, f"{push:.2f} Nm did not move it: let it hang freely")
         else:
@@ -244,11 +199,6 @@ class SignCheck:
             if push * self._sign <= 0.0:
                 self._start = position
         return None
-
-    def _turn(self, position: float) -> None:
-        """Continue with the push the other way, or end the joint after that."""
-        self._sign = {1: -1, -1: 0}[self._sign]
-        self._start, self._waited = position, 0.0
 
     def _restart(self) -> Fault | None:
         self._disturbed += 1
@@ -267,9 +217,9 @@ class SignCheck:
         self._start_joint()
 
     def _start_joint(self) -> None:
-        self._start = math.inf
+        self._start = math.inf  # where the joint was before the push, rad
         self._still_time = self._waited = 0.0
-        self._sign = 1
+        self._sign = 1  # of the push; 0 once both pushes have passed
 
     def _release(self, dt: float) -> bool:
         """Take back the push on the present joint; return whether it is gone."""

@@ -31,7 +31,7 @@ from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DAMPING, DAMPING_RISE, ArmDescent, RestTracker
 from exo_gravity.core.safety.drive import CARRYING, DOUBTFUL, NOTHING, OFF, Drive, Fault, FaultCode, State
-from exo_gravity.core.safety.gate import Proving, StartGate
+from exo_gravity.core.safety.gate import SignCheck, StartGate, SwitchOnCheck
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
 
 RAMP_TIME = 1.0  # s from no torque to full torque: the wearer feels his arm become light, and nothing jolts
@@ -66,7 +66,8 @@ class SafetyMachine:
         self._is_trusted = False  # zeros and signs
         self._delivery = DeliveryMonitor(limits, self._peaks.effort)
         self._gate = StartGate(limits, 0.0)
-        self._proving = Proving(limits, signs=True)
+        self._switch_on = SwitchOnCheck(limits)
+        self._signs = SignCheck(limits.joint_names, NOTHING)
 
     def enable(self, now: float) -> bool:
         """Start the checks, after which torque ramps in. Return False, and do nothing, unless DISABLED."""
@@ -146,7 +147,8 @@ class SafetyMachine:
                 self.trip(FaultCode.COMMAND_IMPOSSIBLE, str(error), now)
         if self.state is State.PROVING:
             damping = DAMPING * min(1.0, (now - self._since) / DAMPING_RISE)
-            return Drive(self._proving.effort, (damping,) * 4, True)
+            check = self._signs if self._switch_on.done else self._switch_on
+            return Drive(tuple(check.effort), (damping,) * 4, True)
         if self.state is State.LETTING_DOWN:
             return self._descend(now, joints, dt)
         return self._stand(now, joints, dt)
@@ -162,13 +164,15 @@ class SafetyMachine:
             self.trip(*fault, now)
         elif self._gate.passed:
             self.waiting_for = ""
-            self._proving = Proving(self.limits, signs=not self._is_trusted)
+            largest = 0.0 if self._is_trusted else self.limits.sign_check_torque
+            self._switch_on = SwitchOnCheck(self.limits)
+            self._signs = SignCheck(self.limits.joint_names, [min(largest, most) for most in self.limits.max_effort])
             self._delivery.reset()
             self._enter(State.PROVING, now)
 
     def _check_delivery(self, now: float, joints: Sequence[JointSample], dt: float) -> None:
         fault = self._delivery.step(dt, joints, self._sent.effort, self._sent.damping)
-        is_proven = self.state in (State.RAMPING_IN, State.ACTIVE) or self._proving.switched_on
+        is_proven = self.state in (State.RAMPING_IN, State.ACTIVE) or self._switch_on.done
         if fault and self.state in CARRYING and is_proven:
             self.trip(*fault, now)
 
@@ -185,11 +189,14 @@ class SafetyMachine:
             self.trip(*fault, now)
 
     def _prove(self, now: float, joints: Sequence[JointSample], dt: float) -> None:
-        fault = self._proving.step(dt, joints, self._sent.damping)
-        self.waiting_for = self._proving.hint
+        if self._switch_on.done:
+            fault = self._signs.step(dt, joints)
+        else:
+            fault = self._switch_on.step(dt, joints, self._sent.damping)
+        self.waiting_for = self._signs.hint
         if fault:
             self.trip(*fault, now)
-        elif self._proving.done:
+        elif self._switch_on.done and self._signs.done:
             self._is_trusted = True
             self._enter(State.RAMPING_IN, now)
 
