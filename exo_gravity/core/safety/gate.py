@@ -162,6 +162,8 @@ class SignCheck:
         self._names = names
         self._torque = torque
         self._joint = -1
+        self._sign = 1  # of the push; 0 once both pushes have passed
+        self._start = math.inf  # where the joint was before the push, rad
         self._next_joint()
 
     def step(self, dt: float, joints: Sequence[JointSample]) -> Fault | None:
@@ -217,9 +219,8 @@ class SignCheck:
         self._start_joint()
 
     def _start_joint(self) -> None:
-        self._start = math.inf  # where the joint was before the push, rad
+        self._start, self._sign = math.inf, 1
         self._still_time = self._waited = 0.0
-        self._sign = 1  # of the push; 0 once both pushes have passed
 
     def _release(self, dt: float) -> bool:
         """Take back the push on the present joint; return whether it is gone."""
