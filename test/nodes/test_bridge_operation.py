@@ -39,7 +39,7 @@ def sent(node, monkeypatch):
     monkeypatch.setattr(operation, "time", SimpleNamespace(monotonic=lambda: clock.now))
 
     def sent(loop, count, answered=None):
-        report = BridgeReport(node, ("a", "b", "c", "elbow"), Traffic(4), 0.004, (3.0, 9.0, 3.0, 3.0))
+        report = BridgeReport(node, ("a", "b", "c", "elbow"), Traffic(4), 250.0, (3.0, 9.0, 3.0, 3.0))
         for n in range(count):
             report.send(loop(n), "none", clock.now if answered is None else answered)
             clock.now += 0.1

@@ -35,10 +35,12 @@ REPLY_SHARE = 0.8  # of a cycle in which replies are awaited
 
 
 class Load(NamedTuple):
-    """The load on one bus. share: of the bitrate, 1 when the bus is full. largest_rate: cycles/s that fill the bus."""
+    """The load on one bus."""
 
     bits_per_second: float
+    #: of the bit rate, 1 when the bus is full
     share: float
+    #: cycles/s that fill the bus
     largest_rate: float
 
 

@@ -129,9 +129,11 @@ class JointMotor:
 
 
 class Peaks(NamedTuple):
-    """The most that the motors of an arm apply at its joints: effort (4,) in Nm, damping (4,) in Nm s/rad."""
+    """The most that the motors of an arm apply at its joints."""
 
+    #: (4,) Nm
     effort: tuple[float, ...]
+    #: (4,) Nm s/rad
     damping: tuple[float, ...] = (math.inf,) * 4
 
 

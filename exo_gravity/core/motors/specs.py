@@ -86,13 +86,18 @@ class MotorCommand(NamedTuple):
 
 
 class MotorReply(NamedTuple):
-    """The content of a reply: rad, rad/s, Nm; temperature (degC) and error code are None from 6-byte firmware."""
+    """The content of a reply."""
 
     motor_id: int
+    #: rad
     position: float
+    #: rad/s
     velocity: float
+    #: Nm
     torque: float
+    #: degC, None from firmware that replies with 6 bytes
     temperature: int | None
+    #: a code of MOTOR_ERRORS, None from firmware that replies with 6 bytes
     error: int | None
 
 

@@ -143,7 +143,7 @@ class SwitchOnCheck:
 
 
 class SignCheck:
-    """Checks that each motor pushes its joint the way its encoder counts, while the arm hangs.
+    """Checks that each motor pushes its joint the way that its encoder shows, while the arm hangs.
 
     Joint after joint: wait until it is still, push it gently and slowly under damping until it moves by about a degree,
     then push it back the other way. A joint that moves backwards has its torque or its encoder reversed: gravity

@@ -52,7 +52,7 @@ class CanBridge(LifecycleNode):
     def __init__(self) -> None:
         super().__init__("can_bridge", automatically_declare_parameters_from_overrides=True)
         values, self._charge = _declared(self)
-        _, motors, limits, period = self._charge
+        motors, limits = self._charge.motors, self._charge.limits
         traffic = traffic_of(values, self._charge.address[2])
         check_bridge(values["rate"], motors, limits, traffic.status_rate)
         traffic.check(values["rate"])
@@ -62,7 +62,7 @@ class CanBridge(LifecycleNode):
         self._bus: MotorBus | None = None  # while inactive
         self._error = ""  # why the last transition failed
         self._exchange = EffortExchange(self, limits, lambda: self.loop)
-        self._report = BridgeReport(self, limits.joint_names, traffic, period, [m.rated_effort for m in motors])
+        self._report = BridgeReport(self, limits.joint_names, traffic, values["rate"], [m.rated_effort for m in motors])
         BridgeServices(self, lambda: self.loop, motors)
         self.create_timer(REPORT_PERIOD, self._on_report)
         log_limits(self, limits, traffic, values["rate"])
@@ -144,8 +144,8 @@ class CanBridge(LifecycleNode):
         if self._owned is None:
             raise BusError("the node is not configured")
         bus, self._bus = self._bus or self._owned.open(), None
-        _, motors, limits, period = self._charge
-        safety = SafetyMachine(limits, period, peaks_of(motors))
+        period = self._charge.period
+        safety = SafetyMachine(self._charge.limits, period, peaks_of(self._charge.motors))
         hand_over = self._owned.watchdog.hand_over
         loop = ControlLoop(bus, safety, period, self._exchange.publish, self._exchange.get_efforts, hand_over)
         loop.start()

@@ -139,17 +139,15 @@ def log_limits(node: Node, limits: Limits, traffic: Traffic, rate: float) -> Non
 class BridgeReport:
     """The status of one bridge.
 
-    period: s of a cycle. rated: (4,) Nm, the motors' rated torque at the joints.
+    rate: Hz, as set. rated: (4,) Nm, the motors' rated torque at the joints.
     """
 
-    def __init__(
-        self, node: Node, names: Sequence[str], traffic: Traffic, period: float, rated: Sequence[float]
-    ) -> None:
+    def __init__(self, node: Node, names: Sequence[str], traffic: Traffic, rate: float, rated: Sequence[float]) -> None:
         self._diagnostics = Diagnostics(node)
         self._names = names
         self._traffic = traffic
         self._rate = Rate()
-        self._slow = SLOW / period  # Hz
+        self._slow = SLOW * rate  # Hz
         self._motors = MotorLoad(rated)
 
     def send(self, loop: ControlLoop | None, refusal: str, answered: float) -> None:
