@@ -29,9 +29,9 @@ WALL_DAMPING = 5.0  # Nm s/rad, from WALL_EDGE on
 WALL_EDGE = 0.02  # rad into the wall over which the damping rises
 WALL_RELEASE = 0.03  # rad/s out of the wall, from which on the spring no longer pushes
 OVERSHOOT = 0.1  # rad past a joint limit that is not yet a fault, because mechanical stops are not infinitely stiff
-# Nobody has a reason to change these.
-MAX_EFFORT_RATE = 50.0  # Nm/s; the full torque of an AK60-6 in 60 ms, slow enough not to jolt the wearer
-MAX_TEMPERATURE = 80.0  # degC of the motor's board, below which AK motors do not limit themselves
+# What was once a parameter, and what no user has a reason to change.
+MAX_EFFORT_RATE = 50.0  # Nm/s; the full torque of an AK60-6 in 60 ms, slow enough not to jolt the arm
+MAX_TEMPERATURE = 80.0  # degC, an assumption: a motor whose own protection switches it off would drop the arm
 DERATING = 10.0  # degC below MAX_TEMPERATURE over which the permitted torque falls to half
 JUMP = 0.05  # rad that two readings may differ by in addition to what max_velocity allows
 HOME = (0.0, 0.0, 0.0, 0.0)  # rad; joint angles are measured from the hanging arm

@@ -34,7 +34,7 @@ from exo_gravity.core.safety.drive import CARRYING, DOUBTFUL, NOTHING, OFF, Driv
 from exo_gravity.core.safety.gate import SignCheck, StartGate, SwitchOnCheck
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
 
-RAMP_TIME = 1.0  # s from no torque to full torque: the wearer feels his arm become light, and nothing jolts
+RAMP_TIME = 1.0  # s from no torque to full torque: the arm becomes light without a jolt
 
 
 class SafetyMachine:
