@@ -69,12 +69,12 @@ def test_without_a_runtime_folder_the_lock_is_in_a_folder_of_this_user(monkeypat
 
 def test_a_second_owner_sends_no_frame_and_the_first_keeps_carrying(make_rig):
     rig = make_rig()
-    owned = OwnedBus(rig.charge, "/right/can_bridge (PID 1)", print)
+    owned = OwnedBus(rig.arm, "/right/can_bridge (PID 1)", print)
     bus = owned.open()
     bus.exchange(Drive(rig.carrying, (0.0,) * 4, True), time.monotonic() + 1.0)
     with rig.open() as listener:
         with pytest.raises(BusError, match="held by /right/can_bridge"):
-            OwnedBus(rig.charge, "/left/can_bridge (PID 2)", print)
+            OwnedBus(rig.arm, "/left/can_bridge (PID 2)", print)
         commands = [m for m in iter(lambda: listener.recv(0.0), None) if m.data[0] != m.arbitration_id]
         assert commands == []
     assert rig.motors_on == [True] * 4
@@ -93,7 +93,7 @@ def test_a_bus_that_another_host_commands_is_refused_without_a_frame(make_rig):
 
     thread = threading.Thread(target=command)
     thread.start()
-    owned = OwnedBus(rig.charge, "a test", print)
+    owned = OwnedBus(rig.arm, "a test", print)
     try:
         with pytest.raises(BusError, match="is in use: another sender commands motor"):
             owned.open()

@@ -7,7 +7,7 @@ import pytest
 
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS
-from exo_gravity.hardware.can.frame_filter import FOREIGN_COMMAND, FrameFilter
+from exo_gravity.hardware.can.motor_bus import FOREIGN_COMMAND, FrameFilter
 
 from ..support.simulated_device import frame
 

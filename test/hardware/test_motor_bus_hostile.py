@@ -21,8 +21,7 @@ from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, SET_ZERO
 from exo_gravity.core.safety.drive import OFF
 from exo_gravity.core.safety.limits import JointSample, Limits
-from exo_gravity.hardware.can.frame_filter import TRIAL
-from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.can.motor_bus import TRIAL, MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 
 MOUNTED = (("AK60-6", 1, 0.0), ("AK80-9", -1, 0.4), ("AK60-6", 1, -0.2), ("AK60-6", 1, 0.0))

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from exo_gravity.core.errors import BusError
+from exo_gravity.hardware.clock import COMPUTER_CLOCK
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.hardware.ownership.owned_bus import OwnedBus
 from exo_gravity.hardware.ownership.watchdog import Watchdog
@@ -29,8 +30,8 @@ class Carrier:
     """A process that carries the arm of `rig` with a constant torque, and its watchdog."""
 
     def __init__(self, rig: SimulatedRig, folder: Path, stderr: int = subprocess.PIPE) -> None:
-        path = folder / "charge.pickle"
-        path.write_bytes(pickle.dumps((rig.charge, rig.carrying)))
+        path = folder / "arm.pickle"
+        path.write_bytes(pickle.dumps((rig.arm, rig.carrying)))
         command = [sys.executable, "-m", "test.hardware.carrier", str(path)]
         pipe = subprocess.PIPE
         self.process = subprocess.Popen(command, cwd=REPO, stdin=pipe, stdout=pipe, stderr=stderr, text=True)
@@ -126,7 +127,7 @@ def test_a_bus_whose_arm_is_being_let_down_is_held_by_the_watchdog(rig, carry):
     carrier = carry()
     carrier.kill()
     with pytest.raises(BusError, match=rf"held by the watchdog \(PID {carrier.watchdog}\) of /right/can_bridge"):
-        BusLock(rig.charge.address, "another")
+        BusLock(rig.arm.address, "another")
     wait_until(lambda: not is_running(carrier.watchdog))
     rig.assert_let_down()
 
@@ -140,7 +141,7 @@ def test_after_bridge_and_watchdog_were_killed_the_next_owner_lets_the_arm_down_
     wait_until(lambda: not is_running(carrier.watchdog))
     assert rig.motors_on == [True] * 4
     log: list[str] = []
-    owned = OwnedBus(rig.charge, "the next owner", log.append)
+    owned = OwnedBus(rig.arm, "the next owner", log.append)
     owned.close()
     assert log[-1] == "the arm is down, its motors are off"
     rig.assert_let_down()
@@ -156,8 +157,8 @@ def test_a_bridge_lives_on_after_the_whole_machine_has_stalled(carry):
 
 
 def test_a_frozen_watchdog_is_noticed_and_recovers(rig):
-    lock = BusLock(rig.charge.address, "a test")
-    watchdog = Watchdog(lock, rig.charge)
+    lock = BusLock(rig.arm.address, "a test")
+    watchdog = Watchdog(lock, rig.arm, COMPUTER_CLOCK)
 
     def is_alive_after(seconds: float) -> bool:
         end = time.monotonic() + seconds
