@@ -6,19 +6,24 @@ other senders) happens then, in order. Sending takes no time.
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import itertools
 import math
+import os
 import random
+import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import can
 
 from exo_gravity.core.motors.wire_formats.wire_format import EXTENDED, ID_BITS, Frame
+from exo_gravity.hardware.clock import COMPUTER_CLOCK
 from exo_gravity.sim import SimulatedDevice
 
+INTERFACE = os.environ.get("EXO_TEST_CAN_INTERFACE", "")
 REPLY_DELAY = (200e-6, 400e-6)  # s, as of the simulated device in real time
 TICK = 0.002  # s between two looks at the arm
 
@@ -51,6 +56,10 @@ class VirtualClock:
 
         self.later(period, call)
         return lambda: is_ended.append(True)
+
+    def stall(self, duration: float) -> None:
+        """Let `duration` s pass in which nothing happens: it is all late then."""
+        self._nanoseconds = self._after(duration)
 
     def run(self, duration: float, is_done: Callable[[], object] = lambda: False) -> None:
         """Let `duration` s pass, or less: until `is_done()` after something has happened."""
@@ -197,8 +206,47 @@ class Wire:
         if end in self.ends:
             self.ends.remove(end)
 
+
+class RealWire:
+    """The bus that EXO_TEST_CAN_INTERFACE and EXO_TEST_CAN_CHANNEL name, used like a `Wire`, in real time."""
+
+    clock = COMPUTER_CLOCK
+
+    def __init__(self) -> None:
+        self._options = {"interface": INTERFACE, "channel": os.environ["EXO_TEST_CAN_CHANNEL"], "fd": True}
+        self._ends: list[can.BusABC] = []
+        self._stop = threading.Event()
+        self._threads: list[threading.Thread] = []
+
+    def open(self) -> can.BusABC:
+        self._ends.append(can.Bus(**self._options))
+        return self._ends[-1]
+
+    def play(self, device: SimulatedDevice) -> None:
+        self._start(lambda bus: device.run(bus, self._stop.is_set))
+
+    def repeat(self, message: can.Message, period: float) -> None:
+        self._start(lambda bus: [bus.send(message) for _ in iter(lambda: self._stop.wait(period), True)])
+
     def close(self) -> None:
-        """Do nothing, for the sake of `RealWire`."""
+        self._stop.set()
+        for thread in self._threads:
+            thread.join()
+        for end in self._ends:
+            end.shutdown()
+
+    def _start(self, run: Callable[[can.BusABC], object]) -> None:
+        self._threads.append(threading.Thread(target=run, args=(self.open(),)))
+        self._threads[-1].start()
+
+
+@contextlib.contextmanager
+def wire_for_test() -> Iterator[Wire | RealWire]:
+    """A wire in virtual time, or the bus that the environment names."""
+    wire = RealWire() if INTERFACE else Wire()
+    yield wire
+    if isinstance(wire, RealWire):
+        wire.close()
 
 
 def message_of(frame: Frame) -> can.Message:
