@@ -66,8 +66,10 @@ def is_running(pid: int) -> bool:
 
 
 @pytest.fixture
-def rig(make_rig: Callable[..., SimulatedRig]) -> SimulatedRig:
-    return make_rig(interface="udp_multicast", carried=True)
+def rig(lock_folder: Path) -> Iterator[SimulatedRig]:
+    rig = SimulatedRig(interface="udp_multicast", carried=True)
+    yield rig
+    rig.close()
 
 
 @pytest.fixture
