@@ -1,31 +1,14 @@
-"""The clock that the hardware's logic is given: the computer's, or one whose time is virtual."""
+"""The clock that the hardware's logic is given. A test gives it one with virtual time."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections.abc import Callable
-from typing import Protocol
 
 
-class Clock(Protocol):
-    """Monotonic time, and ways to wait for it."""
-
-    def monotonic(self) -> float:
-        """Return the time in s."""
-        ...
-
-    def sleep(self, duration: float, /) -> None:
-        """Wait for `duration` s."""
-        ...
-
-    def later(self, delay: float, function: Callable[[], None]) -> None:
-        """Call `function` in `delay` s, on another thread."""
-        ...
-
-
-class ComputerClock:
-    """The computer's monotonic clock."""
+class Clock:
+    """The computer's monotonic clock, in s. Another clock has the same three methods."""
 
     monotonic = staticmethod(time.monotonic)
     sleep = staticmethod(time.sleep)
@@ -37,4 +20,4 @@ class ComputerClock:
         timer.start()
 
 
-COMPUTER_CLOCK = ComputerClock()
+COMPUTER_CLOCK = Clock()

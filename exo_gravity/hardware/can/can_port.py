@@ -113,20 +113,18 @@ class CanPort:
             self._failing_since = now
         elif self._reopen is not None and now - self._failing_since > REOPEN_AFTER:
             self._is_open = False
-            self._clock.later(0.0, partial(self._replace, self._bus, self._reopen))
+            self._clock.later(0.0, partial(self._open_again, self._reopen, self._bus))
         return BusError(f"CAN bus {self.name}: {self._error}")
 
-    def _replace(self, failed: can.BusABC, reopen: Callable[[], can.BusABC]) -> None:
-        _close(failed)
-        self._try_to_open(reopen)
-
-    def _try_to_open(self, reopen: Callable[[], can.BusABC]) -> None:
+    def _open_again(self, reopen: Callable[[], can.BusABC], failed: can.BusABC | None = None) -> None:
+        if failed is not None:
+            _close(failed)
         if self._is_closing:
             return
         try:
             bus = reopen()
         except BusError:
-            self._clock.later(REOPEN_PERIOD, partial(self._try_to_open, reopen))
+            self._clock.later(REOPEN_PERIOD, partial(self._open_again, reopen))
             return
         if self._is_closing:
             _close(bus)

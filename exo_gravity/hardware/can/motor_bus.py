@@ -31,10 +31,8 @@ from exo_gravity.core.motors.wire_formats.wire_format import COMMAND, EXTENDED, 
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import OFF, Drive
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample
-from exo_gravity.hardware.can.can_port import CanPort, open_bus
+from exo_gravity.hardware.can.can_port import CanPort
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
-
-__all__ = ["MotorBus", "open_bus"]
 
 MAX_STALE_FRAMES = 256  # frames read before each cycle: the capacity of udp_multicast, more than any cycle produces
 EXIT_PERIOD = 0.5  # s between two EXIT frames to motors that are off, in case one was lost,

@@ -14,7 +14,7 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import JointMotor, peaks_of
 from exo_gravity.core.safety.delivery import ABSOLUTE, RELATIVE
 from exo_gravity.core.safety.drive import Drive
-from exo_gravity.core.safety.limits import JointSample, Limits
+from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.hardware.can.motor_bus import MotorBus
@@ -107,12 +107,7 @@ def _applied(motors: MotorBus, drive: Drive, period: float) -> tuple[tuple[float
             clock.sleep(period)
     effort, damping = list(drive.effort), list(drive.damping)
     for i, joint in enumerate(motors.samples):
-        if not _is_as_noted(joint, effort[i], damping[i]):
+        expected = effort[i] - damping[i] * joint.velocity
+        if abs(joint.effort - expected) > ABSOLUTE + RELATIVE * abs(expected):  # not without a reply: that is NaN
             effort[i], damping[i] = joint.effort, 0.0
     return tuple(effort), tuple(damping)
-
-
-def _is_as_noted(joint: JointSample, effort: float, damping: float) -> bool:
-    """Return whether the reply shows the noted effort and damping; true without a reply."""
-    expected = effort - damping * joint.velocity
-    return not abs(joint.effort - expected) > ABSOLUTE + RELATIVE * abs(expected)
