@@ -64,11 +64,21 @@ def test_a_motor_that_does_not_reply_may_still_be_powered():
     assert notes[-1].effort[1] == pytest.approx(rig.carrying[1], abs=0.2)
 
 
-def test_a_motor_that_replies_again_late_is_let_down():
+@pytest.mark.parametrize("is_adapter", [False, True], ids=["a motor", "the adapter"])
+def test_an_arm_that_is_reached_again_late_is_let_down(is_adapter):
     rig, log = VirtualRig(), []
     start = rig.clock.monotonic()
-    rig.device.cut_off = (False, True, False, False)
-    rig.clock.later(6.0, lambda: setattr(rig.device, "cut_off", (False,) * 4))
+
+    def lose() -> None:
+        rig.wire.refusal = BusError("no such device")
+        rig.wire.break_down(OSError("no such device"))
+
+    if is_adapter:
+        rig.clock.later(0.1, lose)
+        rig.clock.later(6.0, lambda: setattr(rig.wire, "refusal", None))
+    else:
+        rig.device.cut_off = (False, True, False, False)
+        rig.clock.later(6.0, lambda: setattr(rig.device, "cut_off", (False,) * 4))
     assert let_down_of(rig, log=log.append)
     assert log == ["a motor does not reply; it may still be powered; trying again"]
     assert rig.clock.monotonic() > start + 6.0

@@ -1,7 +1,7 @@
 """The AK motors of one arm on one python-can bus, in MIT mode: command all, collect the replies until a deadline.
 
 The wire formats of the boards (core/wire_formats) may differ. A motor of V1 and V2 boards replies only when commanded,
-200-400 us later. A V3 board sends status frames on its own timer: the first one after a command counts as its reply.
+200-400 us later. A V3 board sends status frames on its own timer: the first one after a command is its reply.
 Frames of other devices are ignored and counted by kind.
 
 A motor obeys every sender. A command to one of our motors that we did not send is answered at once with our own. To
@@ -225,7 +225,7 @@ class MotorBus:
         self._port.send(frame)
 
     def _drain(self) -> None:
-        """Read replies that arrived after their cycle, so that they do not count for this one."""
+        """Read replies that arrived after their cycle, so that they are not taken for replies to this one."""
         for _ in range(MAX_STALE_FRAMES):
             message = self._port.waiting()
             if message is None:

@@ -31,9 +31,9 @@ RETRY_PERIOD = 0.25  # s between two attempts to reach a motor that does not rep
 class ArmOnBus:
     """An arm that may have to be let down, and how to reach it."""
 
-    address: Address
-    motors: Sequence[JointMotor]
-    limits: Limits
+    address: Address  #: Of its bus.
+    motors: Sequence[JointMotor]  #: From shoulder to elbow.
+    limits: Limits  #: That it must never exceed.
     period: float  #: s of a control cycle.
 
     def open(self) -> can.BusABC:
