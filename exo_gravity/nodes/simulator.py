@@ -23,7 +23,7 @@ from std_msgs.msg import String
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS
 from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.hardware.can.motor_bus import open_bus
+from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.nodes.ros.declare import bus_of, declare, values_after
 from exo_gravity.nodes.ros.diagnostics import OK, WARN, Diagnostics
 from exo_gravity.nodes.ros.run import run

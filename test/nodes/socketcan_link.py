@@ -11,7 +11,8 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import EXIT, MOTORS
 from exo_gravity.core.safety.drive import NOTHING, OFF, Drive
-from exo_gravity.hardware.can.motor_bus import MotorBus, open_bus
+from exo_gravity.hardware.can.can_port import open_bus
+from exo_gravity.hardware.can.motor_bus import MotorBus
 
 VCAN = ("socketcan", "vcan0")
 AK60 = MOTORS["AK60-6"]

@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, unpack_command, unpack_reply
-from exo_gravity.hardware.can.motor_bus import open_bus
+from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.tools import launcher
 from exo_gravity.tools.launcher import Launcher
 

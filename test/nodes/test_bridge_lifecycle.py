@@ -47,8 +47,8 @@ def make_bridge(rig: SimulatedRig, monkeypatch: pytest.MonkeyPatch) -> Iterator[
     def make_bridge(autostart: bool = False) -> CanBridge:
         parameters = {
             "autostart": autostart,
-            "can.interface": rig.charge.address[0],
-            "can.channel": rig.charge.address[1],
+            "can.interface": rig.arm.address[0],
+            "can.channel": rig.arm.address[1],
             "sign_check_torque": 0.0,
             "command_timeout": 0.1,  # the tests share a busy machine
             "reply_timeout": 0.1,
@@ -66,7 +66,7 @@ def make_bridge(rig: SimulatedRig, monkeypatch: pytest.MonkeyPatch) -> Iterator[
 
 
 def assert_bus_is_free(rig: SimulatedRig) -> None:
-    BusLock(rig.charge.address, "a test").release()
+    BusLock(rig.arm.address, "a test").release()
 
 
 def assert_nothing_runs(bridge: CanBridge, rig: SimulatedRig) -> None:
@@ -90,7 +90,7 @@ def test_carried_deactivated_once_all_motors_reply_activated_again_and_cleaned_u
     bridge = make_bridge()
     carry(bridge, rig)
     with pytest.raises(BusError, match="is held by /can_bridge"):
-        BusLock(rig.charge.address, "another")
+        BusLock(rig.arm.address, "another")
     rig.device.bus_silent = True
     with monkeypatch.context() as patch:
         patch.setattr(can_bridge, "DESCENT_TIMEOUT", 1.0)
@@ -121,7 +121,7 @@ def test_a_shutdown_lets_the_arm_down_reports_it_and_releases_the_bus(rig, make_
 def test_a_bus_that_is_held_or_cannot_be_opened_fails_the_configuration_and_the_next_one_works(
     rig, make_bridge, monkeypatch
 ):
-    lock = BusLock(rig.charge.address, "another (PID 1)")
+    lock = BusLock(rig.arm.address, "another (PID 1)")
     bridge = make_bridge()
     assert bridge.trigger_configure() is FAILURE
     lock.release()
@@ -133,7 +133,7 @@ def test_a_bus_that_is_held_or_cannot_be_opened_fails_the_configuration_and_the_
 
 
 def test_autostart_without_a_bus_ends_the_node_with_the_reason(rig, make_bridge):
-    lock = BusLock(rig.charge.address, "another (PID 1)")
+    lock = BusLock(rig.arm.address, "another (PID 1)")
     with pytest.raises(BusError, match=r"is held by another \(PID 1\)"):
         make_bridge(autostart=True)
     lock.release()

@@ -27,7 +27,7 @@ from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.params import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.hardware.ownership.handover import Charge
+from exo_gravity.hardware.ownership.handover import ArmOnBus
 from exo_gravity.hardware.ownership.owned_bus import OwnedBus, recover
 from exo_gravity.hardware.scheduling import request_real_time
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
@@ -51,9 +51,9 @@ class CanBridge(LifecycleNode):
 
     def __init__(self) -> None:
         super().__init__("can_bridge", automatically_declare_parameters_from_overrides=True)
-        values, self._charge = _declared(self)
-        motors, limits = self._charge.motors, self._charge.limits
-        traffic = traffic_of(values, self._charge.address[2])
+        values, self._arm = _declared(self)
+        motors, limits = self._arm.motors, self._arm.limits
+        traffic = traffic_of(values, self._arm.address[2])
         check_bridge(values["rate"], motors, limits, traffic.status_rate)
         traffic.check(values["rate"])
         self.loop: ControlLoop | None = None
@@ -132,7 +132,7 @@ class CanBridge(LifecycleNode):
         return TransitionCallbackReturn.FAILURE
 
     def _configure(self) -> None:
-        self._owned = OwnedBus(self._charge, _owner(self), self.get_logger().error)
+        self._owned = OwnedBus(self._arm, _owner(self), self.get_logger().error)
         try:
             self._bus = self._owned.open()
         except BaseException:
@@ -144,8 +144,8 @@ class CanBridge(LifecycleNode):
         if self._owned is None:
             raise BusError("the node is not configured")
         bus, self._bus = self._bus or self._owned.open(), None
-        period = self._charge.period
-        safety = SafetyMachine(self._charge.limits, period, peaks_of(self._charge.motors))
+        period = self._arm.period
+        safety = SafetyMachine(self._arm.limits, period, peaks_of(self._arm.motors))
         hand_over = self._owned.watchdog.hand_over
         loop = ControlLoop(bus, safety, period, self._exchange.publish, self._exchange.get_efforts, hand_over)
         loop.start()
@@ -182,10 +182,10 @@ class CanBridge(LifecycleNode):
             self._report.send(self.loop, self._exchange.refusal, self._exchange.answered)
 
 
-def _declared(node: Node) -> tuple[dict[str, Any], Charge]:
+def _declared(node: Node) -> tuple[dict[str, Any], ArmOnBus]:
     """Declare the parameters; return their values, and the arm that they describe. Raises ParameterError."""
     values = declare(node, CAN_BRIDGE, free_prefix=OPTIONS)
-    return values, Charge(bus_of(node, values), motors_of(values), limits_of(values), 1.0 / values["rate"])
+    return values, ArmOnBus(bus_of(node, values), motors_of(values), limits_of(values), 1.0 / values["rate"])
 
 
 def _owner(node: Node) -> str:
