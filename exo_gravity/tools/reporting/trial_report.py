@@ -15,10 +15,9 @@ from rich.markup import escape
 
 from exo_gravity.bag.content import Bag
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.trial.analysis import MIN_HOLD, TrialAnalysis
+from exo_gravity.core.trial.analysis import MIN_HOLD, HoldCriteria, TrialAnalysis, failures
 from exo_gravity.core.trial.analysis import analyse as analyse_arm
 from exo_gravity.core.trial.recording import Recording
-from exo_gravity.core.trial.verdict import HoldCriteria, failures
 from exo_gravity.tools.cli.extras import missing
 from exo_gravity.tools.reporting import html, page, table
 
