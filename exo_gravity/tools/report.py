@@ -16,8 +16,7 @@ from pathlib import Path
 
 from exo_gravity.core.errors import DataError, ExoGravityError
 from exo_gravity.core.trial.analysis import MIN_HOLD, HoldCriteria
-from exo_gravity.tools.cli.arguments import non_negative
-from exo_gravity.tools.cli.extras import extras
+from exo_gravity.tools.cli import extras, non_negative
 from exo_gravity.tools.video import output
 
 

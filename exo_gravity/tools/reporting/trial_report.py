@@ -18,7 +18,7 @@ from exo_gravity.core.errors import DataError
 from exo_gravity.core.trial.analysis import MIN_HOLD, HoldCriteria, TrialAnalysis, failures
 from exo_gravity.core.trial.analysis import analyse as analyse_arm
 from exo_gravity.core.trial.recording import Recording
-from exo_gravity.tools.cli.extras import missing
+from exo_gravity.tools.cli import missing
 from exo_gravity.tools.reporting import html, page, table
 
 if TYPE_CHECKING:
