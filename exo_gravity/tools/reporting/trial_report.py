@@ -19,7 +19,7 @@ from exo_gravity.core.trial.analysis import MIN_HOLD, HoldCriteria, TrialAnalysi
 from exo_gravity.core.trial.analysis import analyse as analyse_arm
 from exo_gravity.core.trial.recording import Recording
 from exo_gravity.tools.cli import missing
-from exo_gravity.tools.reporting import html, page, table
+from exo_gravity.tools.reporting import html, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,16 +35,13 @@ CAPTIONS = {
 
 @dataclass(frozen=True)
 class Report:
-    """A recording, the analysis of each arm, and the verdict.
-
-    failures: one sentence for each way in which an arm did not hold. notes: what limits the trust in the verdict.
-    """
+    """A recording, the analysis of each arm, and the verdict."""
 
     bag: Bag
     criteria: HoldCriteria
     arms: tuple[tuple[Recording, TrialAnalysis], ...]
-    failures: tuple[str, ...]
-    notes: tuple[str, ...]
+    failures: tuple[str, ...]  #: one sentence for each way in which an arm did not hold
+    notes: tuple[str, ...]  #: what limits the trust in the verdict
 
     @property
     def exit_code(self) -> int:
@@ -88,16 +85,16 @@ def _reservations(bag: Bag) -> Iterator[str]:
         yield f"no figures: {missing('matplotlib', 'report')}"
     unscripted = [recording.name for recording in bag.recordings if not recording.steps]
     if unscripted:
-        yield f"{', '.join(unscripted)}: the recording has no trial script: every still phase counts as a hold"
+        yield f"{', '.join(unscripted)}: the recording has no trial script: every still phase is taken for a hold"
     unknown = [recording.name for recording in bag.recordings if recording.carried is None]
     if unknown:
         names = ", ".join(unknown)
-        yield f"{names}: the recording does not show when the arm was carried: letting it down may count as a slip"
+        yield f"{names}: the recording does not show when the arm was carried: its way down may be taken for a slip"
     for recording in bag.recordings:
         if recording.steps and recording.carried and recording.steps[-1].end > recording.carried[-1][1] + EARLY:
             end = recording.carried[-1][1]
             what = "the recording ends" if end >= float(recording.time[-1]) else "let down"
-            yield f"{recording.name}: {what} at {end:.1f} s, before the script ended: only the time until then counts"
+            yield f"{recording.name}: {what} at {end:.1f} s, before the script ended: only the time before is judged"
 
 
 def write(report: Report, folder: str | Path) -> list[Path]:
@@ -117,7 +114,7 @@ def write(report: Report, folder: str | Path) -> list[Path]:
                 png = html.png_of(figure)
                 (folder / f"{recording.name.replace('/', '_')}_{kind}.png").write_bytes(png)
                 pictures.append(html.picture(png, CAPTIONS[kind]))
-            sections += page.arm_section(recording, analysis, pictures)
+            sections += table.arm_section(recording, analysis, pictures)
         (folder / "report.html").write_text(_page(report, sections), encoding="utf-8")
     except OSError as error:
         raise DataError(f"{folder}: cannot write the report there ({error.strerror})") from None
@@ -160,12 +157,13 @@ def _page(report: Report, sections: Sequence[str]) -> str:
     length = max((float(recording.time[-1]) for recording in bag.recordings), default=0.0)
     events = [f"{table.shown(event.time, 1)} s  {event.text}" for event in bag.events]
     more = [f"and {len(events) - MAX_EVENTS} more"] if len(events) > MAX_EVENTS else []
+    parameters = "\n".join(bag.parameters[node].rstrip() for node in sorted(bag.parameters))
     held = html.verdict("It did not hold." if report.failures else report.held, report.failures, not report.failures)
     ending = (
-        html.explained(page.TERMS),
+        html.explained(table.TERMS),
         html.bullets("Notes", [*bag.problems, *report.notes]),
         html.bullets("Faults and changed parameters", events[:MAX_EVENTS] + more),
-        page.parameters(bag.parameters),
+        html.folded("Parameters at the start", parameters),
     )
     when = f"{report.start:%Y-%m-%d %H:%M:%S}, {length:.0f} s, {bag.path}"
     return html.document(report.title, when, [held, *sections, *ending])
