@@ -24,8 +24,8 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.params import OPTIONS
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.hardware.can.motor_bus import open_bus
-from exo_gravity.nodes.ros.declare import bus_of, declare, values_after
-from exo_gravity.nodes.ros.diagnostics import OK, WARN, Diagnostics
+from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
+from exo_gravity.nodes.ros.parameters import bus_of, declare, values_after
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.sim import SimulatedImu
 from exo_gravity.sim.device import MAX_CATCH_UP

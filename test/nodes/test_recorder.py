@@ -24,7 +24,7 @@ from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
 from exo_gravity.bag.reader import read_bag
-from exo_gravity.nodes.ros.conversions import to_time
+from exo_gravity.nodes.ros.messages import to_time
 
 NODE = [sys.executable, "-c", "from exo_gravity.nodes.recorder.node import main; main()", "--ros-args"]
 NAMES = ["j1", "j2", "j3", "j4"]

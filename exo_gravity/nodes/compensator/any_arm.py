@@ -24,8 +24,8 @@ from exo_gravity.core.compensation.compensator import Answer
 from exo_gravity.core.compensation.params import COMPENSATOR
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.hardware.urdf_arm import UrdfArm
-from exo_gravity.nodes.ros.declare import declare
-from exo_gravity.nodes.ros.diagnostics import row
+from exo_gravity.nodes.ros.messages import row
+from exo_gravity.nodes.ros.parameters import declare
 
 DESCRIPTION_TIMEOUT = 10.0  # s in which robot_description must arrive
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -30,11 +30,10 @@ from exo_gravity.core.view.scene import ArmView, arm_shapes, gravity_shapes
 from exo_gravity.core.view.urdf import joint_names, urdf
 from exo_gravity.nodes.robot_model.markers import marker_array
 from exo_gravity.nodes.robot_model.viewed_arm import STALE, ViewedArm
-from exo_gravity.nodes.ros.declare import declare
-from exo_gravity.nodes.ros.diagnostics import OK, WARN, Diagnostics
-from exo_gravity.nodes.ros.hot_path import HotPath
+from exo_gravity.nodes.ros.hot_path import NEWEST, HotPath
+from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
+from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.tilt_subscription import NEWEST
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 DISCOVERY_PERIOD = 0.5  # s between two searches for arms

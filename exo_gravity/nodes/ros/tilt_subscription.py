@@ -16,7 +16,7 @@ from sensor_msgs.msg import Imu
 from exo_gravity.core.compensation.tilt_input import STILL
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.quaternion import unit_quaternion, up_in_body
-from exo_gravity.nodes.ros.conversions import to_nanoseconds
+from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.sole_publisher import SolePublisher
 
 DATA, PITCH_YAW = "/imu/data", "/imu/pitch_yaw"
