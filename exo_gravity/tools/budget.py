@@ -18,7 +18,7 @@ from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.core.model.budget import USUAL_TILT
 from exo_gravity.core.model.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
 from exo_gravity.core.numbers import one_float
-from exo_gravity.tools.cli.extras import missing
+from exo_gravity.tools.cli import missing
 from exo_gravity.tools.inputs.arms import configured_arms
 from exo_gravity.tools.reporting.budget_table import ArmBudget, arm_budget, table_lines, verdict
 

@@ -15,10 +15,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from exo_gravity.core.errors import DataError, ExoGravityError
-from exo_gravity.core.trial.analysis import MIN_HOLD
-from exo_gravity.core.trial.verdict import HoldCriteria
-from exo_gravity.tools.cli.arguments import non_negative
-from exo_gravity.tools.cli.extras import extras
+from exo_gravity.core.trial.analysis import MIN_HOLD, HoldCriteria
+from exo_gravity.tools.cli import extras, non_negative
 from exo_gravity.tools.video import output
 
 
@@ -50,7 +48,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _repair(path: Path) -> int:
-    from exo_gravity.bag.repair import is_complete, repair
+    from exo_gravity.bag.writer import is_complete, repair
 
     try:
         if is_complete(path):

@@ -17,9 +17,9 @@ from pathlib import Path
 from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.core.model.anfis_law import JOINTS
 from exo_gravity.core.model.tilt import SIDES
-from exo_gravity.tools.cli.extras import extras
+from exo_gravity.tools.cli import extras
 from exo_gravity.tools.inputs.arms import configured_arm
-from exo_gravity.tools.inputs.paper import PAPER_ANFIS
+from exo_gravity.tools.inputs.references import PAPER_ANFIS
 
 RECORDED_RIDGE = 0.03  # larger, because recorded torques contain noise and stiction that the law must not learn
 

@@ -16,8 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from exo_gravity.core.errors import ExoGravityError, ParameterError
-from exo_gravity.tools.cli.arguments import non_negative
-from exo_gravity.tools.cli.extras import extras
+from exo_gravity.tools.cli import extras, non_negative
 from exo_gravity.tools.inputs.parameter_file import packaged_config
 from exo_gravity.tools.trials.scripts import packaged_trials
 from exo_gravity.tools.video import output

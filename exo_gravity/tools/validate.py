@@ -16,7 +16,7 @@ from pathlib import Path
 
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.model.tilt import SIDES
-from exo_gravity.tools.cli.extras import extras
+from exo_gravity.tools.cli import extras
 from exo_gravity.tools.inputs.arms import configured_arm
 
 COUNT, QUICK_COUNT = 100_000, 2_000  # random poses per limit of the tilt

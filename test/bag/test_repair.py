@@ -13,8 +13,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin
 
 from exo_gravity.bag.reader import read_bag
-from exo_gravity.bag.repair import is_complete, repair
-from exo_gravity.bag.writer import BagWriter, offered_qos
+from exo_gravity.bag.writer import BagWriter, is_complete, offered_qos, repair
 from exo_gravity.core.errors import DataError
 from exo_gravity.tools.report import main
 

@@ -6,9 +6,8 @@ import math
 
 import numpy as np
 
-from exo_gravity.core.trial.analysis import analyse
+from exo_gravity.core.trial.analysis import HoldCriteria, analyse, failures
 from exo_gravity.core.trial.recording import ScriptedStep
-from exo_gravity.core.trial.verdict import HoldCriteria, failures
 
 from ..support.synthetic_recording import (
     HANGING,

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from exo_gravity.tools.inputs.executables import node_names
+from exo_gravity.tools.inputs.parameter_file import node_names
 from exo_gravity.tools.launcher import Launcher, main
 
 NODES = Path(__file__).parents[2] / "exo_gravity" / "nodes"

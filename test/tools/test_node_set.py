@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.tools.inputs.node_set import Stages, chosen, in_namespace
-from exo_gravity.tools.inputs.parameter_file import load
+from exo_gravity.tools.inputs.parameter_file import Stages, chosen, in_namespace, load
 
 SIM = Path(__file__).parents[2] / "config" / "sim.yaml"
 NODES = ["/recorder", "/imu", "/left/can_bridge", "/left/compensator", "/right/can_bridge"]

@@ -16,7 +16,7 @@ import pytest
 from rich.console import Console
 
 from exo_gravity.bag.content import Event
-from exo_gravity.core.trial.verdict import HoldCriteria
+from exo_gravity.core.trial.analysis import HoldCriteria
 from exo_gravity.tools.report import main
 from exo_gravity.tools.reporting.trial_report import analyse, print_report, write
 

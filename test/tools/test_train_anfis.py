@@ -16,7 +16,7 @@ from exo_gravity.tools.anfis.projection import Projection
 from exo_gravity.tools.anfis.recorded import TILT_TOPIC, TILT_TYPE, from_bag
 from exo_gravity.tools.anfis.training import RIDGE, train, train_law
 from exo_gravity.tools.inputs.arms import configured_arm
-from exo_gravity.tools.inputs.paper import PAPER_ANFIS
+from exo_gravity.tools.inputs.references import PAPER_ANFIS
 from exo_gravity.tools.train_anfis import main
 
 from ..support import synthetic_bags as made

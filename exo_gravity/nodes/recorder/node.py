@@ -24,8 +24,7 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
-from exo_gravity.bag.content import RECORDER
-from exo_gravity.bag.topics import ASSIST, LOSSES, PARAMETERS, STATES, leaf
+from exo_gravity.bag.content import ASSIST, LOSSES, PARAMETERS, RECORDER, STATES, leaf
 from exo_gravity.bag.writer import BagWriter, offered_qos
 from exo_gravity.nodes.recorder.live_line import ARM_TOPICS, LiveLine
 from exo_gravity.nodes.ros.declare import declare

@@ -13,7 +13,7 @@ from exo_gravity.core.model.anfis_law import AnfisLaw
 from exo_gravity.tools.anfis.training import Trained
 from exo_gravity.tools.comparison.growth import Growth
 from exo_gravity.tools.comparison.laws import Baseline, Row
-from exo_gravity.tools.inputs.paper import PAPER_ANALYTICAL, PAPER_ANFIS, PAPER_SECONDS
+from exo_gravity.tools.inputs.references import PAPER_ANALYTICAL, PAPER_ANFIS, PAPER_SECONDS
 
 
 def paper_table(rows: Sequence[Row], law: AnfisLaw, trained: Sequence[Trained]) -> Iterator[str]:

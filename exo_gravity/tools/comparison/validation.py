@@ -20,8 +20,7 @@ from exo_gravity.tools.comparison.figures import Error, baseline_figure, tilt_fi
 from exo_gravity.tools.comparison.laws import TILTS, Row, cases, compare, laws
 from exo_gravity.tools.comparison.tables import baseline_line, growth_line, law_table, paper_table, write_csv
 from exo_gravity.tools.inputs.arms import ConfiguredArm, with_cog_at_link_ends
-from exo_gravity.tools.inputs.paper import PAPER_ANFIS
-from exo_gravity.tools.inputs.references import REFERENCES
+from exo_gravity.tools.inputs.references import PAPER_ANFIS, REFERENCES
 
 CHUNK = 2_000  # poses between two updates of the progress bar
 ROUNDING = 1e-12  # Nm; the exact law may differ this much from a reference

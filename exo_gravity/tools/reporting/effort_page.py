@@ -4,51 +4,38 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import datetime
-from html import escape
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from exo_gravity.tools.reporting import html
 from exo_gravity.tools.reporting.colours import FAINT, JOINT_COLOURS, make_plain
-from exo_gravity.tools.reporting.effort_table import JOINTS, ZERO_G, Content, EffortResults, comparisons, contents
-from exo_gravity.tools.reporting.page import document_html, figure_html, list_html
+from exo_gravity.tools.reporting.effort_table import JOINTS, ZERO_G, EffortResults, comparisons, contents
 
 CAPTION = (
     "The wearer's torque in each task by joint (top, parts add up to the root of the sum of squares), the inertia and "
     "friction that he feels in the sweeps, and the share of the workspace that a weak arm reaches."
 )
-LEGEND = """A virtual wearer, an impedance controller, moves the simulated arm. <b>Saved</b> compares with motors
-without torque. <b>In holds</b> is the RMS torque while a pose is held. <b>Reflected inertia</b> and friction are what a
-sine sweep of one joint feels."""
+TERMS = {
+    "How it is measured:": "a virtual wearer, an impedance controller, moves the simulated arm.",
+    "Saved": "compares with motors without torque.",
+    "In holds": "is the RMS torque while a pose is held.",
+    "Reflected inertia": "and friction are what a sine sweep of one joint feels.",
+}
 
 
 def write_page(results: EffortResults, folder: Path, when: datetime, how: str) -> None:
     """Write effort.png and report.html into `folder`; how: one line on how the efforts were measured."""
-    buffer = BytesIO()
-    effort_figure(results).savefig(buffer, dpi=120)
-    (folder / "effort.png").write_bytes(buffer.getvalue())
-    body = [figure_html(buffer.getvalue(), CAPTION)]
-    body += [_table(content) for content in contents(results)]
-    body += [list_html("Measures of other devices, and the same measure here", list(comparisons(results)))]
-    body += [f"<footer><p>{LEGEND}</p></footer>"]
+    png = html.png_of(effort_figure(results), 120)
+    (folder / "effort.png").write_bytes(png)
+    body = [html.picture(png, CAPTION)]
+    body += [html.heading(title) + html.table(heads, rows) for title, heads, rows in contents(results)]
+    body += [html.bullets("Measures of other devices, and the same measure here", comparisons(results))]
+    body += [html.explained(TERMS)]
     title = "How hard the arm is to move"
-    (folder / "report.html").write_text(document_html(title, f"{when:%Y-%m-%d %H:%M}, {how}", body), encoding="utf-8")
-
-
-def _table(content: Content) -> str:
-    title, heads, rows = content
-    head = "".join(f"<th>{escape(text)}</th>" for text in heads)
-    lines = "".join(
-        f'<tr><td class="name">{escape(row[0])}</td>{"".join(f"<td>{escape(cell)}</td>" for cell in row[1:])}</tr>'
-        for row in rows
-    )
-    return (
-        f'<h3>{escape(title)}</h3><div class="scroll"><table><thead><tr>{head}</tr></thead>'
-        f"<tbody>{lines}</tbody></table></div>"
-    )
+    (folder / "report.html").write_text(html.document(title, f"{when:%Y-%m-%d %H:%M}, {how}", body), encoding="utf-8")
 
 
 def effort_figure(results: EffortResults) -> Figure:

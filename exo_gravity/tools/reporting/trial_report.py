@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from importlib.util import find_spec
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,17 +15,15 @@ from rich.markup import escape
 
 from exo_gravity.bag.content import Bag
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.trial.analysis import MIN_HOLD, TrialAnalysis
+from exo_gravity.core.trial.analysis import MIN_HOLD, HoldCriteria, TrialAnalysis, failures
 from exo_gravity.core.trial.analysis import analyse as analyse_arm
 from exo_gravity.core.trial.recording import Recording
-from exo_gravity.core.trial.verdict import HoldCriteria, failures
-from exo_gravity.tools.cli.extras import missing
-from exo_gravity.tools.reporting import page, table
+from exo_gravity.tools.cli import missing
+from exo_gravity.tools.reporting import html, page, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-DPI = 150
 MAX_EVENTS = 200
 EARLY = 0.2  # s; can_bridge publishes its state every 0.1 s, so a shorter gap to the script's end means nothing
 TIMESTAMP = re.compile(r"_\d{8}_\d{6}$")  # which `trial` adds to the script's name
@@ -117,10 +114,10 @@ def write(report: Report, folder: str | Path) -> list[Path]:
         for recording, analysis in report.arms:
             pictures = []
             for kind, figure in _figures(report, recording, analysis).items():
-                png = _png(figure)
+                png = html.png_of(figure)
                 (folder / f"{recording.name.replace('/', '_')}_{kind}.png").write_bytes(png)
-                pictures.append(page.figure_html(png, CAPTIONS[kind]))
-            sections.append(page.arm_html(recording, analysis, pictures))
+                pictures.append(html.picture(png, CAPTIONS[kind]))
+            sections += page.arm_section(recording, analysis, pictures)
         (folder / "report.html").write_text(_page(report, sections), encoding="utf-8")
     except OSError as error:
         raise DataError(f"{folder}: cannot write the report there ({error.strerror})") from None
@@ -158,21 +155,17 @@ def _figures(report: Report, recording: Recording, analysis: TrialAnalysis) -> d
     return drawn
 
 
-def _png(figure: Figure) -> bytes:
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI)
-    return buffer.getvalue()
-
-
 def _page(report: Report, sections: Sequence[str]) -> str:
     bag = report.bag
     length = max((float(recording.time[-1]) for recording in bag.recordings), default=0.0)
     events = [f"{table.shown(event.time, 1)} s  {event.text}" for event in bag.events]
     more = [f"and {len(events) - MAX_EVENTS} more"] if len(events) > MAX_EVENTS else []
+    held = html.verdict("It did not hold." if report.failures else report.held, report.failures, not report.failures)
     ending = (
-        page.list_html("Notes", [*bag.problems, *report.notes])
-        + page.list_html("Faults and changed parameters", events[:MAX_EVENTS] + more)
-        + page.parameters_html(bag.parameters)
+        html.explained(page.TERMS),
+        html.bullets("Notes", [*bag.problems, *report.notes]),
+        html.bullets("Faults and changed parameters", events[:MAX_EVENTS] + more),
+        page.parameters(bag.parameters),
     )
     when = f"{report.start:%Y-%m-%d %H:%M:%S}, {length:.0f} s, {bag.path}"
-    return page.page_html(report.title, when, report.failures, report.held, sections, ending)
+    return html.document(report.title, when, [held, *sections, *ending])

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 
-from exo_gravity.core.trial.analysis import MIN_HOLD
+from exo_gravity.core.trial.analysis import MIN_HOLD, HoldCriteria
 from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.core.trial.verdict import HoldCriteria
 from exo_gravity.tools.reporting.trial_report import Report
 
 # One position code over a minute is 0.02 degrees, so the rate over a much shorter hold means little.

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import track
 
 from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.tools.cli.extras import extras, require_ros
+from exo_gravity.tools.cli import extras, require_ros
 from exo_gravity.tools.launcher import stop_on_signals
 from exo_gravity.tools.reporting import effort_table
 from exo_gravity.tools.reporting.effort_page import write_page

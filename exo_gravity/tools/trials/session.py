@@ -16,7 +16,7 @@ from exo_gravity.bag.content import Bag
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.tools.cli.extras import extras
+from exo_gravity.tools.cli import extras
 from exo_gravity.tools.launcher import Stopping, stop_on_signals
 from exo_gravity.tools.reporting import trial_report
 from exo_gravity.tools.trials.busy import ADVICE

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.numbers import one_float
-from exo_gravity.tools.cli.extras import missing
+from exo_gravity.tools.cli import missing
 
 FRAME_RATE = {".mp4": 25, ".gif": 10}  # frames per second
 NEEDED = ("mujoco", "imageio", "av", "PIL")

@@ -1,11 +1,13 @@
-"""Packages that only some tools need, and how to install them.
+"""What the command lines share: argument types, and messages about packages that are not installed.
 
-A tool imports them inside `extras`, after it has parsed its arguments: `--help` works without them, and a missing one
-ends the tool with one line instead of a traceback.
+A tool imports packages that only some tools need inside `extras`, after it has parsed its arguments: `--help` works
+without them, and a missing one ends the tool with one line instead of a traceback.
 """
 
 from __future__ import annotations
 
+import argparse
+import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,6 +21,17 @@ APT = {
     "sklearn": "python3-sklearn",
     "threadpoolctl": "python3-threadpoolctl",
 }
+
+
+def non_negative(text: str) -> float:
+    """Return the number that `text` spells, 0 or more; raise ArgumentTypeError otherwise, also for NaN."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not number >= 0.0:
+        raise argparse.ArgumentTypeError(f"{text}: must be a number, 0 or more")
+    return number
 
 
 def missing(module: str, extra: str) -> str:
