@@ -36,7 +36,7 @@ demo:
 
 calibrate-demo:
 	@$(SETUP) $(DEMO) calibrate
-	$(BIN)/python -m exo_gravity.tools.calibration.demo
+	$(BIN)/python -m bench.calibration.demo
 
 calibrate-study:
 	@$(SETUP) $(TEST) calibrate

@@ -13,7 +13,6 @@ from datetime import datetime
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from exo_gravity.core.trial.recording import Recording, ScriptedStep
@@ -101,17 +100,13 @@ def picture(before: Sequence[Recording], after: Sequence[Recording]) -> Figure:
                 axis.axvline(end, color=FAINT, lw=0.8, ls=":", zorder=0)
         title = f"{name}: up to {creep(recordings):,.{digits}f} degrees per minute"
         axis.set_title(title, loc="left", fontsize=11, color=INK)
-        _plain(axis)
+        make_plain(axis)
+        axis.set(xlim=(0.0, HOLD), xlabel="Time since it was let go (s)")
     legend = "dotted: a limit is exceeded, and the bridge lets the arm down"
     axes[0].text(0.08, 0.97, legend, transform=axes[0].transAxes, fontsize=9, color=INK, va="top")
     axes[0].set_ylabel("Moved by itself since it was let go (deg)")
     axes[1].legend(frameon=False, fontsize=9, loc="upper right")
     return figure
-
-
-def _plain(axis: Axes) -> None:
-    make_plain(axis)
-    axis.set(xlim=(0.0, HOLD), xlabel="Time since it was let go (s)")
 
 
 def main(folder: Path | None = None) -> int:
