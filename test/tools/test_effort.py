@@ -16,7 +16,7 @@ from exo_gravity.sim.effort_study import TASKS
 from exo_gravity.tools import trial
 from exo_gravity.tools.inputs.parameter_file import load, packaged_config
 from exo_gravity.tools.trials import effort, simulated_effort
-from exo_gravity.tools.trials.real_time import Outcome
+from exo_gravity.tools.trials.run import TrialEnd
 from exo_gravity.tools.trials.simulated_effort import EffortStudy
 
 from ..support.ports import own_ports
@@ -83,7 +83,7 @@ def test_a_weak_arm_reaches_more_of_the_workspace_with_more_support():
 
 
 def test_a_study_on_a_busy_computer_ends_with_exit_code_3_and_what_it_has(monkeypatch, tmp_path):
-    outcomes = [Outcome("", 0, ""), Outcome("let down", 1, "simulator was not run for 90 ms")]
+    outcomes = [TrialEnd("", 0, ""), TrialEnd("let down", 1, "simulator was not run for 90 ms")]
     monkeypatch.setattr(effort, "run_attempts", lambda *arguments: outcomes.pop(0))
     console = Console(record=True, width=200)
     assert effort.run(SIMULATED, tmp_path, offline=False, quick=True, console=console) == 3

@@ -6,14 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
 
 from exo_gravity.core.errors import DataError
+from exo_gravity.tools import trial
 from exo_gravity.tools.launcher import StopFlag
-from exo_gravity.tools.trials import session
-from exo_gravity.tools.trials.busy import too_busy
-from exo_gravity.tools.trials.real_time import Outcome
-from exo_gravity.tools.trials.session import Session
+from exo_gravity.tools.trials import run as running
+from exo_gravity.tools.trials.run import TrialEnd, too_busy
 
 SILENT = {"level": 2, "message": "letting down: motor_silent", "state": "letting down", "fault": "motor_silent"}
 STALE = {**SILENT, "message": "letting down: command_stale", "fault": "command_stale"}
@@ -50,21 +48,21 @@ def test_a_real_arm_is_never_excused_by_a_busy_computer():
 
 
 class Attempts:
-    """Stands for the nodes: each attempt has the next of the given outcomes, and records nothing."""
+    """Stands for the nodes: each attempt ends in the next of the given ways, and records nothing."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, *outcomes: Outcome) -> None:
-        self.outcomes = list(outcomes)
-        monkeypatch.setattr(session, "run_nodes", lambda *arguments: self.outcomes.pop(0))
-        monkeypatch.setattr(session, "read_bag", self._no_recording)
-        monkeypatch.setattr(session, "stop_on_signals", StopFlag)
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *ends: TrialEnd) -> None:
+        self.ends = list(ends)
+        monkeypatch.setattr(running, "run_nodes", lambda *arguments: self.ends.pop(0))
+        monkeypatch.setattr("exo_gravity.bag.reader.read_bag", self._no_recording)
+        monkeypatch.setattr(trial, "stop_on_signals", StopFlag)
 
     @staticmethod
     def _no_recording(path: Path) -> None:
         raise DataError(f"{path}: nothing was recorded")
 
 
-BUSY = Outcome("right/can_bridge: letting down: motor_silent", 1, "right/simulator was not run for 140 ms")
-FAULT = Outcome("right/can_bridge: letting down: over_temperature", 1, "")
+BUSY = TrialEnd("right/can_bridge: letting down: motor_silent", 1, "right/simulator was not run for 140 ms")
+FAULT = TrialEnd("right/can_bridge: letting down: over_temperature", 1, "")
 LAST_LINE = (
     "trial: this computer was too busy: right/simulator was not run for 140 ms. "
     "Close other programs and try again. The arm has no fault."
@@ -72,21 +70,20 @@ LAST_LINE = (
 
 
 def run(tmp_path: Path) -> int:
-    config = Path(__file__).parents[2] / "config" / "sim.yaml"
-    return session.run(Session("demo", config, tmp_path, False, None), Console(highlight=False, width=200))
+    return trial.main(["demo", "--output", str(tmp_path)])
 
 
 def test_a_busy_computer_ends_a_trial_with_exit_code_3_and_advice_in_the_last_line(tmp_path, monkeypatch, capsys):
     attempts = Attempts(monkeypatch, BUSY, BUSY, BUSY)
     assert run(tmp_path) == 3
-    assert attempts.outcomes == []
+    assert attempts.ends == []
     assert capsys.readouterr().out.splitlines()[-1] == LAST_LINE
 
 
 def test_a_trial_that_failed_on_a_busy_computer_is_repeated(tmp_path, monkeypatch, capsys):
     attempts = Attempts(monkeypatch, BUSY, FAULT)
     assert run(tmp_path) == 1
-    assert attempts.outcomes == []
+    assert attempts.ends == []
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "this computer was too busy: right/simulator was not run for 140 ms; attempt 2 of 3"
     assert lines[-1] == "trial: right/can_bridge: letting down: over_temperature"
@@ -95,4 +92,4 @@ def test_a_trial_that_failed_on_a_busy_computer_is_repeated(tmp_path, monkeypatc
 def test_a_fault_of_the_arm_is_not_repeated(tmp_path, monkeypatch):
     attempts = Attempts(monkeypatch, FAULT, BUSY)
     assert run(tmp_path) == 1
-    assert attempts.outcomes == [BUSY]
+    assert attempts.ends == [BUSY]

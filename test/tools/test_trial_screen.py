@@ -13,8 +13,8 @@ import pytest
 from rich.console import Console
 
 from exo_gravity.core.trial.script import Step, TrialScript
-from exo_gravity.tools.trials.live import LEAD, Progress, describe
-from exo_gravity.tools.trials.real_time import follow
+from exo_gravity.tools.trials.run import follow
+from exo_gravity.tools.trials.screen import LEAD, TrialScreen, describe
 
 SCRIPT = TrialScript.parse(
     {"name": "short", "steps": [{"move": [0.1, 0.6, 1.2, 0.5], "over": 2.0}, {"hold": 4.0}]},
@@ -25,10 +25,15 @@ ACTIVE = {"level": 0, "message": "active", "state": "active", "fault": "none"}
 class Screen:
     """The screen of a trial, whose clock and recorder's lines the test sets."""
 
-    def __init__(self, guided: bool = True, bridges: Sequence[str] = ("right/can_bridge",)) -> None:
+    def __init__(
+        self, guided: bool = True, bridges: Sequence[str] = ("right/can_bridge",), lead: float | None = LEAD
+    ) -> None:
         self.now, self.out = 0.0, io.StringIO()
         self.console = Console(file=self.out, width=120)
-        self.progress = Progress(SCRIPT, guided, self.console, bridges, lambda: self.now)
+        self.steps: list[tuple[int, float]] = []
+        self.screen = TrialScreen(
+            SCRIPT, guided, self.console, bridges, lead, lambda *step: self.steps.append(step), lambda: self.now
+        )
 
     def at(self, now: float, position: Sequence[float] = (0.0,) * 4, bridge: Any = ACTIVE, **arm: Any) -> str:
         """Process a line of the recorder at `now`, in which the bridge has the status `bridge`; return the screen."""
@@ -36,9 +41,9 @@ class Screen:
         status = {"right/can_bridge": bridge}
         faults = [f"{name}: {values['message']}" for name, values in status.items() if values["level"]]
         arm = {"position": list(position), "effort": [0.0] * 4, **arm}
-        self.progress.take(json.dumps({"right": arm, "status": status, "faults": faults}))
+        self.screen.take(json.dumps({"right": arm, "status": status, "faults": faults}))
         with self.console.capture() as capture:
-            self.console.print(self.progress.screen())
+            self.console.print(self.screen.screen())
         return capture.get()
 
     @property
@@ -79,9 +84,9 @@ def test_the_clock_leads_a_person_through_the_steps():
     screen.at(LEAD + 2.1)
     screen.at(LEAD + 3.0)
     assert "drift 1.00 deg" in screen.at(LEAD + 4.0, position=(0.0, 0.0, math.radians(1.0), 0.0))
-    assert not screen.progress.done
+    assert not screen.screen.done
     screen.at(LEAD + 6.1)
-    assert screen.progress.done
+    assert screen.screen.done
     assert [line[5:] for line in screen.printed] == [
         "bring the arm to 6 34 69 29 deg, then let go",
         "hands off for 4 s",
@@ -90,22 +95,31 @@ def test_the_clock_leads_a_person_through_the_steps():
 
 
 def test_at_a_simulated_arm_the_virtual_wearer_leads():
-    screen = Screen(guided=False)
+    screen = Screen(guided=False, lead=None)
     screen.at(100.0)
     assert screen.printed == []
     screen.at(101.0, step={"step": 0})
     assert screen.printed == ["1/2  the wearer brings the arm to 6 34 69 29 deg"]
     screen.at(102.0, step={"step": 2})
-    assert screen.progress.done
+    assert screen.screen.done
+
+
+def test_on_nodes_that_run_already_the_clock_leads_at_once_whatever_an_earlier_trial_left():
+    screen = Screen(guided=False, bridges=(), lead=0.0)
+    screen.at(100.0, step={"step": 2})
+    screen.at(100.1, step={"step": 2})
+    screen.at(101.0, step={"step": 0})
+    assert screen.steps == [(-1, 0.0), (0, 2.0), (0, pytest.approx(1.1))]
+    assert screen.printed == ["1/2  the wearer brings the arm to 6 34 69 29 deg"]
 
 
 def test_half_a_line_of_a_killed_recorder_is_ignored():
     screen = Screen()
     screen.at(1.0)
-    screen.progress.take('{"right": {"posi')
-    assert screen.progress.silence == 0.0
+    screen.screen.take('{"right": {"posi')
+    assert screen.screen.silence == 0.0
     screen.now = 4.0
-    assert screen.progress.silence == 3.0
+    assert screen.screen.silence == 3.0
 
 
 @pytest.fixture
@@ -121,7 +135,7 @@ def nodes() -> Iterator[threading.Thread]:
 def test_a_recorder_that_ends_ends_the_trial(nodes):
     screen = Screen()
     screen.at(0.0)
-    why = follow(screen.progress, SCRIPT, threading.Event(), lambda: -9, nodes)
+    why = follow(screen.screen, SCRIPT, threading.Event(), lambda: -9, nodes)
     assert why == "the recorder ended with exit code -9 before the trial was done"
 
 
@@ -129,7 +143,7 @@ def test_a_recorder_that_prints_nothing_ends_the_trial(nodes):
     screen = Screen()
     screen.at(0.0)
     screen.now = 10.1
-    why = follow(screen.progress, SCRIPT, threading.Event(), lambda: None, nodes)
+    why = follow(screen.screen, SCRIPT, threading.Event(), lambda: None, nodes)
     assert why == "the recorder has sent no data for 10 s"
 
 
@@ -137,8 +151,16 @@ def test_a_recorder_that_prints_nothing_ends_the_trial(nodes):
 def test_a_latched_fault_ends_the_trial_with_its_reason(nodes, state):
     screen, message = Screen(), f"{state}: motor_silent: elbow"
     screen.at(0.0, bridge={"level": 2, "message": message, "state": state, "fault": "motor_silent"})
-    why = follow(screen.progress, SCRIPT, threading.Event(), lambda: None, nodes)
+    why = follow(screen.screen, SCRIPT, threading.Event(), lambda: None, nodes)
     assert why == f"right/can_bridge: {message}"
+
+
+def test_an_arm_that_is_let_down_ends_a_trial_that_the_clock_leads(nodes):
+    screen = Screen()
+    screen.at(0.0)
+    screen.at(1.0, bridge={"level": 0, "message": "letting down", "state": "letting down", "fault": "none"})
+    why = follow(screen.screen, SCRIPT, threading.Event(), lambda: None, nodes)
+    assert why == "an arm is not active any more"
 
 
 def test_the_steps_of_the_trunk_are_instructions_too() -> None:

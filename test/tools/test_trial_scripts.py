@@ -16,8 +16,8 @@ from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.tools.reporting import trial_report
-from exo_gravity.tools.trials.criteria import criteria_for, missing_holds, shortest_hold
-from exo_gravity.tools.trials.scripts import is_guided, read_script
+from exo_gravity.tools.trial import criteria_for, missing_holds, read_script, shortest_hold
+from exo_gravity.tools.trials.run import is_guided
 
 from ..support import synthetic_bags as made
 

@@ -20,8 +20,7 @@ from exo_gravity.tools.launcher import stop_on_signals
 from exo_gravity.tools.reporting import effort_table
 from exo_gravity.tools.reporting.effort_page import write_page
 from exo_gravity.tools.reporting.effort_table import EffortResults
-from exo_gravity.tools.trials.busy import ADVICE
-from exo_gravity.tools.trials.session import BUSY_CODE, run_attempts
+from exo_gravity.tools.trials.run import ADVICE, BUSY_CODE, run_attempts
 
 with extras("trial", "sim"):
     from exo_gravity.tools.trials.simulated_effort import EffortStudy

@@ -9,11 +9,16 @@ import sys
 from ctypes.util import find_library
 from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
+from exo_gravity.bag.content import Bag
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.numbers import one_float
 from exo_gravity.tools.cli import missing
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
 
 FRAME_RATE = {".mp4": 25, ".gif": 10}  # frames per second
 NEEDED = ("mujoco", "imageio", "av", "PIL")
@@ -94,3 +99,16 @@ def frame_times(end: float, clip: Clip) -> list[float]:
     """Return the times in s, from 0 to `end`, of the recording that the frames show."""
     step = clip.speed / clip.frame_rate
     return [step * i for i in range(max(1, math.floor(end / step) + 1))]
+
+
+def write(bag: Bag, clip: Clip, console: Console) -> None:
+    """Write the clip of a recording, and print where it is. Raises DataError."""
+    select_backend()
+    from rich.progress import Progress
+
+    from exo_gravity.tools.reporting.clip import write_clip
+
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task(f"drawing {clip.path.name}", total=None)
+        write_clip(bag, clip, lambda done, count: progress.update(task, completed=done, total=count))
+    console.print(f"Clip: {clip.path}", markup=False, soft_wrap=True)

@@ -23,11 +23,12 @@ SETTLING = 0.5  # s between letting go and the position from which drift is meas
 LEAD = 5.0  # s for a person to get ready when the arm is carried
 
 
-class Progress:
+class TrialScreen:
     """Follows a script through the recorder's lines.
 
-    guided: a person performs the script, led by the clock, which starts when all `bridges` are active. done: the last
-    step has ended. status: of each node on /diagnostics. faults: warnings and errors of the nodes, as text.
+    guided: a person performs the script. bridges: those that must be active before the clock starts; by default, all
+    that are seen. lead: s from then to the first step, in a script that the clock leads; None if the steps are those of
+    the simulator. on_progress: called with the number of each step and the time left in it, s. clock: monotonic s.
     """
 
     def __init__(
@@ -35,26 +36,30 @@ class Progress:
         script: TrialScript,
         guided: bool,
         console: Console,
-        bridges: Collection[str],
+        bridges: Collection[str] = (),
+        lead: float | None = LEAD,
+        on_progress: Callable[[int, float], None] = lambda step, left: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.done = False
-        self.status: dict[str, dict[str, Any]] = {}
-        self.faults: list[str] = []
+        self.done = False  #: the last step has ended
+        self.status: dict[str, dict[str, Any]] = {}  #: of each node on /diagnostics
+        self.faults: list[str] = []  #: warnings and errors of the nodes
         self._script = script
         self._guided = guided
+        self._lead = lead
         self._bridges = bridges
         self._console = console
+        self._on_progress = on_progress
         self._clock = clock
         self._arms: dict[str, dict[str, Any]] = {}
         self._index = -1  # of the current step
         self._step_start = self._last_line = clock()
-        self._start = math.inf  # of a guided script
+        self._start = math.inf  # of a script that the clock leads
         self._origin: dict[str, list[float]] = {}  # position of each arm from which drift is measured
         self._ending = ""
         self._live = Live(console=console, refresh_per_second=10, get_renderable=self.screen, transient=True)
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> TrialScreen:
         if self._console.is_terminal:
             self._live.start()
         return self
@@ -80,19 +85,32 @@ class Progress:
         self._arms = {name: arm for name, arm in content.items() if "position" in arm}
         if not self._ending:
             self._follow([arm["step"]["step"] for arm in content.values() if "step" in arm])
+            self._on_progress(self._index, self._left)
 
     @property
     def silence(self) -> float:
         """Time in s since the recorder's last line; 0 before its first."""
         return self._clock() - self._last_line if self._arms else 0.0
 
+    @property
+    def is_let_down(self) -> bool:
+        """Whether the clock has started and not every arm is active any more."""
+        return self._start < math.inf and not self._all_active
+
+    @property
+    def _left(self) -> float:
+        """Time in s until the next step."""
+        if 0 <= self._index < len(self._script.steps):
+            return max(0.0, self._script.steps[self._index].duration - self._clock() + self._step_start)
+        return max(0.0, self._start - self._clock()) if self._start < math.inf else 0.0
+
     def _follow(self, simulated_steps: list[int]) -> None:
         index, now = self._index, self._clock()
-        if not self._guided:
+        if self._lead is None:
             index = min(simulated_steps, default=-1)
         elif self._start == math.inf:
             if self._all_active:
-                self._start = now + LEAD
+                self._start = now + self._lead
         elif now >= self._start:
             index = self._script.at(now - self._start)[0]
         if index != self._index:
@@ -137,17 +155,16 @@ class Progress:
         return Group(*lines)
 
     def _headline(self) -> str:
-        steps, now = self._script.steps, self._clock()
+        steps = self._script.steps
         if self._ending or self._index >= len(steps):
             return ""
         if self._index >= 0:
-            left = max(0.0, steps[self._index].duration - now + self._step_start)
             then = describe(steps[self._index + 1], self._guided) if self._index + 1 < len(steps) else "done"
             drift = f"drift {self._drift():.2f} deg    " if self._origin else ""
-            return f"     {left:.0f} s left    {drift}then: {then}"
+            return f"     {self._left:.0f} s left    {drift}then: {then}"
         if self._start < math.inf:
             first = describe(steps[0], self._guided)
-            return f"     take hold of the arm: in {max(0.0, self._start - now):.0f} s, {first}"
+            return f"     take hold of the arm: in {self._left:.0f} s, {first}"
         return "     waiting for the arm to be carried"
 
 
