@@ -5,8 +5,8 @@ The folder of the trial holds the parameters, the recording, the nodes' log and 
 of the recorder lets the arm down, and the trial reports what was recorded until then.
 
 With --attach it starts the recorder alone, for arms that are carried already: the operator's panel runs its trials so.
-It then prints one JSON object per line: {"folder": PATH}, {"step": -1.., "left": s} ten times a second, {"step": null}
-when the script has ended, and last {"problem": TEXT}, '' for none.
+It then prints one JSON object per line: {"folder": PATH}; ten times a second {"step": -1.., "left": s}; when the script
+has ended {"phase": "reporting"}; last {"problem": TEXT}, '' for none.
 
 Exit code 0: the arm held. 1: it did not hold, or the trial did not finish. 2: wrong use or wrong file. 3: the simulated
 device could not run in real time because this computer was too busy.
@@ -106,6 +106,7 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
     path, script = read_script(options.name)
     stopped = stop_on_signals()
     folder = Path(options.output).resolve() / f"{script.name}_{datetime.now():%Y%m%d_%H%M%S}"
+    bag: Bag | None
     if options.offline:
         if clip:
             video.select_backend()  # before the simulated device imports MuJoCo
@@ -163,11 +164,11 @@ def _in_real_time(
     from exo_gravity.tools.trials.run import Attachment, prepare, run_attempts, run_nodes
 
     if options.attach:
-        attachment = Attachment(options.attach == "guided", lambda step, left: _print_json(step=step, left=left))
+        attachment = Attachment(options.attach == "guided", _print_step)
         only_recorder = prepare(None, path, folder, recorded=True)
         _print_json(folder=str(folder))
         end = run_nodes(only_recorder, script, folder, console, stopped, attachment)
-        _print_json(step=None)
+        _print_json(phase="reporting")
     else:
         end = run_attempts(params, path, script, folder, console, stopped)
     try:
@@ -176,6 +177,10 @@ def _in_real_time(
         if not end.trouble:
             raise
         return None, end
+
+
+def _print_step(step: int, left: float) -> None:
+    _print_json(step=step, left=round(left, 1))
 
 
 def _print_json(**values: object) -> None:

@@ -31,7 +31,7 @@ from exo_gravity.panel.control import Control
 from exo_gravity.panel.desk import Desk
 from exo_gravity.panel.facts import Facts
 from exo_gravity.panel.params import PANEL, scripts_folder
-from exo_gravity.panel.studio import Studio
+from exo_gravity.panel.recordings import Recordings
 from exo_gravity.panel.view import SILENT
 
 STATE_PERIOD = 0.1  # s between two states that the pages get
@@ -57,18 +57,20 @@ class Panel(Node):
         self.create_subscription(ParameterEvent, "/parameter_events", self._on_parameter_event, 50)
         self._wearers: dict[str, Client] = {}  # the virtual ones, by their simulator's name
         scripts = scripts_folder(values["trials"])
-        self._studio = Studio(values["output"], scripts, self, self._note)
+        self._recordings = Recordings(values["output"], scripts, self, self._note, time.monotonic)
         own = {name: values[name] for name in ("language", "dead_man")}
-        self._facts = Facts({**own, "trials": list(self._studio.trials)})
+        self._facts = Facts({**own, "trials": list(self._recordings.trials)})
         access = Access(values["host"], values["token"], time.monotonic)
         control = Control(time.monotonic, values["dead_man"])
-        desk = Desk(self._arms, self._studio, control, self._note, time.monotonic)
+        desk = Desk(self._arms, self._recordings, control, self._note, time.monotonic)
         try:
             from exo_gravity.panel.server import PanelServer
         except ModuleNotFoundError as error:
             missing = f"the Python package {error.name} is not installed: pip install 'exo_gravity[panel]'"
             raise ExoGravityError(missing) from None
-        self._server = PanelServer(values["host"], values["port"], access, desk, self._studio.report, self.parameters)
+        self._server = PanelServer(
+            values["host"], values["port"], access, desk, self._recordings.report, self.parameters
+        )
         self._server.start()
         self.create_timer(STATE_PERIOD, self._send_state)
         self.create_timer(DISCOVERY_PERIOD, self._discover)
@@ -76,7 +78,7 @@ class Panel(Node):
 
     def close(self) -> None:
         """End the recording and the server. The arms are left as they are."""
-        self._studio.close()
+        self._recordings.close()
         self._facts.close()
         self._server.stop()
 
@@ -106,7 +108,7 @@ class Panel(Node):
         news = self._facts.news()
         if news is not None:
             self._server.publish_setup(news)
-        state = {"arms": self._arms.state(), "tilt": self._tilt_state(), **self._studio.state()}
+        state = {"arms": self._arms.state(), "tilt": self._tilt_state(), **self._recordings.state()}
         self._server.publish(state)
 
     def _tilt_state(self) -> dict[str, float] | None:
@@ -145,7 +147,7 @@ class Panel(Node):
         if event.node in self._of_nodes:
             self._of_nodes[event.node].refresh()
 
-    # What a trial needs (`Device` of exo_gravity.panel.studio); called on the web server's thread
+    # What a trial needs (`Device` of exo_gravity.panel.recordings); called on the web server's thread
 
     def parameters(self) -> dict[str, dict[str, Any]]:
         """Return the parameters of every node by full name."""
