@@ -43,7 +43,7 @@ class Device(Protocol):
 
 
 class Recordings:
-    """`Files` of `exo_gravity.panel.desk`. note: called with a sentence for the log. clock: monotonic s."""
+    """`Files` of `exo_gravity.panel.control`. note: called with a sentence for the log. clock: monotonic s."""
 
     def __init__(
         self,
