@@ -179,13 +179,12 @@ class Recorder(Node):
         # Other topics have several publishers, each with its own numbers.
         self._drains.append(Drain(self, msgtype, topic, qos, counts_lost=msgtype in (JointState, Imu, Vector3Stamped)))
 
-    def _write_parameters(self, node: str) -> None:
-        parameters = self._unwritten.pop(node)
+    def _write_parameters(self, node: str, values: dict[str, Any]) -> None:
         # ROS's parameter files have no empty lists.
-        values = {name: value for name, value in parameters.values.items() if value != []}
-        text = yaml.safe_dump({node: {"ros__parameters": values}}, default_flow_style=None, width=120)
+        given = {name: value for name, value in values.items() if value != []}
+        text = yaml.safe_dump({node: {"ros__parameters": given}}, default_flow_style=None, width=120)
         self._write_text(PARAMETERS, text)
-        parameters.destroy()
+        self._unwritten.pop(node).destroy()
 
     def _write_text(self, topic: str, text: str) -> None:
         now = self.get_clock().now().nanoseconds
