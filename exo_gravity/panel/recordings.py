@@ -190,8 +190,10 @@ class Recordings:
             self._progress = {**self._progress, **news}
             if "folder" in news:
                 self._folder = Path(news["folder"])
-                if script and (refused := await self._device.perform(script)):
+            elif script and "step" in news:  # the recorder records
+                if refused := await self._device.perform(script):
                     trial.terminate()
+                script = ""
         lines = (await errors).decode(errors="replace").strip().splitlines()
         failed = await trial.wait() not in (0, 1)
         name, problem = self._progress["name"], refused or self._progress.get("problem", "")

@@ -28,6 +28,7 @@ from exo_gravity.tools.launcher import Launcher, Stopping
 from exo_gravity.tools.trials.screen import LEAD, TrialScreen
 
 RECORDER = "/recorder"
+SIMULATED_LEAD = 1.0  # s for the panel to start the virtual wearer, once the recorder runs
 START_TIMEOUT = 60.0  # s until the arm must be carried
 GRACE = 0.5  # s recorded after the last step
 RECORDER_TIMEOUT = 10.0  # s without a line from the recorder
@@ -161,7 +162,7 @@ def run_nodes(
 def _screen(params: Path, script: TrialScript, console: Console, attached: Attachment | None) -> TrialScreen:
     if attached:
         # The simulator's steps may be those of an earlier trial: the clock leads.
-        lead = LEAD if attached.guided else 0.0
+        lead = LEAD if attached.guided else SIMULATED_LEAD
         return TrialScreen(script, attached.guided, console, lead=lead, on_progress=attached.on_progress)
     bridges = [node.lstrip("/") for node in load(params) if node.endswith("/can_bridge")]
     guided = is_guided(params)

@@ -28,7 +28,8 @@ class TrialScreen:
 
     guided: a person performs the script. bridges: those that must be active before the clock starts; by default, all
     that are seen. lead: s from then to the first step, in a script that the clock leads; None if the steps are those of
-    the simulator. on_progress: called with the number of each step and the time left in it, s. clock: monotonic s.
+    the simulator. on_progress: called with the step and the time left in it, s, once the clock has started. clock:
+    monotonic s.
     """
 
     def __init__(
@@ -85,7 +86,8 @@ class TrialScreen:
         self._arms = {name: arm for name, arm in content.items() if "position" in arm}
         if not self._ending:
             self._follow([arm["step"]["step"] for arm in content.values() if "step" in arm])
-            self._on_progress(self._index, self._left)
+            if self._start < math.inf:
+                self._on_progress(self._index, self._left)
 
     @property
     def silence(self) -> float:
@@ -102,7 +104,7 @@ class TrialScreen:
         """Time in s until the next step."""
         if 0 <= self._index < len(self._script.steps):
             return max(0.0, self._script.steps[self._index].duration - self._clock() + self._step_start)
-        return max(0.0, self._start - self._clock()) if self._start < math.inf else 0.0
+        return max(0.0, self._start - self._clock())
 
     def _follow(self, simulated_steps: list[int]) -> None:
         index, now = self._index, self._clock()
