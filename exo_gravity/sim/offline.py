@@ -29,8 +29,8 @@ from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trial.recording import Recording, ScriptedStep
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim.device import SimulatedDevice
-from exo_gravity.sim.effort_script import ScriptedWearer
 from exo_gravity.sim.trunk_motion import TrunkState
+from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 START_TIMEOUT = 60.0  # s for the motors to be switched on
 GRACE = 0.5  # s from the end of the script until the arm is let down
@@ -92,7 +92,7 @@ class OfflineTrial:
         self.script = script
         self.events: list[tuple[float, str]] = []
         self.trouble = ""
-        self._wearer = ScriptedWearer(script)
+        self._wearer = VirtualWearer(script)
         self._delay = delay
         self._start = math.inf  # s, of the script
         self._carried: list[float] = []  # s, the first and the last time at which the motors carried the arm

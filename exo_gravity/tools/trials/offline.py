@@ -1,6 +1,6 @@
 """trial --offline: the simulated arms of a parameter file perform a script without ROS, faster than real time.
 
-It, `simulated_effort` and `trunk_imu` are the only tools that import `sim`: without ROS they cannot start the simulator
+It and `trunk_imu` are the only tools that import `sim`: without ROS they cannot start the simulator
 as a node.
 """
 
