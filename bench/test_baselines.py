@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bench.baselines import __main__ as study
-from bench.baselines import learned
+from bench.baselines import controllers, learned
 from bench.baselines.controllers import HELD, INTEGRAL, STIFFNESS, Burden, Controlled, Feedforward, burden
 from bench.baselines.growth import growth, sizes
 from bench.effort.exertion import REACH
@@ -23,7 +23,7 @@ MOTORS_OF_ARM = configured_arm().motors
 POSE = (0.1, 0.9, 0.6, 0.7)
 STILL = (0.0,) * 4
 MOST = (9.0, 18.0, 9.0, 9.0)
-SHORT = replace(REACH, poses=REACH.poses[:2])
+SHORT = replace(REACH, poses=REACH.poses[:4])
 
 
 def law(theta, pitch):
@@ -43,7 +43,9 @@ def burdens():
         "both": Feedforward(law, True),
         "upright law": Feedforward(lambda theta, _pitch: law(theta, 0.0), False),
     }
-    return {name: burden(make_device, MOTORS_OF_ARM, given, HELD[1:2], SHORT) for name, given in chosen.items()}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(controllers, "RELEASED", 2.0)
+        return {name: burden(make_device, MOTORS_OF_ARM, given, HELD[1:2], SHORT) for name, given in chosen.items()}
 
 
 def test_a_pid_costs_the_wearer_far_more_than_an_arm_without_any_torque(burdens):

@@ -15,7 +15,7 @@ from bench.effort.report import Results, comparisons, figure, tables, write_csv
 from bench.effort.study import NOTHING, ONE_G, ZERO_G, Study
 from exo_gravity.core.compensation.terms.link_inertia import LinkInertia
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
-from exo_gravity.sim.device_params import device_of
+from exo_gravity.sim.params import device_of
 
 SHORT = replace(REACH, poses=REACH.poses[:4])
 
@@ -60,7 +60,7 @@ def test_rms_peak_work_and_jerk_of_a_known_motion():
 @pytest.mark.parametrize("task", [Task("two", ((0.0,) * 4, (0.5, 0.2, 0.3, 0.4)), 1.0, 0.5), Sweep("s", MIDDLE, 2)])
 def test_a_task_is_a_way_without_steps(task):
     times = np.arange(0.0 if isinstance(task, Task) else 3.0, task.duration, 0.001)
-    position, speed = (np.array(rows) for rows in zip(*map(task.at, times), strict=True))
+    position, speed = np.moveaxis([task.at(time) for time in times], 2, 0)
     assert np.gradient(position, 0.001, axis=0)[1:-1] == pytest.approx(speed[1:-1], abs=0.01)
     if isinstance(task, Sweep):  # it ends at its highest frequency
         assert np.abs(speed).max() == pytest.approx(0.1 * 2.0 * np.pi * 2.0, rel=0.03)

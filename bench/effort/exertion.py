@@ -1,9 +1,8 @@
 """A wearer's exertion: a virtual wearer moves the simulated arm along paths, and his torque is measured.
 
-He is an impedance controller with the wearer's passive arm in the exoskeleton. Without help he carries both, and
-overcomes their friction and inertia. Stiffness and damping are of the order of a human arm's; an integrator takes over
-what weight is left, as a person does. The controller exchanges one CAN frame with each motor a cycle; there is no
-safety machine.
+His hand is that of the virtual wearer, and stronger; his passive arm is in the exoskeleton. Without help he carries
+both, and overcomes their friction and inertia. The controller exchanges one CAN frame with each motor a cycle; there is
+no safety machine.
 """
 
 from __future__ import annotations
@@ -20,14 +19,10 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.model.gravity import NO_TORQUE, Torque
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER
-from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import STEP, SimulatedDevice, VirtualWearer
-from exo_gravity.sim.virtual_wearer import minimum_jerk
+from exo_gravity.sim.virtual_wearer import Path, path_between
 
-STIFFNESS = (60.0, 80.0, 60.0, 30.0)  # Nm/rad
-DAMPING = (3.0, 6.0, 5.0, 2.0)  # Nm s/rad
-INTEGRAL = (120.0, 160.0, 150.0, 80.0)  # Nm/(rad s)
 STRENGTH = 60.0  # Nm on any joint, an adult's shoulder
 SETTLING = 3.0  # s at the start of a task, not measured: the torque ramps in, the wearer takes over the rest
 SMOOTHING = 0.02  # s
@@ -53,12 +48,11 @@ class Task:
         """Length in s, with the settling at the first pose."""
         return SETTLING + len(self.poses) * (self.move + self.hold)
 
-    def at(self, elapsed: float) -> tuple[list[float], list[float]]:
-        """Return the wanted angles (4,) in rad and velocities (4,) in rad/s `elapsed` s after the start."""
+    def at(self, elapsed: float) -> Path:
+        """Return the wanted angle in rad and velocity in rad/s of each joint `elapsed` s after the start."""
         index, since = divmod(max(0.0, elapsed - SETTLING), self.move + self.hold)
         n = min(int(index), len(self.poses) - 1)
-        path = minimum_jerk(self.poses[n - 1] if n else self.poses[0], self.poses[n], since, self.move)
-        return [position for position, _ in path], [speed for _, speed in path]
+        return path_between(self.poses[max(0, n - 1)], self.poses[n], since, self.move)
 
     def holding(self, elapsed: np.ndarray) -> np.ndarray:
         """Return for each time (n,) in s since the start whether a pose is held."""
@@ -82,16 +76,16 @@ class Sweep:
         """Length in s, with the settling."""
         return SETTLING + self.length
 
-    def at(self, elapsed: float) -> tuple[list[float], list[float]]:
-        """Return the wanted angles (4,) in rad and velocities (4,) in rad/s `elapsed` s after the start."""
+    def at(self, elapsed: float) -> Path:
+        """Return the wanted angle in rad and velocity in rad/s of each joint `elapsed` s after the start."""
         since = max(0.0, elapsed - SETTLING)
         rate = math.log(self.high / self.low) / self.length
         frequency = self.low * math.exp(rate * since)
         phase = 2.0 * math.pi * (frequency - self.low) / rate
-        position, speed = list(self.pose), [0.0] * JOINT_COUNT
-        position[self.joint] += self.amplitude * math.sin(phase)
-        speed[self.joint] = 2.0 * math.pi * frequency * self.amplitude * math.cos(phase) if since else 0.0
-        return position, speed
+        path = [(position, 0.0) for position in self.pose]
+        speed = 2.0 * math.pi * frequency * self.amplitude * math.cos(phase) if since else 0.0
+        path[self.joint] = self.pose[self.joint] + self.amplitude * math.sin(phase), speed
+        return path
 
 
 POSES = Task(
@@ -167,25 +161,16 @@ def _smoothed(values: np.ndarray, rate: float) -> np.ndarray:
 
 
 class TaskWearer(VirtualWearer):
-    """Follows a task with at most `strength` (4,) Nm. torques: (n, 4) Nm of the wearer, one for each millisecond."""
+    """Follows a task. torques: (n, 4) Nm of the wearer, one for each millisecond."""
 
-    def __init__(self, task: Task | Sweep, strength: Sequence[float] = (STRENGTH,) * JOINT_COUNT) -> None:
-        super().__init__(TrialScript.parse({"name": task.name, "steps": [{"hold": task.duration}]}))
+    def __init__(self, task: Task | Sweep) -> None:
+        super().__init__(TrialScript.parse({"name": task.name, "steps": [{"hold": task.duration}]}), STRENGTH)
         self.task = task
-        self.strength = strength
         self.torques: list[Torque] = []
-        self._carried = [0.0] * JOINT_COUNT
 
     def torque(self, elapsed: float, theta: Sequence[float], velocity: Sequence[float]) -> Torque:
         """Return the wearer's torque (4,) in Nm `elapsed` s after the start of the task."""
-        position, speed = self.task.at(elapsed)
-        torque = []
-        for n in range(JOINT_COUNT):
-            error, most = position[n] - theta[n], self.strength[n]
-            self._carried[n] = max(-most, min(most, self._carried[n] + INTEGRAL[n] * error * STEP))
-            pull = STIFFNESS[n] * error + DAMPING[n] * (speed[n] - velocity[n]) + self._carried[n]
-            torque.append(max(-most, min(most, pull)))
-        self.torques.append(tuple(torque))
+        self.torques.append(self.lead(self.task.at(elapsed), theta, velocity, STEP))
         return self.torques[-1]
 
     def idle(self, elapsed: float, duration: float) -> bool:
@@ -237,7 +222,7 @@ def perform(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the true angles (n, 4) in rad and velocities (n, 4) in rad/s, one for each control cycle; as `measure`."""
     compute = _compensator(controller) if isinstance(controller, Settings) else controller
-    device.arm.reset(wearer.task.at(0.0)[0])
+    device.arm.reset([position for position, _ in wearer.task.at(0.0)])
     device.start(wearer)
     for motor in motors:
         device.exchange(motor.can_id, motor.command(0.0, 0.0))

@@ -32,7 +32,7 @@ from exo_gravity.core.compensation.terms.term import DELAY
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.model.wearer import Wearer
-from exo_gravity.sim.device_params import SIMULATOR, device_of
+from exo_gravity.sim.params import SIMULATOR, device_of
 from exo_gravity.tools.inputs.arms import ConfiguredArm, node_values, read_arm
 from exo_gravity.tools.inputs.parameter_file import load, packaged_config
 

@@ -29,7 +29,7 @@ from exo_gravity.nodes.ros.diagnostics import OK, WARN, Diagnostics
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.sim import SimulatedImu, VirtualWearer
 from exo_gravity.sim.device import MAX_CATCH_UP
-from exo_gravity.sim.device_params import SIMULATOR, device_of, imu_of, set_faults
+from exo_gravity.sim.params import SIMULATOR, device_of, imu_of, set_faults
 from exo_gravity.sim.trunk_motion import TrunkState
 
 TRUNK_SPEED = 0.5  # rad/s at which the trunk moves to a new tilt
