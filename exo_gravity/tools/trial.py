@@ -5,8 +5,8 @@ The folder of the trial holds the parameters, the recording, the nodes' log and 
 of the recorder lets the arm down, and the trial reports what was recorded until then.
 
 With --attach it starts the recorder alone, for arms that are carried already: the operator's panel runs its trials so.
-It then prints one JSON object per line: {"folder": PATH}; while it records, ten times a second {"step": -1.., "left": s};
-after the script {"phase": "reporting"}; and last {"problem": TEXT}, '' for none.
+It then prints one JSON object per line: {"folder": PATH}; ten times a second while it records {"step": -1.., "left": s}
+after the script {"phase": "reporting"}; last {"problem": TEXT}, '' for none.
 
 Exit code 0: the arm held. 1: it did not hold, or the trial did not finish. 2: wrong use or wrong file. 3: the simulated
 device could not run in real time because this computer was too busy.

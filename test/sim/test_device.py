@@ -74,14 +74,12 @@ def test_tilting_the_trunk_moves_the_arm():
 
 def test_the_wearer_starts_after_the_delay():
     device = make_device()
-    assert device.elapsed is None
     device.advance(1.0)
     wearer = VirtualWearer(
         TrialScript.parse({"name": "test", "steps": [{"move": list(RAISED), "over": 2.0}, {"hold": 1.0}]})
     )
     device.start(wearer, delay=0.5)
     device.advance(0.4)
-    assert device.elapsed == pytest.approx(-0.1)
     assert wearer.step is None
     device.advance(2.0)
     assert wearer.step == 0

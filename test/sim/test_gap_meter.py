@@ -2,7 +2,7 @@
 
 import pytest
 
-from exo_gravity.sim.gap_meter import GapMeter
+from exo_gravity.sim.device import GapMeter
 
 
 def passes(meter, times, powered=True, commanded=True):

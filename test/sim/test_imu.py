@@ -134,8 +134,7 @@ def test_the_same_seed_gives_the_same_samples():
     [
         ({"rotation_trunk_from_imu": (0, 0, 0, 2)}, "rotation_trunk_from_imu"),
         ({"rate": 0.0}, "rate"),
-        ({"gyroscope_bias": -1.0}, "gyroscope_bias"),
-        ({"accelerometer_range": 0.0}, "accelerometer_range"),
+        ({"gravity": -1.0}, "gravity"),
         ({"delay": -0.1}, "delay"),
     ],
 )

@@ -22,9 +22,9 @@ from exo_gravity.core.trial.recording import Recording
 from exo_gravity.core.trial.script import TRUNK_ACTIONS, TrialScript
 from exo_gravity.hardware.trunk.orientation_filter import VQF
 from exo_gravity.hardware.trunk.trunk_estimator import ImuSample, TrunkEstimator
-from exo_gravity.sim.device_params import SIMULATOR, device_of, imu_of, set_faults
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu, measured_tilt
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial, TrunkReading
+from exo_gravity.sim.params import SIMULATOR, device_of, imu_of, set_faults
 from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.tools.inputs.arms import named, node_values, read_arm
 from exo_gravity.tools.inputs.parameter_file import Nodes, load
