@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 import yaml
@@ -17,7 +14,6 @@ from exo_gravity.bag.writer import BagWriter, is_complete, offered_qos, repair
 from exo_gravity.core.errors import DataError
 from exo_gravity.tools.report import main
 
-from ..support import ROOT
 from ..support import synthetic_bags as made
 
 
@@ -65,20 +61,12 @@ def test_the_copy_has_an_index_and_metadata_with_types_and_quality_of_service(cu
     assert len(messages) == count
 
 
-def test_a_killed_recorders_recording_is_repaired_on_the_command_line(tmp_path, capsys):
-    path = tmp_path / "bag"
-    command = [sys.executable, "-m", "test.support.bag_processes", "until_killed", str(path)]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
-    for _ in range(8):
-        process.stdout.readline()
-    process.kill()
-    process.communicate()
-    assert main(["--repair", str(path)]) == 0
-    assert f"Written: {path}_repaired, complete, with " in capsys.readouterr().out
-    assert is_complete(tmp_path / "bag_repaired")
-    assert main(["--repair", str(path)]) == 2  # not twice
+def test_a_recording_is_repaired_once_on_the_command_line(cut, capsys):
+    assert main(["--repair", str(cut)]) == 0
+    assert f"Written: {cut}_repaired, complete, with " in capsys.readouterr().out
+    assert main(["--repair", str(cut)]) == 2  # not twice
     assert "exists already" in capsys.readouterr().err
-    assert main(["--repair", str(tmp_path / "bag_repaired")]) == 0
+    assert main(["--repair", f"{cut}_repaired"]) == 0
     assert "nothing to repair" in capsys.readouterr().out
 
 
