@@ -160,20 +160,13 @@ class Guard:
         changes = scope["type"] == "websocket" or scope["method"] not in ("GET", "HEAD")
         if changes and not is_same_origin(headers.get("origin", ""), host):
             return PlainTextResponse("403: this request does not come from the panel's page", 403)
-        if changes and int(headers.get("content-length", "0") or 0) > MAX_BODY:
-            return PlainTextResponse("413: too long", 413)
-        session = HTTPConnection(scope).cookies.get(COOKIE, "")
-        bearer = headers.get("authorization", "").removeprefix("Bearer ")
-        if scope["path"] == "/login" or self._access.allows(session) or self._bears(bearer, scope):
+        if scope["path"] == "/login" or self._access.allows(HTTPConnection(scope).cookies.get(COOKIE, "")):
             return None
         address = _address(scope)
         given = parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [""])[0]
         if scope["type"] == "http" and given and self._access.is_token(given, address):
             return self._opened(scope)  # the address with the token, as the log shows it
         return self._ask(self._access.is_blocked(address))
-
-    def _bears(self, bearer: str, scope: Scope) -> bool:
-        return bool(bearer) and self._access.is_token(bearer, _address(scope))
 
     async def _login(self, scope: Scope, headers: Headers, receive: Receive) -> Response:
         if scope["method"] != "POST":
