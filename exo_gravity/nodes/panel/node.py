@@ -16,7 +16,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from rcl_interfaces.msg import ParameterEvent
 from rcl_interfaces.srv import SetParametersAtomically
@@ -30,7 +30,7 @@ from std_srvs.srv import SetBool, Trigger
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.nodes.panel.setup import Setup
 from exo_gravity.nodes.ros.hot_path import HotPath
-from exo_gravity.nodes.ros.messages import OK
+from exo_gravity.nodes.ros.messages import OK, Diagnostics
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.panel.control import Control
@@ -214,7 +214,7 @@ class Panel(Node):
         values = declare(self, [replace(param, fixed=param.name != "token") for param in PANEL])
         self.undeclare_parameter("token")
         self.failure: Exception | None = None  # ends the node, see run()
-        self._notes = self.create_publisher(DiagnosticArray, "/diagnostics", 50)
+        self._diagnostics = Diagnostics(self)
         self._noted = 0
         self._arms = Arms(self)
         self._tilt: tuple[float, Vector3Stamped] | None = None
@@ -255,11 +255,7 @@ class Panel(Node):
     def _note(self, text: str) -> None:
         """Write `text` to the log, and to /diagnostics, which recordings hold."""
         self._noted += 1
-        self.get_logger().info(text)
-        status = DiagnosticStatus(level=OK, name="panel", message=f"action {self._noted}: {text}")
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = self.get_clock().now().to_msg()
-        self._notes.publish(array)
+        self._diagnostics.report(OK, f"action {self._noted}: {text}")
 
     def _send_state(self) -> None:
         if not self._server.is_running:
