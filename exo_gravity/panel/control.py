@@ -23,7 +23,7 @@ import math
 import secrets
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.panel.params import SETTABLE
@@ -40,49 +40,6 @@ FORGOTTEN = 600.0  # s after which a page that is gone loses its number
 MAX_PAGES = 32
 BURST, REFILL = 20.0, 10.0  # requests that a page may send at once, and per second
 RETRY = 1.0  # s between two attempts to let the arms down
-
-
-class Arms(Protocol):
-    """The arms. Each call returns '' or why it failed."""
-
-    @property
-    def names(self) -> Collection[str]:
-        """The arms that are or were present."""
-
-    async def let_down(self, arm: str) -> str:
-        """Let one arm down."""
-
-    async def enable(self, arm: str) -> str:
-        """Enable one arm."""
-
-    async def clear_fault(self, arm: str) -> str:
-        """Clear the latched fault of one arm."""
-
-    async def set(self, arm: str, values: Mapping[str, Any]) -> str:
-        """Set parameters of the arm's compensator together."""
-
-
-class Files(Protocol):
-    """Recordings, trials and saved parameters. Each call returns '' or why it failed."""
-
-    @property
-    def trials(self) -> Collection[str]:
-        """The trials to choose from."""
-
-    async def record(self) -> str:
-        """Start a recording."""
-
-    async def stop_recording(self) -> str:
-        """End the recording."""
-
-    async def trial(self, name: str) -> str:
-        """Start a trial."""
-
-    async def stop_trial(self) -> str:
-        """End the trial early."""
-
-    async def save(self) -> str:
-        """Write the parameters in force as YAML."""
 
 
 @dataclass(frozen=True)
@@ -153,14 +110,17 @@ class Reply(NamedTuple):
 class Control:
     """The pages, which of them holds control, and what is done for them.
 
-    note: called with a sentence for the log and the recording. clock: monotonic s. dead_man: whether the arms are let
-    down when the page that holds control is gone; until they are, only a page that takes control replaces it.
+    arms: has their `names` and, for each kind of request with the key "arm", a coroutine function that takes the arm,
+    and `set` the values too. files: has the names of the `trials` and such functions for the other requests, of which
+    `trial` takes a name. Each returns '' or why it failed. note: called with a sentence for the log and the recording.
+    clock: monotonic s. dead_man: whether the arms are let down when the page that holds control is gone; until they
+    are, only a page that takes control replaces it.
     """
 
     def __init__(
         self,
-        arms: Arms,
-        files: Files,
+        arms: Any,
+        files: Any,
         note: Callable[[str], object],
         clock: Callable[[], float],
         dead_man: bool = False,
@@ -227,27 +187,14 @@ class Control:
         return Reply(status, text)
 
     async def _carry_out(self, action: Action, page: Page | None) -> str:
-        match action.kind:
-            case "let_down":
-                return await self._let_down([action.arm] if action.arm else self._arms.names)
-            case "take" | "release":
-                self.holder = page if action.kind == "take" else None
-                return ""
-            case "enable":
-                return await self._arms.enable(action.arm)
-            case "clear_fault":
-                return await self._arms.clear_fault(action.arm)
-            case "set":
-                return await self._arms.set(action.arm, action.values)
-            case "trial":
-                return await self._files.trial(action.name)
-            case "stop_trial":
-                return await self._files.stop_trial()
-            case "record":
-                return await self._files.record()
-            case "stop_recording":
-                return await self._files.stop_recording()
-        return await self._files.save()
+        if action.kind == "let_down":
+            return await self._let_down([action.arm] if action.arm else self._arms.names)
+        if action.kind in ("take", "release"):
+            self.holder = page if action.kind == "take" else None
+            return ""
+        function = getattr(self._arms if action.arm else self._files, action.kind)
+        problem: str = await function(*filter(None, (action.arm, action.values, action.name)))
+        return problem
 
     async def _let_down(self, arms: Collection[str]) -> str:
         """Let `arms` down, all at once; return '' or which failed and why. Raises nothing."""

@@ -43,7 +43,8 @@ FULL, REPLACED = 4000, 4001  # why a live connection was closed: too many pages;
 class LivePage:
     """One live connection; holds the newest messages that it has not sent yet, by type."""
 
-    def __init__(self) -> None:
+    def __init__(self, connection: WebSocket) -> None:
+        self.connection = connection
         self._news = asyncio.Event()
         self._waiting: dict[str, str] = {}
 
@@ -52,14 +53,14 @@ class LivePage:
         self._waiting[kind] = text
         self._news.set()
 
-    async def send(self, connection: WebSocket) -> None:
+    async def send(self) -> None:
         """Send what `put` gets, until it is cancelled."""
         while True:
             await self._news.wait()
             self._news.clear()
             waiting, self._waiting = self._waiting, {}
             for text in waiting.values():
-                await connection.send_text(text)
+                await self.connection.send_text(text)
 
 
 class PanelServer:
@@ -82,7 +83,7 @@ class PanelServer:
         self.access = Access(host, token, clock)
         self._control = control
         self._report = report
-        self._pages: dict[str, tuple[LivePage, WebSocket]] = {}  # by secret
+        self._pages: dict[str, LivePage] = {}  # by secret
         self._setup = ""  # none yet
         self._number = 0  # of the newest state
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -117,7 +118,7 @@ class PanelServer:
 
     @property
     def is_running(self) -> bool:
-        """Whether the thread runs."""
+        """Whether it still serves."""
         return self._thread.is_alive()
 
     def publish(self, state: Mapping[str, Any]) -> None:
@@ -127,7 +128,7 @@ class PanelServer:
     def publish_setup(self, setup: Mapping[str, Any]) -> None:
         """Send what changes rarely to all pages, and to those that open later."""
         self._setup = json.dumps({"type": "setup", **setup})
-        self._on_loop(self._send_setup, self._setup)
+        self._on_loop(self._send, "setup", self._setup)
 
     def _on_loop(self, function: Callable[..., None], *args: Any) -> None:
         if self._loop is not None:
@@ -153,13 +154,11 @@ class PanelServer:
             return
         holder, gone = self._control.holder, self._control.is_gone()
         of_holder = {"page": holder.number, "address": holder.address, "gone": gone} if holder else None
-        text = json.dumps({"type": "state", "number": self._number, "control": of_holder, **state})
-        for page, _ in self._pages.values():
-            page.put("state", text)
+        self._send("state", json.dumps({"type": "state", "number": self._number, "control": of_holder, **state}))
 
-    def _send_setup(self, text: str) -> None:
-        for page, _ in self._pages.values():
-            page.put("setup", text)
+    def _send(self, kind: str, text: str) -> None:
+        for page in self._pages.values():
+            page.put(kind, text)
 
     async def _on_live(self, connection: WebSocket) -> None:
         await connection.accept()
@@ -174,20 +173,19 @@ class PanelServer:
 
     async def _serve(self, connection: WebSocket, page: Page) -> None:
         if page.secret in self._pages:
-            await self._pages[page.secret][1].close(REPLACED)
-        live = LivePage()
-        self._pages[page.secret] = live, connection
+            await self._pages[page.secret].connection.close(REPLACED)
+        live = self._pages[page.secret] = LivePage(connection)
         live.put("page", json.dumps({"type": "page", "page": page.secret, "number": page.number}))
         if self._setup:
             live.put("setup", self._setup)
-        sender = asyncio.create_task(live.send(connection))
+        sender = asyncio.create_task(live.send())
         try:
             while True:
                 _given(await connection.receive_json(), "seen", int)
                 self._control.confirm(page)
         finally:
             sender.cancel()
-            if self._pages.get(page.secret, (None,))[0] is live:
+            if self._pages.get(page.secret) is live:
                 del self._pages[page.secret]
                 page.connected = False
 

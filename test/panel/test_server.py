@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +13,9 @@ import httpx
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.panel.server import PanelServer
 
 from ..support.panel_stage import Stage
 
@@ -135,7 +139,11 @@ def test_the_address_with_the_token_opens_the_page_and_leaves_the_address(stages
     opened = get(stage, params={"token": TOKEN})
     assert (opened.status_code, opened.headers["location"]) == (303, "/")
     assert get(stage, params={"token": "wrong"}).status_code == 401
-    assert get(stage, headers={"authorization": f"Bearer {TOKEN}"}).status_code == 200
+
+
+def test_a_port_in_use_is_an_error_that_names_it(stage):
+    with pytest.raises(ParameterError, match=f"{stage.port}.* must be a free address"):
+        PanelServer("127.0.0.1", stage.port, "", stage.control, stage.reports.get, dict, time.monotonic)
 
 
 def test_every_page_gets_setup_and_state_and_a_reloaded_page_stays_the_same(stages):

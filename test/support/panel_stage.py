@@ -145,6 +145,7 @@ class Stage:
         self.url = f"http://127.0.0.1:{self.port}/"
         self.server = PanelServer(host, self.port, token, self.control, self.reports.get, dict, clock)
         self.setup = Setup({"language": "en", "dead_man": dead_man, "trials": list(self.files.trials)})
+        self._bridge = values_of(CAN_BRIDGE, BUS, "can.options")
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._play, daemon=True)
         self.server.start()
@@ -157,13 +158,12 @@ class Stage:
         self.setup.close()
 
     def _play(self) -> None:
-        self.setup.discover(self.arms.names)
         while not self._stopping.wait(PERIOD):
-            for arm in self.arms.names:
-                names = {"joint_names": self.arms.settings[arm]["joint_names"]}
-                self.setup.note(f"/{arm}/can_bridge", values_of(CAN_BRIDGE, {**BUS, **names}, "can.options"))
-                self.setup.note(f"/{arm}/compensator", self.arms.settings[arm])
-            news = self.setup.news()
+            parameters: dict[str, dict[str, Any]] = {}
+            for arm, settings in self.arms.settings.items():
+                parameters[f"/{arm}/compensator"] = dict(settings)
+                parameters[f"/{arm}/can_bridge"] = {**self._bridge, "joint_names": settings["joint_names"]}
+            news = self.setup.news(self.arms.names, parameters)
             if news is not None:
                 self.server.publish_setup(news)
             now = time.monotonic()

@@ -16,7 +16,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from rcl_interfaces.msg import ParameterEvent
 from rcl_interfaces.srv import SetParametersAtomically
@@ -28,9 +28,9 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity.core.errors import ExoGravityError
-from exo_gravity.nodes.panel.setup import BRIDGE, COMPENSATOR_NODE, Setup
+from exo_gravity.nodes.panel.setup import Setup
 from exo_gravity.nodes.ros.hot_path import HotPath
-from exo_gravity.nodes.ros.messages import OK
+from exo_gravity.nodes.ros.messages import OK, Diagnostics
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.panel.control import Control
@@ -43,6 +43,7 @@ DISCOVERY_PERIOD = 0.5  # s between two searches for nodes
 CALL_TIMEOUT = 3.0  # s, longer than can_bridge itself waits
 ABSENT_TIMEOUT = 0.5  # s, where the service seems to be absent
 TILT = "/imu/pitch_yaw"
+BRIDGE, COMPENSATOR = "can_bridge", "compensator"
 
 
 class ArmClient:
@@ -56,7 +57,7 @@ class ArmClient:
         self._efforts = HotPath(node, JointState, f"{space}/effort_commands", self._on_efforts)
         self.enable = node.create_client(SetBool, f"{space}/{BRIDGE}/enable")
         self.clear_fault = node.create_client(Trigger, f"{space}/{BRIDGE}/clear_fault")
-        self.set = parameter_client(node, f"{space}/{COMPENSATOR_NODE}")
+        self.set = parameter_client(node, f"{space}/{COMPENSATOR}")
 
     def state(self, now: float) -> dict[str, Any]:
         """Take the newest messages, and return what the page shows."""
@@ -72,39 +73,71 @@ class ArmClient:
         self.commands = Joints(time.monotonic(), list(message.name), effort=list(message.effort))
 
 
-class ArmClients:
-    """All arms, by name: 'right', 'left', or the namespace that a parameter file gives them.
+class Arms:
+    """All arms, by name: 'right', 'left', or the namespace that a parameter file gives them; and all other nodes.
 
-    `Arms` of `panel.control`. An arm stays in the list when its nodes end: it shows that they do not answer.
+    An arm stays in the list when its nodes end: it shows that they do not answer.
     """
 
     def __init__(self, node: Node) -> None:
         self.clients: dict[str, ArmClient] = {}
+        self.known: dict[str, dict[str, Any]] = {}  #: the newest parameters of each node by full name, also if it ended
         self._node = node
+        self._parameters: dict[str, NodeParameters] = {}
+        self._wearers: dict[str, Client] = {}  # the virtual ones, by their simulator's name
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
+        node.create_subscription(ParameterEvent, "/parameter_events", self._on_parameter_event, 50)
 
     @property
     def names(self) -> Collection[str]:
         """The arms that are or were present."""
         return tuple(self.clients)
 
-    def discover(self, nodes: Collection[str]) -> None:
-        """Add the arms among the full node names."""
-        for full_name in nodes:
-            arm, _, leaf = full_name.strip("/").rpartition("/")
+    def discover(self) -> None:
+        """Add the arms and parameters of new nodes, and read parameters that have changed."""
+        found = self._node.get_node_names_and_namespaces()
+        nodes = {f"{space.rstrip('/')}/{name}" for name, space in found if not name.startswith("_")}
+        nodes.discard(self._node.get_fully_qualified_name())
+        for name in nodes - set(self._parameters):
+            self._parameters[name] = NodeParameters(self._node, name, partial(self.known.__setitem__, name))
+            arm, _, leaf = name.strip("/").rpartition("/")
             if leaf == BRIDGE and arm and arm not in self.clients:
                 self.clients[arm] = ArmClient(self._node, arm)
+            if leaf == "simulator" and name not in self._wearers:
+                self._wearers[name] = parameter_client(self._node, name)
+        for name in set(self._parameters) - nodes:
+            self._parameters.pop(name).destroy()
+        for parameters in self._parameters.values():
+            parameters.update()
 
     def state(self) -> dict[str, Any]:
         """Return what the page shows of each arm."""
         now = time.monotonic()
         return {name: client.state(now) for name, client in sorted(self.clients.items(), reverse=True)}
 
-    def bridge_states(self) -> dict[str, str | None]:
+    # For a trial (`Device` of exo_gravity.panel.recordings); called on the web server's thread
+
+    def parameters(self) -> dict[str, dict[str, Any]]:
+        """Return the parameters of every node that runs, by full name."""
+        of_nodes = sorted(self._parameters.copy().items())
+        return {name: dict(parameters.values) for name, parameters in of_nodes if parameters.is_present}
+
+    def states(self) -> dict[str, str | None]:
         """Return the state that each bridge reports; None if it is silent."""
         now = time.monotonic()
         of_arms = {name: client.bridge for name, client in self.clients.items()}
         return {name: s.values.get("state") if now - s.time < SILENT else None for name, s in of_arms.items()}
+
+    async def perform(self, script: str) -> str:
+        """Let the virtual wearers perform the script at this path; return '' or why not."""
+        problems = []
+        for name, client in sorted(self._wearers.items()):
+            for path in ("", script):  # a script that is set already would not start again
+                problem = await call(client, parameter_request({"trial": path}))
+            problems += [f"{name}: {problem}"] if problem else []
+        return "; ".join(problems)
+
+    # For the pages (`Control`); called on the web server's thread; each returns '' or why it failed
 
     async def let_down(self, arm: str) -> str:
         """Let one arm down. The request is sent even where the service seems to be absent."""
@@ -131,8 +164,12 @@ class ArmClients:
             newest = Status(int.from_bytes(status.level, "big"), status.message, values, time.monotonic())
             if leaf == BRIDGE:
                 self.clients[arm].bridge = newest
-            elif leaf == COMPENSATOR_NODE:
+            elif leaf == COMPENSATOR:
                 self.clients[arm].compensator = newest
+
+    def _on_parameter_event(self, event: ParameterEvent) -> None:
+        if event.node in self._parameters:
+            self._parameters[event.node].refresh()
 
 
 def parameter_client(node: Node, name: str) -> Client:
@@ -177,16 +214,13 @@ class Panel(Node):
         values = declare(self, [replace(param, fixed=param.name != "token") for param in PANEL])
         self.undeclare_parameter("token")
         self.failure: Exception | None = None  # ends the node, see run()
-        self._notes = self.create_publisher(DiagnosticArray, "/diagnostics", 50)
+        self._diagnostics = Diagnostics(self)
         self._noted = 0
-        self._arms = ArmClients(self)
-        self._of_nodes: dict[str, NodeParameters] = {}
+        self._arms = Arms(self)
         self._tilt: tuple[float, Vector3Stamped] | None = None
         self._tilts = HotPath(self, Vector3Stamped, TILT, self._on_tilt)
-        self.create_subscription(ParameterEvent, "/parameter_events", self._on_parameter_event, 50)
-        self._wearers: dict[str, Client] = {}  # the virtual ones, by their simulator's name
         scripts = scripts_folder(values["trials"])
-        self._recordings = Recordings(values["output"], scripts, self, self._note, time.monotonic)
+        self._recordings = Recordings(values["output"], scripts, self._arms, self._note, time.monotonic)
         own = {name: values[name] for name in ("language", "dead_man")}
         self._setup = Setup({**own, "trials": list(self._recordings.trials)})
         control = Control(self._arms, self._recordings, self._note, time.monotonic, values["dead_man"])
@@ -196,10 +230,10 @@ class Panel(Node):
             missing = f"the Python package {error.name} is not installed: pip install 'exo_gravity[panel]'"
             raise ExoGravityError(missing) from None
         address = (values["host"], values["port"], values["token"])
-        self._server = PanelServer(*address, control, self._recordings.report, self.parameters, time.monotonic)
+        self._server = PanelServer(*address, control, self._recordings.report, self._arms.parameters, time.monotonic)
         self._server.start()
         self.create_timer(STATE_PERIOD, self._send_state)
-        self.create_timer(DISCOVERY_PERIOD, self._discover)
+        self.create_timer(DISCOVERY_PERIOD, self._arms.discover)
         self._log_address(values["host"], values["port"])
 
     def close(self) -> None:
@@ -222,17 +256,13 @@ class Panel(Node):
     def _note(self, text: str) -> None:
         """Write `text` to the log, and to /diagnostics, which recordings hold."""
         self._noted += 1
-        self.get_logger().info(text)
-        status = DiagnosticStatus(level=OK, name="panel", message=f"action {self._noted}: {text}")
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = self.get_clock().now().to_msg()
-        self._notes.publish(array)
+        self._diagnostics.report(OK, f"action {self._noted}: {text}")
 
     def _send_state(self) -> None:
         if not self._server.is_running:
             self.failure = RuntimeError("the web server has ended")
         self._tilts.poll()
-        news = self._setup.news()
+        news = self._setup.news(self._arms.names, self._arms.known)
         if news is not None:
             self._server.publish_setup(news)
         state = {"arms": self._arms.state(), "tilt": self._tilt_state(), **self._recordings.state()}
@@ -246,45 +276,6 @@ class Panel(Node):
 
     def _on_tilt(self, message: Vector3Stamped, _info: dict[str, Any]) -> None:
         self._tilt = time.monotonic(), message
-
-    def _discover(self) -> None:
-        found = self.get_node_names_and_namespaces()
-        nodes = {f"{space.rstrip('/')}/{name}" for name, space in found if not name.startswith("_")}
-        nodes.discard(self.get_fully_qualified_name())
-        self._arms.discover(nodes)
-        for name in nodes - set(self._of_nodes):
-            self._of_nodes[name] = NodeParameters(self, name, partial(self._setup.note, name))
-            if name.endswith("/simulator") and name not in self._wearers:
-                self._wearers[name] = parameter_client(self, name)
-        for name in set(self._of_nodes) - nodes:
-            self._of_nodes.pop(name).destroy()
-        for parameters in self._of_nodes.values():
-            parameters.update()
-        self._setup.discover(self._arms.names)
-
-    def _on_parameter_event(self, event: ParameterEvent) -> None:
-        if event.node in self._of_nodes:
-            self._of_nodes[event.node].refresh()
-
-    # What a trial needs (`Device` of exo_gravity.panel.recordings); called on the web server's thread
-
-    def parameters(self) -> dict[str, dict[str, Any]]:
-        """Return the parameters of every node by full name."""
-        of_nodes = sorted(self._of_nodes.copy().items())
-        return {name: dict(parameters.values) for name, parameters in of_nodes if parameters.is_present}
-
-    def states(self) -> dict[str, str | None]:
-        """Return the state of each arm; None if its bridge is silent."""
-        return self._arms.bridge_states()
-
-    async def perform(self, script: str) -> str:
-        """Let the virtual wearers perform the script at this path; return '' or why not."""
-        problems = []
-        for name, client in sorted(self._wearers.items()):
-            for path in ("", script):  # a script that is set already would not start again
-                problem = await call(client, parameter_request({"trial": path}))
-            problems += [f"{name}: {problem}"] if problem else []
-        return "; ".join(problems)
 
 
 def main() -> None:

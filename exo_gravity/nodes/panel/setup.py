@@ -17,84 +17,62 @@ from exo_gravity.core.view.urdf import urdf
 from exo_gravity.nodes.ros.budget_thread import BudgetThread
 from exo_gravity.panel.view import arm_setup, scene_of
 
-BRIDGE, COMPENSATOR_NODE = "can_bridge", "compensator"
 WITHOUT_SUPPORT = frozenset({"support", "mode"})  # which the budget does not depend on
+Values = Mapping[str, Any]
 
 
 class Setup:
-    """Collects the parameters of the nodes, and returns `news` for the pages when something has changed."""
+    """The messages of type `setup`. own: settings of the panel that the pages get too."""
 
-    def __init__(self, own: Mapping[str, Any]) -> None:
-        """Take `own`: settings of the panel that the pages get too."""
+    def __init__(self, own: Values) -> None:
         self._own = own
-        self._arms: defaultdict[str, ArmParameters] = defaultdict(ArmParameters)
-        self._shown: Collection[str] = ()
-        self._changed = True
+        self._limits: defaultdict[str, SupportLimit] = defaultdict(SupportLimit)
+        self._sent: Any = None
 
-    def note(self, node: str, values: Mapping[str, Any]) -> None:
-        """Take the parameters of a node by its full name."""
-        arm, _, leaf = node.strip("/").rpartition("/")
-        if leaf in (BRIDGE, COMPENSATOR_NODE):
-            self._changed |= self._arms[arm].take(leaf, values)
+    def news(self, arms: Collection[str], parameters: Mapping[str, Values]) -> dict[str, Any] | None:
+        """Return the message if anything has changed since the last call, else None. Starts budgets where due.
 
-    def discover(self, arms: Collection[str]) -> None:
-        """Take the names of the arms."""
-        self._changed |= tuple(arms) != tuple(self._shown)
-        self._shown = tuple(arms)
-
-    def news(self) -> dict[str, Any] | None:
-        """Return everything if anything has changed since the last call, else None. Starts budgets where due."""
-        shown = {name: self._arms[name] for name in self._shown}
-        self._changed |= any([arm.update_budget() for arm in shown.values()])
-        if not self._changed:
+        arms: their names. parameters: the newest of each node by its full name.
+        """
+        nodes = {
+            arm: (parameters.get(f"/{arm}/can_bridge", {}), parameters.get(f"/{arm}/compensator", {})) for arm in arms
+        }
+        limits = {arm: self._limits[arm].update(*both) for arm, both in nodes.items()}
+        if self._sent == (nodes, limits):
             return None
-        self._changed = False
-        arms = {name: arm_setup(arm.bridge, arm.compensator, arm.support_limit) for name, arm in shown.items()}
-        return {**self._own, "arms": arms, "scene": _scene(shown.values())}
+        self._sent = nodes, limits
+        setups = {arm: arm_setup(*both, limits[arm]) for arm, both in nodes.items()}
+        return {**self._own, "arms": setups, "scene": _scene([both for both in nodes.values() if all(both)])}
 
     def close(self) -> None:
         """Start no further budget."""
-        for arm in self._arms.values():
-            arm.budget.close()
+        for limit in self._limits.values():
+            limit.thread.close()
 
 
-class ArmParameters:
-    """The parameters of the two nodes of one arm, and the support that follows from them."""
+class SupportLimit:
+    """The largest support 0..1 of one arm within rated torque in the whole workspace."""
 
     def __init__(self) -> None:
-        self.bridge: dict[str, Any] = {}
-        self.compensator: dict[str, Any] = {}
-        #: the largest support 0..1 within rated torque in the whole workspace, 0 if the robot alone needs more; None
-        #: without a wearer, and while it is not known
-        self.support_limit: float | None = None
-        self.budget = BudgetThread()
+        self.thread = BudgetThread()
+        self._checked: Any = None
         self._request: BudgetRequest | None = None
+        self._support: float | None = None
 
-    def take(self, leaf: str, values: Mapping[str, Any]) -> bool:
-        """Take the values of one node; return whether they are new."""
-        before = self.bridge if leaf == BRIDGE else self.compensator
-        if values == before:
-            return False
-        changed = {name for name in {**before, **values} if before.get(name) != values.get(name)}
-        before.clear()
-        before.update(values)
-        if self.bridge and self.compensator and not changed <= WITHOUT_SUPPORT:
-            self._request = budget_request(self.bridge, self.compensator)
-        return True
-
-    def update_budget(self) -> bool:
-        """Collect a finished budget or start one; return whether `support_limit` is new."""
+    def update(self, bridge: Values, compensator: Values) -> float | None:
+        """Return the support, 0 if the robot alone needs more; None without a wearer, and while it is not known."""
+        relevant = bridge, {name: value for name, value in compensator.items() if name not in WITHOUT_SUPPORT}
+        if self._checked != relevant:
+            self._checked, self._request = relevant, _request(bridge, compensator)
         if self._request is None:
-            is_new, self.support_limit = self.support_limit is not None, None
-            return is_new
-        if not self.budget.update(self._request):
-            return False
-        result = self.budget.result
-        self.support_limit = (largest_support(result) or 0.0) if isinstance(result, tuple) else None
-        return True
+            self._support = None
+        elif self.thread.update(self._request):
+            budgets = self.thread.result
+            self._support = (largest_support(budgets) or 0.0) if isinstance(budgets, tuple) else None
+        return self._support
 
 
-def budget_request(bridge: Mapping[str, Any], compensator: Mapping[str, Any]) -> BudgetRequest | None:
+def _request(bridge: Values, compensator: Values) -> BudgetRequest | None:
     """Return the budget with the wearer's whole arm, None without a wearer or with invalid parameters."""
     try:
         values = values_of(COMPENSATOR, compensator)
@@ -107,9 +85,8 @@ def budget_request(bridge: Mapping[str, Any], compensator: Mapping[str, Any]) ->
         return None
 
 
-def _scene(arms: Collection[ArmParameters]) -> dict[str, Any] | None:
-    complete = [arm for arm in arms if arm.bridge and arm.compensator]
+def _scene(nodes: Collection[tuple[Values, Values]]) -> dict[str, Any] | None:
     try:
-        return scene_of(urdf([described(arm.compensator, arm.bridge) for arm in complete])) if complete else None
+        return scene_of(urdf([described(compensator, bridge) for bridge, compensator in nodes])) if nodes else None
     except (ExoGravityError, KeyError):
         return None

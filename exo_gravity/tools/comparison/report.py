@@ -16,8 +16,7 @@ from matplotlib.figure import Figure
 
 from exo_gravity.core.model.gravity import gravity_torque, paper_static_torque
 from exo_gravity.tools.comparison.validation import Part, Row, Validation, rms
-from exo_gravity.tools.inputs.references import PAPER_ANALYTICAL, PAPER_ANFIS, PAPER_SECONDS
-from exo_gravity.tools.inputs.references import gravload
+from exo_gravity.tools.inputs.references import PAPER_ANALYTICAL, PAPER_ANFIS, PAPER_SECONDS, gravload
 
 FLOOR, CEILING = 1e-7, 1.0  # Nm, ends of the colour scale
 FIGURE_GRID = (56, 56, 7)  # positions of joints 2, 3, 4 in the workspace figure
