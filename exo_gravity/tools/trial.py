@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 # One position code over a minute is 0.02 degrees, so the rate over a much shorter hold means little.
 LONG_HOLD = 30.0  # s
 MAX_RATE = 0.2  # deg/min
+START_TIME = 1.0  # s for a panel to start the virtual wearer, once the recorder runs
 
 
 def packaged_trials() -> dict[str, Path]:
@@ -101,7 +102,7 @@ def _hold_durations(script: TrialScript) -> list[float]:
 def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, console: Console) -> int:
     """Run and report a trial; return the exit code. Raises ExoGravityError."""
     from exo_gravity.tools.reporting import trial_report
-    from exo_gravity.tools.trials.run import ADVICE, BUSY_CODE, is_guided
+    from exo_gravity.tools.trials.run import ADVICE, BUSY_CODE, TrialEnd, is_guided, prepare, run_attempts
 
     path, script = read_script(options.name)
     stopped = stop_on_signals()
@@ -110,14 +111,22 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
     if options.offline:
         if clip:
             video.select_backend()  # before the simulated device imports MuJoCo
-        bag, end = _offline(params, path, script, folder, console, stopped)
+        with extras("trial", "sim"):
+            from exo_gravity.tools.trials.offline import run_offline, simulated_trials
+        trials = simulated_trials(params, script)
+        written = prepare(params, path, folder, recorded=False)
+        bag, trouble = run_offline(trials, written, console, stopped.is_set)
+        end = TrialEnd(trouble, int(bool(trouble)))
+    elif options.attach:
+        end = _attached(options.attach == "guided", path, script, folder, console, stopped)
+        bag = _recorded(folder, end)
     else:
-        bag, end = _in_real_time(options, params, path, script, folder, console, stopped)
+        end = run_attempts(params, path, script, folder, console, stopped)
+        bag = _recorded(folder, end)
     trouble, code = end.trouble, end.code
     if bag is not None:
         guided = options.attach == "guided" if options.attach else is_guided(params)
-        criteria = criteria_for(script, options.max_rate)
-        report = trial_report.analyse(bag, criteria, shortest_hold(script, guided))
+        report = trial_report.analyse(bag, criteria_for(script, options.max_rate), shortest_hold(script, guided))
         if guided and not trouble:
             trouble = missing_holds(script, report)
             code = int(bool(trouble))
@@ -138,45 +147,32 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
     return code
 
 
-def _offline(
-    params: Path, path: Path, script: TrialScript, folder: Path, console: Console, stopped: Stopping
-) -> tuple[Bag, TrialEnd]:
-    from exo_gravity.tools.trials.run import TrialEnd, prepare
-
-    with extras("trial", "sim"):
-        from exo_gravity.tools.trials.offline import run_offline, simulated_trials
-
-    trials = simulated_trials(params, script)
-    bag, trouble = run_offline(trials, prepare(params, path, folder, recorded=False), console, stopped.is_set)
-    return bag, TrialEnd(trouble, int(bool(trouble)))
-
-
-def _in_real_time(
-    options: argparse.Namespace,
-    params: Path,
-    path: Path,
-    script: TrialScript,
-    folder: Path,
-    console: Console,
-    stopped: Stopping,
-) -> tuple[Bag | None, TrialEnd]:
+def _recorded(folder: Path, end: TrialEnd) -> Bag | None:
+    """Return the recording of a trial; None if there is none because of what ended the trial. Raises DataError."""
     from exo_gravity.bag.reader import read_bag
-    from exo_gravity.tools.trials.run import Attachment, prepare, run_attempts, run_nodes
 
-    if options.attach:
-        attachment = Attachment(options.attach == "guided", _print_step)
-        only_recorder = prepare(None, path, folder, recorded=True)
-        _print_json(folder=str(folder))
-        end = run_nodes(only_recorder, script, folder, console, stopped, attachment)
-        _print_json(phase="reporting")
-    else:
-        end = run_attempts(params, path, script, folder, console, stopped)
     try:
-        return read_bag(folder / "bag"), end
+        return read_bag(folder / "bag")
     except DataError:
         if not end.trouble:
             raise
-        return None, end
+        return None
+
+
+def _attached(
+    guided: bool, path: Path, script: TrialScript, folder: Path, console: Console, stopped: Stopping
+) -> TrialEnd:
+    """Run the script on arms that are carried already; a fault is then never excused by a busy computer."""
+    from exo_gravity.tools.trials.run import TrialEnd, prepare, run_nodes
+    from exo_gravity.tools.trials.screen import LEAD, TrialScreen
+
+    params = prepare(None, path, folder, recorded=True)
+    _print_json(folder=str(folder))
+    # The clock leads, because a simulator's newest step may be that of an earlier trial.
+    screen = TrialScreen(script, guided, console, lead=LEAD if guided else START_TIME, on_progress=_print_step)
+    end = run_nodes(params, script, folder, screen, stopped)
+    _print_json(phase="reporting")
+    return TrialEnd(end.trouble, end.code)
 
 
 def _print_step(step: int, left: float) -> None:

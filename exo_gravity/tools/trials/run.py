@@ -28,7 +28,6 @@ from exo_gravity.tools.launcher import Launcher, Stopping
 from exo_gravity.tools.trials.screen import LEAD, TrialScreen
 
 RECORDER = "/recorder"
-SIMULATED_LEAD = 1.0  # s for the panel to start the virtual wearer, once the recorder runs
 START_TIMEOUT = 60.0  # s until the arm must be carried
 GRACE = 0.5  # s recorded after the last step
 RECORDER_TIMEOUT = 10.0  # s without a line from the recorder
@@ -60,14 +59,6 @@ class TrialEnd:
     trouble: str  #: why it ended before the script, or ''
     code: int  #: the exit code for that
     busy: str = ""  #: what was late because this computer was too busy, or ''
-
-
-@dataclass(frozen=True)
-class Attachment:
-    """A trial on nodes that run already, which the panel starts."""
-
-    guided: bool  #: whether a person performs the script, not a simulator
-    on_progress: Callable[[int, float], None]  #: called with each step and the time left in it, s
 
 
 def is_guided(params: Path) -> bool:
@@ -103,9 +94,12 @@ def run_attempts(
     params: Path, path: Path, script: TrialScript, folder: Path, console: Console, stopped: Stopping
 ) -> TrialEnd:
     """Run `script`, the file at `path`, on nodes in the new `folder`; repeat it if this computer was too busy."""
+    bridges = [node.lstrip("/") for node in load(params) if node.endswith("/can_bridge")]
+    guided = is_guided(params)
     for attempt in range(1, ATTEMPTS + 1):
         trial = prepare(params, path, folder, recorded=True)
-        end = run_nodes(trial, script, folder, console, stopped)
+        screen = TrialScreen(script, guided, console, bridges, LEAD if guided else None)
+        end = run_nodes(trial, script, folder, screen, stopped)
         if not (end.trouble and end.busy) or end.code == 2 or stopped.is_set() or attempt == ATTEMPTS:
             break
         folder.rename(f"{folder}_attempt_{attempt}")
@@ -114,17 +108,9 @@ def run_attempts(
     return end
 
 
-def run_nodes(
-    params: Path,
-    script: TrialScript,
-    folder: Path,
-    console: Console,
-    stopped: Stopping,
-    attached: Attachment | None = None,
-) -> TrialEnd:
+def run_nodes(params: Path, script: TrialScript, folder: Path, screen: TrialScreen, stopped: Stopping) -> TrialEnd:
     """Run the nodes of `params` until the script is done, a fault latches or `stopped` is set."""
     last_errors: dict[str, str] = {}
-    screen = _screen(params, script, console, attached)
     with (folder / "log.txt").open("w", 1, encoding="utf-8") as log, screen:
 
         def on_line(node: str, line: str) -> None:
@@ -143,10 +129,10 @@ def run_nodes(
         trouble = follow(screen, script, stopped, lambda: _exit_code(launcher, RECORDER), nodes)
         recorder_failed = _exit_code(launcher, RECORDER) is not None and launcher.dead() is None
         if nodes.is_alive():
-            screen.end("closing the recording" if attached else "letting the arm down and closing the recording")
+            screen.end("letting the arm down and closing the recording")
         ending.set()
         nodes.join()
-    busy = "" if attached or stopped.is_set() or recorder_failed else too_busy(screen.status)
+    busy = "" if stopped.is_set() or recorder_failed else too_busy(screen.status)
     if dead and dead[0]:
         node, code = dead[0]
         why = last_errors.get(node, f"see {folder / 'log.txt'}")
@@ -157,16 +143,6 @@ def run_nodes(
     if RECORDER in last_errors and trouble:
         trouble += f": {last_errors[RECORDER]}"
     return TrialEnd(trouble, int(bool(trouble)), busy)
-
-
-def _screen(params: Path, script: TrialScript, console: Console, attached: Attachment | None) -> TrialScreen:
-    if attached:
-        # The simulator's steps may be those of an earlier trial: the clock leads.
-        lead = LEAD if attached.guided else SIMULATED_LEAD
-        return TrialScreen(script, attached.guided, console, lead=lead, on_progress=attached.on_progress)
-    bridges = [node.lstrip("/") for node in load(params) if node.endswith("/can_bridge")]
-    guided = is_guided(params)
-    return TrialScreen(script, guided, console, bridges, LEAD if guided else None)
 
 
 def _exit_code(launcher: Launcher, node: str) -> int | None:
