@@ -43,29 +43,24 @@ def is_wanted(topic: str, msgtype: str) -> bool:
 
 
 class Event(NamedTuple):
-    """A fault, a warning or a changed parameter: s since the start of the recording, and a text."""
+    """A fault, a warning or a changed parameter."""
 
-    time: float
+    time: float  #: s since the start of the recording
     text: str
 
 
 @dataclass(frozen=True)
 class Bag:
-    """What a recording holds.
-
-    start: ns since 1970 of time 0. recordings: one per arm. events: faults, warnings and changed parameters.
-    parameters: YAML text by node. notes: missing parts that do no harm. problems: unreadable parts, one sentence each.
-    is_partial: whether the recording was cut short, or ends before its arms were down.
-    """
+    """What a recording holds."""
 
     path: Path
-    start: int
-    recordings: tuple[Recording, ...]
-    events: tuple[Event, ...]
-    parameters: dict[str, str]
-    notes: tuple[str, ...]
-    problems: tuple[str, ...]
-    is_partial: bool = False
+    start: int  #: ns since 1970 of time 0
+    recordings: tuple[Recording, ...]  #: one per arm
+    events: tuple[Event, ...]  #: faults, warnings and changed parameters
+    parameters: dict[str, str]  #: YAML text by node
+    notes: tuple[str, ...]  #: missing parts that do no harm
+    problems: tuple[str, ...]  #: unreadable parts, one sentence each
+    is_partial: bool = False  #: whether it was cut short, or ends before its arms were down
 
 
 # The parameters of `recorder`.
