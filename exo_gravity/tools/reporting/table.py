@@ -170,7 +170,7 @@ def _key_numbers(recording: Recording, analysis: TrialAnalysis) -> Iterator[tupl
     yield f"{sum(hold.duration for hold in analysis.holds):.0f} s", "total hold time"
     if analysis.holds:
         rates = np.array([hold.drift_rate for hold in analysis.holds])
-        number, joint = np.unravel_index(np.abs(rates).argmax(), rates.shape)
+        number, joint = divmod(int(np.argmax(np.abs(rates))), rates.shape[1])
         error = per_minute(analysis.holds[number].drift_rate_uncertainty[joint])
         label = f"fastest drift: {joint_labels(recording)[joint]}, hold {number + 1}"
         yield f"{shown(per_minute(rates[number, joint]), 2)} ± {shown(error, 2)} deg/min", label

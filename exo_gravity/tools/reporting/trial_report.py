@@ -103,7 +103,7 @@ def write(report: Report, folder: str | Path) -> list[Path]:
     Without matplotlib the figures are left out. Raises DataError if the folder can't be written.
     """
     folder = Path(folder)
-    sections = []
+    sections: list[str] = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for kind, rows in (("holds", table.hold_rows), ("motions", table.motion_rows)):
