@@ -59,8 +59,8 @@ def perturbed_arm(seed: int, body_mass: float = BODY_MASS, wearer_error: float =
         identified, excess = rng.uniform(0.8, 1.0), rng.uniform(0.95, 1.05)
     config = ArmConfig(
         links,
-        wearer_mass=excess * wearer.mass,
-        wearer_cog=wearer.cog,
+        wearer_mass=(excess * wearer.mass).tolist(),
+        wearer_cog=wearer.cog.tolist(),
         coulomb_friction=coulomb.tolist(),
         viscous_friction=viscous.tolist(),
     )

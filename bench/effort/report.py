@@ -122,7 +122,7 @@ def figure(results: Results) -> Figure:
     tasks = list(filter(results.has, ("reach", "poses")))
     result = Figure(figsize=(11.0, 9.2), layout="constrained")
     result.suptitle("How hard the arm is to move", x=0.01, ha="left", weight="bold")
-    top, bottom = result.subfigures(2, 1)
+    top, bottom = result.subfigures(2, 1, squeeze=False)[:, 0]
     for axis, task in zip(np.atleast_1d(top.subplots(1, len(tasks), sharey=True)), tasks, strict=True):
         _draw_task(axis, results, task)
     top.axes[0].legend(loc="lower right", edgecolor="none", fontsize=8)

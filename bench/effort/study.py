@@ -130,6 +130,6 @@ class Study:
                     limit = np.array(settings.max_effort)
                     left -= np.clip(gravity_torque(settings.arm, poses), -limit, limit)
                 needed = np.maximum(needed, np.abs(left) + config.coulomb_friction)
-            for share in STRENGTHS:
-                strength = np.maximum(LEAST, share * most)
-                yield name, share, float(np.all(needed <= strength, axis=1).mean())
+            for strength in STRENGTHS:
+                reached = np.all(needed <= np.maximum(LEAST, strength * most), axis=1)
+                yield name, strength, float(reached.mean())

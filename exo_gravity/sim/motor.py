@@ -71,7 +71,9 @@ class SimulatedMotor:
         self.unplugged = False
         self.temperature = 30.0
         self.error = 0
-        self._forget()
+        self.entered = False
+        self._command, self._data = _NO_COMMAND, b""
+        self._silent_until = -math.inf  # s, after SET_ZERO
         self._random = random.Random(joint.can_id)
 
     @property
@@ -153,10 +155,9 @@ class SimulatedMotor:
         return pack_reply(spec, can_id, *values, temperature, self.error)
 
     def _forget(self) -> None:
-        """Be as after power came back."""
         self.entered = False
         self._command, self._data = _NO_COMMAND, b""
-        self._silent_until = -math.inf  # s, after SET_ZERO
+        self._silent_until = -math.inf
 
 
 def clamp(value: float, limit: float) -> float:

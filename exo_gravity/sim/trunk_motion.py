@@ -31,7 +31,6 @@ class TrunkState(NamedTuple):
     """The trunk at one moment."""
 
     #: rad, rad/s and rad/s^2.
-
     pitch: float = 0.0
     roll: float = 0.0
     pitch_rate: float = 0.0

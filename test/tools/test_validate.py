@@ -29,7 +29,7 @@ def quick(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(validate, "QUICK_COUNT", 60)
         patch.setattr(report, "FIGURE_GRID", (8, 8, 3))
-        patch.setattr(training, "MAX_EVALUATIONS", 12)
+        patch.setattr(training, "MAX_EVALUATIONS", 4)
         patch.setattr(validation, "evaluate", lambda *given: parts.append(evaluate(*given)) or parts[-1])
         patch.setattr("builtins.print", lambda *parts, **_: lines.append(" ".join(map(str, parts))))
         with pytest.raises(SystemExit) as ended:
