@@ -20,6 +20,7 @@ from exo_gravity.tools.calibration.live import LiveTour
 from exo_gravity.tools.inputs.parameter_file import packaged_config
 from test.support.tour_run import Hand
 
+from .calibration import demo
 from .calibration.device import draw
 from .calibration.tour import Player, run_tour
 from .calibration.verdict import verdict
@@ -99,3 +100,14 @@ def test_a_random_device_is_calibrated_from_motors_to_an_arm_that_holds(
     missed = [row for row in verdict([result], []) if not row.held and "within 2 standard errors" not in row.what]
     assert not missed  # of one device, 8 moments are too few to judge their standard errors
     assert math.isfinite(result.creep[0])
+
+
+@pytest.mark.timeout(300)
+def test_the_arm_of_the_demo_falls_before_and_stays_after(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with patch.object(gravity, "run_tour", run_tour([])):
+        assert demo.main(tmp_path / "demo") == 0
+    said = capsys.readouterr().out
+    assert "degrees per minute before, 0.0" in said
+    assert float(said.partition("by itself: ")[2].partition(" ")[0].replace(",", "")) > 5.0
+    names = {path.name for path in (tmp_path / "demo").iterdir()}
+    assert {"old.yaml", "new.yaml", "new.html", "before_and_after.png"} <= names

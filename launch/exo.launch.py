@@ -22,8 +22,7 @@ from launch.events.process import ProcessExited, ProcessStarted, SignalProcess
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from exo_gravity.tools.inputs.executables import executable
-from exo_gravity.tools.inputs.node_set import (
+from exo_gravity.tools.inputs.parameter_file import (
     ABSOLUTE_TOPICS,
     DESCENT_TIMEOUT,
     ENDED_WELL,
@@ -34,10 +33,12 @@ from exo_gravity.tools.inputs.node_set import (
     Stages,
     check_buses,
     chosen,
+    executable,
     in_namespace,
     is_observer,
+    load,
+    packaged_config,
 )
-from exo_gravity.tools.inputs.parameter_file import load, packaged_config
 
 LONGEST_STOP = DESCENT_TIMEOUT + RECOVERY_TIMEOUT  # s until the last bridge is done; `launch` then ends the others
 

@@ -22,15 +22,16 @@ import yaml
 from exo_gravity.core.calibration.identification import Identified
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.model.tilt import rotation_matrix
-from exo_gravity.sim.device_params import SIMULATOR, device_of
+from exo_gravity.sim.params import SIMULATOR, device_of
 from exo_gravity.tools import calibrate
-from exo_gravity.tools.calibration import demo, gravity, motors, scale
+from exo_gravity.tools.calibration import gravity, motors, scale
 from exo_gravity.tools.calibration.live import LiveTour
 from exo_gravity.tools.calibration.outcome import Outcome
 from exo_gravity.tools.calibration.person import Person
 from exo_gravity.tools.inputs.arms import ConfiguredArm, configured_arm, node_values
 from exo_gravity.tools.inputs.parameter_file import load
 
+from . import demo
 from .device import SIMULATOR as SIMULATOR_NODE
 from .device import Device
 from .hand import Hand, hanging, write_bow

@@ -1,4 +1,4 @@
-"""What a recording holds, as plain data that needs no bag library."""
+"""What a recording holds: its topics, and what the reader makes of them, as plain data that needs no bag library."""
 
 from __future__ import annotations
 
@@ -9,31 +9,58 @@ from typing import NamedTuple
 from exo_gravity.core.params import Param
 from exo_gravity.core.trial.recording import Recording
 
+JOINT_STATE = "sensor_msgs/msg/JointState"
+STRING = "std_msgs/msg/String"
+# Of each arm, in its namespace
+STATES, COMMANDS, STEPS, ASSIST = "joint_states", "effort_commands", "wearer_step", "assist_efforts"
+# Of all
+DIAGNOSTICS, PARAMETER_EVENTS = "/diagnostics", "/parameter_events"
+# Of the recorder, in the recording alone
+PARAMETERS, LOSSES = "/recorder/parameters", "/recorder/losses"
+OTHERS = {
+    DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
+    PARAMETER_EVENTS: "rcl_interfaces/msg/ParameterEvent",
+    PARAMETERS: STRING,
+    LOSSES: STRING,
+}
+
+
+def leaf(topic: str) -> str:
+    """Return the last part of a topic's name."""
+    return topic.rpartition("/")[2]
+
+
+def arm_of(name: str) -> str:
+    """Return the namespace of a topic or node without slashes, 'arm' for the root namespace."""
+    return name.rpartition("/")[0].strip("/") or "arm"
+
+
+def is_wanted(topic: str, msgtype: str) -> bool:
+    """Return whether the reader decodes this topic."""
+    if leaf(topic) in (STATES, COMMANDS):
+        return msgtype == JOINT_STATE
+    return OTHERS.get(topic) == msgtype or (leaf(topic) == STEPS and msgtype == STRING)
+
 
 class Event(NamedTuple):
-    """A fault, a warning or a changed parameter: s since the start of the recording, and a text."""
+    """A fault, a warning or a changed parameter."""
 
-    time: float
+    time: float  #: s since the start of the recording
     text: str
 
 
 @dataclass(frozen=True)
 class Bag:
-    """What a recording holds.
-
-    start: ns since 1970 of time 0. recordings: one per arm. events: faults, warnings and changed parameters.
-    parameters: YAML text by node. notes: missing parts that do no harm. problems: unreadable parts, one sentence each.
-    is_partial: whether the recording was cut short, or ends before its arms were down.
-    """
+    """What a recording holds."""
 
     path: Path
-    start: int
-    recordings: tuple[Recording, ...]
-    events: tuple[Event, ...]
-    parameters: dict[str, str]
-    notes: tuple[str, ...]
-    problems: tuple[str, ...]
-    is_partial: bool = False
+    start: int  #: ns since 1970 of time 0
+    recordings: tuple[Recording, ...]  #: one per arm
+    events: tuple[Event, ...]  #: faults, warnings and changed parameters
+    parameters: dict[str, str]  #: YAML text by node
+    notes: tuple[str, ...]  #: missing parts that do no harm
+    problems: tuple[str, ...]  #: unreadable parts, one sentence each
+    is_partial: bool = False  #: whether it was cut short, or ends before its arms were down
 
 
 # The parameters of `recorder`.

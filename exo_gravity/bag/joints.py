@@ -9,50 +9,63 @@ bytes are equal.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from rosbags.typesys import Stores, get_typestore
 
+from exo_gravity.bag.content import JOINT_STATE
 from exo_gravity.core.errors import DataError
 
 FIELDS = ("position", "velocity", "effort")
+TYPES = get_typestore(Stores.ROS2_JAZZY)
 
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Where the numbers of a message are.
-
-    order: '<' or '>', the byte order. fixed: (n,) offsets of the bytes that identify this layout. content: (n,) those
-    bytes. offset: of the first number of each of `FIELDS`, None for an empty field.
-    """
+    """Where the numbers of a message are."""
 
     names: tuple[str, ...]
-    order: str
-    fixed: np.ndarray
-    content: np.ndarray
-    offset: tuple[int | None, ...]
+    order: str  #: '<' or '>', the byte order
+    fixed: np.ndarray  #: (n,) offsets of the bytes that identify this layout
+    content: np.ndarray  #: (n,) those bytes
+    offset: tuple[int | None, ...]  #: of the first number of each of `FIELDS`, None for an empty field
 
     @classmethod
     def of(cls, message: bytes) -> Layout:
         """Return the layout of one message. Raises DataError if it is not a JointState."""
-        cursor = _Cursor(message)
         try:
-            cursor.take(4)
-            cursor.position += 8  # the stamp
-            cursor.text()
-            names = tuple(cursor.text() for _ in range(cursor.count()))
-            offset = []
-            for field in FIELDS:
-                length = cursor.count()
-                if length not in (0, len(names)):
-                    raise DataError(f"a joint state has {length} values of {field} for {len(names)} names")
-                offset.append(cursor.numbers(length))
-        except (struct.error, IndexError, UnicodeDecodeError):
+            decoded: Any = TYPES.deserialize_cdr(message, JOINT_STATE)
+        except Exception:  # rosbags raises what its generated code meets
             raise DataError("a message is damaged, or is not a sensor_msgs/msg/JointState in CDR") from None
-        fixed = np.concatenate([np.arange(*span) for span in cursor.spans])
-        return cls(names, cursor.order, fixed, np.frombuffer(message, np.uint8)[fixed], tuple(offset))
+        is_fixed = np.zeros(len(message), bool)  # the header, lengths and texts; not the stamp, numbers and padding
+        is_fixed[:4] = True
+        at = 12
+
+        def take(size: int) -> None:
+            nonlocal at
+            at += -at % 4
+            is_fixed[at : at + size] = True
+            at += size
+
+        take(4 + len(decoded.header.frame_id.encode()) + 1)
+        take(4)
+        for name in decoded.name:
+            take(4 + len(name.encode()) + 1)
+        offset: list[int | None] = []
+        for field in FIELDS:
+            count = len(getattr(decoded, field))
+            if count not in (0, len(decoded.name)):
+                raise DataError(f"a joint state has {count} values of {field} for {len(decoded.name)} names")
+            take(4)
+            at += -(at - 4) % 8 if count else 0  # alignment counts from the end of the header
+            offset.append(at if count else None)
+            at += 8 * count
+        fixed = np.flatnonzero(is_fixed)
+        order = "<" if message[1] == 1 else ">"
+        return cls(tuple(decoded.name), order, fixed, np.frombuffer(message, np.uint8)[fixed], tuple(offset))
 
     def matches(self, rows: np.ndarray) -> np.ndarray:
         """Return which messages have this layout, (n,) bool; rows: their bytes (n, length)."""
@@ -78,47 +91,6 @@ class Layout:
         """Return `count` numbers of type `kind` at `offset` of each message, (n, count)."""
         part = np.ascontiguousarray(rows[:, offset : offset + int(kind[1]) * count])
         return part.view(np.dtype(self.order + kind))
-
-
-class _Cursor:
-    """Walks through one message and notes the spans of bytes that hold lengths and names."""
-
-    def __init__(self, message: bytes) -> None:
-        self._message = message
-        self.order = "<" if message[1:2] == b"\x01" else ">"
-        self.position = 0
-        self.spans: list[tuple[int, int]] = []
-
-    def take(self, length: int) -> bytes:
-        """Return the next bytes, which are part of the layout."""
-        start, self.position = self.position, self.position + length
-        if self.position > len(self._message):
-            raise IndexError(self.position)
-        self.spans.append((start, self.position))
-        return self._message[start : self.position]
-
-    def count(self) -> int:
-        """Return the length of a sequence or a string."""
-        self.align(4)
-        return int(struct.unpack(f"{self.order}I", self.take(4))[0])
-
-    def text(self) -> str:
-        """Return a string."""
-        return self.take(self.count()).rstrip(b"\x00").decode()
-
-    def numbers(self, count: int) -> int | None:
-        """Skip `count` doubles; return the offset of the first, None for no doubles."""
-        if not count:
-            return None
-        self.align(8)
-        start, self.position = self.position, self.position + 8 * count
-        if self.position > len(self._message):
-            raise IndexError(self.position)
-        return start
-
-    def align(self, size: int) -> None:
-        """Skip padding, whose bytes are undefined. Alignment counts from the end of the header."""
-        self.position += -(self.position - 4) % size
 
 
 class JointArrays:

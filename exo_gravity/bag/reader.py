@@ -2,34 +2,49 @@
 
 An arm is a namespace with a `joint_states` topic. Each of its `effort_commands` carries the stamp of the joint state
 that it answers, so each joint state is paired with the last command that answers an earlier one. Time is that of the
-header stamps; where these run backwards or are far from the recorder's clock, it is the time of arrival.
+header stamps; where these run backwards or are far from the recorder's clock, it is the time of arrival. Whether an arm
+was carried comes from the key `state` of its can_bridge on /diagnostics, never from the text.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
+from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 
-from exo_gravity.bag.content import Bag
-from exo_gravity.bag.events import EventLog
+from exo_gravity.bag.content import (
+    COMMANDS,
+    DIAGNOSTICS,
+    JOINT_STATE,
+    LOSSES,
+    PARAMETER_EVENTS,
+    STATES,
+    STEPS,
+    Bag,
+    Event,
+    arm_of,
+    is_wanted,
+    leaf,
+)
 from exo_gravity.bag.joints import FIELDS, JointArrays
-from exo_gravity.bag.mcap import Batch
-from exo_gravity.bag.storage import Storage
-from exo_gravity.bag.topics import COMMANDS, JOINT_STATE, STATES, arm_of, is_wanted, leaf
+from exo_gravity.bag.storage import Batch, Storage
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.trial.recording import Recording
+from exo_gravity.core.safety.drive import State
+from exo_gravity.core.trial.recording import Recording, ScriptedStep, Span
 
 MAX_COMMAND_AGE = 200_000_000  # ns; an older command is no longer in force
 MAX_CLOCK_OFFSET = 1_000_000_000  # ns between stamp and arrival
 
-Progress = Callable[[int, int], None]  # (bytes done, bytes in total)
+OnRead = Callable[[int, int], None]  # (bytes done, bytes in total)
 
 
-def read_bag(path: str | Path, progress: Progress = lambda done, size: None) -> Bag:
+def read_bag(path: str | Path, on_read: OnRead = lambda done, size: None) -> Bag:
     """Read a recording: a rosbag2 folder, or an .mcap or .db3 file, complete or cut short.
 
     Raises DataError, one sentence, if there is nothing to report: no recording, an empty one, or no arm in it.
@@ -37,7 +52,7 @@ def read_bag(path: str | Path, progress: Progress = lambda done, size: None) -> 
     storage, contents = Storage(path), _Contents()
     for batch in storage.batches(is_wanted):
         contents.add(batch)
-        progress(storage.done, storage.size)
+        on_read(storage.done, storage.size)
     if storage.cut_short:
         contents.is_cut = True
         contents.notes.append(f"the recording was cut short ({storage.cut_short}): what was written before is reported")
@@ -152,3 +167,109 @@ def _in_order(clock: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nda
         return clock, values
     order = np.argsort(clock, kind="stable")
     return clock[order], values[order]
+
+
+CARRIED = (State.RAMPING_IN.value, State.ACTIVE.value)
+STATE_GAP = 1.0  # s; can_bridge reports its state twice a second, except while it ends
+
+
+class EventLog:
+    """Collects script steps, faults, changed parameters, the parameters at the start, and what the recorder lost."""
+
+    def __init__(self) -> None:
+        self.parameters: dict[str, str] = {}
+        self.losses = ""
+        self._events: list[tuple[int, str]] = []
+        self._steps: dict[str, list[tuple[int, str, float]]] = {}  # arm -> (stamp, action, duration)
+        self._states: dict[str, list[tuple[int, str]]] = {}  # arm -> (stamp, state)
+        self._last: dict[str, tuple[int, str]] = {}  # node -> level and text of its last status
+
+    def add(self, topic: str, stamp: int, message: Any) -> None:
+        """Add one decoded message that arrived at `stamp` ns. Raises DataError for an invalid step."""
+        if leaf(topic) == STEPS:
+            self._add_step(topic, stamp, message.data)
+        elif topic == DIAGNOSTICS:
+            for status in message.status:
+                self._add_status(stamp, status)
+        elif topic == PARAMETER_EVENTS:
+            for parameter in message.changed_parameters:
+                self._events.append((stamp, f"{message.node}: {parameter.name} = {_value(parameter.value)}"))
+        elif topic == LOSSES:
+            self.losses = message.data
+        else:
+            node, _, text = message.data.partition(":")
+            self.parameters[node.strip()] = f"{node}:{text}"
+
+    def _add_step(self, topic: str, stamp: int, text: str) -> None:
+        try:
+            step = json.loads(text)
+            entry = stamp, str(step["action"]), float(step["duration"])
+        except (ValueError, KeyError, TypeError):
+            raise DataError(f"{topic}: invalid {STEPS} message") from None
+        self._steps.setdefault(arm_of(topic), []).append(entry)
+
+    def _add_status(self, stamp: int, status: Any) -> None:
+        level = int(status.level)
+        last = self._last.get(status.name, (0, ""))
+        if level > 0 and (level, status.message) != last:
+            self._events.append((stamp, f"{status.name}: {status.message}"))
+        elif level == 0 and last[0] > 0:
+            self._events.append((stamp, f"{status.name}: OK, {status.message}"))
+        self._last[status.name] = (level, status.message)
+        state = next((entry.value for entry in status.values if entry.key == "state"), "")
+        if state:
+            self._states.setdefault(arm_of(status.name), []).append((stamp, state))
+
+    def events(self, start: int) -> tuple[Event, ...]:
+        """Return faults, warnings and changed parameters in order; start: ns of time 0."""
+        return tuple(Event((stamp - start) / 1e9, text) for stamp, text in sorted(self._events))
+
+    def steps(self, arm: str, start: int) -> tuple[ScriptedStep, ...]:
+        """Return the script steps of an arm; each ends when the next one begins, at the latest."""
+        steps = [((stamp - start) / 1e9, action, duration) for stamp, action, duration in self._steps.get(arm, [])]
+        ends = [*(begin for begin, _, _ in steps[1:]), float("inf")]
+        return tuple(
+            ScriptedStep(action, begin, min(begin + duration, end))
+            for (begin, action, duration), end in zip(steps, ends, strict=False)
+        )
+
+    def carried(self, arm: str, start: int, end: float) -> tuple[Span, ...] | None:
+        """Return when the arm was carried, by its reported states; None if no state of it was recorded.
+
+        end: s, of the arm's recording. An arm that is carried in the last state before it counts as carried until then.
+        """
+        if arm not in self._states:
+            return None
+        states = self._in_order(arm, start)
+        groups = [list(group) for carried, group in groupby(states, lambda state: state[1] in CARRIED) if carried]
+        spans = [(group[0][0], group[-1][0]) for group in groups]
+        time, last = states[-1]
+        if last in CARRIED and 0.0 < end - time < STATE_GAP:
+            spans[-1] = spans[-1][0], end
+        return tuple(spans)
+
+    def open_end(self, arm: str, start: int, end: float, is_cut: bool) -> str:
+        """Return what the recording does not show of the arm's way down, as a sentence, or ''.
+
+        end: s, of the arm's recording. is_cut: whether its file was cut short.
+        """
+        time, last = self._in_order(arm, start)[-1] if arm in self._states else (0.0, "")
+        if end - time >= STATE_GAP and not is_cut:
+            return ""  # the joint states go on: they show the way down
+        if last in CARRIED:
+            return f"{arm}: the recording ends while the arm is carried: it does not show how the arm was let down"
+        if last == State.LETTING_DOWN.value:
+            return f"{arm}: the recording ends before the arm was down"
+        return ""
+
+    def _in_order(self, arm: str, start: int) -> list[tuple[float, str]]:
+        return sorted(((stamp - start) / 1e9, state) for stamp, state in self._states[arm])
+
+
+def _value(value: Any) -> object:
+    """Return the Python value of a rcl_interfaces/ParameterValue."""
+    fields = ("", "bool", "integer", "double", "string", "byte_array", "bool_array", "integer_array", "double_array")
+    if not 0 < value.type < len(fields):
+        return list(value.string_array_value) if value.type == len(fields) else "not set"
+    found = getattr(value, f"{fields[value.type]}_value")
+    return found.tolist() if hasattr(found, "tolist") else found

@@ -16,7 +16,7 @@ import yaml
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Imu
 from std_msgs.msg import String
 
@@ -24,13 +24,13 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.hardware.can.can_port import open_bus
-from exo_gravity.nodes.ros.declare import bus_of, declare, values_after
-from exo_gravity.nodes.ros.diagnostics import OK, WARN, Diagnostics
+from exo_gravity.nodes.ros.hot_path import LATCHED
+from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
+from exo_gravity.nodes.ros.parameters import bus_of, declare, values_after
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.sim import SimulatedImu
+from exo_gravity.sim import SimulatedImu, VirtualWearer
 from exo_gravity.sim.device import MAX_CATCH_UP
-from exo_gravity.sim.device_params import SIMULATOR, device_of, imu_of, set_faults
-from exo_gravity.sim.effort_script import ScriptedWearer
+from exo_gravity.sim.params import SIMULATOR, device_of, imu_of, set_faults
 from exo_gravity.sim.trunk_motion import TrunkState
 
 TRUNK_SPEED = 0.5  # rad/s at which the trunk moves to a new tilt
@@ -39,11 +39,9 @@ TRUNK_SPEED = 0.5  # rad/s at which the trunk moves to a new tilt
 def script_of(path: str) -> TrialScript:
     """Return the script in a YAML file. Raises ParameterError."""
     try:
-        script = TrialScript.parse(yaml.safe_load(Path(path).read_text(encoding="utf-8")))
+        return TrialScript.parse(yaml.safe_load(Path(path).read_text(encoding="utf-8")))
     except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
         raise ParameterError("trial", path, f"a readable script file ({error})") from None
-    ScriptedWearer(script)  # checks the names of its tasks
-    return script
 
 
 class Simulator(Node):
@@ -61,12 +59,11 @@ class Simulator(Node):
         self._script = script_of(values["trial"]) if values["trial"] else None
         self._delay = values["trial_delay"]
         self._trunk_target = (values["trunk.pitch"], values["trunk.roll"])
-        self._wearer: ScriptedWearer | None = None
+        self._wearer: VirtualWearer | None = None
         self._new_scripts: deque[TrialScript] = deque()  # set by a parameter, started by the device's thread
         self._published_step: int | None = None
         self._diagnostics = Diagnostics(self)
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._step_publisher = self.create_publisher(String, "wearer_step", latched)
+        self._step_publisher = self.create_publisher(String, "wearer_step", LATCHED)
         self._imu = SimulatedImu(imu_of(values))
         topic = values["imu.topic"]
         self._imu_publisher = self.create_publisher(Imu, topic, qos_profile_sensor_data) if topic else None
@@ -153,7 +150,7 @@ class Simulator(Node):
 
     def _start_wearer(self, script: TrialScript, delay: float) -> None:
         self._script, self._published_step = script, None
-        self._wearer = ScriptedWearer(script)
+        self._wearer = VirtualWearer(script)
         self._device.start(self._wearer, delay)
 
     def _report(self) -> None:

@@ -1,118 +1,240 @@
-"""Who operates the arms: one page at a time holds control, the others watch.
+"""Who operates the arms, what a page may ask for, and what happens when the operator's page is gone.
 
 A page is one browser tab. It keeps its secret while it is reloaded, and confirms each few states that it receives. A
-page that confirms nothing for `GONE` seconds is gone: the laptop is closed, or the network lost.
+page that confirms nothing for `GONE` seconds is gone: the laptop is closed, or the network lost. One page at a time
+holds control, the others watch. Every page may let the arms down, at any time and without a rate limit. The requests:
+
+{"do": "let_down"}                                   all arms
+{"do": "let_down", "arm": "right"}                   one arm
+{"do": "take"}                                       control; every page may
+{"do": "enable", "arm": "right"}                     the rest: only the page that holds control
+{"do": "clear_fault", "arm": "right"}
+{"do": "set", "arm": "right", "values": {"support": 0.3}}
+{"do": "release"}                                    control
+{"do": "record"}, {"do": "stop_recording"}, {"do": "save"}
+{"do": "trial", "name": "demo"}, {"do": "stop_trial"}
 """
 
 from __future__ import annotations
 
+import asyncio
+import logging
+import math
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
+from exo_gravity.core.errors import ExoGravityError, ParameterError
+from exo_gravity.panel.params import SETTABLE
+
+# The kinds of requests, and the keys that each has besides "do".
+KEYS: Mapping[str, frozenset[str]] = {
+    **dict.fromkeys(("take", "release", "record", "stop_recording", "save", "stop_trial"), frozenset()),
+    **dict.fromkeys(("let_down", "enable", "clear_fault"), frozenset({"arm"})),
+    "set": frozenset({"arm", "values"}),
+    "trial": frozenset({"name"}),
+}
 GONE = 2.0  # s without a confirmation
 FORGOTTEN = 600.0  # s after which a page that is gone loses its number
 MAX_PAGES = 32
-BURST, REFILL = 20.0, 10.0  # actions that a page may send at once, and per second
+BURST, REFILL = 20.0, 10.0  # requests that a page may send at once, and per second
+RETRY = 1.0  # s between two attempts to let the arms down
+
+
+@dataclass(frozen=True)
+class Action:
+    """What one request asks for."""
+
+    kind: str
+    arm: str = ""  #: '' for all arms or none
+    values: Mapping[str, Any] = field(default_factory=dict)  #: parameters of the arm's compensator
+    name: str = ""  #: of the trial
+
+    def __str__(self) -> str:
+        """Describe the action for the log, without the wearer's data."""
+        shown = [key if key.startswith("wearer.") else f"{key} = {value}" for key, value in self.values.items()]
+        return " ".join(filter(None, (self.kind.replace("_", " "), self.arm, ", ".join(shown), self.name)))
+
+
+def parse(body: Any, arms: Collection[str], trials: Collection[str]) -> Action:
+    """Return the action that the JSON value `body` describes. Raises ParameterError."""
+    if not isinstance(body, dict):
+        raise ParameterError("request", body, "an object")
+    kind = body.get("do")
+    if not isinstance(kind, str) or kind not in KEYS:
+        raise ParameterError("do", kind, f"one of {', '.join(KEYS)}")
+    allowed = {"do", *KEYS[kind]}
+    if unknown := set(body) - allowed:
+        raise ParameterError("request", sorted(unknown), f"without keys other than {', '.join(sorted(allowed))}")
+    arm, name = body.get("arm", ""), body.get("name", "")
+    if "arm" in KEYS[kind] and arm not in arms and (kind != "let_down" or arm != ""):
+        raise ParameterError("arm", arm, f"one of {', '.join(sorted(arms)) or 'none: no arm is present'}")
+    if kind == "trial" and name not in trials:
+        raise ParameterError("trial", name, f"one of {', '.join(sorted(trials))}")
+    return Action(kind, arm, _checked(body.get("values")) if kind == "set" else {}, name)
+
+
+def _checked(values: Any) -> dict[str, Any]:
+    if not isinstance(values, dict) or not values:
+        raise ParameterError("values", values, "an object of parameters")
+    if unknown := [name for name in values if name not in SETTABLE]:
+        raise ParameterError("values", unknown, f"some of {', '.join(SETTABLE)}")
+    return {name: SETTABLE[name].check(value) for name, value in values.items()}
 
 
 @dataclass
 class Page:
-    """A browser tab. number: shown to people. seen: monotonic s of its last confirmation."""
+    """A browser tab."""
 
-    number: int
+    secret: str
+    number: int  #: shown to people
     address: str
-    seen: float
+    seen: float  #: monotonic s of its last confirmation
+    credited: float  #: monotonic s of its last request
+    credit: float = BURST  #: requests that it may send
     connected: bool = True
-    credit: float = BURST
-    credited: float = field(default=0.0)
 
-    @property
-    def label(self) -> str:
-        """The page in log lines."""
+    def __str__(self) -> str:
+        """Name the page in log lines."""
         return f"{self.address} page {self.number}"
 
 
-class Control:
-    """The pages, and which of them holds control.
+class Reply(NamedTuple):
+    """The answer to a request: an HTTP status and '' or what is wrong."""
 
+    status: int
+    text: str
+
+
+class Control:
+    """The pages, which of them holds control, and what is done for them.
+
+    arms: has their `names` and, for each kind of request with the key "arm", a coroutine function that takes the arm,
+    and `set` the values too. files: has the names of the `trials` and such functions for the other requests, of which
+    `trial` takes a name. Each returns '' or why it failed. note: called with a sentence for the log and the recording.
     clock: monotonic s. dead_man: whether the arms are let down when the page that holds control is gone; until they
     are, only a page that takes control replaces it.
     """
 
-    def __init__(self, clock: Callable[[], float], dead_man: bool = False) -> None:
-        self.dead_man = dead_man
+    def __init__(
+        self,
+        arms: Any,
+        files: Any,
+        note: Callable[[str], object],
+        clock: Callable[[], float],
+        dead_man: bool = False,
+    ) -> None:
+        self.holder: Page | None = None  #: the page that holds control
+        self._arms = arms
+        self._files = files
+        self._note = note
         self._clock = clock
-        self._pages: dict[str, Page] = {}
+        self._dead_man = dead_man
+        self._pages: dict[str, Page] = {}  # by secret
         self._numbers = 0
-        self._holder = ""
+        self._attempted = -math.inf  # s, when `watch` last let the arms down
 
-    @property
-    def holder(self) -> Page | None:
-        """The page that holds control."""
-        return self._pages.get(self._holder)
-
-    def page(self, secret: str) -> Page | None:
-        """Return the page with this secret."""
-        return self._pages.get(secret)
-
-    def open(self, secret: str, address: str) -> tuple[str, Page] | None:
-        """Return secret and page of a new connection; None if there are too many pages.
+    def open(self, secret: str, address: str) -> Page | None:
+        """Return the page of a new connection; None if there are too many pages.
 
         A known secret is the same page, reloaded. A page holds control from the start if no other does, or if the other
         is gone and there is no `dead_man`.
         """
         self._forget()
         page = self._pages.get(secret)
+        now = self._clock()
         if page is None:
             if len(self._pages) >= MAX_PAGES:
                 return None
-            secret = secrets.token_urlsafe(24)
             self._numbers += 1
-            page = self._pages[secret] = Page(self._numbers, address, self._clock(), credited=self._clock())
-        if self.holder is None or (self.is_gone() and not self.dead_man):
-            self._holder = secret
-        page.connected, page.seen = True, self._clock()
-        return secret, page
+            page = Page(secrets.token_urlsafe(24), self._numbers, address, now, now)
+            self._pages[page.secret] = page
+        if self.holder is None or (self.is_gone() and not self._dead_man):
+            self.holder = page
+        page.connected, page.seen = True, now
+        return page
 
-    def close(self, secret: str) -> None:
-        """Note that the page's connection has ended."""
-        if page := self._pages.get(secret):
-            page.connected = False
-
-    def confirm(self, secret: str) -> None:
+    def confirm(self, page: Page) -> None:
         """Note that the page shows the present state."""
-        if page := self._pages.get(secret):
-            page.seen = self._clock()
-
-    def holds(self, secret: str) -> bool:
-        """Return whether the page holds control."""
-        return bool(secret) and secret in self._pages and secret == self._holder
-
-    def take(self, secret: str) -> None:
-        """Give control to the page."""
-        if secret in self._pages:
-            self._holder = secret
-
-    def release(self, secret: str) -> None:
-        """Take control from the page, if it holds it."""
-        if secret == self._holder:
-            self._holder = ""
-
-    def release_all(self) -> None:
-        """Leave control free for the next page that takes it."""
-        self._holder = ""
+        page.seen = self._clock()
 
     def is_gone(self) -> bool:
         """Return whether a page holds control that is gone."""
-        holder = self.holder
-        return holder is not None and self._clock() - holder.seen > GONE
+        return self.holder is not None and self._clock() - self.holder.seen > GONE
 
-    def spend(self, secret: str) -> bool:
-        """Return whether the page may send one more action now."""
+    async def perform(self, body: Any, secret: str, address: str) -> Reply:
+        """Do what the JSON value `body` asks for, sent by the page with `secret`, at `address`."""
         page = self._pages.get(secret)
-        if page is None:
-            return False
+        try:
+            action = parse(body, self._arms.names, self._files.trials)
+        except ExoGravityError as error:
+            return self._refused(page, 400, str(error))
+        if action.kind != "let_down":
+            if page is None:
+                return Reply(403, "unknown page: reload it")
+            if not self._spend(page):
+                return Reply(429, "too many requests: wait a moment")
+            if action.kind != "take" and page is not self.holder:
+                return self._refused(page, 403, f"{action}: another page holds control")
+        problem = await self._carry_out(action, page)
+        self._log(f"{page or f'{address} unknown page'}: {action}: {problem or 'done'}")
+        return Reply(409 if problem else 200, problem)
+
+    def _refused(self, page: Page | None, status: int, text: str) -> Reply:
+        if page and self._spend(page):  # a flood of wrong requests must not fill the log
+            self._log(f"{page}: refused: {text}")
+        return Reply(status, text)
+
+    async def _carry_out(self, action: Action, page: Page | None) -> str:
+        if action.kind == "let_down":
+            return await self._let_down([action.arm] if action.arm else self._arms.names)
+        if action.kind in ("take", "release"):
+            self.holder = page if action.kind == "take" else None
+            return ""
+        function = getattr(self._arms if action.arm else self._files, action.kind)
+        problem: str = await function(*filter(None, (action.arm, action.values, action.name)))
+        return problem
+
+    async def _let_down(self, arms: Collection[str]) -> str:
+        """Let `arms` down, all at once; return '' or which failed and why. Raises nothing."""
+        if not arms:
+            return "no arm is present"
+        results = await asyncio.gather(*map(self._arms.let_down, arms), return_exceptions=True)
+        problems = [_described(result) if isinstance(result, BaseException) else result for result in results]
+        return "; ".join(f"{arm}: {problem}" for arm, problem in zip(arms, problems, strict=True) if problem)
+
+    async def watch(self) -> None:
+        """With `dead_man`, let all arms down if the page that holds control is gone; retry until it worked.
+
+        Call it often. If it fails itself, the reason is noted, the arms are let down as if the page were gone, and the
+        next call watches on.
+        """
+        if not self._dead_man or self._clock() - self._attempted < RETRY:
+            return
+        try:
+            if self.is_gone():
+                holder = self.holder
+                worked = await self._let_down_all(f"{holder} has been gone for {GONE:g} s")
+                if worked and self.holder is holder and self.is_gone():
+                    self.holder = None
+        except Exception as error:
+            await self._let_down_all(f"the watch of the operator's page failed: {_described(error)}")
+
+    async def _let_down_all(self, why: str) -> bool:
+        self._attempted = self._clock()
+        problem = await self._let_down(self._arms.names)
+        self._log(f"{why}: let down: {problem or 'done'}")
+        return not problem
+
+    def _log(self, text: str) -> None:
+        try:
+            self._note(text)
+        except Exception:  # what was to be noted has been done, and the next arm or page must not suffer from this
+            logging.getLogger(__name__).exception("%s", text)
+
+    def _spend(self, page: Page) -> bool:
+        """Return whether the page may send one more request now."""
         now = self._clock()
         page.credit = min(BURST, page.credit + REFILL * (now - page.credited))
         page.credited = now
@@ -124,8 +246,13 @@ class Control:
     def _forget(self) -> None:
         """Drop pages that are long gone, and any that is closed if there are too many."""
         now, full = self._clock(), len(self._pages) >= MAX_PAGES
-        for secret, page in list(self._pages.items()):
-            awaited = self.dead_man and secret == self._holder  # by Desk.watch
+        for page in list(self._pages.values()):
+            awaited = self._dead_man and page is self.holder  # by `watch`
             if not page.connected and not awaited and (full or now - page.seen > FORGOTTEN):
-                del self._pages[secret]
-                self.release(secret)
+                del self._pages[page.secret]
+                if page is self.holder:
+                    self.holder = None
+
+
+def _described(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"

@@ -5,7 +5,7 @@ newest state only, so that nothing queues up.
 
     GET  /               the page            GET /static/...   its files       GET /strings     its texts
     GET  /parameters     those in force
-    POST /action         `actions.py`        GET /report/NAME  a trial's report
+    POST /action         `control.py`        GET /report/NAME  a trial's report
     WS   /live           from the page: {"page": secret, or ""}, then {"seen": number of a state} for every few states
                          to the page: {"type": "page"}, {"type": "setup"}, {"type": "state"}
 """
@@ -30,9 +30,8 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.panel.access import Access
-from exo_gravity.panel.desk import Desk
-from exo_gravity.panel.guard import MAX_BODY, Guard
+from exo_gravity.panel.access import MAX_BODY, Access, Guard
+from exo_gravity.panel.control import Control, Page
 
 FOLDER = Path(__file__).parent
 WATCH_PERIOD = 0.1  # s
@@ -44,7 +43,8 @@ FULL, REPLACED = 4000, 4001  # why a live connection was closed: too many pages;
 class LivePage:
     """One live connection; holds the newest messages that it has not sent yet, by type."""
 
-    def __init__(self) -> None:
+    def __init__(self, connection: WebSocket) -> None:
+        self.connection = connection
         self._news = asyncio.Event()
         self._waiting: dict[str, str] = {}
 
@@ -53,34 +53,37 @@ class LivePage:
         self._waiting[kind] = text
         self._news.set()
 
-    async def send(self, connection: WebSocket) -> None:
-        """Send what `put` gets, without end."""
+    async def send(self) -> None:
+        """Send what `put` gets, until it is cancelled."""
         while True:
             await self._news.wait()
             self._news.clear()
             waiting, self._waiting = self._waiting, {}
             for text in waiting.values():
-                await connection.send_text(text)
+                await self.connection.send_text(text)
 
 
 class PanelServer:
     """Serves the panel at `host` and `port`.
 
-    report: returns the report of a trial by name, or None. parameters: returns those in force by node.
+    report: returns the report of a trial by name, or None. parameters: returns those in force by node. clock: of
+    `access`, monotonic s.
     """
 
     def __init__(
         self,
         host: str,
         port: int,
-        access: Access,
-        desk: Desk,
+        token: str,
+        control: Control,
         report: Callable[[str], Path | None],
         parameters: Callable[[], Mapping[str, Any]],
+        clock: Callable[[], float],
     ) -> None:
-        self._desk = desk
+        self.access = Access(host, token, clock)
+        self._control = control
         self._report = report
-        self._pages: dict[str, tuple[LivePage, WebSocket]] = {}  # by secret
+        self._pages: dict[str, LivePage] = {}  # by secret
         self._setup = ""  # none yet
         self._number = 0  # of the newest state
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -94,7 +97,7 @@ class PanelServer:
             Mount("/static", StaticFiles(directory=FOLDER / "static")),
         ]
         form = (FOLDER / "static" / "login.html").read_text(encoding="utf-8")
-        app = Guard(Starlette(routes=routes, lifespan=self._lifespan), access, form)
+        app = Guard(Starlette(routes=routes, lifespan=self._lifespan), self.access, form)
         self._socket = _listen(host, port)
         config = uvicorn.Config(
             app, log_level="warning", access_log=False, server_header=False, proxy_headers=False, ws_max_size=1024,
@@ -115,7 +118,7 @@ class PanelServer:
 
     @property
     def is_running(self) -> bool:
-        """Whether the thread runs."""
+        """Whether it still serves."""
         return self._thread.is_alive()
 
     def publish(self, state: Mapping[str, Any]) -> None:
@@ -125,7 +128,7 @@ class PanelServer:
     def publish_setup(self, setup: Mapping[str, Any]) -> None:
         """Send what changes rarely to all pages, and to those that open later."""
         self._setup = json.dumps({"type": "setup", **setup})
-        self._on_loop(self._send_setup, self._setup)
+        self._on_loop(self._send, "setup", self._setup)
 
     def _on_loop(self, function: Callable[..., None], *args: Any) -> None:
         if self._loop is not None:
@@ -143,53 +146,48 @@ class PanelServer:
     async def _watch(self) -> None:
         while True:
             await asyncio.sleep(WATCH_PERIOD)
-            await self._desk.watch()
+            await self._control.watch()
 
     def _send_state(self, state: Mapping[str, Any]) -> None:
         self._number += 1
         if not self._pages:
             return
-        control = self._desk.control
-        holder = control.holder
-        of_holder = {"page": holder.number, "address": holder.address, "gone": control.is_gone()} if holder else None
-        text = json.dumps({"type": "state", "number": self._number, "control": of_holder, **state})
-        for page, _ in self._pages.values():
-            page.put("state", text)
+        holder, gone = self._control.holder, self._control.is_gone()
+        of_holder = {"page": holder.number, "address": holder.address, "gone": gone} if holder else None
+        self._send("state", json.dumps({"type": "state", "number": self._number, "control": of_holder, **state}))
 
-    def _send_setup(self, text: str) -> None:
-        for page, _ in self._pages.values():
-            page.put("setup", text)
+    def _send(self, kind: str, text: str) -> None:
+        for page in self._pages.values():
+            page.put(kind, text)
 
     async def _on_live(self, connection: WebSocket) -> None:
         await connection.accept()
-        control = self._desk.control
         with suppress(WebSocketDisconnect, asyncio.TimeoutError, ValueError, KeyError):
             hello = await asyncio.wait_for(connection.receive_json(), HELLO_TIMEOUT)
             address = connection.client.host if connection.client else "unknown"
-            opened = control.open(_given(hello, "page", str), address)
-            if opened is None:
+            page = self._control.open(_given(hello, "page", str), address)
+            if page is None:
                 await connection.close(FULL)
                 return
-            await self._serve(connection, *opened)
+            await self._serve(connection, page)
 
-    async def _serve(self, connection: WebSocket, secret: str, page: Any) -> None:
-        if secret in self._pages:
-            await self._pages[secret][1].close(REPLACED)
-        live = LivePage()
-        self._pages[secret] = live, connection
-        live.put("page", json.dumps({"type": "page", "page": secret, "number": page.number}))
+    async def _serve(self, connection: WebSocket, page: Page) -> None:
+        if page.secret in self._pages:
+            await self._pages[page.secret].connection.close(REPLACED)
+        live = self._pages[page.secret] = LivePage(connection)
+        live.put("page", json.dumps({"type": "page", "page": page.secret, "number": page.number}))
         if self._setup:
             live.put("setup", self._setup)
-        sender = asyncio.create_task(live.send(connection))
+        sender = asyncio.create_task(live.send())
         try:
             while True:
                 _given(await connection.receive_json(), "seen", int)
-                self._desk.control.confirm(secret)
+                self._control.confirm(page)
         finally:
             sender.cancel()
-            if self._pages.get(secret, (None,))[0] is live:
-                del self._pages[secret]
-                self._desk.control.close(secret)
+            if self._pages.get(page.secret) is live:
+                del self._pages[page.secret]
+                page.connected = False
 
     async def _on_action(self, request: Request) -> Response:
         body = b""
@@ -202,7 +200,7 @@ class PanelServer:
         except ValueError:
             return JSONResponse({"error": "the request is not JSON"}, 400)
         address = request.client.host if request.client else "unknown"
-        status, text = await self._desk.perform(content, request.headers.get("x-panel-page", ""), address)
+        status, text = await self._control.perform(content, request.headers.get("x-panel-page", ""), address)
         return JSONResponse({"error": text}, status)
 
     async def _on_report(self, request: Request) -> Response:

@@ -1,4 +1,4 @@
-"""What the page shows of one arm: its state in full, ten times a second, and what changes rarely."""
+"""What the page shows: the state of an arm, ten times a second; its limits and settings; the picture of the arms."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
+from xml.etree import ElementTree
 
 from exo_gravity.panel.params import SETTABLE
 
@@ -23,9 +24,9 @@ OF_BRIDGE = {
 
 @dataclass
 class Joints:
-    """The newest message with joint values. time: monotonic s of its arrival."""
+    """The newest message with joint values."""
 
-    time: float = -math.inf
+    time: float = -math.inf  #: monotonic s of its arrival
     names: Sequence[str] = ()
     position: Sequence[float] = ()
     velocity: Sequence[float] = ()
@@ -34,12 +35,12 @@ class Joints:
 
 @dataclass
 class Status:
-    """The newest diagnostics of one node. level: 0 OK, 1 warning, 2 error. time: monotonic s of its arrival."""
+    """The newest diagnostics of one node."""
 
-    level: int = 0
+    level: int = 0  #: 0 OK, 1 warning, 2 error
     message: str = ""
     values: Mapping[str, str] = field(default_factory=dict)
-    time: float = -math.inf
+    time: float = -math.inf  #: monotonic s of its arrival
 
 
 def arm_state(now: float, joints: Joints, commands: Joints, bridge: Status, compensator: Status) -> dict[str, Any]:
@@ -104,3 +105,48 @@ def arm_setup(bridge: Mapping[str, Any], compensator: Mapping[str, Any], support
         "settings": {name: compensator.get(name) for name in SETTABLE},
         "support_limit": support_limit,
     }
+
+
+def scene_of(urdf: str) -> dict[str, Any]:
+    """Return {"links": {name: [shape]}, "joints": [joint]} of a robot description (`core.view.urdf`).
+
+    shape: kind (box, cylinder or sphere), size in m with the name of each number in keys, xyz in m and rpy in rad in
+    the link's frame, rgba. joint: name, parent, child, xyz, rpy, and axis and limits where it can turn, else None.
+    """
+    robot = ElementTree.fromstring(urdf)
+    colours = {material.get("name"): _numbers(material, "color", "rgba") for material in robot.findall("material")}
+    shapes = {link.get("name", ""): [_shape(v, colours) for v in link.findall("visual")] for link in robot.iter("link")}
+    return {"links": shapes, "joints": [_joint(joint) for joint in robot.findall("joint")]}
+
+
+def _shape(visual: ElementTree.Element, colours: Mapping[str | None, list[float] | None]) -> dict[str, Any]:
+    shape = next(visual.iter("geometry"))[0]
+    return {
+        "kind": shape.tag,
+        "size": [float(word) for value in shape.attrib.values() for word in value.split()],
+        "keys": list(shape.attrib),
+        "rgba": colours[next(visual.iter("material")).get("name")],
+        **_origin(visual),
+    }
+
+
+def _joint(joint: ElementTree.Element) -> dict[str, Any]:
+    limit = joint.find("limit")
+    return {
+        "name": joint.get("name"),
+        "parent": next(joint.iter("parent")).get("link"),
+        "child": next(joint.iter("child")).get("link"),
+        "axis": _numbers(joint, "axis", "xyz"),
+        "lower": float(limit.get("lower", "0")) if limit is not None else None,
+        "upper": float(limit.get("upper", "0")) if limit is not None else None,
+        **_origin(joint),
+    }
+
+
+def _origin(element: ElementTree.Element) -> dict[str, list[float]]:
+    return {key: _numbers(element, "origin", key) or [0.0] * 3 for key in ("xyz", "rpy")}
+
+
+def _numbers(parent: ElementTree.Element, tag: str, key: str) -> list[float] | None:
+    element = parent.find(tag)
+    return [float(word) for word in element.get(key, "").split()] if element is not None else None

@@ -11,36 +11,221 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from exo_gravity.core.errors import ExoGravityError, ParameterError
-from exo_gravity.core.model.budget import USUAL_TILT
-from exo_gravity.core.model.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
+from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.model.budget import (
+    FAMILY,
+    USUAL_TILT,
+    JointBudget,
+    Workspace,
+    budget,
+    largest_support,
+    motor_for,
+    motor_torques,
+    rounded_down,
+    torque_at,
+)
+from exo_gravity.core.model.wearer import SEX, TABLES, TYPICAL_LENGTH, LinkLoad, Wearer
 from exo_gravity.core.numbers import one_float
-from exo_gravity.tools.cli.extras import missing
-from exo_gravity.tools.inputs.arms import configured_arms
-from exo_gravity.tools.reporting.budget_table import ArmBudget, arm_budget, table_lines, verdict
+from exo_gravity.tools.cli import missing
+from exo_gravity.tools.inputs.arms import ConfiguredArm, configured_arms, named
+from exo_gravity.tools.reporting.colours import INK, JOINT_COLOURS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 DPI = 150
+JOINTS = ("shoulder rotation", "shoulder abduction", "shoulder flexion", "elbow flexion")
+HEADINGS = (
+    ("", "", "rated", "peak", "needs", "within", "within", "", "support"),
+    ("joint", "motor", "Nm", "Nm", "Nm", "rated", "peak", "worst pose; pitch, roll (deg)", "within rated"),
+)
+ALONE_COLOUR, CARRYING_COLOUR, RATED_COLOUR, PEAK_COLOUR = JOINT_COLOURS
+RED, YELLOW, PLAIN = "\033[31m", "\033[33m", "\033[0m"
+CELLS = 31  # of a map, along each axis
+REST = 60  # random settings of the angles that a map does not show, the same for each cell
+OTHER = (1, 2, 3, 2)  # the second axis of each joint's map: the angle that affects it most
+
+
+@dataclass(frozen=True)
+class ArmBudget:
+    """What each joint of an arm needs to carry its wearer's arm."""
+
+    name: str  #: of the arm's namespace
+    robot: ArmModel  #: without the wearer
+    motors: tuple[str, ...]
+    workspace: Workspace
+    load: LinkLoad  #: of the wearer's arm
+    support: float  #: 0..1, the share of that load
+    joints: tuple[JointBudget, ...]
+
+    @property
+    def beyond(self) -> list[int]:
+        """Indices of the joints that need more than rated torque somewhere."""
+        return [number for number, joint in enumerate(self.joints) if joint.overloaded]
+
+
+def arm_budget(configured: ConfiguredArm, wearer: Wearer, support: float, max_tilt: float) -> ArmBudget:
+    """Return the budget of an arm that carries `support` (0..1) of the wearer's arm; max_tilt: of the trunk, rad.
+
+    Raises ParameterError if the wearer does not fit the robot.
+    """
+    motors = tuple(configured.can_bridge["motor"])
+    workspace = Workspace(configured.limits.position_min, configured.limits.position_max, max_tilt)
+    with named(f"{configured.namespace}/compensator"):
+        load = wearer.on_links(configured.robot.length)
+        torques = motor_torques(motors, configured.can_bridge["torque_scale"])
+        joints = budget(configured.robot, load, support, workspace, *torques)
+    return ArmBudget(configured.namespace, configured.robot, motors, workspace, load, support, joints)
+
+
+def table_lines(arm: ArmBudget, colour: bool = False) -> Iterator[str]:
+    """Yield the lines of a table with one row per joint; colour: for a terminal, mark joints beyond rated torque."""
+    yield f"{arm.name} at support {arm.support:g}, trunk tilt up to {math.degrees(arm.workspace.max_tilt):g} deg"
+    yield from (_line(*heading) for heading in HEADINGS)
+    for number, joint in enumerate(arm.joints):
+        *pose, pitch, roll = (f"{angle:.0f}" for angle in np.degrees(joint.worst) + 0.0)  # + 0.0: no minus zero
+        line = _line(
+            f"{number + 1} {JOINTS[number]}",
+            arm.motors[number],
+            f"{joint.rated:.3g}",
+            f"{joint.peak:.3g}",
+            f"{joint.torque:.2f}",
+            f"{100 * rounded_down(joint.within_rated):.1f} %",
+            f"{100 * rounded_down(joint.within_peak):.1f} %",
+            f"{', '.join(pose)}; {pitch}, {roll}",
+            "none" if joint.support is None else f"{rounded_down(joint.support):.3f}",
+        )
+        mark = RED if joint.torque > joint.peak else YELLOW
+        yield f"{mark}{line}{PLAIN}" if colour and joint.overloaded else line
+
+
+def _line(*cells: str) -> str:
+    joint, motor, rated, peak, needs, within_rated, within_peak, pose, support = cells
+    torques = f"{rated:>7}{peak:>7}{needs:>8}{within_rated:>10}{within_peak:>10}"
+    return f"  {joint:<22}{motor:<8}{torques}   {pose:<32}{support:>12}".rstrip()
+
+
+def verdict(arm: ArmBudget, wearer: Wearer) -> list[str]:
+    """Return the conclusion in sentences: what is beyond the motors, which motor would do, which support fits."""
+    support = "Full Zero-G" if arm.support == 1.0 else f"Support {arm.support:g}"
+    what = f"{support} of a wearer of {wearer.body_mass:g} kg"
+    if arm.beyond:
+        sentences = [f"{what} is beyond the motors of {arm.name}."]
+        sentences += [_shortage(arm, number) for number in arm.beyond]
+        sentences.append(
+            "A larger motor is heavier and loads the joints before it: change the masses and run this again."
+        )
+        if any(motor_for(arm.joints[number].torque) == "AK80-64" for number in arm.beyond):
+            sentences.append("AK80-64 has a 64:1 gear: the wearer can hardly move it by hand.")
+    else:
+        sentences = [f"{what} is within rated torque everywhere on {arm.name}."]
+    largest = largest_support(arm.joints)
+    if largest is None:
+        sentences.append("The robot alone needs more than rated torque somewhere: no support stays within it.")
+    else:
+        sentences.append(f"The largest support within rated torque everywhere is {largest:g}.")
+    return sentences
+
+
+def _shortage(arm: ArmBudget, number: int) -> str:
+    joint, needs = arm.joints[number], arm.joints[number].torque
+    motor = motor_for(needs)
+    remedy = f"{motor} would do ({FAMILY[motor][0]:g} Nm rated)" if motor else "No motor of its family would do"
+    return (
+        f"Joint {number + 1}, {JOINTS[number]}: {needs:.1f} Nm, {needs / joint.rated:.1f} times the rated torque of "
+        f"its {arm.motors[number]} ({joint.rated:.3g} Nm), {'beyond' if needs > joint.peak else 'within'} its peak "
+        f"({joint.peak:.3g} Nm). {remedy}."
+    )
 
 
 def _write_figures(arms: Sequence[ArmBudget], folder: Path) -> str:
     """Draw a figure of each joint into `folder`; return a line on what was written."""
-    try:
-        from exo_gravity.tools.reporting.budget_figures import joint_figure
-    except ModuleNotFoundError as error:
-        return f"No figures: {missing(error.name or 'matplotlib', 'report')}"
+    if not find_spec("matplotlib"):
+        return f"No figures: {missing('matplotlib', 'report')}"
     names = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for arm in arms:
             for joint in range(len(arm.joints)):
                 names.append(f"{arm.name.strip('/').replace('/', '_')}_joint_{joint + 1}.png")
-                joint_figure(arm, joint).savefig(folder / names[-1], dpi=DPI)
+                _joint_figure(arm, joint).savefig(folder / names[-1], dpi=DPI)
     except OSError as error:
         raise ParameterError("output", str(folder), f"a folder to write to ({error.strerror})") from None
     return f"Written: {', '.join(names)} in {folder}"
+
+
+def _joint_figure(arm: ArmBudget, joint: int) -> Figure:
+    """Return the figure of one joint (0..3)."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11.0, 4.6), layout="constrained")
+    title = f"{arm.name} joint {joint + 1}, {JOINTS[joint]}: {arm.motors[joint]}"
+    figure.suptitle(title, x=0.01, ha="left", weight="bold")
+    shares, where = figure.subplots(1, 2, width_ratios=(1.1, 1.0))
+    _shares(shares, arm, joint)
+    _where(figure, where, arm, joint)
+    return figure
+
+
+def _shares(axis: Axes, arm: ArmBudget, joint: int) -> None:
+    """Draw the share of the workspace that needs at most a torque, for the robot alone and at the chosen support."""
+    points = arm.workspace.points()
+    carrying = arm.robot.with_wearer(*arm.load, arm.support)
+    percent = np.linspace(0.0, 100.0, len(points))
+    for model, colour, label in (
+        (arm.robot, ALONE_COLOUR, "robot alone (One-G)"),
+        (carrying, CARRYING_COLOUR, f"with the wearer's arm at support {arm.support:g}"),
+    ):
+        axis.plot(np.sort(np.abs(torque_at(model, points)[:, joint])), percent, color=colour, lw=1.8, label=label)
+    rated, peak = arm.joints[joint].rated, arm.joints[joint].peak
+    for limit, colour, label in ((rated, RATED_COLOUR, "rated"), (peak, PEAK_COLOUR, "peak")):
+        axis.axvline(limit, color=colour, lw=1.2, ls="--", label=f"{label}: {limit:g} Nm")
+    axis.set_xlim(0.0, 1.05 * max(arm.joints[joint].torque, peak))
+    axis.set_ylim(0.0, 102.0)
+    axis.set_xlabel("Torque (Nm)")
+    axis.set_ylabel("Share of the workspace that needs at most this (%)")
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.legend(loc="lower right", edgecolor="none", framealpha=0.9)
+
+
+def _where(figure: Figure, axis: Axes, arm: ArmBudget, joint: int) -> None:
+    """Map the largest torque over two joint angles, the maximum over the other angles and the trunk's tilt."""
+    from matplotlib.patheffects import withStroke
+
+    other = OTHER[joint]
+    low, high = arm.workspace.bounds
+    across, up = (np.linspace(low[n], high[n], CELLS) for n in (joint, other))
+    ends = np.array(list(product(*(sorted({a, min(max(0.0, a), b), b}) for a, b in zip(low, high, strict=True)))))
+    ends = ends[(ends[:, joint] == low[joint]) & (ends[:, other] == low[other])]
+    rest = np.vstack((arm.workspace.points(REST), ends, arm.joints[joint].worst))
+    points = np.tile(rest, (CELLS * CELLS, 1))
+    grid = np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2)
+    points[:, [joint, other]] = np.repeat(grid, len(rest), axis=0)
+    torque = np.abs(torque_at(arm.robot.with_wearer(*arm.load, arm.support), points)[:, joint])
+    largest = torque.reshape(CELLS, CELLS, len(rest)).max(axis=-1)
+    mesh = axis.pcolormesh(np.degrees(across), np.degrees(up), largest, cmap="cividis", vmin=0.0, shading="gouraud")
+    figure.colorbar(mesh, ax=axis, label=f"Largest torque at support {arm.support:g} (Nm)")
+    for limit, style in ((arm.joints[joint].rated, "-"), (arm.joints[joint].peak, ":")):
+        if largest.min() < limit < largest.max():
+            lines = axis.contour(np.degrees(across), np.degrees(up), largest, [limit], colors="white", linestyles=style)
+            outline: list[Any] = [withStroke(linewidth=2.5, foreground=INK)]
+            lines.set_path_effects(outline)
+            for text in axis.clabel(lines, fmt=f"{limit:g} Nm"):
+                text.set_path_effects(outline)
+    axis.set_title("maximum over the other joints and the trunk's tilt", fontsize=10)
+    axis.set_xlabel(f"Joint {joint + 1} (deg)")
+    axis.set_ylabel(f"Joint {other + 1} (deg)")
 
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:

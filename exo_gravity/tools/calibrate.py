@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 
 from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.core.model.tilt import SIDES
-from exo_gravity.tools.cli.extras import extras, require_ros
+from exo_gravity.tools.cli import extras, require_ros
 from exo_gravity.tools.inputs.arms import configured_arm
 
 if TYPE_CHECKING:

@@ -26,9 +26,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from exo_gravity.core.errors import ExoGravityError
-from exo_gravity.tools.cli.extras import require_ros
-from exo_gravity.tools.inputs.executables import executable, node_names
-from exo_gravity.tools.inputs.node_set import (
+from exo_gravity.tools.cli import require_ros
+from exo_gravity.tools.inputs.parameter_file import (
     DESCENT_TIMEOUT,
     ENDED_WELL,
     RECOVERY,
@@ -38,9 +37,12 @@ from exo_gravity.tools.inputs.node_set import (
     Stages,
     check_buses,
     chosen,
+    executable,
     is_observer,
+    load,
+    node_names,
+    packaged_config,
 )
-from exo_gravity.tools.inputs.parameter_file import load, packaged_config
 
 LOG_FORMAT = "{severity} {message}"
 

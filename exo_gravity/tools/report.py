@@ -15,11 +15,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from exo_gravity.core.errors import DataError, ExoGravityError
-from exo_gravity.core.trial.analysis import MIN_HOLD
-from exo_gravity.core.trial.verdict import HoldCriteria
-from exo_gravity.tools.cli.arguments import non_negative
-from exo_gravity.tools.cli.extras import extras
-from exo_gravity.tools.video import output
+from exo_gravity.core.trial.analysis import MIN_HOLD, HoldCriteria
+from exo_gravity.tools.cli import extras, non_negative
+from exo_gravity.tools.reporting import video
 
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
@@ -38,7 +36,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     limit("--max-drift-after-push", 2.0, "DEG", "the same for a hold after a push (%(default)s)")
     limit("--max-rate", math.inf, "DEG/MIN", "drift rate allowed over a whole hold (no limit)")
     limit("--min-hold", MIN_HOLD, "S", "shortest still phase that counts as a hold (%(default)s)")
-    output.add_arguments(parser)
+    video.add_arguments(parser)
     return parser.parse_args(args)
 
 
@@ -50,7 +48,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _repair(path: Path) -> int:
-    from exo_gravity.bag.repair import is_complete, repair
+    from exo_gravity.bag.writer import is_complete, repair
 
     try:
         if is_complete(path):
@@ -70,7 +68,6 @@ def _run(options: argparse.Namespace) -> int:
 
     from exo_gravity.bag.reader import read_bag
     from exo_gravity.tools.reporting import trial_report
-    from exo_gravity.tools.video import rendered
 
     criteria = HoldCriteria(
         max_stray=math.radians(options.max_drift),
@@ -79,7 +76,7 @@ def _run(options: argparse.Namespace) -> int:
     )
     path, screen = Path(options.bag), Console(stderr=True)
     try:
-        clip = output.requested(options.video, options.video_speed)
+        clip = video.requested(options.video, options.video_speed)
         with Progress(console=screen, transient=True, disable=not screen.is_terminal) as progress:
             task = progress.add_task(f"reading {path.name}", total=None)
             bag = read_bag(path, lambda done, size: progress.update(task, completed=done, total=size))
@@ -87,7 +84,7 @@ def _run(options: argparse.Namespace) -> int:
         beside = path.resolve().with_name(f"{path.resolve().stem}_report")
         written = trial_report.write(report, options.output or beside)
         if clip:
-            rendered.write(bag, clip, screen)
+            video.write(bag, clip, screen)
     except (ExoGravityError, OSError) as error:
         print(f"report: {error}", file=sys.stderr)
         return 2

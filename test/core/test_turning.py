@@ -9,8 +9,7 @@ import exo_gravity.sim.arm
 from exo_gravity.core import ArmModel
 from exo_gravity.core.model.turning import turning_torque
 from exo_gravity.sim import ArmConfig, SimulatedArm
-from exo_gravity.sim.arm import DEFAULT_LINKS
-from exo_gravity.sim.base_motion import rotation_in_base
+from exo_gravity.sim.arm import DEFAULT_LINKS, rotation_in_base
 
 FREE = {name: (0.0,) * 4 for name in ("coulomb_friction", "viscous_friction", "rotor_inertia")}
 

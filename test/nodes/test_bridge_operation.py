@@ -16,7 +16,7 @@ from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.operation import BridgeReport, BridgeServices
-from exo_gravity.nodes.ros.diagnostics import OK, WARN, Diagnostics
+from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
 
 
 def carrying(effort, cycles=0):

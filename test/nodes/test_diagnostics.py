@@ -5,7 +5,7 @@ import math
 import pytest
 import yaml
 
-from exo_gravity.nodes.ros.diagnostics import milliseconds, row
+from exo_gravity.nodes.ros.messages import milliseconds, row
 from exo_gravity.tools.inputs.parameter_file import load
 
 from ..support import CONFIG

@@ -22,7 +22,7 @@ from visualization_msgs.msg import MarkerArray
 
 from exo_gravity.core.view.urdf import ROOT
 from exo_gravity.tools.inputs.arms import configured_arms
-from exo_gravity.tools.inputs.executables import node_names
+from exo_gravity.tools.inputs.parameter_file import node_names
 from exo_gravity.tools.urdf import urdf_of
 
 from ..support import CONFIG

@@ -1,64 +1,121 @@
 """The parameters of another node, as it comes and goes."""
 
-import time
+from __future__ import annotations
 
+import itertools
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 
-from exo_gravity.nodes.ros import node_parameters
-from exo_gravity.nodes.ros.node_parameters import NodeParameters
+from exo_gravity.nodes.ros.parameters import ANSWER_TIMEOUT, NodeParameters
+from exo_gravity.nodes.ros.run import keep_to_this_machine
+
+keep_to_this_machine()
 
 
-def test_a_node_that_has_gone_and_returned_is_read_anew(node):
-    executor = SingleThreadedExecutor(context=node.context)
+@pytest.fixture(scope="module")
+def executor() -> Iterator[SingleThreadedExecutor]:
+    """The executor of the node that asks."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node("asking", namespace="/right", context=context)
+    executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
-    parameters = NodeParameters(node, "/right/other", lambda: None)
+    yield executor
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)
 
-    def wait_until(condition):
-        deadline = time.monotonic() + 30.0
-        while not condition():
-            assert time.monotonic() < deadline
-            executor.spin_once(timeout_sec=0.05)
-            parameters.update()
+
+@pytest.fixture
+def node(executor) -> Node:
+    """The node that asks."""
+    return executor.get_nodes()[0]
+
+
+def other_node(node: Node, value: float = 1.0) -> Node:
+    other = rclpy.create_node("other", namespace="/right", context=node.context)
+    other.declare_parameter("gain", value)
+    return other
+
+
+def wait_until(condition: Callable[[], object], action: Callable[[], object]) -> None:
+    deadline = time.monotonic() + 30.0
+    while not condition():
+        assert time.monotonic() < deadline
+        action()
+
+
+def test_a_node_that_has_gone_and_returned_is_read_anew(node, executor):
+    seen: list[float] = []
+    parameters = NodeParameters(node, "/right/other", lambda values: seen.append(values["gain"]))
+
+    def spin() -> None:
+        executor.spin_once(timeout_sec=0.05)
+        parameters.update()
 
     for value in (1.0, 2.0):
-        other = rclpy.create_node("other", namespace="/right", context=node.context)
-        other.declare_parameter("gain", value)
+        other = other_node(node, value)
         executor.add_node(other)
-        wait_until(lambda value=value: parameters.is_present and parameters.values.get("gain") == value)
+        wait_until(lambda value=value: parameters.is_present and parameters.values.get("gain") == value, spin)
         executor.remove_node(other)
         other.destroy_node()
-        wait_until(lambda: not parameters.is_present)
-    executor.shutdown()
+        wait_until(lambda: not parameters.is_present, spin)
+    assert seen == [1.0, 2.0]
+    parameters.destroy()
+
+
+def test_named_parameters_are_read_alone_and_all_or_none(node, executor):
+    other = other_node(node)
+    executor.add_node(other)
+    answers: dict[str, dict[str, object]] = {}
+    readers = {
+        names: NodeParameters(node, "other", lambda values, names=names: answers.update({names: values}), names)
+        for names in (("gain",), ("gain", "unknown"))
+    }
+
+    def spin() -> None:
+        executor.spin_once(timeout_sec=0.05)
+        for parameters in readers.values():
+            parameters.update()
+
+    wait_until(lambda: len(answers) == 2, spin)
+    assert answers == {("gain",): {"gain": 1.0}, ("gain", "unknown"): {}}
+    for parameters in readers.values():
+        parameters.destroy()
+    executor.remove_node(other)
+    other.destroy_node()
 
 
 def test_a_name_without_services_is_not_present(node):
     ghost = rclpy.create_node("ghost", context=node.context, start_parameter_services=False)
-    parameters = NodeParameters(node, "/ghost", lambda: None)
+    parameters = NodeParameters(node, "/ghost")
     parameters.update()
     assert not parameters.is_present
     ghost.destroy_node()
 
 
-def test_answers_after_the_first_are_ignored_once_it_is_destroyed(node, monkeypatch):
-    monkeypatch.setattr(node_parameters, "TIMEOUT", 0.0)  # every update asks again
-    executor = SingleThreadedExecutor(context=node.context)
-    executor.add_node(node)
-    other = rclpy.create_node("other", namespace="/right", context=node.context)
-    parameters = NodeParameters(node, "/right/other", lambda: parameters.destroy())
-    deadline = time.monotonic() + 30.0
-    while not parameters.is_present:
-        assert time.monotonic() < deadline
-        parameters.update()
-        time.sleep(0.01)
+def test_answers_after_the_first_are_ignored_once_it_is_destroyed(node, executor):
+    other = other_node(node)
+    clock = itertools.count(0.0, ANSWER_TIMEOUT).__next__  # every update asks again
+    answers: list[object] = []
+
+    def destroy(values: dict[str, object]) -> None:
+        answers.append(values)
+        parameters.destroy()
+
+    parameters = NodeParameters(node, "/right/other", destroy, clock=clock)
+    wait_until(lambda: parameters.is_present, parameters.update)
     for _ in range(5):
         parameters.update()
     executor.add_node(other)  # which answers all requests now
-    while not parameters.values:
-        assert time.monotonic() < deadline
-        executor.spin_once(timeout_sec=0.05)
+    wait_until(lambda: answers, lambda: executor.spin_once(timeout_sec=0.05))
     for _ in range(50):
         executor.spin_once(timeout_sec=0.01)
-    assert "use_sim_time" in parameters.values
-    executor.shutdown()
+    assert len(answers) == 1
+    executor.remove_node(other)
     other.destroy_node()

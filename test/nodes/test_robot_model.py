@@ -11,7 +11,6 @@ import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import JointState
@@ -19,12 +18,13 @@ from std_msgs.msg import String
 from visualization_msgs.msg import Marker, MarkerArray
 
 from exo_gravity.core.view.urdf import ROOT
+from exo_gravity.nodes.ros.hot_path import LATCHED
 from exo_gravity.tools.urdf import urdf_of
 
 from ..support import CONFIG
 from ..support.joint_state_feeder import PARTS
+from ..support.launched_nodes import LaunchedNodes
 
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 READINGS = {"left": (0.1, 0.2, 0.3, 0.4), "right": (-0.1, 0.5, 0.6, 0.7)}
 EFFORT = (0.0, 1.5, 1.2, 0.2)
 
@@ -100,22 +100,30 @@ class Viewer:
             self._closing.wait(0.05)
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("robot_model")
+
+
+@pytest.fixture(scope="module")
+def nodes(folder):
+    """Both arms without simulators; the bridges stay inactive, so that the only joint states are those of the test."""
+    content = yaml.safe_load((CONFIG / "sim_both.yaml").read_text(encoding="utf-8"))
+    base = folder / "both.yaml"
+    content["/robot_model"] = {"ros__parameters": {"rate": 50.0}}
+    content["/recorder"] = {"ros__parameters": {"output": str(folder / "bag")}}
+    base.write_text(yaml.safe_dump(content), encoding="utf-8")
+    nodes = LaunchedNodes(folder, base=base, without=("simulator", "imu"), can_bridge={"autostart": False}).start()
+    yield nodes
+    nodes.stop()
+    print("\n".join(nodes.log))
+
+
 @pytest.fixture
 def viewer():
     viewer = Viewer()
     yield viewer
     viewer.close()
-
-
-@pytest.fixture
-def nodes(launch, tmp_path):
-    """Both arms without simulators; the bridges stay inactive, so that the only joint states are those of the test."""
-    content = yaml.safe_load((CONFIG / "sim_both.yaml").read_text(encoding="utf-8"))
-    base = tmp_path / "both.yaml"
-    content["/robot_model"] = {"ros__parameters": {"rate": 50.0}}
-    content["/recorder"] = {"ros__parameters": {"output": str(tmp_path / "bag")}}
-    base.write_text(yaml.safe_dump(content), encoding="utf-8")
-    return launch(base=base, without=("simulator", "imu"), can_bridge={"autostart": False})
 
 
 def test_a_viewer_gets_the_description_the_joint_states_of_both_arms_and_markers(nodes, viewer):
@@ -142,13 +150,13 @@ def test_an_arm_that_falls_silent_disappears_and_the_other_stays(nodes, viewer):
     viewer.wait_until(lambda: viewer.problem == "no messages on /left/joint_states")
 
 
-def test_a_recording_holds_each_joint_state_once_and_the_arms_run_on_if_robot_model_ends(nodes, viewer, tmp_path):
+def test_a_recording_holds_each_joint_state_once_and_the_arms_run_on_if_robot_model_ends(nodes, viewer, folder):
     viewer.wait_until(lambda: len(viewer.states.name) == 8)
     nodes.process("/robot_model").kill()
     nodes.process("/robot_model").wait()
     assert nodes.launcher.dead() is None
     nodes.stop()
-    with AnyReader([tmp_path / "bag"], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
+    with AnyReader([folder / "bag"], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
         topics = {connection.topic for connection in bag.connections}
     assert "/joint_states" not in topics
     assert {"/left/joint_states", "/right/joint_states"} <= topics

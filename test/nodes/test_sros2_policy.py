@@ -155,12 +155,14 @@ def session(tmp_path_factory):
     return found
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("node", NODES)
 @pytest.mark.parametrize("kind", ["publish", "subscribe", "reply"])
 def test_a_node_may_do_exactly_what_it_does(session, node, kind):
     assert read_policy()[node][kind] == session[0][node][kind]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("node", [node for node in NODES if node.endswith(("can_bridge", "simulator", "loop", "imu"))])
 def test_these_nodes_call_no_services_of_other_nodes(session, node):
     assert session[0][node]["request"] == set() == read_policy()[node]["request"]
@@ -171,15 +173,18 @@ def test_a_compensator_may_read_the_parameters_of_its_own_bridge_for_the_budget(
     assert read_policy()[f"/{arm}/compensator"]["request"] == {f"/{arm}/can_bridge/get_parameters"}
 
 
+@pytest.mark.thorough
 def test_the_recorder_may_call_exactly_the_services_that_it_calls(session):
     requests = {f"{node}/{service}" for node in session[1] for service in RECORDER_CALLS}
     assert read_policy()["/recorder"]["request"] == requests
 
 
+@pytest.mark.thorough
 def test_the_panel_may_call_exactly_the_services_that_it_calls(session):
     assert read_policy()["/panel"]["request"] == session[0]["/panel"]["request"]
 
 
+@pytest.mark.thorough
 def test_robot_model_may_read_the_parameters_of_the_arms_and_call_nothing_else(session):
     requests = {f"/{arm}/{node}/get_parameters" for arm in ("left", "right") for node in ("can_bridge", "compensator")}
     assert session[0]["/robot_model"]["request"] == requests == read_policy()["/robot_model"]["request"]

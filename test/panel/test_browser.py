@@ -12,9 +12,9 @@ pytest.importorskip("playwright", reason="no browser driver: install the extra t
 
 from playwright.sync_api import Page
 
-from ..support.panel_browser import NEEDS_CHROMIUM, enable, wait_for_state
+from ..support.panel_browser import IN_BROWSER, enable, wait_for_state
 
-pytestmark = [NEEDS_CHROMIUM, pytest.mark.timeout(300)]
+pytestmark = IN_BROWSER
 BOTH_DOWN = [("let_down", "right"), ("let_down", "left")]
 
 

@@ -13,9 +13,9 @@ pytest.importorskip("playwright", reason="no browser driver: install the extra t
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Page
 
-from ..support.panel_browser import NEEDS_CHROMIUM, wait_for_state
+from ..support.panel_browser import IN_BROWSER, wait_for_state
 
-pytestmark = [NEEDS_CHROMIUM, pytest.mark.timeout(300)]
+pytestmark = IN_BROWSER
 
 
 def serious(page: Page) -> list[str]:

@@ -1,114 +1,328 @@
-"""One page at a time holds control; a page that is gone is noticed."""
+"""Who may do what: requests are checked, one page holds control, and letting down always works."""
+
+from __future__ import annotations
+
+import asyncio
 
 import pytest
 
-from exo_gravity.panel.control import BURST, FORGOTTEN, GONE, MAX_PAGES, REFILL, Control
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.panel.control import (
+    BURST,
+    FORGOTTEN,
+    GONE,
+    MAX_PAGES,
+    REFILL,
+    RETRY,
+    Action,
+    Control,
+    Page,
+    Reply,
+    parse,
+)
+
+from ..support.panel_stage import PlayedArms, PlayedFiles
+
+DOWN = [("let_down", "right"), ("let_down", "left")]
 
 
-class Clock:
-    now = 0.0
+class Panel(Control):
+    """Two pages, of which the first holds control, and what the arms were asked for."""
 
-    def __call__(self) -> float:
-        return self.now
+    def __init__(self, dead_man: bool = False) -> None:
+        self.now = 100.0
+        self.arms, self.files, self.notes = PlayedArms(), PlayedFiles(), list[str]()
+        self.note_error: Exception | None = None
+        super().__init__(self.arms, self.files, self.write, lambda: self.now, dead_man)
+        self.first, self.second = (self.opened(f"10.0.0.{n}") for n in (1, 2))
+
+    def write(self, text: str) -> None:
+        if self.note_error:
+            raise self.note_error
+        self.notes.append(text)
+
+    def opened(self, address: str = "10.0.0.3", secret: str = "") -> Page:
+        page = self.open(secret, address)
+        assert page is not None
+        return page
+
+    def ask(self, page: Page | str, **body: object) -> Reply:
+        secret = page if isinstance(page, str) else page.secret
+        return asyncio.run(self.perform(body, secret, "10.0.0.9"))
+
+    def watch_after(self, seconds: float) -> list[tuple[str, ...]]:
+        """Let `watch` be called `seconds` later; return what it asked of the arms."""
+        self.now += seconds
+        self.arms.calls.clear()
+        asyncio.run(self.watch())
+        return list(self.arms.calls)
 
 
 @pytest.fixture
-def clock() -> Clock:
-    """A clock that a test sets."""
-    return Clock()
+def panel() -> Panel:
+    """A panel without dead man."""
+    return Panel()
 
 
 @pytest.fixture
-def control(clock: Clock) -> Control:
-    """No pages yet."""
-    return Control(clock)
+def guarded() -> Panel:
+    """A panel with dead man."""
+    return Panel(dead_man=True)
 
 
-def opened(control: Control, secret: str = "") -> str:
-    result = control.open(secret, "127.0.0.1")
-    assert result is not None
-    return result[0]
+# Requests
 
 
-def test_the_first_page_holds_control_and_the_second_watches_until_it_takes_it(control):
-    first, second = opened(control), opened(control)
-    assert control.holds(first)
-    assert not control.holds(second)
-    control.take(second)
-    assert control.holds(second)
-    assert not control.holds(first)
+@pytest.mark.parametrize(
+    ("body", "action"),
+    [
+        ({"do": "let_down"}, Action("let_down")),
+        ({"do": "let_down", "arm": "left"}, Action("let_down", "left")),
+        ({"do": "enable", "arm": "right"}, Action("enable", "right")),
+        ({"do": "set", "arm": "right", "values": {"support": 1}}, Action("set", "right", {"support": 1.0})),
+        ({"do": "trial", "name": "demo"}, Action("trial", name="demo")),
+        ({"do": "take"}, Action("take")),
+    ],
+)
+def test_a_right_request_is_understood(body, action):
+    assert parse(body, ("right", "left"), ("demo",)) == action
 
 
-def test_an_unknown_page_never_holds_control(control):
-    control.take("guessed")
-    assert not control.holds("guessed")
-    assert not control.holds("")
-    assert control.holder is None
+@pytest.mark.parametrize(
+    "body",
+    [
+        None,
+        [],
+        "let_down",
+        {},
+        {"do": "set_zero", "arm": "right"},
+        {"do": ["enable"]},
+        {"do": "enable"},
+        {"do": "enable", "arm": "middle"},
+        {"do": "enable", "arm": ["right"]},
+        {"do": "enable", "arm": "right", "force": True},
+        {"do": "let_down", "arm": None},
+        {"do": "take", "arm": "right"},
+        {"do": "trial", "name": "../../etc/passwd"},
+        {"do": "trial"},
+        {"do": "set", "arm": "right"},
+        {"do": "set", "arm": "right", "values": {}},
+        {"do": "set", "arm": "right", "values": [["support", 1]]},
+        {"do": "set", "arm": "right", "values": {"max_effort": [40.0] * 4}},
+        {"do": "set", "arm": "right", "values": {"robot.mass": [0.1] * 4}},
+        {"do": "set", "arm": "right", "values": {"support": 1.01}},
+        {"do": "set", "arm": "right", "values": {"support": -0.01}},
+        {"do": "set", "arm": "right", "values": {"support": float("nan")}},
+        {"do": "set", "arm": "right", "values": {"support": True}},
+        {"do": "set", "arm": "right", "values": {"support": "1"}},
+        {"do": "set", "arm": "right", "values": {"mode": "two_g"}},
+        {"do": "set", "arm": "right", "values": {"wearer.body_mass": 301.0}},
+        {"do": "set", "arm": "right", "values": {"wearer.segment_length": [0.3, 0.3]}},
+        {"do": "set", "arm": "right", "values": {"support": 0.5, "law": "exact"}},
+    ],
+)
+def test_a_wrong_request_is_refused(body):
+    with pytest.raises(ParameterError):
+        parse(body, ("right", "left"), ("demo",))
 
 
-def test_a_reloaded_page_keeps_its_number_and_control(control):
-    first = opened(control)
-    number = control.page(first).number
-    control.close(first)
-    assert opened(control, first) == first
-    assert control.page(first).number == number
-    assert control.holds(first)
+def test_the_log_shows_the_support_but_not_the_wearers_data():
+    values = {"support": 0.3, "wearer.body_mass": 81.5, "wearer.sex": "female"}
+    text = str(Action("set", "right", values))
+    assert text == "set right support = 0.3, wearer.body_mass, wearer.sex"
 
 
-def test_a_secret_that_the_panel_did_not_give_is_not_accepted(control):
-    assert opened(control, "my own") != "my own"
+# What is done
 
 
-def test_the_operators_page_is_gone_when_it_confirms_nothing_for_two_seconds(control, clock):
-    page = opened(control)
-    clock.now += GONE
-    assert not control.is_gone()
-    clock.now += 0.01
-    assert control.is_gone()
-    control.confirm(page)
-    assert not control.is_gone()
+def test_the_operator_enables_an_arm_and_it_is_noted_with_the_client(panel):
+    assert panel.ask(panel.first, do="enable", arm="right") == (200, "")
+    assert panel.arms.calls == [("enable", "right")]
+    assert panel.notes == ["10.0.0.1 page 1: enable right: done"]
 
 
-def test_a_new_page_holds_control_if_the_operators_page_is_gone(control, clock):
-    opened(control)
-    clock.now += GONE + 0.1
-    assert control.holds(opened(control))
+@pytest.mark.parametrize("kind", ["enable", "clear_fault"])
+def test_a_page_that_watches_moves_nothing(panel, kind):
+    for page in (panel.second, "", "guessed"):
+        assert panel.ask(page, do=kind, arm="right").status == 403
+    assert panel.arms.calls == []
 
 
-def test_with_dead_man_the_page_that_holds_control_is_not_forgotten(clock):
-    control = Control(clock, dead_man=True)
-    operator = opened(control)
-    control.close(operator)
-    for _ in range(MAX_PAGES - 1):
-        opened(control)
-    assert control.open("", "127.0.0.1") is None
-    clock.now += FORGOTTEN + 1.0
-    control.open("", "127.0.0.1")
-    assert control.is_gone()
+def test_every_page_may_let_down_even_an_unknown_one(panel):
+    for page in (panel.first, panel.second, "", "guessed"):
+        panel.arms.calls.clear()
+        assert panel.ask(page, do="let_down").status == 200
+        assert panel.arms.calls == DOWN
+    assert panel.ask("", do="let_down", arm="left").status == 200
+    assert panel.arms.calls[-1] == ("let_down", "left")
 
 
-def test_a_watching_page_that_is_gone_does_not_count(control, clock):
-    operator, _ = opened(control), opened(control)
-    clock.now += GONE + 0.1
-    control.confirm(operator)
-    assert not control.is_gone()
+def test_letting_down_has_no_rate_limit_and_everything_else_has(panel):
+    def statuses(count: int) -> list[int]:
+        return [panel.ask(panel.first, do="clear_fault", arm="right").status for _ in range(count)]
+
+    assert statuses(int(BURST) + 1) == [200] * int(BURST) + [429]
+    panel.now += 1.0
+    assert statuses(int(REFILL) + 1) == [200] * int(REFILL) + [429]
+    assert [panel.ask(panel.first, do="let_down").status for _ in range(50)] == [200] * 50
 
 
-def test_a_page_may_send_a_burst_of_actions_and_then_only_so_many_a_second(control, clock):
-    page = opened(control)
-    assert [control.spend(page) for _ in range(int(BURST) + 1)] == [True] * int(BURST) + [False]
-    clock.now += 1.0
-    assert [control.spend(page) for _ in range(int(REFILL) + 1)] == [True] * int(REFILL) + [False]
-    assert not control.spend("guessed")
+def test_a_flood_of_wrong_requests_does_not_fill_the_log(panel):
+    for _ in range(500):
+        panel.ask(panel.first, do="nonsense")
+    assert len(panel.notes) <= BURST
 
 
-def test_pages_do_not_grow_without_end(control, clock):
-    pages = [opened(control) for _ in range(MAX_PAGES)]
-    assert control.open("", "10.0.0.1") is None
-    control.close(pages[5])
-    opened(control)
-    assert control.page(pages[5]) is None
-    control.close(pages[6])
-    clock.now += FORGOTTEN + 1.0
-    opened(control)
-    assert control.page(pages[6]) is None
+def test_a_refusal_of_the_device_reaches_the_page_and_the_log(panel):
+    panel.arms.problem = "refused: the arm is active"
+    assert panel.ask(panel.first, do="enable", arm="right") == (409, "refused: the arm is active")
+    assert panel.notes[-1].endswith("enable right: refused: the arm is active")
+    assert panel.ask(panel.first, do="let_down").text == (
+        "right: refused: the arm is active; left: refused: the arm is active"
+    )
+
+
+def test_an_arm_that_raises_does_not_keep_the_other_one_up(panel):
+    panel.arms.errors["right"] = RuntimeError("the client is gone")
+    assert panel.ask(panel.first, do="let_down") == (409, "right: RuntimeError: the client is gone")
+    assert panel.arms.calls == DOWN
+
+
+def test_without_an_arm_letting_down_fails_visibly(panel):
+    panel.arms.names = ()
+    assert panel.ask(panel.first, do="let_down").status == 409
+
+
+def test_only_the_operator_uses_recordings_trials_and_files(panel):
+    for kind in ("record", "stop_recording", "save", "stop_trial"):
+        assert panel.ask(panel.second, do=kind).status == 403
+        assert panel.ask(panel.first, do=kind).status == 200
+    assert panel.ask(panel.first, do="trial", name="demo").status == 200
+    assert panel.files.calls == ["record", "stop_recording", "save", "stop_trial", "trial demo"]
+
+
+# Who holds control
+
+
+def test_control_is_taken_and_given_up(panel):
+    assert panel.ask(panel.second, do="take").status == 200
+    assert panel.ask(panel.second, do="enable", arm="left").status == 200
+    assert panel.ask(panel.first, do="enable", arm="left").status == 403
+    panel.ask(panel.second, do="release")
+    assert panel.ask(panel.second, do="enable", arm="left").status == 403
+    assert panel.ask("guessed", do="take").status == 403
+    assert panel.holder is None
+
+
+def test_a_reloaded_page_keeps_its_number_and_control(panel):
+    panel.first.connected = False
+    assert panel.opened(secret=panel.first.secret) is panel.first
+    assert panel.holder is panel.first
+    assert panel.first.number == 1
+
+
+def test_a_secret_that_the_panel_did_not_give_is_not_accepted(panel):
+    assert panel.opened(secret="my own").secret != "my own"
+
+
+def test_the_operators_page_is_gone_when_it_confirms_nothing_for_two_seconds(panel):
+    panel.now += GONE
+    assert not panel.is_gone()
+    panel.now += 0.01
+    assert panel.is_gone()
+    panel.confirm(panel.second)
+    assert panel.is_gone()
+    panel.confirm(panel.first)
+    assert not panel.is_gone()
+
+
+def test_a_new_page_holds_control_if_the_operators_page_is_gone(panel):
+    panel.now += GONE + 0.1
+    page = panel.opened()
+    assert panel.holder is page
+
+
+def test_the_number_of_pages_is_limited(panel):
+    pages = [panel.first, panel.second, *(panel.opened() for _ in range(MAX_PAGES - 2))]
+    assert panel.open("", "10.0.0.1") is None
+    pages[5].connected = False
+    panel.opened()
+    assert panel.open(pages[5].secret, "10.0.0.1") is None
+    pages[6].connected = False
+    panel.now += FORGOTTEN + 1.0
+    assert panel.opened(secret=pages[6].secret).secret != pages[6].secret
+
+
+# The operator's page is gone
+
+
+def test_the_arms_go_on_without_dead_man(panel):
+    assert panel.watch_after(GONE + 0.1) == []
+
+
+def test_with_dead_man_the_arms_are_let_down_once(guarded):
+    assert guarded.watch_after(GONE) == []
+    assert guarded.watch_after(0.1) == DOWN
+    assert guarded.notes == ["10.0.0.1 page 1 has been gone for 2 s: let down: done"]
+    assert guarded.watch_after(10.0) == []
+
+
+def test_with_dead_man_a_page_that_opens_meanwhile_does_not_keep_the_arms_up(guarded):
+    guarded.now += GONE + 0.05
+    guarded.opened()
+    assert guarded.watch_after(0.0) == DOWN
+
+
+def test_with_dead_man_a_page_that_takes_control_replaces_the_one_that_is_gone(guarded):
+    guarded.now += GONE - 0.1
+    guarded.confirm(guarded.second)
+    assert guarded.ask(guarded.second, do="take").status == 200
+    assert guarded.watch_after(0.2) == []
+
+
+def test_with_dead_man_the_page_that_holds_control_is_not_forgotten(guarded):
+    guarded.first.connected = False
+    for _ in range(MAX_PAGES - 2):
+        guarded.opened()
+    assert guarded.open("", "10.0.0.1") is None
+    guarded.now += FORGOTTEN + 1.0
+    guarded.open("", "10.0.0.1")
+    assert guarded.is_gone()
+
+
+def test_with_dead_man_letting_down_is_repeated_until_it_works(guarded):
+    guarded.arms.problem = "can_bridge does not answer"
+    guarded.now += GONE + 0.1
+    assert [guarded.watch_after(RETRY / 2) for _ in range(4)] == [DOWN, [], DOWN, []]
+    guarded.arms.problem = ""
+    assert [guarded.watch_after(RETRY) for _ in range(2)] == [DOWN, []]
+
+
+def test_with_dead_man_an_arm_that_raises_is_noted_and_asked_again(guarded):
+    guarded.arms.errors["right"] = RuntimeError("the client is gone")
+    assert guarded.watch_after(GONE + 0.1) == DOWN
+    assert guarded.notes[-1].endswith("gone for 2 s: let down: right: RuntimeError: the client is gone")
+    del guarded.arms.errors["right"]
+    assert [guarded.watch_after(RETRY) for _ in range(2)] == [DOWN, []]
+
+
+def test_with_dead_man_a_log_that_raises_keeps_no_arm_up(guarded, caplog):
+    guarded.note_error = OSError("no space left")
+    assert guarded.watch_after(GONE + 0.1) == DOWN
+    assert "no space left" in caplog.text and "page 1 has been gone for 2 s: let down: done" in caplog.text
+    assert guarded.watch_after(10.0) == []
+
+
+def test_with_dead_man_a_watch_that_fails_says_why_lets_the_arms_down_and_goes_on(guarded, monkeypatch):
+    def fail() -> bool:
+        raise KeyError("page 1")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(guarded, "is_gone", fail)
+        assert guarded.watch_after(0.0) == DOWN
+        assert guarded.notes == ["the watch of the operator's page failed: KeyError: 'page 1': let down: done"]
+        assert guarded.watch_after(0.1) == []
+        assert guarded.watch_after(RETRY) == DOWN
+    guarded.confirm(guarded.first)
+    assert guarded.watch_after(RETRY) == []
+    assert guarded.watch_after(GONE) == DOWN

@@ -21,9 +21,9 @@ pytest.importorskip("playwright", reason="no browser driver: install the extra t
 
 from playwright.sync_api import Browser, Page
 
-from ..support.panel_browser import NEEDS_CHROMIUM, chromium, enable, open_page, wait_for_state
+from ..support.panel_browser import IN_BROWSER, chromium, enable, open_page, wait_for_state
 
-pytestmark = [NEEDS_CHROMIUM, pytest.mark.real_time, pytest.mark.timeout(240)]
+pytestmark = [*IN_BROWSER, pytest.mark.real_time]
 
 
 class Clinic:

@@ -1,20 +1,30 @@
-"""The node `panel` as a process, without a device: its page, its parameters, and its end."""
+"""The node `panel` as a process with an arm that the test plays: its page, its parameters, what it asks of the arm."""
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool, Trigger
+from websockets.sync.client import ClientConnection, connect
 
 from ..support.launched_nodes import executable
 from ..support.ports import free_port
 from ..support.ros_probe import RosProbe
 
 TOKEN = "a token for this test"
+NAMES = [f"joint_{n}" for n in range(4)]
 
 
 class PanelProcess:
@@ -34,56 +44,127 @@ class PanelProcess:
         assert self.process.stderr is not None
         return next(line for line in self.process.stderr if "http://" in line)
 
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+class PlayedArm:
+    """`can_bridge` and `compensator` of the right arm. asked: what their services were asked for."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[str, Any]] = []
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self.bridge, self.compensator = (
+            rclpy.create_node(name, namespace="right", context=self.context) for name in ("can_bridge", "compensator")
+        )
+        self.bridge.declare_parameter("joint_names", NAMES)
+        self.compensator.declare_parameter("support", 0.1)
+        self.bridge.create_service(SetBool, "~/enable", self._on_enable)
+        self.bridge.create_service(Trigger, "~/clear_fault", self._on_clear_fault)
+        self._states = self.bridge.create_publisher(JointState, "joint_states", 1)
+        self._statuses = self.bridge.create_publisher(DiagnosticArray, "/diagnostics", 1)
+        self.bridge.create_timer(0.05, self._publish)
+        self._executor = SingleThreadedExecutor(context=self.context)
+        for node in (self.bridge, self.compensator):
+            self._executor.add_node(node)
+        self._closing = False
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._closing = True
+        self._thread.join()
+        self._executor.shutdown()
+        for node in (self.bridge, self.compensator):
+            node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+    def _spin(self) -> None:
+        while not self._closing:
+            self._executor.spin_once(timeout_sec=0.1)
+
+    def _publish(self) -> None:
+        self._states.publish(JointState(name=NAMES, position=[0.1] * 4, velocity=[0.0] * 4, effort=[1.0] * 4))
+        values = [KeyValue(key="state", value="disabled"), KeyValue(key="fault", value="none")]
+        status = DiagnosticStatus(name="right/can_bridge", message="disabled", values=values)
+        self._statuses.publish(DiagnosticArray(status=[status]))
+
+    def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self.asked.append(("enable", request.data))
+        response.success = True
+        return response
+
+    def _on_clear_fault(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self.asked.append(("clear_fault", None))
+        response.success, response.message = False, "refused: there is no fault"
+        return response
+
 
 @pytest.fixture
-def start(tmp_path: Path) -> Iterator[Callable[..., PanelProcess]]:
-    """A function that starts a panel, which ends with the test."""
-    started: list[PanelProcess] = []
-
-    def start(**parameters: object) -> PanelProcess:
-        started.append(PanelProcess(tmp_path, **parameters))
-        return started[-1]
-
-    yield start
-    for panel in started:
-        panel.process.kill()
-        panel.process.wait()
+def panel(tmp_path: Path) -> Iterator[PanelProcess]:
+    """A panel on loopback."""
+    panel = PanelProcess(tmp_path)
+    assert "on this machine only" in panel.wait_for_address()
+    yield panel
+    panel.close()
 
 
-def test_its_parameters_can_be_read_but_not_its_token(start):
-    panel = start(token=TOKEN)
-    assert TOKEN in panel.wait_for_address()
+def message(connection: ClientConnection, kind: str, condition: Callable[[dict[str, Any]], Any]) -> dict[str, Any]:
+    """Return the first message of this type for which `condition` holds."""
+    while True:
+        content = json.loads(connection.recv(timeout=30))
+        if content["type"] == kind and condition(content):
+            return content
+
+
+def is_known(setup: dict[str, Any], support: float = 0.1) -> bool:
+    arm = setup["arms"].get("right")
+    return bool(arm) and arm["joint_names"] == NAMES and arm["settings"]["support"] == support
+
+
+def test_the_page_shows_and_operates_an_arm_that_comes_and_goes(panel):
+    origin = panel.url.rstrip("/")
+    with connect(panel.url.replace("http", "ws") + "live", origin=origin) as connection:
+        connection.send(json.dumps({"page": ""}))
+        secret = message(connection, "page", lambda _: True)["page"]
+
+        def ask(**body: Any) -> tuple[int, str]:
+            headers = {"origin": origin, "x-panel-page": secret}
+            answer = httpx.post(panel.url + "action", json=body, headers=headers, verify=False)
+            return answer.status_code, answer.json()["error"]
+
+        assert ask(do="let_down") == (409, "no arm is present")
+        arm = PlayedArm()
+        try:
+            message(connection, "setup", is_known)
+            state = message(connection, "state", lambda state: state["arms"]["right"]["joints"])["arms"]["right"]
+            assert [joint["position"] for joint in state["joints"]] == [0.1] * 4
+            assert ask(do="enable", arm="right") == (200, "")
+            assert ask(do="clear_fault", arm="right") == (409, "refused: there is no fault")
+            assert ask(do="set", arm="right", values={"support": 0.2}) == (200, "")
+            message(connection, "setup", lambda setup: is_known(setup, 0.2))
+            assert ask(do="let_down") == (200, "")
+            assert arm.asked == [("enable", True), ("clear_fault", None), ("enable", False)]
+        finally:
+            arm.close()
+        message(connection, "state", lambda state: state["arms"]["right"]["bridge"] is None)
+        assert ask(do="let_down") == (409, "right: /right/can_bridge/enable does not answer")
+
+
+def test_its_parameters_can_be_read_but_not_its_token_and_it_ends_well(tmp_path):
+    panel = PanelProcess(tmp_path, token=TOKEN)
     probe = RosProbe()
     try:
+        assert TOKEN in panel.wait_for_address()
+        assert httpx.get(panel.url, verify=False).status_code == 401
+        assert httpx.get(panel.url, params={"token": TOKEN}, verify=False).status_code == 303
         values = probe.dump_parameters(["/panel"])["/panel"]["ros__parameters"]
         assert values["port"] == panel.port
         assert "token" not in values
+        panel.process.terminate()
+        assert panel.process.wait(30) == 0
     finally:
         probe.close()
-    assert httpx.get(panel.url).status_code == 401
-    assert panel.process.poll() is None
-
-
-def test_on_loopback_it_answers_and_ends_well(start):
-    panel = start()
-    assert "on this machine only" in panel.wait_for_address()
-    assert httpx.get(panel.url).status_code == 200
-    panel.process.terminate()
-    assert panel.process.wait(30) == 0
-
-
-def test_beyond_loopback_it_prints_a_random_token_and_asks_for_it(start):
-    panel = start(host="0.0.0.0")
-    token = panel.wait_for_address().partition("?token=")[2].strip()
-    assert len(token) >= 32
-    assert httpx.get(panel.url).status_code == 401
-    assert httpx.get(panel.url, params={"token": token}).status_code == 303
-
-
-def test_a_port_in_use_is_an_error_with_a_sentence(start):
-    first = start()
-    first.wait_for_address()
-    second = start(port=first.port)
-    assert second.process.wait(60) == 2
-    assert second.process.stderr is not None
-    assert "must be a free address" in second.process.stderr.read()
+        panel.close()

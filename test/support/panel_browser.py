@@ -15,7 +15,11 @@ import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-NEEDS_CHROMIUM = pytest.mark.skipif(not CHROMIUM, reason="no browser: install chromium (apt-get install chromium)")
+IN_BROWSER = [
+    pytest.mark.browser,
+    pytest.mark.skipif(not CHROMIUM, reason="no browser: install chromium (apt-get install chromium)"),
+    pytest.mark.timeout(300),
+]
 # As root, and without a graphics card.
 FLAGS = ["--no-sandbox", "--enable-unsafe-swiftshader", "--force-color-profile=srgb"]
 PATIENCE = 60_000.0  # ms; a busy machine draws slowly

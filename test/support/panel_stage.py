@@ -13,10 +13,8 @@ from typing import Any
 from exo_gravity.core.compensation.params import COMPENSATOR
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.params import CAN_BRIDGE
-from exo_gravity.panel.access import Access
+from exo_gravity.nodes.panel.setup import Setup
 from exo_gravity.panel.control import Control
-from exo_gravity.panel.desk import Desk
-from exo_gravity.panel.facts import Facts
 from exo_gravity.panel.server import PanelServer
 from exo_gravity.panel.view import Joints, Status, arm_state
 
@@ -29,7 +27,7 @@ PERIOD = 0.1  # s between two states
 
 @dataclass
 class PlayedArms:
-    """`Arms` of the desk. calls: what was asked for, in order. problem: the answer to each call."""
+    """`Arms` of the panel. calls: what was asked for, in order. problem: the answer to each call. errors: by arm."""
 
     names: tuple[str, ...] = ("right", "left")
     states: dict[str, str] = field(default_factory=dict)
@@ -37,6 +35,7 @@ class PlayedArms:
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
     calls: list[tuple[str, ...]] = field(default_factory=list)
     problem: str = ""
+    errors: dict[str, Exception] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.states = dict.fromkeys(self.names, "disabled")
@@ -67,6 +66,8 @@ class PlayedArms:
 
     def _change(self, call: str, arm: str, state: str) -> str:
         self.calls.append((call, arm))
+        if arm in self.errors:
+            raise self.errors[arm]
         if not self.problem:
             self.states[arm] = state
         return self.problem
@@ -89,7 +90,7 @@ class PlayedArms:
 
 @dataclass
 class PlayedFiles:
-    """`Files` of the desk."""
+    """`Files` of the panel."""
 
     trials: tuple[str, ...] = ("demo", "two_poses")
     calls: list[str] = field(default_factory=list)
@@ -139,13 +140,12 @@ class Stage:
         self.arms = PlayedArms()
         self.files, self.notes = PlayedFiles(), list[str]()
         self.reports: dict[str, Path] = {}
-        self.access = Access(host, token, clock)
-        self.control = Control(clock, dead_man)
-        desk = Desk(self.arms, self.files, self.control, self.notes.append, clock)
+        self.control = Control(self.arms, self.files, self.notes.append, clock, dead_man)
         self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}/"
-        self.server = PanelServer(host, self.port, self.access, desk, self.reports.get, dict)
-        self.facts = Facts({"language": "en", "dead_man": dead_man, "trials": list(self.files.trials)})
+        self.server = PanelServer(host, self.port, token, self.control, self.reports.get, dict, clock)
+        self.setup = Setup({"language": "en", "dead_man": dead_man, "trials": list(self.files.trials)})
+        self._bridge = values_of(CAN_BRIDGE, BUS, "can.options")
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._play, daemon=True)
         self.server.start()
@@ -155,16 +155,15 @@ class Stage:
         self._stopping.set()
         self._thread.join()
         self.server.stop()
-        self.facts.close()
+        self.setup.close()
 
     def _play(self) -> None:
-        self.facts.discover(self.arms.names)
         while not self._stopping.wait(PERIOD):
-            for arm in self.arms.names:
-                names = {"joint_names": self.arms.settings[arm]["joint_names"]}
-                self.facts.note(f"/{arm}/can_bridge", values_of(CAN_BRIDGE, {**BUS, **names}, "can.options"))
-                self.facts.note(f"/{arm}/compensator", self.arms.settings[arm])
-            news = self.facts.news()
+            parameters: dict[str, dict[str, Any]] = {}
+            for arm, settings in self.arms.settings.items():
+                parameters[f"/{arm}/compensator"] = dict(settings)
+                parameters[f"/{arm}/can_bridge"] = {**self._bridge, "joint_names": settings["joint_names"]}
+            news = self.setup.news(self.arms.names, parameters)
             if news is not None:
                 self.server.publish_setup(news)
             now = time.monotonic()

@@ -16,7 +16,7 @@ from exo_gravity.core.trial.recording import Recording
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import ArmConfig, ImuConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial
-from exo_gravity.tools.trials.trunk_imu import TrunkImu
+from exo_gravity.tools.trials.offline import TrunkImu
 
 FRICTION = 0.03  # Nm in each joint
 POSE = (0.0, 0.4, 0.5, 1.0)  # rad

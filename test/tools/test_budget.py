@@ -35,7 +35,7 @@ def run(tmp_path, capsys):
 def plain(monkeypatch):
     """Figures take longest: draw blank ones in tests that do not look at them."""
     blank = Figure(figsize=(1, 1))
-    monkeypatch.setattr("exo_gravity.tools.reporting.budget_figures.joint_figure", lambda *_: blank)
+    monkeypatch.setattr("exo_gravity.tools.budget._joint_figure", lambda *_: blank)
 
 
 @pytest.mark.usefixtures("plain")
@@ -116,8 +116,7 @@ def test_a_missing_file_ends_with_exit_code_2(capsys):
 
 
 def test_without_matplotlib_the_table_is_printed_and_the_missing_package_is_named(run, monkeypatch, tmp_path):
-    monkeypatch.delitem(sys.modules, "exo_gravity.tools.reporting.budget_figures", raising=False)
-    monkeypatch.setitem(sys.modules, "matplotlib.axes", None)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     code, text = run("--body-mass", 75, "--support", 0.068)
     assert code == 0 and "within rated torque everywhere on /right" in text
     assert "matplotlib is not installed" in text and "exo_gravity[report]" in text

@@ -1,4 +1,6 @@
-"""launcher: which keys of a parameter file it accepts, and how it refuses the others. test/nodes starts real nodes."""
+"""launcher: which keys of a parameter file it accepts, which nodes start, and in which order they stop.
+
+test/nodes starts real nodes."""
 
 import sys
 import time
@@ -7,7 +9,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from exo_gravity.tools.inputs.executables import node_names
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.tools.inputs.parameter_file import Stages, chosen, in_namespace, load, node_names
 from exo_gravity.tools.launcher import Launcher, main
 
 NODES = Path(__file__).parents[2] / "exo_gravity" / "nodes"
@@ -100,3 +103,35 @@ def test_a_pattern_that_matches_no_node_is_refused_with_the_list_of_nodes(capsys
         main(["--params", str(SIM), "--only", "/imu", "*/bridge"])
     error = capsys.readouterr().err
     assert ended.value.code == 2 and "only = '*/bridge': must be a pattern that matches one of /imu" in error
+
+
+NAMES = ["/recorder", "/imu", "/left/can_bridge", "/left/compensator", "/right/can_bridge"]
+
+
+def test_bridges_stop_first_and_recorders_last():
+    assert Stages.of(NAMES) == (["/left/can_bridge", "/right/can_bridge"], ["/imu", "/left/compensator"], ["/recorder"])
+
+
+@pytest.mark.parametrize(
+    ("only", "names"),
+    [
+        ((), NAMES),
+        (("/left/*",), ["/left/can_bridge", "/left/compensator"]),
+        (("*/can_bridge", "/imu"), ["/imu", "/left/can_bridge", "/right/can_bridge"]),
+        (("/IMU",), None),
+        (("can_bridge",), None),
+    ],
+)
+def test_patterns_are_compared_with_full_names(only, names):
+    if names is None:
+        with pytest.raises(ParameterError, match="only = "):
+            chosen(NAMES, only)
+    else:
+        assert chosen(NAMES, only) == names
+
+
+def test_a_namespace_is_put_in_front_of_every_node_and_changes_no_parameter():
+    nodes = load(SIM)
+    moved = load(in_namespace(SIM, "/lab"))
+    assert moved == {f"/lab{node}": parameters for node, parameters in nodes.items()}
+    assert in_namespace(SIM, "") == SIM

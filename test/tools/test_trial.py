@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import yaml
 
-from exo_gravity.tools import launcher
+from exo_gravity.tools import launcher, trial
 from exo_gravity.tools.launcher import OnLine, StopFlag
 from exo_gravity.tools.trial import main
-from exo_gravity.tools.trials import real_time, session
+from exo_gravity.tools.trials import run as running
 
 from ..support import csv_rows
 from ..support.ports import own_ports
@@ -154,7 +154,7 @@ def test_ctrl_c_lets_the_arm_down_and_reports_what_was_recorded(run, capsys, mon
         threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
         return stopped
 
-    monkeypatch.setattr(session, "stop_on_signals", stop_on_signals)
+    monkeypatch.setattr(trial, "stop_on_signals", stop_on_signals)
     code, folder = run("--offline", script={"name": "long", "steps": [SHORT["steps"][0], {"hold": 3000.0}]})
     assert code == 1 and (folder / "report.html").exists()
     text = capsys.readouterr().out
@@ -190,7 +190,7 @@ def test_a_killed_recorder_ends_the_trial_with_a_report_of_what_it_wrote(run, ca
         def react(self) -> None:
             threading.Timer(2.0, self.process("/recorder").kill).start()
 
-    monkeypatch.setattr(real_time, "Launcher", KillRecorder)
+    monkeypatch.setattr(running, "Launcher", KillRecorder)
     code, folder = run(script={"name": "long", "steps": [SHORT["steps"][0], {"hold": 90.0}]})
     assert code == 1 and (folder / "report.html").exists()
     assert "the recorder ended with exit code -9 before the trial was done" in capsys.readouterr().out
@@ -206,8 +206,8 @@ def test_a_node_that_the_computer_does_not_run_ends_a_simulated_trial_with_exit_
             process.send_signal(signal.SIGSTOP)
             threading.Timer(0.4, process.send_signal, (signal.SIGCONT,)).start()
 
-    monkeypatch.setattr(real_time, "Launcher", FreezeNode)
-    monkeypatch.setattr(session, "ATTEMPTS", 1)
+    monkeypatch.setattr(running, "Launcher", FreezeNode)
+    monkeypatch.setattr(running, "ATTEMPTS", 1)
     code, _ = run()
     last = capsys.readouterr().out.splitlines()[-1]
     assert code == 3 and last.startswith("trial: this computer was too busy: right/simulator was not run for ")

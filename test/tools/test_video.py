@@ -12,8 +12,8 @@ import pytest
 
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.tools.inputs.parameter_file import packaged_config
-from exo_gravity.tools.video import output
-from exo_gravity.tools.video.output import backend, frame_times, requested
+from exo_gravity.tools.reporting import video as output
+from exo_gravity.tools.reporting.video import backend, frame_times, requested
 
 SCRIPT = """
 name: short

@@ -1,9 +1,12 @@
-"""The analysis of a trial: the holds of a recording, the drift in each, and the response to pushes.
+"""The analysis of a trial: the holds of a recording, the drift in each, the response to pushes, and the verdict.
 
 Drift is the slope of Huber's M-estimator (Huber 1964) fitted to means over parts of the hold. Averaging resolves less
 than one position code, and a brief touch of the arm has little weight. The standard uncertainty combines the scatter
 with one code over the length of the hold, because a reading that changed once may have been about to change at the
 start.
+
+Whether the arm held is judged within any 10 s of a hold, over the whole hold if a rate is given, and from release to
+the end of a scripted hold. The last criterion fails an arm that falls at once and then hangs still.
 
 SI units throughout: rad, rad/s, Nm, s. Arrays (4,) are in the order of the recording's joints.
 """
@@ -39,25 +42,19 @@ MAX_PARTS = 30  # parts of a hold, to whose means the slope is fitted
 
 @dataclass(frozen=True, eq=False)
 class Hold:
-    """A span from `start` to `end` (s) in which the arm was left alone and still; each array is (4,).
+    """A span in which the arm was left alone and still."""
 
-    pose: rad, mean. drift: rad, from the first part of the hold to its last. drift_rate and its standard uncertainty:
-    rad/s. stray: rad, the largest range within any 10 s. velocity_rms: rad/s as measured, which is half a velocity code
-    for a motor at rest. torque_rms: Nm, measured. torque_error: Nm, RMS of commanded minus measured. after: the kind of
-    the motion before it, or 'start'.
-    """
-
-    start: float
-    end: float
-    pose: np.ndarray
-    drift: np.ndarray
-    drift_rate: np.ndarray
-    drift_rate_uncertainty: np.ndarray
-    stray: np.ndarray
-    velocity_rms: np.ndarray
-    torque_rms: np.ndarray
-    torque_error: np.ndarray
-    after: str
+    start: float  #: s
+    end: float  #: s
+    pose: np.ndarray  #: (4,) rad, mean
+    drift: np.ndarray  #: (4,) rad, from the first part of the hold to its last
+    drift_rate: np.ndarray  #: (4,) rad/s
+    drift_rate_uncertainty: np.ndarray  #: (4,) rad/s, standard uncertainty
+    stray: np.ndarray  #: (4,) rad, largest range within any 10 s
+    velocity_rms: np.ndarray  #: (4,) rad/s as measured: half a velocity code for a motor at rest
+    torque_rms: np.ndarray  #: (4,) Nm, measured
+    torque_error: np.ndarray  #: (4,) Nm, RMS of commanded minus measured
+    after: str  #: kind of the motion before it, or 'start'
 
     @property
     def duration(self) -> float:
@@ -69,34 +66,29 @@ class Hold:
 class Motion:
     """A motion between two holds, or after the last one.
 
-    kind: 'push', 'move', an action of the trunk ('bow', 'lean', 'walk', 'sit'), 'slip' (the arm moved during a hold of
-    the script), 'gap' (nothing was recorded) or 'let down' (the arm was not carried throughout: the motors let it down
-    after a fault or at the end). Without a script, a motion that ends within 20 degrees of its start counts as a push.
-    peak: (4,) rad, signed, largest distance from the pose before. residual: (4,) rad, pose after minus pose before; NaN
-    if the arm was not still again. until_still: s from the first movement, NaN likewise. speed: (4,) rad/s, peak.
+    Without a script, a motion that ends within 20 degrees of its start is taken for a push.
     """
 
+    #: 'push', 'move', an action of the trunk ('bow', 'lean', 'walk', 'sit'), 'slip' (the arm moved during a hold of the
+    #: script), 'gap' (nothing was recorded) or 'let down' (the arm was not carried throughout)
     kind: str
-    start: float
-    end: float
-    peak: np.ndarray
-    residual: np.ndarray
-    until_still: float
-    speed: np.ndarray
+    start: float  #: s
+    end: float  #: s
+    peak: np.ndarray  #: (4,) rad, signed, largest distance from the pose before
+    residual: np.ndarray  #: (4,) rad, pose after minus pose before; NaN if the arm was not still again
+    until_still: float  #: s from the first movement; NaN likewise
+    speed: np.ndarray  #: (4,) rad/s, peak
 
 
 @dataclass(frozen=True, eq=False)
 class Release:
-    """A scripted hold from release on, for as long as the arm was carried.
+    """A scripted hold from release on, for as long as the arm was carried."""
 
-    after: the script's action before it. offset: (4,) rad, at its end. still: whether the arm was still at its end.
-    """
-
-    start: float
-    end: float
-    after: str
-    offset: np.ndarray
-    still: bool
+    start: float  #: s
+    end: float  #: s
+    after: str  #: the script's action before it
+    offset: np.ndarray  #: (4,) rad, at its end
+    still: bool  #: whether the arm was still at its end
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,3 +221,49 @@ def _rms(values: np.ndarray) -> np.ndarray:
     with np.errstate(invalid="ignore"):
         rms: np.ndarray = np.sqrt(squares.sum(axis=0) / known.sum(axis=0))
     return rms
+
+
+@dataclass(frozen=True)
+class HoldCriteria:
+    """How far a held arm may drift."""
+
+    max_stray: float = math.radians(0.5)  #: rad within any 10 s of a hold
+    max_stray_after_push: float = math.radians(2.0)  #: rad, the same for a hold after a push
+    max_rate: float = math.inf  #: rad/s over a hold
+    max_offset: float = math.radians(2.0)  #: rad between release and the end of a scripted hold
+    #: s, shortest hold that is judged by its rate: over a shorter one, a single position code is already a large rate
+    rated_from: float = 0.0
+
+
+def failures(recording: Recording, trial: TrialAnalysis, criteria: HoldCriteria) -> list[str]:
+    """Return one sentence for each criterion that the arm failed; an empty list if it held."""
+    found = []
+    if not trial.holds:
+        never = "carried" if recording.carried == () else "still for long enough to count as a hold"
+        found.append(f"the arm was never {never}")
+    for hold in trial.holds:
+        stray = criteria.max_stray_after_push if hold.after == "push" else criteria.max_stray
+        for joint, name in enumerate(recording.joint_names):
+            where = f"{hold.start:.1f}-{hold.end:.1f} s: {name}"
+            if hold.stray[joint] > stray:
+                found.append(f"{where} strayed {_degrees(hold.stray[joint])} within 10 s, more than {_degrees(stray)}")
+            rate = 60.0 * hold.drift_rate[joint]
+            if abs(rate) > 60.0 * criteria.max_rate and hold.duration >= criteria.rated_from:
+                allowed = _degrees(60.0 * criteria.max_rate)
+                found.append(f"{where} drifted {_degrees(rate)} per minute, more than {allowed}")
+    for motion in trial.motions:
+        peak = np.max(np.abs(motion.peak))
+        if motion.kind == "slip" and peak > criteria.max_stray:
+            where = f"{motion.start:.1f}-{motion.end:.1f} s: the arm"
+            found.append(f"{where} slipped by {_degrees(peak)} during a hold")
+    for release in trial.releases:
+        where = f"{release.start:.1f}-{release.end:.1f} s: the arm"
+        if not release.still:
+            found.append(f"{where} was still moving at the end of a hold")
+        elif release.after != "push" and np.max(np.abs(release.offset)) > criteria.max_offset:
+            found.append(f"{where} moved {_degrees(np.max(np.abs(release.offset)))} from where it was let go")
+    return [f"{recording.name}: {sentence}" for sentence in found]
+
+
+def _degrees(angle: float) -> str:
+    return f"{math.degrees(angle):.2f} degrees"

@@ -24,31 +24,27 @@ Span = tuple[float, float]  # start and end in s
 
 
 class ScriptedStep(NamedTuple):
-    """A step of the trial script: its action ('move', 'hold' or 'push'), and when it started and ended, in s."""
+    """A step of the trial script."""
 
-    action: str
-    start: float
-    end: float
+    action: str  #: 'move', 'hold' or 'push'
+    start: float  #: s
+    end: float  #: s
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """The recording of one arm. Raises DataError if shapes differ, time decreases or a position is not finite.
+    """The recording of one arm. Raises DataError if shapes differ, time decreases or a position is not finite."""
 
-    name: of the arm. time: (n,) s. position, velocity, effort (measured), command (requested effort): (n, 4), NaN where
-    unknown, except for position. steps: the script's steps, empty if they were not recorded. carried: the spans in
-    which the motors carried the arm, in order; outside of them the arm is off or being let down. None if these were
-    not recorded: the arm then counts as carried throughout.
-    """
-
-    name: str
+    name: str  #: of the arm
     joint_names: tuple[str, ...]
-    time: np.ndarray
-    position: np.ndarray
-    velocity: np.ndarray
-    effort: np.ndarray
-    command: np.ndarray
-    steps: tuple[ScriptedStep, ...] = ()
+    time: np.ndarray  #: (n,) s
+    position: np.ndarray  #: (n, 4) rad
+    velocity: np.ndarray  #: (n, 4) rad/s, NaN where unknown
+    effort: np.ndarray  #: (n, 4) Nm, measured, NaN where unknown
+    command: np.ndarray  #: (n, 4) Nm, requested, NaN where unknown
+    steps: tuple[ScriptedStep, ...] = ()  #: of the script, empty if they were not recorded
+    #: The spans in which the motors carried the arm, in order; outside of them it is off or being let down. None if
+    #: these were not recorded: the arm is then taken to be carried throughout.
     carried: tuple[Span, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -73,18 +69,13 @@ class Recording:
 
 
 class Blocks(NamedTuple):
-    """The recording in blocks of 0.1 s.
+    """The recording in blocks of 0.1 s."""
 
-    time: (m + 1,) s, the start of each block and the end of the last. sample: (m + 1,), the first sample of each block
-    and the end. mean: (m, 4), mean position. still: (m,), whether the arm was still. empty: (m,), whether the block has
-    no samples.
-    """
-
-    time: np.ndarray
-    sample: np.ndarray
-    mean: np.ndarray
-    still: np.ndarray
-    empty: np.ndarray
+    time: np.ndarray  #: (m + 1,) s, the start of each block and the end of the last
+    sample: np.ndarray  #: (m + 1,), the first sample of each block and the end
+    mean: np.ndarray  #: (m, 4) rad, mean position
+    still: np.ndarray  #: (m,), whether the arm was still
+    empty: np.ndarray  #: (m,), whether the block has no samples
 
     @property
     def length(self) -> float:

@@ -28,20 +28,15 @@ OF_BRIDGE = ("joint_names", *(param.name for param in LIMIT_PARAMETERS))
 
 @dataclass(frozen=True, eq=False)
 class ArmDescription:
-    """What a description states about one arm.
+    """What a description states about one arm."""
 
-    side: 'left' or 'right'. robot: the arm without a wearer. mass: (4,) kg, used if `robot` is given by its moments.
-    limits: names, position, speed and torque limits of the joints. damping (4,) Nm s/rad, friction (4,) Nm: of the
-    joints, 0 for unknown. shoulder: (3,) m, the arm's base in the trunk's axes; zeros for unknown.
-    """
-
-    side: str
-    robot: ArmModel
-    mass: Vector
-    limits: Limits
-    damping: Vector = ZEROS
-    friction: Vector = ZEROS
-    shoulder: Vector = (0.0, 0.0, 0.0)
+    side: str  #: 'left' or 'right'
+    robot: ArmModel  #: without a wearer
+    mass: Vector  #: (4,) kg, used if `robot` is given by its moments
+    limits: Limits  #: names, position, speed and torque limits of the joints
+    damping: Vector = ZEROS  #: (4,) Nm s/rad, 0 for unknown
+    friction: Vector = ZEROS  #: (4,) Nm, 0 for unknown
+    shoulder: Vector = (0.0, 0.0, 0.0)  #: (3,) m, the arm's base in the trunk's axes; zeros for unknown
 
     def __post_init__(self) -> None:
         if self.side not in SIDES:

@@ -15,17 +15,30 @@ are abduction and flexion on both sides. The gain c_n is no part of a descriptio
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.view.arm_description import ArmDescription, Point
-from exo_gravity.core.view.urdf_shapes import add_link_shapes, add_material, add_mesh, add_trunk_shapes, numbers
 
 ROOT = "trunk"
 TUBE_RADIUS = 0.03  # m; each link has the inertia of a thin tube
+
+
+COLOURS = {
+    "person": (0.80, 0.76, 0.70, 0.6),
+    "tube": (0.16, 0.17, 0.19, 1.0),
+    "motor": (0.55, 0.58, 0.62, 1.0),
+    "centre_of_gravity": (0.85, 0.25, 0.15, 1.0),
+}
+TUBE = 0.0125  # m, radius of the carbon tubes (the paper, appendix A)
+MOTOR_RADIUS, MOTOR_LENGTH = 0.042, 0.04  # m, between AK60-6 and AK80-9
+COG_RADIUS = 0.018  # m
+CHEST, HEAD_RADIUS, HEAD_HEIGHT = (0.14, 0.26, 0.48), 0.10, 0.20  # m
 
 
 class Body(NamedTuple):
@@ -44,13 +57,13 @@ def urdf(arms: Sequence[ArmDescription], meshes: str = "") -> str:
     sides = [arm.side for arm in arms]
     if not arms or len(set(sides)) != len(sides):
         raise ParameterError("side", sides, "one arm for each side that is described")
-    robot = ElementTree.Element("robot", name="exo_gravity")
-    add_material(robot)
-    trunk = ElementTree.SubElement(robot, "link", name=ROOT)
+    robot = Element("robot", name="exo_gravity")
+    _add_material(robot)
+    trunk = SubElement(robot, "link", name=ROOT)
     if meshes:
-        add_mesh(trunk, meshes)
+        _add_mesh(trunk, meshes)
     else:
-        add_trunk_shapes(trunk, [arm.base for arm in arms])
+        _add_trunk_shapes(trunk, [arm.base for arm in arms])
     for arm, names in zip(arms, joint_names(arms), strict=True):
         _add_arm(robot, arm, names, meshes)
     ElementTree.indent(robot)
@@ -104,53 +117,107 @@ def ends(arm: ArmDescription) -> tuple[Point, ...]:
     return ((0.0, arm.outward * first, 0.0), *((0.0, 0.0, -length) for length in others))
 
 
-def _add_arm(robot: ElementTree.Element, arm: ArmDescription, names: Sequence[str], meshes: str) -> None:
+def _add_arm(robot: Element, arm: ArmDescription, names: Sequence[str], meshes: str) -> None:
     lengths, end = arm.robot.length.tolist(), ends(arm)
     axis, parent, origin = axes(arm), ROOT, arm.base
     for n, (name, body) in enumerate(zip(names, bodies(arm), strict=True)):
         _add_joint(robot, name, "revolute", parent, arm.links[n], origin)
         _add_motion(robot[-1], arm, n, axis[n])
-        link = ElementTree.SubElement(robot, "link", name=arm.links[n])
+        link = SubElement(robot, "link", name=arm.links[n])
         _add_inertia(link, body, lengths[n], sideways=n == 0)
         if meshes:
-            add_mesh(link, meshes)
+            _add_mesh(link, meshes)
         else:
             next_axis = axis[n + 1] if n + 1 < JOINT_COUNT else None
-            add_link_shapes(link, end[n], next_axis, body.centre, sideways=n == 0)
+            _add_link_shapes(link, end[n], next_axis, body.centre, sideways=n == 0)
         parent, origin = arm.links[n], end[n]
     _add_joint(robot, f"{arm.links[-1]}_joint", "fixed", parent, arm.links[-1], origin)
-    ElementTree.SubElement(robot, "link", name=arm.links[-1])
+    SubElement(robot, "link", name=arm.links[-1])
 
 
-def _add_joint(robot: ElementTree.Element, name: str, kind: str, parent: str, child: str, origin: Point) -> None:
-    joint = ElementTree.SubElement(robot, "joint", name=name, type=kind)
-    ElementTree.SubElement(joint, "origin", xyz=numbers(*origin), rpy=numbers(0.0, 0.0, 0.0))
-    ElementTree.SubElement(joint, "parent", link=parent)
-    ElementTree.SubElement(joint, "child", link=child)
+def _add_joint(robot: Element, name: str, kind: str, parent: str, child: str, origin: Point) -> None:
+    joint = SubElement(robot, "joint", name=name, type=kind)
+    SubElement(joint, "origin", xyz=_numbers(*origin), rpy=_numbers(0.0, 0.0, 0.0))
+    SubElement(joint, "parent", link=parent)
+    SubElement(joint, "child", link=child)
 
 
-def _add_motion(joint: ElementTree.Element, arm: ArmDescription, n: int, axis: Point) -> None:
+def _add_motion(joint: Element, arm: ArmDescription, n: int, axis: Point) -> None:
     limits = arm.limits
-    ElementTree.SubElement(joint, "axis", xyz=numbers(*axis))
+    SubElement(joint, "axis", xyz=_numbers(*axis))
     values = {
         "lower": limits.position_min[n],
         "upper": limits.position_max[n],
         "effort": limits.max_effort[n],
         "velocity": limits.max_velocity[n],
     }
-    ElementTree.SubElement(joint, "limit", {name: numbers(value) for name, value in values.items()})
+    SubElement(joint, "limit", {name: _numbers(value) for name, value in values.items()})
     damping, friction = float(arm.damping[n]), float(arm.friction[n])
     if damping or friction:
-        ElementTree.SubElement(joint, "dynamics", damping=numbers(damping), friction=numbers(friction))
+        SubElement(joint, "dynamics", damping=_numbers(damping), friction=_numbers(friction))
 
 
-def _add_inertia(link: ElementTree.Element, body: Body, length: float, sideways: bool) -> None:
+def _add_inertia(link: Element, body: Body, length: float, sideways: bool) -> None:
     """Add the inertial element of a thin tube along the link, which points along y if `sideways` and along z if not."""
     along = body.mass * TUBE_RADIUS**2
     across = along / 2 + body.mass * length**2 / 12
     principal = (across, along, across) if sideways else (across, across, along)
-    inertial = ElementTree.SubElement(link, "inertial")
-    ElementTree.SubElement(inertial, "origin", xyz=numbers(*body.centre), rpy=numbers(0.0, 0.0, 0.0))
-    ElementTree.SubElement(inertial, "mass", value=numbers(body.mass))
-    moments = dict(zip(("ixx", "iyy", "izz"), map(numbers, principal), strict=True))
-    ElementTree.SubElement(inertial, "inertia", {**moments, "ixy": "0.0", "ixz": "0.0", "iyz": "0.0"})
+    inertial = SubElement(link, "inertial")
+    SubElement(inertial, "origin", xyz=_numbers(*body.centre), rpy=_numbers(0.0, 0.0, 0.0))
+    SubElement(inertial, "mass", value=_numbers(body.mass))
+    moments = dict(zip(("ixx", "iyy", "izz"), map(_numbers, principal), strict=True))
+    SubElement(inertial, "inertia", {**moments, "ixy": "0.0", "ixz": "0.0", "iyz": "0.0"})
+
+
+def _numbers(*values: float) -> str:
+    """Return numbers as URDF writes them, with every digit, so that nothing is rounded."""
+    return " ".join(repr(float(value) + 0.0) for value in values)  # + 0.0: no negative zero
+
+
+def _add_material(robot: Element) -> None:
+    """Add the colours."""
+    for name, colour in COLOURS.items():
+        SubElement(SubElement(robot, "material", name=name), "color", rgba=_numbers(*colour))
+
+
+def _add_mesh(link: Element, folder: str) -> None:
+    """Add the mesh LINK.stl in `folder`, an address, as the visual of `link`."""
+    visual = SubElement(link, "visual")
+    geometry = SubElement(visual, "geometry")
+    SubElement(geometry, "mesh", filename=f"{folder.rstrip('/')}/{link.get('name')}.stl")
+
+
+def _add_trunk_shapes(trunk: Element, shoulders: Sequence[Point]) -> None:
+    """Add chest, head, and the motor of each joint 1, at `shoulders` (n, 3) m."""
+    x, _, z = (sum(column) / len(shoulders) for column in zip(*shoulders, strict=True))
+    _add(trunk, "person", "box", (x, 0.0, z - CHEST[2] / 2), size=_numbers(*CHEST))
+    _add(trunk, "person", "sphere", (x, 0.0, z + HEAD_HEIGHT), radius=_numbers(HEAD_RADIUS))
+    for shoulder in shoulders:
+        _add_cylinder(trunk, "motor", shoulder, (0.0, 0.0, 1.0), MOTOR_RADIUS, MOTOR_LENGTH)
+
+
+def _add_link_shapes(link: Element, end: Point, next_axis: Point | None, centre: Point, sideways: bool) -> None:
+    """Add the tube to `end`, the motor of the next joint there if there is one, and the centre of gravity, m."""
+    middle = (end[0] / 2, end[1] / 2, end[2] / 2)
+    along = (0.0, 1.0, 0.0) if sideways else (0.0, 0.0, 1.0)
+    if any(end):
+        _add_cylinder(link, "tube", middle, along, TUBE, math.hypot(*end))
+    if next_axis:
+        _add_cylinder(link, "motor", end, next_axis, MOTOR_RADIUS, MOTOR_LENGTH)
+    _add(link, "centre_of_gravity", "sphere", centre, radius=_numbers(COG_RADIUS))
+
+
+def _add_cylinder(link: Element, material: str, centre: Point, axis: Point, radius: float, length: float) -> None:
+    """Add a cylinder along `axis`, one of the frame's axes."""
+    x, y, _ = map(abs, axis)
+    turned = (y * math.pi / 2, x * math.pi / 2, 0.0)  # a cylinder of URDF lies along z
+    _add(link, material, "cylinder", centre, turned, radius=_numbers(radius), length=_numbers(length))
+
+
+def _add(
+    link: Element, material: str, shape: str, centre: Point, turned: Point = (0.0, 0.0, 0.0), **dimensions: str
+) -> None:
+    visual = SubElement(link, "visual")
+    SubElement(visual, "origin", xyz=_numbers(*centre), rpy=_numbers(*turned))
+    SubElement(SubElement(visual, "geometry"), shape, dimensions)
+    SubElement(visual, "material", name=material)

@@ -32,7 +32,7 @@ from exo_gravity.hardware.ownership.owned_bus import OwnedBus, recover
 from exo_gravity.hardware.scheduling import request_real_time
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.can_bridge.operation import CALL_TIMEOUT, BridgeReport, BridgeServices, log_limits
-from exo_gravity.nodes.ros.declare import bus_of, declare
+from exo_gravity.nodes.ros.parameters import bus_of, declare
 from exo_gravity.nodes.ros.run import keep_to_this_machine, run
 
 REPORT_PERIOD = 0.1  # s

@@ -21,7 +21,7 @@ from exo_gravity.core.safety.delivery import MotorLoad
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, MAX_TEMPERATURE, Limits
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.nodes.ros.diagnostics import ERROR, OK, WARN, Diagnostics, milliseconds, row
+from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, milliseconds, row
 from exo_gravity.nodes.ros.run import open_to_others
 
 RECENT = 2.0  # s for which a limit that acted is still shown

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -17,11 +16,10 @@ from exo_gravity.core.compensation.terms.spring import PosePath
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.anfis_law import AnfisLaw
 from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.model.budget import USUAL_TILT
 from exo_gravity.nodes.compensator.assist_efforts import AssistEfforts
 from exo_gravity.nodes.compensator.budget_watch import BudgetWatch
-from exo_gravity.nodes.ros.declare import declare
-from exo_gravity.nodes.ros.diagnostics import row
+from exo_gravity.nodes.ros.messages import row
+from exo_gravity.nodes.ros.parameters import declare
 
 Loaded = TypeVar("Loaded")
 
@@ -50,7 +48,7 @@ class ExoArm:
         self.values = declare(node, COMPENSATOR)
         names = self.values["joint_names"]
         self.control = Compensator(read_settings(self.values), names)
-        self._budget = BudgetWatch(node, names, math.radians(USUAL_TILT) if self.values["use_imu"] else 0.0)
+        self._budget = BudgetWatch(node, names)
         self._assist = AssistEfforts(node, self.control.terms.assist, lock)
 
     def read(self, values: dict[str, Any]) -> Settings:

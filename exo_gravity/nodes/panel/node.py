@@ -1,44 +1,208 @@
 """panel: a web page on the machine that carries the arms: see them, set the support, let them down.
 
 It is a ROS client like any other: it uses the topics, services and parameters that `ros2` can use, and nothing depends
-on it. The web server (exo_gravity/panel/server.py) runs on a separate thread; this node's executor collects the state
-of the arms and sends it to the pages ten times a second.
+on it. The web server (exo_gravity/panel/server.py) runs on a separate thread, which calls the services; this node's
+executor receives the answers, collects the state of the arms and sends it to the pages ten times a second. Joint states
+arrive hundreds of times a second: their subscriptions keep the newest message outside the executor (`hot_path`).
 """
 
 from __future__ import annotations
 
+import asyncio
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Collection, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from rcl_interfaces.msg import ParameterEvent
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.client import Client
 from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.task import Future
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity.core.errors import ExoGravityError
-from exo_gravity.nodes.panel.arms import ArmClients, call, parameter_request
-from exo_gravity.nodes.ros.declare import declare
-from exo_gravity.nodes.ros.diagnostics import OK
+from exo_gravity.nodes.panel.setup import Setup
 from exo_gravity.nodes.ros.hot_path import HotPath
-from exo_gravity.nodes.ros.node_parameters import NodeParameters
+from exo_gravity.nodes.ros.messages import OK, Diagnostics
+from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.tilt_subscription import NEWEST
-from exo_gravity.panel.access import Access, is_loopback
 from exo_gravity.panel.control import Control
-from exo_gravity.panel.desk import Desk
-from exo_gravity.panel.facts import Facts
 from exo_gravity.panel.params import PANEL, scripts_folder
-from exo_gravity.panel.studio import Studio
-from exo_gravity.panel.view import SILENT
+from exo_gravity.panel.recordings import Recordings
+from exo_gravity.panel.view import SILENT, Joints, Status, arm_state
 
 STATE_PERIOD = 0.1  # s between two states that the pages get
 DISCOVERY_PERIOD = 0.5  # s between two searches for nodes
+CALL_TIMEOUT = 3.0  # s, longer than can_bridge itself waits
+ABSENT_TIMEOUT = 0.5  # s, where the service seems to be absent
 TILT = "/imu/pitch_yaw"
+BRIDGE, COMPENSATOR = "can_bridge", "compensator"
+
+
+class ArmClient:
+    """One arm, in the namespace `/name`."""
+
+    def __init__(self, node: Node, name: str) -> None:
+        self.joints, self.commands = Joints(), Joints()
+        self.bridge, self.compensator = Status(), Status()
+        space = f"/{name}"
+        self._states = HotPath(node, JointState, f"{space}/joint_states", self._on_states)
+        self._efforts = HotPath(node, JointState, f"{space}/effort_commands", self._on_efforts)
+        self.enable = node.create_client(SetBool, f"{space}/{BRIDGE}/enable")
+        self.clear_fault = node.create_client(Trigger, f"{space}/{BRIDGE}/clear_fault")
+        self.set = parameter_client(node, f"{space}/{COMPENSATOR}")
+
+    def state(self, now: float) -> dict[str, Any]:
+        """Take the newest messages, and return what the page shows."""
+        self._states.poll()
+        self._efforts.poll()
+        return arm_state(now, self.joints, self.commands, self.bridge, self.compensator)
+
+    def _on_states(self, message: JointState, _info: dict[str, Any]) -> None:
+        values = (message.name, message.position, message.velocity, message.effort)
+        self.joints = Joints(time.monotonic(), *map(list, values))
+
+    def _on_efforts(self, message: JointState, _info: dict[str, Any]) -> None:
+        self.commands = Joints(time.monotonic(), list(message.name), effort=list(message.effort))
+
+
+class Arms:
+    """All arms, by name: 'right', 'left', or the namespace that a parameter file gives them; and all other nodes.
+
+    An arm stays in the list when its nodes end: it shows that they do not answer.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self.clients: dict[str, ArmClient] = {}
+        self.known: dict[str, dict[str, Any]] = {}  #: the newest parameters of each node by full name, also if it ended
+        self._node = node
+        self._parameters: dict[str, NodeParameters] = {}
+        self._wearers: dict[str, Client] = {}  # the virtual ones, by their simulator's name
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
+        node.create_subscription(ParameterEvent, "/parameter_events", self._on_parameter_event, 50)
+
+    @property
+    def names(self) -> Collection[str]:
+        """The arms that are or were present."""
+        return tuple(self.clients)
+
+    def discover(self) -> None:
+        """Add the arms and parameters of new nodes, and read parameters that have changed."""
+        found = self._node.get_node_names_and_namespaces()
+        nodes = {f"{space.rstrip('/')}/{name}" for name, space in found if not name.startswith("_")}
+        nodes.discard(self._node.get_fully_qualified_name())
+        for name in nodes - set(self._parameters):
+            self._parameters[name] = NodeParameters(self._node, name, partial(self.known.__setitem__, name))
+            arm, _, leaf = name.strip("/").rpartition("/")
+            if leaf == BRIDGE and arm and arm not in self.clients:
+                self.clients[arm] = ArmClient(self._node, arm)
+            if leaf == "simulator" and name not in self._wearers:
+                self._wearers[name] = parameter_client(self._node, name)
+        for name in set(self._parameters) - nodes:
+            self._parameters.pop(name).destroy()
+        for parameters in self._parameters.values():
+            parameters.update()
+
+    def state(self) -> dict[str, Any]:
+        """Return what the page shows of each arm."""
+        now = time.monotonic()
+        return {name: client.state(now) for name, client in sorted(self.clients.items(), reverse=True)}
+
+    # For a trial (`Device` of exo_gravity.panel.recordings); called on the web server's thread
+
+    def parameters(self) -> dict[str, dict[str, Any]]:
+        """Return the parameters of every node that runs, by full name."""
+        of_nodes = sorted(self._parameters.copy().items())
+        return {name: dict(parameters.values) for name, parameters in of_nodes if parameters.is_present}
+
+    def states(self) -> dict[str, str | None]:
+        """Return the state that each bridge reports; None if it is silent."""
+        now = time.monotonic()
+        of_arms = {name: client.bridge for name, client in self.clients.items()}
+        return {name: s.values.get("state") if now - s.time < SILENT else None for name, s in of_arms.items()}
+
+    async def perform(self, script: str) -> str:
+        """Let the virtual wearers perform the script at this path; return '' or why not."""
+        problems = []
+        for name, client in sorted(self._wearers.items()):
+            for path in ("", script):  # a script that is set already would not start again
+                problem = await call(client, parameter_request({"trial": path}))
+            problems += [f"{name}: {problem}"] if problem else []
+        return "; ".join(problems)
+
+    # For the pages (`Control`); called on the web server's thread; each returns '' or why it failed
+
+    async def let_down(self, arm: str) -> str:
+        """Let one arm down. The request is sent even where the service seems to be absent."""
+        return await call(self.clients[arm].enable, SetBool.Request(data=False))
+
+    async def enable(self, arm: str) -> str:
+        """Enable one arm."""
+        return await call(self.clients[arm].enable, SetBool.Request(data=True))
+
+    async def clear_fault(self, arm: str) -> str:
+        """Clear the latched fault of one arm."""
+        return await call(self.clients[arm].clear_fault, Trigger.Request())
+
+    async def set(self, arm: str, values: Mapping[str, Any]) -> str:
+        """Set parameters of the arm's compensator together."""
+        return await call(self.clients[arm].set, parameter_request(values))
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            arm, _, leaf = status.name.strip("/").rpartition("/")
+            if arm not in self.clients:
+                continue
+            values = {pair.key: pair.value for pair in status.values}
+            newest = Status(int.from_bytes(status.level, "big"), status.message, values, time.monotonic())
+            if leaf == BRIDGE:
+                self.clients[arm].bridge = newest
+            elif leaf == COMPENSATOR:
+                self.clients[arm].compensator = newest
+
+    def _on_parameter_event(self, event: ParameterEvent) -> None:
+        if event.node in self._parameters:
+            self._parameters[event.node].refresh()
+
+
+def parameter_client(node: Node, name: str) -> Client:
+    """Return a client that sets parameters of the node `name` together."""
+    return node.create_client(SetParametersAtomically, f"{name}/set_parameters_atomically")
+
+
+def parameter_request(values: Mapping[str, Any]) -> SetParametersAtomically.Request:
+    """Return the request that sets `values` together."""
+    messages = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+    return SetParametersAtomically.Request(parameters=messages)
+
+
+async def call(client: Client, request: Any) -> str:
+    """Send `request` at once; return '' if it was carried out, else why not."""
+    loop = asyncio.get_running_loop()
+    done: asyncio.Future[Any] = loop.create_future()
+
+    def answer(future: Future) -> None:
+        loop.call_soon_threadsafe(lambda: None if done.done() else done.set_result(future.result()))
+
+    sent = client.call_async(request)
+    sent.add_done_callback(answer)
+    try:
+        is_there = client.service_is_ready()
+        response = await asyncio.wait_for(done, CALL_TIMEOUT if is_there else ABSENT_TIMEOUT)
+    except asyncio.TimeoutError:
+        client.remove_pending_request(sent)
+        return f"{client.srv_name} does not answer"
+    result = getattr(response, "result", response)
+    if getattr(result, "successful", getattr(result, "success", False)):
+        return ""
+    return getattr(result, "reason", getattr(result, "message", "")) or "refused without a reason"
 
 
 class Panel(Node):
@@ -50,65 +214,58 @@ class Panel(Node):
         values = declare(self, [replace(param, fixed=param.name != "token") for param in PANEL])
         self.undeclare_parameter("token")
         self.failure: Exception | None = None  # ends the node, see run()
-        self._notes = self.create_publisher(DiagnosticArray, "/diagnostics", 50)
+        self._diagnostics = Diagnostics(self)
         self._noted = 0
-        self._arms = ArmClients(self)
-        self._of_nodes: dict[str, NodeParameters] = {}
+        self._arms = Arms(self)
         self._tilt: tuple[float, Vector3Stamped] | None = None
-        self._tilts = HotPath(self, Vector3Stamped, TILT, self._on_tilt, NEWEST)
-        self.create_subscription(ParameterEvent, "/parameter_events", self._on_parameter_event, 50)
-        self._wearers: dict[str, Client] = {}  # the virtual ones, by their simulator's name
+        self._tilts = HotPath(self, Vector3Stamped, TILT, self._on_tilt)
         scripts = scripts_folder(values["trials"])
-        self._studio = Studio(values["output"], scripts, self, self._note)
+        self._recordings = Recordings(values["output"], scripts, self._arms, self._note, time.monotonic)
         own = {name: values[name] for name in ("language", "dead_man")}
-        self._facts = Facts({**own, "trials": list(self._studio.trials)})
-        access = Access(values["host"], values["token"], time.monotonic)
-        control = Control(time.monotonic, values["dead_man"])
-        desk = Desk(self._arms, self._studio, control, self._note, time.monotonic)
+        self._setup = Setup({**own, "trials": list(self._recordings.trials)})
+        control = Control(self._arms, self._recordings, self._note, time.monotonic, values["dead_man"])
         try:
             from exo_gravity.panel.server import PanelServer
         except ModuleNotFoundError as error:
             missing = f"the Python package {error.name} is not installed: pip install 'exo_gravity[panel]'"
             raise ExoGravityError(missing) from None
-        self._server = PanelServer(values["host"], values["port"], access, desk, self._studio.report, self.parameters)
+        address = (values["host"], values["port"], values["token"])
+        self._server = PanelServer(*address, control, self._recordings.report, self._arms.parameters, time.monotonic)
         self._server.start()
         self.create_timer(STATE_PERIOD, self._send_state)
-        self.create_timer(DISCOVERY_PERIOD, self._discover)
-        self._log_address(values["host"], values["port"], access)
+        self.create_timer(DISCOVERY_PERIOD, self._arms.discover)
+        self._log_address(values["host"], values["port"])
 
     def close(self) -> None:
         """End the recording and the server. The arms are left as they are."""
-        self._studio.close()
-        self._facts.close()
+        self._recordings.close()
+        self._setup.close()
         self._server.stop()
 
-    def _log_address(self, host: str, port: int, access: Access) -> None:
+    def _log_address(self, host: str, port: int) -> None:
+        access = self._server.access
         shown = f"[{host}]" if ":" in host else host
         log = self.get_logger()
         if access.is_open:
             log.info(f"the panel is at http://{shown}:{port}/, on this machine only")
             return
         log.info(f"the panel is at http://{shown}:{port}/?token={access.token}")
-        if not is_loopback(host):
+        if not access.on_loopback:
             log.warning("anyone on the network path can read the token: put TLS before it (docs/panel.md)")
 
     def _note(self, text: str) -> None:
         """Write `text` to the log, and to /diagnostics, which recordings hold."""
         self._noted += 1
-        self.get_logger().info(text)
-        status = DiagnosticStatus(level=OK, name="panel", message=f"action {self._noted}: {text}")
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = self.get_clock().now().to_msg()
-        self._notes.publish(array)
+        self._diagnostics.report(OK, f"action {self._noted}: {text}")
 
     def _send_state(self) -> None:
         if not self._server.is_running:
             self.failure = RuntimeError("the web server has ended")
         self._tilts.poll()
-        news = self._facts.news()
+        news = self._setup.news(self._arms.names, self._arms.known)
         if news is not None:
             self._server.publish_setup(news)
-        state = {"arms": self._arms.state(), "tilt": self._tilt_state(), **self._studio.state()}
+        state = {"arms": self._arms.state(), "tilt": self._tilt_state(), **self._recordings.state()}
         self._server.publish(state)
 
     def _tilt_state(self) -> dict[str, float] | None:
@@ -119,53 +276,6 @@ class Panel(Node):
 
     def _on_tilt(self, message: Vector3Stamped, _info: dict[str, Any]) -> None:
         self._tilt = time.monotonic(), message
-
-    def _discover(self) -> None:
-        found = self.get_node_names_and_namespaces()
-        nodes = {f"{space.rstrip('/')}/{name}" for name, space in found if not name.startswith("_")}
-        nodes.discard(self.get_fully_qualified_name())
-        self._arms.discover(nodes)
-        for name in nodes - set(self._of_nodes):
-            self._of_nodes[name] = NodeParameters(self, name, self._on_change(name))
-            if name.endswith("/simulator") and name not in self._wearers:
-                service = f"{name}/set_parameters_atomically"
-                self._wearers[name] = self.create_client(SetParametersAtomically, service)
-        for name in set(self._of_nodes) - nodes:
-            self._of_nodes.pop(name).destroy()
-        for parameters in self._of_nodes.values():
-            parameters.update()
-        self._facts.discover(self._arms.names)
-
-    def _on_change(self, node: str) -> Callable[[], None]:
-        def changed() -> None:
-            if node in self._of_nodes:
-                self._facts.note(node, self._of_nodes[node].values)
-
-        return changed
-
-    def _on_parameter_event(self, event: ParameterEvent) -> None:
-        if event.node in self._of_nodes:
-            self._of_nodes[event.node].refresh()
-
-    # What a trial needs (`Device` of exo_gravity.panel.studio); called on the web server's thread
-
-    def parameters(self) -> dict[str, dict[str, Any]]:
-        """Return the parameters of every node by full name."""
-        of_nodes = sorted(self._of_nodes.copy().items())
-        return {name: dict(parameters.values) for name, parameters in of_nodes if parameters.is_present}
-
-    def states(self) -> dict[str, str | None]:
-        """Return the state of each arm; None if its bridge is silent."""
-        return self._arms.bridge_states()
-
-    async def perform(self, script: str) -> str:
-        """Let the virtual wearers perform the script at this path; return '' or why not."""
-        problems = []
-        for name, client in sorted(self._wearers.items()):
-            for path in ("", script):  # a script that is set already would not start again
-                problem = await call(client, parameter_request({"trial": path}))
-            problems += [f"{name}: {problem}"] if problem else []
-        return "; ".join(problems)
 
 
 def main() -> None:

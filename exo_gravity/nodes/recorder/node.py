@@ -8,7 +8,9 @@ how many messages were lost, if any were. A topic that fails is reported, and th
 
 from __future__ import annotations
 
+import json
 import math
+import sys
 import time
 from collections.abc import Callable
 from functools import partial
@@ -20,17 +22,14 @@ from geometry_msgs.msg import Vector3Stamped
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.serialization import serialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
-from exo_gravity.bag.content import RECORDER
-from exo_gravity.bag.topics import ASSIST, LOSSES, PARAMETERS, STATES, leaf
+from exo_gravity.bag.content import ASSIST, COMMANDS, LOSSES, PARAMETERS, RECORDER, STATES, STEPS, arm_of, leaf
 from exo_gravity.bag.writer import BagWriter, offered_qos
-from exo_gravity.nodes.recorder.live_line import ARM_TOPICS, LiveLine
-from exo_gravity.nodes.ros.declare import declare
-from exo_gravity.nodes.ros.drain import Drain
-from exo_gravity.nodes.ros.node_parameters import NodeParameters
+from exo_gravity.nodes.ros.hot_path import Drain
+from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
 
 SHARED_TOPICS = {
@@ -40,6 +39,7 @@ SHARED_TOPICS = {
     "/diagnostics": DiagnosticArray,
     "/parameter_events": ParameterEvent,
 }
+ARM_TOPICS = {STATES: JointState, COMMANDS: JointState, STEPS: String}  # in the live line
 OF_ARMS = {**ARM_TOPICS, ASSIST: JointState}
 REPEATER = "robot_model"  # its joint states are those of the arms once more
 DRAIN_PERIOD = 0.05  # s between two writes of what has arrived
@@ -179,13 +179,12 @@ class Recorder(Node):
         # Other topics have several publishers, each with its own numbers.
         self._drains.append(Drain(self, msgtype, topic, qos, counts_lost=msgtype in (JointState, Imu, Vector3Stamped)))
 
-    def _write_parameters(self, node: str) -> None:
-        parameters = self._unwritten.pop(node)
+    def _write_parameters(self, node: str, values: dict[str, Any]) -> None:
         # ROS's parameter files have no empty lists.
-        values = {name: value for name, value in parameters.values.items() if value != []}
-        text = yaml.safe_dump({node: {"ros__parameters": values}}, default_flow_style=None, width=120)
+        given = {name: value for name, value in values.items() if value != []}
+        text = yaml.safe_dump({node: {"ros__parameters": given}}, default_flow_style=None, width=120)
         self._write_text(PARAMETERS, text)
-        parameters.destroy()
+        self._unwritten.pop(node).destroy()
 
     def _write_text(self, topic: str, text: str) -> None:
         now = self.get_clock().now().nanoseconds
@@ -196,6 +195,59 @@ def type_name(msgtype: type) -> str:
     """Return 'sensor_msgs/msg/JointState' for that class."""
     package, kind, *_ = msgtype.__module__.split(".")
     return f"{package}/{kind}/{msgtype.__name__}"
+
+
+class LiveLine:
+    """Keeps the latest state, and writes it as one line of JSON for `trial`.
+
+    {"right": {"position": [4 rad], "velocity": [...], "effort": [...], "command": [...], "names": [...],
+    "step": {...}}, "status": {"right/can_bridge": {"level": 2, "message": "...", "state": "fault", ...}},
+    "faults": ["right/can_bridge: ..."], "recorder": {"messages": 1000, "lost": 0}}
+
+    status: the newest of each node on /diagnostics, its values included. faults: those whose level is not OK, as text.
+    recorder: the number of messages that it wrote and lost.
+    """
+
+    def __init__(self) -> None:
+        self._latest: dict[str, bytes] = {}
+        self._status: dict[str, dict[str, Any]] = {}
+
+    def note(self, topic: str, messages: list[bytes]) -> None:
+        """Keep the newest message of a topic, and the newest status of each node."""
+        if topic != "/diagnostics":
+            self._latest[topic] = messages[-1]
+            return
+        for data in messages:
+            for status in deserialize_message(data, DiagnosticArray).status:
+                values = {pair.key: pair.value for pair in status.values}
+                level = int.from_bytes(status.level, "big")
+                self._status[status.name] = values | {"level": level, "message": status.message}
+
+    def write(self, recorder: dict[str, int]) -> None:
+        """Write the line to standard output."""
+        line: dict[str, Any] = {}
+        for topic, data in self._latest.items():
+            name = leaf(topic)
+            if name in ARM_TOPICS:
+                arm = line.setdefault(arm_of(topic), {})
+                arm.update(_summary(name, deserialize_message(data, ARM_TOPICS[name])))
+        line["recorder"] = recorder
+        line["status"] = self._status
+        line["faults"] = [f"{name}: {status['message']}" for name, status in self._status.items() if status["level"]]
+        sys.stdout.write(json.dumps(line) + "\n")
+        sys.stdout.flush()
+
+
+def _summary(name: str, message: JointState | String) -> dict[str, Any]:
+    if name == STEPS:
+        try:
+            return {"step": json.loads(message.data)}
+        except ValueError:  # the report states it
+            return {}
+    if name == COMMANDS:
+        return {"command": list(message.effort)}
+    fields = {field: list(getattr(message, field)) for field in ("position", "velocity", "effort")}
+    return {"names": list(message.name), **fields}
 
 
 def main() -> None:

@@ -13,32 +13,34 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterable
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import Vector3Stamped
+from builtin_interfaces.msg import Duration, Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import Point, Vector3Stamped
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
-from visualization_msgs.msg import MarkerArray
+from std_msgs.msg import ColorRGBA, String
+from visualization_msgs.msg import Marker, MarkerArray
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.tilt import gravity_in_trunk
-from exo_gravity.core.view.arm_description import ROBOT_MODEL
-from exo_gravity.core.view.scene import ArmView, arm_shapes, gravity_shapes
-from exo_gravity.core.view.urdf import joint_names, urdf
-from exo_gravity.nodes.robot_model.markers import marker_array
-from exo_gravity.nodes.robot_model.viewed_arm import STALE, ViewedArm
-from exo_gravity.nodes.ros.declare import declare
-from exo_gravity.nodes.ros.diagnostics import OK, WARN, Diagnostics
-from exo_gravity.nodes.ros.hot_path import HotPath
+from exo_gravity.core.view.arm_description import OF_BRIDGE, OF_COMPENSATOR, ROBOT_MODEL, ArmDescription, described
+from exo_gravity.core.view.scene import ARROW, LINE, SPHERE, TEXT, ArmView, Shape, arm_shapes, gravity_shapes
+from exo_gravity.core.view.urdf import ROOT, joint_names, urdf
+from exo_gravity.nodes.ros.hot_path import LATCHED, NEWEST, HotPath
+from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics, by_name
+from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.tilt_subscription import NEWEST
 
-LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 DISCOVERY_PERIOD = 0.5  # s between two searches for arms
 MARKER_PERIOD = 0.1  # s
+STALE = 0.5  # s after which a reading or a state is no longer shown
+STALE_STATE = 2.0  # s; states come twice a second
+FIELDS = ("position", "velocity", "effort")
+KINDS = {ARROW: Marker.ARROW, LINE: Marker.LINE_STRIP, SPHERE: Marker.SPHERE, TEXT: Marker.TEXT_VIEW_FACING}
+LIFETIME = Duration(nanosec=500_000_000)  # a marker that is no longer sent disappears
 
 
 class RobotModel(Node):
@@ -68,7 +70,7 @@ class RobotModel(Node):
             if name == "compensator" and namespace not in self._arms:
                 self._arms[namespace] = ViewedArm(self, namespace.rstrip("/"))
         for arm in self._arms.values():
-            arm.request()
+            arm.update()
         self._describe()
         problem = self._problem or next((arm.problem for arm in self._arms.values() if arm.problem), "")
         if not self._arms:
@@ -127,6 +129,96 @@ class RobotModel(Node):
 
 def _seconds(stamp: Any) -> tuple[int, int]:
     return stamp.sec, stamp.nanosec
+
+
+class ViewedArm:
+    """The arm in `namespace` ('/right', '' for the root): its parameters and its newest joint states."""
+
+    def __init__(self, node: Node, namespace: str) -> None:
+        self.description: ArmDescription | None = None  #: None until both nodes have answered
+        #: Why there is no description or no reading, '' if nothing is wrong
+        self.problem = f"waiting for the parameters of {namespace}/compensator and {namespace}/can_bridge"
+        self.states_topic = f"{namespace}/joint_states"
+        self.states: JointState | None = None
+        self._node = node
+        self._bridge = f"{namespace}/can_bridge".lstrip("/")
+        self._status, self._status_time = ("", ""), -math.inf
+        self._time = -math.inf
+        self._parameters = [
+            NodeParameters(node, f"{namespace}/{leaf}", self._on_values, names)
+            for leaf, names in (("compensator", OF_COMPENSATOR), ("can_bridge", OF_BRIDGE))
+        ]
+        self._subscription = HotPath(node, JointState, self.states_topic, self._on_states, NEWEST)
+
+    def update(self) -> None:
+        """Read the parameters of both nodes, if they are not known."""
+        for parameters in self._parameters:
+            parameters.update()
+
+    def note(self, status: DiagnosticStatus) -> None:
+        """Keep the status of this arm's bridge; ignore any other."""
+        if status.name == self._bridge:
+            values = {pair.key: pair.value for pair in status.values}
+            self._status, self._status_time = (values.get("state", ""), status.message), time.monotonic()
+
+    def view(self) -> ArmView | None:
+        """Return what is known of the arm now; None without a description or a fresh reading."""
+        self._subscription.poll()
+        now = time.monotonic()
+        if self.description is None:
+            return None
+        if self.states is None or now - self._time > STALE:
+            self.problem = f"no messages on {self.states_topic}"
+            return None
+        names = self.description.limits.joint_names
+        try:
+            theta, velocity, effort = (by_name(self.states, field, names) for field in FIELDS)
+        except ParameterError as error:
+            self.problem = f"{self.states_topic}: {error.name} must be {error.expected}"
+            return None
+        self.problem = ""
+        state, message = self._status if now - self._status_time < STALE_STATE else ("", "")
+        return ArmView(self.description, theta, velocity, effort, state, message)
+
+    def _on_states(self, message: JointState, _info: dict[str, Any]) -> None:
+        self.states, self._time = message, time.monotonic()
+
+    def _on_values(self, _values: object) -> None:
+        if not all(parameters.values for parameters in self._parameters):
+            return
+        try:
+            self.description = described(*(parameters.values for parameters in self._parameters))
+        except ParameterError as error:
+            self.problem = f"{self._bridge.rpartition('/')[0] or 'arm'}: {error}"
+            self._node.get_logger().error(self.problem)
+
+
+def marker_array(shapes: Iterable[tuple[str, Shape]], stamp: Time) -> MarkerArray:
+    """Return the markers of (owner, shape): an owner is a side, or '' for what both arms share."""
+    markers, counts = [], dict[str, int]()
+    for owner, shape in shapes:
+        group = f"{owner}/{shape.group}" if owner else shape.group
+        counts[group] = counts.get(group, -1) + 1
+        markers.append(_marker(group, counts[group], shape, stamp))
+    return MarkerArray(markers=markers)
+
+
+def _marker(group: str, number: int, shape: Shape, stamp: Time) -> Marker:
+    marker = Marker(ns=group, id=number, type=KINDS[shape.kind], action=Marker.ADD, lifetime=LIFETIME, text=shape.text)
+    marker.header.stamp, marker.header.frame_id = stamp, ROOT
+    marker.color = ColorRGBA(**dict(zip("rgba", shape.colour, strict=True)))
+    marker.pose.orientation.w = 1.0
+    points = [Point(x=x, y=y, z=z) for x, y, z in shape.points.tolist()]
+    scale = marker.scale
+    if shape.kind in (LINE, ARROW):
+        marker.points = points
+        scale.x = shape.size
+        if shape.kind == ARROW:  # x: diameter of the shaft, y: of the head
+            scale.y = 2 * shape.size
+    else:
+        marker.pose.position = points[0]
+        scale.x = scale.y = scale.z = shape.size
+    return marker
 
 
 def main() -> None:

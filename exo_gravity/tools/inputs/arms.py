@@ -30,17 +30,14 @@ from exo_gravity.tools.inputs.parameter_file import Nodes, load, packaged_config
 
 @dataclass(frozen=True, eq=False)
 class ConfiguredArm:
-    """One arm of a parameter file, checked.
+    """One arm of a parameter file, checked."""
 
-    namespace: e.g. '/right'. can_bridge, compensator: all parameter values by name. robot: the arm without a wearer.
-    """
-
-    namespace: str
-    can_bridge: Mapping[str, Any]
-    compensator: Mapping[str, Any]
+    namespace: str  #: '/right'
+    can_bridge: Mapping[str, Any]  #: all parameter values by name
+    compensator: Mapping[str, Any]  #: all parameter values by name
     motors: tuple[JointMotor, ...]
     limits: Limits
-    robot: ArmModel
+    robot: ArmModel  #: the arm without a wearer
 
     @property
     def name(self) -> str:

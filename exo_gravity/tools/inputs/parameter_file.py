@@ -3,16 +3,22 @@
     /imu: {ros__parameters: {...}}
     /right/can_bridge: {ros__parameters: {can: {interface: socketcan}, ...}}
 
-The tools read it to find out which nodes to start and which arms they have; the nodes read it through ROS.
+The tools read it to find out which nodes to start and which arms they have; the nodes read it through ROS. `launcher`
+and `launch/exo.launch.py` stop them in the same order: bridges first, because they need the others while they let the
+arms down, and the recorder last.
 """
 
 from __future__ import annotations
 
 import os
+import shutil
 import sys
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from fnmatch import fnmatchcase
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -22,6 +28,18 @@ FORM = "/namespace/executable: {ros__parameters: {...}}"
 MAX_LIST = 100  # entries; the longest list of any parameter has 4, and ROS's reader takes minutes for 200,000
 # libyaml is ten times faster; PyYAML is sometimes built without it.
 Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+NODES_PACKAGE = "exo_gravity.nodes."
+DESCENT_TIMEOUT = 40.0  # s for a bridge to let its arm down, after which it is killed
+WATCHDOG_TIMEOUT = 30.0  # s for the watchdog of a dead bridge to let the arm down
+RECOVERY_TIMEOUT = WATCHDOG_TIMEOUT + DESCENT_TIMEOUT
+STOP_TIMEOUT = 5.0  # s for any other node to end
+SUPERVISED = {"EXO_GRAVITY_SUPERVISED": "1", "PYTHONUNBUFFERED": "1"}  # a node then ends with its standard input
+# Starts can_bridge for one purpose: to let down an arm that was left behind, after that time for its watchdog.
+RECOVERY = {"EXO_GRAVITY_RECOVER": f"{WATCHDOG_TIMEOUT:g}"}
+ENDED_WELL = (0, 2)  # exit codes of a node that ended by itself: stopped, or with wrong parameters or no bus
+OBSERVERS = ("/recorder", "/robot_model", "/panel")
+ABSOLUTE_TOPICS = ("/imu/data", "/imu/data_raw", "/imu/pitch_yaw")  # those that a namespace must be added to
 
 Nodes = dict[str, dict[str, Any]]  # node name -> dotted parameter name -> value
 
@@ -80,3 +98,83 @@ def _flat(node: str, prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
             # ROS's own reader refuses such a list without naming it.
             raise ParameterError(f"{node} {prefix}", value, "a list of one type: 1.0, not 1, next to 2.5")
     yield prefix, value
+
+
+def node_names() -> tuple[str, ...]:
+    """Return the executables that are nodes, from the entry points of the installed package."""
+    try:
+        scripts = distribution("exo_gravity").entry_points.select(group="console_scripts")
+    except PackageNotFoundError:
+        return ()
+    return tuple(sorted(script.name for script in scripts if script.value.startswith(NODES_PACKAGE)))
+
+
+def executable(node: str) -> str:
+    """Return the path of the executable of `node` ('/right/can_bridge'). Raises ParameterError if there is none."""
+    name, names = node.rpartition("/")[2], node_names()
+    if name not in names:
+        raise ParameterError("node name", node, f"/namespace/executable, with one of {', '.join(names)}")
+    prefixes = filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(":"))
+    folders = (
+        Path(sys.argv[0]).resolve().parent,
+        Path(sys.executable).parent,
+        *(Path(prefix, "lib", "exo_gravity") for prefix in prefixes),
+    )
+    path = os.pathsep.join(map(str, folders))
+    found = shutil.which(name, path=path)
+    if found is None:
+        raise ParameterError("node name", node, f"an installed executable: {name} is in none of {path}")
+    return found
+
+
+class Stages(NamedTuple):
+    """Names of nodes, in the order in which they stop."""
+
+    bridges: list[str]
+    others: list[str]
+    recorders: list[str]
+
+    @classmethod
+    def of(cls, nodes: Iterable[str]) -> Stages:
+        """Return the stages of `nodes`, full names."""
+        names = list(nodes)
+        bridges = [node for node in names if node.endswith("/can_bridge")]
+        recorders = [node for node in names if node.endswith("/recorder")]
+        return cls(bridges, [node for node in names if node not in (*bridges, *recorders)], recorders)
+
+
+def is_observer(node: str) -> bool:
+    """Return whether `node` may end alone: the arm does not depend on it, and a full disk must not let the arm down."""
+    return node.endswith(OBSERVERS)
+
+
+def chosen(nodes: Iterable[str], only: Sequence[str]) -> list[str]:
+    """Return the `nodes` that match one of the shell patterns `only`; without patterns, all.
+
+    A pattern is compared with the full name: `/right/*`, `*/compensator`. Raises ParameterError if one matches no node.
+    """
+    names = list(nodes)
+    for pattern in only:
+        if not any(fnmatchcase(node, pattern) for node in names):
+            raise ParameterError("only", pattern, f"a pattern that matches one of {', '.join(names)}")
+    return [node for node in names if not only or any(fnmatchcase(node, pattern) for pattern in only)]
+
+
+def check_buses(nodes: Nodes) -> None:
+    """Raise ParameterError if two bridges would command motors on the same bus, which has one owner."""
+    owner: dict[tuple[tuple[str, str], ...], str] = {}
+    for node in Stages.of(nodes).bridges:
+        bus = tuple(sorted((k, str(v)) for k, v in nodes[node].items() if k.startswith("can.")))
+        other = owner.setdefault(bus, node)
+        if other != node:
+            raise ParameterError(f"{node} can", dict(bus), f"different from the bus of {other}: one arm per bus")
+
+
+def in_namespace(params: Path, namespace: str) -> Path:
+    """Return a parameter file whose nodes are in `namespace` ('/lab'): `params` itself if that is ''."""
+    if not namespace:
+        return params
+    content = yaml.load(params.read_text(encoding="utf-8"), Loader)
+    path = Path(tempfile.mkdtemp(prefix="exo_gravity_"), params.name)
+    path.write_text(yaml.safe_dump({f"{namespace}{node}": entry for node, entry in content.items()}), encoding="utf-8")
+    return path

@@ -1,1 +1,1 @@
-"""What the tools show: reports of trials and torque budgets, as tables, figures and pages."""
+"""What the tools show: reports of trials, figures, pages and clips."""

@@ -14,9 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from exo_gravity.core.trial.analysis import Hold, TrialAnalysis
+from exo_gravity.core.trial.analysis import Hold, HoldCriteria, TrialAnalysis
 from exo_gravity.core.trial.recording import Recording
-from exo_gravity.core.trial.verdict import HoldCriteria
 from exo_gravity.tools.reporting.colours import (
     FAINT,
     HOLD_COLOUR,

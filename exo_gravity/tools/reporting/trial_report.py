@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from importlib.util import find_spec
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,17 +15,15 @@ from rich.markup import escape
 
 from exo_gravity.bag.content import Bag
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.trial.analysis import MIN_HOLD, TrialAnalysis
+from exo_gravity.core.trial.analysis import MIN_HOLD, HoldCriteria, TrialAnalysis, failures
 from exo_gravity.core.trial.analysis import analyse as analyse_arm
 from exo_gravity.core.trial.recording import Recording
-from exo_gravity.core.trial.verdict import HoldCriteria, failures
-from exo_gravity.tools.cli.extras import missing
-from exo_gravity.tools.reporting import page, table
+from exo_gravity.tools.cli import missing
+from exo_gravity.tools.reporting import html, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-DPI = 150
 MAX_EVENTS = 200
 EARLY = 0.2  # s; can_bridge publishes its state every 0.1 s, so a shorter gap to the script's end means nothing
 TIMESTAMP = re.compile(r"_\d{8}_\d{6}$")  # which `trial` adds to the script's name
@@ -38,16 +35,13 @@ CAPTIONS = {
 
 @dataclass(frozen=True)
 class Report:
-    """A recording, the analysis of each arm, and the verdict.
-
-    failures: one sentence for each way in which an arm did not hold. notes: what limits the trust in the verdict.
-    """
+    """A recording, the analysis of each arm, and the verdict."""
 
     bag: Bag
     criteria: HoldCriteria
     arms: tuple[tuple[Recording, TrialAnalysis], ...]
-    failures: tuple[str, ...]
-    notes: tuple[str, ...]
+    failures: tuple[str, ...]  #: one sentence for each way in which an arm did not hold
+    notes: tuple[str, ...]  #: what limits the trust in the verdict
 
     @property
     def exit_code(self) -> int:
@@ -91,16 +85,16 @@ def _reservations(bag: Bag) -> Iterator[str]:
         yield f"no figures: {missing('matplotlib', 'report')}"
     unscripted = [recording.name for recording in bag.recordings if not recording.steps]
     if unscripted:
-        yield f"{', '.join(unscripted)}: the recording has no trial script: every still phase counts as a hold"
+        yield f"{', '.join(unscripted)}: the recording has no trial script: every still phase is taken for a hold"
     unknown = [recording.name for recording in bag.recordings if recording.carried is None]
     if unknown:
         names = ", ".join(unknown)
-        yield f"{names}: the recording does not show when the arm was carried: letting it down may count as a slip"
+        yield f"{names}: the recording does not show when the arm was carried: its way down may be taken for a slip"
     for recording in bag.recordings:
         if recording.steps and recording.carried and recording.steps[-1].end > recording.carried[-1][1] + EARLY:
             end = recording.carried[-1][1]
             what = "the recording ends" if end >= float(recording.time[-1]) else "let down"
-            yield f"{recording.name}: {what} at {end:.1f} s, before the script ended: only the time until then counts"
+            yield f"{recording.name}: {what} at {end:.1f} s, before the script ended: only the time before is judged"
 
 
 def write(report: Report, folder: str | Path) -> list[Path]:
@@ -109,7 +103,7 @@ def write(report: Report, folder: str | Path) -> list[Path]:
     Without matplotlib the figures are left out. Raises DataError if the folder can't be written.
     """
     folder = Path(folder)
-    sections = []
+    sections: list[str] = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for kind, rows in (("holds", table.hold_rows), ("motions", table.motion_rows)):
@@ -117,10 +111,10 @@ def write(report: Report, folder: str | Path) -> list[Path]:
         for recording, analysis in report.arms:
             pictures = []
             for kind, figure in _figures(report, recording, analysis).items():
-                png = _png(figure)
+                png = html.png_of(figure)
                 (folder / f"{recording.name.replace('/', '_')}_{kind}.png").write_bytes(png)
-                pictures.append(page.figure_html(png, CAPTIONS[kind]))
-            sections.append(page.arm_html(recording, analysis, pictures))
+                pictures.append(html.picture(png, CAPTIONS[kind]))
+            sections += table.arm_section(recording, analysis, pictures)
         (folder / "report.html").write_text(_page(report, sections), encoding="utf-8")
     except OSError as error:
         raise DataError(f"{folder}: cannot write the report there ({error.strerror})") from None
@@ -158,21 +152,18 @@ def _figures(report: Report, recording: Recording, analysis: TrialAnalysis) -> d
     return drawn
 
 
-def _png(figure: Figure) -> bytes:
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI)
-    return buffer.getvalue()
-
-
 def _page(report: Report, sections: Sequence[str]) -> str:
     bag = report.bag
     length = max((float(recording.time[-1]) for recording in bag.recordings), default=0.0)
     events = [f"{table.shown(event.time, 1)} s  {event.text}" for event in bag.events]
     more = [f"and {len(events) - MAX_EVENTS} more"] if len(events) > MAX_EVENTS else []
+    parameters = "\n".join(bag.parameters[node].rstrip() for node in sorted(bag.parameters))
+    held = html.verdict("It did not hold." if report.failures else report.held, report.failures, not report.failures)
     ending = (
-        page.list_html("Notes", [*bag.problems, *report.notes])
-        + page.list_html("Faults and changed parameters", events[:MAX_EVENTS] + more)
-        + page.parameters_html(bag.parameters)
+        html.explained(table.TERMS),
+        html.bullets("Notes", [*bag.problems, *report.notes]),
+        html.bullets("Faults and changed parameters", events[:MAX_EVENTS] + more),
+        html.folded("Parameters at the start", parameters),
     )
     when = f"{report.start:%Y-%m-%d %H:%M:%S}, {length:.0f} s, {bag.path}"
-    return page.page_html(report.title, when, report.failures, report.held, sections, ending)
+    return html.document(report.title, when, [held, *sections, *ending])

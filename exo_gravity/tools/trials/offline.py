@@ -1,13 +1,13 @@
 """trial --offline: the simulated arms of a parameter file perform a script without ROS, faster than real time.
 
-It, `simulated_effort` and `trunk_imu` are the only tools that import `sim`: without ROS they cannot start the simulator
-as a node.
+It is the only tool that imports `sim`: without ROS it cannot start the simulator as a node.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +17,17 @@ from rich.progress import Progress
 
 from exo_gravity.bag.content import Bag, Event
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.tilt import rotation_matrix
 from exo_gravity.core.trial.recording import Recording
 from exo_gravity.core.trial.script import TRUNK_ACTIONS, TrialScript
-from exo_gravity.sim.device_params import SIMULATOR, device_of, imu_of, set_faults
-from exo_gravity.sim.imu import SimulatedImu, measured_tilt
-from exo_gravity.sim.offline import ArmSetup, OfflineTrial
+from exo_gravity.hardware.trunk.orientation_filter import VQF
+from exo_gravity.hardware.trunk.trunk_estimator import ImuSample, TrunkEstimator
+from exo_gravity.sim.imu import ImuConfig, SimulatedImu, measured_tilt
+from exo_gravity.sim.offline import ArmSetup, OfflineTrial, TrunkReading
+from exo_gravity.sim.params import SIMULATOR, device_of, imu_of, set_faults
+from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.tools.inputs.arms import named, node_values, read_arm
 from exo_gravity.tools.inputs.parameter_file import Nodes, load
-from exo_gravity.tools.trials.trunk_imu import TrunkImu
 
 
 def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
@@ -112,3 +115,33 @@ def _imu(nodes: Nodes, namespaces: list[str]) -> tuple[dict[str, Any], Sequence[
         if simulator["imu.topic"] and "/imu" in nodes:
             return simulator, nodes["/imu"].get("rotation_trunk_from_imu", [])
     return None
+
+
+class TrunkImu:
+    """A simulated IMU and the estimator that follows it, for `ArmSetup.trunk`."""
+
+    def __init__(self, config: ImuConfig, rotation_trunk_from_imu: Sequence[float], cycle_rate: float) -> None:
+        """Create the IMU `config`, which samples in every n-th of `cycle_rate` cycles per s.
+
+        rotation_trunk_from_imu: the mounting that the controller assumes. Raises ParameterError.
+        """
+        self.cycles = max(1, round(cycle_rate / config.rate))
+        rate = cycle_rate / self.cycles
+        self._imu = SimulatedImu(replace(config, rate=rate))
+        if VQF is None:
+            raise ParameterError("vqf", None, "installed (extra imu) for a trial in which the trunk moves")
+        ranges = config.gyroscope_range, config.accelerometer_range
+        self._estimator = TrunkEstimator(rotation_trunk_from_imu, rate, *ranges)
+        self._rotation = rotation_matrix(rotation_trunk_from_imu, "rotation_trunk_from_imu")
+
+    def measure(self, now: float, state: TrunkState) -> TrunkReading | None:
+        """Return what the trunk's IMU tells of `state` at `now` in s, None while it publishes nothing."""
+        angular_velocity, acceleration = self._imu.sample_of(state)
+        try:
+            answer = self._estimator.update(ImuSample(now, angular_velocity.tolist(), acceleration.tolist()))
+        except ParameterError:  # refused samples are not published
+            return None
+        if answer is None:
+            return None
+        force, turning = self._rotation @ acceleration, self._rotation @ angular_velocity
+        return TrunkReading(answer.gravity.tolist(), force.tolist(), turning.tolist())

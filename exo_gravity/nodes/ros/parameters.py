@@ -1,0 +1,163 @@
+"""A node's own parameters, declared from a table of `core`, and those of another node, read over its services."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.srv import GetParameters, ListParameters
+from rclpy.exceptions import ParameterNotDeclaredException
+from rclpy.node import Node
+from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.task import Future
+
+from exo_gravity.core.motors.joint_motor import OPTIONS
+from exo_gravity.core.params import Param, values_of
+
+ANSWER_TIMEOUT = 5.0  # s after which a request to a node that has died is repeated
+
+
+def declare(node: Node, table: Sequence[Param], free_prefix: str = "") -> dict[str, Any]:
+    """Declare the table's parameters on `node` and return their values by name.
+
+    The node must have been created with `automatically_declare_parameters_from_overrides=True`. Names that start with
+    `free_prefix` are left as given. Raises ParameterError for an impossible value, and for a name that is not in the
+    table.
+    """
+    given = {name: plain(parameter.value) for name, parameter in node.get_parameters_by_prefix("").items()}
+    values = values_of(table, given, free_prefix)
+    for param in table:
+        if node.has_parameter(param.name):
+            node.undeclare_parameter(param.name)
+        node.declare_parameter(param.name, values[param.name], descriptor_of(param), ignore_override=True)
+    return values
+
+
+def values_after(node: Node, table: Sequence[Param], changes: Sequence[Parameter] = ()) -> dict[str, Any]:
+    """Return the values of the table by name as they would be after `changes`, or raise ParameterError."""
+    values = {param.name: node.get_parameter(param.name).value for param in table}
+    values.update({change.name: change.value for change in changes})
+    return values_of(table, {name: plain(value) for name, value in values.items()})
+
+
+def with_floats(node: Node, table: Sequence[Param], changes: Sequence[Parameter]) -> list[Parameter]:
+    """Return `changes` with whole numbers converted to float where needed, as in `ros2 param set ... support 1`.
+
+    Raises ParameterNotDeclaredException with the unknown names, which rclpy itself leaves out.
+    """
+    unknown = [change.name for change in changes if not node.has_parameter(change.name)]
+    if unknown:
+        raise ParameterNotDeclaredException(unknown)
+    floats = {param.name for param in table if isinstance(_first(param.default), float)}
+    return [_with_float(change) if change.name in floats else change for change in changes]
+
+
+def bus_of(node: Node, values: dict[str, Any]) -> tuple[str, str, dict[str, Any]]:
+    """Return interface, channel and options of the node's python-can bus."""
+    options = {name: parameter.value for name, parameter in node.get_parameters_by_prefix(OPTIONS).items()}
+    return values["can.interface"], values["can.channel"], options
+
+
+def descriptor_of(param: Param) -> ParameterDescriptor:
+    """Return the descriptor that `ros2 param describe` shows."""
+    unit = f" [{param.unit}]" if param.unit else ""
+    descriptor = ParameterDescriptor(description=f"{param.description}{unit}", read_only=param.fixed)
+    if param.choices:
+        descriptor.additional_constraints = param.range
+    elif param.bounds and isinstance(param.default, list):
+        descriptor.additional_constraints = param.expected
+    elif param.bounds and isinstance(param.default, float):
+        descriptor.floating_point_range = [FloatingPointRange(from_value=param.bounds[0], to_value=param.bounds[1])]
+    elif param.bounds:
+        descriptor.integer_range = [IntegerRange(from_value=int(param.bounds[0]), to_value=int(param.bounds[1]))]
+    return descriptor
+
+
+def _with_float(change: Parameter) -> Parameter:
+    if change.type_ == Parameter.Type.INTEGER:
+        return Parameter(change.name, value=float(change.value))
+    if change.type_ == Parameter.Type.INTEGER_ARRAY:
+        return Parameter(change.name, value=[float(number) for number in change.value])
+    return change
+
+
+def _first(default: Any) -> Any:
+    return next(iter(default), None) if isinstance(default, list) else default
+
+
+def plain(value: Any) -> Any:
+    """Return a parameter's value with arrays as lists."""
+    return list(value) if isinstance(value, list | tuple) or hasattr(value, "tolist") else value
+
+
+class NodeParameters:
+    """The parameters of another node, in `values` once they are known.
+
+    name: its full name, or its name in `node`'s namespace. on_change: called with `values` on the executor's thread
+    each time that they were read. names: of the parameters to read, all by default; `values` is empty if the node lacks
+    one of them. clock: monotonic s.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        name: str,
+        on_change: Callable[[dict[str, Any]], object] = lambda values: None,
+        names: Sequence[str] = (),
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.values: dict[str, Any] = {}
+        self.is_present = False  #: whether it has its services; a node that has died can stay in ROS's list of names
+        self._node = node
+        self._on_change = on_change
+        self._names = names
+        self._clock = clock
+        self._get = node.create_client(GetParameters, f"{name}/get_parameters")
+        self._list = None if names else node.create_client(ListParameters, f"{name}/list_parameters")
+        self._clients = [self._get] if self._list is None else [self._get, self._list]
+        self._is_due = True
+        self._asked = -math.inf  # s, when the request was sent that has no answer yet
+        self._is_destroyed = False
+
+    def refresh(self) -> None:
+        """Read the parameters again, at the next `update`."""
+        self._is_due = True
+
+    def update(self) -> None:
+        """Read the parameters if they may have changed and the node answers. Call it on the executor's thread."""
+        if self._is_destroyed:
+            return
+        self.is_present = all(client.service_is_ready() for client in self._clients)
+        if not self.is_present:
+            self._is_due = True  # it may return with other values
+            return
+        now = self._clock()
+        if (self._is_due or math.isfinite(self._asked)) and now - self._asked >= ANSWER_TIMEOUT:
+            self._is_due, self._asked = False, now
+            if self._list is None:
+                self._request(self._names)
+            else:
+                listed = self._list.call_async(ListParameters.Request())
+                listed.add_done_callback(lambda done: self._request(done.result().result.names))
+
+    def destroy(self) -> None:
+        """Remove the clients; answers that are still on their way are ignored."""
+        self._is_destroyed = True
+        for client in self._clients:
+            self._node.destroy_client(client)
+
+    def _request(self, names: Sequence[str]) -> None:
+        if not self._is_destroyed:
+            asked = self._get.call_async(GetParameters.Request(names=list(names)))
+            asked.add_done_callback(lambda done: self._on_values(names, done))
+
+    def _on_values(self, names: Sequence[str], future: Future) -> None:
+        if self._is_destroyed:
+            return
+        self._asked = -math.inf
+        values = map(parameter_value_to_python, future.result().values)
+        self.values = {name: plain(value) for name, value in zip(names, values, strict=False) if value is not None}
+        self._on_change(self.values)

@@ -1,0 +1,95 @@
+"""The parameters of `simulator`, and the device that they describe."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from exo_gravity.core.model.arm import MAX_GRAVITY, MAX_LENGTH, MAX_MASS, STANDARD_GRAVITY, ArmModel
+from exo_gravity.core.model.tilt import SIDES
+from exo_gravity.core.motors.joint_motor import MOTOR_PARAMETERS, motors_of
+from exo_gravity.core.params import Param, param_of
+from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
+from exo_gravity.sim.device import SimulatedDevice
+from exo_gravity.sim.imu import ImuConfig
+from exo_gravity.sim.motor import Firmware, simulated_motor
+from exo_gravity.sim.truth import TruthLog
+
+# Parameters of the arm by the field of ArmConfig that owns each of them.
+ARM_FIELDS = {
+    "cog_y": "robot.cog_y",
+    "cog_z": "robot.cog_z",
+    "wearer_mass": "wearer.mass",
+    "wearer_cog": "wearer.cog",
+    "rotor_inertia": "rotor_inertia",
+    "coulomb_friction": "friction.coulomb",
+    "viscous_friction": "friction.viscous",
+    "stribeck_friction": "friction.stribeck",
+    "stribeck_speed": "friction.stribeck_speed",
+    "position_min": "stop.min",
+    "position_max": "stop.max",
+}
+IMU_FIELDS = ("rate", "rotation_trunk_from_imu", "delay")
+_LENGTH, _MASS, _COG = (a.tolist() for a in (DEFAULT_LINKS.length, DEFAULT_LINKS.mass, DEFAULT_LINKS.cog))
+# fmt: off
+SIMULATOR = (
+    Param("side", "right", "which arm; the right arm mirrors the left", choices=SIDES, fixed=True),
+    *MOTOR_PARAMETERS,
+    param_of(Firmware, "reply_to_master", fixed=True),
+    param_of(Firmware, "reply_length", fixed=True),
+    param_of(Firmware, "current_noise", fixed=True),
+    Param("gravity", STANDARD_GRAVITY, "acceleration of gravity", (0.0, MAX_GRAVITY), "m/s^2", fixed=True),
+    Param("link_length", _LENGTH, "true link lengths", (0.0, MAX_LENGTH), "m", fixed=True),
+    Param("robot.mass", _MASS, "true link masses", (0.0, MAX_MASS), "kg", fixed=True),
+    Param("robot.cog", _COG, "true centre of gravity from joint n", (0.0, MAX_LENGTH), "m", fixed=True),
+    *(replace(param_of(ArmConfig, field, fixed=True), name=name) for field, name in ARM_FIELDS.items()),
+    Param("imu.topic", "", "topic of the trunk's IMU; empty: this simulator has no IMU", fixed=True),
+    *(replace(param_of(ImuConfig, field, fixed=True), name=f"imu.{field}") for field in IMU_FIELDS),
+    Param("trunk.pitch", 0.0, "forward tilt of the trunk, approached at 0.5 rad/s", (-3.1, 3.1), "rad"),
+    Param("trunk.roll", 0.0, "tilt of the trunk to the right, approached at 0.5 rad/s", (-3.1, 3.1), "rad"),
+    Param("trial", "", "script file for the virtual wearer; if set while the node runs, the wearer starts at once"),
+    Param("trial_delay", 6.0, "time from the motors being on to the wearer's first step", (0.0, 60.0), "s", fixed=True),
+    Param("truth", "", "file for the arm's true motion at 1 kHz (exo_gravity/sim/truth.py); empty: none", fixed=True),
+    Param("fault.unplugged", [False] * 4, "motors without power"),
+    Param("fault.unplugged_time", 0.0, "time until their power returns, motors off; 0: never", (0.0, 60.0), "s"),
+    Param("fault.cut_off", [False] * 4, "motors with power, but without connection to the bus"),
+    Param("fault.encoder_error", [0.0] * 4, "error of the joint angles that the motors read", (-7.0, 7.0), "rad"),
+    Param("fault.temperature", [30.0] * 4, "motor temperatures", (-40.0, 215.0), "degC"),
+    Param("fault.error", [0] * 4, "motor error codes", (0, 255)),
+    Param("fault.bus_silent", False, "the bus passes no frames"),
+)
+# fmt: on
+
+
+def device_of(values: Mapping[str, Any]) -> SimulatedDevice:
+    """Return the device that parameter values describe, with its trunk tilted. Raises ParameterError."""
+    links = ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"], gravity=values["gravity"])
+    arm = ArmConfig(links, **{field: values[name] for field, name in ARM_FIELDS.items()})
+    firmware = Firmware(
+        values["reply_to_master"],
+        values["reply_length"],
+        current_noise=values["current_noise"],
+    )
+    motors = [simulated_motor(motor, firmware) for motor in motors_of(values)]
+    device = SimulatedDevice(SimulatedArm(arm), motors, values["side"])
+    device.pitch, device.roll = values["trunk.pitch"], values["trunk.roll"]
+    if values["truth"]:
+        device.truth = TruthLog(values["truth"])
+    return device
+
+
+def set_faults(device: SimulatedDevice, values: Mapping[str, Any]) -> None:
+    """Set the faults of `device` that parameter values describe."""
+    device.bus_silent = values["fault.bus_silent"]
+    device.cut_off, device.encoder_error = values["fault.cut_off"], values["fault.encoder_error"]
+    if values["fault.unplugged_time"]:
+        device.return_power(values["fault.unplugged_time"])
+    faults = (values["fault.unplugged"], values["fault.temperature"], values["fault.error"])
+    for motor, unplugged, temperature, error in zip(device.motors, *faults, strict=True):
+        motor.unplugged, motor.temperature, motor.error = unplugged, temperature, error
+
+
+def imu_of(values: Mapping[str, Any]) -> ImuConfig:
+    """Return the trunk's IMU that parameter values describe. Raises ParameterError."""
+    return ImuConfig(**{field: values[f"imu.{field}"] for field in IMU_FIELDS}, gravity=values["gravity"])

@@ -1,0 +1,61 @@
+"""What the command lines share: argument types, and messages about packages that are not installed.
+
+A tool imports packages that only some tools need inside `extras`, after it has parsed its arguments: `--help` works
+without them, and a missing one ends the tool with one line instead of a traceback.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+
+# Ubuntu 24.04 has these; all others come from PyPI only.
+APT = {
+    "matplotlib": "python3-matplotlib",
+    "rich": "python3-rich",
+    "scipy": "python3-scipy",
+    "sklearn": "python3-sklearn",
+    "threadpoolctl": "python3-threadpoolctl",
+}
+
+
+def non_negative(text: str) -> float:
+    """Return the number that `text` spells, 0 or more; raise ArgumentTypeError otherwise, also for NaN."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not number >= 0.0:
+        raise argparse.ArgumentTypeError(f"{text}: must be a number, 0 or more")
+    return number
+
+
+def missing(module: str, extra: str) -> str:
+    """Return a sentence that names the missing `module` and how to install it; extra: e.g. 'report'."""
+    module = module.partition(".")[0]
+    apt = f"apt install {APT[module]}, or " if module in APT else ""
+    return f"the Python package {module} is not installed: {apt}pip install 'exo_gravity[{extra}]'"
+
+
+@contextmanager
+def extras(tool: str, extra: str) -> Iterator[None]:
+    """End `tool` with exit code 2 and one line if an import inside the context finds a package missing."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if not error.name or error.name.startswith("exo_gravity"):
+            raise  # not a package that an extra installs
+        print(f"{tool}: {missing(error.name, extra)}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+def require_ros(tool: str) -> None:
+    """End `tool` with exit code 2 and one line if ROS 2's Python library is not found."""
+    if not find_spec("rclpy"):
+        remedy = "source /opt/ros/jazzy/setup.bash, or without ROS: pip install 'exo_gravity[ros]'"
+        print(f"{tool}: the Python package rclpy is not found: {remedy}", file=sys.stderr)
+        raise SystemExit(2)

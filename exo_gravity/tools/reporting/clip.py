@@ -1,0 +1,250 @@
+"""A recording -> a clip: the arms as they moved, their torques and limits, and a caption with time, step and torques.
+
+The arms are drawn in the trunk's axes, from the parameters that the recording holds. A GIF has one palette for all
+frames, which keeps it small.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import imageio.v3 as iio
+import mujoco
+import numpy as np
+import yaml
+from PIL import Image, ImageDraw, ImageFont
+
+from exo_gravity.bag.content import Bag
+from exo_gravity.core.compensation.params import COMPENSATOR
+from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.params import Param
+from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.params import CAN_BRIDGE
+from exo_gravity.core.trial.recording import Recording
+from exo_gravity.core.view.arm_description import ArmDescription, described
+from exo_gravity.core.view.scene import AMBER, ARROW, GREEN, GREY, LINE, RED, SPHERE, ArmView, Shape, arm_shapes
+from exo_gravity.core.view.urdf import joint_names, urdf
+from exo_gravity.tools.reporting.video import Clip, frame_times
+
+WIDTH, HEIGHT = 640, 480
+GIF_WIDTH, GIF_HEIGHT, COLOURS = 480, 360, 128
+LINE_HEIGHT = 0.042  # of the picture's height
+INK = (40, 44, 52)
+SWATCH = 12  # pixels
+NO_TORQUE = 0.05  # Nm, below which a motor counts as off
+STEPS = {"move": "the wearer moves the arm", "hold": "hands off", "push": "a push"}
+
+OnFrame = Callable[[int, int], None]  # (frames done, frames in total)
+
+
+def write_clip(bag: Bag, clip: Clip, on_frame: OnFrame = lambda done, count: None) -> None:
+    """Write the clip of a recording. Raises DataError if its arms are not described, or it cannot be drawn."""
+    arms = [_description(bag.parameters, recording.name) for recording in bag.recordings]
+    is_gif = clip.path.suffix.lower() == ".gif"
+    size = (GIF_WIDTH, GIF_HEIGHT) if is_gif else (WIDTH, HEIGHT)
+    try:
+        stage = Stage(arms, *size)
+    except ParameterError as error:
+        raise DataError(f"{bag.path}: {error}") from None
+    times = frame_times(min(float(recording.time[-1]) for recording in bag.recordings), clip)
+    pictures = _pictures(stage, list(zip(arms, bag.recordings, strict=True)), times, on_frame)
+    try:
+        _write_gif(pictures, clip) if is_gif else _write_mp4(pictures, clip)
+    except OSError as error:
+        raise DataError(f"{clip.path}: cannot be written ({error.strerror or error})") from None
+    finally:
+        stage.close()
+
+
+def _pictures(
+    stage: Stage, arms: Sequence[tuple[ArmDescription, Recording]], times: Sequence[float], on_frame: OnFrame
+) -> Iterator[Image.Image]:
+    for i, time in enumerate(times):
+        views = [_view(arm, recording, time) for arm, recording in arms]
+        shapes: list[Shape] = [shape for view in views for shape in arm_shapes(view)]
+        picture = Image.fromarray(stage.frame([angle for view in views for angle in view.theta], shapes))
+        _write_caption(picture, [f"{time:.1f} s  {_step(arms[0][1], time)}", *map(_torques, views)])
+        on_frame(i + 1, len(times))
+        yield picture
+
+
+def _view(arm: ArmDescription, recording: Recording, time: float) -> ArmView:
+    """Return what is known of an arm at `time` s."""
+    at = min(int(np.searchsorted(recording.time, time)), len(recording.time) - 1)
+    order = [recording.joint_names.index(name) for name in arm.limits.joint_names]
+    theta, velocity, effort = (
+        np.nan_to_num(row[at, order].astype(float)).tolist()
+        for row in (recording.position, recording.velocity, recording.effort)
+    )
+    powered = State.LETTING_DOWN if max(map(abs, effort)) > NO_TORQUE else State.DISABLED
+    state = State.ACTIVE if _is_carried(recording, time) else powered
+    return ArmView(arm, theta, velocity, effort, state.value)
+
+
+def _is_carried(recording: Recording, time: float) -> bool:
+    return recording.carried is None or any(start <= time <= end for start, end in recording.carried)
+
+
+def _step(recording: Recording, time: float) -> str:
+    """Return what the script does at `time` s."""
+    for step in recording.steps:
+        if step.start <= time < step.end:
+            return STEPS.get(step.action, step.action)
+    if _is_carried(recording, time):
+        return "carried"
+    return "let down" if recording.carried and time > recording.carried[0][0] else "start-up checks"
+
+
+def _torques(view: ArmView) -> str:
+    return f"{view.arm.side} " + " ".join(f"{round(effort, 2) + 0.0:.2f}" for effort in view.effort) + " Nm"
+
+
+def _write_caption(picture: Image.Image, lines: Sequence[str]) -> None:
+    height = LINE_HEIGHT * picture.height
+    font, draw = ImageFont.load_default(height), ImageDraw.Draw(picture)
+    for i, line in enumerate(lines):
+        draw.text((height / 2, height / 2 + 1.2 * height * i), line, INK, font)
+
+
+def _write_mp4(pictures: Iterator[Image.Image], clip: Clip) -> None:
+    with iio.imopen(clip.path, "w", plugin="pyav") as file:
+        file.init_video_stream("libx264", fps=clip.frame_rate)
+        for picture in pictures:
+            file.write_frame(np.asarray(picture))
+
+
+def _write_gif(pictures: Iterator[Image.Image], clip: Clip) -> None:
+    """Write frames in one palette; Pillow stores of each frame only what has changed."""
+    first = next(pictures)
+    palette = _palette(first)
+    frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in (first, *pictures)]
+    frames[0].save(clip.path, save_all=True, append_images=frames[1:], duration=round(1000 / clip.frame_rate), loop=0)
+
+
+def _palette(picture: Image.Image) -> Image.Image:
+    """Return the colours of a picture and those of torques and states, which it may not show yet."""
+    sample = picture.copy()
+    draw = ImageDraw.Draw(sample)
+    for i, colour in enumerate((GREEN, AMBER, RED, GREY)):
+        for j, share in enumerate((0.5, 0.75, 1.0)):  # in shade and in light
+            corner = SWATCH * i, SWATCH * j
+            shade = tuple(round(255 * share * part) for part in colour[:3])
+            draw.rectangle((*corner, corner[0] + SWATCH, corner[1] + SWATCH), shade)
+    return sample.quantize(COLOURS, dither=Image.Dither.NONE)
+
+
+def _description(parameters: Mapping[str, str], name: str) -> ArmDescription:
+    """Return the arm `name` of a recording from the nodes' parameters in it. Raises DataError."""
+    namespace = "" if name == "arm" else f"/{name}"
+    try:
+        values = [
+            _values(parameters, f"{namespace}/{node}", table)
+            for node, table in (("compensator", COMPENSATOR), ("can_bridge", CAN_BRIDGE))
+        ]
+        return described(*values)
+    except ParameterError as error:
+        raise DataError(f"{name}: the recording's parameters do not describe the arm: {error}") from None
+
+
+def _values(parameters: Mapping[str, str], node: str, table: Sequence[Param]) -> dict[str, Any]:
+    """Return the recorded parameters of `node`; the default for one that its version did not have."""
+    text = parameters.get(node)
+    if text is None:
+        raise ParameterError("parameters", sorted(parameters), f"those of {node} among others")
+    given = yaml.safe_load(text)[node]["ros__parameters"]
+    return {param.name: given.get(param.name, param.default) for param in table}
+
+
+MAX_SHAPES = 4000
+AZIMUTH = {"left": 215.0, "right": 145.0}  # deg, of the camera: in front, on the arm's side
+BOTH_SIDES, ELEVATION, DISTANCE = 165.0, -8.0, 1.75  # deg, deg, m
+CENTRE = 0.28  # m below the shoulders, what the camera looks at
+FIELD_OF_VIEW = 38.0  # deg
+SKY = ((0.97, 0.98, 1.0), (0.80, 0.84, 0.89))  # above and below
+
+
+class Stage:
+    """Draws frames of `width` x `height` pixels. Raises DataError if OpenGL does not work here."""
+
+    def __init__(self, arms: Sequence[ArmDescription], width: int, height: int) -> None:
+        self._model = _model(arms, width, height)
+        self._data = mujoco.MjData(self._model)
+        names = [name for four in joint_names(arms) for name in four]
+        self._at = [int(self._model.joint(name).qposadr[0]) for name in names]
+        self._camera = _camera(arms)
+        try:
+            self._renderer = mujoco.Renderer(self._model, height, width, max_geom=MAX_SHAPES)
+        except Exception as error:  # EGL, GLX and OSMesa raise what they like
+            raise DataError(f"OpenGL does not draw here ({type(error).__name__}: {error})") from None
+
+    def frame(self, angles: Iterable[float], shapes: Iterable[Shape]) -> np.ndarray:
+        """Return the picture (height, width, 3) uint8 of the arms at `angles`, rad, four for each arm in order."""
+        self._data.qpos[self._at] = list(angles)
+        mujoco.mj_forward(self._model, self._data)
+        self._renderer.update_scene(self._data, self._camera)
+        for shape in shapes:
+            _add(self._renderer.scene, shape)
+        return np.asarray(self._renderer.render())
+
+    def close(self) -> None:
+        """Free what OpenGL holds."""
+        self._renderer.close()
+
+
+def _model(arms: Sequence[ArmDescription], width: int, height: int) -> Any:
+    """Return the description as a MuJoCo model, with its visuals, light and a sky."""
+    seen = '<mujoco><compiler discardvisual="false" fusestatic="false"/></mujoco></robot>'
+    spec = mujoco.MjSpec.from_string(urdf(arms).replace("</robot>", seen))
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
+    spec.visual.global_.fovy = FIELD_OF_VIEW
+    spec.visual.quality.offsamples, spec.visual.quality.numslices, spec.visual.quality.numstacks = 2, 16, 8
+    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = (0.45,) * 3, (0.35,) * 3
+    spec.add_texture(
+        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=SKY[0], rgb2=SKY[1], width=256, height=1536,
+    )  # fmt: skip
+    spec.worldbody.add_light(pos=(1.5, -1.0, 2.0), dir=(-1.5, 1.0, -2.0), diffuse=(0.5,) * 3, castshadow=False)
+    return spec.compile()
+
+
+def _camera(arms: Sequence[ArmDescription]) -> Any:
+    base = np.mean([arm.base for arm in arms], axis=0)
+    camera = mujoco.MjvCamera()
+    camera.lookat[:] = base - (0.0, 0.0, CENTRE)
+    camera.azimuth = AZIMUTH[arms[0].side] if len(arms) == 1 else BOTH_SIDES
+    camera.elevation, camera.distance = ELEVATION, DISTANCE
+    return camera
+
+
+def _add(scene: Any, shape: Shape) -> None:
+    """Add a shape to MuJoCo's scene; a text is left out, since the caption carries the words."""
+    radius = shape.size / 2
+    if shape.kind == LINE:
+        for start, end in zip(shape.points, shape.points[1:], strict=False):
+            _connect(scene, mujoco.mjtGeom.mjGEOM_CAPSULE, radius, start, end, shape.colour)
+    elif shape.kind == ARROW:
+        start, end = shape.points
+        _connect(scene, mujoco.mjtGeom.mjGEOM_ARROW, radius, start, end, shape.colour)
+    elif shape.kind == SPHERE:
+        size = np.full(3, radius)
+        geom = _next(scene)
+        mujoco.mjv_initGeom(
+            geom,
+            mujoco.mjtGeom.mjGEOM_SPHERE,
+            size,
+            shape.points[0],
+            np.eye(3).ravel(),
+            np.array(shape.colour, np.float32),
+        )
+
+
+def _connect(scene: Any, kind: Any, radius: float, start: np.ndarray, end: np.ndarray, colour: Sequence[float]) -> None:
+    geom = _next(scene)
+    mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), np.array(colour, np.float32))
+    mujoco.mjv_connector(geom, kind, radius, start, end)
+
+
+def _next(scene: Any) -> Any:
+    scene.ngeom += 1
+    return scene.geoms[scene.ngeom - 1]

@@ -1,0 +1,147 @@
+"""HTML pages that need nothing outside themselves: one style, headings, tables and embedded figures.
+
+Every function returns a piece of HTML, and escapes every text that it is given; a line break in a heading is kept.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from io import BytesIO
+from typing import TYPE_CHECKING
+
+from exo_gravity.tools.reporting.colours import JOINT_COLOURS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+DPI = 150
+Rows = Iterable[Sequence[str]]
+
+STYLE = """
+:root { color-scheme: light; }
+body { font: 16px/1.5 system-ui, sans-serif; color: #222; background: #fff; max-width: 72rem; margin: 2rem auto;
+       padding: 0 1rem; }
+h1 { margin: 0; font-size: 1.8rem; } h2 { margin: 2.5rem 0 .5rem; } h3 { margin: 1.5rem 0 .3rem; font-size: 1.05rem; }
+.when, footer { color: #5a646d; } figure { margin: 1rem 0; } img { width: 100%; height: auto; }
+figcaption { color: #5a646d; font-size: .9rem; }
+.verdict { border-left: .4rem solid #009E73; background: #eef7f3; padding: .7rem 1rem; margin: 1.2rem 0; }
+.verdict.not { border-color: #D55E00; background: #fdf1ea; }
+.verdict ul { margin: .3rem 0 0; padding-left: 1.2rem; }
+.key { display: flex; flex-wrap: wrap; gap: 1rem 2.5rem; margin: 1rem 0; }
+.key b { display: block; font-size: 1.5rem; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabular-nums; }
+th, td { padding: .15rem .6rem; text-align: right; white-space: nowrap; }
+th { font-weight: 600; vertical-align: bottom; }
+thead { border-bottom: 2px solid #9aa3ab; } tbody { border-bottom: 1px solid #d5dadf; }
+tbody th { font-weight: inherit; text-align: left; }
+.joint::before { content: "●"; color: var(--c); margin-right: .4rem; }
+pre { background: #f4f6f8; padding: .7rem 1rem; overflow-x: auto; font-size: .85rem; }
+"""
+
+
+def document(title: str, when: str, body: Iterable[str]) -> str:
+    """Return a page; when: the line below the title. body: pieces of HTML."""
+    content = "\n".join(body)
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1"><title>{escape(title)}</title>'
+        f'<style>{STYLE}</style></head><body><main>\n<h1>{escape(title)}</h1><p class="when">{escape(when)}</p>\n'
+        f"{content}</main></body></html>\n"
+    )
+
+
+def verdict(sentence: str, reasons: Iterable[str] = (), good: bool = True) -> str:
+    """Return a banner with the conclusion, and the reasons for it."""
+    kind = "verdict" if good else "verdict not"
+    return f'<div class="{kind}"><b>{escape(sentence)}</b>{_items(reasons)}</div>'
+
+
+def heading(text: str, level: int = 3) -> str:
+    """Return a heading of a section (2) or of a part of one (3)."""
+    return f"<h{level}>{escape(text)}</h{level}>"
+
+
+def paragraph(text: str, term: str = "") -> str:
+    """Return a paragraph; term: bold words at its beginning."""
+    return f"<p>{f'<b>{escape(term)}</b> ' if term else ''}{escape(text)}</p>"
+
+
+def bullets(title: str, lines: Iterable[str]) -> str:
+    """Return a heading and a list, or '' if there are no lines."""
+    items = _items(lines)
+    return heading(title) + items if items else ""
+
+
+def explained(terms: Mapping[str, str]) -> str:
+    """Return the page's last paragraph: what each term means."""
+    return (
+        f"<footer><p>{' '.join(f'<b>{escape(term)}</b> {escape(text)}' for term, text in terms.items())}</p></footer>"
+    )
+
+
+def key_numbers(numbers: Iterable[tuple[str, str]]) -> str:
+    """Return large numbers, each with what it is below it."""
+    cells = "".join(f"<div><b>{escape(number)}</b>{escape(label)}</div>" for number, label in numbers)
+    return f'<div class="key">{cells}</div>'
+
+
+def folded(summary: str, text: str) -> str:
+    """Return preformatted text that a click unfolds, or '' for no text."""
+    return f"<details><summary>{escape(summary)}</summary><pre>{escape(text)}</pre></details>" if text else ""
+
+
+def png_of(figure: Figure, dpi: int = DPI) -> bytes:
+    """Return a figure as PNG."""
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi)
+    return buffer.getvalue()
+
+
+def picture(png: bytes, caption: str) -> str:
+    """Return an embedded PNG with its caption, which is also its text for screen readers."""
+    source = f"data:image/png;base64,{base64.b64encode(png).decode()}"
+    return f'<figure><img alt="{escape(caption)}" src="{source}"><figcaption>{escape(caption)}</figcaption></figure>'
+
+
+def table(heads: Sequence[str], rows: Rows) -> str:
+    """Return a table; the first cell of a row is its heading."""
+    lines = "".join(f'<tr><th scope="row">{escape(first)}</th>{_cells(rest)}</tr>' for first, *rest in rows)
+    return _table(heads, f"<tbody>{lines}</tbody>")
+
+
+def joint_table(heads: Sequence[str], groups: Iterable[tuple[Sequence[str], Rows]]) -> str:
+    """Return a table of groups with one row for each joint, whose first cell is the joint's name.
+
+    groups: the cells that the rows of a group share, which come first, and the rows.
+    """
+    return _table(heads, "".join(_group(shared, list(rows)) for shared, rows in groups))
+
+
+def _group(shared: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [
+        f'<th scope="row" class="joint" style="--c:{colour}">{escape(joint)}</th>{_cells(cells)}'
+        for (joint, *cells), colour in zip(rows, JOINT_COLOURS, strict=True)
+    ]
+    spans = "".join(f'<td rowspan="{len(rows)}">{_broken(cell)}</td>' for cell in shared)
+    return f"<tbody><tr>{spans}{'</tr><tr>'.join(lines)}</tr></tbody>"
+
+
+def _table(heads: Sequence[str], body: str) -> str:
+    head = "".join(f'<th scope="col">{_broken(text)}</th>' if text else "<td></td>" for text in heads)
+    return f'<div class="scroll" tabindex="0"><table><thead><tr>{head}</tr></thead>{body}</table></div>'
+
+
+def _cells(cells: Iterable[str]) -> str:
+    return "".join(f"<td>{escape(cell)}</td>" for cell in cells)
+
+
+def _broken(text: str) -> str:
+    return escape(text).replace("\n", "<br>")
+
+
+def _items(lines: Iterable[str]) -> str:
+    items = "".join(f"<li>{escape(line)}</li>" for line in lines)
+    return f"<ul>{items}</ul>" if items else ""

@@ -1,0 +1,114 @@
+"""Where a clip goes, and whether this computer can draw it: checked before a trial runs, not after."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+from ctypes.util import find_library
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from exo_gravity.bag.content import Bag
+from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.numbers import one_float
+from exo_gravity.tools.cli import missing
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+FRAME_RATE = {".mp4": 25, ".gif": 10}  # frames per second
+NEEDED = ("mujoco", "imageio", "av", "PIL")
+MAX_SPEED = 100.0
+# The libraries by which MuJoCo draws without a screen, and its name for each.
+BACKENDS = {"EGL": "egl", "OSMesa": "osmesa"}
+NO_GRAPHICS = (
+    "no OpenGL that draws without a screen is installed (EGL, OSMesa, or what MUJOCO_GL names): "
+    "apt install libegl1 libgl1-mesa-dri, or apt install libosmesa6"
+)
+
+
+class Clip(NamedTuple):
+    """A clip to write. speed: how many seconds of the recording one second of the clip shows."""
+
+    path: Path
+    speed: float = 1.0
+
+    @property
+    def frame_rate(self) -> int:
+        """Frames per second."""
+        return FRAME_RATE[self.path.suffix.lower()]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add --video and --video-speed."""
+    option = parser.add_argument
+    option("--video", metavar="FILE", help="write a clip of the arms, drawn without a screen: FILE.mp4 or FILE.gif")
+    option("--video-speed", type=float, default=1.0, metavar="X", help="speed of the clip (%(default)s)")
+
+
+def requested(video: str | None, speed: float) -> Clip | None:
+    """Return the clip of the command line, None for none.
+
+    Raises ParameterError for a wrong file or speed, and if a package or OpenGL is missing.
+    """
+    if video is None:
+        return None
+    path = Path(video)
+    if path.suffix.lower() not in FRAME_RATE:
+        raise ParameterError("video", video, f"a file that ends with {' or '.join(FRAME_RATE)}")
+    if not path.absolute().parent.is_dir():
+        raise ParameterError("video", video, "a file in a folder that exists")
+    clip = Clip(path, one_float("video_speed", speed, 0.1, MAX_SPEED))
+    for module in NEEDED:
+        if not find_spec(module):
+            raise ParameterError("video", video, f"left out: {missing(module, 'video')}")
+    try:
+        backend()
+    except DataError as error:
+        raise ParameterError("video", video, f"left out: {error}") from None
+    return clip
+
+
+def backend() -> str:
+    """Return the name by which MuJoCo draws without a screen; MUJOCO_GL, if set, decides. '' on other systems.
+
+    Raises DataError if no library for it is found.
+    """
+    chosen = os.environ.get("MUJOCO_GL", "disabled")
+    if chosen == "disabled" and not sys.platform.startswith("linux"):
+        return ""
+    if chosen not in ("disabled", *BACKENDS.values()):
+        return chosen
+    for library, name in BACKENDS.items():
+        if chosen in ("disabled", name) and find_library(library):
+            return name
+    raise DataError(NO_GRAPHICS)
+
+
+def select_backend() -> None:
+    """Let MuJoCo draw; call it before MuJoCo is imported in this process. Raises DataError as `backend` does."""
+    if name := backend():
+        os.environ["MUJOCO_GL"] = name
+
+
+def frame_times(end: float, clip: Clip) -> list[float]:
+    """Return the times in s, from 0 to `end`, of the recording that the frames show."""
+    step = clip.speed / clip.frame_rate
+    return [step * i for i in range(max(1, math.floor(end / step) + 1))]
+
+
+def write(bag: Bag, clip: Clip, console: Console) -> None:
+    """Write the clip of a recording, and print where it is. Raises DataError."""
+    select_backend()
+    from rich.progress import Progress
+
+    from exo_gravity.tools.reporting.clip import write_clip
+
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task(f"drawing {clip.path.name}", total=None)
+        write_clip(bag, clip, lambda done, count: progress.update(task, completed=done, total=count))
+    console.print(f"Clip: {clip.path}", markup=False, soft_wrap=True)

@@ -1,1 +1,0 @@
-"""Clips of a recording, drawn without a screen."""
