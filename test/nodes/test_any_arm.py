@@ -22,9 +22,9 @@ from std_srvs.srv import Trigger
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.nodes.compensator import any_arm
-from exo_gravity.nodes.compensator.any_arm import LATCHED
 from exo_gravity.nodes.compensator.node import CompensatorNode
-from exo_gravity.nodes.ros.conversions import to_time
+from exo_gravity.nodes.ros.hot_path import LATCHED
+from exo_gravity.nodes.ros.messages import to_time
 from exo_gravity.nodes.ros.run import keep_to_this_machine
 
 keep_to_this_machine()

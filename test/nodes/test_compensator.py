@@ -22,7 +22,7 @@ from exo_gravity.core.compensation.limiter import LONGEST_STEP
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.safety.params import CAN_BRIDGE
-from exo_gravity.nodes.ros.conversions import to_nanoseconds, to_time
+from exo_gravity.nodes.ros.messages import to_nanoseconds, to_time
 
 from ..support.joint_state_feeder import PARTS, POSE, JointStateFeeder
 from ..support.launched_nodes import NO_IMU

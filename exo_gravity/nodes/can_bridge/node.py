@@ -30,7 +30,7 @@ from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.can_bridge.recovery import is_requested, run_recovery
 from exo_gravity.nodes.can_bridge.report import BridgeReport, log_limits
 from exo_gravity.nodes.can_bridge.services import CALL_TIMEOUT, BridgeServices
-from exo_gravity.nodes.ros.declare import bus_of, declare
+from exo_gravity.nodes.ros.parameters import bus_of, declare
 from exo_gravity.nodes.ros.run import run
 
 REPORT_PERIOD = 0.1  # s

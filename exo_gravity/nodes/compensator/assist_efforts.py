@@ -7,15 +7,12 @@ import time
 from typing import Any
 
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core.compensation.terms.assist import AssistInput
-from exo_gravity.nodes.ros.conversions import to_nanoseconds
-from exo_gravity.nodes.ros.hot_path import HotPath
+from exo_gravity.nodes.ros.hot_path import NEWEST, HotPath
+from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.sole_publisher import SolePublisher
-
-NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class AssistEfforts:

@@ -18,8 +18,8 @@ from exo_gravity.core.model.anfis_law import AnfisLaw
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.nodes.compensator.assist_efforts import AssistEfforts
 from exo_gravity.nodes.compensator.budget_watch import BudgetWatch
-from exo_gravity.nodes.ros.declare import declare
-from exo_gravity.nodes.ros.diagnostics import row
+from exo_gravity.nodes.ros.messages import row
+from exo_gravity.nodes.ros.parameters import declare
 
 Loaded = TypeVar("Loaded")
 

@@ -26,12 +26,12 @@ from exo_gravity.hardware.scheduling import request_real_time
 from exo_gravity.nodes.compensator.any_arm import AnyUrdfArm, is_any_arm
 from exo_gravity.nodes.compensator.command_interface import interface_of
 from exo_gravity.nodes.compensator.exo_arm import ExoArm
-from exo_gravity.nodes.ros.declare import values_after, with_floats
-from exo_gravity.nodes.ros.diagnostics import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row
-from exo_gravity.nodes.ros.hot_path import HotPath
+from exo_gravity.nodes.ros.hot_path import NEWEST, HotPath
+from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row
+from exo_gravity.nodes.ros.parameters import values_after, with_floats
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.sole_publisher import DISTRUST, SolePublisher
-from exo_gravity.nodes.ros.tilt_subscription import NEWEST, TiltSubscription
+from exo_gravity.nodes.ros.tilt_subscription import TiltSubscription
 
 SILENCE = 0.5  # s without joint states until diagnostics report it
 REPORT_PERIOD = 0.5  # s
