@@ -7,7 +7,7 @@ import pytest
 
 import exo_gravity.sim.arm
 from exo_gravity.core import ArmModel
-from exo_gravity.core.model.turning import turning_torque
+from exo_gravity.core.model.kinematics import turning_torque
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.base_motion import rotation_in_base

@@ -56,7 +56,7 @@ class CanBridge(LifecycleNode):
         traffic.check(values["rate"])
         self._charge = Charge(address, self._motors, self._limits, self._period)
         self._owner = f"{self.get_fully_qualified_name()} (PID {os.getpid()})"
-        self._real_time = values["thread_priority"], values["lock_memory"]
+        self._real_time = values["thread_priority"], values["thread_priority"] > 0
         self._owned: OwnedBus | None = None  # while configured
         self._bus: MotorBus | None = None  # while inactive
         self._loop: ControlLoop | None = None  # while active

@@ -2,7 +2,7 @@
 
 `can_bridge` watches the age of the efforts and lets the arm down. An effort controller keeps its last command for ever,
 so `MultiArrayInterface` watches the age of the joint states itself, on its own thread, and fades the torque
-(core/compensation/command_fade.py).
+(core/compensation/limiter.py).
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
-from exo_gravity.core.compensation.command_fade import CommandFade, Output
 from exo_gravity.core.compensation.compensator import Answer
+from exo_gravity.core.compensation.limiter import COMMAND_TIMEOUT, CommandFade, Output
 from exo_gravity.core.compensation.tilt_input import MAX_LEAD
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.nodes.ros.messages import by_name, to_nanoseconds, velocity_of
@@ -66,13 +66,13 @@ class MultiArrayInterface:
 
     def __init__(self, node: Node, names: Sequence[str], values: Mapping[str, Any]) -> None:
         self.failure: Exception | None = None  # ended the thread
-        self.topic = values["multi_array.joint_states"]
+        commands = values["multi_array.topic"]
+        self.topic = "/".join([*commands.split("/")[:-2], "joint_states"])  # beside the controller
         self._names = names
         self._clock = node.get_clock()
-        self._timeout = values["multi_array.timeout"]
-        self._fade = CommandFade(self._timeout, values["multi_array.fade_time"])
+        self._fade = CommandFade()
         self._lock = threading.Lock()  # guards the fade, and the order of its messages
-        self._publisher = node.create_publisher(Float64MultiArray, values["multi_array.topic"], 1)
+        self._publisher = node.create_publisher(Float64MultiArray, commands, 1)
         self._message = Float64MultiArray()
         self._is_late = False  # the last joint state, by its stamp
         self._stopping = False
@@ -96,9 +96,9 @@ class MultiArrayInterface:
         may go on publishing.
         """
         age = (self._clock.now().nanoseconds - to_nanoseconds(message.header.stamp)) * 1e-9
-        self._is_late = not -MAX_LEAD <= age <= self._timeout
+        self._is_late = not -MAX_LEAD <= age <= COMMAND_TIMEOUT
         if self._is_late:
-            raise ParameterError("age by its stamp", round(age, 3), f"from {-MAX_LEAD:g} to {self._timeout:g} s")
+            raise ParameterError("age by its stamp", round(age, 3), f"from {-MAX_LEAD:g} to {COMMAND_TIMEOUT:g} s")
         return by_name(message, "position", self._names, exact=False), velocity_of(message, self._names, exact=False)
 
     def send(self, now: float, message: JointState, answer: Answer) -> None:
@@ -150,6 +150,6 @@ CommandInterface = JointStateInterface | MultiArrayInterface
 
 def interface_of(node: Node, names: Sequence[str], values: Mapping[str, Any]) -> CommandInterface:
     """Return the interface that the parameter `command_interface` names."""
-    if values["command_interface"] == "multi_array":
+    if values.get("command_interface") == "multi_array":
         return MultiArrayInterface(node, names, values)
     return JointStateInterface(node, names)
