@@ -41,8 +41,6 @@ GONE: dict[str, str] = {
     "limits.upper": "limits.range, lower and upper edge of each joint in turn",
     "limits.max_effort": "always 1, 2, 1, 1 Nm",
     "assist.max_effort_rate": "always 10 Nm/s",
-    "multi_array.joint_states": "joint_states beside the controller: /joint_states for /effort_controller/commands",
-    "multi_array.timeout": "always 50 ms",
     "multi_array.fade_time": "always 2 s",
     "lock_memory": "thread_priority, which also locks the memory where it is above 0",
     # imu

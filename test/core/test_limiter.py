@@ -8,13 +8,13 @@ EFFORT = (2.0, -4.0)
 
 
 def active(now: float = 10.0) -> CommandFade:
-    fade = CommandFade()
+    fade = CommandFade(0.05)
     assert fade.take(now, EFFORT)
     return fade
 
 
 def test_nothing_is_sent_before_the_first_effort_nor_while_efforts_arrive():
-    fade = CommandFade()
+    fade = CommandFade(0.05)
     fade.withdraw(1.0, "no trunk tilt yet")
     assert fade.tick(1.0) is None and fade.state is Output.WAITING and not fade.problem
     fade.take(10.0, EFFORT)

@@ -23,8 +23,7 @@ from exo_gravity.core.compensation.terms.terms import Terms
 from exo_gravity.core.compensation.tilt_input import Tilted
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.gravity import LAWS, Torque
-from exo_gravity.core.model.kinematics import turning_torque
+from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.model.tilt import Tilt
 
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
@@ -106,18 +105,15 @@ class Compensator(Tilted):
         if felt:
             magnitude = math.hypot(*felt.gravity) / STANDARD_GRAVITY
             tilt = Tilt.of_gravity(settings.side, felt.gravity)._replace(magnitude=magnitude)
-        law = settings.active_law
-        reason = law.outside(settings.arm, theta, tilt)
+        reason = settings.outside(theta, tilt)
         if reason:
             self._fallback, self._fallback_until = reason, now + FALLBACK_TIME
         elif now >= self._fallback_until:
             self._fallback = ""
-        if self._fallback:
-            law = LAWS["exact"]
-        torque = law.torque(settings.arm, theta, tilt)
+        torque = settings.torque(theta, tilt, exact=bool(self._fallback))
         if felt is None:
             return torque
-        turning = turning_torque(settings.arm, settings.side, theta, felt.angular_acceleration)
+        turning = settings.turning_torque(theta, felt.angular_acceleration)
         return tuple(map(operator.add, torque, turning))
 
     def _without_step(self, now: float, theta: Sequence[float]) -> Torque:

@@ -14,9 +14,7 @@ RAMP_TIME = 1.0  # s from zero to full torque, at the start and after a break
 BREAK = 0.2
 LONGEST_STEP = 0.01  # s that the rate limit allows for after a pause, so that the torque does not catch up in one step
 TRANSITION_TIME = 1.0  # s over which a change of law or settings takes effect
-# s after the last joint states, at which the torque for a receiver that does not watch its age begins to fade
-COMMAND_TIMEOUT = 0.05
-FADE_TIME = 2.0  # s of that fade; a launcher kills a node 5 s after it asked it to end
+FADE_TIME = 2.0  # s of the last fade; a launcher kills a node 5 s after it asked it to end
 
 
 def limited(wanted: float, last: float, limit: float, step: float) -> float:
@@ -104,14 +102,15 @@ class CommandFade:
     """Effort commands for a receiver that does not watch their age: late or missing input fades the torque to zero.
 
     An effort controller of ros2_control keeps its last command for ever, and `can_bridge` is not there to let the arm
-    down. So the sender does it: while sound efforts arrive they are passed on; COMMAND_TIMEOUT after the last one, or
-    when they are withdrawn, the last torque fades linearly to zero over FADE_TIME. The fault is latched: zeros follow
+    down. So the sender does it: while sound efforts arrive they are passed on; `timeout` s after the last one, or when
+    they are withdrawn, the last torque fades linearly to zero over FADE_TIME. The fault is latched: zeros follow
     until an operator clears it, because an arm that was let down must not rise by itself. The next torque ramps in.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, timeout: float) -> None:
         self.state = Output.WAITING
         self.reason = ""  #: what began the fade
+        self._timeout = timeout
         self._effort: tuple[float, ...] = ()
         self._time = -math.inf  # s, of the last effort; then of the begin of the fade
 
@@ -139,8 +138,8 @@ class CommandFade:
 
     def tick(self, now: float) -> tuple[float, ...] | None:
         """Return the faded effort (n,) Nm to send at `now` s; None while sound efforts arrive, and before the first."""
-        if self.state is Output.ACTIVE and now - self._time > COMMAND_TIMEOUT:
-            self.withdraw(now, f"no joint_states younger than {1000.0 * COMMAND_TIMEOUT:.0f} ms")
+        if self.state is Output.ACTIVE and now - self._time > self._timeout:
+            self.withdraw(now, f"no joint_states younger than {1000.0 * self._timeout:.0f} ms")
         if self.is_open:
             return None
         left = 1.0 - (now - self._time) / FADE_TIME

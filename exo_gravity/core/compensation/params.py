@@ -63,9 +63,11 @@ COMMAND_PARAMETERS = (
     Param("command_interface", "joint_state",
           "joint_state: to can_bridge; multi_array: to an effort controller of ros2_control", fixed=True,
           choices=("joint_state", "multi_array")),
-    Param("multi_array.topic", "effort_controller/commands",
-          "the effort controller's commands; the joint_states beside it are read, which may have further joints",
+    Param("multi_array.topic", "effort_controller/commands", "topic of the effort controller's commands", fixed=True),
+    Param("multi_array.joint_states", "joint_states", "topic of the joint states, which may have further joints",
           fixed=True),
+    Param("multi_array.timeout", 0.05, "age of the joint states at which the torque begins to fade", (0.01, 0.15), "s",
+          fixed=True, expert=True),
 )
 # What the law `urdf` adds.
 URDF = (

@@ -11,6 +11,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.anfis import AnfisLaw
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import LAWS, NO_TORQUE, Law, Torque
+from exo_gravity.core.model.kinematics import turning_torque
 from exo_gravity.core.model.quaternion import Floats3
 from exo_gravity.core.model.tilt import SIDES, Tilt
 from exo_gravity.core.numbers import JOINT_COUNT
@@ -90,6 +91,19 @@ class Settings:
         object.__setattr__(self, "moving", carried if self.mode == "zero_g" else by_mass)
         object.__setattr__(self, "active_law", law)
 
+    def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = False) -> Torque:
+        """Return the torque (4,) in Nm that holds the arm at `theta` (4,) rad; exact: by the exact law."""
+        law = LAWS["exact"] if exact else self.active_law
+        return law.torque(self.arm, theta, tilt)
+
+    def outside(self, theta: Sequence[float], tilt: Tilt) -> str:
+        """Return why the law does not apply to this pose or tilt, as `Law.outside`; '' if it does."""
+        return self.active_law.outside(self.arm, theta, tilt)
+
+    def turning_torque(self, theta: Sequence[float], angular_acceleration: Sequence[float]) -> Torque:
+        """Return the torque (4,) in Nm that turns the arm with the trunk, whose acceleration (3,) is in rad/s^2."""
+        return turning_torque(self.arm, self.side, theta, angular_acceleration)
+
 
 class GravityModel(Protocol):
     """An arm of n joints whose torques come from outside `core`."""
@@ -109,11 +123,12 @@ class GravityModel(Protocol):
 
 @dataclass(frozen=True)
 class UrdfSettings:
-    """Settings of any serial arm of n joints, whose torques come from `arm`. It is its own law."""
+    """Settings of any serial arm of n joints, whose torques come from `arm`."""
 
     law: ClassVar[str] = URDF_LAW
     side: ClassVar[str] = "left"  # the root link's axes are not mirrored
     inertial: ClassVar[bool] = False
+    shoulder_from_imu: ClassVar[Floats3] = (0.0, 0.0, 0.0)
     terms: ClassVar[None] = None
 
     arm: GravityModel
@@ -135,18 +150,17 @@ class UrdfSettings:
         """Number of joints."""
         return len(self.gain)
 
-    @property
-    def active_law(self) -> UrdfSettings:
-        """These settings."""
-        return self
-
-    def torque(self, arm: GravityModel, theta: Sequence[float], tilt: Tilt) -> Torque:
-        """Return the torque (n,) in Nm that holds `arm` at `theta` (n,) rad."""
+    def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = False) -> Torque:
+        """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad."""
         x, y, z = tilt.gravity_in_trunk
         g = self.gravity
-        torque = arm.torque(theta, (g * x, g * y, g * z))
+        torque = self.arm.torque(theta, (g * x, g * y, g * z))
         return tuple([gain * tau for gain, tau in zip(self.gain, torque, strict=True)])
 
-    def outside(self, _arm: GravityModel, _theta: Sequence[float], _tilt: Tilt) -> str:
+    def outside(self, theta: Sequence[float], tilt: Tilt) -> str:
         """Return '': the law applies everywhere."""
         return ""
+
+    def turning_torque(self, theta: Sequence[float], angular_acceleration: Sequence[float]) -> Torque:
+        """Return zeros (n,): the root link is taken as at rest."""
+        return (0.0,) * self.count

@@ -111,10 +111,10 @@ class ControlledArm:
     def report(self, answer: Answer) -> dict[str, object]:
         """Return the current values for /diagnostics."""
         s, terms = self.control.settings, self.control.terms
-        if isinstance(s, UrdfSettings) or not (terms and self._budget):
+        if isinstance(s, UrdfSettings):
             carried, limits = f"{s.arm.mass:.3f}", row(s.max_effort)
             return {"law": s.law, "mass carried (kg)": carried, "gain": row(s.gain), "max effort (Nm)": limits}
-        return {
+        values: dict[str, object] = {
             "law": s.law,
             "law in use": "exact" if answer.fallback else s.law,
             "mode": s.mode,
@@ -126,11 +126,13 @@ class ControlledArm:
             "wearer cog (m)": row(s.wearer_cog),
             "mass carried (kg)": f"{s.arm.total_mass:.3f}",
             "max effort (Nm)": row(s.max_effort),
-            "terms": ", ".join(terms.active) or "none",
-            "assist": terms.assist.report,
-            "inertia tank (J)": f"{terms.energy:.2f}",
-            "budget": self._budget.text,
         }
+        if terms and self._budget:
+            values["terms"] = ", ".join(terms.active) or "none"
+            values["assist"] = terms.assist.report
+            values["inertia tank (J)"] = f"{terms.energy:.2f}"
+            values["budget"] = self._budget.text
+        return values
 
 
 def sentence(s: Settings | UrdfSettings) -> str:
@@ -195,8 +197,10 @@ class BudgetWatch:
         load = s.wearer_mass, s.wearer_cog
         if self._thread.update(BudgetRequest.of(s.robot, load, support, self._bridge, s.use_imu)):
             result = self._thread.result or ()
-            unknown = isinstance(result, ParameterError)
-            self._note(f"unknown: can_bridge has {result}" if unknown else overload(self._names, result) or WITHIN)
+            if isinstance(result, ParameterError):
+                self._note(f"unknown: can_bridge has {result}")
+            else:
+                self._note(overload(self._names, result) or WITHIN)
 
     def _on_bridge(self, values: dict[str, Any]) -> None:
         table = [param for param in CAN_BRIDGE if param.name in BRIDGE_PARAMETERS]

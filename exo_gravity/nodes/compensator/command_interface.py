@@ -18,7 +18,7 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
 from exo_gravity.core.compensation.compensator import Answer
-from exo_gravity.core.compensation.limiter import COMMAND_TIMEOUT, CommandFade, Output
+from exo_gravity.core.compensation.limiter import CommandFade, Output
 from exo_gravity.core.compensation.tilt_input import MAX_LEAD
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.nodes.ros.messages import by_name, to_nanoseconds, velocity_of
@@ -66,13 +66,13 @@ class MultiArrayInterface:
 
     def __init__(self, node: Node, names: Sequence[str], values: Mapping[str, Any]) -> None:
         self.failure: Exception | None = None  # ended the thread
-        commands = values["multi_array.topic"]
-        self.topic = "/".join([*commands.split("/")[:-2], "joint_states"])  # beside the controller
+        self.topic = values["multi_array.joint_states"]
         self._names = names
         self._clock = node.get_clock()
-        self._fade = CommandFade()
+        self._timeout = values["multi_array.timeout"]
+        self._fade = CommandFade(self._timeout)
         self._lock = threading.Lock()  # guards the fade, and the order of its messages
-        self._publisher = node.create_publisher(Float64MultiArray, commands, 1)
+        self._publisher = node.create_publisher(Float64MultiArray, values["multi_array.topic"], 1)
         self._message = Float64MultiArray()
         self._is_late = False  # the last joint state, by its stamp
         self._stopping = False
@@ -96,9 +96,9 @@ class MultiArrayInterface:
         may go on publishing.
         """
         age = (self._clock.now().nanoseconds - to_nanoseconds(message.header.stamp)) * 1e-9
-        self._is_late = not -MAX_LEAD <= age <= COMMAND_TIMEOUT
+        self._is_late = not -MAX_LEAD <= age <= self._timeout
         if self._is_late:
-            raise ParameterError("age by its stamp", round(age, 3), f"from {-MAX_LEAD:g} to {COMMAND_TIMEOUT:g} s")
+            raise ParameterError("age by its stamp", round(age, 3), f"from {-MAX_LEAD:g} to {self._timeout:g} s")
         return by_name(message, "position", self._names, exact=False), velocity_of(message, self._names, exact=False)
 
     def send(self, now: float, message: JointState, answer: Answer) -> None:

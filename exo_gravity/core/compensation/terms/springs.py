@@ -49,15 +49,10 @@ class TermState(NamedTuple):
 
 
 class Term(Protocol):
-    """One contribution to the torque on top of gravity compensation: a frozen dataclass of parameters.
+    """One contribution to the torque on top of gravity compensation.
 
-    One of them is 0 by default and switches the term off.
+    Most are frozen dataclasses of parameters, and `on` if these ask for any torque; by default they do not.
     """
-
-    @property
-    def on(self) -> bool:
-        """Whether the parameters ask for any torque."""
-        ...
 
     def torque(self, state: TermState) -> Torque:
         """Return the torque (4,) in Nm that the motors add."""

@@ -118,8 +118,7 @@ class Terms:
     def _build(self) -> list[Term]:
         """Return the terms that are on."""
         s = self.settings
-        candidates: tuple[Term, ...] = (s.friction, s.damping, s.spring, s.coupling, s.limits)
-        terms = [term for term in candidates if term.on]
+        terms: list[Term] = [term for term in (s.friction, s.damping, s.spring, s.coupling, s.limits) if term.on]
         if s.inertia.on:
             left = [(MAX_FRICTION_SHARE - s.friction.share) * coulomb for coulomb in s.friction.coulomb]
             terms.append(InertiaTerm(s.inertia.share, LinkInertia.of(self._arm), left, self._tank))
