@@ -47,8 +47,10 @@ class Settings:
     #: (4,) m from joint n, its centre of gravity
     wearer_cog: Sequence[float] = NO_TORQUE
     max_effort: Sequence[float] = owned((3.0, 9.0, 3.0, 3.0), "torque limit per joint", (0.0, MAX_COMMAND), "Nm")
-    max_effort_rate: float = owned(50.0, "fastest change of torque", (1.0, 1000.0), "Nm/s")
-    tilt_timeout: float = owned(0.08, "age of the trunk tilt at which the efforts are withdrawn", (0.01, 0.5), "s")
+    max_effort_rate: float = owned(50.0, "fastest change of torque", (1.0, 1000.0), "Nm/s", expert=True)
+    tilt_timeout: float = owned(
+        0.08, "age of the trunk tilt at which the efforts are withdrawn", (0.01, 0.5), "s", expert=True
+    )
     inertial: bool = owned(False, "also compensate the trunk's acceleration, as its IMU measures it")
     #: (3,) m in the trunk's axes, for `inertial`
     shoulder_from_imu: Floats3 = (0.0, 0.0, 0.0)
