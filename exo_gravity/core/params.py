@@ -56,16 +56,12 @@ class Param:
     name: str
     default: Any
     description: str
-    #: lowest and highest value, also for each number in a list
-    bounds: tuple[float, float] | None = None
+    bounds: tuple[float, float] | None = None  #: lowest and highest value, also for each number in a list
     unit: str = ""
     choices: tuple[str, ...] = ()
-    #: read-only while the node runs
-    fixed: bool = False
-    #: the user must give a non-empty value
-    required: bool = False
-    #: only an expert changes it; the documents list it apart, and the panel does not show it
-    expert: bool = False
+    fixed: bool = False  #: read-only while the node runs
+    required: bool = False  #: the user must give a non-empty value
+    expert: bool = False  #: only an expert changes it; the documents list it apart, and the panel does not show it
     #: a list may have another length than its default; otherwise it has one entry per joint, and keeps its length
     any_length: bool = False
 

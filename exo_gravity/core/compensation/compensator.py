@@ -34,13 +34,10 @@ MAX_ANGLE = 26.0  # rad, more than an AK motor can report with any zero
 class Answer(NamedTuple):
     """One answer of the compensator."""
 
-    #: (n,) Nm; None for the given `reason`
-    effort: Torque | None
+    effort: Torque | None  #: (n,) Nm; None for the given `reason`
     reason: str = ""
-    #: indices of the joints whose torque exceeded `max_effort`
-    clamped: tuple[int, ...] = ()
-    #: why the exact law replaced the chosen one, or ''
-    fallback: str = ""
+    clamped: tuple[int, ...] = ()  #: indices of the joints whose torque exceeded `max_effort`
+    fallback: str = ""  #: why the exact law replaced the chosen one, or ''
 
 
 class Compensator(Tilted):

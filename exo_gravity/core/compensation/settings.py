@@ -35,38 +35,28 @@ class Settings:
 
     count: ClassVar[int] = JOINT_COUNT
 
-    #: 'left' or 'right'
-    side: str
-    #: the exoskeleton's own arm
-    robot: ArmModel
+    side: str  #: 'left' or 'right'
+    robot: ArmModel  #: the exoskeleton's own arm
     law: str = owned("exact", "law that computes the gravity torque", choices=LAW_NAMES)
     mode: str = owned("one_g", "one_g compensates the robot; zero_g also compensates the wearer's arm", choices=MODES)
     support: float = owned(1.0, "share of the wearer's arm that zero_g compensates", (0.0, 1.0))
-    #: (4,) kg, the wearer's segment on each link
-    wearer_mass: Sequence[float] = NO_TORQUE
-    #: (4,) m from joint n, its centre of gravity
-    wearer_cog: Sequence[float] = NO_TORQUE
+    wearer_mass: Sequence[float] = NO_TORQUE  #: (4,) kg, the wearer's segment on each link
+    wearer_cog: Sequence[float] = NO_TORQUE  #: (4,) m from joint n, its centre of gravity
     max_effort: Sequence[float] = owned((3.0, 9.0, 3.0, 3.0), "torque limit per joint", (0.0, MAX_COMMAND), "Nm")
     max_effort_rate: float = owned(50.0, "fastest change of torque", (1.0, 1000.0), "Nm/s", expert=True)
     tilt_timeout: float = owned(
         0.08, "age of the trunk tilt at which the efforts are withdrawn", (0.01, 0.5), "s", expert=True
     )
     inertial: bool = owned(False, "also compensate the trunk's acceleration, as its IMU measures it")
-    #: (3,) m in the trunk's axes, for `inertial`
-    shoulder_from_imu: Floats3 = (0.0, 0.0, 0.0)
-    #: False assumes an upright trunk
-    use_imu: bool = True
-    #: the model for the law 'anfis'
-    anfis: AnfisLaw | None = None
+    shoulder_from_imu: Floats3 = (0.0, 0.0, 0.0)  #: (3,) m in the trunk's axes, for `inertial`
+    use_imu: bool = True  #: False assumes an upright trunk
+    anfis: AnfisLaw | None = None  #: the model for the law 'anfis'
     terms: TermSettings = field(default_factory=TermSettings)
-    #: the robot by its masses, for `terms`; None: `robot`
-    robot_by_mass: ArmModel | None = None
+    robot_by_mass: ArmModel | None = None  #: the robot by its masses, for `terms`; None: `robot`
     #: what is compensated: the robot in One-G, the robot plus `support` times the wearer in Zero-G
     arm: ArmModel = field(init=False)
-    #: the same by its masses
-    moving: ArmModel = field(init=False)
-    #: the law in use
-    active_law: Law = field(init=False)
+    moving: ArmModel = field(init=False)  #: the same by its masses
+    active_law: Law = field(init=False)  #: the law in use
 
     def __post_init__(self) -> None:
         if self.side not in SIDES:
@@ -110,10 +100,8 @@ class Settings:
 class GravityModel(Protocol):
     """An arm of n joints whose torques come from outside `core`."""
 
-    #: the joints' own limits, (n,) Nm; 0 if not known
-    max_effort: tuple[float, ...]
-    #: kg that the joints carry
-    mass: float
+    max_effort: tuple[float, ...]  #: the joints' own limits, (n,) Nm; 0 if not known
+    mass: float  #: kg that the joints carry
 
     def torque(self, theta: Sequence[float], gravity: Sequence[float]) -> Torque:
         """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad.
@@ -134,18 +122,12 @@ class UrdfSettings:
     terms: ClassVar[None] = None
 
     arm: GravityModel
-    #: scales the torque, (n,)
-    gain: Sequence[float]
-    #: m/s^2
-    gravity: float
-    #: (n,) Nm
-    max_effort: Sequence[float]
-    #: Nm/s
-    max_effort_rate: float
-    #: s
-    tilt_timeout: float
-    #: False assumes that the root link's z axis points up
-    use_imu: bool
+    gain: Sequence[float]  #: scales the torque, (n,)
+    gravity: float  #: m/s^2
+    max_effort: Sequence[float]  #: (n,) Nm
+    max_effort_rate: float  #: Nm/s
+    tilt_timeout: float  #: s
+    use_imu: bool  #: False assumes that the root link's z axis points up
 
     @property
     def count(self) -> int:

@@ -46,12 +46,9 @@ class Anfis:
     Raises DataError unless the shapes agree and every number is finite.
     """
 
-    #: premises, (m, d, k), in the inputs' units
-    centre: np.ndarray
-    #: premises, (m, d, k), > 0, in the inputs' units
-    sigma: np.ndarray
-    #: (m, k^d, d + 1), p_0..p_d of each rule; the function of the last input varies fastest
-    consequent: np.ndarray
+    centre: np.ndarray  #: premises, (m, d, k), in the inputs' units
+    sigma: np.ndarray  #: premises, (m, d, k), > 0, in the inputs' units
+    consequent: np.ndarray  #: (m, k^d, d + 1), p_0..p_d of each rule; the function of the last input varies fastest
 
     def __init__(self, centre: ArrayLike, sigma: ArrayLike, consequent: ArrayLike) -> None:
         for field, value in zip(fields(self), (centre, sigma, consequent), strict=True):
@@ -119,18 +116,12 @@ class AnfisLaw:
 
     #: one output in Nm for each of joints 2, 3 and 4 at gain 1; its inputs are theta_2..theta_4, -1..1 over the box
     model: Anfis
-    #: lower corner of the box, (3,) rad
-    low: tuple[float, ...]
-    #: upper corner
-    high: tuple[float, ...]
-    #: M2..M4 in kg m of the arm it was trained for
-    first_moment: tuple[float, ...]
-    #: m/s^2
-    gravity: float
-    #: a sentence on the training data
-    source: str
-    #: RMSE of joints 2 to 4: {'training': (3,) Nm, 'held_out': (3,) Nm}
-    error: Mapping[str, Sequence[float]]
+    low: tuple[float, ...]  #: lower corner of the box, (3,) rad
+    high: tuple[float, ...]  #: upper corner
+    first_moment: tuple[float, ...]  #: M2..M4 in kg m of the arm it was trained for
+    gravity: float  #: m/s^2
+    source: str  #: a sentence on the training data
+    error: Mapping[str, Sequence[float]]  #: RMSE of joints 2 to 4: {'training': (3,) Nm, 'held_out': (3,) Nm}
 
     @classmethod
     def load(cls, content: str | Mapping[str, Any]) -> AnfisLaw:

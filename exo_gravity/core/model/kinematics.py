@@ -42,10 +42,8 @@ PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # the order of `Weight
 class Weights(NamedTuple):
     """The coefficients W of the kinetic energy, kg m^2."""
 
-    #: W_nn, (4,)
-    own: tuple[float, ...]
-    #: W_ij of `PAIRS`, (6,)
-    between: tuple[float, ...]
+    own: tuple[float, ...]  #: W_nn, (4,)
+    between: tuple[float, ...]  #: W_ij of `PAIRS`, (6,)
 
 
 class Frame(NamedTuple):

@@ -12,9 +12,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.wait_for_message import wait_for_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
@@ -234,26 +233,13 @@ def _joint_names(node: Node) -> list[str]:
 
 def _description(node: Node, values: dict[str, Any]) -> str:
     """Return the URDF from its file or topic. Raises ParameterError."""
-    path = values["urdf.file"]
+    path, topic = values["urdf.file"], values["urdf.topic"]
     if not path:
-        return _published(node, values["urdf.topic"])
+        arrived, message = wait_for_message(String, node, topic, qos_profile=LATCHED, time_to_wait=DESCRIPTION_TIMEOUT)
+        if not arrived:
+            raise ParameterError("urdf.topic", topic, f"published, latched, within {DESCRIPTION_TIMEOUT:g} s")
+        return str(message.data)
     try:
         return Path(path).expanduser().read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ParameterError("urdf.file", path, f"a URDF file ({error})") from None
-
-
-def _published(node: Node, topic: str) -> str:
-    received: list[String] = []
-    subscription = node.create_subscription(String, topic, received.append, LATCHED)
-    executor = SingleThreadedExecutor(context=node.context)
-    executor.add_node(node)
-    end = time.monotonic() + DESCRIPTION_TIMEOUT
-    while not received and time.monotonic() < end and rclpy.ok(context=node.context):
-        executor.spin_once(timeout_sec=0.1)
-    executor.remove_node(node)
-    executor.shutdown()
-    node.destroy_subscription(subscription)
-    if not received:
-        raise ParameterError("urdf.topic", topic, f"published, latched, within {DESCRIPTION_TIMEOUT:g} s")
-    return received[0].data

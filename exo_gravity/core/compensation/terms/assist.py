@@ -17,10 +17,10 @@ import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
-from exo_gravity.core.compensation.terms.springs import clamp
+from exo_gravity.core.compensation.terms.springs import TermParameters, clamp
 from exo_gravity.core.model.gravity import NO_TORQUE, Torque
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.params import check_owned, owned
+from exo_gravity.core.params import owned
 from exo_gravity.core.safety.limits import MAX_COMMAND
 
 SLOWEST, FASTEST = 0.1, 0.001  # s between two messages; faster ones are a flood
@@ -35,20 +35,12 @@ RECOVERY = 0.5  # s without a wrong message, after which efforts are believed ag
 
 
 @dataclass(frozen=True)
-class Assist:
+class Assist(TermParameters):
     """Parameters of the group `assist`. Raises ParameterError."""
 
     max_effort: Sequence[float] = owned(
         (0.0,) * JOINT_COUNT, "largest torque from assist_efforts; 0: ignored", (0.0, 10.0), "Nm"
     )
-
-    def __post_init__(self) -> None:
-        check_owned(self)
-
-    @property
-    def on(self) -> bool:
-        """Whether efforts are used at all."""
-        return any(self.max_effort)
 
 
 class AssistInput:

@@ -22,10 +22,10 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from exo_gravity.core.compensation.terms.springs import DELAY, TermState
+from exo_gravity.core.compensation.terms.springs import DELAY, TermParameters, TermState
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.model.kinematics import LinkInertia
-from exo_gravity.core.params import check_owned, owned
+from exo_gravity.core.params import owned
 
 MAX_FRICTION_SHARE = 0.85  # leaves a friction that is 15 % smaller than identified
 STANDSTILL = 0.03  # rad/s, below which a joint is considered to stand: more than one code of 12-bit velocity
@@ -43,7 +43,7 @@ BANDWIDTH = 80.0
 
 
 @dataclass(frozen=True)
-class Friction:
+class Friction(TermParameters):
     """Parameters of the term `friction`. Raises ParameterError."""
 
     share: float = owned(
@@ -51,14 +51,6 @@ class Friction:
     )
     coulomb: Sequence[float] = owned((0.0,) * 4, "identified Coulomb friction", (0.0, 3.0), "Nm")
     viscous: Sequence[float] = owned((0.0,) * 4, "identified viscous friction", (0.0, 1.0), "Nm s/rad")
-
-    def __post_init__(self) -> None:
-        check_owned(self)
-
-    @property
-    def on(self) -> bool:
-        """Whether the term gives torque."""
-        return self.share > 0.0
 
     def torque(self, state: TermState) -> Torque:
         """Return the torque (4,) in Nm, along the motion."""
@@ -76,18 +68,10 @@ class Friction:
 
 
 @dataclass(frozen=True)
-class Inertia:
+class Inertia(TermParameters):
     """Parameters of the term `inertia`. Raises ParameterError."""
 
     share: float = owned(0.0, "share of the arm's inertia that the motors take over; 0: off", (0.0, MAX_INERTIA_SHARE))
-
-    def __post_init__(self) -> None:
-        check_owned(self)
-
-    @property
-    def on(self) -> bool:
-        """Whether the term gives torque."""
-        return self.share > 0.0
 
 
 class EnergyTank:

@@ -10,13 +10,13 @@ import bisect
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.params import check_owned, owned
+from exo_gravity.core.params import check_owned, owned, params_of
 
 DELAY = 0.015  # s from a reading to its torque: 10 ms, and half of a 10 ms cycle in which the torque is held
 LATE = 2.0 * DELAY  # s: a spring of k Nm/rad needs the damping LATE k, in Nm s/rad, to be passive despite the delay
@@ -32,27 +32,17 @@ MAX_PATH_SPEED = 2.0  # rad/s between two poses of a path
 class TermState(NamedTuple):
     """The arm as the terms see it."""
 
-    #: s
-    time: float
-    #: s since the last state, 0 for the first
-    dt: float
-    #: (4,) rad
-    position: Sequence[float]
-    #: (4,) rad/s
-    velocity: Sequence[float]
-    #: (4,) rad/s^2, low-passed
-    acceleration: Sequence[float]
-    #: (4,) Nm of gravity compensation
-    gravity: Sequence[float]
-    #: s since the spring's settings
-    elapsed: float
+    time: float  #: s
+    dt: float  #: s since the last state, 0 for the first
+    position: Sequence[float]  #: (4,) rad
+    velocity: Sequence[float]  #: (4,) rad/s
+    acceleration: Sequence[float]  #: (4,) rad/s^2, low-passed
+    gravity: Sequence[float]  #: (4,) Nm of gravity compensation
+    elapsed: float  #: s since the spring's settings
 
 
 class Term(Protocol):
-    """One contribution to the torque on top of gravity compensation.
-
-    Most are frozen dataclasses of parameters, and `on` if these ask for any torque; by default they do not.
-    """
+    """One contribution to the torque on top of gravity compensation; most are `TermParameters`."""
 
     def torque(self, state: TermState) -> Torque:
         """Return the torque (4,) in Nm that the motors add."""
@@ -60,18 +50,24 @@ class Term(Protocol):
 
 
 @dataclass(frozen=True)
-class Damping:
-    """Virtual viscosity, as a therapist sets it for resistance; it takes energy, except for what comes late."""
+class TermParameters:
+    """The parameters of one term, checked; the first one switches it on."""
 
-    viscosity: Sequence[float] = owned((0.0,) * 4, "virtual viscous friction; 0: off", (0.0, 5.0), "Nm s/rad")
+    #: whether the parameters ask for any torque; by default they do not
+    on: bool = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         check_owned(self)
+        first = params_of(type(self))[0]
+        off = tuple(first.default) if isinstance(first.default, list) else first.default
+        object.__setattr__(self, "on", getattr(self, first.name) != off)
 
-    @property
-    def on(self) -> bool:
-        """Whether the term gives torque."""
-        return any(self.viscosity)
+
+@dataclass(frozen=True)
+class Damping(TermParameters):
+    """Virtual viscosity, as a therapist sets it for resistance; it takes energy, except for what comes late."""
+
+    viscosity: Sequence[float] = owned((0.0,) * 4, "virtual viscous friction; 0: off", (0.0, 5.0), "Nm s/rad")
 
     def check(self, least_inertia: Sequence[float]) -> None:
         """Raise ParameterError unless the viscosity damps these inertias (4,) kg m^2 although it acts late."""
@@ -87,10 +83,8 @@ class Damping:
 class PosePath:
     """Poses over time. Raises ParameterError."""
 
-    #: (n,) s from 0 on, rising
-    times: tuple[float, ...]
-    #: (n, 4) rad
-    poses: tuple[tuple[float, ...], ...]
+    times: tuple[float, ...]  #: (n,) s from 0 on, rising
+    poses: tuple[tuple[float, ...], ...]  #: (n, 4) rad
 
     def __post_init__(self) -> None:
         rising = all(a < b for a, b in itertools.pairwise(self.times))
@@ -120,7 +114,7 @@ class PosePath:
 
 
 @dataclass(frozen=True)
-class Spring:
+class Spring(TermParameters):
     """Pulls the joints towards a pose, or along a recorded path, with a limited torque.
 
     Towards a pose it returns what energy it took, less its damping. A path moves the pose, and gives at most the
@@ -134,23 +128,16 @@ class Spring:
         unit="rad",
         any_length=True,
     )
-    #: largest torque, (4,) Nm
-    max_effort: Sequence[float] = SPRING_EFFORT
-    #: in place of `pose`
-    path: PosePath | None = None
+    max_effort: Sequence[float] = SPRING_EFFORT  #: largest torque, (4,) Nm
+    path: PosePath | None = None  #: in place of `pose`
 
     def __post_init__(self) -> None:
-        check_owned(self)
+        super().__post_init__()
         object.__setattr__(self, "pose", tuple(self.pose))
         if self.path is None and len(self.pose) != JOINT_COUNT:
             object.__setattr__(self, "path", PosePath.of_rows(self.pose))
         elif not _is_pose(self.pose[:JOINT_COUNT]):
             raise ParameterError("spring.pose", list(self.pose), "4 angles from -3.15 to 3.15 rad")
-
-    @property
-    def on(self) -> bool:
-        """Whether the term gives torque."""
-        return any(self.stiffness)
 
     def check(self, least_inertia: Sequence[float]) -> None:
         """Raise ParameterError unless the spring is stable on these inertias (4,) kg m^2."""
@@ -167,7 +154,7 @@ class Spring:
 
 
 @dataclass(frozen=True)
-class Coupling:
+class Coupling(TermParameters):
     """One joint follows others by a ratio, as in the shoulder rhythm of the exoskeleton HARMONY.
 
     A spring between them, of which all feel their part: torque on the follower alone could be turned into energy by
@@ -181,18 +168,12 @@ class Coupling:
         (-50.0, 50.0),
         "Nm/rad",
     )
-    #: largest torque on the follower, Nm
-    max_effort: float = COUPLING_EFFORT
+    max_effort: float = COUPLING_EFFORT  #: largest torque on the follower, Nm
 
     def __post_init__(self) -> None:
-        check_owned(self)
+        super().__post_init__()
         if sum(map(bool, self.stiffness)) == 1:
             raise ParameterError("coupling.stiffness", list(self.stiffness), "of two joints or more, or zeros")
-
-    @property
-    def on(self) -> bool:
-        """Whether the term gives torque."""
-        return any(self.stiffness)
 
     @property
     def largest(self) -> float:
@@ -217,7 +198,7 @@ class Coupling:
 
 
 @dataclass(frozen=True)
-class SoftLimits:
+class SoftLimits(TermParameters):
     """Springs at the edge of a workspace that a therapist chooses, within the joint limits of `can_bridge`.
 
     Raises ParameterError.
@@ -226,13 +207,11 @@ class SoftLimits:
     range: Sequence[float] = owned(
         (-FREE, FREE) * 4, f"lower and upper edge of each joint's workspace; {FREE:g}: none", (-FREE, FREE), "rad"
     )
-    #: of the springs beyond the edges, (4,) Nm/rad
-    stiffness: Sequence[float] = EDGE_STIFFNESS
-    #: largest torque of the springs, (4,) Nm
-    max_effort: Sequence[float] = SPRING_EFFORT
+    stiffness: Sequence[float] = EDGE_STIFFNESS  #: of the springs beyond the edges, (4,) Nm/rad
+    max_effort: Sequence[float] = SPRING_EFFORT  #: largest torque of the springs, (4,) Nm
 
     def __post_init__(self) -> None:
-        check_owned(self)
+        super().__post_init__()
         if not all(low < high for low, high in zip(self.lower, self.upper, strict=True)):
             raise ParameterError("limits.range", list(self.range), "lower and upper edge of each joint, rising")
 
@@ -245,11 +224,6 @@ class SoftLimits:
     def upper(self) -> Sequence[float]:
         """Upper edges (4,) in rad."""
         return self.range[1::2]
-
-    @property
-    def on(self) -> bool:
-        """Whether the term gives torque."""
-        return any(abs(edge) < FREE for edge in self.range)
 
     def on_arm(self, least_inertia: Sequence[float]) -> SoftLimits:
         """Return these limits as stiff as an arm of these inertias (4,) kg m^2 can bear."""
