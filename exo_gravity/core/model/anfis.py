@@ -33,7 +33,7 @@ from exo_gravity.core.numbers import Vector
 MAX_RULES = 10_000  # 6 inputs of 4 functions give 4,096; more is probably a mistake, and would exhaust the memory
 INPUTS = ("theta_2", "theta_3", "theta_4")
 JOINTS = ("2", "3", "4")
-# Largest angle in rad between joint 1's axis and gravity that counts as upright. A trunk tilt of 0.5 degrees changes
+# Largest angle in rad between joint 1's axis and gravity of an upright trunk. A trunk tilt of 0.5 degrees changes
 # the torques of the paper's arm by at most 0.04 Nm, a few steps of the motors' 12-bit torque.
 UPRIGHT = math.radians(0.5)
 FORMAT = "exo_gravity ANFIS law 1"
