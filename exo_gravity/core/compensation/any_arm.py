@@ -15,12 +15,12 @@ from exo_gravity.core.compensation.command_fade import COMMAND_PARAMETERS
 from exo_gravity.core.compensation.compensator import MAX_ANGLE, Answer
 from exo_gravity.core.compensation.limiter import EffortLimiter
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.compensation.tilt_input import Tilted
 from exo_gravity.core.compensation.transition import Transition
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import MAX_GAIN, MAX_GRAVITY, STANDARD_GRAVITY
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.params import REAL_TIME_PARAMETERS, Param, param_of
+from exo_gravity.core.trunk.tilt_input import Tilted
 
 LAW = "urdf"
 MAX_JOINTS = 32

@@ -13,12 +13,10 @@ import operator
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from exo_gravity.core.compensation.felt_motion import FeltMotion
 from exo_gravity.core.compensation.limiter import BREAK, EffortLimiter
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.coupling import JOINTS
 from exo_gravity.core.compensation.terms.terms import Terms
-from exo_gravity.core.compensation.tilt_input import Tilted
 from exo_gravity.core.compensation.transition import Transition
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
@@ -26,6 +24,8 @@ from exo_gravity.core.model.gravity import LAWS, NO_TORQUE, Torque
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.model.turning import turning_torque
 from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.trunk.felt_motion import FeltMotion
+from exo_gravity.core.trunk.tilt_input import Tilted
 
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
 MAX_ANGLE = 26.0  # rad, more than an AK motor can report with any zero

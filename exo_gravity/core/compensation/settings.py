@@ -6,15 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from exo_gravity.core.compensation.terms.settings import TermSettings
-from exo_gravity.core.compensation.tilt_input import STILL
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.anfis_law import AnfisLaw
 from exo_gravity.core.model.arm import MAX_TOTAL_MASS, ArmModel
 from exo_gravity.core.model.gravity import LAWS, NO_TORQUE, Law
-from exo_gravity.core.model.quaternion import Floats3
+from exo_gravity.core.model.rotation import Floats3
 from exo_gravity.core.model.tilt import SIDES
 from exo_gravity.core.params import check_owned, owned
 from exo_gravity.core.safety.limits import MAX_COMMAND
+from exo_gravity.core.trunk.tilt_input import STILL
 
 MODES = ("one_g", "zero_g")
 LAW_NAMES = (*LAWS, "anfis")

@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.model.quaternion import Floats3
-from exo_gravity.core.model.vector3 import cross, dot, plus
+from exo_gravity.core.model.rotation import Floats3, cross, dot, plus
 
 Link = tuple[float, float, float]  # length m, centre of gravity m, mass kg
 

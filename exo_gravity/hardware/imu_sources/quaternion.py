@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from exo_gravity.core.model.quaternion import Quaternion
+from exo_gravity.core.model.rotation import Quaternion
 
 
 def from_angles(*turns: tuple[str, float]) -> Quaternion:

@@ -9,8 +9,8 @@ import math
 from collections.abc import Callable
 
 from exo_gravity.core.errors import DeviceError
+from exo_gravity.core.trunk.imu_sample import ImuSample
 from exo_gravity.hardware.imu_sources.source import ImuSource
-from exo_gravity.hardware.trunk.imu_sample import ImuSample
 
 PAUSE = 0.5  # s between two attempts
 # s without a sample. A chip whose supply broke down for a moment answers, but sleeps.

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from exo_gravity.core.trunk.imu_sample import ImuSample
 from exo_gravity.hardware.imu_sources.sample_clock import SampleClock
 from exo_gravity.hardware.imu_sources.source import Clock
-from exo_gravity.hardware.trunk.imu_sample import ImuSample
 
 Axes = tuple[float, float, float]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
-from exo_gravity.hardware.trunk.imu_sample import ImuSample
+from exo_gravity.core.trunk.imu_sample import ImuSample
 
 Clock = Callable[[], float]  # s; the clock of the stamps
 

@@ -20,7 +20,7 @@ from sensor_msgs.msg import Imu
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.rate import Rate
 from exo_gravity.core.trunk.params import IMU
-from exo_gravity.hardware.trunk.trunk_estimator import ImuSample, TrunkEstimator, TrunkOrientation
+from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator, TrunkOrientation
 from exo_gravity.nodes.imu.device import ImuDevice
 from exo_gravity.nodes.ros.conversions import to_nanoseconds
 from exo_gravity.nodes.ros.declare import declare
@@ -37,7 +37,7 @@ UNKNOWN_HEADING = math.pi**2  # rad^2, its variance
 
 
 class ImuNode(Node):
-    """The ROS shell around `hardware.trunk.trunk_estimator.TrunkEstimator`."""
+    """The ROS shell around `hardware.trunk_estimator.TrunkEstimator`."""
 
     def __init__(self) -> None:
         super().__init__("imu", automatically_declare_parameters_from_overrides=True)
@@ -87,7 +87,7 @@ class ImuNode(Node):
             self._refused += 1
             return
         try:
-            orientation = self._estimator.update(sample_of(message))
+            orientation = self._estimator.update(sample_of(message), self.get_clock().now().nanoseconds * 1e-9)
         except ParameterError as error:
             self._refused += 1
             self._refusal, self._last_refusal = error, str(error)

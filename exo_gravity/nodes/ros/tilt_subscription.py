@@ -13,9 +13,9 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
-from exo_gravity.core.compensation.tilt_input import STILL
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.quaternion import unit_quaternion, up_in_body
+from exo_gravity.core.model.rotation import unit_quaternion, up_in_body
+from exo_gravity.core.trunk.tilt_input import STILL
 from exo_gravity.nodes.ros.conversions import to_nanoseconds
 from exo_gravity.nodes.ros.sole_publisher import SolePublisher
 
@@ -25,7 +25,7 @@ NOT_REPORTED = -1.0  # first entry of a covariance (REP-145)
 
 
 class TiltTarget(Protocol):
-    """What is told the tilt: a `core.compensation.tilt_input.TiltInput`, or a compensator."""
+    """What is told the tilt: a `core.trunk.tilt_input.TiltInput`, or a compensator."""
 
     def set_tilt(self, now: float, pitch: float, roll: float, age: float = 0.0) -> None:
         """Set pitch and roll."""

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.quaternion import Floats3
+from exo_gravity.core.model.rotation import Floats3
 from exo_gravity.core.model.tilt import Tilt, angle_between, gravity_in_trunk
 
 TILT_SPEED = 5.0  # rad/s, faster than a trunk can tilt

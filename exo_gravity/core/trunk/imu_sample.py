@@ -12,11 +12,12 @@ from typing import NamedTuple
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.quaternion import Floats3
+from exo_gravity.core.model.rotation import Floats3
 from exo_gravity.core.numbers import one_float
 
-GYROSCOPE_RANGE = math.radians(2000.0)  # rad/s, the usual widest range of a MEMS gyroscope
-ACCELEROMETER_RANGE = 16.0 * STANDARD_GRAVITY  # m/s^2
+# The usual widest ranges of a MEMS sensor, and those that any sensor may have.
+GYROSCOPE_RANGE, GYROSCOPE_RANGES = 34.9, (1.0, 200.0)  # rad/s; 2000 deg/s
+ACCELEROMETER_RANGE, ACCELEROMETER_RANGES = 156.9, (15.0, 4000.0)  # m/s^2; 16 g
 SATURATED = 0.995  # share of the range
 BEYOND = 1.03  # share of the range: scale factors of MEMS sensors are wrong by up to 3 %
 DEAD = 0.02  # m/s^2: even in free fall noise and bias make more
@@ -25,41 +26,41 @@ SAME = 0.15  # share of 1 g
 
 
 class ImuSample(NamedTuple):
-    """One sample in the IMU's own axes.
+    """One sample in the IMU's own axes; None marks what the IMU does not report.
 
-    time: s, when it was taken, not when it arrived. angular_velocity: (3,) rad/s; acceleration: (3,) m/s^2, +9.8
-    upward at rest (REP-145). orientation: (x, y, z, w), world from IMU, world z up. None marks what the IMU does not
-    report; without an orientation the other two are required.
+    Without an orientation the other two are required.
     """
 
+    #: s, when it was taken, not when it arrived
     time: float
+    #: (3,) rad/s
     angular_velocity: Sequence[float] | None
+    #: (3,) m/s^2, +9.8 upward at rest (REP-145)
     acceleration: Sequence[float] | None
+    #: (x, y, z, w), world from IMU, world z up
     orientation: Sequence[float] | None = None
 
 
-class Ranges(NamedTuple):
-    """The sensor's ranges: gyroscope in rad/s, accelerometer in m/s^2, each for one axis."""
+class Ranges:
+    """The sensor's ranges, each for one axis."""
 
-    gyroscope: float = GYROSCOPE_RANGE
-    accelerometer: float = ACCELEROMETER_RANGE
-
-    @classmethod
-    def of(cls, gyroscope: float, accelerometer: float) -> Ranges:
-        """Return checked ranges; raises ParameterError for one that no IMU has."""
-        return cls(
-            one_float("gyroscope_range", gyroscope, 1.0, 200.0, "rad/s"),
-            one_float("accelerometer_range", accelerometer, 15.0, 4000.0, "m/s^2"),
-        )
+    def __init__(self, gyroscope: float, accelerometer: float) -> None:
+        """Take the ranges in rad/s and m/s^2. Raises ParameterError for one that no IMU has."""
+        self.gyroscope = one_float("gyroscope_range", gyroscope, *GYROSCOPE_RANGES, "rad/s")
+        self.accelerometer = one_float("accelerometer_range", accelerometer, *ACCELEROMETER_RANGES, "m/s^2")
+        self._saturated_rate = SATURATED * self.gyroscope
+        self._saturated_acceleration = SATURATED * self.accelerometer
 
     def angular_velocity(self, values: Sequence[float] | None) -> tuple[Floats3, bool]:
         """Return the rates, and whether one is saturated; raises ParameterError if one is impossible."""
         rate = three_floats("angular_velocity", values)
         largest = max(map(abs, rate))
+        if largest < self._saturated_rate:
+            return rate, False
         if largest > BEYOND * self.gyroscope:
             expected = f"at most gyroscope_range = {self.gyroscope:.4g} rad/s about each axis (is it in deg/s?)"
             raise ParameterError("angular_velocity", rate, expected)
-        return rate, largest >= SATURATED * self.gyroscope
+        return rate, True
 
     def acceleration(self, values: Sequence[float] | None, last: Floats3 | None) -> tuple[Floats3, bool]:
         """Return the acceleration, and whether an axis is saturated; raises ParameterError if it is impossible.
@@ -68,6 +69,8 @@ class Ranges(NamedTuple):
         """
         acceleration = three_floats("linear_acceleration", values)
         largest = max(map(abs, acceleration))
+        if ALMOST_NOTHING <= largest < self._saturated_acceleration:
+            return acceleration, False
         if largest > BEYOND * self.accelerometer:
             expected = f"at most accelerometer_range = {self.accelerometer:.4g} m/s^2 along each axis"
             raise ParameterError("linear_acceleration", acceleration, expected)
@@ -75,7 +78,7 @@ class Ranges(NamedTuple):
             raise ParameterError("linear_acceleration", acceleration, "not zero, as a dead accelerometer reports")
         if largest < ALMOST_NOTHING and last is not None and _is_in_g(acceleration, last):
             raise ParameterError("linear_acceleration", acceleration, "in m/s^2, not in g")
-        return acceleration, largest >= SATURATED * self.accelerometer
+        return acceleration, largest >= self._saturated_acceleration
 
 
 def _is_in_g(acceleration: Floats3, last: Floats3) -> bool:
