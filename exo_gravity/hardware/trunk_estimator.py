@@ -72,16 +72,20 @@ class VqfFusion:
         scaled[0] = a + (x + share * (u - x) - a) * periods
         scaled[1] = b + (y + share * (v - y) - b) * periods
         scaled[2] = c + (z + share * (w - z) - c) * periods
-        vqf.updateGyr(scaled)
         self._due += dt
-        if self._due > 0.5 * period:
-            count = round(self._due / period)
-            self._due -= count * period
-            if acceleration is not None:
-                measured = self._acceleration
-                measured[0], measured[1], measured[2] = acceleration
-                for _ in range(count):
-                    vqf.updateAcc(measured)
+        count = round(self._due / period)
+        self._due -= count * period
+        if acceleration is None:
+            count = 0
+        else:
+            measured = self._acceleration
+            measured[0], measured[1], measured[2] = acceleration
+        if count:
+            vqf.update(scaled, measured)
+        else:
+            vqf.updateGyr(scaled)
+        for _ in range(1, count):
+            vqf.updateAcc(measured)
         self._count += 1
         if self._count % BIAS_INTERVAL == 0:
             self._read_bias()

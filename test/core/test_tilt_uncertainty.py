@@ -39,7 +39,7 @@ def test_saturated_samples_add_up_over_a_run():
     uncertainty = settled()
     for _ in range(3):
         uncertainty.advance(0.001, STILL, STILL)
-        uncertainty.saturate(0.001, RANGE)
+        uncertainty.lose(OVERSHOOT * RANGE * 0.001)
     assert added(uncertainty) == pytest.approx(3 * OVERSHOOT * RANGE * 0.001, rel=0.01)
 
 
@@ -66,13 +66,13 @@ def test_repeated_samples_add_by_the_square_of_their_time():
 
 def test_what_was_lost_decays_and_too_much_makes_the_estimate_begin_anew():
     uncertainty = settled()
-    uncertainty.saturate(0.002, RANGE)
+    uncertainty.lose(OVERSHOOT * RANGE * 0.002)
     before = added(uncertainty)
     assert not uncertainty.is_lost
     for _ in range(round(100 * DECAY_TIME)):
         uncertainty.advance(0.01, STILL, STILL)
     assert added(uncertainty) == pytest.approx(before / math.e, rel=0.02)
-    uncertainty.saturate(0.004, RANGE)
+    uncertainty.lose(OVERSHOOT * RANGE * 0.004)
     assert added(uncertainty) > 0.03 and uncertainty.is_lost and not uncertainty.is_settled
     uncertainty.restart()
     assert not uncertainty.is_lost and not uncertainty.is_settled
@@ -81,9 +81,9 @@ def test_what_was_lost_decays_and_too_much_makes_the_estimate_begin_anew():
 def test_a_start_in_motion_takes_longer_and_an_unknown_bias_and_a_contradiction_widen_it():
     still, moving = TiltUncertainty(0.01), TiltUncertainty(0.01)
     for _ in range(120):
-        for uncertainty, deviation in ((still, 0.002), (moving, 0.7)):
+        for uncertainty, square in ((still, 4e-6), (moving, 0.5)):
             uncertainty.advance(0.01, STILL, STILL)
-            uncertainty.combine(0.0, deviation, 0.0)
+            uncertainty.combine(0.0, square, 0.0)
     assert still.is_settled and not moving.is_settled
     still.combine(0.02, 0.0, 0.0)
     assert not still.is_settled

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -22,8 +22,9 @@ from exo_gravity.core.model.tilt import angle_between, pitch_roll, rotation_matr
 from exo_gravity.core.numbers import one_float
 from exo_gravity.core.trunk.imu_checks import Agreement, ClockCheck, EqualValues, GravityCheck
 from exo_gravity.core.trunk.imu_sample import ACCELEROMETER_RANGE, GYROSCOPE_RANGE, ImuSample, Ranges, three_floats
-from exo_gravity.core.trunk.uncertainty import SETTLE_TIME, TiltUncertainty
+from exo_gravity.core.trunk.uncertainty import OVERSHOOT, SETTLE_TIME, TiltUncertainty
 
+LEAST_OFFSET = 0.005  # s of the clock that matter
 MAX_GAP = 0.1  # s between two samples, after which the estimate begins anew
 CHECK_PERIOD = 0.0095  # s between two comparisons of gyroscope and accelerometer
 REPORTED_SIGMA = math.radians(1.0)  # rad; data sheets of fused sensors state 1 to 2 degrees
@@ -50,19 +51,35 @@ class Fusion(Protocol):
         """
 
 
-class TrunkOrientation(NamedTuple):
+class TrunkOrientation:
     """The trunk's orientation by one sample."""
 
-    #: rad (REP-103: > 0 bows forward)
-    pitch: float
-    #: rad (> 0 leans right)
-    roll: float
-    #: (x, y, z, w), world from trunk; its heading is arbitrary
-    orientation: np.ndarray
-    #: unit vector (3,) in the trunk's axes (x forward, y left, z up)
-    gravity: np.ndarray
-    #: one standard deviation of the tilt, rad
-    uncertainty: float
+    __slots__ = ("_down", "_imu_from_trunk", "_world_from_imu", "uncertainty")
+
+    def __init__(self, down: Floats3, world_from_imu: Quaternion, imu_from_trunk: Quaternion, sigma: float) -> None:
+        #: one standard deviation of the tilt, rad
+        self.uncertainty = sigma
+        self._down, self._world_from_imu, self._imu_from_trunk = down, world_from_imu, imu_from_trunk
+
+    @property
+    def gravity(self) -> np.ndarray:
+        """Its unit vector (3,) in the trunk's axes (x forward, y left, z up)."""
+        return np.array(self._down)
+
+    @property
+    def pitch(self) -> float:
+        """In rad (REP-103: > 0 bows forward)."""
+        return pitch_roll(self._down)[0]
+
+    @property
+    def roll(self) -> float:
+        """In rad (> 0 leans right)."""
+        return pitch_roll(self._down)[1]
+
+    @property
+    def orientation(self) -> np.ndarray:
+        """(x, y, z, w), world from trunk; its heading is arbitrary."""
+        return np.array(product(self._world_from_imu, self._imu_from_trunk))
 
 
 class TiltEstimator:
@@ -106,11 +123,15 @@ class TiltEstimator:
     @property
     def settling(self) -> str:
         """Why there is no orientation yet; empty once there is."""
-        if not self._is_fused:
-            return "" if self._age >= SETTLE_TIME else self._why
-        if self._agreement.is_suspect:
+        if self._is_fused and self._agreement.is_suspect:
             return f"until gyroscope and accelerometer agree on a turn of the trunk; {self._why}"
-        return "" if self._uncertainty.is_settled else self._why
+        return "" if self._is_settled else self._why
+
+    @property
+    def _is_settled(self) -> bool:
+        if not self._is_fused:
+            return self._age >= SETTLE_TIME
+        return self._uncertainty.is_settled and not self._agreement.is_suspect
 
     def update(self, sample: ImuSample, arrival: float | None = None) -> TrunkOrientation | None:
         """Process a sample; return the trunk's orientation, or None while it is not sure enough.
@@ -119,65 +140,73 @@ class TiltEstimator:
         Raises ParameterError if the sample is impossible, frozen or not later than the last one (it is then ignored),
         or if what it measures contradicts itself or the samples before it.
         """
-        time, is_saturated, reported = float(sample.time), False, None
-        rate: Floats3
+        is_fused, is_saturated = sample.orientation is None, False
         acceleration: Floats3 | None
-        if sample.orientation is None:
+        if is_fused:
             if self._fusion is None:
                 raise ParameterError("orientation", None, "reported by the IMU, or install vqf to fuse it")
             rate, is_saturated = self._ranges.angular_velocity(sample.angular_velocity)
-            acceleration, is_clipped = self._ranges.acceleration(sample.acceleration, self._last_acceleration)
-            acceleration = None if is_clipped else acceleration
+            acceleration = self._ranges.acceleration(sample.acceleration, self._last_acceleration)
         else:
-            reported = unit_quaternion("orientation", sample.orientation)
+            quaternion = unit_quaternion("orientation", sample.orientation)
             given, force = sample.angular_velocity, sample.acceleration
             rate = ZERO if given is None else three_floats("angular_velocity", given)
             acceleration = None if force is None else three_floats("linear_acceleration", force)
+        time = float(sample.time)
         dt = time - self._time
         if not math.isfinite(time) or -MAX_GAP <= dt <= 0.0:  # far in the past: another clock, like a gap
             raise ParameterError("stamp", time, "a finite number, later than the last stamp")
-        is_judged = reported is None and not is_saturated
         try:
-            self._equal.check(time, rate, acceleration, self._up if is_judged else None)
+            self._equal.check(time, rate, acceleration, self._up if is_fused and not is_saturated else None)
         except ParameterError as error:
-            if self._equal.duration == 0.0:
+            if not self._equal.duration:  # an axis is stuck
                 self._doubt(error)
             raise
-        if (reported is None) is not self._is_fused or abs(dt) > MAX_GAP:
-            self._restart(f"gap of {dt:.2f} s" if (reported is None) is self._is_fused else "started")
-            self._is_fused, dt, self._clock = reported is None, 0.0, ClockCheck()
+        if not 0.0 < dt <= MAX_GAP or is_fused is not self._is_fused:
+            self._restart(f"gap of {dt:.2f} s" if is_fused is self._is_fused else "started")
+            self._is_fused, dt, self._clock = is_fused, 0.0, ClockCheck()
         self._time = time
-        if reported is None:
+        if is_fused:
             quaternion = self._fuse(dt, rate, acceleration, is_saturated)
         else:
-            quaternion = self._follow(dt, reported, acceleration)
+            self._follow(dt, quaternion, acceleration)
         if arrival is not None:
-            try:
-                self._clock.check(time, arrival)
-            except ParameterError as error:
-                self._restart(f"{error.name} must be {error.expected}")
-                raise
-        return None if self.settling else self._output(quaternion)
+            self._check_clock(time, arrival)
+        if not self._is_settled:
+            return None
+        assert self._up
+        (x, y, z), (p, q, r) = self._up, self._rows
+        gravity = (
+            -p[0] * x - p[1] * y - p[2] * z,
+            -q[0] * x - q[1] * y - q[2] * z,
+            -r[0] * x - r[1] * y - r[2] * z,
+        )
+        sigma = math.sqrt(self._uncertainty.variance) if is_fused else REPORTED_SIGMA
+        return TrunkOrientation(gravity, quaternion, self._imu_from_trunk, sigma)
 
     def _fuse(self, dt: float, rate: Floats3, acceleration: Floats3 | None, is_saturated: bool) -> Quaternion:
         """Return the orientation, world from IMU, `dt` s after the last sample; 0 for the first one."""
-        assert self._fusion
-        uncertainty = self._uncertainty
+        fusion, uncertainty = self._fusion, self._uncertainty
+        assert fusion
         uncertainty.advance(dt, rate, self._last_rate or rate)
         if self._equal.duration:
             uncertainty.repeat(dt, self._equal.duration)
         elif is_saturated:
-            uncertainty.saturate(dt, self._ranges.gyroscope)
+            uncertainty.lose(OVERSHOOT * self._ranges.gyroscope * dt)
         if uncertainty.is_lost:
             self._restart("too much rotation was not measured")
-        quaternion = self._fusion.advance(dt, rate, self._last_rate or rate, acceleration)
+        quaternion = fusion.advance(dt, rate, self._last_rate or rate, acceleration)
         self._last_rate, self._last_acceleration = rate, acceleration
         self._up = up_in_body(quaternion)
         if acceleration:
             self._check(dt, quaternion, acceleration)
-        self._speed = max(abs(rate[0]) + abs(rate[1]) + abs(rate[2]), self._speed * (1.0 - dt))
-        contradiction = self._agreement.contradiction + self._speed * self._clock.offset
-        uncertainty.combine(self._fusion.bias_sigma, self._agreement.deviation, contradiction)
+        contradiction = self._agreement.contradiction
+        if self._clock.offset > LEAST_OFFSET:
+            self._speed = max(math.hypot(*rate), self._speed)
+            contradiction += self._speed * self._clock.offset
+        else:
+            self._speed = 0.0
+        uncertainty.combine(fusion.bias_sigma, self._agreement.square, contradiction)
         return quaternion
 
     def _check(self, dt: float, quaternion: Quaternion, acceleration: Floats3) -> None:
@@ -202,8 +231,8 @@ class TiltEstimator:
             self._why = f"{error.name} must be {error.expected}"
             raise
 
-    def _follow(self, dt: float, quaternion: Quaternion, acceleration: Floats3 | None) -> Quaternion:
-        """Return the orientation that the IMU reports."""
+    def _follow(self, dt: float, quaternion: Quaternion, acceleration: Floats3 | None) -> None:
+        """Follow the orientation that the IMU reports, world from IMU."""
         self._age += dt
         up = up_in_body(quaternion)
         if self._up and angle_between(up, self._up) > MAX_REPORTED_RATE * max(dt, self._period) + MAX_JUMP:
@@ -211,15 +240,13 @@ class TiltEstimator:
         self._up = up
         if acceleration:
             self._gravity.update(dt, up, acceleration)
-        return quaternion
 
-    def _output(self, quaternion: Quaternion) -> TrunkOrientation:
-        assert self._up
-        x, y, z = self._up
-        gravity = [-a * x - b * y - c * z for a, b, c in self._rows]
-        orientation = np.array(product(quaternion, self._imu_from_trunk))
-        sigma = math.sqrt(self._uncertainty.variance) if self._is_fused else REPORTED_SIGMA
-        return TrunkOrientation(*pitch_roll(gravity), orientation, np.array(gravity), sigma)
+    def _check_clock(self, time: float, arrival: float) -> None:
+        try:
+            self._clock.check(time, arrival)
+        except ParameterError as error:
+            self._restart(f"{error.name} must be {error.expected}")
+            raise
 
     def _doubt(self, error: ParameterError) -> None:
         """Begin anew, and wait for gyroscope and accelerometer to agree."""
@@ -236,7 +263,7 @@ class TiltEstimator:
         self._why = why
         self._age = 0.0  # s of a reported orientation
         self._unchecked = NOTHING
-        self._speed = 0.0  # rad/s, the highest lately
+        self._speed = 0.0  # rad/s, the highest since the clock has been off
         self._up: Floats3 | None = None  # the world's z axis in the IMU's axes, by the last sample
         self._last_rate: Floats3 | None = None
         self._last_acceleration: Floats3 | None = None

@@ -55,6 +55,7 @@ class EqualValues:
         self._values: tuple[float, ...] = (math.nan,) * 6  # gyroscope and accelerometer
         self._counts = [0] * 6  # of equal values
         self._ups = [0.0] * 6  # the estimate's vertical when the accelerometer's axis began to repeat its value
+        self._any_equal = False  # axes, by the last sample
         self._stuck: set[int] = set()
 
     def check(self, time: float, rate: Floats3, acceleration: Floats3 | None, up: Floats3 | None) -> None:
@@ -62,8 +63,12 @@ class EqualValues:
 
         up: the vertical in the IMU's axes by an estimate from the samples before; None if there is none.
         """
-        values, last = rate + (acceleration or ZERO), self._values
+        last, values = self._values, rate + (acceleration or ZERO)
+        (a, b, c, d, e, f), (u, v, w, x, y, z) = last, values
         self._values = values
+        if a != u and b != v and c != w and d != x and e != y and f != z and not self._any_equal:
+            self._since, self._count, self.duration = time, 1, 0.0
+            return
         if values == last and time > self._since:
             self._count += 1
             self.duration = time - self._since
@@ -84,6 +89,8 @@ class EqualValues:
                 name, shown = ("angular_velocity", rate) if axis < 3 else ("linear_acceleration", acceleration)
                 expected = f"different from sample to sample while the trunk turns: the {'xyz'[axis % 3]} axis is stuck"
                 raise ParameterError(name, shown, expected)
+
+        self._any_equal = any(self._counts)
 
     def _is_stuck(self, axis: int, acceleration: Floats3, up: Floats3) -> bool:
         """Count an equal value; return whether it should have changed."""
@@ -146,12 +153,7 @@ class Agreement:
         self._unlike = self._rest = 0.0  # s
         self._age = 0.0  # s
         self._mean: Floats3 = ZERO  # in 1 g
-        self._square = 0.0  # of the deviation from the mean
-
-    @property
-    def deviation(self) -> float:
-        """Deviation of the acceleration in the world from its mean, RMS, as a share of 1 g."""
-        return math.sqrt(self._square)
+        self.square = 0.0  #: of the deviation from the mean
 
     @property
     def is_begun(self) -> bool:
@@ -208,11 +210,11 @@ class Agreement:
         (u, v, w), (x, y, z) = self._mean, acceleration_in_world
         x, y, z = x / STANDARD_GRAVITY - u, y / STANDARD_GRAVITY - v, z / STANDARD_GRAVITY - w
         self._mean = u, v, w = u + share * x, v + share * y, w + share * z
-        self._square += share * ((1.0 - share) * (x * x + y * y + z * z) - self._square)
+        self.square += share * ((1.0 - share) * (x * x + y * y + z * z) - self.square)
         shift = math.sqrt(u * u + v * v + (w - 1.0) ** 2)
         if shift < OFFSET or self._age < LEAST_TIME:
             return
-        limit = OFFSET + (WALK + DIRECTION_TIME * math.sqrt(self._square)) / span
+        limit = OFFSET + (WALK + DIRECTION_TIME * math.sqrt(self.square)) / span
         if shift > limit:
             mean = [round(STANDARD_GRAVITY * component, 2) for component in (u, v, w)]
             expected = f"within {STANDARD_GRAVITY * limit:.2f} m/s^2 of gravity upwards: check units, axes and signs"
@@ -236,7 +238,8 @@ class ClockCheck:
     def check(self, time: float, arrival: float) -> None:
         """Check the stamp `time` of a sample that arrived at `arrival`, both s. Raises ParameterError."""
         lag = arrival - time
-        self._shortest = min(self._shortest, lag)
+        if lag < self._shortest:
+            self._shortest = lag
         if self._end == math.inf:
             self._end, self._last, self._before = arrival + WINDOW, lag, lag
         if arrival >= self._end:

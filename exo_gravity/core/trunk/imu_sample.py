@@ -48,52 +48,46 @@ class Ranges:
         """Take the ranges in rad/s and m/s^2. Raises ParameterError for one that no IMU has."""
         self.gyroscope = one_float("gyroscope_range", gyroscope, *GYROSCOPE_RANGES, "rad/s")
         self.accelerometer = one_float("accelerometer_range", accelerometer, *ACCELEROMETER_RANGES, "m/s^2")
-        self._saturated_rate = SATURATED * self.gyroscope
-        self._saturated_acceleration = SATURATED * self.accelerometer
 
     def angular_velocity(self, values: Sequence[float] | None) -> tuple[Floats3, bool]:
         """Return the rates, and whether one is saturated; raises ParameterError if one is impossible."""
-        rate = three_floats("angular_velocity", values)
-        largest = max(map(abs, rate))
-        if largest < self._saturated_rate:
+        rate = x, y, z = three_floats("angular_velocity", values)
+        usual = SATURATED * self.gyroscope
+        if -usual < x < usual and -usual < y < usual and -usual < z < usual:
             return rate, False
-        if largest > BEYOND * self.gyroscope:
+        if max(map(abs, rate)) > BEYOND * self.gyroscope:
             expected = f"at most gyroscope_range = {self.gyroscope:.4g} rad/s about each axis (is it in deg/s?)"
             raise ParameterError("angular_velocity", rate, expected)
         return rate, True
 
-    def acceleration(self, values: Sequence[float] | None, last: Floats3 | None) -> tuple[Floats3, bool]:
-        """Return the acceleration, and whether an axis is saturated; raises ParameterError if it is impossible.
+    def acceleration(self, values: Sequence[float] | None, last: Floats3 | None) -> Floats3 | None:
+        """Return the acceleration, None if an axis is saturated; raises ParameterError if it is impossible.
 
         last: the acceleration before it, None at first.
         """
-        acceleration = three_floats("linear_acceleration", values)
+        acceleration = x, y, z = three_floats("linear_acceleration", values)
+        usual, square = SATURATED * self.accelerometer, x * x + y * y + z * z
+        if square > ALMOST_NOTHING**2 and -usual < x < usual and -usual < y < usual and -usual < z < usual:
+            return acceleration
         largest = max(map(abs, acceleration))
-        if ALMOST_NOTHING <= largest < self._saturated_acceleration:
-            return acceleration, False
         if largest > BEYOND * self.accelerometer:
             expected = f"at most accelerometer_range = {self.accelerometer:.4g} m/s^2 along each axis"
             raise ParameterError("linear_acceleration", acceleration, expected)
         if largest < DEAD:
             raise ParameterError("linear_acceleration", acceleration, "not zero, as a dead accelerometer reports")
-        if largest < ALMOST_NOTHING and last is not None and _is_in_g(acceleration, last):
+        in_g = tuple(STANDARD_GRAVITY * component for component in acceleration)
+        if last and square < ALMOST_NOTHING**2 and math.dist(in_g, last) < SAME * STANDARD_GRAVITY:
             raise ParameterError("linear_acceleration", acceleration, "in m/s^2, not in g")
-        return acceleration, largest >= self._saturated_acceleration
-
-
-def _is_in_g(acceleration: Floats3, last: Floats3) -> bool:
-    """Return whether `last` was at rest, and `acceleration` is the same divided by 9.8."""
-    was_at_rest = abs(math.hypot(*last) / STANDARD_GRAVITY - 1.0) < SAME
-    x, y, z = (STANDARD_GRAVITY * component for component in acceleration)
-    return was_at_rest and math.dist((x, y, z), last) < SAME * STANDARD_GRAVITY
+        return acceleration if largest < usual else None
 
 
 def three_floats(name: str, values: Sequence[float] | None) -> Floats3:
     """Return `values` as 3 finite floats, or raise ParameterError that names them."""
     try:
-        x, y, z = map(float, values)  # type: ignore[arg-type]  # None is one of the wrong values
+        x, y, z = values  # type: ignore[misc]  # None is one of the wrong values
+        x, y, z = float(x), float(y), float(z)
     except (TypeError, ValueError):
         raise ParameterError(name, values, "3 finite numbers") from None
-    if not math.isfinite(x + y + z):
+    if not -math.inf < x + y + z < math.inf:
         raise ParameterError(name, values, "3 finite numbers")
     return x, y, z

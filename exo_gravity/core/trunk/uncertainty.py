@@ -83,13 +83,8 @@ class TiltUncertainty:
             acceleration = change / (dt if dt > 0.5 * period else 0.5 * period)
             if change * dt > JUMP and acceleration > UNUSUAL * math.sqrt(self._square):
                 self.lose(change * dt)
-            share = dt / ACCELERATION_TIME
-            self._square += (acceleration * acceleration - self._square) * (share if share < 1.0 else 1.0)
+            self._square += (acceleration * acceleration - self._square) * dt / ACCELERATION_TIME
         self._period = period + USUAL_SHARE * (dt - period)
-
-    def saturate(self, dt: float, gyroscope_range: float) -> None:
-        """Add `dt` s of a saturated rate."""
-        self.lose(OVERSHOOT * gyroscope_range * dt)
 
     def repeat(self, dt: float, duration: float) -> None:
         """Add a sample that repeats the last one, the `duration` s of equal ones having grown by `dt`."""
@@ -101,15 +96,15 @@ class TiltUncertainty:
         self._run += angle
         self._is_losing = True
 
-    def combine(self, bias_sigma: float, deviation: float, contradiction: float) -> None:
+    def combine(self, bias_sigma: float, square: float, contradiction: float) -> None:
         """Add up the terms.
 
-        bias_sigma: rad/s. deviation: of the acceleration in the world from its mean, RMS, as a share of 1 g.
-        contradiction: rad by which gyroscope and accelerometer contradict each other.
+        bias_sigma: rad/s. square: mean one of the deviation of the acceleration in the world from its mean, as a share
+        of 1 g. contradiction: rad by which gyroscope and accelerometer contradict each other.
         """
         if self._age >= START_TIME:
             self._start = 0.0
         elif self._age >= SETTLE_TIME:  # a movement after a still start does not make it larger again
-            self._start = min(self._start, deviation * CORRELATION_TIME / self._age)
+            self._start = min(self._start, math.sqrt(square) * CORRELATION_TIME / self._age)
         bias, contradiction = BIAS_TIME * bias_sigma, contradiction / SIGMAS
         self.variance = BASE * BASE + bias * bias + self._start**2 + contradiction * contradiction + self._lost

@@ -33,6 +33,7 @@ PITCH_YAW, DATA = "/imu/pitch_yaw", "/imu/data"
 # The fusion integrates every sample. A queue of depth 1 would lose samples whenever the node is delayed.
 DEPTH = 50
 WATCH_PERIOD = 0.1  # s
+SAME_CLOCK = 5.0  # s between stamp and arrival
 UNKNOWN_HEADING = math.pi**2  # rad^2, its variance
 
 
@@ -86,8 +87,10 @@ class ImuNode(Node):
         if self._is_intruded(self._arrived):  # the estimator starts anew after the gap
             self._refused += 1
             return
+        sample, now = sample_of(message), self.get_clock().now().nanoseconds * 1e-9
         try:
-            orientation = self._estimator.update(sample_of(message), self.get_clock().now().nanoseconds * 1e-9)
+            # The stamps of a record that is played back are not this computer's: the compensator refuses their age.
+            orientation = self._estimator.update(sample, now if abs(now - sample.time) < SAME_CLOCK else None)
         except ParameterError as error:
             self._refused += 1
             self._refusal, self._last_refusal = error, str(error)
