@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.compensation.limiter import LONGEST_STEP
-from exo_gravity.core.compensation.tilt_input import MAX_LEAD
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.tilt import Tilt, pitch_roll
+from exo_gravity.core.trunk.tilt_input import MAX_LEAD
 
 from ..support.compensator_run import PERIOD, ROBOT, THETA, CompensatorRun, settings_with
 

@@ -16,15 +16,15 @@ import operator
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from exo_gravity.core.compensation.felt_motion import FeltMotion
 from exo_gravity.core.compensation.limiter import BREAK, EffortLimiter, Transition
 from exo_gravity.core.compensation.settings import Settings, UrdfSettings
 from exo_gravity.core.compensation.terms.terms import Terms
-from exo_gravity.core.compensation.tilt_input import Tilted
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.trunk.felt_motion import FeltMotion
+from exo_gravity.core.trunk.tilt_input import Tilted
 
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
 JOINTS = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")

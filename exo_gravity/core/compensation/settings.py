@@ -12,7 +12,7 @@ from exo_gravity.core.model.anfis import AnfisLaw
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import LAWS, NO_TORQUE, Law, Torque
 from exo_gravity.core.model.kinematics import turning_torque
-from exo_gravity.core.model.quaternion import Floats3
+from exo_gravity.core.model.rotation import Floats3
 from exo_gravity.core.model.tilt import SIDES, Tilt
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import check_owned, owned

@@ -24,8 +24,7 @@ import numpy as np
 
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import Torque
-from exo_gravity.core.model.quaternion import Floats3
-from exo_gravity.core.model.vector3 import cross, dot, plus
+from exo_gravity.core.model.rotation import Floats3, cross, dot, plus
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 
 # kg m^2 at the gear's output: 243.5 and 607 g cm^2 (published motor tables) times the gear ratio squared, AK60-6 and

@@ -19,8 +19,8 @@ from std_srvs.srv import Trigger
 
 from exo_gravity.core.compensation.compensator import Answer
 from exo_gravity.core.compensation.limiter import CommandFade, Output
-from exo_gravity.core.compensation.tilt_input import MAX_LEAD
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.trunk.tilt_input import MAX_LEAD
 from exo_gravity.nodes.ros.messages import by_name, to_nanoseconds, velocity_of
 
 TICK = 0.01  # s between two messages of a fade

@@ -7,8 +7,7 @@ from dataclasses import replace
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.tilt import rotation_matrix
-from exo_gravity.hardware.trunk.orientation_filter import VQF
-from exo_gravity.hardware.trunk.trunk_estimator import ImuSample, TrunkEstimator
+from exo_gravity.hardware.trunk_estimator import VQF, ImuSample, TrunkEstimator
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu
 from exo_gravity.sim.offline import TrunkReading
 from exo_gravity.sim.trunk_motion import TrunkState

@@ -17,8 +17,7 @@ import numpy as np
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.quaternion import Floats3
-from exo_gravity.core.model.vector3 import acceleration_of, plus
+from exo_gravity.core.model.rotation import Floats3, acceleration_of, plus
 
 WINDOW = 0.045  # s; the samples that the parabola fits, 5 at 100 Hz
 MIN_SAMPLES = 4  # that it fits at a lower rate, or after losses, if
