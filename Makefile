@@ -8,6 +8,8 @@
 # make faults       the whole fault matrix on the simulated device, 20 minutes; a table and build/faults.json
 # make mutations    deliberate defects, each of which must turn a row of the fault matrix unsafe; 7 minutes
 # make bench        the laws, the loop and the tools against peers, 12 minutes on a quiet machine; QUICK=1: part of it
+# make effort-study  how hard the simulated arm is to move, under every setting, 5 minutes; QUICK=1: part of it
+# make baselines    in place of a model: PID, cube map, learned laws, a growing ANFIS, 6 minutes; build/baselines
 # make imu-report   the trunk's inclination error on recorded motion, here and by VQF and imufusion; TRIALS=FOLDER
 # make socketcan    motor bus and nodes on vcan0; RUN=COMMAND runs the tests through COMMAND, in a virtual machine for example
 # make ros2-launch  the launch file under `ros2 launch`, where ROS 2 and a build of this package are sourced
@@ -28,8 +30,8 @@ DEMO := imu sim report
 TEST := $(DEMO) panel validate video test
 SETUP := VENV=$(VENV) .ci/setup
 
-.PHONY: demo calibrate-demo calibrate-study test lint docs faults mutations bench imu-report socketcan \
-        pythons constraints clean ros2-launch two-computers dist panel presses test-all test-long
+.PHONY: demo calibrate-demo calibrate-study test lint docs faults mutations bench effort-study baselines imu-report \
+        socketcan pythons constraints clean ros2-launch two-computers dist panel presses test-all test-long
 
 demo:
 	@$(SETUP) $(DEMO)
@@ -79,6 +81,14 @@ mutations:
 bench:
 	@$(SETUP) $(TEST)
 	$(BIN)/python -m bench $(if $(QUICK),--quick)
+
+effort-study:
+	@$(SETUP) $(TEST)
+	$(BIN)/python -m bench.effort $(if $(QUICK),--quick)
+
+baselines:
+	@$(SETUP) $(TEST)
+	$(BIN)/python -m bench.baselines
 
 imu-report:
 	@$(SETUP) imu validate

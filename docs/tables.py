@@ -23,7 +23,7 @@ from exo_gravity.core.safety.params import CAN_BRIDGE
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.core.view.arm_description import ROBOT_MODEL
 from exo_gravity.panel.params import PANEL
-from exo_gravity.sim.device_params import SIMULATOR
+from exo_gravity.sim.params import SIMULATOR
 
 DOCS = Path(__file__).parent
 POLICY = DOCS.parent / "config" / "sros2" / "policy.xml"  # a test compares it with the running nodes

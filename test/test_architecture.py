@@ -21,7 +21,6 @@ MAY_IMPORT = {
 # asks the motors before there is anything that a node could be started with.
 EXCEPTIONS = {
     "exo_gravity/tools/trials/offline.py": {"sim"},
-    "exo_gravity/tools/trials/simulated_effort.py": {"sim"},
     "exo_gravity/tools/trials/trunk_imu.py": {"sim", "hardware"},
     "exo_gravity/tools/calibration/motors.py": {"hardware"},
     "exo_gravity/tools/calibration/motor_watch.py": {"hardware"},

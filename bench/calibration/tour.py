@@ -28,8 +28,8 @@ from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.params import CAN_BRIDGE, limits_of
 from exo_gravity.sim import SimulatedDevice
-from exo_gravity.sim.device_params import SIMULATOR, device_of, imu_of
 from exo_gravity.sim.imu import SimulatedImu, measured_tilt
+from exo_gravity.sim.params import SIMULATOR, device_of, imu_of
 from exo_gravity.tools.calibration.live import LiveTour
 from exo_gravity.tools.inputs.arms import node_values
 from exo_gravity.tools.inputs.parameter_file import load

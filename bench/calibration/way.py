@@ -22,7 +22,7 @@ import yaml
 from exo_gravity.core.calibration.identification import Identified
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.model.tilt import rotation_matrix
-from exo_gravity.sim.device_params import SIMULATOR, device_of
+from exo_gravity.sim.params import SIMULATOR, device_of
 from exo_gravity.tools import calibrate
 from exo_gravity.tools.calibration import demo, gravity, motors, scale
 from exo_gravity.tools.calibration.live import LiveTour

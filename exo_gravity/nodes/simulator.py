@@ -28,10 +28,9 @@ from exo_gravity.nodes.ros.hot_path import LATCHED
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
 from exo_gravity.nodes.ros.parameters import bus_of, declare, values_after
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.sim import SimulatedImu
+from exo_gravity.sim import SimulatedImu, VirtualWearer
 from exo_gravity.sim.device import MAX_CATCH_UP
-from exo_gravity.sim.device_params import SIMULATOR, device_of, imu_of, set_faults
-from exo_gravity.sim.effort_script import ScriptedWearer
+from exo_gravity.sim.params import SIMULATOR, device_of, imu_of, set_faults
 from exo_gravity.sim.trunk_motion import TrunkState
 
 TRUNK_SPEED = 0.5  # rad/s at which the trunk moves to a new tilt
@@ -40,11 +39,9 @@ TRUNK_SPEED = 0.5  # rad/s at which the trunk moves to a new tilt
 def script_of(path: str) -> TrialScript:
     """Return the script in a YAML file. Raises ParameterError."""
     try:
-        script = TrialScript.parse(yaml.safe_load(Path(path).read_text(encoding="utf-8")))
+        return TrialScript.parse(yaml.safe_load(Path(path).read_text(encoding="utf-8")))
     except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
         raise ParameterError("trial", path, f"a readable script file ({error})") from None
-    ScriptedWearer(script)  # checks the names of its tasks
-    return script
 
 
 class Simulator(Node):
@@ -62,7 +59,7 @@ class Simulator(Node):
         self._script = script_of(values["trial"]) if values["trial"] else None
         self._delay = values["trial_delay"]
         self._trunk_target = (values["trunk.pitch"], values["trunk.roll"])
-        self._wearer: ScriptedWearer | None = None
+        self._wearer: VirtualWearer | None = None
         self._new_scripts: deque[TrialScript] = deque()  # set by a parameter, started by the device's thread
         self._published_step: int | None = None
         self._diagnostics = Diagnostics(self)
@@ -153,7 +150,7 @@ class Simulator(Node):
 
     def _start_wearer(self, script: TrialScript, delay: float) -> None:
         self._script, self._published_step = script, None
-        self._wearer = ScriptedWearer(script)
+        self._wearer = VirtualWearer(script)
         self._device.start(self._wearer, delay)
 
     def _report(self) -> None:

@@ -4,7 +4,7 @@ It knows nothing of the compensator: CAN frames and IMU samples are the only con
 
     motors = [SimulatedMotor(JointMotor(MOTORS["AK60-6"], can_id=1)), ...]     four, shoulder to elbow
     device = SimulatedDevice(SimulatedArm(ArmConfig()), motors, side="right")
-    device.start(VirtualWearer(script), delay=2.0)                           progress: device.elapsed, wearer.step
+    device.start(VirtualWearer(script), delay=2.0)     progress: wearer.step
     device.run(bus, stop.is_set)                                               real time, on any python-can bus
 
 or without a bus, as fast as possible:
@@ -21,15 +21,13 @@ what its IMU measures.
 from exo_gravity.sim.arm import STEP, ArmConfig, SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu
-from exo_gravity.sim.motor import Firmware, SimulatedMotor
-from exo_gravity.sim.v3_motor import SimulatedV3Motor, simulated_motor
-from exo_gravity.sim.virtual_wearer import Hand, VirtualWearer
+from exo_gravity.sim.motor import Firmware, SimulatedMotor, SimulatedV3Motor, simulated_motor
+from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 __all__ = [
     "STEP",
     "ArmConfig",
     "Firmware",
-    "Hand",
     "ImuConfig",
     "SimulatedArm",
     "SimulatedDevice",

@@ -4,6 +4,9 @@
 Physics catches up with the clock in steps of 1 ms before a frame is processed, so a motor always replies with the
 present state of the arm. A reply is sent 200 to 400 us after its command, as measured on AK motors. V3 boards send
 status frames on their own timer, only in `run`.
+
+udp_multicast returns every frame to its sender, unmarked; most buses do not. A reply is therefore remembered until its
+echo arrives. If many replies were sent and no echo ever arrived, the bus does not echo.
 """
 
 from __future__ import annotations
@@ -13,28 +16,104 @@ import math
 import operator
 import random
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 
 import can
 
-from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.model.gravity import NO_TORQUE, Torque
-from exo_gravity.core.motors.wire_formats.wire_format import Frame
+from exo_gravity.core.motors.wire_formats.wire_format import EXTENDED, ID_BITS, Frame
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.sim.arm import STEP, SimulatedArm
-from exo_gravity.sim.base_motion import felt_in_base
-from exo_gravity.sim.can_link import CanLink
-from exo_gravity.sim.gap_meter import GapMeter
-from exo_gravity.sim.motor import SimulatedMotor
+from exo_gravity.sim.arm import STEP, SimulatedArm, felt_in_base
+from exo_gravity.sim.motor import SimulatedMotor, SimulatedV3Motor, StatusTimer
 from exo_gravity.sim.trunk_motion import TrunkMotion, TrunkState, motion_of
 from exo_gravity.sim.truth import TruthLog
-from exo_gravity.sim.v3_motor import SimulatedV3Motor, StatusTimer
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 REPLY_DELAY = (200e-6, 400e-6)  # s
 MAX_CATCH_UP = 0.05  # s of physics simulated at once; after a longer stall the rest of the time is lost
 IDLE_PERIOD = 0.005  # s after which physics advances even without a frame
+MAX_PENDING_ECHOES = 512  # twice the number of frames that a udp_multicast socket buffers
+
+
+class GapMeter:
+    """Measures gaps in s while the motors are on; both start again when the motors are switched on.
+
+    longest_stall: between two passes of the device's loop. longest_silence: in which no command arrived.
+    """
+
+    def __init__(self) -> None:
+        self.longest_stall = 0.0
+        self.longest_silence = 0.0
+        self._powered = False
+        self._last_pass = 0.0
+        self._last_command = 0.0
+
+    def note(self, now: float, powered: bool, commanded: bool) -> None:
+        """Note one pass at `now` s: whether a motor was on before it, and whether a command arrived in it."""
+        if powered and not self._powered:
+            self.longest_stall = self.longest_silence = 0.0
+            self._last_pass = self._last_command = now
+        if powered:
+            self.longest_stall = max(self.longest_stall, now - self._last_pass)
+            self.longest_silence = max(self.longest_silence, now - self._last_command)
+        if commanded:
+            self._last_command = now
+        self._powered = powered
+        self._last_pass = now
+
+
+class CanLink:
+    """Receives commands from `bus` and sends replies to it. Raises BusError when the bus fails."""
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self._bus = bus
+        self._pending: deque[Frame] = deque()  # echoes that have not arrived
+        self._echo_seen = False
+        self._no_echo = False
+
+    def receive(self, timeout: float) -> tuple[Frame | None, float]:
+        """Return the next frame that is not an echo, or None, and its age in s.
+
+        A remote frame is returned without data.
+        """
+        try:
+            message = self._bus.recv(timeout)
+        except can.CanOperationError as error:
+            # On udp_multicast a datagram without a CAN frame raises while it is unpacked: that is not a bus failure.
+            if error.__cause__ is None or isinstance(error.__cause__, OSError):
+                raise BusError(f"receiving on {self._bus.channel_info} failed: {error}") from error
+            return None, 0.0
+        if message is None or message.is_error_frame or message.is_fd:
+            return None, 0.0
+        frame = message.arbitration_id | (EXTENDED if message.is_extended_id else 0), bytes(message.data)
+        if self._is_echo(frame):
+            return None, 0.0
+        return frame, max(0.0, time.time() - message.timestamp)
+
+    def send(self, frame: Frame) -> None:
+        """Send a reply or a status frame."""
+        if not self._no_echo:
+            self._pending.append(frame)
+            if len(self._pending) > MAX_PENDING_ECHOES:
+                self._no_echo = not self._echo_seen
+                self._pending.clear()
+        frame_id, data = frame
+        try:
+            self._bus.send(
+                can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED)
+            )
+        except can.CanError as error:
+            raise BusError(f"sending on {self._bus.channel_info} failed: {error}") from error
+
+    def _is_echo(self, frame: Frame) -> bool:
+        if frame not in self._pending:
+            return False
+        self._pending.remove(frame)
+        self._echo_seen = True
+        return True
 
 
 class SimulatedDevice:
@@ -79,12 +158,6 @@ class SimulatedDevice:
     def time(self) -> float:
         """Simulated time in s."""
         return self._steps * STEP
-
-    @property
-    def elapsed(self) -> float | None:
-        """Time in s since the wearer's script started, negative before its start; None without a wearer."""
-        trial = self._trial
-        return None if trial is None else self.time - trial[1]
 
     @property
     def powered(self) -> bool:
@@ -160,7 +233,8 @@ class SimulatedDevice:
             frame, age = link.receive(max(0.0, due - time.monotonic()))
             now = time.monotonic()
             self.gaps.note(now, self.powered, frame is not None)
-            self._catch_up(now - last)
+            self.slip += max(0.0, now - last - MAX_CATCH_UP)
+            self.advance(min(now - last, MAX_CATCH_UP))
             last = now
             if frame and (reply := self.exchange(*frame)):
                 delay = self._random.uniform(*REPLY_DELAY) - min(age, REPLY_DELAY[0])
@@ -172,10 +246,6 @@ class SimulatedDevice:
                     link.send(frame)
             if not outbox:
                 on_idle(last)
-
-    def _catch_up(self, duration: float) -> None:
-        self.slip += max(0.0, duration - MAX_CATCH_UP)
-        self.advance(min(duration, MAX_CATCH_UP))
 
     def _steady(self, duration: float) -> bool:
         """Return whether no torque changes for `duration` s, so that MuJoCo can make all of its steps at once."""

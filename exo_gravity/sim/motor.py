@@ -1,23 +1,33 @@
-"""An AK motor that answers real frames: MIT mode of V1 and V2 boards, as described in `core.motors.specs`.
+"""AK motors that answer real frames: MIT mode of V1 and V2 boards, and of V3 boards.
 
-What the firmware does (CubeMars driver manual V1.0.15; Ben Katz's drive, from which it is derived):
+What the firmware of V1 and V2 does (CubeMars driver manual V1.0.15; Ben Katz's drive, from which it is derived):
 - It replies to commands and never sends anything else.
 - Torque flows only between ENTER and EXIT. The last command survives EXIT, and the next ENTER executes it at once.
 - SET_ZERO makes the present angle zero. It gets no reply, and the motor ignores frames while it writes its memory.
 - A command stays in force until the next one: the motor has no time-out.
+
+What a V3 board does (CubeMars driver manual V3.0.0; frames in core/motors/wire_formats/mit_v3.py):
+- A command in MIT mode switches the motor on and stays in force until the next one. A current is a command too; 0 A
+  switches the motor off. Other control modes are ignored here.
+- It replies to nothing. It sends its state `status_rate` times a second, on or off.
 """
 
 from __future__ import annotations
 
+import heapq
 import math
 import random
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.bus_load import MAX_STATUS_RATE
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import ENTER, EXIT, SET_ZERO, MotorCommand, pack_reply, unpack_command
+from exo_gravity.core.motors.specs import ENTER, EXIT, SET_ZERO, MotorCommand, MotorReply, pack_reply, unpack_command
+from exo_gravity.core.motors.wire_formats import MIT_V3
 from exo_gravity.core.motors.wire_formats.mit import MASTER_ID
+from exo_gravity.core.motors.wire_formats.mit_v3 import MODE_CURRENT
+from exo_gravity.core.motors.wire_formats.wire_format import EXTENDED, Frame
 from exo_gravity.core.numbers import one_float
 from exo_gravity.core.params import owned
 
@@ -26,17 +36,16 @@ _NO_COMMAND = MotorCommand(0.0, 0.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Firmware:
-    """Differences between firmwares, except the wire ranges (`MotorSpec.with_ranges`).
-
-    reply_length: 8 bytes, or 6 without temperature and error. zero_silence: s for which the motor ignores frames after
-    SET_ZERO; users report 0.5 to 1.5. current_noise: standard deviation of one reply. status_rate: status frames per s
-    of a V3 board.
-    """
+    """Differences between firmwares, except the wire ranges (`MotorSpec.with_ranges`)."""
 
     reply_to_master: bool = owned(False, "replies carry ID 0 instead of the motor's own")
+    #: 6 without temperature and error.
     reply_length: int = owned(8, "bytes of a reply, 6 or 8", (6, 8))
+    #: s for which the motor ignores frames after SET_ZERO; users report 0.5 to 1.5.
     zero_silence: float = 1.0
+    #: Standard deviation of one reply.
     current_noise: float = owned(0.0, "noise of the torque in replies, as a share of it", (0.0, 0.5))
+    #: Status frames per s of a V3 board.
     status_rate: float = MAX_STATUS_RATE
 
     def __post_init__(self) -> None:
@@ -52,7 +61,8 @@ class SimulatedMotor:
 
     joint: the true mounting and scale of the motor, from which the controller's parameters may differ. Faults that may
     be set at any time: `unplugged` (no power: no torque, no replies, and only the zero is remembered), `temperature`
-    (degC) and `error` (a code of MOTOR_ERRORS, reported only).
+    (degC) and `error` (a code of MOTOR_ERRORS, reported only). entered: whether the motor is on, after ENTER and before
+    EXIT.
     """
 
     def __init__(self, joint: JointMotor, firmware: Firmware | None = None) -> None:
@@ -61,7 +71,7 @@ class SimulatedMotor:
         self.unplugged = False
         self.temperature = 30.0
         self.error = 0
-        self._entered = False
+        self.entered = False
         self._command, self._data = _NO_COMMAND, b""
         self._silent_until = -math.inf  # s, after SET_ZERO
         self._random = random.Random(joint.can_id)
@@ -77,19 +87,14 @@ class SimulatedMotor:
         return (self.joint.can_id,)
 
     @property
-    def entered(self) -> bool:
-        """Whether the motor is on: after ENTER, before EXIT."""
-        return self._entered
-
-    @property
     def damping(self) -> float:
         """Damping in Nm s/rad that the motor applies to the joint."""
-        return self._command.kd * self.joint.torque_scale if self._entered else 0.0
+        return self._command.kd * self.joint.torque_scale if self.entered else 0.0
 
     @property
     def steady(self) -> bool:
         """Whether the torque stays constant until the next frame, however the joint moves."""
-        return not (self.unplugged or (self._entered and (self._command.kp or self._command.kd)))
+        return not (self.unplugged or (self.entered and (self._command.kp or self._command.kd)))
 
     def receive(
         self, data: bytes, position: float, velocity: float, now: float, frame_id: int | None = None
@@ -106,9 +111,9 @@ class SimulatedMotor:
             self._silent_until = now + self.firmware.zero_silence
             return None
         if data == ENTER:
-            self._entered = True
+            self.entered = True
         elif data == EXIT:
-            self._entered = False
+            self.entered = False
         elif data != self._data:  # an arm at rest gets the same command in every cycle
             self._command, self._data = unpack_command(self.joint.spec, data), data
         return self._reply(position, velocity)
@@ -120,7 +125,7 @@ class SimulatedMotor:
         """
         if self.unplugged:
             self._forget()
-        if not self._entered:
+        if not self.entered:
             return 0.0
         joint, command = self.joint, self._command
         torque = command.torque + command.kd * (command.velocity - joint.direction * velocity)
@@ -150,7 +155,7 @@ class SimulatedMotor:
         return pack_reply(spec, can_id, *values, temperature, self.error)
 
     def _forget(self) -> None:
-        self._entered = False
+        self.entered = False
         self._command, self._data = _NO_COMMAND, b""
         self._silent_until = -math.inf
 
@@ -158,3 +163,72 @@ class SimulatedMotor:
 def clamp(value: float, limit: float) -> float:
     """Return `value` within -`limit`..`limit`."""
     return value if -limit <= value <= limit else math.copysign(limit, value)
+
+
+class SimulatedV3Motor(SimulatedMotor):
+    """One motor with a V3 board; attributes and faults like `SimulatedMotor`."""
+
+    def __init__(self, joint: JointMotor, firmware: Firmware | None = None) -> None:
+        super().__init__(joint, firmware)
+        self._current_id = EXTENDED | MODE_CURRENT << 8 | joint.can_id
+
+    @property
+    def received_ids(self) -> tuple[int, ...]:
+        """Arbitration IDs of the frames that the board obeys."""
+        return self.joint.command_id, self._current_id
+
+    def receive(
+        self, data: bytes, position: float, velocity: float, now: float, frame_id: int | None = None
+    ) -> bytes | None:
+        """Execute the frame; frame_id: by default that of a command in MIT mode. Returns None: there is no reply."""
+        if self.unplugged:
+            return None
+        if frame_id == self._current_id:
+            if len(data) == 4:
+                current = int.from_bytes(data, "big", signed=True) / 1000.0
+                self._command = MotorCommand(0.0, 0.0, 0.0, 0.0, current * self.joint.spec.torque_per_ampere)
+                self.entered = current != 0.0
+        elif len(data) == 8:
+            self._command = MIT_V3.unpack_command(self.joint.spec, data)
+            self.entered = True
+        return None
+
+    def status(self, position: float, velocity: float) -> Frame | None:
+        """Return the status frame of the joint at `position` rad and `velocity` rad/s; None without power."""
+        if self.unplugged:
+            return None
+        values = self._readings(position, velocity)
+        temperature = round(clamp(self.temperature, 127.0))
+        reply = MotorReply(self.joint.can_id, *values, temperature, self.error)
+        return MIT_V3.status_id(self.joint.can_id), MIT_V3.pack_reply(self.joint.spec, reply)
+
+
+class StatusTimer:
+    """When each V3 board among `motors` sends its next status frame, from `now` (s) on."""
+
+    def __init__(self, motors: Sequence[SimulatedMotor], now: float, rng: random.Random) -> None:
+        self._periods = {
+            joint: 1.0 / motor.firmware.status_rate
+            for joint, motor in enumerate(motors)
+            if isinstance(motor, SimulatedV3Motor)
+        }
+        self._due = [(now + rng.uniform(0.0, period), joint) for joint, period in self._periods.items()]
+        heapq.heapify(self._due)
+
+    @property
+    def next(self) -> float:
+        """The time in s of the next status frame; infinity for none."""
+        return self._due[0][0] if self._due else math.inf
+
+    def due(self, now: float) -> Iterator[int]:
+        """Yield each joint whose status frame is due at `now` (s), once; frames that were missed are not made up."""
+        while self.next <= now:
+            due, joint = self._due[0]
+            period = self._periods[joint]
+            heapq.heapreplace(self._due, (max(due, now - period) + period, joint))
+            yield joint
+
+
+def simulated_motor(joint: JointMotor, firmware: Firmware | None = None) -> SimulatedMotor:
+    """Return the motor with the board that speaks the wire format of `joint`."""
+    return (SimulatedMotor if joint.wire_format.replies else SimulatedV3Motor)(joint, firmware)

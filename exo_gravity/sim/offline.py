@@ -29,8 +29,8 @@ from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trial.recording import Recording, ScriptedStep
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim.device import SimulatedDevice
-from exo_gravity.sim.effort_script import ScriptedWearer
 from exo_gravity.sim.trunk_motion import TrunkState
+from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 START_TIMEOUT = 60.0  # s for the motors to be switched on
 GRACE = 0.5  # s from the end of the script until the arm is let down
@@ -43,12 +43,11 @@ CARRIED = (State.RAMPING_IN, State.ACTIVE)
 
 
 class TrunkReading(NamedTuple):
-    """What the `imu` node publishes, vectors (3,) in the trunk's axes.
+    """What the `imu` node publishes, vectors (3,) in the trunk's axes."""
 
-    gravity: unit vector. specific_force m/s^2, angular_velocity rad/s: as measured.
-    """
-
+    #: Unit vector.
     gravity: Sequence[float]
+    #: m/s^2 and rad/s, as measured.
     specific_force: Sequence[float]
     angular_velocity: Sequence[float]
 
@@ -65,19 +64,18 @@ class TrunkSensor(Protocol):
 
 @dataclass(frozen=True)
 class ArmSetup:
-    """One arm: `device` is the truth; motors, limits and settings are the controller's parameters.
-
-    rate: control cycles per s. tilt: pitch and roll of the trunk in rad as measured, None without an IMU. trunk: the
-    IMU of a trunk that moves, in place of `tilt`.
-    """
+    """One arm: `device` is the truth; motors, limits and settings are the controller's parameters."""
 
     name: str
     device: SimulatedDevice
     motors: Sequence[JointMotor]
     limits: Limits
     settings: Settings
+    #: Control cycles per s.
     rate: float
+    #: Pitch and roll of the trunk in rad as measured, None without an IMU.
     tilt: tuple[float, float] | None
+    #: The IMU of a trunk that moves, in place of `tilt`.
     trunk: TrunkSensor | None = None
 
 
@@ -92,7 +90,7 @@ class OfflineTrial:
         self.script = script
         self.events: list[tuple[float, str]] = []
         self.trouble = ""
-        self._wearer = ScriptedWearer(script)
+        self._wearer = VirtualWearer(script)
         self._delay = delay
         self._start = math.inf  # s, of the script
         self._carried: list[float] = []  # s, the first and the last time at which the motors carried the arm

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.model.rotation import acceleration_of
@@ -21,20 +21,23 @@ NONE: Vector = (0.0, 0.0, 0.0)
 # Control of Human Movement) of 1.75 m. The shoulder's distance from the spine is neglected.
 HIP_TO_SHOULDER: Vector = (0.0, 0.0, 0.5)  # m
 FADE = 1.0  # s in which walking starts, and stops
+SEAT_SPEED = 0.8  # m/s, of a free fall over the last 3 cm
+# s. The impact is half a period of 5 Hz, at which a seated trunk resonates (Griffin, Handbook of Human Vibration); its
+# peak is 1.3 g.
+DESCENT, IMPACT = 0.5, 0.1
 
 
 class TrunkState(NamedTuple):
-    """The trunk at one moment: its tilt in rad, rad/s and rad/s^2, and the shoulder's acceleration in m/s^2.
+    """The trunk at one moment."""
 
-    acceleration: (3,) in the trunk's axes, without gravity.
-    """
-
+    #: rad, rad/s and rad/s^2.
     pitch: float = 0.0
     roll: float = 0.0
     pitch_rate: float = 0.0
     roll_rate: float = 0.0
     pitch_acceleration: float = 0.0
     roll_acceleration: float = 0.0
+    #: Of the shoulder without gravity, (3,) m/s^2 in the trunk's axes.
     acceleration: Vector = NONE
 
     @property
@@ -50,14 +53,6 @@ class TrunkState(NamedTuple):
         return self.roll_acceleration, bow * cosine - both * sine, -bow * sine - both * cosine
 
 
-class TrunkMotion(Protocol):
-    """A motion of the trunk."""
-
-    def at(self, elapsed: float) -> TrunkState:
-        """Return the trunk's state `elapsed` s after the motion began."""
-        ...
-
-
 @dataclass(frozen=True)
 class Turn:
     """The trunk turns about the hips from one pitch and roll (rad) to another in `duration` s, with minimum jerk."""
@@ -68,7 +63,7 @@ class Turn:
 
     def at(self, elapsed: float) -> TrunkState:
         """Return the trunk's state `elapsed` s after the motion began."""
-        way, pace, change = _minimum_jerk(elapsed / self.duration)
+        way, pace, change = minimum_jerk(elapsed / self.duration)
         by = self.end[0] - self.start[0], self.end[1] - self.start[1]
         pitch_rate, roll_rate = (angle * pace / self.duration for angle in by)
         bow, lean = (angle * change / self.duration**2 for angle in by)
@@ -79,22 +74,24 @@ class Turn:
 
 @dataclass(frozen=True)
 class Walk:
-    """Walking at a comfortable speed, around the tilt at which it starts.
+    """Walking at a comfortable speed, around the tilt at which it starts; a stride is two steps.
 
-    stride: strides per s; a stride is two steps. Amplitudes in m/s^2: `vertical` and `forward` at the frequency of the
-    steps, `heel_strike` (vertical) at twice that, `lateral` at the frequency of the strides. Their RMS, 0.17, 0.10 and
-    0.10 g, are of the order measured on trunks (Menz, Lord and Fitzpatrick 2003; Kavanagh and Menz 2008). pitch_sway,
-    roll_sway: amplitudes in rad at the frequency of the steps and of the strides; the ranges, 2 and 4 degrees, are of
-    the order measured on the thorax (Crosbie et al. 1997). The thorax's rotation about the vertical is neglected.
+    The RMS of the accelerations, 0.17, 0.10 and 0.10 g, are of the order measured on trunks (Menz, Lord and Fitzpatrick
+    2003; Kavanagh and Menz 2008). The ranges of the sway, 2 and 4 degrees, are of the order measured on the thorax
+    (Crosbie et al. 1997). The thorax's rotation about the vertical is neglected.
     """
 
     start: tuple[float, float]
     duration: float
+    #: Per s.
     stride: float = 0.95
+    #: Amplitudes in m/s^2 at the frequency of the steps, for the heel strike (vertical) at twice that.
     vertical: float = 0.23 * STANDARD_GRAVITY
     heel_strike: float = 0.06 * STANDARD_GRAVITY
     forward: float = 0.14 * STANDARD_GRAVITY
+    #: Amplitude in m/s^2 at the frequency of the strides.
     lateral: float = 0.14 * STANDARD_GRAVITY
+    #: Amplitudes in rad at the frequency of the steps and of the strides.
     pitch_sway: float = math.radians(1.0)
     roll_sway: float = math.radians(2.0)
 
@@ -102,7 +99,7 @@ class Walk:
         """Return the trunk's state `elapsed` s after the motion began."""
         fade = min(FADE, self.duration / 2.0)
         direction = 1.0 if elapsed < self.duration / 2.0 else -1.0
-        share, slope, bend = _minimum_jerk(min(elapsed, self.duration - elapsed) / fade)
+        share, slope, bend = minimum_jerk(min(elapsed, self.duration - elapsed) / fade)
         envelope = share, direction * slope / fade, bend / fade**2
         strides = 2.0 * math.pi * self.stride
         phase = strides * elapsed
@@ -118,28 +115,22 @@ class Walk:
 
 @dataclass(frozen=True)
 class SitDown:
-    """Sitting down hard: the trunk gains `speed` (m/s) downwards in `descent` s and loses it in the `impact`.
-
-    Both accelerations are half sines. speed: of a free fall over the last 3 cm. impact: half a period of 5 Hz, at which
-    a seated trunk resonates (Griffin, Handbook of Human Vibration); its peak is 1.3 g.
-    """
+    """Sitting down hard: the trunk gains `SEAT_SPEED` downwards and loses it on the seat; both are half sines."""
 
     start: tuple[float, float]
-    speed: float = 0.8
-    descent: float = 0.5
-    impact: float = 0.1
 
     def at(self, elapsed: float) -> TrunkState:
         """Return the trunk's state `elapsed` s after the motion began."""
-        up = 0.0
-        if 0.0 <= elapsed < self.descent:
-            up = -self._peak(self.descent) * math.sin(math.pi * elapsed / self.descent)
-        elif self.descent <= elapsed < self.descent + self.impact:
-            up = self._peak(self.impact) * math.sin(math.pi * (elapsed - self.descent) / self.impact)
+        up, begin = 0.0, 0.0
+        for sign, duration in ((-1.0, DESCENT), (1.0, IMPACT)):
+            if begin <= elapsed < begin + duration:
+                peak = math.pi * SEAT_SPEED / (2.0 * duration)
+                up = sign * peak * math.sin(math.pi * (elapsed - begin) / duration)
+            begin += duration
         return TrunkState(*self.start, acceleration=_in_trunk((0.0, 0.0, up), *self.start))
 
-    def _peak(self, duration: float) -> float:
-        return math.pi * self.speed / (2.0 * duration)
+
+TrunkMotion = Turn | Walk | SitDown
 
 
 def motion_of(step: Step, pitch: float, roll: float) -> TrunkMotion | None:
@@ -154,7 +145,7 @@ def motion_of(step: Step, pitch: float, roll: float) -> TrunkMotion | None:
     return SitDown(here) if step.action == "sit" else None
 
 
-def _minimum_jerk(share: float) -> Vector:
+def minimum_jerk(share: float) -> Vector:
     """Return the way from 0 to 1 at a share of its duration, and its first and second derivatives by the share."""
     s = max(0.0, min(1.0, share))
     way = s**3 * (10.0 - 15.0 * s + 6.0 * s * s)

@@ -9,44 +9,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from exo_gravity.core.model.gravity import NO_TORQUE, Torque
-from exo_gravity.core.numbers import JOINT_COUNT, four_floats, one_float
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.sim.trunk_motion import minimum_jerk
+
+# The hand's compliance in Nm/rad, Nm s/rad and Nm/(rad s): of the order of a human arm's; least damping where the arm
+# is lightest.
+STIFFNESS, DAMPING, INTEGRAL = (60.0, 80.0, 60.0, 30.0), (3.0, 6.0, 5.0, 2.0), (120.0, 160.0, 150.0, 80.0)
+STRENGTH = 25.0  # Nm on any joint; an adult's arm and the robot, stretched out, need 15 to 20 Nm
+MOVING = 0.75  # share of a move's duration in which the hand moves; then it holds the arm still
 
 Path = list[tuple[float, float]]  # of each joint: position in rad, velocity in rad/s
-_MOVING = 0.75  # share of a move's duration in which the hand moves; then it holds the arm still
-
-
-@dataclass(frozen=True)
-class Hand:
-    """The hand's compliance per joint (4,), and its strength.
-
-    stiffness Nm/rad, damping Nm s/rad: of the order of a human arm's; least damping where the arm is lightest.
-    integral: Nm/(rad s). max_torque: Nm on any joint; an adult's arm and the robot, stretched out, need 15 to 20 Nm.
-    """
-
-    stiffness: Sequence[float] = (60.0, 80.0, 60.0, 30.0)
-    damping: Sequence[float] = (3.0, 6.0, 5.0, 2.0)
-    integral: Sequence[float] = (120.0, 160.0, 150.0, 80.0)
-    max_torque: float = 25.0
-
-    def __post_init__(self) -> None:
-        for name, high, unit in (("stiffness", 500.0, "Nm/rad"), ("damping", 20.0, "Nm s/rad"), ("integral", 1e3, "")):
-            object.__setattr__(self, name, tuple(four_floats(name, getattr(self, name), 0.0, high, unit).tolist()))
-        one_float("max_torque", self.max_torque, 0.0, 100.0, "Nm")
 
 
 class VirtualWearer:
-    """Performs `script` once. step: index of the current step, None before the first, len(steps) after the last."""
+    """Performs `script` once, with at most `strength` Nm on any joint.
 
-    def __init__(self, script: TrialScript, hand: Hand | None = None) -> None:
+    step: index of the current step, None before the first, len(steps) after the last.
+    """
+
+    def __init__(self, script: TrialScript, strength: float = STRENGTH) -> None:
         self.script = script
-        self.hand = hand or Hand()
+        self.strength = strength
         self.step: int | None = None
         self._elapsed = 0.0
-        self._start: Sequence[float] = (0.0,) * JOINT_COUNT
+        self._start: Sequence[float] = NO_TORQUE
         self._weight = [0.0] * JOINT_COUNT
 
     def torque(self, elapsed: float, theta: Sequence[float], velocity: Sequence[float]) -> Torque:
@@ -67,8 +56,8 @@ class VirtualWearer:
             return NO_TORQUE
         step = self.script.steps[index]
         if step.action == "move":
-            path = minimum_jerk(self._start, step.value, since, _MOVING * step.duration)
-            return self._lead(path, theta, velocity, period)
+            path = path_between(self._start, step.value, since, MOVING * step.duration)
+            return self.lead(path, theta, velocity, period)
         if step.action == "push":
             share = math.sin(math.pi * since / step.duration)
             return tuple(share * torque for torque in step.value)
@@ -82,25 +71,18 @@ class VirtualWearer:
         step = self.script.steps[index]
         return index == self.step and step.action == "hold" and since + duration <= step.duration
 
-    def _lead(self, path: Path, theta: Sequence[float], velocity: Sequence[float], period: float) -> Torque:
-        """Return the torque of a hand that leads the joints along `path`; period: s since the last call."""
-        hand, limit = self.hand, self.hand.max_torque
-        torque = []
+    def lead(self, path: Path, theta: Sequence[float], velocity: Sequence[float], period: float) -> Torque:
+        """Return the torque (4,) in Nm of a hand that leads the joints along `path`; period: s since the last call."""
+        torque, limit = [], self.strength
         for n, (position, speed) in enumerate(path):
             error = position - theta[n]
-            self._weight[n] = _clamp(self._weight[n] + hand.integral[n] * error * period, limit)
-            pull = hand.stiffness[n] * error + hand.damping[n] * (speed - velocity[n]) + self._weight[n]
-            torque.append(_clamp(pull, limit))
+            self._weight[n] = max(-limit, min(limit, self._weight[n] + INTEGRAL[n] * error * period))
+            pull = STIFFNESS[n] * error + DAMPING[n] * (speed - velocity[n]) + self._weight[n]
+            torque.append(max(-limit, min(limit, pull)))
         return tuple(torque)
 
 
-def minimum_jerk(start: Sequence[float], end: Sequence[float], since: float, duration: float) -> Path:
-    """Return position and velocity of each joint `since` s into a minimum-jerk move from `start` to `end`."""
-    s = min(1.0, since / duration)
-    way = s**3 * (10.0 - 15.0 * s + 6.0 * s * s)
-    pace = 30.0 * s * s * (1.0 - s) ** 2 / duration
-    return [(a + way * (b - a), pace * (b - a)) for a, b in zip(start, end, strict=True)]
-
-
-def _clamp(value: float, limit: float) -> float:
-    return max(-limit, min(limit, value))
+def path_between(start: Sequence[float], end: Sequence[float], since: float, duration: float) -> Path:
+    """Return where the joints are `since` s into a minimum-jerk move from `start` to `end`, (4,) rad, in `duration`."""
+    way, pace, _ = minimum_jerk(since / duration)
+    return [(a + way * (b - a), pace / duration * (b - a)) for a, b in zip(start, end, strict=True)]

@@ -48,7 +48,7 @@ def _check_output(path: Path) -> None:
 
 def _run(options: argparse.Namespace) -> None:
     """Train, save the law and print its errors."""
-    from exo_gravity.tools.anfis.data import from_gravload
+    from exo_gravity.tools.anfis.samples import from_bag, from_gravload
     from exo_gravity.tools.anfis.training import RIDGE, train_law
 
     output = Path(options.output)
@@ -56,8 +56,6 @@ def _run(options: argparse.Namespace) -> None:
     configured = configured_arm(options.params, options.side)
     functions = options.functions or (2 if options.bag else 4)
     if options.bag:
-        from exo_gravity.tools.anfis.recorded import from_bag
-
         samples, ridge = from_bag(options.bag, configured, functions), RECORDED_RIDGE
     else:
         samples, ridge = from_gravload(configured), RIDGE

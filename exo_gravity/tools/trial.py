@@ -26,11 +26,10 @@ from exo_gravity.tools.video import output
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="trial", description="Run a trial from start to report.")
     option = parser.add_argument
-    option("name", help=f"{', '.join(packaged_trials())}, effort, or a YAML file with a script")
+    option("name", help=f"{', '.join(packaged_trials())} or a YAML file with a script")
     option("--params", metavar="FILE", help="parameter file (default: the simulated right arm)")
     option("--output", metavar="DIR", default="trials", help="where to create the trial's folder (%(default)s)")
     option("--offline", action="store_true", help="on the simulated device, without ROS and faster than real time")
-    option("--quick", action="store_true", help="effort: a reach task under four settings")
     option(
         "--max-rate",
         type=non_negative,
@@ -51,13 +50,6 @@ def main(args: Sequence[str] | None = None) -> int:
             from rich.console import Console
 
             from exo_gravity.tools.trials import session
-        if options.name == "effort":
-            if clip:
-                raise ParameterError("--video", options.video, "left out: effort plays many short trials")
-            from exo_gravity.tools.reporting.trial_report import report_console
-            from exo_gravity.tools.trials import effort
-
-            return effort.run(params, Path(options.output), options.offline, options.quick, report_console())
         request = session.Session(options.name, params, Path(options.output), options.offline, options.max_rate, clip)
         return session.run(request, Console(highlight=False))
     except ExoGravityError as error:

@@ -29,25 +29,20 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     option("--side", choices=SIDES, default="right", help="which of its arms (default: right)")
     option("--output", metavar="DIR", default="validation", help="folder for CSV and figures (default: validation)")
     option("--quick", action="store_true", help=f"{QUICK_COUNT:,} random positions instead of {COUNT:,}")
-    option("--growth", action="store_true", help="also measure the ANFIS with 2 to 6 inputs (3 minutes)")
-    option("--baselines", action="store_true", help="also train and tabulate laws without a model (3 minutes)")
     return parser.parse_args(args)
 
 
 def _run(options: argparse.Namespace) -> bool:
     """Run the comparison and print it; return whether all checks held."""
+    from exo_gravity.tools.comparison import report
     from exo_gravity.tools.comparison.validation import Validation
 
     configured = configured_arm(options.params, options.side)
     output = Path(options.output)
     output.mkdir(parents=True, exist_ok=True)
     validation = Validation.of(configured, QUICK_COUNT if options.quick else COUNT)
-    print("\n".join(validation.tables()))
-    written = validation.write(output)
-    if options.growth:
-        written.append(validation.measure_growth(output))
-    if options.baselines:
-        written += validation.measure_baselines(output)
+    print("\n".join(report.tables(validation)))
+    written = report.write(validation, output)
     print()
     verdicts = list(validation.checks())
     for held, sentence in verdicts:
@@ -60,7 +55,7 @@ def main(args: Sequence[str] | None = None) -> None:
     """Entry point of the executable `validate`."""
     options = _arguments(args)
     try:
-        with extras("validate", "report,sim,validate" if options.baselines else "report,validate"):
+        with extras("validate", "report,validate"):
             held = _run(options)
     except (ExoGravityError, OSError) as error:
         print(f"validate: {error}", file=sys.stderr)

@@ -13,8 +13,7 @@ from exo_gravity.core import ArmModel
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.kinematics import LinkInertia, turning_torque
 from exo_gravity.sim import ArmConfig, SimulatedArm
-from exo_gravity.sim.arm import DEFAULT_LINKS
-from exo_gravity.sim.base_motion import rotation_in_base
+from exo_gravity.sim.arm import DEFAULT_LINKS, rotation_in_base
 from exo_gravity.tools.inputs.references import OFFSET, pinocchio_model
 
 from .test_gravity_oracles import random_arm

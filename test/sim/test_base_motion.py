@@ -10,8 +10,7 @@ import pytest
 
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.sim import ArmConfig, SimulatedArm
-from exo_gravity.sim.arm import _mjcf
-from exo_gravity.sim.base_motion import felt_in_base, in_base, rotation_in_base
+from exo_gravity.sim.arm import _mjcf, felt_in_base, in_base, rotation_in_base
 from exo_gravity.sim.trunk_motion import TrunkState
 
 from ..support.trunk import orientation

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.specs import ENTER, SET_ZERO, unpack_reply
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, VirtualWearer
+from exo_gravity.sim.device import GapMeter
 
 from ..support.simulated_device import RAISED, SPECS, command, make_device
 
@@ -74,14 +77,12 @@ def test_tilting_the_trunk_moves_the_arm():
 
 def test_the_wearer_starts_after_the_delay():
     device = make_device()
-    assert device.elapsed is None
     device.advance(1.0)
     wearer = VirtualWearer(
         TrialScript.parse({"name": "test", "steps": [{"move": list(RAISED), "over": 2.0}, {"hold": 1.0}]})
     )
     device.start(wearer, delay=0.5)
     device.advance(0.4)
-    assert device.elapsed == pytest.approx(-0.1)
     assert wearer.step is None
     device.advance(2.0)
     assert wearer.step == 0
@@ -110,3 +111,96 @@ def test_after_set_zero_a_motor_does_not_reply_for_a_while_of_simulated_time():
 def test_two_motors_with_the_same_id_are_rejected(ids):
     with pytest.raises(ParameterError, match="can_id"):
         make_device(ids=ids)
+
+
+def passes(meter, times, powered=True, commanded=True):
+    for now in times:
+        meter.note(now, powered, commanded)
+
+
+def test_a_device_that_runs_regularly_has_short_gaps():
+    meter = GapMeter()
+    passes(meter, (0.0, 0.002, 0.004, 0.006))
+    assert meter.longest_stall == pytest.approx(0.002)
+    assert meter.longest_silence == pytest.approx(0.002)
+
+
+def test_a_device_that_is_not_run_is_a_stall_and_a_silence():
+    meter = GapMeter()
+    passes(meter, (0.0, 0.002, 0.142, 0.144))
+    assert meter.longest_stall == pytest.approx(0.14)
+    assert meter.longest_silence == pytest.approx(0.14)
+
+
+def test_a_controller_that_sends_nothing_is_a_silence_but_no_stall():
+    meter = GapMeter()
+    passes(meter, (0.0, 0.002))
+    passes(meter, (0.002 * n for n in range(2, 42)), commanded=False)
+    assert meter.longest_stall == pytest.approx(0.002)
+    assert meter.longest_silence == pytest.approx(0.08)
+
+
+def test_gaps_while_the_motors_are_off_do_not_count():
+    meter = GapMeter()
+    passes(meter, (0.0, 0.3), powered=False, commanded=False)
+    passes(meter, (0.6, 0.602))
+    assert meter.longest_stall == meter.longest_silence == pytest.approx(0.002)
+
+
+def test_the_measurement_starts_again_when_the_motors_are_switched_on_again():
+    meter = GapMeter()
+    passes(meter, (0.0, 0.3))
+    passes(meter, (0.4,), powered=False)
+    assert meter.longest_stall == pytest.approx(0.3)
+    passes(meter, (0.5, 0.502))
+    assert meter.longest_stall == pytest.approx(0.002)
+
+
+@pytest.fixture
+def device():
+    return make_device()
+
+
+def perform(device, *steps):
+    device.start(VirtualWearer(TrialScript.parse({"name": "trunk", "steps": list(steps)})))
+
+
+def test_the_trunk_bows_and_stays_bowed(device):
+    device.pitch, device.roll = 0.1, -0.06
+    perform(device, {"hold": 0.5}, {"bow": 0.5, "over": 1.0}, {"hold": 0.5})
+    device.advance(0.4)
+    assert (device.pitch, device.trunk_moves) == (0.1, False)
+    device.advance(0.6)
+    assert device.trunk_moves
+    assert device.trunk.pitch == device.pitch == pytest.approx(0.3, abs=0.001)
+    assert device.trunk.pitch_rate == pytest.approx(0.4 * 1.875, rel=0.01)
+    device.advance(1.0)
+    assert (device.pitch, device.roll) == pytest.approx((0.5, -0.06), abs=1e-6)
+    assert not device.trunk_moves
+    assert device.trunk[2:] == (0.0,) * 4 + ((0.0,) * 3,)
+
+
+def test_a_walking_trunk_stays_where_it_was(device):
+    device.pitch = 0.1
+    perform(device, {"walk": 4.0}, {"hold": 1.0})
+    pitches = []
+    for _ in range(450):
+        device.advance(0.01)
+        pitches.append(device.pitch)
+    assert np.ptp(pitches) == pytest.approx(math.radians(2.0), rel=0.02)
+    assert pitches[-1] == pytest.approx(0.1, abs=1e-6)
+
+
+def test_a_new_script_ends_the_motion_of_the_old_one(device):
+    perform(device, {"walk": 10.0})
+    device.advance(2.3)
+    assert any(device.trunk.acceleration)
+    perform(device, {"hold": 1.0})
+    device.advance(0.01)
+    assert device.trunk == (device.pitch, device.roll, 0.0, 0.0, 0.0, 0.0, (0.0,) * 3)
+
+
+def test_the_arm_feels_the_shock_of_sitting_down(device):
+    perform(device, {"sit": 2.0})
+    device.advance(0.551)  # at the peak of the shock, 1.28 g
+    np.testing.assert_allclose(device.arm.model.opt.gravity, (0.0, 0.0, 2.28 * 9.80665), atol=0.1)

@@ -14,7 +14,7 @@ import pytest
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.specs import ENTER, unpack_reply
-from exo_gravity.sim import Firmware, can_link
+from exo_gravity.sim import Firmware
 from exo_gravity.sim import device as device_module
 
 from ..support.simulated_device import SPECS, command, frame, make_device
@@ -101,7 +101,7 @@ def test_an_echo_that_the_bus_marks_is_not_taken_for_a_command():
 def test_on_a_bus_without_echo_a_command_with_the_bytes_of_a_reply_is_executed():
     options = {"interface": "virtual", "channel": f"device-{next(channels)}"}
     with running(make_device(), options) as host:
-        for _ in range(can_link.MAX_PENDING_ECHOES + 5):
+        for _ in range(device_module.MAX_PENDING_ECHOES + 5):
             host.send(frame(1, command(0)))
             reply = next_reply(host)
         host.send(frame(1, bytes(reply.data)))

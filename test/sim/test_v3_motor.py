@@ -11,7 +11,7 @@ from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
 from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
 from exo_gravity.sim import Firmware, SimulatedMotor, SimulatedV3Motor, simulated_motor
-from exo_gravity.sim.v3_motor import StatusTimer
+from exo_gravity.sim.motor import StatusTimer
 
 from ..support.simulated_device import make_device
 

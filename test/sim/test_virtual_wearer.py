@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import gravity_torque
-from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.sim import STEP, ArmConfig, Hand, SimulatedArm, VirtualWearer
+from exo_gravity.sim import STEP, ArmConfig, SimulatedArm, VirtualWearer
 
 POSE = (-0.6, 0.9, 0.8, 0.7)
 PUSH = (0.5, 2.0, 1.5, 1.0)
@@ -71,8 +70,8 @@ def test_a_motion_starts_at_the_present_pose():
     assert torque == NO_TORQUE
 
 
-def test_the_hand_is_limited_to_its_max_torque():
-    arm, wearer = SimulatedArm(), VirtualWearer(SCRIPT, Hand(max_torque=1.0))
+def test_the_hand_is_limited_to_its_strength():
+    arm, wearer = SimulatedArm(), VirtualWearer(SCRIPT, strength=1.0)
     torques = simulate(arm, wearer, 0.0, 2.0)
     assert np.abs(torques).max() == 1.0
     assert np.degrees(np.abs(np.subtract(arm.positions, POSE)).max()) > 5
@@ -102,9 +101,3 @@ def test_the_wearer_reports_the_active_step():
         wearer.torque(elapsed, POSE, NO_TORQUE)
         seen.append(wearer.step)
     assert seen == [None, 0, 1, 2, 3, 4]
-
-
-def test_an_impossible_hand_is_rejected_by_name():
-    with pytest.raises(ParameterError) as caught:
-        Hand(stiffness=(60.0, 80.0, 60.0))
-    assert caught.value.name == "stiffness"

@@ -68,7 +68,7 @@ def test_zero_g_holds_the_wearers_arm_for_30_s_within_half_a_degree(tilt, pose):
 
 @pytest.mark.parametrize(("tilt", "pose"), HELD[:3])
 def test_one_g_lets_the_same_arm_sink(tilt, pose):
-    assert moved(carried(replace(CONTROLLER, mode="one_g"), pose, tilt))[1] > 10.0
+    assert moved(carried(replace(CONTROLLER, mode="one_g"), pose, tilt, seconds=10.0))[1] > 10.0
 
 
 def test_a_sweep_of_the_support_changes_the_torque_smoothly_until_it_holds_the_arm_alone():

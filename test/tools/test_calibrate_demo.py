@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from exo_gravity.sim.device_params import SIMULATOR, device_of
+from exo_gravity.sim.params import SIMULATOR, device_of
 from exo_gravity.tools.calibration import demo, gravity
 from exo_gravity.tools.calibration.live import LiveTour
 from exo_gravity.tools.inputs.arms import configured_arm, node_values

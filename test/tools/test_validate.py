@@ -14,8 +14,7 @@ from exo_gravity.core import ArmModel
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.tools import validate
 from exo_gravity.tools.anfis import training
-from exo_gravity.tools.comparison import figures, laws, validation
-from exo_gravity.tools.comparison.growth import growth, sizes
+from exo_gravity.tools.comparison import report, validation
 from exo_gravity.tools.inputs.arms import configured_arm, with_cog_at_link_ends
 from exo_gravity.tools.inputs.references import REFERENCES, gravload
 
@@ -29,8 +28,8 @@ def quick(tmp_path_factory):
     lines, parts, evaluate = [], [], validation.evaluate
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(validate, "QUICK_COUNT", 60)
-        patch.setattr(figures, "GRID", (8, 8, 3))
-        patch.setattr(training, "MAX_EVALUATIONS", 12)
+        patch.setattr(report, "FIGURE_GRID", (8, 8, 3))
+        patch.setattr(training, "MAX_EVALUATIONS", 4)
         patch.setattr(validation, "evaluate", lambda *given: parts.append(evaluate(*given)) or parts[-1])
         patch.setattr("builtins.print", lambda *parts, **_: lines.append(" ".join(map(str, parts))))
         with pytest.raises(SystemExit) as ended:
@@ -77,7 +76,7 @@ def test_a_reference_that_is_not_installed_is_named_with_what_installs_it(name, 
 
 
 def test_the_first_case_is_the_1053_positions_with_an_upright_trunk():
-    case = next(laws.cases("", configured_arm(), 10))
+    case = next(validation.cases("", configured_arm(), 10))
     assert case.theta.shape == (13 * 9 * 9, 4)
     assert len(np.unique(case.theta, axis=0)) == 1053
     assert np.all(case.axis_angle == 0) and np.all(case.theta[:, 0] == 0)
@@ -85,7 +84,7 @@ def test_the_first_case_is_the_1053_positions_with_an_upright_trunk():
 
 def test_the_random_cases_turn_joint_1_and_tilt_the_trunk_within_their_limits():
     configured = configured_arm()
-    cases = list(laws.cases("", configured, 500))[1:]
+    cases = list(validation.cases("", configured, 500))[1:]
     assert [case.limit for case in cases] == [0, 5, 10, 20, 30]
     for case in cases:
         assert np.all((case.theta >= configured.low) & (case.theta <= configured.high)) and np.ptp(case.theta[:, 0]) > 3
@@ -94,18 +93,18 @@ def test_the_random_cases_turn_joint_1_and_tilt_the_trunk_within_their_limits():
 
 
 def test_rmse_largest_error_and_share_are_those_of_a_known_error():
-    case = next(laws.cases("", configured_arm(), 10))
+    case = next(validation.cases("", configured_arm(), 10))
     expected = np.full((1053, 4), 2.0)
     given = expected + 0.1
     given[0, 2] += 1.0
-    rows = laws.compare(case, {"law": given}, "reference", expected)
+    rows = validation.compare(case, {"law": given}, "reference", expected)
     assert (rows[0].rmse, rows[0].largest, rows[0].share) == pytest.approx((0.1, 0.1, 0.05))
     assert rows[2].largest == pytest.approx(1.1)
 
 
 def test_a_joint_that_needs_no_torque_has_no_share():
-    case = next(laws.cases("", configured_arm(), 10))
-    assert math.isnan(laws.compare(case, {"law": np.ones((1053, 4))}, "", np.zeros((1053, 4)))[0].share)
+    case = next(validation.cases("", configured_arm(), 10))
+    assert math.isnan(validation.compare(case, {"law": np.ones((1053, 4))}, "", np.zeros((1053, 4)))[0].share)
 
 
 def test_the_papers_assumptions_are_cog_at_link_ends_gain_1_and_its_own_gravity():
@@ -209,16 +208,6 @@ def test_an_output_folder_that_cant_be_made_ends_with_2(tmp_path, capsys):
         validate.main(["--output", str(tmp_path / "file" / "folder")])
     assert ended.value.code == 2
     assert "file" in capsys.readouterr().err
-
-
-def test_growth_is_measured_from_2_to_6_inputs():
-    assert {inputs for _, inputs in sizes()} == {2, 3, 4, 5, 6}
-
-
-def test_the_growth_of_one_model_counts_its_rules_parameters_and_positions():
-    row = growth(configured_arm(), 2, 3)
-    assert (row.rules, row.parameters, row.positions) == (8, 8 * 4 + 2 * 3 * 2, 5**3)
-    assert row.training_time > 0 and row.inference_time > 0 and 0 < row.held_out_rmse < 1
 
 
 def test_gravload_gets_gravity_in_its_own_sign():

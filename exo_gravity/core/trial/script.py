@@ -9,7 +9,6 @@
       - {lean: 0.3, over: 3.0}                       lean to this roll of the trunk (rad, to the right)
       - {walk: 60.0}                                 walk
       - {sit: 2.0}                                   sit down hard, and wait for the rest of the time
-      - {task: reach, over: 15.0}                    perform a task of `trial effort`: the virtual wearer only
 
 A human wearer reads the steps from the screen; the simulator's virtual wearer executes them.
 """
@@ -37,13 +36,12 @@ class Step:
     """One step: an `action` and its `value`.
 
     'move': the pose (4,) in rad; 'push': the torque (4,) in Nm; 'bow', 'lean': the angle (1,) in rad; 'hold', 'walk',
-    'sit', 'task': (). name: of a 'task'.
+    'sit': ().
     """
 
     action: str
     duration: float
     value: tuple[float, ...] = ()
-    name: str = ""
 
     @classmethod
     def parse(cls, entry: Any, where: str) -> Step:
@@ -60,11 +58,9 @@ class Step:
             if keys == {action, "over"}:
                 value = four_floats(f"{where}.{action}", entry[action], -bound, bound, unit)
                 return cls(action, _over(entry, where), tuple(value.tolist()))
-        if keys == {"task", "over"}:
-            return cls("task", _over(entry, where), name=str(entry["task"]))
         expected = (
             "{move: [4 rad], over: s}, {hold: s}, {push: [4 Nm], over: s}, {bow: rad, over: s}, {lean: rad, over: s}, "
-            "{walk: s}, {sit: s} or {task: name, over: s}"
+            "{walk: s} or {sit: s}"
         )
         raise ParameterError(where, entry, expected)
 

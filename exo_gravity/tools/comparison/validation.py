@@ -1,31 +1,121 @@
-"""The paper's comparison as a whole: both sets of centres of gravity, tables, files, and the checks of the result."""
+"""The paper's comparison: every law against every reference, and the checks of the result.
+
+Each arm is compared over the 1,053 positions with an upright trunk, and over random poses whose pitch and sideways tilt
+are uniform within a limit. The paper's laws take the angle between joint 1's axis and gravity as theta_1, as in the
+compensator.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
 from exo_gravity.core.model.anfis import AnfisLaw
-from exo_gravity.core.model.gravity import gravity_torque, paper_static_torque
-from exo_gravity.tools.anfis.data import GRID, from_gravload
+from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.model.gravity import gravity_torque, paper_mobile_torque, paper_static_torque
+from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.tools.anfis.samples import GRID, from_gravload
 from exo_gravity.tools.anfis.training import Trained, train_law
-from exo_gravity.tools.comparison import growth
-from exo_gravity.tools.comparison.figures import Error, baseline_figure, tilt_figure, workspace_figure
-from exo_gravity.tools.comparison.laws import TILTS, Row, cases, compare, laws
-from exo_gravity.tools.comparison.tables import baseline_line, growth_line, law_table, paper_table, write_csv
 from exo_gravity.tools.inputs.arms import ConfiguredArm, with_cog_at_link_ends
 from exo_gravity.tools.inputs.paper import PAPER_ANFIS
 from exo_gravity.tools.inputs.references import REFERENCES
 
+TILTS = (0, 5, 10, 20, 30)  # degrees
 CHUNK = 2_000  # poses between two updates of the progress bar
 ROUNDING = 1e-12  # Nm; the exact law may differ this much from a reference
 LINK_ENDS, CONFIGURED = "at the link ends", "as configured"
+
+
+class Case(NamedTuple):
+    """Poses of an arm, each with a trunk tilt."""
+
+    #: Which centres of gravity.
+    cog: str
+    #: 'workspace' or 'random'.
+    positions: str
+    #: Of the tilt, degrees.
+    limit: int
+    arm: ArmModel
+    #: (n, 4) rad.
+    theta: np.ndarray
+    #: (n, 3), and (n,) rad: as in `core.model.tilt.Tilt`.
+    direction: np.ndarray
+    axis_angle: np.ndarray
+    beta: np.ndarray
+    phi: np.ndarray
+
+    def torques(self, anfis: AnfisLaw) -> dict[str, np.ndarray]:
+        """Return the torques (n, 4) in Nm by each law; the ANFIS also outside its training box."""
+        axis_first = np.column_stack((self.axis_angle, self.theta[:, 1:]))  # with the paper's theta_1
+        return {
+            "exact": gravity_torque(self.arm, self.theta, self.direction),
+            "EQ2-EQ5": paper_static_torque(self.arm, axis_first),
+            "EQ1m-EQ4m": paper_mobile_torque(self.arm, axis_first, self.beta, self.phi),
+            "ANFIS": self.arm.gain * np.pad(anfis.torques(self.theta[:, 1:]), ((0, 0), (1, 0))),
+        }
+
+
+@dataclass(frozen=True)
+class Row:
+    """The error in Nm of `law` against `reference` on one joint (1..4) over the `count` poses of a case."""
+
+    cog: str
+    positions: str
+    limit: int
+    count: int
+    law: str
+    reference: str
+    joint: int
+    rmse: float
+    largest: float
+    rms_torque: float
+
+    @property
+    def share(self) -> float:
+        """RMSE / RMS torque; NaN for a joint without gravity torque."""
+        return self.rmse / self.rms_torque if self.rms_torque > 1e-12 else math.nan
+
+
+def cases(cog: str, configured: ConfiguredArm, count: int) -> Iterator[Case]:
+    """Yield the 1,053 positions, then `count` random poses for each of `TILTS`."""
+    box = zip(configured.low[1:], configured.high[1:], GRID, strict=True)
+    theta = np.array(list(product((0.0,), *(np.linspace(low, high, n) for low, high, n in box))))
+    yield _case(cog, "workspace", 0, configured, theta, np.zeros((len(theta), 2)))
+    for limit in TILTS:
+        rng, bound = np.random.default_rng(limit), math.radians(limit)
+        theta = rng.uniform(configured.low, configured.high, (count, 4))
+        yield _case(cog, "random", limit, configured, theta, rng.uniform(-bound, bound, (count, 2)))
+
+
+def _case(cog: str, positions: str, limit: int, configured: ConfiguredArm, theta: np.ndarray, tilt: np.ndarray) -> Case:
+    tilts = [Tilt.of(configured.side, pitch, roll) for pitch, roll in tilt.tolist()]
+    felt = (np.array([getattr(t, name) for t in tilts]) for name in ("direction", "axis_angle", "beta", "phi"))
+    return Case(cog, positions, limit, configured.robot, theta, *felt)
+
+
+def compare(case: Case, torque: dict[str, np.ndarray], reference: str, expected: np.ndarray) -> list[Row]:
+    """Return a row per law and joint; torque: of each law (n, 4) Nm; expected: of the reference (n, 4) Nm."""
+    rows = []
+    for law, given in torque.items():
+        error = given - expected
+        figures = zip(rms(error), np.abs(error).max(axis=0), rms(expected), strict=True)
+        for joint, numbers in enumerate(figures, start=1):
+            head = case.cog, case.positions, case.limit, len(case.theta), law, reference, joint
+            rows.append(Row(*head, *map(float, numbers)))
+    return rows
+
+
+def rms(values: np.ndarray) -> np.ndarray:
+    """Return the root mean square of each column."""
+    result: np.ndarray = np.sqrt(np.mean(np.square(values), axis=0))
+    return result
 
 
 @dataclass(frozen=True)
@@ -47,7 +137,7 @@ def evaluate(cog: str, configured: ConfiguredArm, count: int) -> Part:
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(f"comparing, CoGs {cog}", total=total)
         for case in cases(cog, configured, count):
-            torque = {name: compute(case) for name, compute in laws(law).items()}
+            torque = case.torques(law)
             for name, reference in references.items():
                 expected = []
                 for start in range(0, len(case.theta), CHUNK):
@@ -60,9 +150,11 @@ def evaluate(cog: str, configured: ConfiguredArm, count: int) -> Part:
 
 @dataclass(frozen=True)
 class Validation:
-    """link_ends: with the paper's assumptions, d_n = l_n. as_configured: with the configured centres of gravity."""
+    """The comparison as a whole."""
 
+    #: With the paper's assumptions, d_n = l_n.
     link_ends: Part
+    #: With the configured centres of gravity.
     as_configured: Part
 
     @classmethod
@@ -75,13 +167,6 @@ class Validation:
     def rows(self) -> list[Row]:
         """The rows of both parts."""
         return self.link_ends.rows + self.as_configured.rows
-
-    def tables(self) -> Iterator[str]:
-        """Yield the lines of all tables."""
-        part = self.link_ends
-        yield from law_table(self.rows)
-        yield "\nThe paper's comparison (d_n = l_n, g = 9.8 m/s^2, torques in Nm, not scaled)"
-        yield from paper_table(part.rows, part.law, part.trained)
 
     def checks(self) -> Iterator[tuple[bool, str]]:
         """Yield (held, sentence) for each check."""
@@ -100,46 +185,3 @@ class Validation:
             ratios = [paper / ours for ours, paper in zip(self.link_ends.law.error[kind], PAPER_ANFIS, strict=True)]
             shares = ", ".join(f"1/{ratio:.0f}" for ratio in ratios)
             yield min(ratios) >= 1.0, f"ANFIS {where}: RMSE {shares} of the paper's, joints 2, 3, 4"
-
-    def write(self, output: Path) -> list[str]:
-        """Write the rows as CSV, and the figures; return the names of the files."""
-        arm, law = self.as_configured.configured.robot, self.as_configured.law
-        reference = REFERENCES["gravload"](arm)
-
-        def error_of(torque: Callable[[np.ndarray], np.ndarray]) -> Error:
-            return lambda theta: torque(theta) - reference(theta, np.tile((0.0, 0.0, 1.0), (len(theta), 1)))
-
-        errors = {
-            "exact": error_of(lambda theta: gravity_torque(arm, theta)),
-            "EQ2-EQ5": error_of(lambda theta: paper_static_torque(arm, theta)),
-            "ANFIS": error_of(lambda theta: arm.gain * np.pad(law.torques(theta[:, 1:]), ((0, 0), (1, 0)))),
-        }
-        write_csv(output / "laws.csv", self.rows)
-        workspace_figure(output / "workspace.png", self.as_configured.configured, errors)
-        tilt_figure(output / "tilt.png", self.rows)
-        return ["laws.csv", "workspace.png", "tilt.png"]
-
-    def measure_growth(self, output: Path) -> str:
-        """Print and write how the ANFIS grows with its inputs; return the name of the file."""
-        print(f"\nGrowth of an ANFIS for joint 3, inputs {', '.join(growth.INPUTS)}; Nm; the last rows take a minute")
-        print(growth_line())
-        rows = []
-        for functions, inputs in growth.sizes():
-            rows.append(growth.growth(self.as_configured.configured, functions, inputs))
-            print(growth_line(rows[-1]), flush=True)
-        write_csv(output / "growth.csv", rows)
-        return "growth.csv"
-
-    def measure_baselines(self, output: Path) -> list[str]:
-        """Print and write what laws without a model are worth; return the names of the files."""
-        from exo_gravity.tools.comparison.baselines import SAMPLES, baselines
-
-        print(f"\nLaws without a model of the arm, from {SAMPLES:,} torques without noise; against gravload")
-        print(baseline_line())
-        rows = []
-        for row in baselines(self.as_configured.configured):
-            rows.append(row)
-            print(baseline_line(row), flush=True)
-        write_csv(output / "baselines.csv", rows)
-        baseline_figure(output / "baselines.png", rows)
-        return ["baselines.csv", "baselines.png"]

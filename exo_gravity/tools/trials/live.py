@@ -159,8 +159,6 @@ def describe(step: Step, guided: bool) -> str:
     if step.action == "push":
         pushed = "once, briefly" if step.duration < 1.0 else f"for {step.duration:g} s, then let go"
         return f"push the arm {pushed}" if guided else "the wearer pushes the arm"
-    if step.action == "task":
-        return f"the wearer performs the task {step.name} of {step.duration:.0f} s"
     if step.action in TRUNK_ACTIONS:
         return _of_trunk(step) if guided else f"the wearer: {_of_trunk(step)}"
     return f"hands off for {step.duration:g} s"

@@ -1,6 +1,6 @@
 """trial --offline: the simulated arms of a parameter file perform a script without ROS, faster than real time.
 
-It, `simulated_effort` and `trunk_imu` are the only tools that import `sim`: without ROS they cannot start the simulator
+It and `trunk_imu` are the only tools that import `sim`: without ROS they cannot start the simulator
 as a node.
 """
 
@@ -19,9 +19,9 @@ from exo_gravity.bag.content import Bag, Event
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.trial.recording import Recording
 from exo_gravity.core.trial.script import TRUNK_ACTIONS, TrialScript
-from exo_gravity.sim.device_params import SIMULATOR, device_of, imu_of, set_faults
 from exo_gravity.sim.imu import SimulatedImu, measured_tilt
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial
+from exo_gravity.sim.params import SIMULATOR, device_of, imu_of, set_faults
 from exo_gravity.tools.inputs.arms import named, node_values, read_arm
 from exo_gravity.tools.inputs.parameter_file import Nodes, load
 from exo_gravity.tools.trials.trunk_imu import TrunkImu

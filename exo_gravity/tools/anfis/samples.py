@@ -1,11 +1,13 @@
-"""Samples for an ANFIS from a recording: the mean measured torque of each hold of a rosbag2.
+"""Samples for an ANFIS: torques of joints 2 to 4 of an upright arm, computed or recorded, in Nm at gain 1, not scaled.
 
-A measured torque lacks the part that stiction carries, so approach each pose from both sides. Torques are in Nm at
-gain 1, not scaled. Every fifth hold is held out.
+Computed: `gravload` torques at the paper's 1,053 positions, 13 x 9 x 9 over joints 2, 3, 4, checked half-way between
+them. Recorded: the mean measured torque of each hold of a rosbag2, of which every fifth is held out. A measured torque
+lacks the part that stiction carries, so approach each pose from both sides.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -22,11 +24,44 @@ from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.trial.analysis import analyse
 from exo_gravity.core.trial.recording import Recording
-from exo_gravity.tools.anfis.data import Samples
 from exo_gravity.tools.inputs.arms import ConfiguredArm
+from exo_gravity.tools.inputs.references import gravload
 
+GRID = (13, 9, 9)  # positions of joints 2, 3, 4: 1,053 as in the paper
 HELD_OUT = 5  # every fifth hold
 TILT_TOPIC, TILT_TYPE = "/imu/pitch_yaw", "geometry_msgs/msg/Vector3Stamped"
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Training and held-out samples of joints 2 to 4."""
+
+    #: (n, 3) rad in the box low..high, and (n, 3) Nm.
+    angle: np.ndarray
+    torque: np.ndarray
+    held_out_angle: np.ndarray
+    held_out_torque: np.ndarray
+    #: (3,) rad.
+    low: np.ndarray
+    high: np.ndarray
+    #: What the samples are from, in words.
+    source: str
+
+
+def from_gravload(configured: ConfiguredArm) -> Samples:
+    """Return the upright arm's torques by the Robotics Toolbox, on the grid and half-way between its positions."""
+    low, high = configured.low[1:], configured.high[1:]
+    axes = [np.linspace(a, b, count) for a, b, count in zip(low, high, GRID, strict=True)]
+    reference = gravload(replace(configured.robot, gain=np.ones(4)))
+
+    def torques(angle: np.ndarray) -> np.ndarray:
+        theta = np.column_stack((np.zeros(len(angle)), angle))
+        return reference(theta, np.tile((0.0, 0.0, 1.0), (len(theta), 1)))[:, 1:]
+
+    angle = np.array(list(product(*axes)))
+    between = np.array(list(product(*((axis[1:] + axis[:-1]) / 2 for axis in axes))))
+    source = f"gravload of the Robotics Toolbox, {len(angle)} positions"
+    return Samples(angle, torques(angle), between, torques(between), low, high, source)
 
 
 def from_bag(path: str | Path, configured: ConfiguredArm, functions: int) -> Samples:
@@ -73,7 +108,7 @@ def held(recording: Recording, tilted: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _tilted(path: str | Path, side: str, start: int) -> np.ndarray:
-    """Return the times in s at which the trunk was not upright; without an IMU it counts as upright."""
+    """Return the times in s at which the trunk was not upright; without an IMU it is taken as upright."""
     types = get_typestore(Stores.ROS2_JAZZY)
     times = []
     for batch in Storage(path).batches(lambda topic, msgtype: (topic, msgtype) == (TILT_TOPIC, TILT_TYPE)):

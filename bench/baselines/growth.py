@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from exo_gravity.core.model.anfis import Anfis
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.tools.anfis.training import train
-from exo_gravity.tools.comparison.laws import rms
+from exo_gravity.tools.comparison.validation import rms
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 
 INPUTS = ("theta_3", "theta_4", "theta_2", "theta_1", "pitch", "tilt")
@@ -31,8 +31,7 @@ EVALUATIONS = 20  # of the premises
 MANY = 2000  # consequents; beyond, one least-squares solution takes a minute, so the premises are not trained
 
 
-@dataclass(frozen=True)
-class Growth:
+class Growth(NamedTuple):
     """One model: its size, its training and inference time in s, and its RMSE in Nm."""
 
     inputs: int

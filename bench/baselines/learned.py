@@ -1,10 +1,11 @@
-"""What others use in place of a model: error, memory, time a pose, seconds to train, and what it costs the wearer.
+"""Learned laws: their error, memory, time a pose, seconds to train, and what they cost the wearer.
 
 The inputs are the four angles and the trunk's pitch and sideways tilt. Each baseline gets exact torques, without the
 friction and noise of real ones, from a training box: `SHARE` of each joint's range, and tilts up to `TILT`. It is
 judged inside that box and outside, up to the joints' limits and `FAR_TILT`.
 
-The cube map is CyberForce's: torques at the vertices of a grid, interpolated. Outside the box the nearest edge counts.
+The cube map is CyberForce's: torques at the vertices of a grid, interpolated. Outside the box it gives the
+torque at the nearest edge.
 """
 
 from __future__ import annotations
@@ -14,9 +15,8 @@ import pickle
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
@@ -30,10 +30,13 @@ from threadpoolctl import threadpool_limits
 
 from exo_gravity.core.model.gravity import LAWS, gravity_torque
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.tools.comparison.laws import Baseline, rms
-from exo_gravity.tools.inputs.arms import ConfiguredArm
+from exo_gravity.sim.params import SIMULATOR, device_of
+from exo_gravity.tools.comparison.validation import rms
+from exo_gravity.tools.inputs.arms import ConfiguredArm, node_values, read_arm
+from exo_gravity.tools.inputs.parameter_file import load, packaged_config
 from exo_gravity.tools.inputs.references import gravload
-from exo_gravity.tools.trials.simulated_effort import baseline_burden
+
+from .controllers import Burden, Feedforward, Law, burden
 
 SHARE = 0.7  # of each joint's range, in its middle
 TILT, FAR_TILT = math.radians(10.0), math.radians(30.0)
@@ -44,11 +47,30 @@ HELD_OUT = 2_000  # positions, inside and outside each
 TIMED = 200  # poses, one at a time
 INPUTS = 6
 
-Law = Callable[[Sequence[float], float], Sequence[float]]  # angles (4,) in rad, the trunk's pitch in rad -> Nm (4,)
 Model = Callable[[np.ndarray], np.ndarray]  # inputs (n, 6) in -1..1 over the training box -> (n, 4) Nm
 
 
-class Task:
+class Baseline(NamedTuple):
+    """A law inside and outside the box where others were trained; NaN where there is no such figure."""
+
+    law: str
+    #: RMSE and largest error over all joints in Nm.
+    inside_rmse: float = math.nan
+    inside_largest: float = math.nan
+    outside_rmse: float = math.nan
+    outside_largest: float = math.nan
+    #: Bytes.
+    memory: float = math.nan
+    #: s.
+    pose_time: float = math.nan
+    training_time: float = math.nan
+    #: As in `Burden`.
+    exertion: float = math.nan
+    sag: float = math.nan
+    sag_bowed: float = math.nan
+
+
+class Workspace:
     """The torques of `configured`, by inputs scaled to -1..1 over the training box.
 
     held_out: inputs (n, 6) inside and outside the box, each with the torques (n, 4) by the Robotics Toolbox.
@@ -102,21 +124,21 @@ class Task:
 
 def baselines(configured: ConfiguredArm) -> Iterator[Baseline]:
     """Train each baseline, let it carry the simulated arm, and yield its figures; those without a law first."""
-    task = Task(configured)
-    inputs = task.inside(SAMPLES, 0)
-    torque = task.torque(inputs)
+    workspace = Workspace(configured)
+    inputs = workspace.inside(SAMPLES, 0)
+    torque = workspace.torque(inputs)
     few = slice(GAUSSIAN_SAMPLES)
-    exact = task.law(task.torque)
+    exact = workspace.law(workspace.torque)
     yield _in_use("motors without torque", None, feedback=False)
     yield _in_use("joint PID", None, feedback=True)
-    judged = _judged("exact law", task, lambda: (task.torque, configured.robot))
-    yield replace(judged, pose_time=_pose_time(task.in_the_loop, inputs[:TIMED]))
+    judged = _judged("exact law", workspace, lambda: (workspace.torque, configured.robot))
+    yield judged._replace(pose_time=_pose_time(workspace.in_the_loop, inputs[:TIMED]))
     yield _in_use("exact law and PID", exact, feedback=True)
-    yield _judged("cube map", task, lambda: _cube_map(task))
+    yield _judged("cube map", workspace, lambda: _cube_map(workspace))
     with threadpool_limits(1):
-        yield _judged("neural network", task, lambda: _fitted(_network(), inputs, torque))
-        yield _judged("Gaussian process", task, lambda: _fitted(_gaussian_process(), inputs[few], torque[few]))
-        yield _judged("gradient boosting", task, lambda: _fitted(_boosting(), inputs, torque))
+        yield _judged("neural network", workspace, lambda: _fitted(_network(), inputs, torque))
+        yield _judged("Gaussian process", workspace, lambda: _fitted(_gaussian_process(), inputs[few], torque[few]))
+        yield _judged("gradient boosting", workspace, lambda: _fitted(_boosting(), inputs, torque))
 
 
 def _in_use(name: str, law: Law | None, feedback: bool) -> Baseline:
@@ -124,14 +146,14 @@ def _in_use(name: str, law: Law | None, feedback: bool) -> Baseline:
     return Baseline(name, **baseline_burden(law, feedback, 0.0)._asdict())
 
 
-def _judged(law: str, task: Task, train: Callable[[], tuple[Model, Any]]) -> Baseline:
+def _judged(law: str, workspace: Workspace, train: Callable[[], tuple[Model, Any]]) -> Baseline:
     """Return the figures of the model that `train` returns, with what must be kept of it."""
     started = time.perf_counter()
     model, kept = train()
     seconds = time.perf_counter() - started
-    pose_time = _pose_time(model, task.inside(TIMED, 3))
-    in_use = baseline_burden(task.law(model), False, pose_time)._asdict()
-    inside, outside = (model(inputs) - expected for inputs, expected in task.held_out)
+    pose_time = _pose_time(model, workspace.inside(TIMED, 3))
+    in_use = baseline_burden(workspace.law(model), False, pose_time)._asdict()
+    inside, outside = (model(inputs) - expected for inputs, expected in workspace.held_out)
     return Baseline(
         law,
         inside_rmse=float(rms(inside.ravel())),
@@ -145,6 +167,13 @@ def _judged(law: str, task: Task, train: Callable[[], tuple[Model, Any]]) -> Bas
     )
 
 
+def baseline_burden(law: Law | None, feedback: bool, pose_time: float) -> Burden:
+    """Return what a controller costs the wearer on the packaged simulator; arguments: as in `Feedforward`."""
+    nodes = load(packaged_config("sim.yaml"))
+    simulator = {**node_values(nodes, "/right/simulator", SIMULATOR), "trunk.pitch": 0.0, "trunk.roll": 0.0}
+    return burden(lambda: device_of(simulator), read_arm(nodes, "/right").motors, Feedforward(law, feedback, pose_time))
+
+
 def _pose_time(model: Model, inputs: np.ndarray) -> float:
     """Return the median time in s of one pose."""
     times = []
@@ -155,9 +184,9 @@ def _pose_time(model: Model, inputs: np.ndarray) -> float:
     return float(np.median(times))
 
 
-def _cube_map(task: Task) -> tuple[Model, Any]:
+def _cube_map(workspace: Workspace) -> tuple[Model, Any]:
     axis = np.linspace(-1.0, 1.0, VERTICES)
-    torque = task.torque(np.array(list(product(axis, repeat=INPUTS))))
+    torque = workspace.torque(np.array(list(product(axis, repeat=INPUTS))))
     table = RegularGridInterpolator((axis,) * INPUTS, torque.reshape(*(VERTICES,) * INPUTS, 4))
     return lambda inputs: table(np.clip(inputs, -1.0, 1.0)), torque
 

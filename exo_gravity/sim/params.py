@@ -13,15 +13,8 @@ from exo_gravity.core.params import Param, param_of
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.imu import ImuConfig
-from exo_gravity.sim.motor import Firmware
+from exo_gravity.sim.motor import Firmware, simulated_motor
 from exo_gravity.sim.truth import TruthLog
-from exo_gravity.sim.v3_motor import simulated_motor
-
-
-def _param(name: str, owner: type, field: str) -> Param:
-    """Return the read-only parameter `name` that a field of the dataclass `owner` owns."""
-    return replace(param_of(owner, field, fixed=True), name=name)
-
 
 # Parameters of the arm by the field of ArmConfig that owns each of them.
 ARM_FIELDS = {
@@ -37,6 +30,7 @@ ARM_FIELDS = {
     "position_min": "stop.min",
     "position_max": "stop.max",
 }
+IMU_FIELDS = ("rate", "rotation_trunk_from_imu", "delay")
 _LENGTH, _MASS, _COG = (a.tolist() for a in (DEFAULT_LINKS.length, DEFAULT_LINKS.mass, DEFAULT_LINKS.cog))
 # fmt: off
 SIMULATOR = (
@@ -49,11 +43,9 @@ SIMULATOR = (
     Param("link_length", _LENGTH, "true link lengths", (0.0, MAX_LENGTH), "m", fixed=True),
     Param("robot.mass", _MASS, "true link masses", (0.0, MAX_MASS), "kg", fixed=True),
     Param("robot.cog", _COG, "true centre of gravity from joint n", (0.0, MAX_LENGTH), "m", fixed=True),
-    *(_param(name, ArmConfig, field) for field, name in ARM_FIELDS.items()),
+    *(replace(param_of(ArmConfig, field, fixed=True), name=name) for field, name in ARM_FIELDS.items()),
     Param("imu.topic", "", "topic of the trunk's IMU; empty: this simulator has no IMU", fixed=True),
-    _param("imu.rate", ImuConfig, "rate"),
-    _param("imu.rotation_trunk_from_imu", ImuConfig, "rotation_trunk_from_imu"),
-    _param("imu.delay", ImuConfig, "delay"),
+    *(replace(param_of(ImuConfig, field, fixed=True), name=f"imu.{field}") for field in IMU_FIELDS),
     Param("trunk.pitch", 0.0, "forward tilt of the trunk, approached at 0.5 rad/s", (-3.1, 3.1), "rad"),
     Param("trunk.roll", 0.0, "tilt of the trunk to the right, approached at 0.5 rad/s", (-3.1, 3.1), "rad"),
     Param("trial", "", "script file for the virtual wearer; if set while the node runs, the wearer starts at once"),
@@ -101,5 +93,4 @@ def set_faults(device: SimulatedDevice, values: Mapping[str, Any]) -> None:
 
 def imu_of(values: Mapping[str, Any]) -> ImuConfig:
     """Return the trunk's IMU that parameter values describe. Raises ParameterError."""
-    owned = {field: values[f"imu.{field}"] for field in ("rotation_trunk_from_imu", "rate", "delay")}
-    return ImuConfig(**owned, gravity=values["gravity"])
+    return ImuConfig(**{field: values[f"imu.{field}"] for field in IMU_FIELDS}, gravity=values["gravity"])
