@@ -53,7 +53,7 @@ def settings_by_name(base: Settings, coulomb: Sequence[float], viscous: Sequence
     base: of the arm and its wearer. coulomb Nm, viscous Nm s/rad: the friction that the terms know, (4,) each.
     """
     known = Friction(coulomb=coulomb, viscous=viscous)
-    least = LinkInertia(base.robot_by_mass or base.robot).least()
+    least = LinkInertia.of(base.robot_by_mass or base.robot).least()
     soft = [min(20.0, SOFT * inertia / (4.0 * DELAY**2)) for inertia in least]  # Nm/rad
     terms = {
         "friction": TermSettings(friction=replace(known, share=0.4)),
