@@ -19,18 +19,18 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
-from exo_gravity.core.compensation.terms.coupling import JOINTS
+from exo_gravity.core.compensation.compensator import JOINTS
 
 RATE = 500.0  # Hz
-SETTLING = 1.5  # s after a change of parameters: ramp_time of the terms, and some more
+SETTLING = 1.5  # s after a change of parameters: their transition, and some more
 NONE, FAINT = [0.0] * 4, [1e-18] * 4
 OFF: dict[str, Any] = {
     "friction.share": 0.0,
     "inertia.share": 0.0,
     "damping.viscosity": NONE,
     "spring.stiffness": NONE,
-    "coupling.stiffness": 0.0,
-    "limits.stiffness": NONE,
+    "coupling.stiffness": NONE,
+    "limits.range": [-3.15, 3.15] * 4,
     "assist.max_effort": NONE,
 }
 ON: dict[str, Any] = {
@@ -38,8 +38,8 @@ ON: dict[str, Any] = {
     "inertia.share": 1e-18,
     "damping.viscosity": FAINT,
     "spring.stiffness": FAINT,
-    "coupling.stiffness": 1e-18,
-    "limits.stiffness": FAINT,
+    "coupling.stiffness": FAINT,
+    "limits.range": [-3.149, 3.149] * 4,
     "assist.max_effort": [1.0] * 4,
 }
 

@@ -2,8 +2,7 @@
 
 from math import radians
 
-from exo_gravity.core import ArmModel, Tilt, gravity_torque
-from exo_gravity.core.model.wearer import Wearer
+from exo_gravity.core import ArmModel, Tilt, Wearer, gravity_torque
 
 JOINTS = ("rotation", "abduction", "flexion", "elbow")
 POSE = [radians(angle) for angle in (0, 30, 40, 30)]

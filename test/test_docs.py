@@ -42,7 +42,7 @@ def test_the_tables_in_docs_equal_the_declarations() -> None:
 
 def test_every_table_has_its_place_in_a_document() -> None:
     places = {n for path in DOCUMENTS for n in re.findall(r"<!-- table: (\w+) -->", path.read_text(encoding="utf-8"))}
-    assert places == {*NODES, "any_arm", "faults", "topics"}
+    assert places == {*NODES, "urdf_arm", "faults", "topics"}
 
 
 @pytest.mark.parametrize(

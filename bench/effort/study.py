@@ -20,17 +20,12 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.compensation.terms.coupling import Coupling
-from exo_gravity.core.compensation.terms.damping import Damping
-from exo_gravity.core.compensation.terms.friction import Friction
-from exo_gravity.core.compensation.terms.inertia import Inertia
-from exo_gravity.core.compensation.terms.link_inertia import LinkInertia
+from exo_gravity.core.compensation.terms.friction_inertia import Friction, Inertia
 from exo_gravity.core.compensation.terms.settings import TermSettings
-from exo_gravity.core.compensation.terms.soft_limits import SoftLimits
-from exo_gravity.core.compensation.terms.spring import Spring
-from exo_gravity.core.compensation.terms.term import DELAY
+from exo_gravity.core.compensation.terms.springs import DELAY, Coupling, Damping, SoftLimits, Spring
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import gravity_torque
+from exo_gravity.core.model.kinematics import LinkInertia
 from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.sim.params import SIMULATOR, device_of
 from exo_gravity.tools.inputs.arms import ConfiguredArm, node_values, read_arm
@@ -58,7 +53,7 @@ def settings_by_name(base: Settings, coulomb: Sequence[float], viscous: Sequence
     base: of the arm and its wearer. coulomb Nm, viscous Nm s/rad: the friction that the terms know, (4,) each.
     """
     known = Friction(coulomb=coulomb, viscous=viscous)
-    least = LinkInertia(base.robot_by_mass or base.robot).least()
+    least = LinkInertia.of(base.robot_by_mass or base.robot).least()
     soft = [min(20.0, SOFT * inertia / (4.0 * DELAY**2)) for inertia in least]  # Nm/rad
     terms = {
         "friction": TermSettings(friction=replace(known, share=0.4)),
@@ -66,8 +61,8 @@ def settings_by_name(base: Settings, coulomb: Sequence[float], viscous: Sequence
         "friction and inertia": TermSettings(friction=replace(known, share=0.4), inertia=Inertia(0.7)),
         "damping": TermSettings(damping=Damping([SOFT * inertia / (2.0 * DELAY) for inertia in least])),
         "spring": TermSettings(spring=Spring(soft, MIDDLE)),
-        "coupling": TermSettings(coupling=Coupling(0.5 * min(soft), "shoulder_flexion", "elbow_flexion", 0.8)),
-        "limits": TermSettings(limits=SoftLimits(soft, lower=(-0.5, 0.3, 0.0, 0.2))),
+        "coupling": TermSettings(coupling=Coupling((0.0, 0.0, -0.4 * min(soft), 0.5 * min(soft)))),
+        "limits": TermSettings(limits=SoftLimits((-0.5, 1.5, 0.3, 1.6, 0.0, 1.6, 0.2, 2.5), soft)),
     }
     zero = replace(base, mode="zero_g", support=1.0)
     return {

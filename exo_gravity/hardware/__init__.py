@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from exo_gravity.hardware.trunk.trunk_estimator import ImuSample, TrunkEstimator
+    from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 
 __all__ = ["ImuSample", "TrunkEstimator"]
 
@@ -14,6 +14,6 @@ def __getattr__(name: str) -> Any:
     """Import the estimator on first use: the bridge and its watchdog do without it and its filter."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from exo_gravity.hardware.trunk import trunk_estimator
+    from exo_gravity.hardware import trunk_estimator
 
     return getattr(trunk_estimator, name)

@@ -23,10 +23,10 @@ from sensor_msgs.msg import JointState
 
 from exo_gravity.core.calibration.params import CALIBRATOR, tour_of
 from exo_gravity.core.calibration.tour import Measured
-from exo_gravity.core.compensation.tilt_input import TiltInput
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.safety.drive import State
+from exo_gravity.core.trunk.tilt_input import TiltInput
 from exo_gravity.nodes.ros.hot_path import NEWEST, HotPath
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, by_name
 from exo_gravity.nodes.ros.parameters import declare

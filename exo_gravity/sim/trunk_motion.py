@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.vector3 import acceleration_of
+from exo_gravity.core.model.rotation import acceleration_of
 from exo_gravity.core.trial.script import Step
 
 Vector = tuple[float, float, float]

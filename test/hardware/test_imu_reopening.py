@@ -5,7 +5,7 @@ import pytest
 
 from exo_gravity.core.errors import DeviceError, ParameterError
 from exo_gravity.hardware.imu_sources import Reopening, open_source
-from exo_gravity.hardware.imu_sources.sample_clock import SampleClock
+from exo_gravity.hardware.imu_sources.source import SampleClock
 
 from ..support.fake_imu.bus import FakeBus, FakeTime
 from ..support.fake_imu.invensense import FakeMpu6050

@@ -10,8 +10,8 @@ from vqf import VQF
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.tilt import gravity_in_trunk
+from exo_gravity.core.trunk.estimator import MAX_GAP
 from exo_gravity.hardware import ImuSample, TrunkEstimator
-from exo_gravity.hardware.trunk.trunk_estimator import MAX_GAP
 
 from ..support.handheld_imu import read_recording
 
@@ -246,7 +246,7 @@ def test_a_driver_that_reports_its_orientation_alone_is_not_frozen():
 
 
 def test_without_vqf_an_imu_must_report_its_orientation(monkeypatch):
-    monkeypatch.setattr("exo_gravity.hardware.trunk.trunk_estimator.VQF", None)
+    monkeypatch.setattr("exo_gravity.hardware.trunk_estimator.VQF", None)
     estimator = settled(report=True)
     with pytest.raises(ParameterError, match="install vqf"):
         estimator.update(GOOD)

@@ -16,38 +16,65 @@ G = 9.80665
 STILL_TIME = 3.0  # s at the start of each motion
 
 
+Trunk = Callable[[np.ndarray], np.ndarray]  # times (n,) s -> roll, pitch and yaw (n, 3) rad
+
+
 @dataclass(frozen=True)
 class Motion:
-    """Samples of an IMU in its own axes, (n, 3), and gravity's true direction there, (n, 3); times (n,) s."""
+    """Samples of an IMU in its own axes."""
 
+    #: nominal, Hz
     rate: float
+    #: (n,) s, by their stamps
     times: np.ndarray
+    #: (n, 3) rad/s
     gyroscope: np.ndarray
+    #: (n, 3) m/s^2
     accelerometer: np.ndarray
+    #: (n, 3), gravity's true direction
     gravity: np.ndarray
+    #: (n,) s, None: not known
+    arrivals: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """errors: (n,) degrees of the published tilts, NaN where none was. refusals: (n,) messages, '' for none."""
+    """What an estimator makes of the samples of a motion."""
 
+    #: (n,) degrees of the published tilts, NaN where none was
     errors: np.ndarray
+    #: (n,) messages, '' for none
     refusals: list[str]
 
 
 def bowing_and_walking(duration: float = 15.0, rate: float = 100.0) -> Motion:
     """Return a trunk that stands still, bows by 40 degrees, leans by 25 and sways, while it walks from 8 s on."""
     times = np.arange(round(duration * rate)) / rate
+    return sampled(bowing_trunk, times, 1.0 / rate, rate)
+
+
+def bowing_trunk(times: np.ndarray) -> np.ndarray:
+    """Return roll, pitch and yaw (n, 3) rad of the trunk of `bowing_and_walking`."""
     moving = np.clip(times - STILL_TIME, 0.0, None)
     roll = 0.22 * (1.0 - np.cos(1.9 * moving)) + 0.02 * np.sin(7.0 * moving)
     pitch = 0.35 * (1.0 - np.cos(1.4 * moving)) + 0.02 * np.sin(5.0 * moving)
-    yaw = 0.3 * np.sin(0.9 * moving)
-    world_from_imu = Rotation.from_euler("xyz", np.stack((roll, pitch, yaw), axis=1))
-    turns = (world_from_imu[:-1].inv() * world_from_imu[1:]).as_rotvec() * rate
+    return np.stack((roll, pitch, 0.3 * np.sin(0.9 * moving)), axis=1)
+
+
+def sampled(
+    trunk: Callable[[np.ndarray], np.ndarray], times: np.ndarray, span: float | np.ndarray, rate: float
+) -> Motion:
+    """Return the samples, taken at `times` s, of an IMU on a trunk that walks from 8 s on.
+
+    span: s before each sample over which the gyroscope averages, one or (n,).
+    """
+    span = np.broadcast_to(span, times.shape)
+    before, world_from_imu = (Rotation.from_euler("xyz", trunk(at)) for at in (times - span, times))
+    turns = (before.inv() * world_from_imu).as_rotvec() / span[:, None]
     walks = np.clip((times - 8.0) / 0.5, 0.0, 1.0)[:, None]
     steps = np.stack((0.8 * np.sin(12.6 * times), 1.0 * np.sin(6.3 * times), 2.5 * np.sin(12.6 * times + 1.0)), axis=1)
     random = np.random.default_rng(7)
-    gyroscope = np.vstack((turns[:1], turns)) + 0.005 + random.normal(0.0, 0.002, (len(times), 3))
+    gyroscope = turns + 0.005 + random.normal(0.0, 0.002, (len(times), 3))
     force = world_from_imu.inv().apply(np.array((0.0, 0.0, G)) + walks * steps)
     accelerometer = force + 0.05 + random.normal(0.0, 0.03, (len(times), 3))
     return Motion(rate, times, gyroscope, accelerometer, world_from_imu.inv().apply((0.0, 0.0, -1.0)))
@@ -58,10 +85,11 @@ def follow(motion: Motion) -> Outcome:
     estimator = TrunkEstimator((0.0, 0.0, 0.0, 1.0), motion.rate)
     answers, refusals = np.full(motion.gravity.shape, np.nan), []
     columns = (motion.times.tolist(), motion.gyroscope.tolist(), motion.accelerometer.tolist())
-    for k, sample in enumerate(zip(*columns, strict=True)):
+    arrivals = [None] * len(motion.times) if motion.arrivals is None else motion.arrivals.tolist()
+    for k, (arrival, *sample) in enumerate(zip(arrivals, *columns, strict=True)):
         refusals.append("")
         try:
-            answer = estimator.update(ImuSample(*sample))
+            answer = estimator.update(ImuSample(*sample), arrival)
         except ParameterError as error:
             refusals[-1] = str(error)
             continue
@@ -105,7 +133,7 @@ def slow_clock(share: float) -> Fault:
     def apply(motion: Motion, first: int) -> Motion:
         times = motion.times.copy()
         times[first:] = times[first] + share * (times[first:] - times[first])
-        return replace(motion, times=times)
+        return replace(motion, times=times, arrivals=motion.times)
 
     return apply
 

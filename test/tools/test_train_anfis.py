@@ -9,7 +9,7 @@ import yaml
 
 from exo_gravity.core import gravity_torque
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.anfis_law import AnfisLaw, scaled
+from exo_gravity.core.model.anfis import AnfisLaw, scaled
 from exo_gravity.tools.anfis.samples import TILT_TOPIC, TILT_TYPE, from_bag, from_gravload
 from exo_gravity.tools.anfis.training import RIDGE, Projection, train, train_law
 from exo_gravity.tools.inputs.arms import configured_arm

@@ -34,27 +34,21 @@ UNKNOWN.setflags(write=False)
 class ArmModel:
     """Lengths, centres of gravity, masses and gains of a 4-joint arm.
 
-    length: (4,) m, link lengths l_n (the a_n of Table 1).
-    cog: (4,) m, distance d_n of link n's centre of gravity from joint n along the link, 0 <= d_n <= l_n.
-    mass: (4,) kg, link masses m_n.
-    gain: (4,), the paper's c_n, which scales the torque of joint n; 0..2, 1 by default.
-    gravity: m/s^2.
-    off_axis: (W, Z, Y3, Y4) kg m, first moments across the links, see `core.model.moments`; 0 by default.
-
-    Immutable. Raises ParameterError that names the invalid value. Two derived values, in plain floats for the control
-    loop: `first_moment`, M1..M4 in kg m, is the mass of link n times d_n plus all mass beyond link n times l_n;
-    `scale` is c_n times gravity. `from_moments` makes an arm whose masses are not known: `by_moments` is then True, and
-    `cog` and `mass` are NaN.
+    Immutable. Raises ParameterError that names the invalid value. `from_moments` makes an arm whose masses are not
+    known.
     """
 
-    length: np.ndarray
-    cog: np.ndarray
-    mass: np.ndarray
-    gain: np.ndarray
-    gravity: float
-    off_axis: tuple[float, ...]
+    length: np.ndarray  #: (4,) m, link lengths l_n (the a_n of Table 1)
+    cog: np.ndarray  #: (4,) m, d_n of link n's centre of gravity from joint n along the link, 0 <= d_n <= l_n
+    mass: np.ndarray  #: (4,) kg, link masses m_n
+    gain: np.ndarray  #: (4,), the paper's c_n, which scales the torque of joint n; 0..2, 1 by default
+    gravity: float  #: m/s^2
+    off_axis: tuple[float, ...]  #: (W, Z, Y3, Y4) kg m across the links, see `core.model.moments`; 0 by default
+    #: M1..M4 in kg m: the mass of link n times d_n plus all mass beyond link n times l_n; plain floats
     first_moment: tuple[float, ...] = field(init=False, repr=False)
+    #: (4,) m/s^2, c_n times gravity; plain floats
     scale: tuple[float, ...] = field(init=False, repr=False)
+    #: whether the arm was made by `from_moments`; then `cog` and `mass` are NaN
     by_moments: bool = field(init=False, repr=False)
 
     def __init__(

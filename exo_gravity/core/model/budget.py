@@ -59,11 +59,11 @@ def motor_torques(motors: Sequence[str], torque_scale: Sequence[float]) -> tuple
 
 @dataclass(frozen=True)
 class Workspace:
-    """Joint limits (4,) in rad, and the largest trunk pitch and roll in either direction in rad (up to pi/2)."""
+    """Every pose within the joint limits at every trunk tilt up to a bound."""
 
-    position_min: Vector
-    position_max: Vector
-    max_tilt: float
+    position_min: Vector  #: (4,) rad
+    position_max: Vector  #: (4,) rad
+    max_tilt: float  #: largest trunk pitch and roll in either direction, rad (up to pi/2)
 
     def __post_init__(self) -> None:
         low = four_floats("position_min", self.position_min, -3.15, 3.15, "rad")
@@ -87,20 +87,15 @@ class Workspace:
 
 @dataclass(frozen=True)
 class JointBudget:
-    """The torque that one joint needs at a given support, and the largest support it allows.
+    """The torque that one joint needs at a given support, and the largest support it allows."""
 
-    rated, peak: Nm, of its motor. torque: Nm, the largest needed in the workspace. worst: (6,) rad, the pose and the
-    trunk's pitch and roll at which it is needed. within_rated, within_peak: shares 0..1 of the workspace in which the
-    motor stays within its rated and peak torque. support: the largest support 0..1 at which the joint stays within
-    rated torque everywhere; None if the robot alone needs more.
-    """
-
-    rated: float
-    peak: float
-    torque: float
-    worst: np.ndarray
-    within_rated: float
-    within_peak: float
+    rated: float  #: Nm, of its motor
+    peak: float  #: Nm
+    torque: float  #: Nm, the largest needed in the workspace
+    worst: np.ndarray  #: (6,) rad, the pose and the trunk's pitch and roll at which it is needed
+    within_rated: float  #: share 0..1 of the workspace in which the motor stays within its rated torque
+    within_peak: float  #: the same for peak torque
+    #: the largest support 0..1 at which the joint stays within rated torque everywhere; None: the robot needs more
     support: float | None
 
     @property
@@ -113,16 +108,11 @@ class JointBudget:
 class BudgetRequest:
     """A budget to compute; two are equal if their budgets are."""
 
-    #: the arm without a wearer
-    robot: ArmModel
-    #: mass (4,) kg and centre of gravity (4,) m of the wearer's arm on each link
-    load: tuple[tuple[float, ...], tuple[float, ...]]
-    #: share 0..1 of the wearer's arm that is carried
-    support: float
-    #: values of `BRIDGE_PARAMETERS`, (4,) each
-    bridge: tuple[tuple[Any, ...], ...]
-    #: largest trunk pitch and roll in either direction, rad
-    max_tilt: float
+    robot: ArmModel  #: the arm without a wearer
+    load: tuple[tuple[float, ...], tuple[float, ...]]  #: mass (4,) kg and centre of gravity (4,) m on each link
+    support: float  #: share 0..1 of the wearer's arm that is carried
+    bridge: tuple[tuple[Any, ...], ...]  #: values of `BRIDGE_PARAMETERS`, (4,) each
+    max_tilt: float  #: largest trunk pitch and roll in either direction, rad
 
     @classmethod
     def of(

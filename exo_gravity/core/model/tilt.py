@@ -19,20 +19,19 @@ SIDES = ("left", "right")
 
 
 class Tilt(NamedTuple):
-    """The trunk's tilt in one arm's base frame; create it with `Tilt.of` or `Tilt.of_gravity`.
+    """The trunk's tilt in one arm's base frame; create it with `Tilt.of` or `Tilt.of_gravity`."""
 
-    pitch, roll: the trunk's, in rad (REP-103). direction: (3,) unit vector of gravity in the arm's base frame.
-    axis_angle: angle between joint 1's axis and gravity in rad, 0..pi; the paper's theta_1. beta, phi: the paper's tilt
-    angles, which its mobile law adds to theta_3 and theta_2. magnitude: of gravity as the arm feels it, as a share of
-    its own; the laws multiply their torque by it.
-    """
-
+    #: the trunk's, rad (REP-103)
     pitch: float
     roll: float
+    #: (3,) unit vector of gravity in the arm's base frame
     direction: tuple[float, float, float]
+    #: angle between joint 1's axis and gravity, rad, 0..pi; the paper's theta_1
     axis_angle: float
+    #: the paper's tilt angles, rad, which its mobile law adds to theta_3 and theta_2
     beta: float
     phi: float
+    #: of gravity as the arm feels it, as a share of its own; the laws multiply their torque by it
     magnitude: float = 1.0
 
     @property
@@ -113,12 +112,3 @@ def rotation_matrix(quaternion: Vector | None, name: str = "quaternion") -> np.n
             (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
         )
     )
-
-
-def gravity_from_orientation(quaternion: Vector, rotation_trunk_from_imu: np.ndarray) -> np.ndarray:
-    """Return gravity's unit vector (3,) in the trunk's axes from an IMU's orientation.
-
-    quaternion: (x, y, z, w), world from IMU, world z up (REP-145). rotation_trunk_from_imu: (3, 3).
-    """
-    down_in_imu = -rotation_matrix(quaternion, "orientation")[2]  # the last row is the world's z axis in the IMU frame
-    return np.asarray(rotation_trunk_from_imu @ down_in_imu)

@@ -23,10 +23,10 @@ from exo_gravity.core.numbers import Vector, four_floats, one_float
 
 
 class Segment(NamedTuple):
-    """mass: share of body mass. cog: centre of gravity from the proximal joint, as a share of the segment's length."""
+    """One segment of a body."""
 
-    mass: float
-    cog: float
+    mass: float  #: share of body mass
+    cog: float  #: centre of gravity from the proximal joint, as a share of the segment's length
 
 
 SEX = ("female", "male")
@@ -44,24 +44,20 @@ TYPICAL_LENGTH = (0.28, 0.27, 0.086)
 
 
 class LinkLoad(NamedTuple):
-    """The wearer's mass on each link of the robot: mass (4,) kg; cog (4,) m from joint n along link n."""
+    """The wearer's mass on each link of the robot."""
 
-    mass: np.ndarray
-    cog: np.ndarray
+    mass: np.ndarray  #: (4,) kg
+    cog: np.ndarray  #: (4,) m from joint n along link n
 
 
 @dataclass(frozen=True)
 class Wearer:
-    """The body data that determine the weight of a wearer's arm.
+    """The body data that determine the weight of a wearer's arm. Raises ParameterError that names the invalid value."""
 
-    body_mass: kg. sex: 'female' or 'male'. table: 'de_leva' or 'winter'. segment_length: (3,) m, upper arm, forearm,
-    hand (wrist to third knuckle). Raises ParameterError that names the invalid value.
-    """
-
-    body_mass: float
-    sex: str = "male"
-    table: str = "de_leva"
-    segment_length: Sequence[float] = TYPICAL_LENGTH
+    body_mass: float  #: kg
+    sex: str = "male"  #: 'female' or 'male'
+    table: str = "de_leva"  #: or 'winter'
+    segment_length: Sequence[float] = TYPICAL_LENGTH  #: (3,) m, upper arm, forearm, hand (wrist to third knuckle)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "body_mass", one_float("body_mass", self.body_mass, 10.0, 300.0, "kg"))

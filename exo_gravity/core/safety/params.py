@@ -8,7 +8,7 @@ from typing import Any
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.bus_load import MAX_STATUS_RATE, REPLY_SHARE
 from exo_gravity.core.motors.joint_motor import MOTOR_PARAMETERS, JointMotor
-from exo_gravity.core.params import JOINT_NAMES, Param, params_of
+from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, params_of
 from exo_gravity.core.safety.limits import HOME_TOLERANCE, Limits
 
 FROZEN = 0.08  # s without a drive from the control loop while the watchdog itself runs, after which it takes over
@@ -23,8 +23,7 @@ CAN_BRIDGE = (
           fixed=True),
     *MOTOR_PARAMETERS,
     *LIMIT_PARAMETERS,
-    Param("thread_priority", 0, "SCHED_FIFO priority of the control loop's threads, whose memory is then locked "
-          "(mlockall); 0 for none", (0, 99), fixed=True, expert=True),
+    *REAL_TIME_PARAMETERS,
 )
 # fmt: on
 

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from exo_gravity.core.params import Param
+from exo_gravity.core.trunk.imu_sample import (
+    ACCELEROMETER_RANGE,
+    ACCELEROMETER_RANGES,
+    GYROSCOPE_RANGE,
+    GYROSCOPE_RANGES,
+)
 
-GYROSCOPE_RANGE, GYROSCOPE_RANGES = 34.9, (1.0, 200.0)  # rad/s; 2000 deg/s
-ACCELEROMETER_RANGE, ACCELEROMETER_RANGES = 156.9, (15.0, 4000.0)  # m/s^2; 16 g
 # fmt: off
 IMU_SOURCES = ("topic", "mpu6050", "icm20948", "lsm6dsox", "witmotion", "bno085")
 IMU = (
@@ -19,11 +23,11 @@ IMU = (
     # No rotation would be a safe default. Four zeros are not a rotation, so the node rejects them.
     Param("rotation_trunk_from_imu", [0.0] * 4, "mounting of the IMU, unit quaternion x, y, z, w; required",
           (-1.0, 1.0), fixed=True),
-    Param("rate", 100.0, "sample rate of the IMU, within 15 %", (20.0, 2000.0), "Hz", fixed=True),
+    Param("rate", 100.0, "nominal sample rate of the IMU", (20.0, 2000.0), "Hz", fixed=True),
     Param("gyroscope_range", GYROSCOPE_RANGE, "rate at which the gyroscope saturates", GYROSCOPE_RANGES, "rad/s",
           fixed=True),
     Param("accelerometer_range", ACCELEROMETER_RANGE, "acceleration at which the accelerometer saturates",
           ACCELEROMETER_RANGES, "m/s^2", fixed=True),
-    Param("timeout", 0.1, "time without IMU data that counts as an error", (0.02, 1.0), "s", fixed=True),
+    Param("timeout", 0.1, "time without IMU data that is an error", (0.02, 1.0), "s", fixed=True),
 )
 # fmt: on

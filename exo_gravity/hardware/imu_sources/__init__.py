@@ -1,4 +1,4 @@
-"""IMUs that the `imu` node reads itself, one file each; `open_source` opens the one that the parameters name."""
+"""IMUs that the `imu` node reads itself; `open_source` opens the one that the parameters name."""
 
 from __future__ import annotations
 
@@ -7,15 +7,11 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from exo_gravity.core.errors import DeviceError, ParameterError
-from exo_gravity.hardware.imu_sources.bno085 import Bno085
-from exo_gravity.hardware.imu_sources.fifo_source import FifoSource
-from exo_gravity.hardware.imu_sources.i2c import Bus, Registers, open_bus
-from exo_gravity.hardware.imu_sources.icm20948 import Icm20948
+from exo_gravity.hardware.imu_sources.i2c import Bus, FifoSource, Registers, open_bus
+from exo_gravity.hardware.imu_sources.invensense import Icm20948, Mpu6050
 from exo_gravity.hardware.imu_sources.lsm6dsox import Lsm6dsox
-from exo_gravity.hardware.imu_sources.mpu6050 import Mpu6050
-from exo_gravity.hardware.imu_sources.reopening import Reopening
-from exo_gravity.hardware.imu_sources.source import Clock, ImuSource
-from exo_gravity.hardware.imu_sources.witmotion import WitMotion
+from exo_gravity.hardware.imu_sources.serial_sensors import Bno085, WitMotion
+from exo_gravity.hardware.imu_sources.source import Clock, ImuSource, Reopening
 
 __all__ = ["ImuSource", "Reopening", "open_source"]
 

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 from exo_gravity.core.errors import DeviceError
-from exo_gravity.hardware.imu_sources.fifo_source import RADIANS_PER_DEGREE, FifoSource, acceleration_scale, axes
-from exo_gravity.hardware.imu_sources.sampled_source import Axes, Measurement
+from exo_gravity.hardware.imu_sources.i2c import FifoSource, axes
+from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Axes, Measurement, acceleration_scale
 
 FIFO_CTRL3, FIFO_CTRL4, WHO_AM_I, CTRL1_XL, CTRL2_G, CTRL3_C, CTRL5_C, CTRL9_XL = (
     0x09, 0x0A, 0x0F, 0x10, 0x11, 0x12, 0x14, 0x18,

@@ -20,7 +20,7 @@ from sensor_msgs.msg import Imu
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.rate import Rate
 from exo_gravity.core.trunk.params import IMU
-from exo_gravity.hardware.trunk.trunk_estimator import ImuSample, TrunkEstimator, TrunkOrientation
+from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator, TrunkOrientation
 from exo_gravity.nodes.imu.device import ImuDevice
 from exo_gravity.nodes.ros.hot_path import HotPath
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, milliseconds, row, to_nanoseconds
@@ -32,11 +32,12 @@ PITCH_YAW, DATA = "/imu/pitch_yaw", "/imu/data"
 # The fusion integrates every sample. A queue of depth 1 would lose samples whenever the node is delayed.
 DEPTH = 50
 WATCH_PERIOD = 0.1  # s
+SAME_CLOCK = 5.0  # s between stamp and arrival
 UNKNOWN_HEADING = math.pi**2  # rad^2, its variance
 
 
 class ImuNode(Node):
-    """The ROS shell around `hardware.trunk.trunk_estimator.TrunkEstimator`."""
+    """The ROS shell around `hardware.trunk_estimator.TrunkEstimator`."""
 
     def __init__(self) -> None:
         super().__init__("imu", automatically_declare_parameters_from_overrides=True)
@@ -85,8 +86,10 @@ class ImuNode(Node):
         if self._is_intruded(self._arrived):  # the estimator starts anew after the gap
             self._refused += 1
             return
+        sample, now = sample_of(message), self.get_clock().now().nanoseconds * 1e-9
         try:
-            orientation = self._estimator.update(sample_of(message))
+            # The stamps of a record that is played back are not this computer's: the compensator refuses their age.
+            orientation = self._estimator.update(sample, now if abs(now - sample.time) < SAME_CLOCK else None)
         except ParameterError as error:
             self._refused += 1
             self._refusal, self._last_refusal = error, str(error)

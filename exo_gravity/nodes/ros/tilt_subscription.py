@@ -12,9 +12,9 @@ from geometry_msgs.msg import Vector3Stamped
 from rclpy.node import Node
 from sensor_msgs.msg import Imu
 
-from exo_gravity.core.compensation.tilt_input import STILL
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.quaternion import unit_quaternion, up_in_body
+from exo_gravity.core.model.rotation import unit_quaternion, up_in_body
+from exo_gravity.core.trunk.tilt_input import STILL
 from exo_gravity.nodes.ros.hot_path import NEWEST
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.sole_publisher import SolePublisher
@@ -24,7 +24,7 @@ NOT_REPORTED = -1.0  # first entry of a covariance (REP-145)
 
 
 class TiltTarget(Protocol):
-    """What is told the tilt: a `core.compensation.tilt_input.TiltInput`, or a compensator."""
+    """What receives the tilt: a `core.trunk.tilt_input.TiltInput`, or a compensator."""
 
     def set_tilt(self, now: float, pitch: float, roll: float, age: float = 0.0) -> None:
         """Set pitch and roll."""
@@ -61,28 +61,30 @@ class TiltSubscription:
     def _on_data(self, message: Imu, info: dict[str, Any]) -> None:
         if message.orientation_covariance[0] == NOT_REPORTED:
             return  # another driver's raw data
-        now, age = self._received(DATA, message.header.stamp, info)
         q, w, a = message.orientation, message.angular_velocity, message.linear_acceleration
         rate = STILL if message.angular_velocity_covariance[0] == NOT_REPORTED else (w.x, w.y, w.z)
-        try:
+
+        def set_gravity(now: float, age: float) -> None:
             x, y, z = up_in_body(unit_quaternion("orientation", (q.x, q.y, q.z, q.w)))
-            with self._lock:
-                self._target.set_gravity(now, (-x, -y, -z), rate, age)
-                if self._on_motion and message.linear_acceleration_covariance[0] != NOT_REPORTED:
-                    self._on_motion(now, (a.x, a.y, a.z), rate, age)
-        except ParameterError as error:
-            self._on_refusal(DATA, error)
+            self._target.set_gravity(now, (-x, -y, -z), rate, age)
+            if self._on_motion and message.linear_acceleration_covariance[0] != NOT_REPORTED:
+                self._on_motion(now, (a.x, a.y, a.z), rate, age)
+
+        self._pass_on(DATA, message.header.stamp, info, set_gravity)
 
     def _on_pitch_yaw(self, message: Vector3Stamped, info: dict[str, Any]) -> None:
-        now, age = self._received(PITCH_YAW, message.header.stamp, info)
-        try:
-            with self._lock:
-                self._target.set_tilt(now, message.vector.y, message.vector.x, age)
-        except ParameterError as error:
-            self._on_refusal(PITCH_YAW, error)
+        pitch, roll = message.vector.y, message.vector.x
+        self._pass_on(
+            PITCH_YAW, message.header.stamp, info, lambda now, age: self._target.set_tilt(now, pitch, roll, age)
+        )
 
-    def _received(self, topic: str, stamp: Time, info: dict[str, Any]) -> tuple[float, float]:
-        """Return the present monotonic time in s, and the age of the stamp in s by the node's clock."""
+    def _pass_on(self, topic: str, stamp: Time, info: dict[str, Any], use: Callable[[float, float], None]) -> None:
+        """Call `use` with the present monotonic time in s, and the age of the stamp in s by the node's clock."""
         if self._senders[topic].is_another(info):
             self._on_intruder(topic)
-        return time.monotonic(), (self._node.get_clock().now().nanoseconds - to_nanoseconds(stamp)) * 1e-9
+        age = (self._node.get_clock().now().nanoseconds - to_nanoseconds(stamp)) * 1e-9
+        try:
+            with self._lock:
+                use(time.monotonic(), age)
+        except ParameterError as error:
+            self._on_refusal(topic, error)

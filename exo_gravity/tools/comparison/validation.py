@@ -17,7 +17,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from exo_gravity.core.model.anfis_law import AnfisLaw
+from exo_gravity.core.model.anfis import AnfisLaw
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import gravity_torque, paper_mobile_torque, paper_static_torque
 from exo_gravity.core.model.tilt import Tilt

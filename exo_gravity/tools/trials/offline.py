@@ -20,8 +20,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.tilt import rotation_matrix
 from exo_gravity.core.trial.recording import Recording
 from exo_gravity.core.trial.script import TRUNK_ACTIONS, TrialScript
-from exo_gravity.hardware.trunk.orientation_filter import VQF
-from exo_gravity.hardware.trunk.trunk_estimator import ImuSample, TrunkEstimator
+from exo_gravity.hardware.trunk_estimator import VQF, ImuSample, TrunkEstimator
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu, measured_tilt
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial, TrunkReading
 from exo_gravity.sim.params import SIMULATOR, device_of, imu_of, set_faults

@@ -1,0 +1,269 @@
+"""Samples of an inertial measurement unit (IMU) on the trunk -> gravity in the trunk's axes, and how sure that is.
+
+An orientation that the IMU reports is used as it is. Without one, a fusion of gyroscope and accelerometer is needed
+(`Fusion`). Without a magnetometer the heading drifts, on which gravity does not depend.
+
+Only a sample that no working IMU gives is refused, with the reason; the estimate goes on over it. What was not
+measured, in a gap or in saturation, makes the estimate less certain (`uncertainty`). While it may be off by more than 3
+degrees there is no output: the output never jumps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.rotation import ZERO, Floats3, Quaternion, product, rotated, unit_quaternion, up_in_body
+from exo_gravity.core.model.tilt import angle_between, pitch_roll, rotation_matrix
+from exo_gravity.core.numbers import one_float
+from exo_gravity.core.trunk.imu_checks import Agreement, ClockCheck, EqualValues, GravityCheck
+from exo_gravity.core.trunk.imu_sample import ACCELEROMETER_RANGE, GYROSCOPE_RANGE, ImuSample, Ranges, three_floats
+from exo_gravity.core.trunk.uncertainty import OVERSHOOT, SETTLE_TIME, TiltUncertainty
+
+LEAST_OFFSET = 0.005  # s of the clock that matter
+MAX_GAP = 0.1  # s between two samples, after which the estimate begins anew
+CHECK_PERIOD = 0.0095  # s between two comparisons of gyroscope and accelerometer
+REPORTED_SIGMA = math.radians(1.0)  # rad; data sheets of fused sensors state 1 to 2 degrees
+MAX_REPORTED_RATE = 15.0  # rad/s; a reported orientation that turns faster has jumped: no trunk turns so fast
+NOTHING = (0.0, 0.0, 0.0, 0.0, 0)  # sum of accelerations, s and samples since the last comparison
+MAX_JUMP = 0.01  # rad by which rounding may turn a reported orientation
+
+
+class Fusion(Protocol):
+    """Orientation from gyroscope and accelerometer; the heading is arbitrary."""
+
+    #: of the gyroscope, (3,) rad/s, which the fusion estimates and subtracts
+    bias: Floats3
+    #: rad/s, its standard deviation
+    bias_sigma: float
+
+    def restart(self) -> None:
+        """Forget the orientation, keep the bias."""
+
+    def advance(self, dt: float, rate: Floats3, last_rate: Floats3, acceleration: Floats3 | None) -> Quaternion:
+        """Return the orientation `dt` s after the last sample, world from IMU.
+
+        rate, last_rate: of this sample and the last one. acceleration: None if it is not known.
+        """
+
+
+class TrunkOrientation:
+    """The trunk's orientation by one sample."""
+
+    __slots__ = ("_down", "_imu_from_trunk", "_world_from_imu", "uncertainty")
+
+    def __init__(self, down: Floats3, world_from_imu: Quaternion, imu_from_trunk: Quaternion, sigma: float) -> None:
+        #: one standard deviation of the tilt, rad
+        self.uncertainty = sigma
+        self._down, self._world_from_imu, self._imu_from_trunk = down, world_from_imu, imu_from_trunk
+
+    @property
+    def gravity(self) -> np.ndarray:
+        """Its unit vector (3,) in the trunk's axes (x forward, y left, z up)."""
+        return np.array(self._down)
+
+    @property
+    def pitch(self) -> float:
+        """In rad (REP-103: > 0 bows forward)."""
+        return pitch_roll(self._down)[0]
+
+    @property
+    def roll(self) -> float:
+        """In rad (> 0 leans right)."""
+        return pitch_roll(self._down)[1]
+
+    @property
+    def orientation(self) -> np.ndarray:
+        """(x, y, z, w), world from trunk; its heading is arbitrary."""
+        return np.array(product(self._world_from_imu, self._imu_from_trunk))
+
+
+class TiltEstimator:
+    """Follows one IMU."""
+
+    def __init__(
+        self,
+        rotation_trunk_from_imu: Sequence[float],
+        fusion: Fusion | None,
+        rate: float = 100.0,
+        gyroscope_range: float = GYROSCOPE_RANGE,
+        accelerometer_range: float = ACCELEROMETER_RANGE,
+    ) -> None:
+        """Create an estimator for an IMU mounted at `rotation_trunk_from_imu`, (x, y, z, w), known from a calibration.
+
+        fusion: None if the IMU reports its orientation. rate: nominal sample rate in Hz. gyroscope_range rad/s,
+        accelerometer_range m/s^2: of the sensor, at which it saturates. Raises ParameterError.
+        """
+        #: (3, 3), trunk from IMU
+        self.rotation = rotation_matrix(rotation_trunk_from_imu, "rotation_trunk_from_imu")
+        self._rows = self.rotation.tolist()
+        x, y, z, w = map(float, rotation_trunk_from_imu)
+        self._imu_from_trunk = (-x, -y, -z, w)
+        self._period = 1.0 / one_float("rate", rate, 2.0 / MAX_GAP, 10_000.0, "Hz")
+        self._ranges = Ranges(gyroscope_range, accelerometer_range)
+        self._fusion = fusion
+        self._uncertainty = TiltUncertainty(self._period)
+        self._equal = EqualValues()
+        self._agreement = Agreement()
+        self._clock = ClockCheck()
+        self._is_fused: bool | None = None  # None before the first sample
+        self._time = -math.inf
+        self._why = "no sample yet"
+        self._restart(self._why)
+
+    @property
+    def gyroscope_bias(self) -> np.ndarray:
+        """The gyroscope bias that the fusion estimates and subtracts, (3,) rad/s in the IMU's axes."""
+        return np.array(self._fusion.bias if self._fusion else ZERO)
+
+    @property
+    def settling(self) -> str:
+        """Why there is no orientation yet; empty once there is."""
+        if self._is_fused and self._agreement.is_suspect:
+            return f"until gyroscope and accelerometer agree on a turn of the trunk; {self._why}"
+        return "" if self._is_settled else self._why
+
+    @property
+    def _is_settled(self) -> bool:
+        if not self._is_fused:
+            return self._age >= SETTLE_TIME
+        return self._uncertainty.is_settled and not self._agreement.is_suspect
+
+    def update(self, sample: ImuSample, arrival: float | None = None) -> TrunkOrientation | None:
+        """Process a sample; return the trunk's orientation, or None while it is not sure enough.
+
+        arrival: s, when the sample arrived, by a clock that need not agree with that of the stamps; None: not known.
+        Raises ParameterError if the sample is impossible, frozen or not later than the last one (it is then ignored),
+        or if what it measures contradicts itself or the samples before it.
+        """
+        is_fused, is_saturated = sample.orientation is None, False
+        acceleration: Floats3 | None
+        if is_fused:
+            if self._fusion is None:
+                raise ParameterError("orientation", None, "reported by the IMU, or install vqf to fuse it")
+            rate, is_saturated = self._ranges.angular_velocity(sample.angular_velocity)
+            acceleration = self._ranges.acceleration(sample.acceleration, self._last_acceleration)
+        else:
+            quaternion = unit_quaternion("orientation", sample.orientation)
+            given, force = sample.angular_velocity, sample.acceleration
+            rate = ZERO if given is None else three_floats("angular_velocity", given)
+            acceleration = None if force is None else three_floats("linear_acceleration", force)
+        time = float(sample.time)
+        dt = time - self._time
+        if not math.isfinite(time) or -MAX_GAP <= dt <= 0.0:  # far in the past: another clock, like a gap
+            raise ParameterError("stamp", time, "a finite number, later than the last stamp")
+        try:
+            self._equal.check(time, rate, acceleration, self._up if is_fused and not is_saturated else None)
+        except ParameterError as error:
+            if not self._equal.duration:  # an axis is stuck
+                self._doubt(error)
+            raise
+        if not 0.0 < dt <= MAX_GAP or is_fused is not self._is_fused:
+            self._restart(f"gap of {dt:.2f} s" if is_fused is self._is_fused else "started")
+            self._is_fused, dt, self._clock = is_fused, 0.0, ClockCheck()
+        self._time = time
+        if is_fused:
+            quaternion = self._fuse(dt, rate, acceleration, is_saturated)
+        else:
+            self._follow(dt, quaternion, acceleration)
+        if arrival is not None:
+            self._check_clock(time, arrival)
+        if not self._is_settled:
+            return None
+        assert self._up
+        (x, y, z), (p, q, r) = self._up, self._rows
+        gravity = (
+            -p[0] * x - p[1] * y - p[2] * z,
+            -q[0] * x - q[1] * y - q[2] * z,
+            -r[0] * x - r[1] * y - r[2] * z,
+        )
+        sigma = math.sqrt(self._uncertainty.variance) if is_fused else REPORTED_SIGMA
+        return TrunkOrientation(gravity, quaternion, self._imu_from_trunk, sigma)
+
+    def _fuse(self, dt: float, rate: Floats3, acceleration: Floats3 | None, is_saturated: bool) -> Quaternion:
+        """Return the orientation, world from IMU, `dt` s after the last sample; 0 for the first one."""
+        fusion, uncertainty = self._fusion, self._uncertainty
+        assert fusion
+        uncertainty.advance(dt, rate, self._last_rate or rate)
+        if self._equal.duration:
+            uncertainty.repeat(dt, self._equal.duration)
+        elif is_saturated:
+            uncertainty.lose(OVERSHOOT * self._ranges.gyroscope * dt)
+        if uncertainty.is_lost:
+            self._restart("too much rotation was not measured")
+        quaternion = fusion.advance(dt, rate, self._last_rate or rate, acceleration)
+        self._last_rate, self._last_acceleration = rate, acceleration
+        self._up = up_in_body(quaternion)
+        if acceleration:
+            self._check(dt, quaternion, acceleration)
+        contradiction = self._agreement.contradiction
+        if self._clock.offset > LEAST_OFFSET:
+            self._speed = max(math.hypot(*rate), self._speed)
+            contradiction += self._speed * self._clock.offset
+        else:
+            self._speed = 0.0
+        uncertainty.combine(fusion.bias_sigma, self._agreement.square, contradiction)
+        return quaternion
+
+    def _check(self, dt: float, quaternion: Quaternion, acceleration: Floats3) -> None:
+        """Compare gyroscope and accelerometer, whose mean since the last comparison is taken."""
+        x, y, z, span, count = self._unchecked
+        a, b, c = acceleration
+        x, y, z, span, count = x + a, y + b, z + c, span + dt, count + 1
+        if span < CHECK_PERIOD and self._agreement.is_begun:
+            self._unchecked = x, y, z, span, count
+            return
+        self._unchecked = NOTHING
+        mean = x / count, y / count, z / count
+        try:
+            self._agreement.check_turns(span, self._up, mean)
+        except ParameterError as error:
+            self._doubt(error)
+            raise
+        try:
+            self._agreement.check_mean(span, rotated(quaternion, mean))
+        except ParameterError as error:
+            self._agreement.suspect()
+            self._why = f"{error.name} must be {error.expected}"
+            raise
+
+    def _follow(self, dt: float, quaternion: Quaternion, acceleration: Floats3 | None) -> None:
+        """Follow the orientation that the IMU reports, world from IMU."""
+        self._age += dt
+        up = up_in_body(quaternion)
+        if self._up and angle_between(up, self._up) > MAX_REPORTED_RATE * max(dt, self._period) + MAX_JUMP:
+            self._restart("orientation jumped")
+        self._up = up
+        if acceleration:
+            self._gravity.update(dt, up, acceleration)
+
+    def _check_clock(self, time: float, arrival: float) -> None:
+        try:
+            self._clock.check(time, arrival)
+        except ParameterError as error:
+            self._restart(f"{error.name} must be {error.expected}")
+            raise
+
+    def _doubt(self, error: ParameterError) -> None:
+        """Begin anew, and wait for gyroscope and accelerometer to agree."""
+        self._agreement.suspect()
+        self._restart(f"{error.name} must be {error.expected}")
+
+    def _restart(self, why: str) -> None:
+        """Begin anew with the next sample, or the present one."""
+        if self._fusion:
+            self._fusion.restart()
+        self._uncertainty.restart()
+        self._agreement.restart()
+        self._gravity = GravityCheck()
+        self._why = why
+        self._age = 0.0  # s of a reported orientation
+        self._unchecked = NOTHING
+        self._speed = 0.0  # rad/s, the highest since the clock has been off
+        self._up: Floats3 | None = None  # the world's z axis in the IMU's axes, by the last sample
+        self._last_rate: Floats3 | None = None
+        self._last_acceleration: Floats3 | None = None

@@ -1,0 +1,265 @@
+"""What no working IMU does over several samples: repeat values, contradict gravity or itself, run by a wrong clock.
+
+While a person moves, the accelerometer also measures the movement. So each check against it waits until a movement
+cannot be the reason. The limits were set on the trials of docs/imu.md.
+"""
+
+from __future__ import annotations
+
+import math
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.arm import STANDARD_GRAVITY
+from exo_gravity.core.model.rotation import ZERO, Floats3
+
+FROZEN_TIME, FROZEN_SAMPLES = 0.1, 10  # s of equal samples, and at least this many
+STUCK_SAMPLES = 5
+NEAR_GRAVITY = 0.15  # share of 1 g
+TURN = math.radians(3.0)
+STUCK_TURN = 0.1  # of gravity's unit vector along an axis
+
+QUIET_TIME, QUIET = 0.15, 0.1  # s over which the acceleration must be near 1 g, by a share of 1 g
+MAX_CONTRADICTION = math.radians(20.0)
+CONTRADICTION_TIME = 0.5  # s; less than the time to settle, so that a wrong orientation is never used
+
+TURN_TIME = 1.0  # s over which the two turns are compared
+CLEAR_TURN = 0.04  # of a unit vector: 2.3 degrees
+CLEAR = 6.0  # times the deviation from 1 g, that a turn must also exceed
+UNLIKE, ALIKE = 0.6, 0.3  # share of the gyroscope's turn by which the two differ, with other axes or sign, or without
+PATIENCE = 0.06  # s of unlike turns; like ones reduce them. In good data it was up to 0.04 s
+FORGET_TIME = 2.0  # s
+AGREEMENT_TIME = 0.2  # s of like turns
+AT_REST, REST_TIME = 0.03, 3.0  # share of 1 g; s: at rest the estimate is right whatever the gyroscope measures
+
+AVERAGE_TIME, LEAST_TIME = 2.0, 0.5  # s of samples whose mean is gravity; fewer are not judged
+OFFSET = 0.04  # share of 1 g: bias and scale of an accelerometer that was never calibrated
+WALK = 0.75 / STANDARD_GRAVITY  # s: m/s, per 1 g; 0.45 m/s is needed for an IMU swung in a circle by hand
+DIRECTION_TIME = 0.3  # s for which a movement keeps its direction
+
+WINDOW, DRIFTING_WINDOWS = 0.25, 2  # s; in a row
+MAX_DRIFT, MAX_OFFSET = 0.03, 0.06  # s a second, in each of these windows; s, in all of them
+
+
+class EqualValues:
+    """Values that an IMU repeats with new stamps: all from a frozen one, one axis from a broken one.
+
+    Gyroscope and accelerometer of a MEMS IMU have noise, so their values differ from sample to sample (measured: no two
+    samples in a row were equal in 13,514). A vector of zeros is not judged: some drivers fill in zeros for what the IMU
+    does not measure. At rest coarse steps can hide the noise of one axis; so an axis is stuck only if the trunk turned
+    meanwhile: gravity by the estimate along the accelerometer's axis, or the accelerometer away from the estimate.
+    """
+
+    def __init__(self) -> None:
+        self.duration = 0.0  #: s for which whole samples have been equal
+        self._since, self._count = math.inf, 0  # of equal samples
+        self._values: tuple[float, ...] = (math.nan,) * 6  # gyroscope and accelerometer
+        self._counts = [0] * 6  # of equal values
+        self._ups = [0.0] * 6  # the estimate's vertical when the accelerometer's axis began to repeat its value
+        self._any_equal = False  # axes, by the last sample
+        self._stuck: set[int] = set()
+
+    def check(self, time: float, rate: Floats3, acceleration: Floats3 | None, up: Floats3 | None) -> None:
+        """Check the sample of `time` (s). Raises ParameterError once the IMU is frozen, or one of its axes is stuck.
+
+        up: the vertical in the IMU's axes by an estimate from the samples before; None if there is none.
+        """
+        last, values = self._values, rate + (acceleration or ZERO)
+        (a, b, c, d, e, f), (u, v, w, x, y, z) = last, values
+        self._values = values
+        if a != u and b != v and c != w and d != x and e != y and f != z and not self._any_equal:
+            self._since, self._count, self.duration = time, 1, 0.0
+            return
+        if values == last and time > self._since:
+            self._count += 1
+            self.duration = time - self._since
+            if self._count >= FROZEN_SAMPLES and self.duration >= FROZEN_TIME and any(values):
+                expected = "different from sample to sample, as noise makes them: the IMU or its driver is frozen"
+                raise ParameterError("angular_velocity and linear_acceleration", list(values), expected)
+            return
+        self._since, self._count, self.duration = time, 1, 0.0
+        if up is None or acceleration is None:
+            return
+        for axis in range(6):
+            if values[axis] != last[axis]:
+                if self._counts[axis]:
+                    self._counts[axis] = 0
+                    self._stuck.discard(axis)
+            elif self._is_stuck(axis, acceleration, up):
+                self._stuck.add(axis)
+                name, shown = ("angular_velocity", rate) if axis < 3 else ("linear_acceleration", acceleration)
+                expected = f"different from sample to sample while the trunk turns: the {'xyz'[axis % 3]} axis is stuck"
+                raise ParameterError(name, shown, expected)
+
+        self._any_equal = any(self._counts)
+
+    def _is_stuck(self, axis: int, acceleration: Floats3, up: Floats3) -> bool:
+        """Count an equal value; return whether it should have changed."""
+        if not self._counts[axis]:
+            self._ups[axis] = up[axis % 3]
+        self._counts[axis] += 1
+        if self._counts[axis] < STUCK_SAMPLES or axis in self._stuck:
+            return axis in self._stuck
+        if axis >= 3:
+            return abs(up[axis - 3] - self._ups[axis]) > STUCK_TURN
+        norm = math.hypot(*acceleration)
+        x, y, z = acceleration
+        is_near = abs(norm / STANDARD_GRAVITY - 1.0) < NEAR_GRAVITY
+        return is_near and math.dist(up, (x / norm, y / norm, z / norm)) > TURN
+
+
+class GravityCheck:
+    """A reported orientation against the accelerometer: one that the driver does not have, or upside down."""
+
+    def __init__(self) -> None:
+        self._deviation = self._contradicted = 0.0  # share of 1 g, mean over QUIET_TIME; s
+
+    def update(self, dt: float, up: Floats3, acceleration: Floats3) -> None:
+        """Raise ParameterError once `up`, the world's z axis in the IMU's axes, has been contradicted for too long."""
+        x, y, z = acceleration
+        norm = math.hypot(x, y, z)
+        now = abs(norm / STANDARD_GRAVITY - 1.0)
+        self._deviation += (now - self._deviation) * min(1.0, dt / QUIET_TIME)
+        if self._deviation < QUIET and now < QUIET:
+            contradicts = up[0] * x + up[1] * y + up[2] * z < norm * math.cos(MAX_CONTRADICTION)
+            self._contradicted = self._contradicted + dt if contradicts else 0.0
+        if self._contradicted > CONTRADICTION_TIME:
+            limit = math.degrees(MAX_CONTRADICTION)
+            expected = f"within {limit:g} degrees of the accelerometer at rest: check the IMU's axes, units and signs"
+            raise ParameterError("gravity_in_imu", [round(-component, 2) for component in up], expected)
+
+
+class Agreement:
+    """Gyroscope against accelerometer, for an IMU that reports no orientation.
+
+    Turns: gravity must have turned by both alike over the last second. The more the acceleration's length deviates from
+    1 g, the larger a turn must be to be compared.
+
+    Mean: the mean acceleration in the world must be gravity, because a velocity is bounded. Over a time T a change of
+    velocity by v shifts the mean by v / T. For a person who starts to walk v is known; for any other movement it is the
+    deviation of the acceleration from its mean times the time for which it keeps its direction.
+    """
+
+    def __init__(self) -> None:
+        self.is_suspect = False  #: whether the two must agree on a turn, or the trunk rest, before the estimate is used
+        self._agreed = 0.0  # s
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew with the next sample. Whether the two have agreed before is kept."""
+        self.contradiction = 0.0  #: rad by which the two turns differ, while they clearly do
+        self._deviation = 0.0  # of the acceleration's length from 1 g, mean over QUIET_TIME, as a share
+        self._up: Floats3 | None = None  # mean over TURN_TIME, like the next one
+        self._measured: Floats3 = ZERO
+        self._unlike = self._rest = 0.0  # s
+        self._age = 0.0  # s
+        self._mean: Floats3 = ZERO  # in 1 g
+        self.square = 0.0  #: of the deviation from the mean
+
+    @property
+    def is_begun(self) -> bool:
+        """Whether there was a sample since the restart."""
+        return self._up is not None
+
+    def suspect(self) -> None:
+        """Require that the two agree on a turn."""
+        self.is_suspect, self._agreed = True, 0.0
+
+    def check_turns(self, dt: float, up: Floats3, acceleration: Floats3) -> None:
+        """Compare the estimate, whose world z axis is `up` in the IMU's axes, with `acceleration`.
+
+        Raises ParameterError once the two have contradicted each other for longer than a movement can make them.
+        """
+        (a, b, c), (x, y, z) = up, acceleration
+        norm = math.sqrt(x * x + y * y + z * z)
+        x, y, z = x / norm, y / norm, z / norm
+        self._deviation += (abs(norm / STANDARD_GRAVITY - 1.0) - self._deviation) * min(1.0, dt / QUIET_TIME)
+        share, deviation = dt / TURN_TIME, self._deviation
+        (d, e, f), (u, v, w) = (self._up, self._measured) if self._up else (up, (x, y, z))
+        d, e, f = d + share * (a - d), e + share * (b - e), f + share * (c - f)
+        u, v, w = u + share * (x - u), v + share * (y - v), w + share * (z - w)
+        self._up, self._measured = (d, e, f), (u, v, w)
+        self._unlike -= self._unlike * dt / FORGET_TIME
+        self.contradiction = 0.0
+        a, b, c = a - d, b - e, c - f
+        size = math.sqrt(a * a + b * b + c * c)
+        if size <= CLEAR_TURN:
+            if self.is_suspect:
+                self._rest = self._rest + dt if deviation < AT_REST else 0.0
+                self.is_suspect = self._rest < REST_TIME
+            return
+        self._rest = 0.0
+        difference = math.dist((x - u, y - v, z - w), (a, b, c))
+        if size <= CLEAR * deviation:
+            return
+        if difference < ALIKE * size:
+            self._agreed += dt
+            self._unlike = max(0.0, self._unlike - 2.0 * dt)
+            self.is_suspect = self.is_suspect and self._agreed < AGREEMENT_TIME
+        elif difference > UNLIKE * size:
+            self._unlike += dt
+            self.contradiction = difference * self._unlike / PATIENCE  # a movement can look like one for 12 ms
+            if self._unlike > PATIENCE:
+                expected = "the turn that the accelerometer shows: check the gyroscope's unit, axes and signs"
+                raise ParameterError("turn by angular_velocity", [round(v, 3) for v in (a, b, c)], expected)
+
+    def check_mean(self, dt: float, acceleration_in_world: Floats3) -> None:
+        """Raise ParameterError if the mean of `acceleration_in_world` (3,) m/s^2 cannot be gravity."""
+        self._age += dt
+        span = self._age if self._age < AVERAGE_TIME else AVERAGE_TIME
+        share = dt / span if dt else 1.0
+        (u, v, w), (x, y, z) = self._mean, acceleration_in_world
+        x, y, z = x / STANDARD_GRAVITY - u, y / STANDARD_GRAVITY - v, z / STANDARD_GRAVITY - w
+        self._mean = u, v, w = u + share * x, v + share * y, w + share * z
+        self.square += share * ((1.0 - share) * (x * x + y * y + z * z) - self.square)
+        shift = math.sqrt(u * u + v * v + (w - 1.0) ** 2)
+        if shift < OFFSET or self._age < LEAST_TIME:
+            return
+        limit = OFFSET + (WALK + DIRECTION_TIME * math.sqrt(self.square)) / span
+        if shift > limit:
+            mean = [round(STANDARD_GRAVITY * component, 2) for component in (u, v, w)]
+            expected = f"within {STANDARD_GRAVITY * limit:.2f} m/s^2 of gravity upwards: check units, axes and signs"
+            raise ParameterError("mean linear_acceleration in the world", mean, expected)
+
+
+class ClockCheck:
+    """The stamps against the arrival of the samples: by a slow or fast clock every turn is too small or too large.
+
+    Timers, batches and busy computers make samples arrive late for a moment, but never before they were taken. So the
+    shortest time from stamp to arrival in each WINDOW must not grow, or fall below all before, from window to window.
+    """
+
+    def __init__(self) -> None:
+        self.offset = 0.0  #: s by which the clock may have gone wrong by the last sample
+        self._end = math.inf  # s, of the present window
+        # s from stamp to arrival: shortest in this window and in the last one, before it began to drift, and ever
+        self._shortest = self._last = self._before = self._least = math.inf
+        self._drifts = 0  # windows in a row with a drift, < 0 for a fast clock
+
+    def check(self, time: float, arrival: float) -> None:
+        """Check the stamp `time` of a sample that arrived at `arrival`, both s. Raises ParameterError."""
+        lag = arrival - time
+        if lag < self._shortest:
+            self._shortest = lag
+        if self._end == math.inf:
+            self._end, self._last, self._before = arrival + WINDOW, lag, lag
+        if arrival >= self._end:
+            self._close(MAX_DRIFT * (WINDOW + arrival - self._end))
+            self._end = arrival + WINDOW
+        self.offset = abs(lag - self._before) if lag > self._before or self._before <= self._least else 0.0
+        if abs(self._drifts) >= DRIFTING_WINDOWS and abs(self._last - self._before) > MAX_OFFSET:
+            drifted = f"{1e3 * (self._before - self._last):+.0f} ms in {WINDOW * abs(self._drifts):.1f} s"
+            expected = f"by a clock as fast as this computer's, not one that gains {drifted}"
+            raise ParameterError("stamp", round(time, 4), expected)
+
+    def _close(self, limit: float) -> None:
+        """End the window, in which a drift by more than `limit` s is one."""
+        step, least = self._shortest - self._last, min(self._least, self._last)
+        is_slow, is_fast = step > limit, step < -limit and self._last <= least
+        if is_slow or is_fast:
+            direction = 1 if is_slow else -1
+            if self._drifts * direction <= 0:
+                self._drifts, self._before = 0, self._last
+            self._drifts += direction
+        else:
+            self._drifts, self._before = 0, self._shortest
+        self._last, self._least, self._shortest = self._shortest, least, math.inf

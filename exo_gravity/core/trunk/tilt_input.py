@@ -1,0 +1,127 @@
+"""The trunk's tilt as messages bring it: checked, and extrapolated to the moment at which it is used.
+
+Each becomes gravity's direction, an angular velocity and an age. Gravity's vector (`/imu/data`) goes before pitch and
+roll (`/imu/pitch_yaw`), which are used only while no vector arrives: it comes with the angular velocity that
+extrapolates it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.rotation import ZERO, Floats3
+from exo_gravity.core.model.tilt import Tilt, angle_between, gravity_in_trunk
+from exo_gravity.core.numbers import Vector
+from exo_gravity.core.trunk.imu_sample import three_floats
+
+TILT_SPEED = 5.0  # rad/s, faster than a trunk can tilt
+TILT_JUMP = 0.1  # rad, by which two tilts may differ however close in time
+MAX_LEAD = 0.05  # s that the stamp of a tilt may be ahead of our clock: /clock comes in steps, hosts differ by ms
+MAX_LAG = 1.0  # s that it may be behind; beyond, the stamp comes from another clock
+STILL = ZERO  # rad/s
+
+
+class TiltInput:
+    """The newest tilt of the trunk, for one arm. timeout: s after which a tilt is too old; may be changed."""
+
+    def __init__(self, side: str, timeout: float) -> None:
+        self.timeout = timeout
+        self._side = side
+        self._tilt = Tilt.of(side)
+        self._angular_velocity = STILL
+        self._time = -math.inf  # s, when it was measured
+        self._arrival = -math.inf
+        self._vector_arrival = -math.inf  # of a gravity vector, accepted or not
+        self._refusal = ""  # why the newest one was refused; contains no measured value
+
+    def set_tilt(self, now: float, pitch: float, roll: float, age: float = 0.0) -> None:
+        """Set pitch and roll in rad, which arrived at `now` (s) and were measured `age` s earlier.
+
+        Ignored while gravity's vector arrives. Raises ParameterError if a trunk cannot have moved that far since the
+        last measurement, and if `age` is impossible because the clock that stamped it differs from ours.
+        """
+        if now - self._vector_arrival > self.timeout:
+            self._set(now, lambda: gravity_in_trunk(*Tilt.of(self._side, pitch, roll)[:2]), STILL, age)
+
+    def set_gravity(
+        self, now: float, gravity: Sequence[float], angular_velocity: Sequence[float] = STILL, age: float = 0.0
+    ) -> None:
+        """Set gravity's direction (3,) and the angular velocity (3,) rad/s, in the trunk's axes; else as `set_tilt`."""
+        self._vector_arrival = now
+        self._set(now, lambda: gravity, angular_velocity, age)
+
+    def at(self, now: float) -> Tilt:
+        """Return the tilt at `now`, turned on from the newest measurement, by no more than TILT_SPEED."""
+        lead = min(now - self._time, self.timeout)
+        rate = math.hypot(*self._angular_velocity)
+        if not rate or not 0.0 < lead < math.inf:
+            return self._tilt
+        lead *= min(1.0, TILT_SPEED / rate)
+        # A vector at rest in the world turns in the axes of a body by -w: g' = g x w.
+        b, a, c = self._tilt.direction  # in the arm's base frame, whose right one is mirrored
+        b, c = (b if self._side == "left" else -b), -c
+        x, y, z = self._angular_velocity
+        turned = a + lead * (b * z - c * y), b + lead * (c * x - a * z), c + lead * (a * y - b * x)
+        return Tilt.of_gravity(self._side, turned)
+
+    def age(self, now: float) -> float:
+        """Return the age of the newest tilt at `now` by its stamp, in s; infinity before the first tilt."""
+        return now - self._time
+
+    def problem(self, now: float) -> str:
+        """Return why there is no fresh tilt at `now`; '' if there is one."""
+        if now - self._time <= self.timeout:
+            return ""
+        text = f"trunk tilt older than {self.timeout * 1000:.0f} ms"
+        if self._time == -math.inf:
+            text = "no trunk tilt yet"
+        elif now - self._arrival <= self.timeout:
+            text += " by its stamp: the IMU driver lags, or its clock differs"
+        return f"{text} (the newest was refused: {self._refusal})" if self._refusal else text
+
+    def _set(self, now: float, gravity: Callable[[], Vector], angular_velocity: Sequence[float], age: float) -> None:
+        """Take a direction of gravity, or note why it is refused and raise ParameterError."""
+        try:
+            tilt = Tilt.of_gravity(self._side, gravity())
+            self._accept(now, tilt, three_floats("angular_velocity", angular_velocity), age)
+        except ParameterError as error:
+            self._refusal = f"{error.name} must be {error.expected}"
+            raise
+
+    def _accept(self, now: float, tilt: Tilt, angular_velocity: Floats3, age: float) -> None:
+        if not -MAX_LEAD <= age <= MAX_LAG:
+            expected = (
+                f"from {-MAX_LEAD:g} to {MAX_LAG:g} s: synchronise the clocks of the IMU driver and this computer"
+            )
+            raise ParameterError("age of the trunk tilt by its stamp", round(age, 3), expected)
+        measured = now - max(0.0, age)
+        # Directions are compared, which are continuous where pitch and roll flip, in a bow through 90 degrees.
+        reach = TILT_JUMP + TILT_SPEED * max(0.0, measured - self._time)
+        if angle_between(tilt.direction, self._tilt.direction) > reach:
+            expected = f"within {TILT_JUMP:g} rad plus {TILT_SPEED:g} rad/s of the last tilt"
+            raise ParameterError("trunk tilt", [tilt.pitch, tilt.roll], expected)
+        self._tilt, self._angular_velocity = tilt, angular_velocity
+        self._time, self._arrival, self._refusal = measured, now, ""
+
+
+class Tilted:
+    """What the controls of all arms share: the tilt of the trunk, or of the root link of another arm."""
+
+    def __init__(self, side: str, timeout: float) -> None:
+        self._tilt = TiltInput(side, timeout)
+
+    def set_tilt(self, now: float, pitch: float, roll: float, age: float = 0.0) -> None:
+        """Set pitch and roll; see `TiltInput.set_tilt`."""
+        self._tilt.set_tilt(now, pitch, roll, age)
+
+    def set_gravity(
+        self, now: float, gravity: Sequence[float], angular_velocity: Sequence[float] = STILL, age: float = 0.0
+    ) -> None:
+        """Set gravity's direction; see `TiltInput.set_gravity`."""
+        self._tilt.set_gravity(now, gravity, angular_velocity, age)
+
+    def tilt_age(self, now: float) -> float:
+        """Return the age of the newest tilt in s."""
+        return self._tilt.age(now)

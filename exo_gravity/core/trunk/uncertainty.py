@@ -1,0 +1,110 @@
+"""How far the estimated tilt may be off: a small model, in which each thing that was not measured has its term.
+
+One standard deviation of the tilt is the root of the sum of the squares of
+    BASE                      VQF's error on real motion: 0.3 to 1.2 degrees RMS (docs/imu.md)
+    BIAS_TIME * s_b           gyroscope bias not yet learnt: its standard deviation s_b, over VQF's 3 s window
+    v / (g T)                 start: T s after it, the mean acceleration is wrong by a change of speed v over T, which
+                              is the deviation of the acceleration times CORRELATION_TIME
+    d / SIGMAS                gyroscope and accelerometer contradict each other by an angle d
+    a t^2 n / 30              a gap of t s or n usual intervals, 5 at most: rates interpolated, while the rotation
+                              accelerated by a, as lately; measured on the same trials
+    OVERSHOOT * range * t     t s of saturation: the true rate exceeded the range by this share
+    a t^2 / 2                 t s of repeated samples: the rate may have changed since
+    w t                       a rate that changes by w in one sample of t s, unusually and by more than JUMP
+The last four add up, and decay with VQF's time constant.
+"""
+
+from __future__ import annotations
+
+import math
+
+from exo_gravity.core.model.rotation import Floats3
+
+MAX_ERROR = math.radians(3.0)  # of a tilt that is used
+SIGMAS = 2.0  # standard deviations by which a tilt may be off
+BASE = math.radians(0.6)
+BIAS_TIME = 2.0  # s
+CORRELATION_TIME = 0.25  # s, a quarter of a stride
+SETTLE_TIME = 1.0  # s, the shortest time from a start to the first tilt
+START_TIME = 10.0  # s, after which the error of the start has gone
+DECAY_TIME = 3.0  # s, VQF's tauAcc
+LEAST_ACCELERATION = 20.0  # rad/s^2, assumed in a gap even after rest
+ACCELERATION_TIME = 0.3  # s
+OVERSHOOT = 0.25
+JUMP = math.radians(2.0)  # a sample; in good data a knock made 1.4 degrees
+UNUSUAL = 8.0  # times the angular acceleration of the last ACCELERATION_TIME
+GAP = 1.5  # usual intervals
+LONG_GAP, GAP_DIVISOR = 5.0, 30.0
+USUAL_SHARE = 0.02  # by which one interval changes the usual one
+
+
+class TiltUncertainty:
+    """Follows one estimate, whose samples are usually `period` s apart."""
+
+    def __init__(self, period: float) -> None:
+        self._period = period
+        self._square = 0.0  # of the angular acceleration, (rad/s^2)^2, mean over ACCELERATION_TIME
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew: nothing is known but the accelerometer."""
+        self.variance = math.inf  #: of the tilt, rad^2
+        self._lost = 0.0  # rad^2, of gaps and saturation
+        self._run = 0.0  # rad lost in the present run of samples that do not show the rotation
+        self._is_losing = False  # whether the run goes on
+        self._start = math.pi  # rad, error of the start
+        self._age = 0.0  # s since the start
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether so much rotation was not measured that the estimate must begin anew."""
+        return SIGMAS * SIGMAS * self._lost > MAX_ERROR * MAX_ERROR
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the tilt is off by no more than MAX_ERROR."""
+        return self._age >= SETTLE_TIME and SIGMAS * SIGMAS * self.variance <= MAX_ERROR * MAX_ERROR
+
+    def advance(self, dt: float, rate: Floats3, last_rate: Floats3) -> None:
+        """Add the rotation that was not measured between the last sample and this one, `dt` s later."""
+        if not self._is_losing:
+            self._run = 0.0
+        self._is_losing = False
+        if dt <= 0.0:
+            return
+        self._age += dt
+        self._lost *= 1.0 - 2.0 * dt / DECAY_TIME
+        period = self._period
+        if dt > GAP * period:
+            share = min(dt / period, LONG_GAP) / GAP_DIVISOR
+            self._lost += max(LEAST_ACCELERATION**2, self._square) * (share * dt * dt) ** 2
+        else:
+            change = math.dist(rate, last_rate)
+            acceleration = change / (dt if dt > 0.5 * period else 0.5 * period)
+            if change * dt > JUMP and acceleration > UNUSUAL * math.sqrt(self._square):
+                self.lose(change * dt)
+            self._square += (acceleration * acceleration - self._square) * dt / ACCELERATION_TIME
+        self._period = period + USUAL_SHARE * (dt - period)
+
+    def repeat(self, dt: float, duration: float) -> None:
+        """Add a sample that repeats the last one, the `duration` s of equal ones having grown by `dt`."""
+        self.lose(0.5 * math.sqrt(self._square) * (2.0 * duration - dt) * dt)
+
+    def lose(self, angle: float) -> None:
+        """Add an angle in rad; the angles of one run have one direction, those of different runs do not."""
+        self._lost += angle * (angle + 2.0 * self._run)  # the difference of the squares
+        self._run += angle
+        self._is_losing = True
+
+    def combine(self, bias_sigma: float, square: float, contradiction: float) -> None:
+        """Add up the terms.
+
+        bias_sigma: rad/s. square: mean one of the deviation of the acceleration in the world from its mean, as a share
+        of 1 g. contradiction: rad by which gyroscope and accelerometer contradict each other.
+        """
+        if self._age >= START_TIME:
+            self._start = 0.0
+        elif self._age >= SETTLE_TIME:  # a movement after a still start does not make it larger again
+            self._start = min(self._start, math.sqrt(square) * CORRELATION_TIME / self._age)
+        bias, contradiction = BIAS_TIME * bias_sigma, contradiction / SIGMAS
+        self.variance = BASE * BASE + bias * bias + self._start**2 + contradiction * contradiction + self._lost

@@ -1,0 +1,240 @@
+"""Sensors on serial ports, through `pyserial`: packets of a fixed length, cut out of a stream of bytes.
+
+WitMotion (WT901, WT61, HWT905 ...): packets of 11 bytes, 0x55, type, data, checksum. Data sheet WT901 v20-0702, 5.1 and
+5.2; "WIT Standard Communication Protocol". The sensor fuses by itself; its angles turn about z, y', x'', and its world
+is east, north, up. Rate and content are set at each opening, and not saved.
+
+BNO085 (BNO080, BNO086) in its UART-RVC mode: 100 packets of 19 bytes a second, already fused. 0xAA 0xAA, a counter,
+yaw, pitch, roll in 0.01 degrees, acceleration x y z in mg with gravity, three reserved bytes, the sum of all but the
+header (data sheet 1000-3927, 1.3.5.2). There is no gyroscope in it. The data sheet turns by yaw, then pitch, then roll,
+and calls y the pitch's axis and x the roll's. Its own example contradicts it: pitch -1.10 and roll 20.85 degrees with
+an acceleration of (-371, -20, 977) mg, which is what gravity gives for a pitch about x and a roll about y. So it is
+done here: yaw about z, pitch about x', roll about y''.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import struct
+from collections.abc import Callable
+
+from exo_gravity.core.errors import DeviceError, ParameterError
+from exo_gravity.core.model.rotation import Quaternion
+from exo_gravity.hardware.imu_sources.source import (
+    RADIANS_PER_DEGREE,
+    Axes,
+    Clock,
+    ImuSource,
+    Measurement,
+    acceleration_scale,
+)
+
+ACCELERATION, ANGULAR_VELOCITY, ANGLES, QUATERNION = 0x51, 0x52, 0x53, 0x59
+WITMOTION_LENGTH = 11
+UNLOCK = b"\xff\xaa\x69\x88\xb5"
+CONTENT = b"\xff\xaa\x02\x0e\x02"  # RSW: quaternion, angles, angular velocity, acceleration
+PACKETS_A_SAMPLE = 4
+RATES = {20.0: 0x07, 50.0: 0x08, 100.0: 0x09, 200.0: 0x0B}  # Hz: RRATE
+BITS_A_BYTE = 10  # on the wire
+RATE_PER_LSB = RADIANS_PER_DEGREE * 2000.0 / 32768
+WITMOTION_ACCELERATION = acceleration_scale(32768 / 16.0)
+WITMOTION_ANGLE = RADIANS_PER_DEGREE * 180.0 / 32768
+
+Numbers = tuple[int, int, int, int]  # of a packet
+
+RVC_RATE, RVC_LENGTH = 100.0, 19  # Hz, fixed; bytes
+RVC_ANGLE, RVC_ACCELERATION = 0.01 * RADIANS_PER_DEGREE, acceleration_scale(1000.0)
+
+
+class SerialPort:
+    """An open port that is read without waiting."""
+
+    def __init__(self, device: str, port: str, baud: int) -> None:
+        """Open `port`. Raises DeviceError, and ParameterError without pyserial."""
+        self.name = f"{device} on {port}"
+        try:
+            import serial
+        except ImportError:
+            expected = "topic, or install the extra imu (pyserial)"
+            raise ParameterError("source", "an IMU on a serial port", expected) from None
+        try:
+            self._port = serial.Serial(port, baud, timeout=0, write_timeout=0.2)
+        except (OSError, ValueError) as error:  # pyserial's own errors are OSErrors
+            raise DeviceError(self.name, f"cannot be opened: {error}") from None
+
+    def read(self) -> bytes:
+        """Return the bytes that have arrived."""
+        try:
+            return bytes(self._port.read(self._port.in_waiting))
+        except OSError as error:
+            raise DeviceError(self.name, f"cannot be read: {error}") from None
+
+    def write(self, data: bytes) -> None:
+        """Send `data`."""
+        try:
+            self._port.write(data)
+        except OSError as error:
+            raise DeviceError(self.name, f"cannot be written: {error}") from None
+
+    def close(self) -> None:
+        """Close the port."""
+        with contextlib.suppress(OSError):
+            self._port.close()
+
+
+class Packets:
+    """Cuts packets of one length out of a stream of bytes, and finds their start again after lost or extra bytes."""
+
+    def __init__(self, header: bytes, length: int, is_whole: Callable[[bytes], bool]) -> None:
+        self.damaged = 0  #: times that packets that had arrived well were followed by one that had not
+        self._header = header
+        self._length = length
+        self._is_whole = is_whole
+        self._pending = bytearray()
+        self._in_step = False
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Return the whole packets that `data` completes."""
+        self._pending += data
+        packets, at = [], 0
+        while len(self._pending) - at >= self._length:
+            packet = bytes(self._pending[at : at + self._length])
+            if packet.startswith(self._header) and self._is_whole(packet):
+                packets.append(packet)
+                at += self._length
+                self._in_step = True
+                continue
+            self.damaged += self._in_step
+            self._in_step = False
+            at += 1
+        del self._pending[:at]
+        return packets
+
+
+class SerialSource(ImuSource):
+    """Base of the sensors on serial ports; a sensor's class decodes its packets."""
+
+    def __init__(self, port: SerialPort, packets: Packets, rate: float, clock: Clock) -> None:
+        """Read from an open port."""
+        super().__init__(port.name, rate, clock)
+        self._port = port
+        self._packets = packets
+        self._damaged = 0  # packets, as last seen
+        self.silence = "not one byte"
+
+    def close(self) -> None:
+        """Close the port; never raises."""
+        self._port.close()
+
+    def _measure(self, now: float) -> list[Measurement]:
+        data = self._port.read()
+        packets = self._packets.feed(data)
+        if data:
+            self.silence = "not one byte" if packets else "bytes, but no whole packet: is serial.baud the sensor's?"
+        if self._packets.damaged > self._damaged:
+            self._damaged = self._packets.damaged
+            self._why_lost = "damaged packets"
+        return [measurement for packet in packets if (measurement := self._decode(packet))]
+
+    def _decode(self, packet: bytes) -> Measurement | None:
+        """Return the measurement that a packet completes."""
+        raise NotImplementedError
+
+
+class WitMotion(SerialSource):
+    """A WitMotion sensor. A sample is complete with its orientation: a quaternion, or angles if it sends none."""
+
+    def __init__(self, port: str, baud: int, rate: float, clock: Clock) -> None:
+        """Open the port and set the sensor's rate. Raises DeviceError, ParameterError."""
+        rate = min(RATES, key=lambda candidate: abs(candidate - rate))
+        needed = int(rate * PACKETS_A_SAMPLE * WITMOTION_LENGTH * BITS_A_BYTE)
+        if baud < needed:
+            raise ParameterError("serial.baud", baud, f"{needed} or more for {rate:g} samples a second")
+        opened = SerialPort("WitMotion", port, baud)
+        super().__init__(opened, Packets(b"\x55", WITMOTION_LENGTH, _is_whole), rate, clock)
+        self._parts: dict[int, Numbers] = {}  # of the present sample, by type
+        self._last_type = 0  # that completes a sample
+        self._begun = False
+        self._skipped = 0  # samples since the last whole one
+        try:
+            opened.write(UNLOCK + CONTENT + bytes((0xFF, 0xAA, 0x03, RATES[rate], 0x00)))
+        except DeviceError:
+            opened.close()
+            raise
+
+    def _decode(self, packet: bytes) -> Measurement | None:
+        kind, numbers = packet[1], struct.unpack_from("<4h", packet, 2)
+        if kind not in (ACCELERATION, ANGULAR_VELOCITY, ANGLES, QUATERNION):
+            return None
+        if kind == ACCELERATION:  # a sample begins
+            self.temperature = numbers[3] / 100.0
+            if self._begun:  # from the second one on it is known which packets this sensor sends
+                self._skipped += bool(self._parts) and bool(self._last_type)
+                self._last_type = max(self._last_type, *self._parts, 0)
+            self._begun, self._parts = True, {}
+        self._parts[kind] = numbers
+        if kind != self._last_type:
+            return None
+        parts, self._parts = self._parts, {}
+        if not {ACCELERATION, ANGULAR_VELOCITY} <= parts.keys():
+            self._skipped += 1
+            return None
+        skipped, self._skipped = self._skipped, 0
+        return Measurement(
+            _axes(parts[ANGULAR_VELOCITY], RATE_PER_LSB),
+            _axes(parts[ACCELERATION], WITMOTION_ACCELERATION),
+            _orientation(parts),
+            skipped,
+        )
+
+
+def _orientation(parts: dict[int, Numbers]) -> Quaternion | None:
+    if QUATERNION in parts:
+        w, x, y, z = (number / 32768 for number in parts[QUATERNION])
+        return x, y, z, w
+    if ANGLES in parts:
+        roll, pitch, yaw, _ = (number * WITMOTION_ANGLE for number in parts[ANGLES])
+        return from_angles(("z", yaw), ("y", pitch), ("x", roll))
+    return None
+
+
+def _is_whole(packet: bytes) -> bool:
+    return 0x50 <= packet[1] <= 0x5F and sum(packet[:10]) & 0xFF == packet[10]
+
+
+def _axes(numbers: Numbers, scale: float) -> Axes:
+    x, y, z, _ = numbers
+    return x * scale, y * scale, z * scale
+
+
+class Bno085(SerialSource):
+    """A BNO085 with PS0 high and PS1 low, which selects UART-RVC."""
+
+    def __init__(self, port: str, baud: int, clock: Clock) -> None:
+        """Open the port. Raises DeviceError, ParameterError."""
+        packets = Packets(b"\xaa\xaa", RVC_LENGTH, lambda packet: sum(packet[2:18]) & 0xFF == packet[18])
+        super().__init__(SerialPort("BNO085", port, baud), packets, RVC_RATE, clock)
+        self._counter: int | None = None
+
+    def _decode(self, packet: bytes) -> Measurement:
+        counter, yaw, pitch, roll, x, y, z = struct.unpack_from("<B6h", packet, 2)
+        skipped = 0 if self._counter is None else (counter - self._counter - 1) & 0xFF
+        self._counter = counter
+        orientation = from_angles(("z", yaw * RVC_ANGLE), ("x", pitch * RVC_ANGLE), ("y", roll * RVC_ANGLE))
+        acceleration = (x * RVC_ACCELERATION, y * RVC_ACCELERATION, z * RVC_ACCELERATION)
+        return Measurement(None, acceleration, orientation, skipped)
+
+
+def from_angles(*turns: tuple[str, float]) -> Quaternion:
+    """Return the orientation after turns by (axis, rad) in order, each about an axis of the body as turned so far."""
+    x, y, z, w = 0.0, 0.0, 0.0, 1.0
+    for axis, angle in turns:
+        s, c = math.sin(angle / 2), math.cos(angle / 2)
+        if axis == "x":
+            x, y, z, w = x * c + w * s, y * c + z * s, z * c - y * s, w * c - x * s
+        elif axis == "y":
+            x, y, z, w = x * c - z * s, y * c + w * s, z * c + x * s, w * c - y * s
+        else:
+            x, y, z, w = x * c + y * s, y * c - x * s, z * c + w * s, w * c - z * s
+    return x, y, z, w

@@ -1,1 +1,0 @@
-"""The trunk's tilt from its IMU."""

@@ -1,0 +1,108 @@
+"""The compensator of another arm than the exoskeleton's: a pendulum of two joints."""
+
+import math
+import random
+
+import numpy as np
+import pytest
+
+from exo_gravity.core.compensation.compensator import Compensator
+from exo_gravity.core.compensation.limiter import LONGEST_STEP, RAMP_TIME, TRANSITION_TIME
+from exo_gravity.core.compensation.params import urdf_settings_of, urdf_table
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.params import values_of
+
+PERIOD = 0.004  # s
+POSE = (0.4, -0.7)
+
+
+class Pendulum:
+    """Two joints about y, each with 1 kg m; it hangs along -z."""
+
+    max_effort = (30.0, 0.0)
+    mass = 2.0
+
+    def torque(self, theta, gravity):
+        (first, second), (x, _, z) = theta, gravity
+        lower = -z * math.sin(first + second) - x * math.cos(first + second)
+        return lower - z * math.sin(first) - x * math.cos(first), lower
+
+
+def settings(**changes):
+    given = {"joint_names": ["a", "b"], "max_effort": [0.0, 20.0], "use_imu": False, **changes}
+    return urdf_settings_of(values_of(urdf_table(2, ()), given), Pendulum())
+
+
+def steps(arm, start, seconds):
+    return [arm.step(start + n * PERIOD, POSE).effort for n in range(round(seconds / PERIOD))]
+
+
+def test_it_ramps_in_and_then_gives_the_models_torque_times_the_gain():
+    arm = Compensator(settings(gain=[1.0, 0.5], max_effort_rate=1000.0))
+    efforts = steps(arm, 5.0, RAMP_TIME + 0.1)
+    first, second = Pendulum().torque(POSE, (0.0, 0.0, -9.80665))
+    assert efforts[0] == (0.0, 0.0)
+    assert efforts[125] == pytest.approx((0.5 * first, 0.25 * second), rel=0.01)
+    assert efforts[-1] == pytest.approx((first, 0.5 * second), abs=1e-12)
+
+
+def test_gravity_comes_from_the_tilt_in_the_root_links_axes():
+    arm = Compensator(settings(use_imu=True, max_effort_rate=1000.0, tilt_timeout=0.5))
+    assert arm.step(1.0, POSE).reason == "no trunk tilt yet"
+    for n in range(300):
+        arm.set_gravity(2.0 + n * PERIOD, (0.6, 0.0, -0.8))
+        answer = arm.step(2.0 + n * PERIOD, POSE)
+    assert answer.effort == pytest.approx(Pendulum().torque(POSE, (0.6 * 9.80665, 0.0, -0.8 * 9.80665)), abs=1e-9)
+    assert arm.step(4.0, POSE).reason == "trunk tilt older than 500 ms"
+
+
+def test_pitch_and_roll_give_the_same_gravity_as_the_vector():
+    arm = Compensator(settings(use_imu=True, max_effort_rate=1000.0))
+    for n in range(300):
+        arm.set_tilt(2.0 + n * PERIOD, math.asin(0.6), 0.0)
+        answer = arm.step(2.0 + n * PERIOD, POSE)
+    assert answer.effort == pytest.approx(Pendulum().torque(POSE, (0.6 * 9.80665, 0.0, -0.8 * 9.80665)), abs=1e-9)
+
+
+def test_a_change_of_settings_fades_in_without_a_step():
+    arm = Compensator(settings(max_effort_rate=1000.0))
+    before = steps(arm, 1.0, 1.5)[-1]
+    arm.apply(settings(gain=[2.0, 2.0], max_effort_rate=1000.0))
+    efforts = [before, *steps(arm, 2.5, TRANSITION_TIME + 0.1)]
+    assert np.allclose(efforts[-1], np.multiply(2.0, before), rtol=0.0, atol=1e-12)
+    assert np.abs(np.diff(efforts, axis=0)).max() <= np.abs(before).max() * PERIOD / TRANSITION_TIME + 1e-9
+
+
+def test_random_changes_of_settings_never_exceed_the_rate_limit():
+    chance, arm, now = random.Random(3), Compensator(settings()), 1.0
+    last = (0.0, 0.0)
+    for n in range(3000):
+        if n % 50 == 0:
+            gain = [chance.uniform(0.0, 2.0) for _ in range(2)]
+            arm.apply(settings(gain=gain, gravity=chance.uniform(0.0, 25.0)))
+        now += PERIOD
+        effort = arm.step(now, POSE).effort
+        assert all(abs(a - b) <= 50.0 * min(PERIOD, LONGEST_STEP) + 1e-9 for a, b in zip(effort, last, strict=True))
+        last = effort
+
+
+def test_torque_beyond_the_limit_of_the_urdf_is_clamped_and_named():
+    arm = Compensator(settings(max_effort=[3.0, 20.0], max_effort_rate=1000.0))
+    for n in range(300):
+        answer = arm.step(1.0 + n * PERIOD, (1.5, 0.0))
+    assert answer.effort[0] == 3.0 and answer.clamped == (0,)
+
+
+@pytest.mark.parametrize("theta", [(0.0,), (0.0, 0.0, 0.0), (math.nan, 0.0), (0.0, 30.0)])
+def test_impossible_angles_are_refused(theta):
+    assert "are not 2 numbers within 26 rad" in Compensator(settings()).step(1.0, theta).reason
+
+
+def test_a_joint_without_any_effort_limit_is_refused():
+    with pytest.raises(ParameterError, match=r"max_effort of b = 0\.0: must be greater than 0"):
+        settings(max_effort=[0.0, 0.0])
+
+
+def test_a_list_must_have_one_entry_per_joint():
+    with pytest.raises(ParameterError, match="gain"):
+        settings(gain=[1.0] * 3)
