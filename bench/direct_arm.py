@@ -9,7 +9,7 @@ from pathlib import Path
 
 from exo_gravity.core.model.gravity import LAWS, Torque
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.motors.params import OPTIONS
+from exo_gravity.core.motors.joint_motor import OPTIONS
 from exo_gravity.hardware.can.motor_bus import MotorBus, open_bus
 from exo_gravity.tools.inputs.arms import read_arm
 from exo_gravity.tools.inputs.parameter_file import load

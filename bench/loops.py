@@ -15,7 +15,7 @@ from .timing import percentile
 RATES = (("one arm", False, 200), ("one arm", False, 500), ("one arm", False, 1000), ("both arms", True, 200),
          ("both arms", True, 500))  # fmt: skip
 QUICK_RATES = (RATES[1], RATES[3])
-RAMP = 1.0  # s, can_bridge's ramp_time
+RAMP = 1.0  # s, can_bridge's RAMP_TIME
 KINDS = ("nodes", "fifo", "python", "rclpy")
 PEERS = ("python", "Python without ROS"), ("rclpy", "bare rclpy")
 ATTEMPTS = 3

@@ -19,7 +19,7 @@ from exo_gravity.core.calibration.params import CALIBRATOR
 from exo_gravity.core.compensation.any_arm import any_arm_table
 from exo_gravity.core.compensation.params import COMPENSATOR
 from exo_gravity.core.params import Param
-from exo_gravity.core.safety.faults import FaultCode
+from exo_gravity.core.safety.drive import FaultCode
 from exo_gravity.core.safety.params import CAN_BRIDGE
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.core.view.arm_description import ROBOT_MODEL

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from exo_gravity.core.safety.faults import FaultCode
+from exo_gravity.core.safety.drive import FaultCode
 
 ROOT = Path(__file__).parents[1]
 TABLES = ROOT / "docs" / "tables.py"
@@ -48,7 +48,7 @@ def test_every_table_has_its_place_in_a_document() -> None:
 @pytest.mark.parametrize(
     ("document", "table", "declared", "changed"),
     [
-        ("parameters.md", "can_bridge", "| `max_effort_rate` | 50 |", "| `max_effort_rate` | 60 |"),
+        ("parameters.md", "can_bridge", "| `reply_timeout` | 0.05 |", "| `reply_timeout` | 0.06 |"),
         ("safety.md", "faults", f"| {FaultCode.MOTOR_SILENT.meaning} |", "| a motor is quiet |"),
     ],
 )

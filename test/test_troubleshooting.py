@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from exo_gravity.core.safety.faults import FaultCode
+from exo_gravity.core.safety.drive import FaultCode
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")

@@ -20,8 +20,7 @@ from exo_gravity.core.calibration.params import CALIBRATOR, tour_of
 from exo_gravity.core.calibration.tour import Tour
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.motors.joint_motor import JointMotor, peaks_of
-from exo_gravity.core.motors.params import motors_of
+from exo_gravity.core.motors.joint_motor import JointMotor, motors_of, peaks_of
 from exo_gravity.core.motors.specs import ENTER, EXIT
 from exo_gravity.core.safety.drive import Drive, State
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits

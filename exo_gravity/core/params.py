@@ -21,6 +21,15 @@ KINDS = {float: "number", int: "whole number", str: "string", bool: "true or fal
 # Parameters that are gone, by the node that had them, and what replaces each.
 GONE: dict[str, str] = {
     # can_bridge
+    "max_effort_rate": "always 50 Nm/s; the compensator's own max_effort_rate may be lower",
+    "max_temperature": "always 80 degC",
+    "ramp_time": "always 1 s",
+    "fade_time": "always 2 s",
+    "damping": "always 5 Nm s/rad, the most that the motors can",
+    "home": "always 0: joint angles are measured from the hanging arm, see the parameter zero",
+    "home_tolerance": "always 0.5 rad for an AK60-6 and 0.34 rad for an AK80-9, less than half a turn of the rotor",
+    "status_rate": "V3 boards are to send 500 status frames a second, 200 on a bus below 500 kbit/s",
+    "lock_memory": "memory is locked where thread_priority is not 0",
     # compensator
     # imu
     # calibrator

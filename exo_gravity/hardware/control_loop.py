@@ -21,8 +21,7 @@ from typing import Any, NamedTuple
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.bus_load import REPLY_SHARE
-from exo_gravity.core.safety.drive import CARRYING, OFF, State
-from exo_gravity.core.safety.faults import FaultCode
+from exo_gravity.core.safety.drive import CARRYING, OFF, FaultCode, State
 from exo_gravity.core.safety.limits import JointSample
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus

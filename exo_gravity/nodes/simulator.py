@@ -21,7 +21,7 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import String
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.params import OPTIONS
+from exo_gravity.core.motors.joint_motor import OPTIONS
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.hardware.can.motor_bus import open_bus
 from exo_gravity.nodes.ros.hot_path import LATCHED

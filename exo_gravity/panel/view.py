@@ -79,7 +79,7 @@ def arm_setup(bridge: Mapping[str, Any], compensator: Mapping[str, Any], support
 
     support_limit: the largest support within the motors' rated torque, None if it is not known.
     """
-    limits = {name: bridge.get(name) for name in ("joint_names", "position_min", "position_max", "max_temperature")}
+    limits = {name: bridge.get(name) for name in ("joint_names", "position_min", "position_max")}
     efforts = [values["max_effort"] for values in (bridge, compensator) if values.get("max_effort")]
     return {
         **limits,

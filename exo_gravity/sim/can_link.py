@@ -12,7 +12,7 @@ from collections import deque
 import can
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.wire_formats.wire_format import EXTENDED, ID_BITS, Frame
+from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, Frame
 
 MAX_PENDING_ECHOES = 512  # twice the number of frames that a udp_multicast socket buffers
 

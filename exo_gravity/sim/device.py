@@ -19,7 +19,7 @@ import can
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.gravity import NO_TORQUE, Torque
-from exo_gravity.core.motors.wire_formats.wire_format import Frame
+from exo_gravity.core.motors.wire_formats import Frame
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim.arm import STEP, SimulatedArm

@@ -8,7 +8,7 @@ from typing import Any
 
 from exo_gravity.core.model.arm import MAX_GRAVITY, MAX_LENGTH, MAX_MASS, STANDARD_GRAVITY, ArmModel
 from exo_gravity.core.model.tilt import SIDES
-from exo_gravity.core.motors.params import MOTOR_PARAMETERS, motors_of
+from exo_gravity.core.motors.joint_motor import MOTOR_PARAMETERS, motors_of
 from exo_gravity.core.params import Param, param_of
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
@@ -78,7 +78,6 @@ def device_of(values: Mapping[str, Any]) -> SimulatedDevice:
         values["reply_to_master"],
         values["reply_length"],
         current_noise=values["current_noise"],
-        status_rate=values["status_rate"],
     )
     motors = [simulated_motor(motor, firmware) for motor in motors_of(values)]
     device = SimulatedDevice(SimulatedArm(arm), motors, values["side"])

@@ -17,7 +17,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.bus_load import MAX_STATUS_RATE
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, SET_ZERO, MotorCommand, pack_reply, unpack_command
-from exo_gravity.core.motors.wire_formats.mit import MASTER_ID
+from exo_gravity.core.motors.wire_formats import MASTER_ID
 from exo_gravity.core.numbers import one_float
 from exo_gravity.core.params import owned
 

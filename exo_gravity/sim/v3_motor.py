@@ -15,9 +15,7 @@ from collections.abc import Iterator, Sequence
 
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MotorCommand, MotorReply
-from exo_gravity.core.motors.wire_formats import MIT_V3
-from exo_gravity.core.motors.wire_formats.mit_v3 import MODE_CURRENT
-from exo_gravity.core.motors.wire_formats.wire_format import EXTENDED, Frame
+from exo_gravity.core.motors.wire_formats import EXTENDED, MIT_V3, MODE_CURRENT, Frame
 from exo_gravity.sim.motor import Firmware, SimulatedMotor, clamp
 
 

@@ -1,11 +1,14 @@
-"""Torque asked against torque replied: a motor that does not deliver is noticed, a noisy current sensor is not."""
+"""The torque in the replies: a motor that does not deliver is noticed, a noisy sensor is not, and a load adds up."""
+
+import math
 
 import numpy as np
 import pytest
 
-from exo_gravity.core.safety.delivery import DeliveryMonitor, SwitchOnCheck
+from exo_gravity.core.safety.delivery import THERMAL_TIME, DeliveryMonitor, MotorLoad
 from exo_gravity.core.safety.drive import Drive
-from exo_gravity.core.safety.limits import JointSample
+from exo_gravity.core.safety.gate import SwitchOnCheck
+from exo_gravity.core.safety.limits import UNKNOWN, JointSample
 
 from ..support.safety_run import LIMITS, PERIOD
 
@@ -82,3 +85,33 @@ def test_a_light_joint_that_moves_when_pushed_has_shown_that_its_motor_is_on():
         joints = [JointSample(0.5, speed, net, 30, 0, now) for speed, net in zip(velocity, torque, strict=True)]
         assert not check.step(PERIOD, joints, damping)
         velocity = [speed + net / 0.005 * PERIOD for speed, net in zip(velocity, torque, strict=True)]  # 0.005 kg m^2
+
+
+def sample(effort: float, velocity: float = 0.0) -> JointSample:
+    return JointSample(0.0, velocity, effort, 30, 0, 0.0)
+
+
+def load_after(seconds: float, step: float, torque: float) -> MotorLoad:
+    load = MotorLoad((3.0, 9.0))
+    for number in range(round(seconds / step) + 1):
+        load.update(number * step, (sample(torque), UNKNOWN))
+    return load
+
+
+@pytest.mark.parametrize("step", [0.1, 0.5])
+def test_a_constant_torque_warms_a_cold_motor_exponentially_whatever_the_period(step):
+    rms, other = load_after(THERMAL_TIME, step, 6.0).rms
+    assert rms == pytest.approx(6.0 * math.sqrt(1.0 - math.exp(-1.0)), rel=1e-9)
+    assert other == 0.0
+
+
+def test_a_torque_above_rated_is_overload_only_when_it_lasts():
+    assert load_after(5.0, 0.1, 6.0).share[0] < 1.0
+    assert load_after(60.0, 0.1, 6.0).share[0] > 1.0
+    assert load_after(600.0, 0.1, 2.9).share[0] < 1.0
+
+
+def test_power_is_torque_times_speed_and_negative_where_the_motor_brakes():
+    load = MotorLoad((3.0, 9.0, 3.0))
+    load.update(1.0, (sample(2.0, 3.0), sample(-2.0, 3.0), UNKNOWN))
+    assert load.power == (6.0, -6.0, 0.0)

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.safety.limits import Limits
+from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, Limits
 
 from ..support.safety_run import LIMITS, PERIOD, SafetyRun, reading
 
@@ -18,7 +18,7 @@ def test_torque_exceeds_neither_its_limit_nor_its_rate():
     arm.effort = (39.0, -39.0, 39.0, -39.0)
     arm.cycle(1.0)
     assert arm.drive.effort == (3.0, -9.0, 3.0, -3.0)
-    assert max(arm.steps) <= LIMITS.max_effort_rate * PERIOD * 1.0001
+    assert max(arm.steps) <= MAX_EFFORT_RATE * PERIOD * 1.0001
     assert "max_effort (b)" in arm.machine.acted
 
 
@@ -71,8 +71,7 @@ def test_a_wall_pushes_back_before_a_joint_limit():
         ("max_velocity", (0.0,) * 4),
         ("position_max", (0.0,) * 4),
         ("command_timeout", 5.0),
-        ("fade_time", 0.0),
-        ("damping", math.nan),
+        ("sign_check_torque", math.nan),
         ("joint_names", ("a", "a", "b", "c")),
     ],
 )

@@ -6,10 +6,11 @@ import math
 
 import pytest
 
-from exo_gravity.core.safety.drive import OFF, State
-from exo_gravity.core.safety.faults import FaultCode
+from exo_gravity.core.safety.descent import DAMPING
+from exo_gravity.core.safety.drive import OFF, FaultCode, State
+from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
 
-from ..support.safety_run import EFFORT, LIMITS, PERIOD, SafetyRun
+from ..support.safety_run import EFFORT, PERIOD, SafetyRun
 
 FAULTS = [
     (lambda arm: arm.silent.add(3), "motor_silent"),
@@ -17,7 +18,7 @@ FAULTS = [
     (lambda arm: arm.changes[0].update(temperature=81), "over_temperature"),
     (lambda arm: arm.changes[1].update(velocity=5.2), "over_speed"),
     (lambda arm: arm.off.add(1), "torque_not_delivered"),
-    (lambda arm: arm.changes[1].update(position=0.7), "position_jump"),
+    (lambda arm: arm.changes[1].update(position=0.2), "position_jump"),
     (lambda arm: setattr(arm, "effort_age", 0.051), "command_stale"),
     (lambda arm: setattr(arm, "effort", None), "command_withdrawn"),
     (lambda arm: setattr(arm, "effort", (0.0, math.nan, 0.0, 0.0)), "command_impossible"),
@@ -42,7 +43,7 @@ def test_after_a_fault_the_arm_is_let_down_gently_and_the_fault_stays_latched(sp
     arm.cycle(10.0)
     assert arm.machine.state is State.FAULT
     assert arm.drive == OFF
-    assert max(arm.steps) <= LIMITS.max_effort_rate * PERIOD * 1.0001
+    assert max(arm.steps) <= MAX_EFFORT_RATE * PERIOD * 1.0001
     arm.cycle(10.0)
     assert arm.machine.state is State.FAULT
 
@@ -51,7 +52,7 @@ def test_the_motors_are_switched_off_once_nothing_holds_the_arm_and_it_rests():
     arm = SafetyRun().until_active()
     arm.machine.disable(arm.now)
     for step in range(1500):  # creeps for 6 s at 0.02 rad/s, less than the velocity's resolution
-        arm.changes[2].update(position=0.5 - 0.02 * PERIOD * step)
+        arm.changes[2].update(position=-0.02 * PERIOD * step)
         arm.cycle()
         assert arm.drive.powered
     assert arm.drive.effort == arm.drive.damping == OFF.effort
@@ -73,9 +74,9 @@ def test_a_silent_motors_torque_is_held_and_lowered_from_what_it_applies_when_it
     arm.steps.clear()
     arm.cycle(0.5)
     assert arm.machine.state is State.LETTING_DOWN
-    assert arm.drive.damping[1] == LIMITS.damping
+    assert arm.drive.damping[1] == DAMPING
     arm.cycle(10.0)
-    assert max(arm.steps) <= LIMITS.max_effort_rate * PERIOD * 1.0001
+    assert max(arm.steps) <= MAX_EFFORT_RATE * PERIOD * 1.0001
     assert arm.machine.state is State.FAULT
     assert arm.drive == OFF
     assert arm.fault_code == "motor_silent"

@@ -7,8 +7,8 @@ import math
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exo_gravity.core.safety.drive import CARRYING, OFF, State
-from exo_gravity.core.safety.faults import Fault, FaultCode
+from exo_gravity.core.safety.drive import CARRYING, OFF, Fault, FaultCode, State
+from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
 
 from ..support.safety_run import LIMITS, PERIOD, SafetyRun
 
@@ -51,7 +51,7 @@ def test_no_sequence_of_events_lets_torque_flow_without_fresh_input_or_step(even
         had_fault = arm.machine.fault
         arm.cycle(value if event == "time" else PERIOD)
         check(arm, had_fault if event != "clear" else None)
-    assert max(arm.steps, default=0.0) <= LIMITS.max_effort_rate * PERIOD * 1.0001
+    assert max(arm.steps, default=0.0) <= MAX_EFFORT_RATE * PERIOD * 1.0001
 
 
 def check(arm: SafetyRun, had_fault: Fault | None) -> None:

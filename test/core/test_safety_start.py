@@ -1,16 +1,18 @@
-"""The start of the safety machine: the checks before torque flows, the sign check, and the ramp."""
+"""The start of the safety machine: the checks before torque flows, the ramp, and what is trusted from then on."""
 
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Sequence
 
 import pytest
 
-from exo_gravity.core.safety.delivery import TEST_TORQUE
-from exo_gravity.core.safety.drive import OFF, State
+from exo_gravity.core.safety.drive import OFF, FaultCode, State
+from exo_gravity.core.safety.gate import TEST_TORQUE
+from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
 
-from ..support.safety_run import EFFORT, LIMITS, PERIOD, SafetyRun
+from ..support.safety_run import EFFORT, PERIOD, SafetyRun
 
 
 def test_a_new_machine_keeps_the_motors_off():
@@ -27,7 +29,7 @@ def test_torque_ramps_in_over_the_ramp_time_without_a_step():
     assert arm.drive.effort[1] == pytest.approx(-2.0, abs=0.15)
     arm.cycle(1.0)
     assert arm.drive.effort == pytest.approx(EFFORT)
-    assert max(arm.steps) <= LIMITS.max_effort_rate * PERIOD * 1.0001
+    assert max(arm.steps) <= MAX_EFFORT_RATE * PERIOD * 1.0001
 
 
 @pytest.mark.parametrize(
@@ -80,17 +82,17 @@ def test_a_fault_during_the_checks_is_latched(change, code):
 
 def test_an_arm_away_from_home_is_refused_until_it_has_been_carried_once():
     arm = SafetyRun()
-    arm.changes[1].update(position=0.5 + math.radians(40.0))  # a turn of an AK80-9's motor
+    arm.changes[1].update(position=math.radians(40.0))  # a turn of an AK80-9's motor
     arm.enable()
     arm.cycle(1.0)
     assert arm.fault_code == "implausible_zero"
-    assert "b: 1.198 rad at the start" in arm.machine.fault.reason
+    assert "b: 0.698 rad at the start" in arm.machine.fault.reason
 
     arm = SafetyRun().until_active()
     arm.machine.disable(arm.now)
     arm.cycle(8.0)
     for step in range(31):  # moved by hand
-        arm.changes[1].update(position=0.5 + 0.02 * step)
+        arm.changes[1].update(position=0.02 * step)
         arm.cycle(0.02)
     arm.enable()
     arm.cycle(3.0)
@@ -115,7 +117,7 @@ class YieldingArm(SafetyRun):
     def __init__(self, mobility: Sequence[float]) -> None:
         super().__init__(sign_check_torque=1.5)
         self.mobility = mobility
-        self.position = [0.5] * 4
+        self.position = [0.0] * 4
         self.largest_effort = [0.0] * 4
 
     def cycle(self, seconds: float = PERIOD) -> YieldingArm:
@@ -137,8 +139,8 @@ def test_each_joints_sign_is_checked_once_and_gently_before_the_arm_is_carried()
     assert arm.machine.state is State.PROVING
     arm.cycle(14.0)
     assert arm.machine.state is State.ACTIVE
-    assert all(0.45 < position < 0.56 for position in arm.position)
-    assert max(arm.steps) <= LIMITS.max_effort_rate * PERIOD * 1.0001
+    assert all(-0.05 < position < 0.06 for position in arm.position)
+    assert max(arm.steps) <= MAX_EFFORT_RATE * PERIOD * 1.0001
     arm.machine.disable(arm.now)
     arm.cycle(8.0)
     arm.largest_effort = [0.0] * 4
@@ -157,3 +159,61 @@ def test_a_joint_that_moves_backwards_or_not_at_all_under_the_test_torque_is_ref
     assert arm.fault_code == code
     assert arm.machine.fault.reason.startswith("c: ")
     assert arm.largest_effort[3] == TEST_TORQUE
+
+
+def assert_a_wrong_angle_is_refused(arm):
+    """The encoder of an arm that is off is wrong by a turn of the motor: the arm is not carried."""
+    arm.changes[1].update(position=math.radians(40.0))  # one turn of an AK80-9's motor
+    arm.cycle()
+    arm.enable().cycle(1.0)
+    assert arm.fault_code == "implausible_zero"
+
+
+def test_a_motor_that_is_found_off_is_switched_on_again_with_the_torque_that_held_the_arm():
+    arm = SafetyRun().until_active()
+    arm.off.add(1)
+    arm.steps.clear()
+    since = arm.now
+    while not any(arm.drive.enter):
+        arm.cycle()
+    assert arm.now - since <= 0.06
+    assert arm.drive.enter == (False, True, False, False)
+    assert arm.fault_code == "torque_not_delivered"
+    assert "b: -4.00 Nm commanded" in arm.machine.fault.reason
+    assert arm.drive.effort[1] < -3.0
+
+
+@pytest.mark.parametrize("doubt", ["position_jump", "motor_error", "outside_limits", "torque_not_delivered"])
+def test_after_a_fault_that_casts_doubt_on_them_zeros_are_checked_again(doubt):
+    arm = SafetyRun().until_active()
+    arm.machine.trip(FaultCode(doubt), "test", arm.now)
+    arm.cycle(10.0)
+    assert arm.machine.clear(arm.now)
+    assert_a_wrong_angle_is_refused(arm)
+
+
+def test_an_angle_that_jumps_while_the_arm_is_off_is_no_longer_trusted():
+    arm = SafetyRun().until_active()
+    arm.machine.disable(arm.now)
+    arm.cycle(8.0)
+    assert_a_wrong_angle_is_refused(arm)
+
+
+def test_a_motor_that_does_not_switch_on_is_refused_at_every_start():
+    arm = SafetyRun().until_active()
+    arm.machine.disable(arm.now)
+    arm.cycle(8.0)
+    arm.off.add(3)
+    arm.enable().cycle(1.6)
+    assert arm.fault_code == "torque_not_delivered"
+    assert "d: the motor did not switch on" in arm.machine.fault.reason
+
+
+def test_noise_of_the_current_sensors_is_no_fault():
+    arm = SafetyRun().until_active()
+    dice = random.Random(3)
+    for _ in range(5_000):  # 20 s
+        for i, torque in enumerate(arm.applied):
+            arm.changes[i] = {"effort": torque * dice.gauss(1.0, 0.05) + dice.gauss(0.0, 0.12)}
+        arm.cycle()
+    assert arm.machine.state is State.ACTIVE

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import pytest
 
-from exo_gravity.core.safety.faults import Fault
+from exo_gravity.core.safety.drive import Fault
+from exo_gravity.core.safety.gate import MAX_DISTURBED, MIN_PUSH, SignCheck
 from exo_gravity.core.safety.limits import JointSample
-from exo_gravity.core.safety.sign_check import MAX_DISTURBED, MIN_PUSH, SignCheck
 
 PERIOD = 0.004  # s
 NAMES = ("a", "b", "c", "d")
@@ -18,7 +18,7 @@ class Joint:
     """The first joint alone: it yields at 0.2 rad/s per Nm beyond `friction`, and to a `hand`: rad/s at a time in s."""
 
     def __init__(self, hand: Callable[[float], float] = lambda now: 0.0, friction: float = 0.3) -> None:
-        self.check = SignCheck(NAMES, (1.5, 0.0, 0.0, 0.0), 50.0)
+        self.check = SignCheck(NAMES, (1.5, 0.0, 0.0, 0.0))
         self.pushes: list[float] = []
         self._hand = hand
         self._friction = friction

@@ -1,14 +1,18 @@
-"""Parameters of a bridge that are possible alone, but not together."""
+"""Parameters of a bridge: impossible alone, impossible together, and gone."""
 
 from __future__ import annotations
+
+import math
+import re
 
 import pytest
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.params import motors_of
-from exo_gravity.core.params import values_of
-from exo_gravity.core.safety.checks import check_bridge
-from exo_gravity.core.safety.params import CAN_BRIDGE, limits_of
+from exo_gravity.core.motors.joint_motor import motors_of
+from exo_gravity.core.motors.specs import MOTORS
+from exo_gravity.core.params import GONE, values_of
+from exo_gravity.core.safety.limits import HOME_TOLERANCE
+from exo_gravity.core.safety.params import CAN_BRIDGE, check_bridge, limits_of
 
 
 def check(**given):
@@ -22,7 +26,6 @@ def check(**given):
         {},
         {"max_effort": [9.0, 18.0, 9.0, 9.0]},  # peak torque
         {"max_effort": [6.75, 18.0, 9.0, 9.0], "torque_scale": [0.75, 1.0, 1.0, 1.0]},
-        {"home_tolerance": [0.523, 0.349, 0.523, 0.523]},
         {"rate": 40.0},
         {"rate": 25.0, "command_timeout": 0.08, "reply_timeout": 0.1},
         {"rate": 200.0, "command_timeout": 0.01},
@@ -35,14 +38,19 @@ def test_consistent_parameters_are_accepted(given):
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [
+        ({"max_efort": [3.0, 9.0, 3.0, 3.0]}, "max_efort = [3.0, 9.0, 3.0, 3.0]: must be one of"),
+        ({"can_id": [1, 2, 2, 4]}, "can_id = [1, 2, 2, 4]: must be 4 different IDs"),
+        ({"motor": ["AK60-6", "AK80-9", "AK60-6", "AK10-9"]}, "4 strings, one of AK60-6, AK80-9"),
+        (
+            {"rate": 401.0, "wire_format": ["mit", "mit", "mit_v3", "mit"]},
+            "at most 400 Hz: each cycle waits for a status",
+        ),
         (
             {"max_effort": [18.0] * 4},
             "max_effort = [18.0, 18.0, 18.0, 18.0]: must be at most the motors' peak torque, [9.0,",
         ),
         ({"max_effort": [3.0, 18.0, 3.0, 3.0], "torque_scale": [1.0, 0.9, 1.0, 1.0]}, "peak torque, [9.0, 16.2, 9.0"),
         ({"max_effort": [6.0, 9.0, 3.0, 3.0], "torque_range": [5.0, 18.0, 15.0, 15.0]}, "peak torque, [5.0, 18.0, 9.0"),
-        ({"home_tolerance": [6.3] * 4}, "at most half a turn of each motor's rotor, [0.523, 0.349, 0.523, 0.523] rad"),
-        ({"home_tolerance": [0.5, 0.36, 0.5, 0.5]}, "home_tolerance = [0.5, 0.36, 0.5, 0.5]: must be"),
         ({"rate": 39.0}, "rate = 39.0: must be at least 40 Hz: command_timeout = 0.05 s must span 2 periods"),
         ({"rate": 30.0, "command_timeout": 0.1}, "at least 40 Hz: reply_timeout = 0.05 s must span 2 periods"),
         (
@@ -51,7 +59,28 @@ def test_consistent_parameters_are_accepted(given):
         ),
     ],
 )
-def test_contradicting_parameters_are_refused_with_both_values(given, sentence):
+def test_impossible_and_contradicting_parameters_are_refused_with_their_values(given, sentence):
     with pytest.raises(ParameterError) as caught:
         check(**given)
     assert sentence in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("max_effort_rate", "max_temperature", "ramp_time", "fade_time", "damping", "home", "home_tolerance"),
+        *("status_rate", "lock_memory"),
+    ],
+)
+def test_a_parameter_that_is_gone_is_refused_with_what_replaces_it(name):
+    with pytest.raises(
+        ParameterError, match=rf"{name} = 1.0: must be left out, because it is gone: {re.escape(GONE[name])}"
+    ):
+        check(**{name: 1.0})
+
+
+def test_a_joint_that_is_off_by_a_turn_of_its_rotor_is_never_near_its_zero():
+    for motor, tolerance in HOME_TOLERANCE.items():
+        assert tolerance < math.pi / MOTORS[motor].gear_ratio
+    values = values_of(CAN_BRIDGE, {"can.interface": "virtual", "can.channel": "arm", "motor": ["AK80-9"] * 4})
+    assert limits_of(values).home_tolerance == (0.34,) * 4

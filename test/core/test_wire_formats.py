@@ -10,12 +10,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from exo_gravity.core.errors import FrameError, ParameterError
-from exo_gravity.core.motors.bus_load import Traffic, stuffed_bits, worst_frame_bits
-from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, JointMotor
-from exo_gravity.core.motors.params import motors_of, traffic_of
+from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, JointMotor, motors_of
 from exo_gravity.core.motors.specs import MOTORS, MotorReply, MotorSpec
-from exo_gravity.core.motors.wire_formats import FORMATS, MIT, MIT_V3, WireFormat
-from exo_gravity.core.motors.wire_formats.wire_format import COMMAND, EXTENDED, ID_BITS, OTHER, REPLY
+from exo_gravity.core.motors.wire_formats import (
+    COMMAND,
+    EXTENDED,
+    FORMATS,
+    MIT,
+    MIT_V3,
+    OTHER,
+    REPLY,
+    WireFormat,
+)
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.params import CAN_BRIDGE
 
@@ -156,34 +162,3 @@ def test_the_torque_range_of_a_v1_board_is_refused_for_a_v3_board():
     with pytest.raises(ParameterError, match=r"torque_range = 15\.0: must be 12 or 0 for an AK60-6 with wire_format"):
         motors_of(parameters(**given))
     assert motors_of(parameters(**{**given, "torque_range": [9.0, 0.0, 0.0, 0.0]}))[0].spec.torque_range == 9.0
-
-
-def test_eight_motors_at_500_hz_do_not_fit_on_250_kbit_per_s():
-    with pytest.raises(ParameterError, match=r"at most 129 Hz.*: 8 motors need 968 kbit/s of its 250"):
-        Traffic(8, bitrate=250_000).check(500.0)
-    assert Traffic(8, bitrate=250_000).check(100.0).share == pytest.approx(0.77, abs=0.01)
-
-
-def test_a_rate_that_leaves_replies_no_time_is_warned_of_with_figures():
-    assert Traffic(4, bitrate=500_000).warning(250.0) == ""
-    assert "at most 206 Hz" in Traffic(4, bitrate=250_000).warning(240.0)
-
-
-def test_status_frames_load_the_bus_at_their_own_rate():
-    quiet, busy = (Traffic(0, 4, status_rate=rate).load(250.0).bits_per_second for rate in (250.0, 500.0))
-    assert busy - quiet == pytest.approx(4 * 250.0 * 141)
-    with pytest.raises(ParameterError, match="at most 0 Hz"):
-        Traffic(0, 4, bitrate=250_000).check(100.0)
-
-
-def test_a_frame_with_a_29_bit_id_has_131_bits_and_at_most_160():
-    assert (stuffed_bits(0x15555555, b"\x55" * 8, True), worst_frame_bits(8, True)) == (pytest.approx(131, abs=3), 160)
-    assert stuffed_bits(MIT_V3.command_id(1) & ID_BITS, MIT_V3.pack_command(AK60, 0.0, 0.0, 0.0, 0.0, 0.0), True) <= 160
-
-
-@pytest.mark.parametrize("interface", ["gs_usb", "slcan"])
-def test_an_adapter_without_a_bit_rate_is_refused(interface):
-    values = parameters(**{"can.interface": interface})
-    with pytest.raises(ParameterError, match=rf"can.options.bitrate = None: must be set for {interface}"):
-        traffic_of(values, {})
-    assert traffic_of(values, {"bitrate": 250_000}).bitrate == 250_000

@@ -9,7 +9,7 @@ import can
 
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS
-from exo_gravity.core.motors.wire_formats.wire_format import EXTENDED, ID_BITS
+from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS
 
 from ..support.load import start_frames
 from .fault_case import Action

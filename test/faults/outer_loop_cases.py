@@ -15,7 +15,7 @@ from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.tools.inputs.parameter_file import load
 
 from ..support import CONFIG, ROOT
-from ..support.launched_nodes import GENTLE, NO_IMU, LaunchedNodes, Parameters
+from ..support.launched_nodes import NO_IMU, LaunchedNodes, Parameters
 from .actions import publish, send_signal
 from .fault_case import PROCESS_REACTION, Action, FaultCase
 from .outer_loop import BE_SOUND, EFFORTS, FLOOD, GO_WRONG, NAMES, TOPIC
@@ -40,7 +40,7 @@ class AssistedRig(Rig):
         self._outer_loop: subprocess.Popen[bytes] | None = None
 
     def _make_nodes(self, port: int) -> list[LaunchedNodes]:
-        bridge = {**GENTLE, "rate": self.rate}
+        bridge = {"rate": self.rate}
         compensator = {**NO_IMU, "assist": {"max_effort": [1.0] * 4}}
         return [self._nodes(without=("imu", "simulator"), port=port, can_bridge=bridge, compensator=compensator)]
 

@@ -21,7 +21,7 @@ import yaml
 
 from exo_gravity.tools.inputs.parameter_file import load
 
-from ..support.launched_nodes import GENTLE, REAL, SIMULATED, LaunchedNodes, Parameters, children, full_name, prefer
+from ..support.launched_nodes import REAL, SIMULATED, LaunchedNodes, Parameters, children, full_name, prefer
 from ..support.ros_probe import RosProbe
 from ..support.truth import Truth
 
@@ -82,7 +82,7 @@ class Rig:
 
     def _make_nodes(self, port: int) -> list[LaunchedNodes]:
         """Return the nodes of each launcher apart from the simulator; the first one has the bridge."""
-        bridge = {**GENTLE, "ramp_time": 0.5, "rate": self.rate, **self.bridge}
+        bridge = {"rate": self.rate, **self.bridge}
         return [self._nodes(without=SIMULATOR, port=port, can_bridge=bridge, compensator=self.compensator)]
 
     def _nodes(self, **options: Any) -> LaunchedNodes:

@@ -19,7 +19,7 @@ from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.tools.inputs.parameter_file import load
 
 from ..support import CONFIG
-from ..support.launched_nodes import GENTLE, NO_IMU, LaunchedNodes, LauncherProcess, Parameters
+from ..support.launched_nodes import NO_IMU, LaunchedNodes, LauncherProcess, Parameters
 from ..support.ros_probe import RosProbe
 from ..support.truth import Truth
 from .rig import CARRY_LIMIT, NEAR, SIMULATOR, Rig
@@ -36,7 +36,7 @@ class TwoLaunchersRig(Rig):
     simulator: ClassVar[Parameters] = UPRIGHT
 
     def _make_nodes(self, port: int) -> list[LaunchedNodes]:
-        bridge = {**GENTLE, "rate": self.rate}
+        bridge = {"rate": self.rate}
         others = self._nodes(without=("compensator", "imu", "simulator"), port=port, can_bridge=bridge)
         compensator = self._nodes(without=("can_bridge", "simulator", "imu"), port=port, compensator=NO_IMU)
         return [others, compensator]
@@ -59,7 +59,7 @@ class CommandedRig(Rig):
         self.probe.executor.wake()
 
     def _make_nodes(self, port: int) -> list[LaunchedNodes]:
-        bridge = {**GENTLE, "rate": self.rate}
+        bridge = {"rate": self.rate}
         return [self._nodes(without=("compensator", "imu", "simulator"), port=port, can_bridge=bridge)]
 
     def _on_joint_states(self, state: JointState) -> None:
@@ -87,7 +87,7 @@ class ExternalClockRig(Rig):
 
     def _make_nodes(self, port: int) -> list[LaunchedNodes]:
         clock = {"use_sim_time": True}
-        compensator, bridge = {**clock, **NO_IMU}, {**clock, **GENTLE}
+        compensator, bridge = {**clock, **NO_IMU}, clock
         return [self._nodes(without=("imu", "simulator"), port=port, compensator=compensator, can_bridge=bridge)]
 
     def _publish_clock(self) -> None:
@@ -99,9 +99,7 @@ class LauncherRig(Rig):
     """The launcher is a process, as for users; `launcher` is that process."""
 
     def _make_nodes(self, port: int) -> list[LaunchedNodes]:
-        self._launcher = LauncherProcess(
-            self.folder, without=SIMULATOR, port=port, timing=self.timing, can_bridge=GENTLE
-        )
+        self._launcher = LauncherProcess(self.folder, without=SIMULATOR, port=port, timing=self.timing)
         return [self._launcher]
 
     @property
@@ -152,16 +150,10 @@ class HighFrictionRig(Rig):
     simulator: ClassVar[Parameters] = {"friction": {"coulomb": [0.5] * 4}}
 
 
-class SlowFadeRig(Rig):
-    """The torque fades over 30 s."""
-
-    bridge: ClassVar[Parameters] = {"fade_time": 30.0}
-
-
 class SignCheckRig(Rig):
-    """The signs are checked at the start, and the torque ramps in over 3 s."""
+    """The signs are checked at the start."""
 
-    bridge: ClassVar[Parameters] = {"sign_check_torque": 1.5, "ramp_time": 3.0}
+    bridge: ClassVar[Parameters] = {"sign_check_torque": 1.5}
 
 
 class BowRig(Rig):

@@ -7,6 +7,7 @@ import pytest
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, unpack_command
 from exo_gravity.core.safety.drive import NOTHING, Drive
+from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
 from exo_gravity.hardware.ownership import handover
 from exo_gravity.hardware.ownership.handover import Charge, let_down
 
@@ -28,7 +29,7 @@ def test_the_arm_is_lowered_from_the_noted_torques_and_its_motors_are_switched_o
         torques = [command.torque for command in commands(listener, 2) if command]
     assert torques[0] == pytest.approx(rig.carrying[1], abs=0.02)
     largest = max(abs(after - before) for before, after in itertools.pairwise(torques))
-    assert largest <= LIMITS.max_effort_rate * PERIOD + 2 * MOTORS["AK80-9"].torque_range / 4095
+    assert largest <= MAX_EFFORT_RATE * PERIOD + 2 * MOTORS["AK80-9"].torque_range / 4095
     assert notes[0].powered and not notes[-1].powered
     rig.assert_let_down()
 

@@ -18,8 +18,7 @@ from can.broadcastmanager import ThreadBasedCyclicSendTask
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.motors.specs import ENTER, EXIT, MotorReply
-from exo_gravity.core.motors.wire_formats import MIT, MIT_V3, WireFormat
-from exo_gravity.core.motors.wire_formats.wire_format import EXTENDED, ID_BITS
+from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, MIT, MIT_V3, WireFormat
 from exo_gravity.core.safety.drive import NOTHING, OFF, Drive
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedDevice

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from ..support.launched_nodes import FAST, LaunchedNodes, children
+from ..support.launched_nodes import LaunchedNodes, children
 from ..support.ros_probe import RosProbe
 from ..support.truth import Truth
 
@@ -69,7 +69,7 @@ class Launched:
 @pytest.fixture
 def launched(prepare: Callable[..., LaunchedNodes], probe: RosProbe) -> Iterator[Launched]:
     """An arm that is carried."""
-    nodes = prepare(truth=True, can_bridge={**FAST, "damping": 5.0})
+    nodes = prepare(truth=True)
     launched = Launched(nodes)
     try:
         probe.wait_until_carried()

@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import rclpy
@@ -18,10 +17,9 @@ from exo_gravity.hardware.control_loop import EffortCommand
 from exo_gravity.hardware.ownership import bus_lock, owned_bus
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.nodes.can_bridge import node as can_bridge
-from exo_gravity.nodes.can_bridge import services as bridge_services
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.can_bridge.node import CanBridge
-from exo_gravity.nodes.can_bridge.report import BridgeReport
+from exo_gravity.nodes.can_bridge.operation import BridgeReport
 
 from ..hardware.simulated_rig import NoWatchdog, SimulatedRig, wait_until
 
@@ -67,16 +65,12 @@ def make_bridge(rig: SimulatedRig, monkeypatch: pytest.MonkeyPatch) -> Iterator[
     rclpy.try_shutdown()
 
 
-def state_of(bridge: CanBridge) -> str:
-    return bridge._state_machine.current_state[1]
-
-
 def assert_bus_is_free(rig: SimulatedRig) -> None:
     BusLock(rig.charge.address, "a test").release()
 
 
 def assert_nothing_runs(bridge: CanBridge, rig: SimulatedRig) -> None:
-    assert bridge._loop is None
+    assert bridge.loop is None
     assert "control" not in [thread.name for thread in threading.enumerate()]
     assert rig.motors_on == [False] * 4
 
@@ -84,23 +78,28 @@ def assert_nothing_runs(bridge: CanBridge, rig: SimulatedRig) -> None:
 def carry(bridge: CanBridge, rig: SimulatedRig) -> None:
     assert bridge.trigger_configure() is SUCCESS
     assert bridge.trigger_activate() is SUCCESS
-    safety = bridge._loop.safety
+    safety = bridge.loop.safety
     wait_until(lambda: safety.state in (State.ACTIVE, State.FAULT))
     while safety.state is State.FAULT:  # as a busy machine causes
-        bridge._loop.call(lambda: safety.clear(time.monotonic()) and safety.enable(time.monotonic())).result(5.0)
+        bridge.loop.call(lambda: safety.clear(time.monotonic()) and safety.enable(time.monotonic())).result(5.0)
         wait_until(lambda: safety.state in (State.ACTIVE, State.FAULT))
     assert rig.motors_on == [True] * 4
 
 
-def test_configured_activated_deactivated_activated_again_and_cleaned_up(rig, make_bridge):
+def test_carried_deactivated_once_all_motors_reply_activated_again_and_cleaned_up(rig, make_bridge, monkeypatch):
     bridge = make_bridge()
     carry(bridge, rig)
     with pytest.raises(BusError, match="is held by /can_bridge"):
         BusLock(rig.charge.address, "another")
-    assert bridge.trigger_deactivate() is SUCCESS
+    rig.device.bus_silent = True
+    with monkeypatch.context() as patch:
+        patch.setattr(can_bridge, "DESCENT_TIMEOUT", 1.0)
+        assert bridge.trigger_deactivate() is FAILURE
+    rig.device.bus_silent = False
+    assert bridge.trigger_deactivate() is SUCCESS  # so the node had stayed active
     assert_nothing_runs(bridge, rig)
     assert bridge.trigger_activate() is SUCCESS
-    wait_until(lambda: bridge._loop.safety.state is State.CHECKING)
+    wait_until(lambda: bridge.loop.safety.state is State.CHECKING)
     assert bridge.trigger_deactivate() is SUCCESS
     assert bridge.trigger_cleanup() is SUCCESS
     assert_nothing_runs(bridge, rig)
@@ -119,20 +118,18 @@ def test_a_shutdown_lets_the_arm_down_reports_it_and_releases_the_bus(rig, make_
     assert_bus_is_free(rig)
 
 
-def test_a_held_bus_fails_the_configuration(rig, make_bridge):
+def test_a_bus_that_is_held_or_cannot_be_opened_fails_the_configuration_and_the_next_one_works(
+    rig, make_bridge, monkeypatch
+):
     lock = BusLock(rig.charge.address, "another (PID 1)")
     bridge = make_bridge()
     assert bridge.trigger_configure() is FAILURE
-    assert state_of(bridge) == "unconfigured"
     lock.release()
-    assert bridge.trigger_configure() is SUCCESS
-
-
-def test_a_bus_that_cannot_be_opened_fails_the_configuration_and_is_released(rig, make_bridge, monkeypatch):
-    bridge = make_bridge()
-    monkeypatch.setattr(can_bridge.OwnedBus, "open", raises(BusError("CAN bus can0 cannot be opened")))
-    assert bridge.trigger_configure() is FAILURE
+    with monkeypatch.context() as patch:
+        patch.setattr(can_bridge.OwnedBus, "open", raises(BusError("CAN bus can0 cannot be opened")))
+        assert bridge.trigger_configure() is FAILURE
     assert_bus_is_free(rig)
+    assert bridge.trigger_configure() is SUCCESS
 
 
 def test_autostart_without_a_bus_ends_the_node_with_the_reason(rig, make_bridge):
@@ -142,54 +139,18 @@ def test_autostart_without_a_bus_ends_the_node_with_the_reason(rig, make_bridge)
     lock.release()
 
 
-def test_a_failed_activation_leaves_nothing_running_and_the_next_one_works(rig, make_bridge, monkeypatch):
+def test_a_failed_activation_leaves_nothing_running_and_a_dead_control_thread_is_a_failure_of_the_node(
+    rig, make_bridge, monkeypatch
+):
     bridge = make_bridge()
     assert bridge.trigger_configure() is SUCCESS
     with monkeypatch.context() as patch:
         patch.setattr(can_bridge, "request_real_time", raises(OSError("no such thread")))
         assert bridge.trigger_activate() is FAILURE
-    assert state_of(bridge) == "inactive"
     assert_nothing_runs(bridge, rig)
-    assert bridge.trigger_activate() is SUCCESS
-
-
-def test_a_deactivation_fails_while_a_motor_does_not_reply(rig, make_bridge, monkeypatch):
-    bridge = make_bridge()
-    carry(bridge, rig)
-    rig.device.bus_silent = True
-    monkeypatch.setattr(can_bridge, "DESCENT_TIMEOUT", 1.0)
-    assert bridge.trigger_deactivate() is FAILURE
-    assert state_of(bridge) == "active"
-    rig.device.bus_silent = False
-    monkeypatch.setattr(can_bridge, "DESCENT_TIMEOUT", 60.0)
-    assert bridge.trigger_deactivate() is SUCCESS
-    assert_nothing_runs(bridge, rig)
-
-
-def test_an_enable_that_timed_out_never_arms_the_arm_later(rig, make_bridge, monkeypatch):
-    bridge = make_bridge()
-    assert bridge.trigger_configure() is SUCCESS
-    assert bridge.trigger_activate() is SUCCESS
-    loop = bridge._loop
-    loop.call(lambda: loop.safety.disable(time.monotonic())).result(5.0)
-    monkeypatch.setattr(bridge_services, "CALL_TIMEOUT", 0.1)
-    resume = threading.Event()
-    loop.call(resume.wait)
-    services = bridge_services.BridgeServices(bridge, lambda: loop, bridge._motors, bridge._limits)
-    response = services._on_enable(SimpleNamespace(data=True), SimpleNamespace())
-    assert not response.success
-    assert response.message == "the control thread did not respond"
-    resume.set()
-    loop.call(lambda: None).result(5.0)
-    assert loop.safety.state is State.DISABLED
-
-
-def test_a_dead_control_thread_is_a_failure_of_the_node(rig, make_bridge):
-    bridge = make_bridge()
-    assert bridge.trigger_configure() is SUCCESS
     assert bridge.trigger_activate() is SUCCESS
     assert bridge.failure is None
-    bridge._loop.safety.step = raises(RuntimeError("broken"))
+    bridge.loop.safety.step = raises(RuntimeError("broken"))
     wait_until(lambda: bridge.failure)
     assert str(bridge.failure) == "broken"
 

@@ -14,7 +14,7 @@ from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.tools import train_anfis
 
 from ..support import CONFIG
-from ..support.launched_nodes import GENTLE, NO_IMU, SIMULATED, LaunchedNodes
+from ..support.launched_nodes import NO_IMU, SIMULATED, LaunchedNodes
 from ..support.ros_probe import RosProbe
 
 pytestmark = pytest.mark.real_time
@@ -33,7 +33,7 @@ def script(tmp_path: Path) -> str:
 
 
 def test_a_released_arm_stays_follows_live_changes_and_is_let_down_gently(launch, probe, script, listen):
-    nodes = launch(can_bridge=GENTLE)
+    nodes = launch()
     listener = listen(nodes)
     probe.bring_to(script)
     released = probe.joint_angles()

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 import exo_gravity.panel
-from exo_gravity.core.safety.drive import State
-from exo_gravity.core.safety.faults import FaultCode
+from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.trial.script import TIMED, TURNS
 
 FOLDER = Path(exo_gravity.panel.__file__).parent

@@ -26,8 +26,7 @@ PORTS = own_ports(20_000)
 GROUP = "239.74.163.2"
 AUTOGROUP_NICE = -15
 NO_IMU: Parameters = {"use_imu": False}  # for the compensator, which then starts without waiting for a tilt
-FAST: Parameters = {"sign_check_torque": 0.0, "ramp_time": 0.5, "fade_time": 0.5, "damping": 1.5}
-GENTLE: Parameters = {**FAST, "ramp_time": 1.0, "fade_time": 2.0, "damping": 5.0}
+FAST: Parameters = {"sign_check_torque": 0.0}
 # Rate and time-outs of config/sim.yaml, which suit a busy machine, and those of a real device.
 SIMULATED: dict[str, Parameters] = {
     "can_bridge": {"rate": 100.0, "command_timeout": 0.1, "reply_timeout": 0.1},

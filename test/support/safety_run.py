@@ -17,7 +17,6 @@ LIMITS = Limits(
     position_max=(1.6, 3.1, 2.5, 3.1),
     max_velocity=(5.0, 5.0, 5.0, 6.0),
     max_effort=(3.0, 9.0, 3.0, 3.0),
-    home=(0.5, 0.5, 0.5, 0.5),
     sign_check_torque=0.0,
 )
 EFFORT = (0.5, -4.0, 2.0, 1.0)  # Nm
@@ -25,7 +24,7 @@ EFFORT = (0.5, -4.0, 2.0, 1.0)  # Nm
 
 def reading(**changes: Any) -> JointSample:
     """Return the reading of a joint at rest at home, with `changes`."""
-    return JointSample(**{"position": 0.5, "velocity": 0.0, "effort": 0.0, "temperature": 30, "error": 0, **changes})
+    return JointSample(**{"position": 0.0, "velocity": 0.0, "effort": 0.0, "temperature": 30, "error": 0, **changes})
 
 
 class SafetyRun:

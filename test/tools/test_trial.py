@@ -56,7 +56,7 @@ def changed(folder: Path, changes: Changes) -> Path:
     for node, entry in content.items():
         values = entry["ros__parameters"]
         if node == "/right/can_bridge":
-            values.update(sign_check_torque=0.0, ramp_time=0.5, fade_time=0.5, damping=1.5)  # saves seconds
+            values.update(sign_check_torque=0.0)  # saves seconds
         elif node == "/right/simulator":
             values["trial_delay"] = 1.5
         values.update(changes.get(node, {}))

@@ -1,16 +1,20 @@
-"""A motor on a joint: joint angle, effort and damping <-> the frames of its wire format."""
+"""A motor on a joint, its parameters, and what they say about the bus.
+
+A `JointMotor` translates joint angle, effort and damping to the frames of its wire format, and back.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.specs import MotorReply, MotorSpec, standstill
-from exo_gravity.core.motors.wire_formats import MIT, WireFormat
-from exo_gravity.core.motors.wire_formats.wire_format import Frame
+from exo_gravity.core.motors.bus_load import BITRATE, Traffic
+from exo_gravity.core.motors.specs import MOTORS, WIRE_RANGE_BOUNDS, MotorReply, MotorSpec, standstill
+from exo_gravity.core.motors.wire_formats import FORMATS, MIT, Frame, WireFormat
+from exo_gravity.core.params import Param
 
 # In the format `mit` the first byte of a reply is the motor's ID. The first byte of our commands is 0x7f or 0x80,
 # because their position is always 0. With IDs below 0x7f a command echoed by the bus cannot look like a reply.
@@ -18,20 +22,25 @@ MAX_CAN_ID = 126
 TORQUE_SCALE_BOUNDS = (0.2, 2.0)
 
 
+OPTIONS = "can.options"  # parameters below this prefix go to python-can unchanged
+# python-can's interfaces that open a bus at another bit rate than the motors' unless they are given one.
+NEED_BITRATE = ("cantact", "gs_usb", "ixxat", "kvaser", "pcan", "slcan", "usb2can", "vector")
+
+
 @dataclass(frozen=True)
 class JointMotor:
-    """One motor on one joint.
-
-    can_id: 1..MAX_CAN_ID. direction: +1 or -1; joint angle = direction * (motor angle - zero). zero: motor angle in rad
-    at which the joint angle is 0. torque_scale: real output torque per commanded Nm (users report 0.75 for one AK80-9).
-    wire_format: of the board. Raises ParameterError.
-    """
+    """One motor on one joint. Raises ParameterError."""
 
     spec: MotorSpec
+    #: 1 to MAX_CAN_ID
     can_id: int
+    #: 1 or -1: joint angle = direction * (motor angle - zero)
     direction: int = 1
+    #: motor angle in rad at which the joint angle is 0
     zero: float = 0.0
+    #: real output torque per commanded Nm (users report 0.75 for one AK80-9)
     torque_scale: float = 1.0
+    #: of the motor's board
     wire_format: WireFormat = MIT
 
     def __post_init__(self) -> None:
@@ -45,6 +54,14 @@ class JointMotor:
         low, high = TORQUE_SCALE_BOUNDS
         if not low <= self.torque_scale <= high:
             raise ParameterError("torque_scale", self.torque_scale, f"from {low:g} to {high:g}")
+
+    @property
+    def rated_effort(self) -> float:
+        """The largest torque in Nm at the joint that the motor bears for any time.
+
+        A motor that gives less than commanded already has its rated current when its rated torque is commanded.
+        """
+        return self.spec.rated_torque * min(1.0, self.torque_scale)
 
     @property
     def peak_effort(self) -> float:
@@ -112,12 +129,72 @@ class JointMotor:
 
 
 class Peaks(NamedTuple):
-    """The most that the motors of an arm apply at its joints: effort (4,) in Nm, damping (4,) in Nm s/rad."""
+    """The most that the motors of an arm apply at its joints."""
 
+    #: (4,) Nm
     effort: tuple[float, ...]
+    #: (4,) Nm s/rad
     damping: tuple[float, ...] = (math.inf,) * 4
 
 
 def peaks_of(motors: Sequence[JointMotor]) -> Peaks:
     """Return what `motors` apply at most."""
     return Peaks(tuple(motor.peak_effort for motor in motors), tuple(motor.peak_damping for motor in motors))
+
+
+# fmt: off
+# `can_bridge` assumes these properties of its motors; `simulator` builds motors that have them.
+MOTOR_PARAMETERS = (
+    Param("can.interface", "", "python-can interface, e.g. socketcan, udp_multicast", fixed=True, required=True),
+    Param("can.channel", "", "python-can channel, e.g. can0", fixed=True, required=True),
+    Param("motor", ["AK60-6", "AK80-9", "AK60-6", "AK60-6"], "motor types", choices=tuple(MOTORS), fixed=True),
+    Param("can_id", [1, 2, 3, 4], "CAN IDs", (1, MAX_CAN_ID), fixed=True),
+    Param("direction", [1, 1, 1, 1], "1 or -1: joint angle = direction * (motor angle - zero)", (-1, 1), fixed=True),
+    Param("zero", [0.0] * 4, "motor angle at which the joint angle is 0", (-12.5, 12.5), "rad", fixed=True),
+    Param("torque_scale", [1.0] * 4, "real output torque per commanded Nm", TORQUE_SCALE_BOUNDS, fixed=True),
+    Param("wire_format", ["mit"] * 4, "wire format of the motor's board: mit for V1 and V2, mit_v3 for V3",
+          choices=tuple(FORMATS), fixed=True),
+    Param("velocity_range", [0.0] * 4, "velocity range of the firmware's wire format; 0: the usual one of the motor",
+          (0.0, WIRE_RANGE_BOUNDS[1]), "rad/s", fixed=True),
+    Param("torque_range", [0.0] * 4, "torque range of the firmware's wire format; 0: the usual one of the motor",
+          (0.0, WIRE_RANGE_BOUNDS[1]), "Nm", fixed=True),
+    Param("torque_per_ampere", [0.0] * 4, "V3: output torque by the current in status frames; 0: rated torque by "
+          "rated current", (0.0, 10.0), "Nm/A", fixed=True, expert=True),
+)
+# fmt: on
+_OF_A_MOTOR = tuple(param.name for param in MOTOR_PARAMETERS if isinstance(param.default, list))
+
+
+def motors_of(values: Mapping[str, Any]) -> tuple[JointMotor, ...]:
+    """Return the four motors that parameter values describe, or raise ParameterError."""
+    ids = values["can_id"]
+    if len(set(ids)) != len(ids):
+        raise ParameterError("can_id", ids, "4 different IDs")
+    return tuple(_motor_of({name: values[name][joint] for name in _OF_A_MOTOR}) for joint in range(len(ids)))
+
+
+def _motor_of(given: Mapping[str, Any]) -> JointMotor:
+    """Return one motor with the ranges of its firmware, 0 for the usual ones; raises ParameterError.
+
+    A range that is usual on V1 and V2 boards is refused for another: it would scale every torque without an error.
+    """
+    plain, board = MOTORS[given["motor"]], FORMATS[given["wire_format"]]
+    usual = board.ranged(plain)
+    for name in ("velocity_range", "torque_range"):
+        own = getattr(usual, name)
+        if given[name] == getattr(plain, name) != own:
+            raise ParameterError(name, given[name], f"{own:g} or 0 for an {plain.name} with wire_format = {board.name}")
+    ranges = (given[name] or getattr(usual, name) for name in ("velocity_range", "torque_range"))
+    per_ampere = given["torque_per_ampere"] or usual.torque_per_ampere
+    spec = replace(usual.with_ranges(*ranges), torque_per_ampere=per_ampere)
+    can_id, direction, zero, scale = (given[name] for name in ("can_id", "direction", "zero", "torque_scale"))
+    return JointMotor(spec, can_id, direction, zero, scale, board)
+
+
+def traffic_of(values: Mapping[str, Any], options: Mapping[str, Any]) -> Traffic:
+    """Return the traffic on the bus of the four motors; options: those of python-can. Raises ParameterError."""
+    interface, bitrate = values["can.interface"], options.get("bitrate")
+    if bitrate is None and interface in NEED_BITRATE:
+        raise ParameterError(f"{OPTIONS}.bitrate", bitrate, f"set for {interface}, as on the motors, e.g. {BITRATE}")
+    replying = sum(FORMATS[name].replies for name in values["wire_format"])
+    return Traffic(replying, len(values["wire_format"]) - replying, bitrate or BITRATE)

@@ -40,23 +40,24 @@ MOTOR_ERRORS = {
 
 @dataclass(frozen=True)
 class MotorSpec:
-    """A motor type: the ranges of its wire format, which are not physical limits, and its physical limits.
-
-    position_range rad, velocity_range rad/s, torque_range Nm: the wire range is +- this value. kp_max Nm/rad, kd_max
-    Nm s/rad: the wire range starts at 0. rated_torque, peak_torque: Nm at the output. gear_ratio: motor turns per turn
-    of the output. pole_pairs: of the motor. torque_per_ampere: Nm at the output, rated torque by rated current; only V3
-    boards report a current.
-    """
+    """A motor type: the ranges of its wire format, which are not physical limits, and its physical limits."""
 
     name: str
+    #: rad/s, Nm: the wire range is +- this value
     velocity_range: float
     torque_range: float
+    #: Nm at the output
     rated_torque: float
     peak_torque: float
+    #: turns of the motor per turn of the output
     gear_ratio: int
+    #: of the motor
     pole_pairs: int
+    #: Nm at the output, rated torque by rated current; only V3 boards report a current
     torque_per_ampere: float
+    #: rad: the wire range is +- this value
     position_range: float = 12.5
+    #: Nm/rad, Nm s/rad: the wire range starts at 0
     kp_max: float = 500.0
     kd_max: float = 5.0
 
@@ -69,31 +70,9 @@ class MotorSpec:
         return replace(self, velocity_range=velocity_range, torque_range=torque_range)
 
 
-MOTORS = {
-    spec.name: spec
-    for spec in (
-        MotorSpec(
-            "AK60-6",
-            velocity_range=45.0,
-            torque_range=15.0,
-            rated_torque=3.0,
-            peak_torque=9.0,
-            gear_ratio=6,
-            pole_pairs=14,
-            torque_per_ampere=3.0 / 7.4,
-        ),
-        MotorSpec(
-            "AK80-9",
-            velocity_range=50.0,
-            torque_range=18.0,
-            rated_torque=9.0,
-            peak_torque=18.0,
-            gear_ratio=9,
-            pole_pairs=21,
-            torque_per_ampere=9.0 / 10.3,
-        ),
-    )
-}
+_AK60 = MotorSpec("AK60-6", 45.0, 15.0, 3.0, 9.0, gear_ratio=6, pole_pairs=14, torque_per_ampere=3.0 / 7.4)
+_AK80 = MotorSpec("AK80-9", 50.0, 18.0, 9.0, 18.0, gear_ratio=9, pole_pairs=21, torque_per_ampere=9.0 / 10.3)
+MOTORS = {spec.name: spec for spec in (_AK60, _AK80)}
 
 
 class MotorCommand(NamedTuple):
@@ -107,13 +86,18 @@ class MotorCommand(NamedTuple):
 
 
 class MotorReply(NamedTuple):
-    """The content of a reply: rad, rad/s, Nm; temperature (degC) and error code are None from 6-byte firmware."""
+    """The content of a reply."""
 
     motor_id: int
+    #: rad
     position: float
+    #: rad/s
     velocity: float
+    #: Nm
     torque: float
+    #: degC, None from firmware that replies with 6 bytes
     temperature: int | None
+    #: a code of MOTOR_ERRORS, None from firmware that replies with 6 bytes
     error: int | None
 
 
@@ -123,14 +107,8 @@ def pack_command(spec: MotorSpec, position: float, velocity: float, kp: float, k
     position rad, velocity rad/s, kp 0..500 Nm/rad, kd 0..5 Nm s/rad, torque Nm. Raises ParameterError on NaN, infinity
     or a value outside the spec's range.
     """
-    word = (
-        to_code("position", position, -spec.position_range, spec.position_range, 0xFFFF) << 48
-        | to_code("velocity", velocity, -spec.velocity_range, spec.velocity_range, 0xFFF) << 36
-        | to_code("kp", kp, 0.0, spec.kp_max, 0xFFF) << 24
-        | to_code("kd", kd, 0.0, spec.kd_max, 0xFFF) << 12
-        | to_code("torque", torque, -spec.torque_range, spec.torque_range, 0xFFF)
-    )
-    data = word.to_bytes(8, "big")
+    p, v, stiffness, damping, t = command_codes(spec, position, velocity, kp, kd, torque)
+    data = (p << 48 | v << 36 | stiffness << 24 | damping << 12 | t).to_bytes(8, "big")
     # With all other fields at their maximum, the top torque codes spell ENTER, EXIT or SET_ZERO. Send the code below.
     return data if data[0] != 0xFF or data not in SPECIAL_FRAMES else data[:7] + b"\xfb"
 
@@ -140,12 +118,31 @@ def unpack_command(spec: MotorSpec, data: bytes | bytearray) -> MotorCommand:
     if len(data) != 8 or bytes(data) in SPECIAL_FRAMES:
         raise FrameError(data, "8 bytes and not a special frame")
     word = int.from_bytes(data, "big")
+    codes = word >> 48, word >> 36 & 0xFFF, word >> 24 & 0xFFF, word >> 12 & 0xFFF, word & 0xFFF
+    return command_of_codes(spec, *codes)
+
+
+def command_codes(
+    spec: MotorSpec, position: float, velocity: float, kp: float, kd: float, torque: float
+) -> tuple[int, int, int, int, int]:
+    """Return the codes of a command's fields, in the order of the arguments. Raises ParameterError."""
+    return (
+        to_code("position", position, -spec.position_range, spec.position_range, 0xFFFF),
+        to_code("velocity", velocity, -spec.velocity_range, spec.velocity_range, 0xFFF),
+        to_code("kp", kp, 0.0, spec.kp_max, 0xFFF),
+        to_code("kd", kd, 0.0, spec.kd_max, 0xFFF),
+        to_code("torque", torque, -spec.torque_range, spec.torque_range, 0xFFF),
+    )
+
+
+def command_of_codes(spec: MotorSpec, position: int, velocity: int, kp: int, kd: int, torque: int) -> MotorCommand:
+    """Return the command whose fields have these codes."""
     return MotorCommand(
-        from_code(word >> 48, -spec.position_range, spec.position_range, 0xFFFF),
-        from_code(word >> 36 & 0xFFF, -spec.velocity_range, spec.velocity_range, 0xFFF),
-        from_code(word >> 24 & 0xFFF, 0.0, spec.kp_max, 0xFFF),
-        from_code(word >> 12 & 0xFFF, 0.0, spec.kd_max, 0xFFF),
-        from_code(word & 0xFFF, -spec.torque_range, spec.torque_range, 0xFFF),
+        from_code(position, -spec.position_range, spec.position_range, 0xFFFF),
+        from_code(velocity, -spec.velocity_range, spec.velocity_range, 0xFFF),
+        from_code(kp, 0.0, spec.kp_max, 0xFFF),
+        from_code(kd, 0.0, spec.kd_max, 0xFFF),
+        from_code(torque, -spec.torque_range, spec.torque_range, 0xFFF),
     )
 
 

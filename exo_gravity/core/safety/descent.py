@@ -3,7 +3,7 @@
 Each joint has a torque s, which starts as the last one applied, and a damping k, which the motor itself applies. With v
 the joint's velocity and V the permitted speed:
 
-    |v| <= V:  s fades to zero within `fade_time`; once s is zero, k fades to zero, too
+    |v| <= V:  s fades to zero within FADE_TIME; once s is zero, k fades to zero, too
     |v| >  V:  s grows against the motion, s' = -SPEED_GAIN (v - sign(v) V), at most to the motor's peak torque; k grows
 
 So s lowers a heavy link, and k a light one, at V and a little more. No model of the arm is needed: masses, tilt and
@@ -19,11 +19,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from exo_gravity.core.safety.limits import JointSample, Limits
+from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, UNKNOWN, JointSample
 
-REST_TIME = 2.0  # s at rest with nothing holding the arm, until it counts as down
+REST_TIME = 2.0  # s at rest with nothing holding the arm, until it is down
 LONGEST_REST = 6.0  # s with nothing holding the arm, after which it is down even if the wearer moves it
 LONGEST_SILENCE = 5.0  # s for which the way down waits for a silent motor
+
+SETTLED = 0.005  # rad that a joint at rest may turn
+SETTLING_TIME = 0.5  # s
 
 DESCENT_SPEED = 0.35  # rad/s; a horizontal arm is down within 10 s
 MIN_SPEED = 0.04  # rad/s; two codes of the velocity
@@ -31,7 +34,8 @@ SPEED_RECOVERY = 5.0  # s, time constant
 SWING_SPEED = 0.05  # rad/s; slower motion has no direction
 SPEED_GAIN = 20.0  # Nm/rad; with full damping, inertias of 0.005 to 1 kg m^2 do not oscillate
 MIN_FADE_RATE = 0.5  # Nm/s
-MAX_DAMPING = 5.0  # Nm s/rad, the range of kd on the wire
+DAMPING = 5.0  # Nm s/rad, the range of kd on the wire: with less the joint swings longer
+FADE_TIME = 2.0  # s from full torque to none: the wearer has time to take over his arm
 DAMPING_RISE = 0.2  # s; damping that starts at once would be a torque step
 DAMPING_GROWTH = 0.05  # s in which damping doubles at twice the permitted speed
 DAMPING_GAIN = 5.0  # Nm/rad; lets zero damping grow
@@ -42,19 +46,16 @@ MIN_DAMPING = 0.01  # Nm s/rad; smaller values become zero
 class JointDescent:
     """One joint on its way down: `effort` in Nm and `damping` in Nm s/rad are to be applied now.
 
-    effort, damping: what the motor applies when the descent starts. brake: Nm, the largest torque against the motion.
-    limits: of the arm; `damping` is reached first, within DAMPING_RISE.
+    effort, damping: what the motor applies when the descent starts; the damping first rises to DAMPING, within
+    DAMPING_RISE. brake: Nm, the largest torque against the motion.
     """
 
-    def __init__(self, effort: float, damping: float, brake: float, limits: Limits) -> None:
+    def __init__(self, effort: float, damping: float, brake: float) -> None:
         self.effort = max(-brake, min(brake, effort))
         self.damping = damping
-        self._full_damping = limits.damping
-        self._fade_time = limits.fade_time
         self._brake = brake
-        self._max_rate = limits.max_effort_rate
-        self._fade_rate = self._rate_to_fade(effort)
-        self._is_rising = True  # the damping has not yet reached full_damping
+        self._fade_rate = _rate_to_fade(effort)
+        self._is_rising = True  # the damping has not yet reached DAMPING
         self._speed = DESCENT_SPEED
         self._direction = 0.0
 
@@ -67,26 +68,23 @@ class JointDescent:
         """Continue from `effort` (Nm), which the motor is found to apply after a silence, without damping."""
         self.effort = max(-self._brake, min(self._brake, effort))
         self.damping = 0.0
-        self._fade_rate = self._rate_to_fade(effort)
+        self._fade_rate = _rate_to_fade(effort)
         self._is_rising = True
 
     def step(self, dt: float, velocity: float) -> None:
-        """Advance by `dt` s with the joint's `velocity` in rad/s; NaN counts as 0."""
+        """Advance by `dt` s with the joint's `velocity` in rad/s; NaN is taken as 0."""
         if not math.isfinite(velocity):
             velocity = 0.0
         self._limit_swing(dt, velocity)
         excess = velocity - max(-self._speed, min(self._speed, velocity))
         if excess:
-            most = self._max_rate * dt
+            most = MAX_EFFORT_RATE * dt
             change = max(-most, min(most, -SPEED_GAIN * excess * dt))
             self.effort = max(-self._brake, min(self._brake, self.effort + change))
         else:
             fade = self._fade_rate * dt
             self.effort -= max(-fade, min(fade, self.effort))
         self._step_damping(dt, abs(excess))
-
-    def _rate_to_fade(self, effort: float) -> float:
-        return min(self._max_rate, max(MIN_FADE_RATE, abs(effort) / self._fade_time))
 
     def _limit_swing(self, dt: float, velocity: float) -> None:
         self._speed += (DESCENT_SPEED - self._speed) * dt / SPEED_RECOVERY
@@ -97,15 +95,19 @@ class JointDescent:
 
     def _step_damping(self, dt: float, excess: float) -> None:
         if self._is_rising:
-            self.damping = min(self._full_damping, self.damping + self._full_damping / DAMPING_RISE * dt)
-            self._is_rising = self.damping < self._full_damping
+            self.damping = min(DAMPING, self.damping + DAMPING / DAMPING_RISE * dt)
+            self._is_rising = self.damping < DAMPING
         elif excess:
             growth = 1.0 + excess / self._speed * dt / DAMPING_GROWTH
-            self.damping = min(MAX_DAMPING, self.damping * growth + DAMPING_GAIN * excess * dt)
+            self.damping = min(DAMPING, self.damping * growth + DAMPING_GAIN * excess * dt)
         elif self.effort == 0.0:
             self.damping *= math.exp(-dt / DAMPING_FADE)
             if self.damping < MIN_DAMPING:
                 self.damping = 0.0
+
+
+def _rate_to_fade(effort: float) -> float:
+    return min(MAX_EFFORT_RATE, max(MIN_FADE_RATE, abs(effort) / FADE_TIME))
 
 
 class ArmDescent:
@@ -114,10 +116,8 @@ class ArmDescent:
     peak: (4,) Nm, the largest torque of each motor against the motion.
     """
 
-    def __init__(
-        self, now: float, effort: Sequence[float], damping: Sequence[float], peak: Sequence[float], limits: Limits
-    ) -> None:
-        self._joints = tuple(JointDescent(*joint, limits) for joint in zip(effort, damping, peak, strict=True))
+    def __init__(self, now: float, effort: Sequence[float], damping: Sequence[float], peak: Sequence[float]) -> None:
+        self._joints = tuple(JointDescent(*joint) for joint in zip(effort, damping, peak, strict=True))
         self._silent: Sequence[bool] = (False,) * len(self._joints)
         self._start = now
         self._held = now  # when something last held the arm, s
@@ -148,3 +148,33 @@ class ArmDescent:
         free = now - self._held
         is_down = free >= LONGEST_REST or (free >= REST_TIME and now - rest_since >= REST_TIME)
         return is_down and (not any(self._silent) or now - self._start >= LONGEST_SILENCE)
+
+
+class RestTracker:
+    """Whether an arm is at rest, judged by position: a damped arm can creep at less than one code of the velocity.
+
+    since: s, the time since which no replying joint has turned by more than SETTLED.
+    """
+
+    def __init__(self) -> None:
+        self.since = -math.inf
+        self._reference: Sequence[JointSample] = (UNKNOWN,) * 4
+
+    def step(self, now: float, joints: Sequence[JointSample], silent: Sequence[bool]) -> None:
+        """Take the newest readings at `now` (s); silent: (4,) whose motor does not reply."""
+        moved = (
+            not is_silent and not abs(joint.position - reference.position) <= SETTLED
+            for joint, reference, is_silent in zip(joints, self._reference, silent, strict=True)
+        )
+        if any(moved):
+            self.since, self._reference = now, joints
+        if not any(silent):
+            return
+        # A silent joint may have moved by the time it replies again.
+        self._reference = [
+            UNKNOWN if is_silent else reference for reference, is_silent in zip(self._reference, silent, strict=True)
+        ]
+
+    def is_settled(self, now: float) -> bool:
+        """Return whether no replying joint has moved for SETTLING_TIME."""
+        return now - self.since >= SETTLING_TIME

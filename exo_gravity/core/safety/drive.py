@@ -1,4 +1,7 @@
-"""What the motors of an arm receive in one cycle, and the states of the machine that decides it."""
+"""What the safety machine decides: its state, what the motors receive, and the fault that let a worn arm down.
+
+Every fault has a code for programs and a sentence for people.
+"""
 
 from __future__ import annotations
 
@@ -21,16 +24,20 @@ class State(str, Enum):
     FAULT = "fault"
 
 
+# The states in which torque is applied on request.
+CARRYING = (State.PROVING, State.RAMPING_IN, State.ACTIVE)
+
+
 class Drive(NamedTuple):
-    """What the motors receive.
+    """What the motors receive in one cycle."""
 
-    effort: (4,) Nm. damping: (4,) Nm s/rad. powered: whether they are to be on. enter: (4,) which motors must be
-    switched on again, because they are found off.
-    """
-
+    #: (4,) Nm
     effort: tuple[float, ...]
+    #: (4,) Nm s/rad
     damping: tuple[float, ...]
+    #: whether the motors are to be on
     powered: bool
+    #: (4,) which motors must be switched on again, because they are found off
     enter: tuple[bool, ...] = (False, False, False, False)
 
     def within(self, peak_damping: tuple[float, ...]) -> Drive:
@@ -40,7 +47,68 @@ class Drive(NamedTuple):
         return self._replace(damping=tuple(map(min, self.damping, peak_damping)))
 
 
-# The states in which torque is applied on request.
-CARRYING = (State.PROVING, State.RAMPING_IN, State.ACTIVE)
-
 OFF = Drive(NOTHING, NOTHING, False)
+
+
+class FaultCode(str, Enum):
+    """The code of a fault, as published on /diagnostics; `meaning` explains it.
+
+    Every fault latches: the arm is let down, or stays off, until the operator clears the fault.
+    """
+
+    meaning: str
+
+    def __new__(cls, value: str, meaning: str) -> FaultCode:
+        """Create a code from its text and its meaning."""
+        code = str.__new__(cls, value)
+        code._value_ = value
+        code.meaning = meaning
+        return code
+
+    def __str__(self) -> str:
+        return str(self.value)
+
+    # The motors
+    MOTOR_SILENT = "motor_silent", "a motor has not replied within `reply_timeout`"
+    MOTOR_ERROR = "motor_error", "a motor reports an error"
+    OVER_TEMPERATURE = "over_temperature", "a motor is hotter than 80 degC"
+    TORQUE_NOT_DELIVERED = "torque_not_delivered", "a motor's reply shows another torque than the commanded one"
+    # The motion
+    OVER_SPEED = "over_speed", "a joint turns faster than `max_velocity`"
+    OUTSIDE_LIMITS = "outside_limits", "a joint is more than 0.1 rad beyond `position_min` or `position_max`"
+    POSITION_JUMP = "position_jump", "an angle changed by 0.05 rad more than `max_velocity` allows"
+    # The start gate
+    IMPLAUSIBLE_ZERO = "implausible_zero", "a joint is over 0.5 rad (AK80-9: 0.34 rad) from 0 at the first start"
+    WRONG_SIGN = "wrong_sign", "a joint moved against a small test torque at the first start"
+    SIGN_UNPROVEN = "sign_unproven", "a joint did not move under a small test torque at the first start"
+    # The efforts
+    COMMAND_STALE = "command_stale", "no effort command answers a joint state younger than `command_timeout`"
+    COMMAND_WITHDRAWN = "command_withdrawn", "the compensator withdrew its efforts; its diagnostics give the reason"
+    COMMAND_IMPOSSIBLE = "command_impossible", "an effort is NaN, beyond 40 Nm, misnamed or missing"
+    SECOND_COMMANDER = "second_commander", "two publishers send effort commands"
+    # The bus and the computer
+    FOREIGN_COMMAND = "foreign_command", "another sender commands a motor of this arm"
+    BUS_ERROR = "bus_error", "the CAN bus cannot be opened, or sending or receiving failed"
+    WATCHDOG_DEAD = "watchdog_dead", "the watchdog process has died"
+    INTERNAL_ERROR = "internal_error", "the control loop raised an unexpected exception"
+
+
+# After these faults zeros and signs are checked again: an encoder may have lost its turn count, or a motor its power.
+DOUBTFUL = frozenset(
+    {
+        FaultCode.MOTOR_SILENT,
+        FaultCode.MOTOR_ERROR,
+        FaultCode.TORQUE_NOT_DELIVERED,
+        FaultCode.OUTSIDE_LIMITS,
+        FaultCode.POSITION_JUMP,
+        FaultCode.IMPLAUSIBLE_ZERO,
+        FaultCode.FOREIGN_COMMAND,
+    }
+)
+
+
+class Fault(NamedTuple):
+    """A fault that occurred: its code, and a sentence that names the joint, the value and the limit."""
+
+    code: FaultCode
+    reason: str

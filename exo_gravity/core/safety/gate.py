@@ -1,7 +1,8 @@
 """The start gate: what must hold before the motors of an arm are switched on, and before they carry it.
 
 `StartGate` waits until, for CALM seconds, every motor has replied without a fault, at rest and within its limits, and
-fresh efforts have arrived. `Proving` then checks that the motors are on, and that their signs are right.
+fresh efforts have arrived. `SwitchOnCheck` then checks that the motors are on, and `SignCheck` that their signs are
+right.
 """
 
 from __future__ import annotations
@@ -9,15 +10,28 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from exo_gravity.core.safety.delivery import SwitchOnCheck
-from exo_gravity.core.safety.faults import Fault, FaultCode
-from exo_gravity.core.safety.limits import JointSample, Limits
-from exo_gravity.core.safety.sign_check import SignCheck
+from exo_gravity.core.safety.drive import Fault, FaultCode
+from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, JointSample, Limits
 
 AT_REST = 0.1  # rad/s; two to four codes of the 12-bit velocity
 CALM = 1.0  # s without a fault before the motors are switched on: middleware and machine stutter while nodes start
 # The gate waits for these to pass; other faults refuse the start.
 WAITED_OUT = frozenset({FaultCode.MOTOR_SILENT, FaultCode.OVER_SPEED})
+
+TEST_TORQUE = 0.4  # Nm, each way, that shows that a motor is on
+TEST_TIME = 0.06  # s, each way
+TEST_SHARE = 0.5  # of the test torque that must appear in the replies
+TEST_ATTEMPTS = 3
+
+RISE = 2.0  # Nm/s
+FALL = 10.0  # Nm/s
+MIN_PUSH = 0.1  # Nm; motion under a smaller push is not caused by it
+MOVED = 0.02  # rad; fifty codes of the position
+STILL = 0.003  # rad within which a joint is still
+STILL_TIME = 0.2  # s for which it must stay within STILL
+PUSH_TIMEOUT = 0.5  # s at full torque
+REST_TIMEOUT = 5.0  # s for the joint to come to rest
+MAX_DISTURBED = 5  # times that a joint may move without a push
 
 
 class StartGate:
@@ -65,48 +79,165 @@ class StartGate:
         limits = self._limits
         columns = (limits.joint_names, joints, limits.position_min, limits.position_max)
         for name, joint, low, high in zip(*columns, strict=True):
-            excess = joint.position - max(low, min(high, joint.position))
-            if excess:
+            if excess := joint.position - max(low, min(high, joint.position)):
                 return f"{name} to be moved by {-excess:+.2f} rad, within its limits {low:g} to {high:g}"
         return ""
 
 
-class Proving:
-    """The checks with the motors on: each one must show that it is on, and if `signs` is true, its sign is checked.
+class SwitchOnCheck:
+    """Checks that all four motors are on: a short push each way, under damping, must appear in their replies.
 
-    effort: (4,) Nm to apply now. done: whether all joints have passed. hint: what the wearer should do, or ''.
+    effort: (4,) Nm to apply now. done: whether the check has ended. It is made up to TEST_ATTEMPTS times: on a busy
+    computer replies may be late.
     """
 
-    def __init__(self, limits: Limits, signs: bool) -> None:
-        push = [min(limits.sign_check_torque, most) if signs else 0.0 for most in limits.max_effort]
-        self._switch_on = SwitchOnCheck(limits)
-        self._signs = SignCheck(limits.joint_names, push, limits.max_effort_rate)
+    def __init__(self, limits: Limits) -> None:
+        self.done = False
+        self._names = limits.joint_names
+        self._torque = [min(TEST_TORQUE, most) for most in limits.max_effort]
+        self.effort = [0.0] * len(self._torque)
+        self._attempts = 0
+        self._last_time = [0.0] * len(self._torque)
+        self._begin()
 
-    @property
-    def effort(self) -> tuple[float, ...]:
-        """Torque (4,) in Nm to apply now."""
-        return tuple((self._signs if self._switch_on.done else self._switch_on).effort)
-
-    @property
-    def switched_on(self) -> bool:
-        """Whether all motors have shown that they are on."""
-        return self._switch_on.done
-
-    @property
-    def done(self) -> bool:
-        """Whether all joints have passed."""
-        return self._switch_on.done and self._signs.done
-
-    @property
-    def hint(self) -> str:
-        """What the wearer should do, or ''."""
-        return self._signs.hint
+    def _begin(self) -> None:
+        self._elapsed = 0.0
+        self._sums = [[0.0, 0.0] for _ in self._torque]
+        self._counts = [[0, 0] for _ in self._torque]
 
     def step(self, dt: float, joints: Sequence[JointSample], damping: Sequence[float]) -> Fault | None:
-        """Advance by `dt` s with the newest readings, and the damping (4,) in Nm s/rad that the motors apply.
+        """Advance by `dt` s with the replies to the last commands; return the fault that they show, if any.
 
-        Returns the fault that they show, if any.
+        damping: (4,) Nm s/rad, last sent. Its torque is part of the replies, and a light joint moves.
         """
-        if self._switch_on.done:
-            return self._signs.step(dt, joints)
-        return self._switch_on.step(dt, joints, damping)
+        self._elapsed += dt
+        phase, into = divmod(self._elapsed, TEST_TIME)
+        if phase >= 2:
+            return self._finish(dt)
+        for i, joint in enumerate(joints):
+            if into > 0.4 * TEST_TIME and joint.time > self._last_time[i]:
+                self._counts[i][int(phase)] += 1
+                self._sums[i][int(phase)] += joint.effort + damping[i] * joint.velocity
+            self._last_time[i] = joint.time
+            self._approach(i, self._torque[i] if phase == 0 else -self._torque[i], dt)
+        return None
+
+    def _finish(self, dt: float) -> Fault | None:
+        for name, torque, sums, counts in zip(self._names, self._torque, self._sums, self._counts, strict=True):
+            forward, backward = (total / max(1, count) for total, count in zip(sums, counts, strict=True))
+            if forward - backward < TEST_SHARE * 2.0 * torque:
+                self._attempts += 1
+                if self._attempts < TEST_ATTEMPTS:
+                    self._begin()
+                    return None
+                reason = f"{name}: the motor did not switch on: {torque:g} Nm commanded, {forward:.2f} Nm replied"
+                return Fault(FaultCode.TORQUE_NOT_DELIVERED, reason)
+        for i in range(len(self.effort)):
+            self._approach(i, 0.0, dt)
+        self.done = not any(self.effort)
+        return None
+
+    def _approach(self, i: int, target: float, dt: float) -> None:
+        step = MAX_EFFORT_RATE * dt
+        self.effort[i] += max(-step, min(step, target - self.effort[i]))
+
+
+class SignCheck:
+    """Checks that each motor pushes its joint the way that its encoder shows, while the arm hangs.
+
+    Joint after joint: wait until it is still, push it gently and slowly under damping until it moves by about a degree,
+    then push it back the other way. A joint that moves backwards has its torque or its encoder reversed: gravity
+    compensation would double its weight. A joint that does not move has no torque, or is held. A joint that moves
+    before it is pushed is being moved by the wearer: the check starts again, a few times. It cannot detect a
+    `direction` that reverses torque and encoder alike: such a joint moves as expected.
+
+    torque: (4,) Nm, the largest push on each joint; a joint with 0 is skipped. effort: (4,) Nm to apply now. done:
+    whether every joint has passed. hint: what the wearer should do, '' for nothing.
+    """
+
+    def __init__(self, names: Sequence[str], torque: Sequence[float]) -> None:
+        self.effort = [0.0] * len(names)
+        self.done = False
+        self.hint = ""
+        self._names = names
+        self._torque = torque
+        self._joint = -1
+        self._sign = 1  # of the push; 0 once both pushes have passed
+        self._start = math.inf  # where the joint was before the push, rad
+        self._next_joint()
+
+    def step(self, dt: float, joints: Sequence[JointSample]) -> Fault | None:
+        """Advance by `dt` s with the joints' readings; return the fault that they show, if any."""
+        if self.done:
+            return None
+        position = joints[self._joint].position
+        if self._still_time < STILL_TIME:
+            self._release(dt)
+            return self._wait_for_rest(dt, position)
+        if self._sign == 0:  # both pushes have passed
+            if self._release(dt):
+                self._next_joint()
+            return None
+        return self._push(dt, position)
+
+    def _push(self, dt: float, position: float) -> Fault | None:
+        push, most = self.effort[self._joint], self._torque[self._joint]
+        moved = self._sign * (position - self._start)
+        if moved >= MOVED or moved <= -MOVED:
+            if self._sign * push < MIN_PUSH:
+                return self._restart()
+            if moved < 0.0:
+                reason = f"{push:.2f} Nm moved it backwards: torque or encoder is reversed"
+                return self._fault(FaultCode.WRONG_SIGN, reason)
+            self._sign = {1: -1, -1: 0}[self._sign]  # the push the other way, or the end of this joint
+            self._start, self._waited = position, 0.0
+        elif abs(push) >= most and self._waited > PUSH_TIMEOUT:
+            return self._fault(FaultCode.SIGN_UNPROVEN, f"{push:.2f} Nm did not move it: let it hang freely")
+        else:
+            self._waited += dt if abs(push) >= most else 0.0
+            # A push in the old direction is released faster than a new one is built up.
+            step = (FALL if push * self._sign < 0.0 else RISE) * dt
+            self.effort[self._joint] = max(-most, min(most, push + self._sign * step))
+            if push * self._sign <= 0.0:
+                self._start = position
+        return None
+
+    def _restart(self) -> Fault | None:
+        self._disturbed += 1
+        if self._disturbed > MAX_DISTURBED:
+            return self._fault(FaultCode.SIGN_UNPROVEN, "it moves without being pushed: hold still and let it hang")
+        self.hint = f"{self._names[self._joint]} moves without being pushed: hold still"
+        self._start_joint()
+        return None
+
+    def _next_joint(self) -> None:
+        self._joint += 1
+        while self._joint < len(self._names) and not self._torque[self._joint]:
+            self._joint += 1
+        self.done = self._joint == len(self._names)
+        self._disturbed, self.hint = 0, ""
+        self._start_joint()
+
+    def _start_joint(self) -> None:
+        self._start, self._sign = math.inf, 1
+        self._still_time = self._waited = 0.0
+
+    def _release(self, dt: float) -> bool:
+        """Take back the push on the present joint; return whether it is gone."""
+        push, step = self.effort[self._joint], FALL * dt
+        self.effort[self._joint] = push - max(-step, min(step, push))
+        return push == 0.0
+
+    def _wait_for_rest(self, dt: float, position: float) -> Fault | None:
+        self._still_time += dt
+        self._waited += dt
+        if not abs(position - self._start) <= STILL or self.effort[self._joint] != 0.0:
+            self._start, self._still_time = position, 0.0
+        if self._still_time >= STILL_TIME:
+            self._waited = 0.0
+        elif self._waited > REST_TIMEOUT:
+            return self._fault(FaultCode.SIGN_UNPROVEN, "it does not come to rest: hold still and let it hang")
+        return None
+
+    def _fault(self, code: FaultCode, reason: str) -> Fault:
+        return Fault(code, f"{self._names[self._joint]}: {reason}")

@@ -10,14 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.specs import MOTOR_ERRORS, MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import check_owned, owned
-from exo_gravity.core.safety.drive import NOTHING
-from exo_gravity.core.safety.faults import Fault, FaultCode
+from exo_gravity.core.safety.drive import NOTHING, Fault, FaultCode
 
 MAX_COMMAND = 40.0  # Nm: no arm needs half of it, so a larger effort command is wrong
 PEAK_TORQUE = max(spec.peak_torque for spec in MOTORS.values())  # Nm
@@ -30,18 +29,31 @@ WALL_DAMPING = 5.0  # Nm s/rad, from WALL_EDGE on
 WALL_EDGE = 0.02  # rad into the wall over which the damping rises
 WALL_RELEASE = 0.03  # rad/s out of the wall, from which on the spring no longer pushes
 OVERSHOOT = 0.1  # rad past a joint limit that is not yet a fault, because mechanical stops are not infinitely stiff
-DERATING = 10.0  # degC below max_temperature over which the permitted torque falls to half
+# What was once a parameter, and what no user has a reason to change.
+MAX_EFFORT_RATE = 50.0  # Nm/s; the full torque of an AK60-6 in 60 ms, slow enough not to jolt the arm
+MAX_TEMPERATURE = 80.0  # degC, an assumption: a motor whose own protection switches it off would drop the arm
+DERATING = 10.0  # degC below MAX_TEMPERATURE over which the permitted torque falls to half
 JUMP = 0.05  # rad that two readings may differ by in addition to what max_velocity allows
+HOME = (0.0, 0.0, 0.0, 0.0)  # rad; joint angles are measured from the hanging arm
+# rad from HOME at the first start. The zero of a motor with a single encoder may be off by whole turns of the rotor (60
+# degrees of an AK60-6's output, 40 of an AK80-9's): less than half of that shows it.
+HOME_TOLERANCE = {"AK60-6": 0.5, "AK80-9": 0.34}
 
 
 class JointSample(NamedTuple):
-    """The newest reading of one joint: rad, rad/s, Nm, degC, error code, and its time on the caller's clock in s."""
+    """The newest reading of one joint."""
 
+    #: rad
     position: float
+    #: rad/s
     velocity: float
+    #: Nm
     effort: float
+    #: degC, None if the firmware reports none
     temperature: int | None
+    #: a code of MOTOR_ERRORS, None if the firmware reports none
     error: int | None
+    #: s on the caller's clock
     time: float
 
 
@@ -52,9 +64,7 @@ UNKNOWN = JointSample(math.nan, math.nan, math.nan, None, None, -math.inf)
 class Limits:
     """The limits that the worn arm must never exceed: one entry per joint (4,), or one number for all joints.
 
-    All fields except `joint_names` are parameters of `can_bridge`. The zero of a motor with a single encoder may be off
-    by whole turns of the rotor (60 degrees of an AK60-6's output, 40 of an AK80-9's): the defaults of `home_tolerance`
-    are below half of that. Raises ParameterError that names the invalid value.
+    The fields with a description are parameters of `can_bridge`. Raises ParameterError that names the invalid value.
     """
 
     joint_names: tuple[str, ...]
@@ -64,18 +74,15 @@ class Limits:
     max_effort: Sequence[float] = owned(
         (3.0, 9.0, 3.0, 3.0), "torque limit, by default the motors' rated torque", (0.0, PEAK_TORQUE), "Nm"
     )
-    max_effort_rate: float = owned(50.0, "fastest change of torque", (1.0, 1000.0), "Nm/s")
-    max_temperature: float = owned(80.0, "motor temperature that trips a fault", (30.0, 120.0), "degC")
     command_timeout: float = owned(0.05, "age of effort commands that trips a fault", (0.01, 0.1), "s")
     reply_timeout: float = owned(0.05, "time without a reply from a motor that trips a fault", (0.01, 0.1), "s")
-    ramp_time: float = owned(1.0, "time from zero to full torque when the arm is enabled", (0.5, 30.0), "s")
-    fade_time: float = owned(2.0, "time from full to zero torque when the arm is let down", (0.5, 30.0), "s")
-    damping: float = owned(5.0, "motor-side damping (kd) while the arm is let down", (0.5, 5.0), "Nm s/rad")
-    home: Sequence[float] = owned((0.0, 0.0, 0.0, 0.0), "pose of the hanging arm", (-3.15, 3.15), "rad")
-    home_tolerance: Sequence[float] = owned(
-        (0.5, 0.34, 0.5, 0.5), "largest distance from home at the first start", (0.01, 6.3), "rad"
+    sign_check_torque: float = owned(
+        1.5, "largest test torque of the sign check; 0 skips the check", (0.0, 3.0), "Nm", expert=True
     )
-    sign_check_torque: float = owned(1.5, "largest test torque of the sign check; 0 skips the check", (0.0, 3.0), "Nm")
+    #: (4,) rad from HOME at the first start; `limits_of` takes it from the motors
+    home_tolerance: Sequence[float] = tuple(HOME_TOLERANCE[name] for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6"))
+    #: (4,) rad, the hanging arm
+    home: ClassVar[tuple[float, ...]] = HOME
 
     def __post_init__(self) -> None:
         if len(set(self.joint_names)) != JOINT_COUNT or not all(self.joint_names):
@@ -86,7 +93,7 @@ class Limits:
             raise ParameterError("position_max", list(self.position_max), expected)
 
     def is_silent(self, now: float, joint: JointSample) -> bool:
-        """Return whether the motor counts as silent: its reading `joint` is older than `reply_timeout` at `now` (s)."""
+        """Return whether the motor is silent: its reading `joint` is older than `reply_timeout` at `now` (s)."""
         return not now - joint.time <= self.reply_timeout
 
     def find_fault(
@@ -105,9 +112,9 @@ class Limits:
             if joint.error:
                 text = MOTOR_ERRORS.get(joint.error, "unknown")
                 return Fault(FaultCode.MOTOR_ERROR, f"{name}: the motor reports error {joint.error} ({text})")
-            if joint.temperature is not None and joint.temperature >= self.max_temperature:
-                limit = f"the limit is {self.max_temperature:g}"
-                return Fault(FaultCode.OVER_TEMPERATURE, f"{name}: {joint.temperature} degC, {limit}")
+            if joint.temperature is not None and joint.temperature >= MAX_TEMPERATURE:
+                reason = f"{name}: {joint.temperature} degC, the limit is {MAX_TEMPERATURE:g}"
+                return Fault(FaultCode.OVER_TEMPERATURE, reason)
             if not abs(joint.velocity) <= fastest:
                 return Fault(FaultCode.OVER_SPEED, f"{name}: {joint.velocity:.2f} rad/s, the limit is {fastest:g}")
             if not low - overshoot <= joint.position <= high + overshoot:
@@ -123,12 +130,11 @@ class Limits:
         return abs(joint.position - last.position) > JUMP + self.max_velocity[i] * (joint.time - last.time)
 
     def find_wrong_zero(self, joints: Sequence[JointSample]) -> Fault | None:
-        """Return the fault of the first joint that is not near `home`, where the arm must hang, or None."""
-        columns = (self.joint_names, joints, self.home, self.home_tolerance)
-        for name, joint, home, tolerance in zip(*columns, strict=True):
+        """Return the fault of the first joint that is not near HOME, where the arm must hang, or None."""
+        for name, joint, home, tolerance in zip(self.joint_names, joints, HOME, self.home_tolerance, strict=True):
             if not abs(joint.position - home) <= tolerance:
                 reason = (
-                    f"{name}: {joint.position:.3f} rad at the start, must be within {tolerance:g} of home = {home:g}: "
+                    f"{name}: {joint.position:.3f} rad at the start, must be within {tolerance:g} of {home:g}: "
                     "let the arm hang, or correct the parameter zero"
                 )
                 return Fault(FaultCode.IMPLAUSIBLE_ZERO, reason)
@@ -142,13 +148,13 @@ class Limits:
         effort: (4,) Nm, requested. share: 0..1, the ramp's factor on effort and soft wall. before: (4,) Nm, applied
         `dt` s ago. Raises ParameterError if an effort is NaN or beyond MAX_COMMAND.
         """
-        step = self.max_effort_rate * dt
+        step = MAX_EFFORT_RATE * dt
         shaped, acted = [], set()
         for i, (name, joint) in enumerate(zip(self.joint_names, joints, strict=True)):
             if not abs(effort[i]) <= MAX_COMMAND:
                 raise ParameterError(f"effort of {name}", effort[i], f"from -{MAX_COMMAND:g} to {MAX_COMMAND:g} Nm")
             depth = self._depth(i, joint.position)
-            permitted = self.max_effort[i] * self._derating(joint.temperature)
+            permitted = self.max_effort[i] * _derating(joint.temperature)
             wall = _wall_torque(depth, joint.velocity) if depth else 0.0
             wanted = share * (effort[i] + wall)
             clamped = max(-permitted, min(permitted, wanted))
@@ -177,10 +183,12 @@ class Limits:
         below = self.position_min[i] + WALL_WIDTH - position
         return above if above > 0.0 else -max(0.0, below)
 
-    def _derating(self, temperature: int | None) -> float:
-        if temperature is None or temperature <= self.max_temperature - DERATING:
-            return 1.0
-        return max(0.5, 0.5 + 0.5 * (self.max_temperature - temperature) / DERATING)
+
+def _derating(temperature: int | None) -> float:
+    """Return the share of torque that a motor of `temperature` (degC) is permitted."""
+    if temperature is None or temperature <= MAX_TEMPERATURE - DERATING:
+        return 1.0
+    return max(0.5, 0.5 + 0.5 * (MAX_TEMPERATURE - temperature) / DERATING)
 
 
 def _wall_torque(depth: float, velocity: float) -> float:

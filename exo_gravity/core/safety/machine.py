@@ -1,6 +1,6 @@
 """The state machine between the requested efforts and the motors. Pure: time is an argument.
 
-    DISABLED --enable--> CHECKING --all well--> PROVING --motors on, signs right--> RAMPING_IN --ramp_time--> ACTIVE
+    DISABLED --enable--> CHECKING --all well--> PROVING --motors on, signs right--> RAMPING_IN --RAMP_TIME--> ACTIVE
         ^                 |    |                   |                                    |                       |
         |         disable |    | fault             |     disable, fault                 |                       |
         +-----------------+    v                   v                                    v                       |
@@ -8,9 +8,9 @@
         +-------------------------------------------+ down: FAULT after a fault, else DISABLED
 
 - DISABLED, CHECKING, FAULT: the motors are off. Zero commands poll their positions.
-- CHECKING waits for the start gate (gate.py). If zeros are not trusted, the arm must hang at `Limits.home`.
-- PROVING: each motor must show in its replies that it is on (delivery.py). If signs are not trusted, each joint
-  is pushed gently, and must move the right way (sign_check.py).
+- CHECKING waits for the start gate (gate.py). If zeros are not trusted, the arm must hang.
+- PROVING: each motor must show in its replies that it is on. If signs are not trusted, each joint is pushed gently, and
+  must move the right way (gate.py).
 - LETTING_DOWN lowers each joint at a bounded speed (descent.py). The motors are switched off once nothing holds
   the arm and nothing moves it. A motor that cannot be reached stays in this state's care: if it replies again, however
   late, its joint is lowered from the torque that it then applies.
@@ -29,12 +29,12 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import Peaks
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.delivery import DeliveryMonitor
-from exo_gravity.core.safety.descent import DAMPING_RISE, ArmDescent
-from exo_gravity.core.safety.drive import CARRYING, NOTHING, OFF, Drive, State
-from exo_gravity.core.safety.faults import DOUBTFUL, Fault, FaultCode
-from exo_gravity.core.safety.gate import Proving, StartGate
+from exo_gravity.core.safety.descent import DAMPING, DAMPING_RISE, ArmDescent, RestTracker
+from exo_gravity.core.safety.drive import CARRYING, DOUBTFUL, NOTHING, OFF, Drive, Fault, FaultCode, State
+from exo_gravity.core.safety.gate import SignCheck, StartGate, SwitchOnCheck
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
-from exo_gravity.core.safety.rest import RestTracker
+
+RAMP_TIME = 1.0  # s from no torque to full torque: the arm becomes light without a jolt
 
 
 class SafetyMachine:
@@ -59,14 +59,15 @@ class SafetyMachine:
         self._since = 0.0
         self._now = -math.inf
         self._sent = OFF  # last sent to the motors
-        self._descent = ArmDescent(0.0, NOTHING, NOTHING, self._peaks.effort, limits)
+        self._descent = ArmDescent(0.0, NOTHING, NOTHING, self._peaks.effort)
         self._rest = RestTracker()
         self._before: Sequence[JointSample] = (UNKNOWN,) * 4
         self._silent: Sequence[bool] = (True,) * 4
         self._is_trusted = False  # zeros and signs
         self._delivery = DeliveryMonitor(limits, self._peaks.effort)
         self._gate = StartGate(limits, 0.0)
-        self._proving = Proving(limits, signs=True)
+        self._switch_on = SwitchOnCheck(limits)
+        self._signs = SignCheck(limits.joint_names, NOTHING)
 
     def enable(self, now: float) -> bool:
         """Start the checks, after which torque ramps in. Return False, and do nothing, unless DISABLED."""
@@ -145,8 +146,9 @@ class SafetyMachine:
             except ParameterError as error:
                 self.trip(FaultCode.COMMAND_IMPOSSIBLE, str(error), now)
         if self.state is State.PROVING:
-            damping = self.limits.damping * min(1.0, (now - self._since) / DAMPING_RISE)
-            return Drive(self._proving.effort, (damping,) * 4, True)
+            damping = DAMPING * min(1.0, (now - self._since) / DAMPING_RISE)
+            check = self._signs if self._switch_on.done else self._switch_on
+            return Drive(tuple(check.effort), (damping,) * 4, True)
         if self.state is State.LETTING_DOWN:
             return self._descend(now, joints, dt)
         return self._stand(now, joints, dt)
@@ -162,13 +164,15 @@ class SafetyMachine:
             self.trip(*fault, now)
         elif self._gate.passed:
             self.waiting_for = ""
-            self._proving = Proving(self.limits, signs=not self._is_trusted)
+            largest = 0.0 if self._is_trusted else self.limits.sign_check_torque
+            self._switch_on = SwitchOnCheck(self.limits)
+            self._signs = SignCheck(self.limits.joint_names, [min(largest, most) for most in self.limits.max_effort])
             self._delivery.reset()
             self._enter(State.PROVING, now)
 
     def _check_delivery(self, now: float, joints: Sequence[JointSample], dt: float) -> None:
         fault = self._delivery.step(dt, joints, self._sent.effort, self._sent.damping)
-        is_proven = self.state in (State.RAMPING_IN, State.ACTIVE) or self._proving.switched_on
+        is_proven = self.state in (State.RAMPING_IN, State.ACTIVE) or self._switch_on.done
         if fault and self.state in CARRYING and is_proven:
             self.trip(*fault, now)
 
@@ -185,25 +189,28 @@ class SafetyMachine:
             self.trip(*fault, now)
 
     def _prove(self, now: float, joints: Sequence[JointSample], dt: float) -> None:
-        fault = self._proving.step(dt, joints, self._sent.damping)
-        self.waiting_for = self._proving.hint
+        if self._switch_on.done:
+            fault = self._signs.step(dt, joints)
+        else:
+            fault = self._switch_on.step(dt, joints, self._sent.damping)
+        self.waiting_for = self._signs.hint
         if fault:
             self.trip(*fault, now)
-        elif self._proving.done:
+        elif self._switch_on.done and self._signs.done:
             self._is_trusted = True
             self._enter(State.RAMPING_IN, now)
 
     def _carry(self, now: float, joints: Sequence[JointSample], effort: Sequence[float], dt: float) -> Drive:
         ramp = 1.0
         if self.state is State.RAMPING_IN:
-            ramp = (now - self._since) / self.limits.ramp_time
+            ramp = (now - self._since) / RAMP_TIME
             if ramp >= 1.0:
                 ramp = 1.0
                 self._enter(State.ACTIVE, now)
         shaped, acted = self.limits.shape(effort, ramp, joints, self._sent.effort, dt)
         self.acted.update(dict.fromkeys(acted, now))
         # Damping rises at once, since the soft wall already rises with the position, and falls over DAMPING_RISE.
-        fall = self.limits.damping / DAMPING_RISE * dt
+        fall = DAMPING / DAMPING_RISE * dt
         walls = zip(self.limits.wall_damping(joints), self._sent.damping, strict=True)
         return Drive(shaped, tuple(max(wall, last - fall) for wall, last in walls), True)
 
@@ -242,7 +249,7 @@ class SafetyMachine:
 
     def _let_down(self, now: float) -> None:
         applied = self._delivery.applied(self._sent, self._silent)
-        self._descent = ArmDescent(now, *applied, self._peaks.effort, self.limits)
+        self._descent = ArmDescent(now, *applied, self._peaks.effort)
         self._enter(State.LETTING_DOWN, now)
 
     def _enter(self, state: State, now: float) -> None:

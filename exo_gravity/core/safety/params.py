@@ -1,13 +1,18 @@
-"""The parameters of `can_bridge`, and the limits that they describe."""
+"""The parameters of `can_bridge`, the limits that they describe, and the checks of one against another."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from exo_gravity.core.motors.params import MOTOR_PARAMETERS
-from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, params_of
-from exo_gravity.core.safety.limits import Limits
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.bus_load import MAX_STATUS_RATE, REPLY_SHARE
+from exo_gravity.core.motors.joint_motor import MOTOR_PARAMETERS, JointMotor
+from exo_gravity.core.params import JOINT_NAMES, Param, params_of
+from exo_gravity.core.safety.limits import HOME_TOLERANCE, Limits
+
+FROZEN = 0.08  # s without a drive from the control loop while the watchdog itself runs, after which it takes over
+PERIODS = 2  # control periods that must fit into each time-out, so that one late cycle is not a fault
 
 # fmt: off
 LIMIT_PARAMETERS = params_of(Limits, fixed=True)
@@ -18,11 +23,43 @@ CAN_BRIDGE = (
           fixed=True),
     *MOTOR_PARAMETERS,
     *LIMIT_PARAMETERS,
-    *REAL_TIME_PARAMETERS,
+    Param("thread_priority", 0, "SCHED_FIFO priority of the control loop's threads, whose memory is then locked "
+          "(mlockall); 0 for none", (0, 99), fixed=True, expert=True),
 )
 # fmt: on
 
 
 def limits_of(values: Mapping[str, Any]) -> Limits:
-    """Return the limits that `can_bridge`'s parameter values describe, or raise ParameterError."""
-    return Limits(tuple(values["joint_names"]), **{param.name: values[param.name] for param in LIMIT_PARAMETERS})
+    """Return the limits that `can_bridge`'s parameter values describe, or raise ParameterError.
+
+    `motor` may be missing from the values of another node: `home_tolerance` is then that of the usual motors.
+    """
+    given = {param.name: values[param.name] for param in LIMIT_PARAMETERS}
+    if "motor" in values:
+        given["home_tolerance"] = tuple(HOME_TOLERANCE[name] for name in values["motor"])
+    return Limits(tuple(values["joint_names"]), **given)
+
+
+def check_bridge(
+    rate: float, motors: Sequence[JointMotor], limits: Limits, status_rate: float = MAX_STATUS_RATE
+) -> None:
+    """Check the parameters of a `can_bridge` with control rate `rate` (Hz) against each other.
+
+    status_rate: status frames a second of V3 boards. Raises ParameterError that names both values.
+    """
+    timeouts = {
+        "command_timeout": limits.command_timeout,
+        "reply_timeout": limits.reply_timeout,
+        "the watchdog's time-out": FROZEN,
+    }
+    name, shortest = min(timeouts.items(), key=lambda item: item[1])
+    if rate * shortest < PERIODS - 1e-9:
+        expected = f"at least {PERIODS / shortest:g} Hz: {name} = {shortest:g} s must span {PERIODS} periods"
+        raise ParameterError("rate", rate, expected)
+    if rate > REPLY_SHARE * status_rate + 1e-9 and not all(motor.wire_format.replies for motor in motors):
+        expected = f"at most {REPLY_SHARE * status_rate:g} Hz: each cycle waits for a status frame of a V3 board"
+        raise ParameterError("rate", rate, f"{expected}, which sends {status_rate:g} a second")
+    peak = [motor.peak_effort for motor in motors]
+    if any(effort > most + 1e-9 for effort, most in zip(limits.max_effort, peak, strict=True)):
+        shown = [round(effort, 2) for effort in peak]
+        raise ParameterError("max_effort", list(limits.max_effort), f"at most the motors' peak torque, {shown} Nm")

@@ -20,9 +20,7 @@ import can
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID
 from exo_gravity.core.motors.specs import MOTORS, pack_command, unpack_reply
-from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
-from exo_gravity.core.motors.wire_formats.mit import MASTER_ID
-from exo_gravity.core.motors.wire_formats.wire_format import COMMAND, EXTENDED, REPLY, Frame
+from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, MASTER_ID, MIT, MIT_V3, REPLY, Frame
 from exo_gravity.hardware.can.can_port import CanPort
 from exo_gravity.hardware.can.motor_bus import open_bus
 from exo_gravity.hardware.ownership.bus_lock import Address, BusLock

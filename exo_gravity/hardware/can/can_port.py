@@ -16,7 +16,7 @@ import can
 from can.interfaces.socketcan import SocketcanBus
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.wire_formats.wire_format import EXTENDED, ID_BITS, Frame
+from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, Frame
 
 REOPEN_AFTER = 0.02  # s of failures in a row after which the bus is opened again
 REOPEN_PERIOD = 0.1  # s between two attempts

@@ -15,8 +15,7 @@ from collections.abc import Sequence
 import can
 
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.wire_formats import WireFormat
-from exo_gravity.core.motors.wire_formats.wire_format import COMMAND, EXTENDED, REPLY, Frame
+from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, REPLY, Frame, WireFormat
 
 FOREIGN_COMMAND = "foreign command"
 TRIAL = 32  # frames sent until it is known whether the bus echoes

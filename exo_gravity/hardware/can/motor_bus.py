@@ -23,7 +23,7 @@ import can
 
 from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.wire_formats.wire_format import REPLY, Frame
+from exo_gravity.core.motors.wire_formats import REPLY, Frame
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import OFF, Drive
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample

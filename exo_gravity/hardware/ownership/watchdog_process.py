@@ -22,7 +22,7 @@ from queue import SimpleQueue
 
 import can
 
-from exo_gravity.core.safety.checks import FROZEN
+from exo_gravity.core.safety.params import FROZEN
 from exo_gravity.hardware.ownership.drive_notes import DriveNotes
 from exo_gravity.hardware.ownership.handover import Charge, let_down
 

@@ -17,7 +17,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.safety.faults import FaultCode
+from exo_gravity.core.safety.drive import FaultCode
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.hardware.control_loop import NO_COMMAND, ControlLoop, EffortCommand
 from exo_gravity.nodes.ros.hot_path import HotPath
@@ -37,11 +37,8 @@ class EffortExchange:
     refused, or "none".
     """
 
-    def __init__(
-        self, node: Node, names: Sequence[str], limits: Limits, get_loop: Callable[[], ControlLoop | None]
-    ) -> None:
+    def __init__(self, node: Node, limits: Limits, get_loop: Callable[[], ControlLoop | None]) -> None:
         self.refusal = "none"
-        self._names = names
         self._limits = limits
         self._get_loop = get_loop
         self._clock = node.get_clock()
@@ -50,7 +47,7 @@ class EffortExchange:
         self._published: OrderedDict[int, float] = OrderedDict()
         self._commander = SolePublisher(node, "effort_commands")
         self._publisher = node.create_publisher(JointState, "joint_states", 1)
-        self._joint_states = JointState(name=names)  # one message, reused
+        self._joint_states = JointState(name=list(limits.joint_names))  # one message, reused
         self._efforts = HotPath(node, JointState, "effort_commands", self._on_efforts, EFFORTS)
 
     @property
@@ -95,7 +92,7 @@ class EffortExchange:
             self.refusal = f"stamp {to_nanoseconds(message.header.stamp)} ns answers no joint state of this bridge"
         else:
             try:
-                effort = by_name(message, "effort", self._names) if message.effort else None
+                effort = by_name(message, "effort", self._limits.joint_names) if message.effort else None
             except ParameterError as error:
                 effort, self.refusal = None, str(error)
                 loop.trip(FaultCode.COMMAND_IMPOSSIBLE, f"effort_commands: {error.name} must be {error.expected}")

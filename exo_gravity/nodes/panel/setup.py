@@ -9,7 +9,7 @@ from typing import Any
 from exo_gravity.core.compensation.params import COMPENSATOR, robot_of, wearer_of
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.model.budget import BudgetRequest, largest_support
-from exo_gravity.core.motors.params import OPTIONS
+from exo_gravity.core.motors.joint_motor import OPTIONS
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.params import CAN_BRIDGE
 from exo_gravity.core.view.arm_description import described

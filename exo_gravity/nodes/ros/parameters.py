@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.task import Future
 
-from exo_gravity.core.motors.params import OPTIONS
+from exo_gravity.core.motors.joint_motor import OPTIONS
 from exo_gravity.core.params import Param, values_of
 
 ANSWER_TIMEOUT = 5.0  # s after which a request to a node that has died is repeated

@@ -18,8 +18,7 @@ from statistics import fmean
 from rich.table import Table
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.params import OPTIONS
+from exo_gravity.core.motors.joint_motor import OPTIONS, JointMotor
 from exo_gravity.core.motors.specs import MOTOR_ERRORS
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.hardware.can.bus_scan import Answer, BusScan

@@ -21,8 +21,7 @@ from exo_gravity.core.compensation.terms.spring import PosePath
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.anfis_law import AnfisLaw
 from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.params import OPTIONS, motors_of
+from exo_gravity.core.motors.joint_motor import OPTIONS, JointMotor, motors_of
 from exo_gravity.core.params import Param, values_of
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.params import CAN_BRIDGE, limits_of

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from exo_gravity.core.safety.faults import FaultCode
+from exo_gravity.core.safety.drive import FaultCode
 
 LONG_GAP = 50.0  # ms; a simulated device loses time after such a stall
 # Faults that a busy computer can cause; '' stands for a trial that ended early without a fault.

@@ -20,8 +20,7 @@ from exo_gravity.core.calibration.tracking import MassMatrix
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.moments import moments_of
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.safety.drive import State
-from exo_gravity.core.safety.faults import FaultCode
+from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS

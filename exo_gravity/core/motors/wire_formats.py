@@ -1,0 +1,189 @@
+"""The wire formats of AK motors' boards: the frames of `mit` (V1 and V2 boards) and `mit_v3` (V3 boards).
+
+`mit`: the frames of `core.motors.specs`, with the motor's ID as an 11-bit arbitration ID. A motor replies to each
+command, with its own ID or the master's (0); the first byte is the motor's ID. ENTER, EXIT and SET_ZERO are special
+commands.
+
+`mit_v3` (CubeMars driver manual V3.0.0): 29-bit IDs, control mode << 8 | motor ID. Command, control mode 8, 8 bytes, a
+big-endian bit stream, ranges in `V3_RANGES`:
+
+    kp 12 | kd 12 | position 16 | velocity 12 | torque 12        tau = kp (p - p_motor) + kd (v - v_motor) + torque
+
+A command gets no reply. The board sends a status frame on its own timer, 1 to 500 times a second, ID 0x29 << 8 | motor
+ID, big-endian integers:
+
+    position 0.1 deg 16 | speed 10 electrical rpm 16 | current 0.01 A 16 | board temperature degC 8 | error 8
+
+Speed and current are the motor's: pole pairs and gear ratio lead to the output's speed, `torque_per_ampere` to its
+torque. No frame switches a motor on: its first command does. The current 0 A (control mode 1) switches it off. A
+command without gains and torque comes before it (`MotorBus`), but is not enough: no 12-bit code is exactly 0 Nm.
+
+A further format is one subclass of `WireFormat` that overrides what differs, and one entry in `FORMATS`.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass, replace
+
+from exo_gravity.core.errors import FrameError, ParameterError
+from exo_gravity.core.motors import specs
+from exo_gravity.core.motors.specs import ENTER, EXIT, SET_ZERO, MotorCommand, MotorReply, MotorSpec
+
+EXTENDED = 1 << 31  # set in the arbitration ID of a frame with a 29-bit ID, as in SocketCAN
+ID_BITS = 0x1FFFFFFF  # of an arbitration ID
+MASTER_ID = 0  # the arbitration ID of replies from some firmware versions of V1 and V2 boards
+
+MODE_CURRENT, MODE_MIT, LAST_MODE = 1, 8, 15  # control modes of V3 boards
+STATUS = 0x29
+NO_CURRENT = bytes(4)  # int32, mA
+V3_POSITION_RANGE = 12.56  # rad
+V3_RANGES = {"AK60-6": (60.0, 12.0), "AK80-9": (65.0, 18.0)}  # rad/s, Nm
+POSITION_STEP = math.radians(0.1)  # rad
+SPEED_STEP = 10.0 * 2.0 * math.pi / 60.0  # electrical rad/s
+CURRENT_STEP = 0.01  # A
+_STATUS = struct.Struct(">hhhbB")
+
+Frame = tuple[int, bytes]  # arbitration ID and data
+REPLY, COMMAND, OTHER = "reply", "command", "other"
+
+
+@dataclass(frozen=True)
+class WireFormat:
+    """The frames of one kind of board, as pure functions; here those of V1 and V2 boards."""
+
+    #: the value of the parameter `wire_format`
+    name: str = "mit"
+    #: whether a motor replies to each command, and only then; if not, it sends its state on its own timer
+    replies: bool = True
+    #: whether its IDs have 29 bits
+    is_extended: bool = False
+
+    def ranged(self, spec: MotorSpec) -> MotorSpec:
+        """Return the motor with the usual ranges of this format."""
+        return spec
+
+    def command_id(self, motor_id: int) -> int:
+        """Return the arbitration ID of commands to a motor."""
+        return motor_id
+
+    def pack_command(
+        self, spec: MotorSpec, position: float, velocity: float, kp: float, kd: float, torque: float
+    ) -> bytes:
+        """Return the data of a command: rad, rad/s, Nm/rad, Nm s/rad, Nm. Raises ParameterError beyond the ranges."""
+        return specs.pack_command(spec, position, velocity, kp, kd, torque)
+
+    def unpack_command(self, spec: MotorSpec, data: bytes | bytearray) -> MotorCommand:
+        """Return the content of a command. Raises FrameError."""
+        return specs.unpack_command(spec, data)
+
+    def pack_reply(self, spec: MotorSpec, reply: MotorReply) -> bytes:
+        """Return the data of a reply or status frame. Raises ParameterError on NaN or a value that does not fit."""
+        return specs.pack_reply(spec, *reply)
+
+    def unpack_reply(self, spec: MotorSpec, motor_id: int, data: bytes | bytearray) -> MotorReply:
+        """Return the content of a reply or status frame of the motor `motor_id`. Raises FrameError."""
+        return specs.unpack_reply(spec, data)
+
+    def enter(self, motor_id: int) -> tuple[Frame, ...]:
+        """Return the frames that switch a motor on, before its first command; none if the command itself does."""
+        return ((motor_id, ENTER),)
+
+    def exit(self, motor_id: int) -> tuple[Frame, ...]:
+        """Return the frames that switch a motor off."""
+        return ((motor_id, EXIT),)
+
+    def set_zero(self, motor_id: int) -> tuple[Frame, ...]:
+        """Return the frames that make the present angle zero; none if the board has no such frame."""
+        return ((motor_id, SET_ZERO),)
+
+    def classify(self, frame_id: int, data: bytes | bytearray, motor_ids: frozenset[int]) -> tuple[str, int]:
+        """Return what a frame is, REPLY, COMMAND or OTHER, and the ID of the motor in `motor_ids`, 0 for none.
+
+        The frame's ID has `is_extended` bits. The first byte of a command is never its motor's ID.
+        """
+        length = len(data)
+        if length in (6, 8) and data[0] in motor_ids and frame_id in (MASTER_ID, data[0]):
+            return REPLY, data[0]
+        if length == 8 and frame_id in motor_ids and data[0] != frame_id:
+            return COMMAND, frame_id
+        return OTHER, 0
+
+
+@dataclass(frozen=True)
+class V3Format(WireFormat):
+    """The frames of V3 boards; the methods are those of `WireFormat`."""
+
+    name: str = "mit_v3"
+    replies: bool = False
+    is_extended: bool = True
+
+    def ranged(self, spec: MotorSpec) -> MotorSpec:
+        """Return the motor with the ranges of manual V3.0.0."""
+        velocity_range, torque_range = V3_RANGES[spec.name]
+        return replace(spec, position_range=V3_POSITION_RANGE, velocity_range=velocity_range, torque_range=torque_range)
+
+    def command_id(self, motor_id: int) -> int:
+        return EXTENDED | MODE_MIT << 8 | motor_id
+
+    def status_id(self, motor_id: int) -> int:
+        """Return the 29-bit ID of a motor's status frames."""
+        return EXTENDED | STATUS << 8 | motor_id
+
+    def pack_command(
+        self, spec: MotorSpec, position: float, velocity: float, kp: float, kd: float, torque: float
+    ) -> bytes:
+        p, v, stiffness, damping, t = specs.command_codes(spec, position, velocity, kp, kd, torque)
+        return (stiffness << 52 | damping << 40 | p << 24 | v << 12 | t).to_bytes(8, "big")
+
+    def unpack_command(self, spec: MotorSpec, data: bytes | bytearray) -> MotorCommand:
+        if len(data) != 8:
+            raise FrameError(data, "8 bytes")
+        word = int.from_bytes(data, "big")
+        codes = word >> 24 & 0xFFFF, word >> 12 & 0xFFF, word >> 52, word >> 40 & 0xFFF, word & 0xFFF
+        return specs.command_of_codes(spec, *codes)
+
+    def pack_reply(self, spec: MotorSpec, reply: MotorReply) -> bytes:
+        numbers = []
+        for name, value, step in zip(("position", "velocity", "torque"), reply[1:4], _steps(spec), strict=True):
+            limit = 0x7FFF * step
+            if not abs(value) <= limit:
+                raise ParameterError(name, value, f"from {-limit:g} to {limit:g}")
+            numbers.append(round(value / step))
+        return _STATUS.pack(*numbers, max(-128, min(127, reply.temperature or 0)), reply.error or 0)
+
+    def unpack_reply(self, spec: MotorSpec, motor_id: int, data: bytes | bytearray) -> MotorReply:
+        if len(data) != 8:
+            raise FrameError(data, "a status frame of 8 bytes")
+        position, speed, current, temperature, error = _STATUS.unpack(data)
+        rad, rad_per_s, newton_metres = _steps(spec)
+        reply = position * rad, speed * rad_per_s, current * newton_metres
+        return MotorReply(motor_id, *reply, temperature, error)
+
+    def enter(self, motor_id: int) -> tuple[Frame, ...]:
+        return ()  # a command does it
+
+    def exit(self, motor_id: int) -> tuple[Frame, ...]:
+        return ((EXTENDED | MODE_CURRENT << 8 | motor_id, NO_CURRENT),)
+
+    def set_zero(self, motor_id: int) -> tuple[Frame, ...]:
+        return ()
+
+    def classify(self, frame_id: int, data: bytes | bytearray, motor_ids: frozenset[int]) -> tuple[str, int]:
+        """Return what a frame with a 29-bit ID is; a frame of any control mode is a command."""
+        motor_id, kind = frame_id & 0xFF, (frame_id & ID_BITS) >> 8
+        if motor_id not in motor_ids:
+            return OTHER, 0
+        if kind == STATUS and len(data) == 8:
+            return REPLY, motor_id
+        return (COMMAND, motor_id) if kind <= LAST_MODE else (OTHER, 0)
+
+
+def _steps(spec: MotorSpec) -> tuple[float, float, float]:
+    """Return the output's angle (rad), speed (rad/s) and torque (Nm) that one step of a status frame means."""
+    return POSITION_STEP, SPEED_STEP / (spec.pole_pairs * spec.gear_ratio), CURRENT_STEP * spec.torque_per_ampere
+
+
+MIT, MIT_V3 = WireFormat(), V3Format()
+FORMATS: dict[str, WireFormat] = {MIT.name: MIT, MIT_V3.name: MIT_V3}

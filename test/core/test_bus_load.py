@@ -1,0 +1,143 @@
+"""The bits of CAN frames and the bus load, against the CAN specification and hand-computed figures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.bus_load import (
+    BITRATE,
+    TYPICAL_COMMAND,
+    TYPICAL_REPLY,
+    TYPICAL_STATUS,
+    TYPICAL_V3_COMMAND,
+    Traffic,
+    frame_bits,
+)
+from exo_gravity.core.motors.joint_motor import traffic_of
+from exo_gravity.core.motors.specs import MOTORS, MotorReply, pack_command, pack_reply
+from exo_gravity.core.motors.wire_formats import ID_BITS, MIT_V3
+
+AK60 = MOTORS["AK60-6"]
+V3 = MIT_V3.ranged(AK60)
+
+
+def stuffed_bits(can_id: int, data: bytes, is_extended: bool = False) -> int:
+    """The exact number of bits of one frame, with its stuff bits: after 5 equal bits, which start the next run."""
+    head = [*bits_of(can_id >> 18, 11), 1, 1, *bits_of(can_id & 0x3FFFF, 18)] if is_extended else bits_of(can_id, 11)
+    bits = [0, *head, 0, 0, 0, *bits_of(len(data), 4), *(bit for byte in data for bit in bits_of(byte, 8))]
+    bits += bits_of(crc(bits), 15)
+    count, last, run = 0, None, 0
+    for bit in bits:
+        run = run + 1 if bit == last else 1
+        last = bit
+        if run == 5:
+            count, last, run = count + 1, 1 - bit, 1
+    return frame_bits(len(data), is_extended)[0] + count
+
+
+def bits_of(value: int, width: int) -> list[int]:
+    return [value >> place & 1 for place in reversed(range(width))]
+
+
+def crc(bits: list[int]) -> int:
+    """CAN's CRC-15: polynomial 0x4599, initial value 0."""
+    register = 0
+    for bit in bits:
+        turn = bit ^ register >> 14
+        register = (register << 1 & 0x7FFF) ^ (0x4599 if turn else 0)
+    return register
+
+
+def frames(kind: str) -> Iterator[tuple[int, bytes, bool]]:
+    """ID, data and kind of ID of a carried arm's frames, in random poses and at random permitted torques."""
+    rng = np.random.default_rng(5)
+    for index in range(2000):
+        can_id = index % 4 + 1
+        torque, position, velocity = rng.uniform((-3, -1.65, -1), (3, 3.14, 1)).tolist()
+        temperature = int(rng.integers(20, 60))
+        if kind == "command":
+            yield can_id, pack_command(AK60, 0.0, 0.0, 0.0, 0.0, torque), False
+        elif kind == "reply":
+            yield can_id, pack_reply(AK60, can_id, position, velocity, torque, temperature, 0), False
+        elif kind == "V3 command":
+            yield MIT_V3.command_id(can_id) & ID_BITS, MIT_V3.pack_command(V3, 0.0, 0.0, 0.0, 0.0, torque), True
+        else:
+            reply = MotorReply(can_id, position, velocity, torque, temperature, 0)
+            yield MIT_V3.status_id(can_id) & ID_BITS, MIT_V3.pack_reply(V3, reply), True
+
+
+@pytest.mark.parametrize(
+    ("size", "is_extended", "bits"), [(8, False, (111, 135)), (6, False, (95, 115)), (8, True, (131, 160))]
+)
+def test_a_frame_has_the_bits_that_the_specification_counts(size, is_extended, bits):
+    assert frame_bits(size, is_extended) == bits
+
+
+def test_the_counter_of_this_test_agrees_with_a_hand_count_and_the_check_value_of_crc_15_can():
+    # 34 zeros (start, ID, control, length 0, a CRC of 0): a stuff bit after the first 5, then after every 5 more.
+    assert stuffed_bits(0, b"") == frame_bits(0)[0] + 34 // 5
+    assert crc([bit for byte in b"123456789" for bit in bits_of(byte, 8)]) == 0x059E
+
+
+@pytest.mark.parametrize("is_extended", [False, True])
+def test_every_frame_is_between_its_length_without_stuffing_and_the_worst_case(is_extended):
+    rng = np.random.default_rng(1)
+    for _ in range(300):
+        data = bytes(rng.choice([0x00, 0xFF, 0x0F, 0x07, 0xF8], int(rng.integers(0, 9))).tolist())
+        least, most = frame_bits(len(data), is_extended)
+        assert least <= stuffed_bits(int(rng.integers(0, 2048)), data, is_extended) <= most
+
+
+@pytest.mark.parametrize(
+    ("kind", "typical"),
+    [
+        ("command", TYPICAL_COMMAND),
+        ("reply", TYPICAL_REPLY),
+        ("V3 command", TYPICAL_V3_COMMAND),
+        ("V3 status", TYPICAL_STATUS),
+    ],
+)
+def test_the_typical_bits_are_the_mean_over_the_frames_of_a_carried_arm(kind, typical):
+    assert np.mean([stuffed_bits(*frame) for frame in frames(kind)]) == pytest.approx(typical, abs=1.0)
+
+
+def test_four_motors_at_500_hz_use_half_the_bus_and_up_to_926_hz_always_fit():
+    assert Traffic(4).load(500.0).share == pytest.approx(0.48, abs=0.01)
+    assert Traffic(4).load(500.0, worst=True).share == pytest.approx(0.54)
+    assert Traffic(4).load(1.0, worst=True).largest_rate == pytest.approx(926.0, abs=0.5)
+    full = Traffic(4).load(Traffic(4).load(1.0).largest_rate)
+    assert full.share == pytest.approx(1.0) and full.bits_per_second == pytest.approx(BITRATE)
+
+
+def test_a_rate_beyond_the_bus_capacity_is_rejected_with_the_largest_rate():
+    assert Traffic(4).check(1000.0).share < 1.0
+    with pytest.raises(ParameterError, match=r"rate = 600\.0: must be at most 516 Hz"):
+        Traffic(8).check(600.0)
+    with pytest.raises(ParameterError, match=r"at most 129 Hz.*: 8 motors need 968 kbit/s of its 250"):
+        Traffic(8, bitrate=250_000).check(500.0)
+
+
+def test_a_rate_that_leaves_replies_no_time_is_warned_of_with_figures():
+    assert Traffic(4, bitrate=500_000).warning(250.0) == ""
+    assert "at most 206 Hz" in Traffic(4, bitrate=250_000).warning(240.0)
+
+
+def test_status_frames_load_the_bus_at_their_own_rate_which_is_lower_on_a_slow_bus():
+    fast, slow = Traffic(0, 4), Traffic(0, 4, bitrate=250_000)
+    assert (fast.status_rate, slow.status_rate) == (500.0, 200.0)
+    assert fast.load(250.0).bits_per_second == pytest.approx(4 * (500.0 * TYPICAL_STATUS + 250.0 * TYPICAL_V3_COMMAND))
+    assert slow.check(160.0).share < 1.0
+
+
+@pytest.mark.parametrize("interface", ["gs_usb", "slcan"])
+def test_an_adapter_without_a_bit_rate_is_refused(interface):
+    values = {"can.interface": interface, "wire_format": ["mit", "mit", "mit", "mit_v3"]}
+    with pytest.raises(ParameterError, match=rf"can.options.bitrate = None: must be set for {interface}"):
+        traffic_of(values, {})
+    with pytest.raises(ParameterError, match=r"can.options.bitrate = 5: must be a whole number from 10000"):
+        traffic_of(values, {"bitrate": 5})
+    assert traffic_of(values, {"bitrate": 250_000}) == Traffic(3, 1, 250_000)

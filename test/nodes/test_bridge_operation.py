@@ -1,0 +1,134 @@
+"""What an operator of can_bridge sees and may do: its report on /diagnostics, and its services."""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import Future
+from types import SimpleNamespace
+
+import pytest
+
+from exo_gravity.core.motors.bus_load import Traffic
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import MOTORS
+from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.safety.limits import JointSample, Limits
+from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.nodes.can_bridge import operation
+from exo_gravity.nodes.can_bridge.operation import BridgeReport, BridgeServices
+from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
+
+
+def carrying(effort, cycles=0):
+    """Return what a bridge reports on: an arm that is carried at rest, the elbow with `effort` Nm."""
+    safety = SafetyMachine(Limits(("a", "b", "c", "elbow")), 0.004)
+    safety.state = State.ACTIVE
+    samples = [JointSample(0.5, 2.0, torque, 40, 0, 0.0) for torque in (0.0, 0.0, 0.0, effort)]
+    counts = dict.fromkeys(("late", "incomplete", "cycle_errors"), 0)
+    return SimpleNamespace(safety=safety, samples=samples, ignored={}, failure=None, cycles=cycles, **counts)
+
+
+@pytest.fixture
+def sent(node, monkeypatch):
+    """A function that lets a bridge report on `loop(n)`, `count` times, 0.1 s apart; it returns the reports.
+
+    answered: when the answered joint states were measured, s; None for always now.
+    """
+    reports, clock = [], SimpleNamespace(now=1000.0)
+    monkeypatch.setattr(Diagnostics, "report", lambda _, *report: reports.append(report))
+    monkeypatch.setattr(operation, "time", SimpleNamespace(monotonic=lambda: clock.now))
+
+    def sent(loop, count, answered=None):
+        report = BridgeReport(node, ("a", "b", "c", "elbow"), Traffic(4), 250.0, (3.0, 9.0, 3.0, 3.0))
+        for n in range(count):
+            report.send(loop(n), "none", clock.now if answered is None else answered)
+            clock.now += 0.1
+        return reports
+
+    return sent
+
+
+def test_a_motor_that_stays_above_its_rated_torque_is_named_with_load_and_power(sent):
+    reports = sent(lambda n: carrying(6.0, 25 * n), 1200, answered=-math.inf)
+    assert reports[20][:2] == (OK, "active")
+    level, message, values = reports[-1]
+    assert (level, message) == (WARN, "active, above rated torque for too long: elbow")
+    assert values["elbow power (W)"] == "12" and values["elbow torque (Nm)"] == "6"
+    assert 180 < int(values["elbow RMS of rated torque (%)"]) < 200 and values["a RMS of rated torque (%)"] == "0"
+    assert values["rate (Hz)"] == "250.0" and values["age of efforts (ms)"] == "none"
+
+
+def test_a_loop_below_its_rate_is_reported(sent):
+    reports = sent(lambda n: carrying(1.0, 20 * n), 30)
+    assert reports[-1][:2] == (WARN, "active, slower than 225 Hz")
+
+
+@pytest.fixture
+def ask(node):
+    """A function that asks for a service of a bridge whose control thread is `loop`; it returns the message."""
+
+    def ask(service, loop, data=None, zero=0.0):
+        motors = [JointMotor(MOTORS["AK60-6"], can_id, zero=zero) for can_id in (1, 2, 3, 4)]
+        response = getattr(BridgeServices(node, lambda: loop, motors), service)(
+            SimpleNamespace(data=data), SimpleNamespace()
+        )
+        assert response.success is (not response.message)
+        return response.message
+
+    return ask
+
+
+def standing():
+    """A control loop whose arm is off and at rest, and which runs a call at once. zeroed: times that zero was set."""
+    loop = SimpleNamespace(safety=SafetyMachine(Limits(("a", "b", "c", "elbow")), 0.004), zeroed=0)
+    loop.samples = (JointSample(0.0, 0.0, 0.0, 40, 0, math.inf),) * 4
+
+    def call(function):
+        future = Future()
+        future.set_result(function())
+        return future
+
+    def set_zero():
+        loop.zeroed += 1
+
+    loop.call, loop.set_zero = call, set_zero
+    loop.safety.step(0.0, loop.samples, None, 0.0)
+    return loop
+
+
+def test_an_operator_enables_disables_and_clears_or_reads_why_not(ask):
+    loop = standing()
+    assert ask("enable", loop, True) == ""
+    assert ask("enable", loop, True) == "refused: the arm is checking"
+    loop.safety.trip(FaultCode.BUS_ERROR, "unplugged", 1.0)
+    assert ask("enable", loop, True) == "refused: the arm is fault (unplugged)"
+    assert ask("enable", loop, False) == ""
+    assert ask("clear_fault", loop) == ""
+    assert ask("clear_fault", loop) == "no fault to clear: the arm is disabled"
+    assert ask("enable", None, True) == "the node is not active"
+
+
+def test_the_zero_is_set_only_for_an_arm_that_is_off_at_rest_and_replies(ask, monkeypatch):
+    loop = standing()
+    assert (
+        ask("set_zero", loop, zero=0.1) == "zero = [0.1, 0.1, 0.1, 0.1]: must be all 0 when the motors store the zero"
+    )
+    assert ask("set_zero", loop) == ""
+    loop.safety.enable(0.0)
+    assert ask("set_zero", loop) == "refused: the arm is checking, must be disabled"
+    loop.safety.disable(0.0)
+    loop.samples = (*loop.samples[:3], loop.samples[3]._replace(time=-math.inf))
+    assert ask("set_zero", loop) == "refused: a motor does not reply"
+    assert loop.zeroed == 1
+    monkeypatch.setattr(operation, "ZERO_TIMEOUT", 0.0)
+    loop.samples = (*loop.samples[:3], JointSample(0.5, 0.0, 0.0, 40, 0, math.inf))
+    assert ask("set_zero", loop).endswith("c at 0.000 rad, elbow at 0.500 rad")
+
+
+def test_an_enable_that_timed_out_never_arms_the_arm_later(ask, monkeypatch):
+    monkeypatch.setattr(operation, "CALL_TIMEOUT", 0.01)
+    loop, pending = standing(), Future()
+    loop.call = lambda function: pending
+    assert ask("enable", loop, True) == "the control thread did not respond"
+    assert not pending.set_running_or_notify_cancel()  # which the control thread asks before it runs a call
+    assert loop.safety.state is State.DISABLED
