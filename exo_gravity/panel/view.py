@@ -17,8 +17,6 @@ OF_BRIDGE = {
     "limits": "limits acting",
     "rate": "rate (Hz)",
     "answered": "age of efforts (ms)",
-    "late": "late cycles",
-    "incomplete": "incomplete cycles",
 }
 
 
@@ -29,7 +27,6 @@ class Joints:
     time: float = -math.inf  #: monotonic s of its arrival
     names: Sequence[str] = ()
     position: Sequence[float] = ()
-    velocity: Sequence[float] = ()
     effort: Sequence[float] = ()
 
 
@@ -43,41 +40,26 @@ class Status:
     time: float = -math.inf  #: monotonic s of its arrival
 
 
-def arm_state(now: float, joints: Joints, commands: Joints, bridge: Status, compensator: Status) -> dict[str, Any]:
-    """Return the state of one arm for the page. Old values are left out: their key is null or missing."""
-    state: dict[str, Any] = {"bridge": _bridge(now, bridge), "compensator": None, "joints": None, "age": None}
+def arm_state(now: float, joints: Joints, bridge: Status, compensator: Status) -> dict[str, Any]:
+    """Return the state of one arm for the page; None in the place of what is old."""
+    state: dict[str, Any] = {"bridge": None, "compensator": None, "joints": None}
+    if now - bridge.time < SILENT:
+        values = {key: bridge.values.get(name, "") for key, name in OF_BRIDGE.items()}
+        state["bridge"] = {"level": bridge.level, "message": bridge.message, **values}
     if now - compensator.time < SILENT:
-        keys = ("support", "mode", "law", "budget", "mass carried (kg)")
-        values = {key.split(" (")[0]: compensator.values.get(key) for key in keys}
-        state["compensator"] = {"level": compensator.level, "message": compensator.message, **values}
+        carried = compensator.values.get("mass carried (kg)")
+        state["compensator"] = {"level": compensator.level, "message": compensator.message, "mass carried": carried}
     if now - joints.time < SILENT:
-        temperature = {name: bridge.values.get(f"{name} temperature (degC)") for name in joints.names}
-        state["age"] = round(1000 * (now - joints.time), 1)  # ms
         state["joints"] = [
             {
                 "name": name,
                 "position": _rounded(joints.position, n),
-                "velocity": _rounded(joints.velocity, n),
                 "effort": _rounded(joints.effort, n),
-                "command": _command(now, name, commands),
-                "temperature": _number(temperature[name]) if state["bridge"] else None,
+                "temperature": _number(bridge.values.get(f"{name} temperature (degC)")) if state["bridge"] else None,
             }
             for n, name in enumerate(joints.names)
         ]
     return state
-
-
-def _bridge(now: float, bridge: Status) -> dict[str, Any] | None:
-    if now - bridge.time >= SILENT:
-        return None
-    values = {key: bridge.values.get(name, "") for key, name in OF_BRIDGE.items()}
-    return {"level": bridge.level, "message": bridge.message, **values}
-
-
-def _command(now: float, name: str, commands: Joints) -> float | None:
-    if name not in commands.names or now - commands.time >= SILENT:
-        return None
-    return _rounded(commands.effort, list(commands.names).index(name))
 
 
 def _rounded(values: Sequence[float], index: int) -> float | None:
@@ -86,7 +68,7 @@ def _rounded(values: Sequence[float], index: int) -> float | None:
 
 def _number(text: str | None) -> float | None:
     try:
-        value = float(text) if text is not None else math.nan
+        value = float(text or "nan")
     except ValueError:
         return None
     return value if math.isfinite(value) else None

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
-
-from ..support.panel_stage import Stage
 
 pytest.importorskip("playwright", reason="no browser driver: install the extra test")
 
@@ -18,13 +17,13 @@ pytestmark = IN_BROWSER
 BOTH_DOWN = [("let_down", "right"), ("let_down", "left")]
 
 
-def wait_for_call(page: Page, stage: Stage, call: tuple[str, ...]) -> None:
-    """Wait until the arms were asked for this."""
+def wait_until(page: Page, condition: Callable[[], bool]) -> None:
+    """Wait until `condition()` holds, while the page goes on."""
     for _ in range(600):
-        if call in stage.arms.calls:
+        if condition():
             return
         page.wait_for_timeout(100)
-    raise AssertionError(stage.arms.calls)
+    raise AssertionError("the condition did not hold within a minute")
 
 
 def test_enable_asks_once_and_says_what_will_happen(visit, stage):
@@ -97,11 +96,7 @@ def test_the_support_slides_and_shows_the_motors_limit(visit, stage):
     page.focus('[data-arm="right"] input')
     for _ in range(20):
         page.keyboard.press("ArrowRight")
-    for _ in range(300):
-        if stage.arms.settings["right"]["support"] == pytest.approx(0.15):
-            break
-        page.wait_for_timeout(100)
-    assert stage.arms.settings["right"]["support"] == pytest.approx(0.15)
+    wait_until(page, lambda: stage.arms.settings["right"]["support"] == pytest.approx(0.15))
     assert "More than rated torque" in page.inner_text('[data-arm="right"] .limit')
 
 
@@ -111,12 +106,9 @@ def test_the_slider_shows_the_support_in_force_from_the_start_and_a_slip_does_no
     assert page.input_value('[data-arm="right"] .support input') == "5"
     page.focus('[data-arm="right"] .support input')
     page.keyboard.press("ArrowRight")
-    wait_for_call(page, stage, ("set", "right", "{'support': 0.055}"))
+    wait_until(page, lambda: ("set", "right", "{'support': 0.055}") in stage.arms.calls)
     page.keyboard.press("End")
-    for _ in range(600):
-        if stage.arms.settings["right"]["support"] > 0.2:
-            break
-        page.wait_for_timeout(100)
+    wait_until(page, lambda: stage.arms.settings["right"]["support"] > 0.2)
     page.keyboard.press("Home")
     supports = [float(call[2].split(": ")[1].rstrip("}")) for call in stage.arms.calls if call[0] == "set"]
     assert supports[0] == 0.055
@@ -179,6 +171,7 @@ def test_recording_trial_wearer_and_parameters_are_asked_for(visit, stage):
     page.select_option("#trials", "two_poses")
     page.click("#trial-start")
     page.click("#save")
+    wait_until(page, lambda: "save" in stage.files.calls)
     page.fill("input[name=body_mass]", "62")
     page.select_option("select[name=sex]", "female")
     page.click("#wearer button")

@@ -77,15 +77,13 @@ class PlayedArms:
         names = [f"{name}_{leaf}" for leaf in LEAVES]
         position = [0.3 * math.sin(0.5 * now + n) for n in range(4)]
         effort = [0.8 * math.sin(0.5 * now + n) for n in range(4)]
-        joints = Joints(now, names, position, [0.0] * 4, effort)
+        joints = Joints(now, names, position, effort)
         state, fault = self.states[name], self.faults.get(name, "none")
         values = {"state": state, "fault": fault, "rate (Hz)": "250.0", "age of efforts (ms)": "4.1"}
         values |= {"limits acting": "none", **{f"{joint} temperature (degC)": "31" for joint in names}}
         message = f"fault: {fault}: {name} elbow" if fault != "none" else state
-        support = self.settings[name]["support"]
-        of_compensator = {"support": str(support), "mode": self.settings[name]["mode"], "mass carried (kg)": "1.854"}
         bridge = Status(2 if fault != "none" else 0, message, values, now)
-        return arm_state(now, joints, joints, bridge, Status(0, "compensating", of_compensator, now))
+        return arm_state(now, joints, bridge, Status(0, "compensating", {"mass carried (kg)": "1.854"}, now))
 
 
 @dataclass

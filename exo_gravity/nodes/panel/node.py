@@ -3,7 +3,7 @@
 It is a ROS client like any other: it uses the topics, services and parameters that `ros2` can use, and nothing depends
 on it. The web server (exo_gravity/panel/server.py) runs on a separate thread, which calls the services; this node's
 executor receives the answers, collects the state of the arms and sends it to the pages ten times a second. Joint states
-arrive hundreds of times a second: their subscriptions keep the newest message outside the executor (`hot_path`).
+arrive hundreds of times a second: their subscription keeps the newest message outside the executor (`hot_path`).
 """
 
 from __future__ import annotations
@@ -50,27 +50,19 @@ class ArmClient:
     """One arm, in the namespace `/name`."""
 
     def __init__(self, node: Node, name: str) -> None:
-        self.joints, self.commands = Joints(), Joints()
-        self.bridge, self.compensator = Status(), Status()
-        space = f"/{name}"
-        self._states = HotPath(node, JointState, f"{space}/joint_states", self._on_states)
-        self._efforts = HotPath(node, JointState, f"{space}/effort_commands", self._on_efforts)
-        self.enable = node.create_client(SetBool, f"{space}/{BRIDGE}/enable")
-        self.clear_fault = node.create_client(Trigger, f"{space}/{BRIDGE}/clear_fault")
-        self.set = parameter_client(node, f"{space}/{COMPENSATOR}")
+        self.joints, self.bridge, self.compensator = Joints(), Status(), Status()
+        self.enable = node.create_client(SetBool, f"/{name}/{BRIDGE}/enable")
+        self.clear_fault = node.create_client(Trigger, f"/{name}/{BRIDGE}/clear_fault")
+        self.set = parameter_client(node, f"/{name}/{COMPENSATOR}")
+        self._states = HotPath(node, JointState, f"/{name}/joint_states", self._on_states)
 
     def state(self, now: float) -> dict[str, Any]:
-        """Take the newest messages, and return what the page shows."""
+        """Take the newest joint states, and return what the page shows."""
         self._states.poll()
-        self._efforts.poll()
-        return arm_state(now, self.joints, self.commands, self.bridge, self.compensator)
+        return arm_state(now, self.joints, self.bridge, self.compensator)
 
     def _on_states(self, message: JointState, _info: dict[str, Any]) -> None:
-        values = (message.name, message.position, message.velocity, message.effort)
-        self.joints = Joints(time.monotonic(), *map(list, values))
-
-    def _on_efforts(self, message: JointState, _info: dict[str, Any]) -> None:
-        self.commands = Joints(time.monotonic(), list(message.name), effort=list(message.effort))
+        self.joints = Joints(time.monotonic(), *map(list, (message.name, message.position, message.effort)))
 
 
 class Arms:
