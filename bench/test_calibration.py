@@ -15,7 +15,7 @@ import pytest
 from exo_gravity.core.calibration.motion import Station
 from exo_gravity.core.calibration.params import as_text
 from exo_gravity.tools import calibrate
-from exo_gravity.tools.calibration import gravity
+from exo_gravity.tools.calibration import live
 from exo_gravity.tools.calibration.live import LiveTour
 from exo_gravity.tools.inputs.parameter_file import packaged_config
 from test.support.tour_run import Hand
@@ -60,7 +60,7 @@ def gravity_with(folder: Path, trouble: Torque | None, changes: Mapping[str, Any
         return run_tour([], prepare)(options, nodes, say)
 
     params, output = str(packaged_config("sim.yaml")), str(folder / "new.yaml")
-    with patch.object(gravity, "run_tour", run):
+    with patch.object(live, "run_tour", run):
         return calibrate.main(["gravity", "--params", params, "--output", output, *more])
 
 
@@ -104,7 +104,7 @@ def test_a_random_device_is_calibrated_from_motors_to_an_arm_that_holds(
 
 @pytest.mark.timeout(300)
 def test_the_arm_of_the_demo_falls_before_and_stays_after(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with patch.object(gravity, "run_tour", run_tour([])):
+    with patch.object(live, "run_tour", run_tour([])):
         assert demo.main(tmp_path / "demo") == 0
     said = capsys.readouterr().out
     assert "degrees per minute before, 0.0" in said

@@ -25,7 +25,6 @@ EXCEPTIONS = {
     "exo_gravity/tools/trials/simulated_effort.py": {"sim"},
     "exo_gravity/tools/trials/trunk_imu.py": {"sim", "hardware"},
     "exo_gravity/tools/calibration/motors.py": {"hardware"},
-    "exo_gravity/tools/calibration/motor_watch.py": {"hardware"},
 }
 
 

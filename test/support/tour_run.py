@@ -135,8 +135,7 @@ def worst_error(tour: Tour, truth: ArmModel) -> float:
     from exo_gravity.core import gravity_torque
 
     return max(
-        float(np.abs(np.subtract(o.effort, gravity_torque(truth, o.theta, o.direction))).max())
-        for o, _ in tour.measured
+        float(np.abs(np.subtract(o.effort, gravity_torque(truth, o.theta, o.direction))).max()) for o in tour.measured
     )
 
 

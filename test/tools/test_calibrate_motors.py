@@ -23,9 +23,9 @@ from exo_gravity.hardware.can.bus_scan import BusScan
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice, simulated_motor
 from exo_gravity.tools.calibrate import main
-from exo_gravity.tools.calibration.motors import run
-from exo_gravity.tools.calibration.outcome import Outcome
-from exo_gravity.tools.calibration.person import Person
+from exo_gravity.tools.calibration.live import Person
+from exo_gravity.tools.calibration.motors import calibrate_motors
+from exo_gravity.tools.calibration.result import CalibrationResult
 from exo_gravity.tools.inputs.arms import configured_arm
 
 from ..support.simulated_device import SPECS, frame
@@ -91,11 +91,11 @@ class Bench:
             self.during(request, step)
             watch()
 
-    def calibrate(self, pose: tuple[float, ...] = (0.0,) * 4) -> Outcome:
+    def calibrate(self, pose: tuple[float, ...] = (0.0,) * 4) -> CalibrationResult:
         console = Console(width=120, record=True, file=open(os.devnull, "w"))  # noqa: SIM115
         arm = configured_arm(self.params, "right")
         options = argparse.Namespace(params=self.params, wait=self.wait, pose=pose)
-        outcome = run(options, arm, console.print)
+        outcome = calibrate_motors(options, arm, console.print)
         self.said = console.export_text().splitlines()
         return outcome
 

@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.tools.calibration.person import Person
+from exo_gravity.tools.calibration.live import Person
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def test_the_motors_are_watched_until_enter_is_pressed(keys: tuple[IO[str], IO[s
 
 def test_a_program_without_a_person_ends_with_the_reason(keys: tuple[IO[str], IO[str]]) -> None:
     keys[1].close()
-    with pytest.raises(DataError, match="nobody is there to press Enter"):
+    with pytest.raises(DataError, match="standard input has ended"):
         Person(Console(file=io.StringIO()), keys[0]).ask("bow")
 
 
