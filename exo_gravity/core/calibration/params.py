@@ -5,22 +5,20 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from exo_gravity.core.calibration.friction import friction_stations
 from exo_gravity.core.calibration.guess import TorqueGuess
-from exo_gravity.core.calibration.motion import MAX_SPEED, Station
-from exo_gravity.core.calibration.poses import BestPoses, FixedStations, Itinerary, measurable
+from exo_gravity.core.calibration.poses import BestPoses, FixedStations, Itinerary
 from exo_gravity.core.calibration.tour import Tour
 from exo_gravity.core.compensation.params import COMPENSATOR
-from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import MAX_LENGTH, MAX_MASS, MAX_MOMENT
 from exo_gravity.core.model.moments import load_moments
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.numbers import JOINT_COUNT, one_float
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.params import CAN_BRIDGE
@@ -30,15 +28,14 @@ LIMITS = ("position_min", "position_max", "max_effort", "home")
 BRIDGE = ("rate", *LIMITS)  # as can_bridge's
 # fmt: off
 CALIBRATOR = (
-    *(param for param in COMPENSATOR if param.name in ARM),
+    *(replace(param, fixed=True) for param in COMPENSATOR if param.name in ARM),
     Param("first_moment", [0.0] * 4, "M1 to M4 as far as known, with the wearer", (0.0, MAX_MOMENT), "kg m",
           fixed=True),
     Param("off_axis", [0.0] * 4, "W, Z, Y3, Y4 as far as known", (-MAX_MOMENT, MAX_MOMENT), "kg m", fixed=True),
     *(param for param in CAN_BRIDGE if param.name in BRIDGE),
     Param("tour.poses", 12, "number of poses that are chosen", (1, 100), fixed=True),
     Param("tour.duration", 230.0, "time that the poses are chosen for", (30.0, 3600.0), "s", fixed=True),
-    Param("tour.stations", "", "JSON list of [[4 angles], speed, amplitude, cycles], in place of chosen poses",
-          fixed=True),
+    Param("tour.friction", False, "sweep the hanging arm at several speeds, in place of chosen poses", fixed=True),
     Param("tour.load_mass", 0.0, "weight that hangs on link 4", (0.0, MAX_MASS), "kg", fixed=True),
     Param("tour.load_lever", 0.0, "its distance from the elbow", (0.0, MAX_LENGTH), "m", fixed=True),
 )
@@ -52,28 +49,6 @@ def tour_of(values: Mapping[str, Any]) -> Tour:
     moments = np.array((*values["first_moment"], *values["off_axis"])) + load_moments(values["link_length"], *load)
     guess = TorqueGuess(values["link_length"], moments, Tilt.of(values["side"]), values["gravity"])
     itinerary: Itinerary = BestPoses(limits, values["tour.poses"], values["tour.duration"])
-    if values["tour.stations"]:
-        itinerary = FixedStations(stations_of(values["tour.stations"], limits))
+    if values["tour.friction"]:
+        itinerary = FixedStations(friction_stations(limits))
     return Tour(limits, guess, itinerary, values["rate"], load)
-
-
-def stations_of(text: str, limits: Limits) -> list[Station]:
-    """Return the stations in the JSON `text`. Raises ParameterError if one leaves the limits or is too fast."""
-    try:
-        given = [Station(tuple(map(float, theta)), *rest) for theta, *rest in json.loads(text)]
-    except (ValueError, TypeError):
-        raise ParameterError("tour.stations", text, "JSON: [[[4 angles], speed, amplitude, cycles], ...]") from None
-    for station in given:
-        one_float("tour.stations speed", station.speed, 0.005, MAX_SPEED, "rad/s")
-        one_float("tour.stations amplitude", station.amplitude, 0.01, 1.0, "rad")
-        one_float("tour.stations cycles", station.cycles, 1, 20)
-        low, high = measurable(limits, station.amplitude)
-        theta = np.array(station.theta)
-        if len(theta) != JOINT_COUNT or not np.all((theta >= low) & (theta <= high)):
-            raise ParameterError("tour.stations", list(station.theta), f"from {low.tolist()} to {high.tolist()} rad")
-    return given
-
-
-def as_text(stations: Sequence[Station]) -> str:
-    """Return stations as the parameter `tour.stations`."""
-    return json.dumps([list(station) for station in stations])

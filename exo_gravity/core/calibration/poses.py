@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from typing import Protocol
 
 import numpy as np
 
@@ -31,22 +30,6 @@ NOISE = 0.03  # Nm in any pose
 NOISE_SHARE = 0.02  # of the torque
 # deg of each joint, within the paper's ranges: from these a missing pose is suggested.
 GRID = ((-60, 0, 60), (15, 45, 75, 105, 135), (-30, 0, 30, 60, 90, 120), (0, 30, 60, 90, 120, 150))
-
-
-class Itinerary(Protocol):
-    """Chooses the poses of a tour, one after the other."""
-
-    count: int  # of all poses
-
-    def next(
-        self, taken: np.ndarray, position: np.ndarray, elapsed: float, guess: TorqueGuess, friction: Sequence[float]
-    ) -> Station | None:
-        """Return the next station, None after the last. Raises DataError if no pose can be held.
-
-        taken: (n, 4) rad, the poses measured so far. position: (4,) rad, where the arm is. elapsed: s since the start
-        of the tour. friction: (4,) Nm, 0 if unknown.
-        """
-        ...
 
 
 class FixedStations:
@@ -82,7 +65,12 @@ class BestPoses:
     def next(
         self, taken: np.ndarray, position: np.ndarray, elapsed: float, guess: TorqueGuess, friction: Sequence[float]
     ) -> Station | None:
-        """Return the best of the candidates that can be held and reached; the first is the hanging arm."""
+        """Return the best of the candidates that can be held and reached; the first is the hanging arm.
+
+        taken: (n, 4) rad, the poses measured so far. position: (4,) rad, where the arm is. elapsed: s since the start
+        of the tour. friction: (4,) Nm, 0 if unknown. Returns None after the last; raises DataError if no pose can be
+        held.
+        """
         if len(taken) >= self.count:
             return None
         if not len(taken) and not self._is_started:
@@ -129,6 +117,9 @@ class BestPoses:
             can = np.all(needed <= SHARE * np.array(self._limits.max_effort), axis=1)
             result &= can.reshape(len(way), -1).all(axis=0)
         return result
+
+
+Itinerary = FixedStations | BestPoses
 
 
 def candidates(limits: Limits) -> np.ndarray:

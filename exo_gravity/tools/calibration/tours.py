@@ -12,13 +12,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.calibration.friction import FrictionCurve, fit_friction, friction_stations
+from exo_gravity.core.calibration.friction import FrictionCurve, fit_friction
 from exo_gravity.core.calibration.identification import Identified, Observation, identify
-from exo_gravity.core.calibration.params import as_text
 from exo_gravity.core.calibration.poses import candidates, next_pose
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.gravity import gravity_torque
@@ -145,8 +143,7 @@ def calibrate_friction(options: argparse.Namespace, arm: ConfiguredArm, say: Say
     """Sweep all joints of the hanging arm, and fit the friction of each. Raises ParameterError."""
     if options.bag:
         return friction_from(arm, sweeps_of(options.bag, arm))
-    changes: dict[str, Any] = {"tour.stations": as_text(friction_stations(arm.limits))}
-    tour = live.run_tour(options, tour_parameters(options.params, arm, changes), say)
+    tour = live.run_tour(options, tour_parameters(options.params, arm, {"tour.friction": True}), say)
     return friction_from(arm, tour.measured, tour.refusals(options.record))
 
 

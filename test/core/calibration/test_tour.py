@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.calibration.friction import fit_friction, friction_stations
+from exo_gravity.core.calibration.friction import fit_friction
 from exo_gravity.core.calibration.guess import TorqueGuess
 from exo_gravity.core.calibration.motion import ACCELERATION, MAX_SPEED, Line, Station, Sweep, average
-from exo_gravity.core.calibration.params import as_text, stations_of
 from exo_gravity.core.calibration.poses import BestPoses, FixedStations, candidates, measurable
 from exo_gravity.core.calibration.tour import Tour
 from exo_gravity.core.calibration.tracking import MassMatrix
-from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.moments import load_moments, moments_of
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.safety.drive import State
@@ -265,11 +264,3 @@ def test_friction_over_speed_is_fitted_with_and_without_stribeck():
     assert fit.coulomb == pytest.approx(0.2, abs=0.01)
     with pytest.raises(DataError, match="at 1 speeds"):
         fit_friction(speed[:1], speed[:1])
-
-
-def test_stations_survive_the_parameter_and_are_checked():
-    stations = friction_stations(LIMITS)
-    assert stations_of(as_text(stations), LIMITS) == stations
-    for text in ("[", "[[1]]", as_text([Station((0.0, 0.0, 0.0, 3.1))]), as_text([Station(POSE.theta, speed=0.5)])):
-        with pytest.raises(ParameterError, match=r"tour\.stations"):
-            stations_of(text, LIMITS)
