@@ -95,6 +95,17 @@ def test_the_recording_of_a_tour_gives_the_same_torques(tours, tmp_path):
         assert np.all((one.speed > 0.03) & (one.speed < 0.3))
 
 
+def test_held_poses_are_as_uncertain_as_friction(tmp_path):
+    poses = np.random.default_rng(5).uniform((-1.0, 0.2, -0.3, 0.2), (1.0, 1.6, 1.5, 1.8), (6, 4))
+    position, time = np.repeat(poses, 300, axis=0), 0.01 * np.arange(1800) + np.repeat(5.0 * np.arange(6), 300)
+    nothing = np.full_like(position, np.nan)
+    holds = Recording("right", ARM.joint_names, time, position, nothing, gravity_torque(TRUTH, position), nothing)
+    upright = replace(ARM, compensator={**ARM.compensator, "use_imu": False})
+    found = recorded.observations_of(write_bag(tmp_path / "bag", messages(holds)), upright)
+    np.testing.assert_allclose([o.theta for o in found], poses, atol=1e-3)
+    assert np.min([o.spread for o in found]) > 0.2
+
+
 def test_recordings_without_and_with_the_weight_give_kilograms_and_true_scales(tours, tmp_path):
     files = [str(packaged_config("sim.yaml")), str(tmp_path / "1.yaml"), str(tmp_path / "2.yaml")]
     bare = str(recorded_by(tours[0][0], tmp_path / "bare"))

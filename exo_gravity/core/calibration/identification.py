@@ -139,14 +139,10 @@ def _rows(observations: Sequence[Observation], length: Vector, gravity: float) -
     """Return the observations as arrays, with what is held. Raises DataError that names the observation."""
     if not observations:
         raise DataError("no pose was observed")
-    for index, observation in enumerate(observations):
-        for name, count in (("theta", 4), ("direction", 3), ("effort", 4), ("friction", 4), ("spread", 4)):
-            values = np.asarray(getattr(observation, name), dtype=float)
-            if values.shape != (count,) or not np.all(np.isfinite(values)):
-                raise DataError(f"pose {index + 1}: {name} = {values.tolist()}: must be {count} finite numbers")
-        if np.min(observation.spread) < 0.0:
-            raise DataError(f"pose {index + 1}: spread = {list(observation.spread)}: must be at least 0 Nm")
     theta, direction, effort, spread = columns(observations)
+    for name, values in (("theta", theta), ("direction", direction), ("effort", effort), ("spread", spread)):
+        for index in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
+            raise DataError(f"pose {index + 1}: {name} = {values[index].tolist()}: must be finite numbers")
     load = np.array([load_moments(length, one.load_mass, one.load_lever) for one in observations])
     beside = np.zeros((*load.shape, len(BESIDE)))
     for angle, (across, along) in enumerate(BESIDE):

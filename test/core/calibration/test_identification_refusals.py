@@ -107,18 +107,10 @@ def test_a_weight_that_is_too_light_to_show_the_scale_is_refused():
         identify(observations, LENGTH)
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"effort": (0.0, np.nan, 0.0, 0.0)}, "pose 2: effort"),
-        ({"theta": (0.0, 0.0, 0.0)}, "pose 2: theta"),
-        ({"spread": (0.0, 0.1, -0.1, 0.0)}, "pose 2: spread"),
-    ],
-)
-def test_an_impossible_observation_is_refused_by_number_and_name(change, words):
+def test_an_impossible_observation_is_refused_by_number_and_name():
     observations = Device(12).tour()
-    observations[1] = observations[1]._replace(**change)
-    with pytest.raises(DataError, match=words):
+    observations[1] = observations[1]._replace(effort=(0.0, np.nan, 0.0, 0.0))
+    with pytest.raises(DataError, match="pose 2: effort"):
         identify(observations, LENGTH)
     with pytest.raises(DataError, match="no pose"):
         identify([], LENGTH)
