@@ -2,10 +2,12 @@
 #
 #   docker build --tag exo_gravity .
 #   docker run --rm exo_gravity ros2 run exo_gravity trial demo --output /tmp/trials
-#   docker run --rm --network host --cap-add SYS_NICE --ulimit rtprio=98 --ulimit memlock=-1 \
+#   docker run --rm --network host --stop-timeout 60 --cap-add SYS_NICE --ulimit rtprio=98 --ulimit memlock=-1 \
 #       --volume "$PWD/my.yaml:/exo.yaml:ro" exo_gravity ros2 run exo_gravity launcher --params /exo.yaml
 #
-# A CAN interface of the host needs --network host; the interface itself is set up on the host.
+# `docker stop` kills a container 10 s after it asked it to end, but letting an arm down takes up to 22 s:
+# --stop-timeout (stop_grace_period in a compose file) gives it 60 s. A CAN interface of the host needs
+# --network host; the interface itself is set up on the host.
 FROM ros:jazzy-ros-base
 
 SHELL ["/bin/bash", "-o", "pipefail", "-c"]

@@ -1,7 +1,8 @@
 # make demo         four nodes as processes on the simulated device, about 75 s; a table and figures in trials/
 # make calibrate-demo  a simulated arm with a wrong parameter file, calibrated, 5 minutes; a picture before and after
 # make calibrate-study  20 random simulated devices, calibrated from motors to an arm that holds, offline, 20 minutes
-# make test         all tests
+# make test         the tests, under 5 minutes on two cores
+# make test-all     the same, then the longer ones (make test-long): browser, 13 poses, video, SROS2, two computers
 # make lint         ruff, mypy, ament's flake8 and pep257, shellcheck
 # make docs         these documents as a site, in build/site; a warning is an error
 # make faults       the whole fault matrix on the simulated device, 20 minutes; a table and build/faults.json
@@ -13,7 +14,7 @@
 # make two-computers  the arm on two computers over better and worse wires, 6 minutes; a table and build/two_computers.json
 # make dist         wheel and source distribution in dist/, the wheel installed in an empty environment and tried
 # make panel        the simulated right arm and the operator's page, until Ctrl-C
-# make test-panel   the operator's page in a real browser; PRESSES=50 also measures from press to torque on the bus
+# make presses      from a press on the operator's page to the torque on the bus; PRESSES=50
 # make pythons      for each supported Python found here: set-up from nothing, a short trial, the nodes
 # make constraints  renews the versions in constraints/
 # make clean        removes what these made
@@ -28,7 +29,7 @@ TEST := $(DEMO) panel validate video test
 SETUP := VENV=$(VENV) .ci/setup
 
 .PHONY: demo calibrate-demo calibrate-study test lint docs faults mutations bench imu-report socketcan \
-        pythons constraints clean ros2-launch two-computers dist panel test-panel
+        pythons constraints clean ros2-launch two-computers dist panel presses test-all test-long
 
 demo:
 	@$(SETUP) $(DEMO)
@@ -42,12 +43,21 @@ calibrate-study:
 	@$(SETUP) $(TEST) calibrate
 	$(BIN)/python -m bench.calibration
 
-# The nodes' tests need a quiet machine, and run two at a time; the others share its cores.
+# Tests of running nodes need a machine that keeps up with them: they run alone.
 test:
 	@$(SETUP) $(TEST)
-	$(BIN)/python -m pytest --ignore test/panel -m "not real_time" -n auto
-	$(BIN)/python -m pytest --ignore test/panel -m real_time -n 2
-	@$(MAKE) --no-print-directory test-panel
+	$(BIN)/python -m pytest -n auto -m "not (real_time or browser or thorough)"
+	$(BIN)/python -m pytest -m "real_time and not (browser or thorough)"
+
+test-all: test test-long
+
+test-long:
+	@$(SETUP) $(TEST)
+	@mkdir -p build
+	@command -v chromium chromium-browser >/dev/null || ! test -w /var/lib/dpkg || \
+		(apt-get update && apt-get install --yes chromium) >build/chromium.log 2>&1 || true
+	$(BIN)/python -m pytest -n auto -m "(browser or thorough) and not real_time"
+	$(BIN)/python -m pytest -m "(browser or thorough) and real_time"
 
 lint:
 	@$(SETUP) $(TEST) dev
@@ -98,14 +108,9 @@ panel:
 	@$(SETUP) $(DEMO) panel
 	$(BIN)/launcher --panel
 
-test-panel:
+presses:
 	@$(SETUP) $(TEST)
-	@mkdir -p build
-	@command -v chromium chromium-browser >/dev/null || ! test -w /var/lib/dpkg || \
-		(apt-get update && apt-get install --yes chromium) >build/chromium.log 2>&1 || true
-	$(BIN)/python -m pytest test/panel -m "not real_time" -n 2
-	$(BIN)/python -m pytest test/panel -m real_time
-	$(if $(PRESSES),$(BIN)/python -m bench.panel press $(PRESSES))
+	$(BIN)/python -m bench.panel press $(or $(PRESSES),50)
 
 pythons:
 	.ci/pythons

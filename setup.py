@@ -38,7 +38,6 @@ extras = {
         "mcap-ros2-support>=0.5",
         "playwright>=1.49",
         "pytest>=8.0",
-        "pytest-rerunfailures>=14.0",
         "pytest-timeout>=2.3",
         "pytest-xdist>=3.5",
     ],

@@ -27,10 +27,10 @@ os.environ.setdefault("ROS_DOMAIN_ID", str(os.getpid() % 100 + 1))  # before rcl
 from rich.console import Console
 from rich.table import Table
 
-from ..support.stall_clock import StallClock
 from .cases import CASES
 from .fault_case import FaultCase
 from .runner import Result, RigPool, not_run
+from .stall_clock import StallClock
 
 STALL = 0.03  # s for which the machine stood still, so that an unsafe result shows nothing about the nodes
 ATTEMPTS = 3

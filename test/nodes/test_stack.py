@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,8 @@ from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.tools import train_anfis
 
 from ..support import CONFIG
-from ..support.launched_nodes import GENTLE, NO_IMU, SIMULATED
+from ..support.launched_nodes import GENTLE, NO_IMU, SIMULATED, LaunchedNodes
+from ..support.ros_probe import RosProbe
 
 pytestmark = pytest.mark.real_time
 
@@ -66,35 +67,19 @@ def test_a_released_arm_stays_follows_live_changes_and_is_let_down_gently(launch
     steps = np.diff([message.effort[2] for message in probe.effort_commands])
     assert np.abs(steps).max() < 0.5 * abs(target - before)
 
-    # When the nodes stop, the arm is let down before the motors are switched off.
-    probe.joint_states.clear()
-    nodes.stop()
-    assert max(max(map(abs, message.velocity)) for message in probe.joint_states) < 1.0
-    assert abs(probe.joint_angles()[2]) < 0.2  # friction holds it there
-    assert listener.motors_are_off()
-
-
-def test_without_the_compensator_the_same_arm_falls(launch, probe, script):
-    launch(without=("compensator", "imu"))
-    probe.wait_until(lambda: probe.status_contains("can_bridge", "waiting for effort commands"))
-    assert probe.set_parameters("simulator", trial=script).successful
-    probe.wait_until(lambda: probe.wearer_is_at("hold"))
-    released = probe.joint_angles()
-    probe.wait_until(lambda: np.abs(np.subtract(probe.joint_angles(), released)).max() > math.radians(20))
-
-
-def test_ctrl_c_to_the_bridge_switches_the_motors_off_and_stops_all_nodes(launch, probe, listen):
-    nodes = launch(compensator=NO_IMU)
-    listener = listen(nodes)
-    probe.wait_until_carried()
     # No node maps another one's shared memory, on which it could block.
     for node in ("can_bridge", "compensator", "simulator"):
         maps = Path(f"/proc/{nodes.process(node).pid}/maps").read_text()
         assert "librmw_fastrtps" in maps
         assert "fastrtps_port" not in maps
+
+    # Ctrl-C to the bridge: the arm is let down, then the motors are switched off, then all nodes stop.
+    probe.joint_states.clear()
     nodes.process("can_bridge").send_signal(signal.SIGINT)
     probe.wait_until(lambda: nodes.have_ended)
     assert nodes.ended_node == ("/right/can_bridge", 0)
+    assert max(max(map(abs, message.velocity)) for message in probe.joint_states) < 1.0
+    assert abs(probe.joint_angles()[2]) < 0.2  # friction holds it there
     assert listener.motors_are_off()
 
 
@@ -117,26 +102,40 @@ def test_only_the_operator_clears_the_fault_after_the_compensator_died(launch, p
     probe.wait_until_carried()
 
 
-def test_set_zero_makes_the_present_pose_zero_and_is_refused_while_the_arm_is_carried(launch, probe):
-    launch(simulator={"zero": [0.3, 0.0, 0.0, 0.2]}, can_bridge={"zero": [0.0] * 4}, compensator=NO_IMU)
-    probe.wait_until_carried()
-    assert not probe.trigger("set_zero").success
-    assert probe.enable(False).success
-    probe.wait_until(lambda: probe.state == "disabled")
-    assert probe.joint_angles()[0] == pytest.approx(0.3, abs=0.1)  # the checks at the start move a light joint
-    probe.wait_until(lambda: probe.trigger("set_zero").success)  # refused while the arm still creeps
-    probe.wait_until(lambda: np.abs(probe.joint_angles()).max() < 0.02)
+@pytest.fixture(scope="module")
+def seated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosProbe]:
+    """The arm of a seated wearer, whose first motor has its zero 0.3 rad off: observed, not carried yet."""
+    nodes = LaunchedNodes(
+        tmp_path_factory.mktemp("seated"),
+        without=("imu",),
+        simulator={"zero": [0.3, 0.0, 0.0, 0.2]},
+        can_bridge={"zero": [0.0] * 4},
+        compensator=NO_IMU,
+    ).start()
+    probe = RosProbe()
+    yield probe
+    probe.close()
+    nodes.stop()
+    print("\n".join(nodes.log))
 
 
-def test_the_anfis_law_runs_from_its_file_and_the_exact_law_replaces_it_outside_its_training(launch, probe, tmp_path):
+def test_set_zero_makes_the_present_pose_zero_and_is_refused_while_the_arm_is_carried(seated):
+    seated.wait_until_carried()
+    assert not seated.trigger("set_zero").success
+    assert seated.enable(False).success
+    seated.wait_until(lambda: seated.state == "disabled")
+    assert seated.joint_angles()[0] == pytest.approx(0.3, abs=0.1)  # the checks at the start move a light joint
+    seated.wait_until(lambda: seated.trigger("set_zero").success)  # refused while the arm still creeps
+    seated.wait_until(lambda: np.abs(seated.joint_angles()).max() < 0.02)
+
+
+def test_the_anfis_law_runs_from_its_file_and_the_exact_law_replaces_it_outside_its_training(seated, tmp_path):
     path = str(tmp_path / "anfis.json")
     assert train_anfis.main(["--params", str(CONFIG / "sim.yaml"), "--output", path]) is None
-    launch(compensator=NO_IMU)
-    probe.wait_until_carried()
-    assert "anfis_file" in probe.set_parameters("compensator", law="anfis").reason
-    assert probe.set_parameters("compensator", atomically=True, law="anfis", anfis_file=path).successful
-    probe.wait_until(lambda: probe.diagnostic("compensator", "law") == "anfis")
-    probe.wait_until(lambda: probe.status_contains("compensator", "compensating"))
-    assert probe.set_parameters("compensator", wearer__body_mass=75.0, mode="zero_g", atomically=True).successful
+    assert "anfis_file" in seated.set_parameters("compensator", law="anfis").reason
+    assert seated.set_parameters("compensator", atomically=True, law="anfis", anfis_file=path).successful
+    seated.wait_until(lambda: seated.diagnostic("compensator", "law") == "anfis")
+    seated.wait_until(lambda: seated.status_contains("compensator", "compensating"))
+    assert seated.set_parameters("compensator", wearer__body_mass=75.0, mode="zero_g", atomically=True).successful
     message = "the exact law replaces anfis: the ANFIS was trained for another arm"
-    probe.wait_until(lambda: probe.status_contains("compensator", message))
+    seated.wait_until(lambda: seated.status_contains("compensator", message))

@@ -11,7 +11,7 @@ import sys
 import threading
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import yaml
 
@@ -25,7 +25,6 @@ Parameters = Mapping[str, Any]
 PORTS = own_ports(20_000)
 GROUP = "239.74.163.2"
 AUTOGROUP_NICE = -15
-LATE = ("stalled for ", "fault: command_stale", "fault: motor_silent")
 NO_IMU: Parameters = {"use_imu": False}  # for the compensator, which then starts without waiting for a tilt
 FAST: Parameters = {"sign_check_torque": 0.0, "ramp_time": 0.5, "fade_time": 0.5, "damping": 1.5}
 GENTLE: Parameters = {**FAST, "ramp_time": 1.0, "fade_time": 2.0, "damping": 5.0}
@@ -49,10 +48,7 @@ class LaunchedNodes:
     log the arm's true motion, at `truth_path`. The attribute `ended_node` is what `Launcher.run` returned.
 
     Nodes that have started run before other processes, if permitted: others that start would keep them waiting.
-    late: what nodes logged that had to wait nevertheless, until the test run empties it.
     """
-
-    late: ClassVar[list[str]] = []
 
     def __init__(
         self,
@@ -108,8 +104,6 @@ class LaunchedNodes:
         if node not in self._preferred:
             self._preferred.add(node)
             prefer(self.pid(node))
-        if any(sign in line for sign in LATE):
-            self.late.append(self.log[-1])
 
     def _run(self) -> None:
         self.ended_node = self.launcher.run(self.stopping)

@@ -11,7 +11,7 @@ from .arm import PEERS
 from .case import play
 from .network import Wire
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.real_time, pytest.mark.thorough]
 
 TIMEOUT = 1000.0 * SIMULATED["can_bridge"]["command_timeout"]  # ms
 

@@ -1,6 +1,6 @@
 """A process that measures how long the machine stands still, beside the tests that need it to keep up.
 
-Run with `-m test.support.stall_clock`, it wakes every `TICK` s on each processor: a virtual machine may halt one of
+Run with `-m test.faults.stall_clock`, it wakes every `TICK` s on each processor: a virtual machine may halt one of
 them alone. For each line on its standard input it prints the longest time in s between two wake-ups since the last such
 line. It ends when its standard input closes.
 """
@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 
-from . import ROOT
+from ..support import ROOT
 
 TICK = 0.005  # s
 
