@@ -19,7 +19,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
-from exo_gravity.core.compensation.terms.coupling import JOINTS
+from exo_gravity.core.compensation.compensator import JOINTS
 
 RATE = 500.0  # Hz
 SETTLING = 1.5  # s after a change of parameters: ramp_time of the terms, and some more

@@ -16,8 +16,7 @@ from xml.etree import ElementTree
 
 from exo_gravity.bag.content import RECORDER
 from exo_gravity.core.calibration.params import CALIBRATOR
-from exo_gravity.core.compensation.any_arm import any_arm_table
-from exo_gravity.core.compensation.params import COMPENSATOR
+from exo_gravity.core.compensation.params import COMPENSATOR, urdf_table
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.faults import FaultCode
 from exo_gravity.core.safety.params import CAN_BRIDGE
@@ -34,7 +33,7 @@ COMMAND = "python docs/tables.py"
 PARAMETERS = {
     "can_bridge": CAN_BRIDGE,
     "compensator": COMPENSATOR,
-    "any_arm": any_arm_table(1),
+    "urdf_arm": urdf_table(1, ["command_interface"]),
     "imu": IMU,
     "simulator": SIMULATOR,
     "recorder": RECORDER,

@@ -3,12 +3,14 @@
 from exo_gravity.core.model.arm import STANDARD_GRAVITY, ArmModel
 from exo_gravity.core.model.gravity import LAWS, gravity_torque, paper_mobile_torque, paper_static_torque
 from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.model.wearer import Wearer
 
 __all__ = [
     "LAWS",
     "STANDARD_GRAVITY",
     "ArmModel",
     "Tilt",
+    "Wearer",
     "gravity_torque",
     "paper_mobile_torque",
     "paper_static_torque",

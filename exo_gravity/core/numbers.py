@@ -16,13 +16,18 @@ JOINT_COUNT = 4
 
 def four_floats(name: str, values: Vector, low: float, high: float, unit: str = "") -> np.ndarray:
     """Return `values` as a read-only array (4,), or raise ParameterError unless they are 4 numbers in [low, high]."""
-    expected = f"{JOINT_COUNT} numbers from {low:g} to {high:g}{' ' + unit if unit else ''}"
+    return floats(name, values, JOINT_COUNT, low, high, unit)
+
+
+def floats(name: str, values: Vector, count: int, low: float, high: float, unit: str = "") -> np.ndarray:
+    """Return `values` as a read-only array, or raise ParameterError unless they are `count` numbers in [low, high]."""
+    expected = f"{count} numbers from {low:g} to {high:g}{' ' + unit if unit else ''}"
     try:
         array = np.array(values, dtype=float)
     except (TypeError, ValueError):
         raise ParameterError(name, values, expected) from None
     # NaN fails both comparisons, so this check rejects it too.
-    if array.shape != (JOINT_COUNT,) or not np.all((array >= low) & (array <= high)):
+    if array.shape != (count,) or not np.all((array >= low) & (array <= high)):
         raise ParameterError(name, values, expected)
     array.setflags(write=False)
     return array

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.numbers import four_floats, one_float
+from exo_gravity.core.numbers import floats, one_float
 
 # ROS declares these on every node, and `ros2 param dump` writes them to files.
 ROS_PARAMETERS = ("use_sim_time", "start_type_description_service")
@@ -22,6 +22,27 @@ KINDS = {float: "number", int: "whole number", str: "string", bool: "true or fal
 GONE: dict[str, str] = {
     # can_bridge
     # compensator
+    "max_total_mass": "always 10 kg",
+    "transition_time": "always 1 s; change `support` in small steps for a slower change",
+    "wearer.table": "always de_leva; give wearer.mass and wearer.cog for other masses",
+    "terms.max_effort": "always 2, 4, 2, 2 Nm",
+    "terms.max_effort_rate": "always 50 Nm/s",
+    "terms.ramp_time": "always 1 s",
+    "inertia.rotor": "always that of the AK60-6 and AK80-9",
+    "spring.max_effort": "always 1, 2, 1, 1 Nm",
+    "spring.path_file": "spring.pose, which also takes a path: rows of the time in s and four angles",
+    "coupling.leader": "coupling.stiffness, with an entry for each joint",
+    "coupling.follower": "coupling.stiffness, whose largest entry is the follower's",
+    "coupling.ratio": "coupling.stiffness: [0, -1, 2, 0] pulls joint 3 to half the angle of joint 2",
+    "coupling.offset": "always 0 rad",
+    "coupling.max_effort": "always 1 Nm",
+    "limits.stiffness": "limits.range; the stiffness is 10 Nm/rad, or half of what is stable",
+    "limits.lower": "limits.range, lower and upper edge of each joint in turn",
+    "limits.upper": "limits.range, lower and upper edge of each joint in turn",
+    "limits.max_effort": "always 1, 2, 1, 1 Nm",
+    "assist.max_effort_rate": "always 10 Nm/s",
+    "multi_array.fade_time": "always 2 s",
+    "lock_memory": "thread_priority, which also locks the memory where it is above 0",
     # imu
     # calibrator
     # simulator
@@ -30,22 +51,23 @@ GONE: dict[str, str] = {
 
 @dataclass(frozen=True)
 class Param:
-    """One parameter. The type of `default` is the parameter's type.
-
-    unit: '' for none. bounds: lowest and highest value, also for each number in a list. fixed: read-only while the
-    node runs. required: the user must give a non-empty value. expert: only an expert changes it; the documents list it
-    apart, and the panel does not show it.
-    """
+    """One parameter. The type of `default` is the parameter's type."""
 
     name: str
     default: Any
     description: str
+    #: lowest and highest value, also for each number in a list
     bounds: tuple[float, float] | None = None
     unit: str = ""
     choices: tuple[str, ...] = ()
+    #: read-only while the node runs
     fixed: bool = False
+    #: the user must give a non-empty value
     required: bool = False
+    #: only an expert changes it; the documents list it apart, and the panel does not show it
     expert: bool = False
+    #: a list may have another length than its default; otherwise it has one entry per joint, and keeps its length
+    any_length: bool = False
 
     def check(self, value: Any) -> Any:
         """Return `value` in this parameter's type; an integer is converted if the type is float.
@@ -56,8 +78,7 @@ class Param:
         items, kind = list(value) if is_list else [value], type(self.default)
         if kind is list:
             kind = type(self.default[0]) if self.default else str
-            # A list with a default has one entry per joint, and keeps that length.
-            if not is_list or len(items) != len(self.default or items):
+            if not is_list or (len(items) != len(self.default or items) and not self.any_length):
                 raise ParameterError(self.name, value, self.expected)
         elif is_list:
             raise ParameterError(self.name, value, self.expected)
@@ -87,7 +108,8 @@ class Param:
         """A description of the permitted values, for error messages."""
         if isinstance(self.default, list):
             kind = KINDS[type(self.default[0]) if self.default else str]
-            text = f"{len(self.default)} {kind}s" if self.default else f"a list of {kind}s"
+            is_free = self.any_length or not self.default
+            text = f"a list of {kind}s" if is_free else f"{len(self.default)} {kind}s"
         else:
             kind = KINDS[type(self.default)]
             text = kind if isinstance(self.default, bool) else f"a {kind}"
@@ -101,10 +123,11 @@ def owned(
     unit: str = "",
     choices: tuple[str, ...] = (),
     expert: bool = False,
+    any_length: bool = False,
 ) -> Any:
-    """Return a dataclass field that owns a parameter; a tuple as default makes it a list with one entry per joint."""
+    """Return a dataclass field that owns a parameter; a tuple as default makes it a list."""
     plain = list(default) if isinstance(default, tuple) else default
-    param = Param("", plain, description, bounds, unit, choices, expert=expert)
+    param = Param("", plain, description, bounds, unit, choices, expert=expert, any_length=any_length)
     return field(default=default, metadata={"param": param})
 
 
@@ -130,7 +153,7 @@ def check_owned(instance: Any) -> None:
             if value not in param.choices:
                 raise ParameterError(param.name, value, param.range)
         elif param.bounds and isinstance(param.default, list):
-            checked = tuple(four_floats(param.name, value, *param.bounds, param.unit).tolist())
+            checked = tuple(floats(param.name, value, len(param.default), *param.bounds, param.unit).tolist())
             object.__setattr__(instance, param.name, checked)
         elif param.bounds:
             object.__setattr__(instance, param.name, one_float(param.name, value, *param.bounds, param.unit))
@@ -158,9 +181,13 @@ JOINT_NAMES = Param(
     "the four joints from the shoulder to the elbow, as in joint_states",
     fixed=True,
 )
-# fmt: off
 REAL_TIME_PARAMETERS = (
-    Param("thread_priority", 0, "SCHED_FIFO priority of the control loop's threads; 0 for none", (0, 99), fixed=True),
-    Param("lock_memory", False, "lock the process's memory (mlockall) if permitted", fixed=True),
+    Param(
+        "thread_priority",
+        0,
+        "above 0: SCHED_FIFO priority of the control loop's threads, and locked memory, where permitted",
+        (0, 99),
+        fixed=True,
+        expert=True,
+    ),
 )
-# fmt: on

@@ -16,7 +16,7 @@ import yaml
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Imu
 from std_msgs.msg import String
 
@@ -24,8 +24,9 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.params import OPTIONS
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.hardware.can.motor_bus import open_bus
-from exo_gravity.nodes.ros.declare import bus_of, declare, values_after
-from exo_gravity.nodes.ros.diagnostics import OK, WARN, Diagnostics
+from exo_gravity.nodes.ros.hot_path import LATCHED
+from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
+from exo_gravity.nodes.ros.parameters import bus_of, declare, values_after
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.sim import SimulatedImu
 from exo_gravity.sim.device import MAX_CATCH_UP
@@ -65,8 +66,7 @@ class Simulator(Node):
         self._new_scripts: deque[TrialScript] = deque()  # set by a parameter, started by the device's thread
         self._published_step: int | None = None
         self._diagnostics = Diagnostics(self)
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._step_publisher = self.create_publisher(String, "wearer_step", latched)
+        self._step_publisher = self.create_publisher(String, "wearer_step", LATCHED)
         self._imu = SimulatedImu(imu_of(values))
         topic = values["imu.topic"]
         self._imu_publisher = self.create_publisher(Imu, topic, qos_profile_sensor_data) if topic else None

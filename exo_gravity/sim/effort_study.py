@@ -10,16 +10,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.compensation.terms.coupling import Coupling
-from exo_gravity.core.compensation.terms.damping import Damping
-from exo_gravity.core.compensation.terms.friction import Friction
-from exo_gravity.core.compensation.terms.inertia import Inertia
-from exo_gravity.core.compensation.terms.link_inertia import LinkInertia
+from exo_gravity.core.compensation.terms.friction_inertia import Friction, Inertia
 from exo_gravity.core.compensation.terms.settings import TermSettings
-from exo_gravity.core.compensation.terms.soft_limits import SoftLimits
-from exo_gravity.core.compensation.terms.spring import Spring
-from exo_gravity.core.compensation.terms.term import DELAY
+from exo_gravity.core.compensation.terms.springs import DELAY, Coupling, Damping, SoftLimits, Spring
 from exo_gravity.core.effort import Effort
+from exo_gravity.core.model.kinematics import LinkInertia
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.effort import Sweep, Task, measure
@@ -51,7 +46,7 @@ def effort_settings(base: Settings, coulomb: Sequence[float], viscous: Sequence[
     """
     known = Friction(coulomb=coulomb, viscous=viscous)
     links = base.robot_by_mass or base.robot
-    least = LinkInertia(links).least()
+    least = LinkInertia.of(links).least()
     soft = [min(20.0, SOFT * inertia / (4.0 * DELAY**2)) for inertia in least]  # Nm/rad
     terms = {
         "friction": TermSettings(friction=replace(known, share=0.4)),
@@ -59,8 +54,8 @@ def effort_settings(base: Settings, coulomb: Sequence[float], viscous: Sequence[
         "friction and inertia": TermSettings(friction=replace(known, share=0.4), inertia=Inertia(0.7)),
         "damping": TermSettings(damping=Damping([SOFT * inertia / (2.0 * DELAY) for inertia in least])),
         "spring": TermSettings(spring=Spring(soft, MIDDLE)),
-        "coupling": TermSettings(coupling=Coupling(0.5 * min(soft), "shoulder_flexion", "elbow_flexion", 0.8)),
-        "limits": TermSettings(limits=SoftLimits(soft, lower=(-0.5, 0.3, 0.0, 0.2))),
+        "coupling": TermSettings(coupling=Coupling((0.0, 0.0, -0.4 * min(soft), 0.5 * min(soft)))),
+        "limits": TermSettings(limits=SoftLimits((-0.5, 1.5, 0.3, 1.6, 0.0, 1.6, 0.2, 2.5), soft)),
     }
     zero = replace(base, mode="zero_g", support=1.0)
     return {

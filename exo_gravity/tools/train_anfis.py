@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from exo_gravity.core.errors import ExoGravityError, ParameterError
-from exo_gravity.core.model.anfis_law import JOINTS
+from exo_gravity.core.model.anfis import JOINTS
 from exo_gravity.core.model.tilt import SIDES
 from exo_gravity.tools.cli import extras
 from exo_gravity.tools.inputs.arms import configured_arm

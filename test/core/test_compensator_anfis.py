@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.compensation.compensator import FALLBACK_TIME
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.anfis import Anfis
-from exo_gravity.core.model.anfis_law import AnfisLaw
+from exo_gravity.core.model.anfis import Anfis, AnfisLaw
 from exo_gravity.core.model.tilt import Tilt
 
 from ..support.compensator_run import PERIOD, ROBOT, THETA, CompensatorRun, settings_with

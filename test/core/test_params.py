@@ -8,9 +8,9 @@ import pytest
 
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.limiter import LONGEST_STEP
-from exo_gravity.core.compensation.params import COMPENSATOR, settings_of
+from exo_gravity.core.compensation.params import COMPENSATOR, settings_of, urdf_table
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.params import values_of
+from exo_gravity.core.params import GONE, values_of
 
 LIVE = [param for param in COMPENSATOR if not param.fixed]
 WRONG = (-0.1, math.nan, math.inf, 900.0, "", "heavy", True, None, [], [0.1] * 3, [0.1] * 5, [0.1, math.nan, 0.1, 0.1])
@@ -66,13 +66,18 @@ def test_parameters_that_ros_declares_on_every_node_are_ignored(name):
     assert name not in values_of(COMPENSATOR, {name: True})
 
 
-def test_max_total_mass_bounds_the_total_mass():
+def test_the_wearers_arm_follows_from_the_body_mass():
     wearer = {"wearer.body_mass": 75.0, "mode": "zero_g"}
     assert settings_of(values_of(COMPENSATOR, wearer)).arm.total_mass == pytest.approx(5.559, abs=1e-3)
-    values = values_of(COMPENSATOR, {**wearer, "max_total_mass": 5.0})
-    with pytest.raises(ParameterError, match=r"total mass in kg = 5.56: must be at most max_total_mass = 5 \("):
-        settings_of(values)
-    assert settings_of({**values, "support": 0.5}).arm.total_mass == pytest.approx(3.707, abs=1e-3)
+    half = values_of(COMPENSATOR, {**wearer, "support": 0.5})
+    assert settings_of(half).arm.total_mass == pytest.approx(3.707, abs=1e-3)
+
+
+def test_a_parameter_that_is_gone_is_refused_with_what_replaces_it():
+    with pytest.raises(ParameterError, match=r"^limits.lower = .*it is gone: limits.range"):
+        values_of(COMPENSATOR, {"limits.lower": [0.0] * 4})
+    names = {param.name for param in (*COMPENSATOR, *urdf_table(4, ["command_interface"]))}
+    assert len(COMPENSATOR) <= 35 and not names & set(GONE)
 
 
 def test_first_moments_replace_masses_and_centres_of_gravity():
@@ -92,7 +97,7 @@ def test_a_law_that_needs_masses_refuses_moments(law, name):
         settings_of(values)
 
 
-def test_max_total_mass_refuses_moments_that_only_a_heavier_arm_can_have():
+def test_moments_that_only_too_heavy_an_arm_can_have_are_refused():
     values = values_of(COMPENSATOR, {"robot.first_moment": [0.1, 0.2, 6.0, 0.03]})
-    with pytest.raises(ParameterError, match=r"total mass in kg = 20.0: must be at most max_total_mass = 10"):
+    with pytest.raises(ParameterError, match=r"total mass in kg = 20.0: must be at most 10 "):
         settings_of(values)

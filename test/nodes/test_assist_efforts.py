@@ -103,11 +103,20 @@ class Rig:
         return bool(np.allclose(self.added, torque, atol=tolerance))
 
 
-@pytest.fixture
-def rig() -> Iterator[Rig]:
+@pytest.fixture(scope="module")
+def running() -> Iterator[Rig]:
     rig = Rig()
     yield rig
     rig.close()
+
+
+@pytest.fixture
+def rig(running: Rig) -> Iterator[Rig]:
+    """The node of this module, without terms and without efforts of the outer loop."""
+    yield running
+    running.assisted, running.velocity = False, STILL
+    running.set(assist__max_effort=[0.0] * 4, friction__share=0.0)
+    running.wait_until(lambda: running.adds(STILL))
 
 
 def test_efforts_of_the_outer_loop_are_added_and_the_arm_stays_carried_without_them(rig):
@@ -162,22 +171,3 @@ def test_terms_are_set_live_and_need_velocities(rig):
     rig.wait_until(lambda: rig.values["terms"] == "friction")
     rig.velocity = ()
     rig.wait_until(lambda: rig.adds(STILL))
-
-
-def test_a_spring_follows_the_path_in_a_file(rig, tmp_path):
-    file = tmp_path / "way.csv"
-    end = np.add(POSE, (0.2, 0.0, 0.0, 0.0))
-    file.write_text("".join(f"{t},{','.join(map(str, pose))}\n" for t, pose in ((0.0, POSE), (1.0, end))))
-    assert "a file with a path" in rig.set(spring__path_file=str(tmp_path / "none.csv"))[0]
-    rig.wait_until(lambda: rig.adds(STILL))
-    assert rig.set(spring__path_file=str(file), spring__stiffness=[2.0, 2.0, 2.0, 1.0]) == ["", ""]
-    rig.wait_until(lambda: rig.adds((0.4, 0.0, 0.0, 0.0)))
-    rig.velocity = ()  # without velocities a spring would not be damped
-    rig.wait_until(lambda: rig.without > 100)
-
-
-def test_a_spring_beyond_what_the_arm_can_bear_is_refused_by_its_name(rig):
-    reasons = rig.set(spring__stiffness=[50.0, 0.0, 0.0, 0.0], coupling__follower="shoulder_abduction")
-    assert reasons[0].startswith("spring.stiffness = ") and "late is stable" in reasons[0]
-    assert reasons[1].startswith("coupling.follower = ")
-    assert rig.set(spring__stiffness=[2.0, 2.0, 2.0, 1.0]) == [""]

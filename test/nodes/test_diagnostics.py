@@ -12,7 +12,7 @@ from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.nodes.can_bridge import report as bridge_report
 from exo_gravity.nodes.can_bridge.report import BridgeReport
-from exo_gravity.nodes.ros.diagnostics import OK, WARN, Diagnostics, milliseconds, row
+from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics, milliseconds, row
 from exo_gravity.tools.inputs.parameter_file import load
 
 from ..support import CONFIG

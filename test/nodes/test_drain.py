@@ -2,7 +2,7 @@
 
 import pytest
 
-from exo_gravity.nodes.ros.drain import LossCounter
+from exo_gravity.nodes.ros.hot_path import LossCounter
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 
 from exo_gravity.hardware import ImuSample, TrunkEstimator
-from exo_gravity.nodes.ros.conversions import to_nanoseconds, to_time
+from exo_gravity.nodes.ros.messages import to_nanoseconds, to_time
 
 from ..support.handheld_imu import read_recording
 

@@ -14,7 +14,7 @@ from sensor_msgs.msg import Imu
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.nodes.imu.device import ImuDevice
 from exo_gravity.nodes.imu.node import ImuNode
-from exo_gravity.nodes.ros.conversions import to_nanoseconds
+from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.run import keep_to_this_machine
 
 from ..support.fake_imu.chip import G

@@ -6,7 +6,7 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 
 from exo_gravity.nodes.ros import node_parameters
-from exo_gravity.nodes.ros.node_parameters import NodeParameters
+from exo_gravity.nodes.ros.parameters import NodeParameters
 
 
 def test_a_node_that_has_gone_and_returned_is_read_anew(node):

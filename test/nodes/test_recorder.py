@@ -18,18 +18,18 @@ import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rclpy.qos import qos_profile_sensor_data
 from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
 from exo_gravity.bag.reader import read_bag
-from exo_gravity.nodes.ros.conversions import to_time
+from exo_gravity.nodes.ros.hot_path import LATCHED
+from exo_gravity.nodes.ros.messages import to_time
 
 NODE = [sys.executable, "-c", "from exo_gravity.nodes.recorder.node import main; main()", "--ros-args"]
 NAMES = ["j1", "j2", "j3", "j4"]
 COUNT = 300
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def start(output, *arguments, **options):

@@ -11,7 +11,6 @@ import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import JointState
@@ -19,12 +18,12 @@ from std_msgs.msg import String
 from visualization_msgs.msg import Marker, MarkerArray
 
 from exo_gravity.core.view.urdf import ROOT
+from exo_gravity.nodes.ros.hot_path import LATCHED
 from exo_gravity.tools.urdf import urdf_of
 
 from ..support import CONFIG
 from ..support.joint_state_feeder import PARTS
 
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 READINGS = {"left": (0.1, 0.2, 0.3, 0.4), "right": (-0.1, 0.5, 0.6, 0.7)}
 EFFORT = (0.0, 1.5, 1.2, 0.2)
 

@@ -67,7 +67,7 @@ def test_a_compensator_without_a_parameter_file_starts_and_waits_for_joint_state
 def test_a_parameter_dump_starts_the_same_nodes_without_changes(tmp_path, prepare, launch, probe):
     first = launch(compensator={"wearer": {"body_mass": 70.0}})
     nodes = list(yaml.safe_load(first.path.read_text()))
-    assert probe.set_parameters("compensator", support=0.3, transition_time=2, atomically=True).successful
+    assert probe.set_parameters("compensator", support=0.3, max_effort_rate=40, atomically=True).successful
     dumped = probe.dump_parameters(nodes)
     first.stop()
     for node in nodes:  # a dump also has these if a publisher's quality of service can be set
@@ -86,7 +86,7 @@ def test_a_parameter_dump_starts_the_same_nodes_without_changes(tmp_path, prepar
 
 
 def test_real_time_threads_and_locked_memory_are_used_or_the_log_states_that_they_are_not_permitted(launch, probe):
-    nodes = launch(without=OTHER_NODES, compensator={**NO_IMU, "thread_priority": 10, "lock_memory": True})
+    nodes = launch(without=OTHER_NODES, compensator={**NO_IMU, "thread_priority": 10})
     probe.wait_until(lambda: "waiting for joint_states" in "".join(nodes.log))
     process = Path(f"/proc/{nodes.process('compensator').pid}")
     real_time_threads = {

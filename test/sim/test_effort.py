@@ -10,7 +10,7 @@ import pytest
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.compensation.terms.link_inertia import LinkInertia
+from exo_gravity.core.model.kinematics import LinkInertia
 from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
@@ -64,7 +64,7 @@ def test_a_sweep_in_exact_zero_g_feels_the_inertia_and_friction_of_the_simulated
     exact = replace(BASE, robot=DEFAULT_LINKS)
     inertia, coulomb, _ = measure(device, MOTORS_OF_ARM, exact, Sweep("sweep", MIDDLE, joint), RATE).felt
     # Two masses on a link have a little more inertia than one at their common centre of gravity.
-    assert 0.97 < inertia / LinkInertia(arm).matrix(MIDDLE)[joint, joint] < 1.25
+    assert 0.97 < inertia / LinkInertia.of(arm).matrix(MIDDLE)[joint, joint] < 1.25
     assert coulomb == pytest.approx(COULOMB[joint], rel=0.25)
 
 

@@ -7,7 +7,7 @@ import threading
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from exo_gravity.nodes.ros.conversions import to_time
+from exo_gravity.nodes.ros.messages import to_time
 
 PARTS = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
 POSE = (0.2, 0.9, 0.7, 0.6)  # rad

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rclpy.parameter import Parameter
 
-NUMBERS = ["support", "gravity", "wearer.body_mass", "max_effort_rate", "transition_time"]
+NUMBERS = ["support", "gravity", "wearer.body_mass", "max_effort_rate"]
 LISTS = ["gain", "robot.mass", "robot.cog", "wearer.mass", "wearer.cog", "max_effort"]
-CHOICES = ["law", "mode", "wearer.sex", "wearer.table"]
-READ_ONLY = ["side", "link_length", "max_total_mass", "joint_names", "use_imu"]
+CHOICES = ["law", "mode", "wearer.sex"]
+READ_ONLY = ["side", "link_length", "joint_names", "use_imu"]
 
 
 class Change(NamedTuple):
@@ -38,7 +38,7 @@ def random_changes(count: int, link_length: Sequence[float], seed: int = 5) -> I
 
 
 def _valid(rng: random.Random, link_length: Sequence[float]) -> dict[str, Any]:
-    """Return a random valid value of each parameter. A wearer may be too heavy for `max_total_mass` all the same."""
+    """Return a random valid value of each parameter. A wearer may be too heavy all the same."""
 
     def four(low: float, high: float) -> list[float]:
         return [rng.uniform(low, high) for _ in range(4)]
@@ -54,10 +54,9 @@ def _valid(rng: random.Random, link_length: Sequence[float]) -> dict[str, Any]:
         "wearer.mass": [0.0, 0.0, *four(0.0, rng.choice([2.5, 9.0]))[2:]],
         "wearer.cog": [0.0, 0.0, *four(0.0, 0.3)[2:]],
         "wearer.body_mass": rng.uniform(40.0, 110.0),
-        "wearer.table": rng.choice(["de_leva", "winter"]),
+        "wearer.sex": rng.choice(["female", "male"]),
         "max_effort": four(0.0, 18.0),
         "max_effort_rate": rng.choice([1, 50, rng.uniform(1.0, 50.0)]),
-        "transition_time": rng.choice([1, rng.uniform(0.2, 5.0)]),
     }
 
 

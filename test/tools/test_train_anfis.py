@@ -10,7 +10,7 @@ import yaml
 
 from exo_gravity.core import gravity_torque
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.anfis_law import AnfisLaw, scaled
+from exo_gravity.core.model.anfis import AnfisLaw, scaled
 from exo_gravity.tools.anfis.data import from_gravload
 from exo_gravity.tools.anfis.projection import Projection
 from exo_gravity.tools.anfis.recorded import TILT_TOPIC, TILT_TYPE, from_bag

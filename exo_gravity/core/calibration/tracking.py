@@ -6,19 +6,16 @@ have the same natural frequency, however they are coupled.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from exo_gravity.core.model.gravity import Torque
-from exo_gravity.core.model.moments import load_moments
+from exo_gravity.core.model.kinematics import ROTORS, LinkInertia, weights_of_moments
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 
-ROTOR = (0.0015, 0.005, 0.0015, 0.0015)  # kg m^2 at the output: an AK80-9 at joint 2, else a little more than an AK60-6
 # kg m^2 added to each joint: with it a 1 kg weight on link 4 at 100 Hz is carried without sticking (measured).
 ADDED = 0.005
-REACH = (0.8, 0.8, 0.8, 0.6)  # of a link's length, at which its mass is assumed
 FREQUENCY_PER_RATE = 0.12  # natural frequency in rad/s per control cycle per s; two cycles of delay cost 27 degrees
 MAX_FREQUENCY = 20.0  # rad/s
 INTEGRAL_SHARE = 0.4  # of the frequency, at which the integral part acts; unstable from 2 on
@@ -34,41 +31,14 @@ FULL_FRICTION_SPEED = 0.03  # rad/s of the reference, from which on friction is 
 
 
 class MassMatrix:
-    """The approximate mass matrix of an arm that is known by its first moments: one point of mass on each link.
-
-    length: (4,) m. moment: M1..M4 in kg m, with the load. load: a weight in kg on link 4, and its distance from the
-    elbow in m.
-    """
+    """The approximate mass matrix of an arm that is known by its moments; arguments: as in `weights_of_moments`."""
 
     def __init__(self, length: Vector, moment: Vector, load: tuple[float, float] = (0.0, 0.0)) -> None:
-        lengths = np.asarray(length, dtype=float)
-        bare = np.asarray(moment, dtype=float) - load_moments(lengths.tolist(), *load)[:JOINT_COUNT]
-        own = np.zeros(JOINT_COUNT)
-        reach = np.maximum(lengths * REACH, 0.01)
-        for link in reversed(range(JOINT_COUNT)):
-            own[link] = max(0.0, bare[link] - own[link + 1 :].sum() * lengths[link]) / reach[link]
-        self._length = lengths
-        # Link, mass in kg, and distance from the link's joint in m.
-        self._points = [*zip(range(JOINT_COUNT), own, reach, strict=True), (JOINT_COUNT - 1, *load)]
+        self._links = LinkInertia(weights_of_moments(length, moment, load), [rotor + ADDED for rotor in ROTORS])
 
     def at(self, theta: Sequence[float]) -> np.ndarray:
         """Return the mass matrix (4, 4) in kg m^2 at `theta` (4,) rad."""
-        s1, c1, s2, c2 = math.sin(theta[0]), math.cos(theta[0]), math.sin(theta[1]), math.cos(theta[1])
-        x1, y1 = np.array((c1, s1, 0.0)), np.array((0.0, 0.0, -1.0))
-        z1 = np.array((-s1, c1, 0.0))
-        # Frame 2 is turned about z1 by theta_2 - 90 degrees; frames 3 and 4 about z2.
-        x2, z2 = s2 * x1 - c2 * y1, -c2 * x1 - s2 * y1
-        x3, x4 = (math.cos(a) * x2 + math.sin(a) * z1 for a in (theta[2], theta[2] + theta[3]))
-        axes = np.array(((0.0, 0.0, 1.0), z1, z2, z2))
-        along = np.array((x1, x2, x3, x4))
-        origins = np.zeros((JOINT_COUNT, 3))
-        origins[1:] = np.cumsum(along[:-1] * self._length[:-1, None], axis=0)
-        matrix = np.diag(ROTOR) + ADDED * np.eye(JOINT_COUNT)
-        for link, mass, reach in self._points:
-            point = origins[link] + reach * along[link]
-            jacobian = np.cross(axes[: link + 1], point - origins[: link + 1])
-            matrix[: link + 1, : link + 1] += mass * jacobian @ jacobian.T
-        return matrix
+        return self._links.matrix(theta)
 
 
 class Tracker:

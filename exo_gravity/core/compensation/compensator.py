@@ -1,9 +1,12 @@
-"""Joint angles and trunk tilt -> step-free torques that hold the arm, or the reason why there are none.
+"""Joint angles and trunk tilt -> step-free torques that hold an arm of n joints, or the reason why there are none.
 
 Each call checks that the input is fresh and finite, evaluates the law, blends in the last change of settings, ramps in,
 clamps and limits the rate. A change of law, mode, mass or gain never steps the torque: the difference between the
-torques before and after the change is kept as a remainder that fades over `transition_time`. Where the chosen law does
-not apply, the exact law replaces it, with the same transition, for at least `FALLBACK_TIME`.
+torques before and after the change is kept as a remainder that fades. Where the chosen law does not apply, the exact
+law replaces it, with the same transition, for at least `FALLBACK_TIME`.
+
+The exoskeleton's own arm (`Settings`) has a wearer and terms on top of gravity compensation; any other arm
+(`UrdfSettings`) has the torque of its URDF alone.
 """
 
 from __future__ import annotations
@@ -14,60 +17,59 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from exo_gravity.core.compensation.felt_motion import FeltMotion
-from exo_gravity.core.compensation.limiter import BREAK, EffortLimiter
-from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.compensation.terms.coupling import JOINTS
+from exo_gravity.core.compensation.limiter import BREAK, EffortLimiter, Transition
+from exo_gravity.core.compensation.settings import Settings, UrdfSettings
 from exo_gravity.core.compensation.terms.terms import Terms
 from exo_gravity.core.compensation.tilt_input import Tilted
-from exo_gravity.core.compensation.transition import Transition
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.gravity import LAWS, NO_TORQUE, Torque
+from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.model.turning import turning_torque
-from exo_gravity.core.numbers import JOINT_COUNT
 
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
+JOINTS = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
 MAX_ANGLE = 26.0  # rad, more than an AK motor can report with any zero
 
 
 class Answer(NamedTuple):
-    """One answer of the compensator.
+    """One answer of the compensator."""
 
-    effort: (n,) Nm, or None for the given `reason`. clamped: indices of the joints whose torque exceeded
-    `max_effort`. fallback: why the exact law replaced the chosen one, or ''.
-    """
-
+    #: (n,) Nm; None for the given `reason`
     effort: Torque | None
     reason: str = ""
+    #: indices of the joints whose torque exceeded `max_effort`
     clamped: tuple[int, ...] = ()
+    #: why the exact law replaced the chosen one, or ''
     fallback: str = ""
 
 
 class Compensator(Tilted):
     """The control law and its state: ramp, rate limit, and the remainder of the last change of settings.
 
-    names: of the joints (4,), for the outer loop's input. terms: what is added to gravity compensation.
+    names: of the joints (4,), for the outer loop's input.
     """
 
-    def __init__(self, settings: Settings, names: Sequence[str] = JOINTS) -> None:
+    def __init__(self, settings: Settings | UrdfSettings, names: Sequence[str] = JOINTS) -> None:
         self.settings = settings
-        self.terms = Terms(names, settings.terms, settings.moving)
+        #: what is added to gravity compensation; None if `settings` have no terms
+        self.terms = Terms(names, settings.terms, settings.moving) if isinstance(settings, Settings) else None
         super().__init__(settings.side, settings.tilt_timeout)
         self._motion = FeltMotion()
-        self._limiter = EffortLimiter(JOINT_COUNT)
+        self._nothing = (0.0,) * settings.count
+        self._limiter = EffortLimiter(settings.count)
         self._transition = Transition()  # of the last change of law or settings
-        self._torque = NO_TORQUE  # before ramp and limits
-        self._pending: Settings | None = None
+        self._torque: Torque = self._nothing  # before ramp and limits
+        self._pending: Settings | UrdfSettings | None = None
         self._fallback = ""  # why the exact law replaces the chosen one
         self._fallback_until = -math.inf
 
-    def apply(self, settings: Settings) -> None:
+    def apply(self, settings: Settings | UrdfSettings) -> None:
         """Use new settings from the next `step` on; the torque moves to them without a step."""
         if settings.side != self.settings.side:
             raise ParameterError("side", settings.side, f"{self.settings.side}, because the side cannot change")
         self._pending = settings
-        self.terms.apply(settings.terms, settings.moving)
+        if self.terms is not None and isinstance(settings, Settings):
+            self.terms.apply(settings.terms, settings.moving)
 
     def set_motion(
         self, now: float, specific_force: Sequence[float], angular_velocity: Sequence[float], age: float = 0.0
@@ -79,18 +81,19 @@ class Compensator(Tilted):
         self._motion.add(now - max(0.0, age), specific_force, angular_velocity)
 
     def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Answer:
-        """Return the torque for joint angles `theta` (4,) rad at `now` s on a monotonic clock.
+        """Return the torque for joint angles `theta` (n,) rad at `now` s on a monotonic clock.
 
-        velocity: (4,) rad/s, None if not known: then the terms add nothing.
+        velocity: (n,) rad/s, None if not known: then the terms add nothing.
         """
-        if len(theta) != JOINT_COUNT or not all(-MAX_ANGLE <= angle <= MAX_ANGLE for angle in theta):
-            return Answer(None, f"joint angles {list(theta)} are not 4 numbers within {MAX_ANGLE:g} rad")
+        count = len(self._nothing)
+        if len(theta) != count or not all(-MAX_ANGLE <= angle <= MAX_ANGLE for angle in theta):
+            return Answer(None, f"joint angles {list(theta)} are not {count} numbers within {MAX_ANGLE:g} rad")
         if self.settings.use_imu and (problem := self._tilt.problem(now)):
             return Answer(None, problem)
         torque = self._without_step(now, theta)
         if not all(map(math.isfinite, torque)):
             return Answer(None, f"torque {list(torque)} Nm from the law is not finite")
-        added = self.terms.torque(now, theta, velocity, torque) if velocity else NO_TORQUE
+        added = self.terms.torque(now, theta, velocity, torque) if velocity and self.terms else self._nothing
         s = self.settings
         effort, clamped = self._limiter.limit(now, torque, added, s.max_effort, s.max_effort_rate)
         return Answer(effort, clamped=clamped, fallback=self._fallback)
@@ -102,18 +105,15 @@ class Compensator(Tilted):
         if felt:
             magnitude = math.hypot(*felt.gravity) / STANDARD_GRAVITY
             tilt = Tilt.of_gravity(settings.side, felt.gravity)._replace(magnitude=magnitude)
-        law = settings.active_law
-        reason = law.outside(settings.arm, theta, tilt)
+        reason = settings.outside(theta, tilt)
         if reason:
             self._fallback, self._fallback_until = reason, now + FALLBACK_TIME
         elif now >= self._fallback_until:
             self._fallback = ""
-        if self._fallback:
-            law = LAWS["exact"]
-        torque = law.torque(settings.arm, theta, tilt)
+        torque = settings.torque(theta, tilt, exact=bool(self._fallback))
         if felt is None:
             return torque
-        turning = turning_torque(settings.arm, settings.side, theta, felt.angular_acceleration)
+        turning = settings.turning_torque(theta, felt.angular_acceleration)
         return tuple(map(operator.add, torque, turning))
 
     def _without_step(self, now: float, theta: Sequence[float]) -> Torque:
@@ -135,4 +135,4 @@ class Compensator(Tilted):
         if bool(self._fallback) != replaced and 0.0 <= now - self._limiter.last_answer <= BREAK:
             # Continue from the last torque: the replaced law may not apply at `theta`.
             return self._transition.begin(now, self._torque, torque)
-        return self._transition.blended(now, torque, self.settings.transition_time)
+        return self._transition.blended(now, torque)

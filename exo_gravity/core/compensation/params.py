@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
-from exo_gravity.core.compensation.command_fade import COMMAND_PARAMETERS
-from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.compensation.settings import URDF_LAW, GravityModel, Settings, UrdfSettings
 from exo_gravity.core.compensation.terms.settings import term_parameters, term_settings_of
-from exo_gravity.core.compensation.terms.spring import PosePath
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.anfis_law import AnfisLaw
+from exo_gravity.core.model.anfis import AnfisLaw
 from exo_gravity.core.model.arm import (
     MAX_GAIN,
     MAX_GRAVITY,
@@ -21,8 +20,11 @@ from exo_gravity.core.model.arm import (
     ArmModel,
 )
 from exo_gravity.core.model.tilt import SIDES
-from exo_gravity.core.model.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
+from exo_gravity.core.model.wearer import SEX, TYPICAL_LENGTH, Wearer
 from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, param_of, params_of
+
+MAX_JOINTS = 32
+MAX_EFFORT = 1000.0  # Nm; an industrial arm's largest joint
 
 # fmt: off
 COMPENSATOR = (
@@ -30,7 +32,7 @@ COMPENSATOR = (
     JOINT_NAMES,
     Param("link_length", [0.05, 0.13, 0.30, 0.30], "l_n, link lengths", (0.0, MAX_LENGTH), "m", fixed=True),
     param_of(Settings, "law"),
-    Param("anfis_file", "", "model for the law anfis, written by train_anfis"),
+    Param("anfis_file", "", "model for the law anfis, written by train_anfis", expert=True),
     param_of(Settings, "mode"),
     param_of(Settings, "support"),
     Param("gain", [1.0, 1.0, 1.0, 1.0], "c_n, scales the torque of joint n", (0.0, MAX_GAIN)),
@@ -38,51 +40,101 @@ COMPENSATOR = (
     Param("robot.mass", [0.585, 0.468, 0.598, 0.203], "m_n, link masses", (0.0, MAX_MASS), "kg"),
     Param("robot.cog", [0.046, 0.113, 0.237, 0.128], "d_n, centre of gravity from joint n", (0.0, MAX_LENGTH), "m"),
     Param("robot.first_moment", [0.0] * 4, "M1 to M4 by `calibrate`, in place of mass and cog; zeros: not given",
-          (0.0, MAX_MOMENT), "kg m"),
+          (0.0, MAX_MOMENT), "kg m", expert=True),
     Param("robot.off_axis", [0.0] * 4, "W, Z, Y3, Y4 by `calibrate`: moments across the links, for the law exact",
-          (-MAX_MOMENT, MAX_MOMENT), "kg m"),
+          (-MAX_MOMENT, MAX_MOMENT), "kg m", expert=True),
     Param("wearer.mass", [0.0, 0.0, 0.0, 0.0], "mass of the wearer's arm on each link", (0.0, MAX_MASS), "kg"),
     Param("wearer.cog", [0.0, 0.0, 0.0, 0.0], "centre of gravity of that mass from joint n", (0.0, MAX_LENGTH), "m"),
     Param("wearer.body_mass", 0.0, "body mass; computes wearer.mass and wearer.cog if these are 0", (0.0, 300.0), "kg"),
     Param("wearer.sex", "male", "selects the column of the segment table", choices=SEX),
-    Param("wearer.table", "de_leva", "table of segment masses and centres of gravity", choices=tuple(TABLES)),
     Param("wearer.segment_length", list(TYPICAL_LENGTH), "upper arm, forearm, hand", (0.0, 0.6), "m"),
-    param_of(Settings, "max_total_mass", fixed=True),
     param_of(Settings, "max_effort"),
     param_of(Settings, "max_effort_rate"),
-    param_of(Settings, "transition_time"),
     param_of(Settings, "inertial"),
     Param("shoulder_from_imu", [0.0] * 3, "the arm's base from the IMU along the trunk's axes, for inertial",
           (-1.0, 1.0), "m"),
     Param("use_imu", True, "false assumes an upright trunk (the paper's seated wearer)", fixed=True),
     param_of(Settings, "tilt_timeout"),
-    *COMMAND_PARAMETERS,
     *term_parameters(),
-    Param("spring.path_file", "", "CSV file with the path of the spring, rows of s and 4 angles in rad; empty: pose"),
     *REAL_TIME_PARAMETERS,
+)
+# What is declared where a file gives `command_interface`, for an arm with an effort controller of ros2_control.
+COMMAND_PARAMETERS = (
+    Param("command_interface", "joint_state",
+          "joint_state: to can_bridge; multi_array: to an effort controller of ros2_control", fixed=True,
+          choices=("joint_state", "multi_array")),
+    Param("multi_array.topic", "effort_controller/commands", "topic of the effort controller's commands", fixed=True),
+    Param("multi_array.joint_states", "joint_states", "topic of the joint states, which may have further joints",
+          fixed=True),
+    Param("multi_array.timeout", 0.05, "age of the joint states at which the torque begins to fade", (0.01, 0.15), "s",
+          fixed=True, expert=True),
+)
+# What the law `urdf` adds.
+URDF = (
+    Param("urdf.file", "", "path of the URDF; empty: the topic urdf.topic", fixed=True),
+    Param("urdf.topic", "/robot_description", "latched topic of the URDF, a std_msgs/String", fixed=True),
 )
 # fmt: on
 
 
-def settings_of(values: Mapping[str, Any], anfis: AnfisLaw | None = None, path: PosePath | None = None) -> Settings:
+def compensator_table(given: Collection[str]) -> tuple[Param, ...]:
+    """Return the parameters of `compensator` for a file that gives the names `given`."""
+    return (*COMPENSATOR, *_command_parameters(given))
+
+
+def _command_parameters(given: Collection[str]) -> tuple[Param, ...]:
+    return COMMAND_PARAMETERS if any(param.name in given for param in COMMAND_PARAMETERS) else ()
+
+
+def urdf_table(count: int, given: Collection[str]) -> tuple[Param, ...]:
+    """Return the parameters of `compensator` for the law `urdf`, `count` joints and a file with the names `given`."""
+    other = {
+        "law": {"default": URDF_LAW, "choices": (URDF_LAW,), "fixed": True,
+                "description": "urdf computes the torque of any serial arm from its URDF"},
+        "joint_names": {"default": [f"joint{n + 1}" for n in range(count)],
+                        "description": "in the order of the commands; the URDF's other joints are taken as fixed at 0"},
+        "gain": {"default": [1.0] * count, "description": "scales the torque of each joint"},
+        "gravity": {},
+        "max_effort": {"default": [0.0] * count, "bounds": (0.0, MAX_EFFORT),
+                       "description": "torque limit per joint; 0: the URDF's"},
+        "max_effort_rate": {},
+        "use_imu": {"description": "false assumes that the root link's z axis points up"},
+        "tilt_timeout": {},
+        "thread_priority": {},
+    }  # fmt: skip
+    shared = [replace(param, **other[param.name]) for param in COMPENSATOR if param.name in other]  # type: ignore[arg-type]
+    return (*shared, *URDF, *_command_parameters(given))
+
+
+def settings_of(values: Mapping[str, Any], anfis: AnfisLaw | None = None) -> Settings:
     """Return the settings that `compensator`'s parameter values describe, or raise ParameterError.
 
-    anfis: the model in `anfis_file`, path: the way in `spring.path_file`; None if no file is given.
+    anfis: the model in `anfis_file`; None if no file is given.
     """
-    robot = robot_of(values)
     mass, cog = wearer_of(values)
     return Settings(
         side=values["side"],
-        robot=robot,
+        robot=robot_of(values),
         wearer_mass=mass,
         wearer_cog=cog,
         shoulder_from_imu=tuple(values["shoulder_from_imu"]),
         use_imu=values["use_imu"],
         anfis=anfis,
-        terms=term_settings_of(values, path),
+        terms=term_settings_of(values),
         robot_by_mass=ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"]),
         **{param.name: values[param.name] for param in params_of(Settings)},
     )
+
+
+def urdf_settings_of(values: Mapping[str, Any], model: GravityModel) -> UrdfSettings:
+    """Return the settings that parameter values describe for the arm `model`, or raise ParameterError."""
+    limits = []
+    for name, given, own in zip(values["joint_names"], values["max_effort"], model.max_effort, strict=True):
+        if not (given or own):
+            raise ParameterError(f"max_effort of {name}", given, "greater than 0, because the URDF has no effort limit")
+        limits.append(given or own)
+    others = {name: values[name] for name in ("gain", "gravity", "max_effort_rate", "tilt_timeout", "use_imu")}
+    return UrdfSettings(model, max_effort=tuple(limits), **others)
 
 
 def robot_of(values: Mapping[str, Any]) -> ArmModel:
@@ -102,7 +154,7 @@ def wearer_of(values: Mapping[str, Any]) -> tuple[Sequence[float], Sequence[floa
     """Return mass and centre of gravity (4,) of the wearer on each link; explicit values override the table's."""
     if any(values["wearer.mass"]) or not values["wearer.body_mass"]:
         return values["wearer.mass"], values["wearer.cog"]
-    person = {name: values[f"wearer.{name}"] for name in ("body_mass", "sex", "table", "segment_length")}
+    person = {name: values[f"wearer.{name}"] for name in ("body_mass", "sex", "segment_length")}
     try:
         load = Wearer(**person).on_links(values["link_length"])
     except ParameterError as error:

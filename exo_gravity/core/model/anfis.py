@@ -5,31 +5,52 @@ functions, here Gaussians: mu = exp(-((u - centre) / sigma)^2 / 2). Each of thei
 strength w of a rule is the product of its memberships, its consequent is f = p_0 + p_1 u_1 + ... + p_d u_d, and the
 output is sum(w f) / sum(w). On a grid partition sum(w) is the product of one sum per input. The memberships of each
 input can therefore be normalised separately, and the sum over the rules taken one input at a time.
+
+`AnfisLaw` is a control law of such models: learned torques for joints 2 to 4, valid inside the box of joint angles it
+was trained in, for one arm with an upright trunk. There joint 1 needs no torque, and the law gives it none. Outside the
+box, on a tilted trunk or with another arm the model would extrapolate with an unknown error. `outside` then returns the
+reason, and the caller uses the exact law instead. Gains c_n and gravity scale the torque as in every other law.
 """
 
 from __future__ import annotations
 
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from exo_gravity.core.errors import DataError
+from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.model.gravity import Torque
+from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.numbers import Vector
 
 MAX_RULES = 10_000  # 6 inputs of 4 functions give 4,096; more is probably a mistake, and would exhaust the memory
+INPUTS = ("theta_2", "theta_3", "theta_4")
+JOINTS = ("2", "3", "4")
+# Largest angle in rad between joint 1's axis and gravity that counts as upright. A trunk tilt of 0.5 degrees changes
+# the torques of the paper's arm by at most 0.04 Nm, a few steps of the motors' 12-bit torque.
+UPRIGHT = math.radians(0.5)
+FORMAT = "exo_gravity ANFIS law 1"
 
 
 @dataclass(frozen=True, eq=False, init=False)
 class Anfis:
     """m models with one output each, on the same d inputs, with k membership functions per input.
 
-    centre, sigma: (m, d, k), the premises, in the inputs' units; sigma > 0.
-    consequent: (m, k^d, d + 1), p_0..p_d of each rule; the function of the last input varies fastest.
     Raises DataError unless the shapes agree and every number is finite.
     """
 
+    #: premises, (m, d, k), in the inputs' units
     centre: np.ndarray
+    #: premises, (m, d, k), > 0, in the inputs' units
     sigma: np.ndarray
+    #: (m, k^d, d + 1), p_0..p_d of each rule; the function of the last input varies fastest
     consequent: np.ndarray
 
     def __init__(self, centre: ArrayLike, sigma: ArrayLike, consequent: ArrayLike) -> None:
@@ -90,3 +111,110 @@ def _array(name: str, value: ArrayLike) -> np.ndarray:
         raise DataError(f"ANFIS: {name} has NaN or infinite entries: must be finite")
     array.setflags(write=False)
     return array
+
+
+@dataclass(frozen=True, eq=False)
+class AnfisLaw:
+    """Torques of an arm on an upright trunk, learned over a box of joint angles."""
+
+    #: one output in Nm for each of joints 2, 3 and 4 at gain 1; its inputs are theta_2..theta_4, -1..1 over the box
+    model: Anfis
+    #: lower corner of the box, (3,) rad
+    low: tuple[float, ...]
+    #: upper corner
+    high: tuple[float, ...]
+    #: M2..M4 in kg m of the arm it was trained for
+    first_moment: tuple[float, ...]
+    #: m/s^2
+    gravity: float
+    #: a sentence on the training data
+    source: str
+    #: RMSE of joints 2 to 4: {'training': (3,) Nm, 'held_out': (3,) Nm}
+    error: Mapping[str, Sequence[float]]
+
+    @classmethod
+    def load(cls, content: str | Mapping[str, Any]) -> AnfisLaw:
+        """Return the law from JSON text or its parsed mapping. Raises DataError that names what is wrong."""
+        try:
+            content = json.loads(content) if isinstance(content, str) else content
+            if content["format"] != FORMAT:
+                raise DataError(f"ANFIS file: format = {content['format']!r}: must be {FORMAT!r}")
+            joints = [content["joints"][joint] for joint in JOINTS]
+            box = [tuple(float(bound) for bound in content["box"][name]) for name in INPUTS]
+            low, high = zip(*box, strict=True)
+            law = cls(
+                Anfis(*([joint[part] for joint in joints] for part in ("centre", "sigma", "consequent"))),
+                low,
+                high,
+                tuple(float(moment) for moment in content["arm"]["first_moment"]),
+                float(content["arm"]["gravity"]),
+                str(content["source"]),
+                {kind: [float(joint[f"{kind}_rmse"]) for joint in joints] for kind in ("training", "held_out")},
+            )
+        except KeyError as error:
+            raise DataError(f"ANFIS file: the key {error.args[0]} is missing") from None
+        except (TypeError, ValueError) as error:
+            raise DataError(f"ANFIS file: {error}: must be a file from train_anfis") from None
+        law._check()
+        return law
+
+    def _check(self) -> None:
+        inputs = self.model.centre.shape[1]
+        if inputs != len(INPUTS):
+            raise DataError(f"ANFIS file: {inputs} inputs: must be {len(INPUTS)}, {', '.join(INPUTS)}")
+        for name, low, high in zip(INPUTS, self.low, self.high, strict=True):
+            if not -2 * math.pi <= low < high <= 2 * math.pi:
+                raise DataError(f"ANFIS file: box of {name} = {[low, high]}: must be [low, high] in rad")
+        if len(self.first_moment) != len(JOINTS) or not all(0 <= moment < math.inf for moment in self.first_moment):
+            raise DataError(f"ANFIS file: first_moment = {list(self.first_moment)}: must be M2, M3, M4 in kg m")
+        if not 0 < self.gravity < math.inf:
+            raise DataError(f"ANFIS file: gravity = {self.gravity}: must be greater than 0 m/s^2")
+
+    def dump(self) -> str:
+        """Return the JSON text that `load` reads, one line per rule."""
+        parts = (self.model.centre, self.model.sigma, self.model.consequent)
+        joints = {}
+        for i, joint in enumerate(JOINTS):
+            joints[joint] = {f"{kind}_rmse": float(values[i]) for kind, values in self.error.items()}
+            joints[joint] |= dict(zip(("centre", "sigma", "consequent"), (p[i].tolist() for p in parts), strict=True))
+        content = {
+            "format": FORMAT,
+            "about": "Takagi-Sugeno models (Jang 1993) of the holding torque in Nm of joints 2 to 4, trunk upright. "
+            "Inputs: joint angles, scaled to -1..1 over the box (rad). Consequents: p_0..p_3 of each rule.",
+            "source": self.source,
+            "arm": {"first_moment": self.first_moment, "gravity": self.gravity},
+            "box": dict(zip(INPUTS, zip(self.low, self.high, strict=True), strict=True)),
+            "joints": joints,
+        }
+        return re.sub(r"\[[^\[\]]*\]", lambda found: " ".join(found[0].split()), json.dumps(content, indent=1)) + "\n"
+
+    def outside(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> str:
+        """Return why the law was not trained for this arm, pose or tilt, in a sentence; '' if it was.
+
+        The sentence contains no measured value, so it stays the same as long as the reason does.
+        """
+        if not tilt.axis_angle <= UPRIGHT:
+            return f"the trunk is tilted by more than {math.degrees(UPRIGHT):g} degrees; the ANFIS was trained upright"
+        for joint, angle, low, high in zip(JOINTS, theta[1:], self.low, self.high, strict=True):
+            if not low <= angle <= high:
+                return f"theta_{joint} is outside the ANFIS's training range, {low:.3f} to {high:.3f} rad"
+        for joint, moment, trained in zip(JOINTS, arm.first_moment[1:], self.first_moment, strict=True):
+            if not math.isclose(moment, trained, rel_tol=1e-6, abs_tol=1e-12):
+                return f"the ANFIS was trained for another arm, whose M{joint} is {trained:.4f} kg m"
+        return ""
+
+    def torque(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
+        """Return the torque (4,) in Nm at pose `theta` (4,) rad; meaningless where `outside` gives a reason."""
+        tau = self.torques(np.array((theta[1:],)))[0].tolist()
+        felt, scale = tilt.magnitude / self.gravity, arm.scale
+        return (0.0, *(felt * scale[joint] * value for joint, value in enumerate(tau, start=1)))
+
+    def torques(self, theta: np.ndarray) -> np.ndarray:
+        """Return the torques (n, 3) in Nm of joints 2 to 4 for their angles (n, 3) in rad, at gain 1."""
+        return self.model.output(scaled(theta, self.low, self.high))
+
+
+def scaled(theta: np.ndarray, low: Vector, high: Vector) -> np.ndarray:
+    """Return angles (n, d) in rad, scaled to -1..1 over the box from `low` to `high` (d,)."""
+    fraction: np.ndarray = (2.0 * theta - low - high) / np.subtract(high, low)
+    return fraction

@@ -11,9 +11,10 @@ these and improves one coordinate after another until nothing gets worse.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats, one_float
 
 Cost = Callable[[np.ndarray], np.ndarray]  # points (n, 6) -> (n,)
 
+BRIDGE_PARAMETERS = ("motor", "torque_scale", "position_min", "position_max")  # of `can_bridge`, that a budget needs
 USUAL_TILT = 20.0  # deg of trunk pitch and roll, in both directions, that a budget covers by default
 SAMPLES = 50_000  # random poses, which give shares to within 0.5 %
 STARTS = 5  # poses from which the worst one is sought, because a search can end in a local maximum
@@ -105,6 +107,40 @@ class JointBudget:
     def overloaded(self) -> bool:
         """Whether the joint needs more than rated torque in some pose."""
         return self.torque > self.rated
+
+
+@dataclass(frozen=True)
+class BudgetRequest:
+    """A budget to compute; two are equal if their budgets are."""
+
+    #: the arm without a wearer
+    robot: ArmModel
+    #: mass (4,) kg and centre of gravity (4,) m of the wearer's arm on each link
+    load: tuple[tuple[float, ...], tuple[float, ...]]
+    #: share 0..1 of the wearer's arm that is carried
+    support: float
+    #: values of `BRIDGE_PARAMETERS`, (4,) each
+    bridge: tuple[tuple[Any, ...], ...]
+    #: largest trunk pitch and roll in either direction, rad
+    max_tilt: float
+
+    @classmethod
+    def of(
+        cls, robot: ArmModel, load: tuple[Vector, Vector], support: float, bridge: Mapping[str, Any], use_imu: bool
+    ) -> BudgetRequest:
+        """Return the request for `robot`; bridge: the parameter values of its `can_bridge`.
+
+        use_imu: whether the trunk may tilt, by USUAL_TILT.
+        """
+        mass, cog = (tuple(map(float, values)) for values in load)
+        chosen = tuple(tuple(bridge[name]) for name in BRIDGE_PARAMETERS)
+        return cls(robot, (mass, cog), support, chosen, math.radians(USUAL_TILT) if use_imu else 0.0)
+
+    def joints(self, pause: Callable[[], None]) -> tuple[JointBudget, ...]:
+        """Return the budget of each joint; pause: as in `budget`. Raises ParameterError."""
+        motors, torque_scale, low, high = self.bridge
+        torques = motor_torques(motors, torque_scale)
+        return budget(self.robot, self.load, self.support, Workspace(low, high, self.max_tilt), *torques, pause)
 
 
 def largest_support(joints: Sequence[JointBudget]) -> float | None:

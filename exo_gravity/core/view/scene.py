@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from exo_gravity.core.model.kinematics import frames
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 from exo_gravity.core.safety.drive import CARRYING, State
 from exo_gravity.core.safety.limits import WALL_WIDTH
 from exo_gravity.core.view.arm_description import ArmDescription
-from exo_gravity.core.view.urdf import axes, ends
 
 Colour = tuple[float, float, float, float]
 
@@ -80,22 +80,20 @@ class ArmView(NamedTuple):
 
 def arm_pose(arm: ArmDescription, theta: Sequence[float]) -> ArmPose:
     """Return where `arm` is at `theta` (4,) rad."""
-    rotation, origins = np.eye(3), [np.array(arm.base)]
-    turned, hanging = [], []
-    along = ((0.0, arm.outward, 0.0), *((0.0, 0.0, -1.0),) * 3)
-    for axis, direction, end, angle in zip(axes(arm), along, ends(arm), theta, strict=True):
-        turned.append(rotation @ axis)
-        hanging.append(rotation @ direction)
-        rotation = rotation @ rotation_about(np.array(axis), angle)
-        origins.append(origins[-1] + rotation @ end)
-    return ArmPose(np.array(origins), np.array(turned), np.array(hanging))
+    length = arm.robot.length
+    links = frames(length.tolist(), theta)
+    along = _in_trunk(arm, [link.along for link in links])
+    turned = _in_trunk(arm, [link.axis for link in links]) * arm.outward  # a mirror reverses rotations
+    origins = _in_trunk(arm, [link.origin for link in links]) + arm.base
+    angle = np.array(theta)[:, None]
+    hanging = np.cos(angle) * along - np.sin(angle) * np.cross(turned, along)
+    return ArmPose(np.vstack((origins, origins[3] + length[3] * along[3])), turned, hanging)
 
 
-def rotation_about(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Return the rotation matrix (3, 3) by `angle` rad about the unit vector `axis` (3,), by Rodrigues' formula."""
-    x, y, z = axis
-    cross = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
-    return np.asarray(np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross)
+def _in_trunk(arm: ArmDescription, points: Sequence[Sequence[float]]) -> np.ndarray:
+    """Return vectors (n, 3) of the arm's base frame in the trunk's axes: x0 outward, y0 forward, z0 down."""
+    x, y, z = np.array(points).T
+    return np.stack((y, arm.outward * x, -z), axis=1)
 
 
 def gravity_shapes(gravity: Vector | None) -> list[Shape]:

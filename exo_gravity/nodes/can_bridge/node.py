@@ -30,7 +30,7 @@ from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.can_bridge.recovery import is_requested, run_recovery
 from exo_gravity.nodes.can_bridge.report import BridgeReport, log_limits
 from exo_gravity.nodes.can_bridge.services import CALL_TIMEOUT, BridgeServices
-from exo_gravity.nodes.ros.declare import bus_of, declare
+from exo_gravity.nodes.ros.parameters import bus_of, declare
 from exo_gravity.nodes.ros.run import run
 
 REPORT_PERIOD = 0.1  # s
@@ -56,7 +56,7 @@ class CanBridge(LifecycleNode):
         traffic.check(values["rate"])
         self._charge = Charge(address, self._motors, self._limits, self._period)
         self._owner = f"{self.get_fully_qualified_name()} (PID {os.getpid()})"
-        self._real_time = values["thread_priority"], values["lock_memory"]
+        self._real_time = values["thread_priority"], values["thread_priority"] > 0
         self._owned: OwnedBus | None = None  # while configured
         self._bus: MotorBus | None = None  # while inactive
         self._loop: ControlLoop | None = None  # while active

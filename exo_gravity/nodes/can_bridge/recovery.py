@@ -12,7 +12,7 @@ from exo_gravity.core.motors.params import OPTIONS, motors_of
 from exo_gravity.core.safety.params import CAN_BRIDGE, limits_of
 from exo_gravity.hardware.ownership.handover import Charge
 from exo_gravity.hardware.ownership.owned_bus import recover
-from exo_gravity.nodes.ros.declare import bus_of, declare
+from exo_gravity.nodes.ros.parameters import bus_of, declare
 from exo_gravity.nodes.ros.run import keep_to_this_machine
 
 # Set by launcher and launch file: the time in s for the watchdog of the dead bridge to let the arm down.

@@ -13,7 +13,7 @@ from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.motor_load import MotorLoad
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.nodes.ros.diagnostics import ERROR, OK, WARN, Diagnostics, milliseconds, row
+from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, milliseconds, row
 from exo_gravity.nodes.ros.run import open_to_others
 
 RECENT = 2.0  # s for which a limit that acted is still shown

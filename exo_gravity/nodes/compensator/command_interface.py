@@ -2,7 +2,7 @@
 
 `can_bridge` watches the age of the efforts and lets the arm down. An effort controller keeps its last command for ever,
 so `MultiArrayInterface` watches the age of the joint states itself, on its own thread, and fades the torque
-(core/compensation/command_fade.py).
+(core/compensation/limiter.py).
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
-from exo_gravity.core.compensation.command_fade import CommandFade, Output
 from exo_gravity.core.compensation.compensator import Answer
+from exo_gravity.core.compensation.limiter import CommandFade, Output
 from exo_gravity.core.compensation.tilt_input import MAX_LEAD
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.nodes.ros.conversions import by_name, to_nanoseconds, velocity_of
+from exo_gravity.nodes.ros.messages import by_name, to_nanoseconds, velocity_of
 
 TICK = 0.01  # s between two messages of a fade
 JointReading = tuple[Sequence[float], Sequence[float] | None]  # positions (n,) rad, velocities (n,) rad/s if known
@@ -70,7 +70,7 @@ class MultiArrayInterface:
         self._names = names
         self._clock = node.get_clock()
         self._timeout = values["multi_array.timeout"]
-        self._fade = CommandFade(self._timeout, values["multi_array.fade_time"])
+        self._fade = CommandFade(self._timeout)
         self._lock = threading.Lock()  # guards the fade, and the order of its messages
         self._publisher = node.create_publisher(Float64MultiArray, values["multi_array.topic"], 1)
         self._message = Float64MultiArray()
@@ -150,6 +150,6 @@ CommandInterface = JointStateInterface | MultiArrayInterface
 
 def interface_of(node: Node, names: Sequence[str], values: Mapping[str, Any]) -> CommandInterface:
     """Return the interface that the parameter `command_interface` names."""
-    if values["command_interface"] == "multi_array":
+    if values.get("command_interface") == "multi_array":
         return MultiArrayInterface(node, names, values)
     return JointStateInterface(node, names)

@@ -23,15 +23,14 @@ from exo_gravity.core.compensation.compensator import Answer
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.rate import Rate
 from exo_gravity.hardware.scheduling import request_real_time
-from exo_gravity.nodes.compensator.any_arm import AnyUrdfArm, is_any_arm
+from exo_gravity.nodes.compensator.arm import ControlledArm, sentence
 from exo_gravity.nodes.compensator.command_interface import interface_of
-from exo_gravity.nodes.compensator.exo_arm import ExoArm
-from exo_gravity.nodes.ros.declare import values_after, with_floats
-from exo_gravity.nodes.ros.diagnostics import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row
-from exo_gravity.nodes.ros.hot_path import HotPath
+from exo_gravity.nodes.ros.hot_path import NEWEST, HotPath
+from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row
+from exo_gravity.nodes.ros.parameters import values_after, with_floats
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.sole_publisher import DISTRUST, SolePublisher
-from exo_gravity.nodes.ros.tilt_subscription import NEWEST, TiltSubscription
+from exo_gravity.nodes.ros.tilt_subscription import TiltSubscription
 
 SILENCE = 0.5  # s without joint states until diagnostics report it
 REPORT_PERIOD = 0.5  # s
@@ -39,12 +38,12 @@ MAX_CHANGES = 16  # answers whose reason is new, waiting for the report
 
 
 class CompensatorNode(Node):
-    """The ROS shell around the control of an `ExoArm`, or of an `AnyUrdfArm` with the law `urdf`."""
+    """The ROS shell around a compensator."""
 
     def __init__(self) -> None:
         super().__init__("compensator", automatically_declare_parameters_from_overrides=True)
         self._lock = threading.Lock()  # guards the control: joint states arrive on another thread
-        self._arm = AnyUrdfArm(self) if is_any_arm(self) else ExoArm(self, self._lock)
+        self._arm = ControlledArm(self, self._lock)
         self._control, values = self._arm.control, self._arm.values
         self._names = values["joint_names"]
         self._interface = interface_of(self, self._names, values)
@@ -68,11 +67,11 @@ class CompensatorNode(Node):
         # Only the executor's thread reports: diagnostics and budget are not for two threads.
         self._changed = self.create_guard_condition(self._report_changes)
         self.create_timer(REPORT_PERIOD, self._report_current)
-        self._log(self._control.settings)
+        self.get_logger().info(sentence(self._control.settings))
         self._arm.start()
         self._interface.start()
         self._joint_states.start()
-        for refused in request_real_time(values["thread_priority"], values["lock_memory"]):
+        for refused in request_real_time(values["thread_priority"], values["thread_priority"] > 0):
             self.get_logger().warning(refused)
 
     @property
@@ -127,16 +126,13 @@ class CompensatorNode(Node):
 
     def _apply_parameters(self, _changes: list[Parameter]) -> None:
         try:
-            settings: Any = self._arm.read(values_after(self, self._arm.table))
+            settings = self._arm.read(values_after(self, self._arm.table))
         except ParameterError as error:  # checked just before: only a file can have changed since
             self.get_logger().error(f"parameters not applied: {error}")
             return
         with self._lock:
             self._control.apply(settings)
-        self._log(settings)
-
-    def _log(self, settings: Any) -> None:
-        self.get_logger().info(self._arm.sentence(settings))
+        self.get_logger().info(sentence(settings))
 
     def _values(self, now: float, answer: Answer) -> dict[str, object]:
         """Return the current values for /diagnostics."""

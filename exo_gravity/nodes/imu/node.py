@@ -22,10 +22,9 @@ from exo_gravity.core.rate import Rate
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.hardware.trunk.trunk_estimator import ImuSample, TrunkEstimator, TrunkOrientation
 from exo_gravity.nodes.imu.device import ImuDevice
-from exo_gravity.nodes.ros.conversions import to_nanoseconds
-from exo_gravity.nodes.ros.declare import declare
-from exo_gravity.nodes.ros.diagnostics import ERROR, OK, WARN, Diagnostics, milliseconds, row
 from exo_gravity.nodes.ros.hot_path import HotPath
+from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, milliseconds, row, to_nanoseconds
+from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.sole_publisher import DISTRUST, SolePublisher
 

@@ -21,8 +21,7 @@ from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
-from exo_gravity.nodes.ros.hot_path import HotPath
-from exo_gravity.nodes.ros.tilt_subscription import NEWEST
+from exo_gravity.nodes.ros.hot_path import NEWEST, HotPath
 from exo_gravity.panel.view import SILENT, Joints, Status, arm_state
 
 CALL_TIMEOUT = 3.0  # s, longer than can_bridge itself waits

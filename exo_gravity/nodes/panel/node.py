@@ -22,12 +22,10 @@ from rclpy.node import Node
 
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.nodes.panel.arms import ArmClients, call, parameter_request
-from exo_gravity.nodes.ros.declare import declare
-from exo_gravity.nodes.ros.diagnostics import OK
-from exo_gravity.nodes.ros.hot_path import HotPath
-from exo_gravity.nodes.ros.node_parameters import NodeParameters
+from exo_gravity.nodes.ros.hot_path import NEWEST, HotPath
+from exo_gravity.nodes.ros.messages import OK
+from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.tilt_subscription import NEWEST
 from exo_gravity.panel.access import Access, is_loopback
 from exo_gravity.panel.control import Control
 from exo_gravity.panel.desk import Desk

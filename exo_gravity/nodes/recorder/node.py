@@ -27,9 +27,8 @@ from std_msgs.msg import String
 from exo_gravity.bag.content import ASSIST, LOSSES, PARAMETERS, RECORDER, STATES, leaf
 from exo_gravity.bag.writer import BagWriter, offered_qos
 from exo_gravity.nodes.recorder.live_line import ARM_TOPICS, LiveLine
-from exo_gravity.nodes.ros.declare import declare
-from exo_gravity.nodes.ros.drain import Drain
-from exo_gravity.nodes.ros.node_parameters import NodeParameters
+from exo_gravity.nodes.ros.hot_path import Drain
+from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
 
 SHARED_TOPICS = {

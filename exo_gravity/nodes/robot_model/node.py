@@ -18,7 +18,6 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
@@ -30,13 +29,11 @@ from exo_gravity.core.view.scene import ArmView, arm_shapes, gravity_shapes
 from exo_gravity.core.view.urdf import joint_names, urdf
 from exo_gravity.nodes.robot_model.markers import marker_array
 from exo_gravity.nodes.robot_model.viewed_arm import STALE, ViewedArm
-from exo_gravity.nodes.ros.declare import declare
-from exo_gravity.nodes.ros.diagnostics import OK, WARN, Diagnostics
-from exo_gravity.nodes.ros.hot_path import HotPath
+from exo_gravity.nodes.ros.hot_path import LATCHED, NEWEST, HotPath
+from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
+from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.tilt_subscription import NEWEST
 
-LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 DISCOVERY_PERIOD = 0.5  # s between two searches for arms
 MARKER_PERIOD = 0.1  # s
 

@@ -16,9 +16,8 @@ from sensor_msgs.msg import JointState
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.view.arm_description import OF_BRIDGE, OF_COMPENSATOR, ArmDescription, described
 from exo_gravity.core.view.scene import ArmView
-from exo_gravity.nodes.ros.conversions import by_name
-from exo_gravity.nodes.ros.hot_path import HotPath
-from exo_gravity.nodes.ros.tilt_subscription import NEWEST
+from exo_gravity.nodes.ros.hot_path import NEWEST, HotPath
+from exo_gravity.nodes.ros.messages import by_name
 
 STALE = 0.5  # s after which a reading or a state is no longer shown
 STALE_STATE = 2.0  # s; states come twice a second

@@ -10,17 +10,16 @@ from typing import Any, Protocol
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
 from exo_gravity.core.compensation.tilt_input import STILL
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.quaternion import unit_quaternion, up_in_body
-from exo_gravity.nodes.ros.conversions import to_nanoseconds
+from exo_gravity.nodes.ros.hot_path import NEWEST
+from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.sole_publisher import SolePublisher
 
 DATA, PITCH_YAW = "/imu/data", "/imu/pitch_yaw"
-NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 NOT_REPORTED = -1.0  # first entry of a covariance (REP-145)
 
 

@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.bag.storage import Storage
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.anfis_law import INPUTS, UPRIGHT, scaled
+from exo_gravity.core.model.anfis import INPUTS, UPRIGHT, scaled
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.trial.analysis import analyse

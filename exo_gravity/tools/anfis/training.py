@@ -18,8 +18,7 @@ from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.anfis import Anfis
-from exo_gravity.core.model.anfis_law import JOINTS, AnfisLaw, scaled
+from exo_gravity.core.model.anfis import JOINTS, Anfis, AnfisLaw, scaled
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.tools.anfis.data import Samples
 from exo_gravity.tools.anfis.projection import OnEvaluation, Projection

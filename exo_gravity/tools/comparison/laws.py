@@ -14,7 +14,7 @@ from itertools import product
 
 import numpy as np
 
-from exo_gravity.core.model.anfis_law import AnfisLaw
+from exo_gravity.core.model.anfis import AnfisLaw
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import gravity_torque, paper_mobile_torque, paper_static_torque
 from exo_gravity.core.model.tilt import Tilt

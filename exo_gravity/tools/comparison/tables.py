@@ -9,7 +9,7 @@ from dataclasses import asdict
 from itertools import groupby
 from pathlib import Path
 
-from exo_gravity.core.model.anfis_law import AnfisLaw
+from exo_gravity.core.model.anfis import AnfisLaw
 from exo_gravity.tools.anfis.training import Trained
 from exo_gravity.tools.comparison.growth import Growth
 from exo_gravity.tools.comparison.laws import Baseline, Row

@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from exo_gravity.core.model.anfis_law import AnfisLaw
+from exo_gravity.core.model.anfis import AnfisLaw
 from exo_gravity.core.model.gravity import gravity_torque, paper_static_torque
 from exo_gravity.tools.anfis.data import GRID, from_gravload
 from exo_gravity.tools.anfis.training import Trained, train_law

@@ -14,12 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.compensation.any_arm import LAW as URDF_LAW
-from exo_gravity.core.compensation.params import COMPENSATOR, settings_of
-from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.compensation.terms.spring import PosePath
+from exo_gravity.core.compensation.params import compensator_table, settings_of
+from exo_gravity.core.compensation.settings import URDF_LAW, Settings
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.model.anfis_law import AnfisLaw
+from exo_gravity.core.model.anfis import AnfisLaw
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.params import OPTIONS, motors_of
@@ -71,15 +69,7 @@ class ConfiguredArm:
     def settings(self) -> Settings:
         """Return the compensator's settings, with the model in `anfis_file`. Raises ParameterError."""
         with named(f"{self.namespace}/compensator"):
-            return settings_of(self.compensator, _anfis_model(self.compensator["anfis_file"]), self._path())
-
-    def _path(self) -> PosePath | None:
-        """Return the path in `spring.path_file`, None for no file."""
-        path = self.compensator["spring.path_file"]
-        try:
-            return PosePath.load(Path(path).read_text(encoding="utf-8")) if path else None
-        except (OSError, UnicodeDecodeError, DataError) as error:
-            raise ParameterError("spring.path_file", path, f"a file with a path ({error})") from None
+            return settings_of(self.compensator, _anfis_model(self.compensator["anfis_file"]))
 
 
 def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:
@@ -88,7 +78,9 @@ def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:
     Raises ParameterError where a node is missing or a parameter is unknown or impossible.
     """
     can_bridge = node_values(nodes, f"{namespace}/can_bridge", CAN_BRIDGE)
-    compensator = node_values(_with_own_law(nodes, f"{namespace}/compensator"), f"{namespace}/compensator", COMPENSATOR)
+    node = f"{namespace}/compensator"
+    nodes = _with_own_law(nodes, node)
+    compensator = node_values(nodes, node, compensator_table(nodes.get(node, ())))
     with named(f"{namespace}/can_bridge"):
         motors, limits = motors_of(can_bridge), limits_of(can_bridge)
     with named(f"{namespace}/compensator"):

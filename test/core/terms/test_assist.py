@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exo_gravity.core.compensation.terms.assist import FADE, RAMP, RECOVERY, Assist, AssistInput
+from exo_gravity.core.compensation.terms.assist import FADE, MAX_RATE, RAMP, RECOVERY, Assist, AssistInput
 
 NAMES = ["rotation", "abduction", "flexion", "elbow"]
 ASSIST = Assist((1.0, 2.0, 1.0, 1.0))
@@ -216,5 +216,5 @@ def test_no_sequence_of_messages_exceeds_the_bound_or_steps(sequence):
     torques = np.array(loop.torques).reshape(-1, 4)
     assert np.all(np.abs(torques) <= ASSIST.max_effort)
     # Fading from the bound, or following at the permitted rate while it ramps in.
-    most = np.array(ASSIST.max_effort) * (CYCLE / FADE + CYCLE / RAMP) + ASSIST.max_effort_rate * CYCLE
+    most = np.array(ASSIST.max_effort) * (CYCLE / FADE + CYCLE / RAMP) + MAX_RATE * CYCLE
     assert np.all(np.abs(np.diff(torques, axis=0)) <= most)

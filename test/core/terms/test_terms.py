@@ -3,38 +3,51 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exo_gravity.core.compensation.terms.coupling import Coupling
-from exo_gravity.core.compensation.terms.damping import Damping
-from exo_gravity.core.compensation.terms.friction import MAX_SPEED, MOVING, STILL, Friction
-from exo_gravity.core.compensation.terms.inertia import TANK, EnergyTank, Inertia
+from exo_gravity.core.compensation.limiter import LONGEST_STEP
+from exo_gravity.core.compensation.terms.friction_inertia import (
+    MAX_SPEED,
+    SLIDING,
+    STANDSTILL,
+    TANK,
+    EnergyTank,
+    Friction,
+    Inertia,
+)
 from exo_gravity.core.compensation.terms.settings import TermSettings, term_parameters, term_settings_of
-from exo_gravity.core.compensation.terms.shaper import LONGEST_STEP, Shaper, Shaping
-from exo_gravity.core.compensation.terms.soft_limits import SoftLimits
-from exo_gravity.core.compensation.terms.spring import PosePath, Spring
-from exo_gravity.core.compensation.terms.term import TermState
-from exo_gravity.core.compensation.terms.terms import Terms
-from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.compensation.terms.springs import (
+    Coupling,
+    Damping,
+    PosePath,
+    SoftLimits,
+    Spring,
+    TermState,
+    stable_stiffness,
+)
+from exo_gravity.core.compensation.terms.terms import MAX_EFFORT, MAX_EFFORT_RATE, Terms
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.kinematics import LinkInertia
 from exo_gravity.core.params import values_of
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")
 ZERO = (0.0,) * 4
 STATE = TermState(1.0, 0.002, (0.2, 0.7, 0.6, 0.5), ZERO, ZERO, ZERO, 0.0)
+EDGES = (-1.5, 1.5, 0.0, 1.6, -0.6, 1.6, 0.0, 2.5)
 four = st.tuples(*[st.floats(-40.0, 40.0)] * 4)
 ALL = TermSettings(
     friction=Friction(0.7, (0.2, 0.4, 0.2, 0.2), (0.02,) * 4),
     inertia=Inertia(0.7),
     damping=Damping((0.05, 0.1, 0.05, 0.05)),
     spring=Spring((2.0, 4.0, 2.0, 1.0)),
-    coupling=Coupling(1.5),
-    limits=SoftLimits((2.0,) * 4),
+    coupling=Coupling((0.0, -0.75, 1.5, 0.0)),
+    limits=SoftLimits(EDGES, (2.0,) * 4),
 )
 
 
@@ -50,17 +63,17 @@ def test_friction_is_along_the_motion_and_below_what_the_joint_loses(velocity, s
 
 def test_friction_is_zero_at_standstill_and_does_not_step():
     friction = Friction(0.8, (0.2,) * 4)
-    speeds = np.linspace(-2.0 * MOVING, 2.0 * MOVING, 400)
+    speeds = np.linspace(-2.0 * SLIDING, 2.0 * SLIDING, 400)
     torque = np.array([friction.torque(STATE._replace(velocity=(v, 0.0, 0.0, 0.0)))[0] for v in speeds])
     one_code = 2.0 * 45.0 / 4095.0
-    assert one_code < STILL  # standstill reads as half a code, and may flicker to the next
-    assert not torque[np.abs(speeds) <= STILL].any()
+    assert one_code < STANDSTILL  # standstill reads as half a code, and may flicker to the next
+    assert not torque[np.abs(speeds) <= STANDSTILL].any()
     assert np.abs(np.diff(torque)).max() < 0.01
     assert torque[-1] == pytest.approx(0.16)
 
 
 def test_coupling_pulls_both_joints_so_that_no_way_around_gives_energy():
-    coupling = Coupling(3.0, "shoulder_abduction", "elbow_flexion", ratio=0.5, offset=0.1, max_effort=0.4)
+    coupling = Coupling((0.0, -1.5, 0.0, 3.0), max_effort=0.4)
     angle = np.linspace(0.0, 2.0 * math.pi, 2001)
     way = np.stack((0.0 * angle, 0.8 + 0.5 * np.cos(angle), 0.0 * angle, 0.6 + 0.4 * np.sin(angle)), axis=1)
     torque = np.array([coupling.torque(STATE._replace(position=tuple(q))) for q in way])
@@ -70,7 +83,7 @@ def test_coupling_pulls_both_joints_so_that_no_way_around_gives_energy():
 
 
 def test_the_workspace_is_free_inside_and_pushes_back_outside():
-    limits = SoftLimits((3.0,) * 4, lower=(-1.0, 0.2, 0.0, 0.0), upper=(1.0, 1.0, 1.0, 1.0), max_effort=(0.5,) * 4)
+    limits = SoftLimits((-1.0, 1.0, 0.2, 1.0, 0.0, 1.0, 0.0, 1.0), (3.0,) * 4, (0.5,) * 4)
     inside = STATE._replace(position=(0.9, 0.3, 0.5, 0.99), velocity=(1.0,) * 4)
     assert limits.torque(inside) == ZERO
     outside = STATE._replace(position=(1.1, 0.1, 9.0, -0.1))
@@ -96,12 +109,14 @@ def test_an_impossible_path_is_refused(times, poses):
         PosePath(times, poses)
 
 
-def test_a_path_is_read_from_csv_and_a_wrong_file_is_refused():
-    path = PosePath.load("0, 0, 0, 0, 0\n\n1.5,0.1,0.2,0.3,-0.4\n")
-    assert path == PosePath((0.0, 1.5), (ZERO, (0.1, 0.2, 0.3, -0.4)))
-    for text in ("", "0,0,0,0", "t,a,b,c,d\n0,0,0,0,0", "0,0,0,0,0\n0.1,3,0,0,0", "0,0,0,0,nan"):
-        with pytest.raises(DataError, match="not a path"):
-            PosePath.load(text)
+def test_a_pose_of_more_than_four_numbers_is_a_path_of_rows():
+    spring = Spring((1.0,) * 4, (0.0, 0.0, 0.0, 0.0, 0.0, 1.5, 0.1, 0.2, 0.3, -0.4))
+    assert spring.path == PosePath((0.0, 1.5), (ZERO, (0.1, 0.2, 0.3, -0.4)))
+    for rows in ((), (0.0,) * 6, (0.0,) * 3, (0.0, 0, 0, 0, 0, 0.1, 3, 0, 0, 0), (0.0, 0.0, 0.0, 0.0, math.nan)):
+        with pytest.raises(ParameterError, match=r"path|pose"):
+            Spring((1.0,) * 4, rows)
+    with pytest.raises(ParameterError, match=r"^spring.pose = .*4 angles"):
+        Spring((1.0,) * 4, (0.0, 0.0, 0.0, math.nan))
 
 
 def test_the_tank_gives_what_it_holds_and_no_more():
@@ -163,20 +178,32 @@ def test_after_a_pause_the_terms_begin_again_from_no_torque():
     assert np.abs(driven.run(0.002)).max() <= 50.0 * 0.002
 
 
+class Wild(NamedTuple):
+    """A term that gives any torque, in place of a spring."""
+
+    torques: list[tuple[float, ...]]
+    on = True
+
+    def torque(self, _state: TermState) -> tuple[float, ...]:
+        return self.torques[0]
+
+
 wild = st.one_of(st.floats(-30.0, 30.0), st.sampled_from([math.nan, math.inf, -math.inf, 1e308]))
 
 
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.tuples(st.tuples(*[wild] * 4), st.sampled_from([0.0, 0.001, 0.002, 0.01, 0.05])), max_size=60))
-def test_whatever_the_terms_give_the_shaped_torque_is_bounded_and_rate_limited(sums):
-    shaper = Shaper(Shaping())
+def test_whatever_the_terms_give_their_sum_is_bounded_and_rate_limited(sums):
+    given = [ZERO]
+    terms, now, before = Terms(NAMES, TermSettings(spring=Wild(given)), DEFAULT_LINKS), 1.0, ZERO
     for total, dt in sums:
-        before = shaper.output
-        after = shaper.shape(total, dt)
-        assert all(abs(tau) <= limit for tau, limit in zip(after, shaper.shaping.max_effort, strict=True))
+        now, given[0] = now + dt, total
+        after = terms.torque(now, STATE.position, ZERO, ZERO)
+        assert all(abs(tau) <= limit for tau, limit in zip(after, MAX_EFFORT, strict=True))
         steps = np.abs(np.subtract(after, before))
-        assert steps.max() <= shaper.shaping.max_effort_rate * min(dt, LONGEST_STEP) + 1e-12
-        assert bool(shaper.refusal) is not math.isfinite(sum(total))
+        assert steps.max() <= MAX_EFFORT_RATE * min(dt, LONGEST_STEP) + 1e-9
+        assert bool(terms.problem) is not math.isfinite(sum(total))
+        before = after
 
 
 @settings(max_examples=60, deadline=None)
@@ -186,32 +213,38 @@ def test_all_terms_together_stay_bounded_in_any_state(states):
     for position, velocity, dt in states:
         now += dt
         torque = terms.torque(now, position, velocity, ZERO)
-        assert all(abs(tau) <= limit for tau, limit in zip(torque, ALL.terms.max_effort, strict=True))
+        assert all(abs(tau) <= limit for tau, limit in zip(torque, MAX_EFFORT, strict=True))
 
 
 @pytest.mark.parametrize(
     ("chosen", "name"),
     [
         (TermSettings(spring=Spring((50.0, 0.0, 0.0, 0.0))), "spring.stiffness"),
-        (TermSettings(limits=SoftLimits((0.0, 0.0, 0.0, 9.0))), "limits.stiffness"),
         (TermSettings(damping=Damping((0.0, 0.0, 0.0, 3.0))), "damping.viscosity"),
-        (TermSettings(coupling=Coupling(30.0)), "coupling.stiffness"),
+        (TermSettings(coupling=Coupling((0.0, -15.0, 30.0, 0.0))), "coupling.stiffness"),
     ],
 )
 def test_a_spring_or_damper_that_would_be_unstable_when_late_is_refused_with_the_most_that_is_stable(chosen, name):
     with pytest.raises(ParameterError, match=f"^{name} = .* at most .* late is stable"):
-        chosen.check(DEFAULT_LINKS)
-    ALL.check(DEFAULT_LINKS)
+        chosen.on_arm(DEFAULT_LINKS)
+    assert ALL.on_arm(DEFAULT_LINKS) == ALL
+
+
+def test_soft_limits_are_no_stiffer_than_the_arm_can_bear():
+    stiff = TermSettings(limits=SoftLimits(EDGES)).on_arm(DEFAULT_LINKS).limits.stiffness
+    most = stable_stiffness(LinkInertia.of(DEFAULT_LINKS).least())
+    assert stiff == pytest.approx(np.minimum(10.0, 0.8 * np.array(most)))
 
 
 def test_parameters_make_settings_and_name_their_group_in_errors():
     table = term_parameters()
     assert term_settings_of(values_of(table, {})) == TermSettings()
-    values = values_of(table, {"friction.share": 0.5, "coupling.leader": "elbow_flexion", "spring.pose": [0.1] * 4})
+    coupling = [0.0, -1.0, 2.0, 0.0]
+    values = values_of(table, {"friction.share": 0.5, "coupling.stiffness": coupling, "spring.pose": [0.1] * 4})
     built = term_settings_of(values)
-    assert (built.friction.share, built.coupling.leader, built.spring.pose) == (0.5, "elbow_flexion", (0.1,) * 4)
-    with pytest.raises(ParameterError, match=r"^coupling.follower = 'elbow_flexion'"):
-        term_settings_of({**values, "coupling.follower": "elbow_flexion"})
-    with pytest.raises(ParameterError, match=r"^limits.upper"):
-        term_settings_of({**values, "limits.upper": [-3.0] * 4})
-    assert not any(getattr(replace(TermSettings()), p.name.split(".")[0]) is None for p in table)
+    assert (built.friction.share, built.coupling.stiffness, built.spring.pose) == (0.5, tuple(coupling), (0.1,) * 4)
+    with pytest.raises(ParameterError, match=r"^coupling.stiffness = .* two joints or more"):
+        term_settings_of({**values, "coupling.stiffness": [0.0, 1.0, 0.0, 0.0]})
+    with pytest.raises(ParameterError, match=r"^limits.range"):
+        term_settings_of({**values, "limits.range": [-3.0] * 8})
+    assert not any(getattr(TermSettings(), param.name.split(".")[0]) is None for param in table)

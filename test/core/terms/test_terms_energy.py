@@ -13,15 +13,10 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.compensation.terms.coupling import Coupling
-from exo_gravity.core.compensation.terms.damping import Damping
-from exo_gravity.core.compensation.terms.friction import Friction
-from exo_gravity.core.compensation.terms.inertia import TANK, Inertia
-from exo_gravity.core.compensation.terms.link_inertia import LinkInertia
+from exo_gravity.core.compensation.terms.friction_inertia import TANK, Friction, Inertia
 from exo_gravity.core.compensation.terms.settings import TermSettings
-from exo_gravity.core.compensation.terms.soft_limits import SoftLimits
-from exo_gravity.core.compensation.terms.spring import Spring
-from exo_gravity.core.compensation.terms.term import DELAY
+from exo_gravity.core.compensation.terms.springs import DELAY, Coupling, Damping, SoftLimits, Spring
+from exo_gravity.core.model.kinematics import LinkInertia
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
@@ -53,7 +48,7 @@ class Case:
 
     def pushed(self, settings: TermSettings, strength: float = 0.6) -> TermsRun:
         """Return a run in which a wearer pushes the arm about, and then leaves it alone until it rests."""
-        settings.check(self.links)
+        settings = settings.on_arm(self.links)
         run = TermsRun(settings, self.config, self.links, period=self.period, delay=self.delay)
         wearer = sines(self.seed, PUSHED, strength)
         run.run(PUSHED, wearer)
@@ -66,7 +61,7 @@ CASES = [Case(seed) for seed in range(4)]
 
 def stiffest(links: ArmModel) -> tuple[float, ...]:
     """Return the stiffness (4,) in Nm/rad up to which springs are accepted."""
-    return tuple((0.999 * np.array(LinkInertia(links).least()) / (4.0 * DELAY**2)).tolist())
+    return tuple((0.999 * np.array(LinkInertia.of(links).least()) / (4.0 * DELAY**2)).tolist())
 
 
 @pytest.mark.parametrize("case", CASES, ids=str)
@@ -101,7 +96,7 @@ def test_inertia_without_an_identified_friction_lives_on_its_tank(case):
 
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_the_strongest_damping_only_takes(case):
-    least = np.array(LinkInertia(case.links).least())
+    least = np.array(LinkInertia.of(case.links).least())
     run = case.pushed(TermSettings(damping=Damping(tuple((0.999 * least / (2.0 * DELAY)).tolist()))))
     assert run.given < -0.02
     assert run.most_given < 0.01
@@ -117,7 +112,7 @@ def test_the_stiffest_spring_gives_no_more_than_it_stored(case):
 
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_the_stiffest_edges_of_a_workspace_return_no_more_than_they_took(case):
-    edges = SoftLimits(stiffest(case.links), np.subtract(POSE, 0.1), np.add(POSE, 0.1))
+    edges = SoftLimits(np.stack((np.subtract(POSE, 0.1), np.add(POSE, 0.1)), axis=1).ravel(), stiffest(case.links))
     run = case.pushed(TermSettings(limits=edges))
     assert run.given < 0.0
     assert run.most_given < 0.05
@@ -125,9 +120,9 @@ def test_the_stiffest_edges_of_a_workspace_return_no_more_than_they_took(case):
 
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_a_coupling_gives_no_more_than_it_stored(case):
-    coupling = Coupling(3.0, "shoulder_flexion", "elbow_flexion", 0.5, max_effort=1.0)
+    coupling = Coupling((0.0, 0.0, -1.5, 3.0))
     run = case.pushed(TermSettings(coupling=coupling))
-    gap = abs(POSE[2] - 0.5 * POSE[3])
+    gap = abs(POSE[3] - 0.5 * POSE[2])
     assert run.most_given < 0.5 * 3.0 * gap**2 + 0.25
 
 
@@ -140,8 +135,8 @@ def test_all_terms_together_let_the_arm_come_to_rest(case):
             inertia=Inertia(0.8),
             damping=Damping((0.02,) * 4),
             spring=Spring(half, POSE),
-            coupling=Coupling(1.0, "shoulder_flexion", "elbow_flexion"),
-            limits=SoftLimits(half),
+            coupling=Coupling((0.0, 0.0, -0.5, 1.0)),
+            limits=SoftLimits((-1.5, 1.5, 0.0, 1.6, -0.6, 1.6, 0.0, 2.5), half),
         )
     )
 

@@ -3,7 +3,7 @@
     off        `max_effort` is 0
     waiting    no messages yet, or they stopped; no torque
     refused    the last ones were wrong; no torque until they have been sound for RECOVERY
-    assisting  the efforts are followed: clamped to `max_effort`, limited to `max_effort_rate`, ramped in over RAMP
+    assisting  the efforts are followed: clamped to `max_effort`, limited to MAX_RATE, ramped in over RAMP
 
 Messages may come at 10 to 500 Hz. An effort is valid for 1.5 observed periods after its stamp, and for MIN_VALID at
 least, so that a single late message costs nothing. Then, or at once when a message is wrong, the torque fades in FADE.
@@ -17,7 +17,7 @@ import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
-from exo_gravity.core.compensation.terms.term import clamp
+from exo_gravity.core.compensation.terms.springs import clamp
 from exo_gravity.core.model.gravity import NO_TORQUE, Torque
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import check_owned, owned
@@ -26,9 +26,10 @@ from exo_gravity.core.safety.limits import MAX_COMMAND
 SLOWEST, FASTEST = 0.1, 0.001  # s between two messages; faster ones are a flood
 MIN_VALID = 0.05  # s from its stamp for which an effort is valid at any rate
 PERIODS = 1.5  # observed periods for which it is valid
-SMOOTHING = 0.2  # share of a new interval in the observed period
+PERIOD_SMOOTHING = 0.2  # share of a new interval in the observed period
 MAX_LEAD = 0.02  # s that a stamp may be ahead
 FADE = 0.05  # s from full assistance to none
+MAX_RATE = 10.0  # Nm/s, the fastest change of the torque
 RAMP = 0.5  # s from none to full
 RECOVERY = 0.5  # s without a wrong message, after which efforts are believed again
 
@@ -40,7 +41,6 @@ class Assist:
     max_effort: Sequence[float] = owned(
         (0.0,) * JOINT_COUNT, "largest torque from assist_efforts; 0: ignored", (0.0, 10.0), "Nm"
     )
-    max_effort_rate: float = owned(10.0, "fastest change of that torque", (0.5, 50.0), "Nm/s")
 
     def __post_init__(self) -> None:
         check_owned(self)
@@ -103,7 +103,7 @@ class AssistInput:
         """
         interval, self._arrival = now - self._arrival, now
         if interval < SLOWEST * PERIODS:
-            self._period += SMOOTHING * (min(interval, SLOWEST) - self._period)
+            self._period += PERIOD_SMOOTHING * (min(interval, SLOWEST) - self._period)
         problem = self._problem(now, names, efforts, stamp, publisher, interval)
         self._publisher = publisher
         if problem:
@@ -143,7 +143,7 @@ class AssistInput:
         self._gain = min(1.0, self._gain + dt / RAMP) if sound else max(0.0, self._gain - dt / FADE)
         if self._gain <= 0.0:
             return NO_TORQUE
-        step = self.assist.max_effort_rate * dt
+        step = MAX_RATE * dt
         for joint, (last, target) in enumerate(zip(self._held, self._target, strict=True)):
             self._held[joint] = max(last - step, min(last + step, target))
         gain = self._gain

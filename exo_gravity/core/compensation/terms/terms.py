@@ -1,23 +1,32 @@
-"""The terms at work: their sum behind the shaper, plus the outer loop's input."""
+"""The terms at work: their bounded sum, plus the outer loop's input.
+
+The sum is bounded, rate-limited, and never steps: the difference that a change of parameters makes fades. Whatever is
+wrong with the sum, gravity compensation goes on beneath it.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
-from exo_gravity.core.compensation.terms.acceleration import AccelerationFilter
+from exo_gravity.core.compensation.limiter import LONGEST_STEP, Transition, limited
 from exo_gravity.core.compensation.terms.assist import AssistInput
-from exo_gravity.core.compensation.terms.friction import MAX_SHARE
-from exo_gravity.core.compensation.terms.inertia import EnergyTank, InertiaTerm
-from exo_gravity.core.compensation.terms.link_inertia import LinkInertia
-from exo_gravity.core.compensation.terms.settings import TermSettings
-from exo_gravity.core.compensation.terms.shaper import Shaper
-from exo_gravity.core.compensation.terms.term import Term, TermState
+from exo_gravity.core.compensation.terms.friction_inertia import (
+    MAX_FRICTION_SHARE,
+    AccelerationFilter,
+    EnergyTank,
+    InertiaTerm,
+)
+from exo_gravity.core.compensation.terms.settings import GROUPS, TermSettings
+from exo_gravity.core.compensation.terms.springs import Term, TermState
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import NO_TORQUE, Torque
+from exo_gravity.core.model.kinematics import LinkInertia
 
 MAX_GAP = 0.2  # s between two cycles, beyond which the terms begin again from no torque
 NO_ACCELERATION = (0.0,) * 4
+MAX_EFFORT = (2.0, 4.0, 2.0, 2.0)  # Nm of all terms: well below the motors' rated torque, which gravity needs
+MAX_EFFORT_RATE = 50.0  # Nm/s
 
 
 class Terms:
@@ -30,7 +39,9 @@ class Terms:
         self.settings = settings
         self.assist = AssistInput(names, settings.assist)
         self._arm = arm
-        self._shaper = Shaper(settings.terms)
+        self._refusal = ""  # why the sum is not used
+        self._output = NO_TORQUE
+        self._transition = Transition()
         self._tank = EnergyTank()
         self._acceleration = AccelerationFilter()
         self._time = self._spring_start = -math.inf
@@ -41,8 +52,7 @@ class Terms:
     @property
     def active(self) -> list[str]:
         """The names of the terms that are on, and 'assist' if efforts are used."""
-        names = ("friction", "inertia", "damping", "spring", "coupling", "limits", "assist")
-        return [name for name in names if getattr(self.settings, name).on]
+        return [name for name in GROUPS if getattr(self.settings, name).on]
 
     @property
     def energy(self) -> float:
@@ -54,7 +64,7 @@ class Terms:
         """Why the sum of the terms or the outer loop's efforts are not used although they are asked for, or ''."""
         assist = self.assist
         refused = assist.reason if assist.assist.on and assist.state == "refused" else ""
-        return self._shaper.refusal or refused
+        return self._refusal or refused
 
     def apply(self, settings: TermSettings, arm: ArmModel) -> None:
         """Use new settings and a new arm from the next `torque` on; the torque moves to them without a step."""
@@ -70,21 +80,23 @@ class Terms:
         if self._idle:
             return NO_TORQUE
         if not 0.0 <= dt <= MAX_GAP:
-            self._shaper.restart()
-            dt = 0.0
+            self._output, self._transition, dt = NO_TORQUE, Transition(), 0.0
         acceleration = self._acceleration.update(velocity, dt) if self.settings.inertia.on else NO_ACCELERATION
         state = TermState(now, dt, theta, velocity, acceleration, gravity, now - self._spring_start)
-        total = self._sum(state)
+        total = self._transition.blended(now, self._sum(state))
         if self._pending is not None:
             self._change(*self._pending, now)
             after = self._sum(state._replace(dt=0.0, elapsed=now - self._spring_start))
-            self._shaper.change(total, after)
-            total = after
-        shaped = self._shaper.shape(total, dt)
-        if self._shaper.refusal:
+            total = self._transition.begin(now, total, after)
+        self._refusal = "" if math.isfinite(sum(total)) else "torque of the terms is not finite"
+        if self._refusal:
+            total, self._transition = NO_TORQUE, Transition()
             self._acceleration = AccelerationFilter()  # it may have kept what is not finite
+        step = MAX_EFFORT_RATE * min(dt, LONGEST_STEP)
+        columns = zip(total, self._output, MAX_EFFORT, strict=True)
+        self._output = shaped = tuple([limited(wanted, last, limit, step) for wanted, last, limit in columns])
         if self.assist.idle:
-            self._idle = not self._active and self._shaper.idle
+            self._idle = not self._active and self._transition.is_over and shaped == NO_TORQUE
             return shaped
         a, b, c, d = self.assist.torque(now)
         return a + shaped[0], b + shaped[1], c + shaped[2], d + shaped[3]
@@ -100,14 +112,14 @@ class Terms:
         if settings.spring != self.settings.spring:
             self._spring_start = now
         self.settings, self._arm, self._pending = settings, arm, None
-        self.assist.assist, self._shaper.shaping = settings.assist, settings.terms
+        self.assist.assist = settings.assist
         self._active = self._build()
 
     def _build(self) -> list[Term]:
         """Return the terms that are on."""
         s = self.settings
-        terms: list[Term] = [s.friction, s.damping, s.spring, s.coupling, s.limits]
+        terms: list[Term] = [term for term in (s.friction, s.damping, s.spring, s.coupling, s.limits) if term.on]
         if s.inertia.on:
-            left = [(MAX_SHARE - s.friction.share) * coulomb for coulomb in s.friction.coulomb]
-            terms.append(InertiaTerm(s.inertia, LinkInertia(self._arm, s.inertia.rotor), left, self._tank))
-        return [term for term in terms if term.on]
+            left = [(MAX_FRICTION_SHARE - s.friction.share) * coulomb for coulomb in s.friction.coulomb]
+            terms.append(InertiaTerm(s.inertia.share, LinkInertia.of(self._arm), left, self._tank))
+        return terms

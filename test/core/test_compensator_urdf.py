@@ -1,4 +1,4 @@
-"""The compensator of n joints, with a pendulum of two joints as its model."""
+"""The compensator of another arm than the exoskeleton's: a pendulum of two joints."""
 
 import math
 import random
@@ -6,8 +6,9 @@ import random
 import numpy as np
 import pytest
 
-from exo_gravity.core.compensation.any_arm import AnyArm, any_arm_settings, any_arm_table
-from exo_gravity.core.compensation.limiter import LONGEST_STEP, RAMP_TIME
+from exo_gravity.core.compensation.compensator import Compensator
+from exo_gravity.core.compensation.limiter import LONGEST_STEP, RAMP_TIME, TRANSITION_TIME
+from exo_gravity.core.compensation.params import urdf_settings_of, urdf_table
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import values_of
 
@@ -29,7 +30,7 @@ class Pendulum:
 
 def settings(**changes):
     given = {"joint_names": ["a", "b"], "max_effort": [0.0, 20.0], "use_imu": False, **changes}
-    return any_arm_settings(values_of(any_arm_table(2), given), Pendulum())
+    return urdf_settings_of(values_of(urdf_table(2, ()), given), Pendulum())
 
 
 def steps(arm, start, seconds):
@@ -37,7 +38,7 @@ def steps(arm, start, seconds):
 
 
 def test_it_ramps_in_and_then_gives_the_models_torque_times_the_gain():
-    arm = AnyArm(Pendulum(), settings(gain=[1.0, 0.5], max_effort_rate=1000.0))
+    arm = Compensator(settings(gain=[1.0, 0.5], max_effort_rate=1000.0))
     efforts = steps(arm, 5.0, RAMP_TIME + 0.1)
     first, second = Pendulum().torque(POSE, (0.0, 0.0, -9.80665))
     assert efforts[0] == (0.0, 0.0)
@@ -46,7 +47,7 @@ def test_it_ramps_in_and_then_gives_the_models_torque_times_the_gain():
 
 
 def test_gravity_comes_from_the_tilt_in_the_root_links_axes():
-    arm = AnyArm(Pendulum(), settings(use_imu=True, max_effort_rate=1000.0, tilt_timeout=0.5))
+    arm = Compensator(settings(use_imu=True, max_effort_rate=1000.0, tilt_timeout=0.5))
     assert arm.step(1.0, POSE).reason == "no trunk tilt yet"
     for n in range(300):
         arm.set_gravity(2.0 + n * PERIOD, (0.6, 0.0, -0.8))
@@ -56,29 +57,29 @@ def test_gravity_comes_from_the_tilt_in_the_root_links_axes():
 
 
 def test_pitch_and_roll_give_the_same_gravity_as_the_vector():
-    arm = AnyArm(Pendulum(), settings(use_imu=True, max_effort_rate=1000.0))
+    arm = Compensator(settings(use_imu=True, max_effort_rate=1000.0))
     for n in range(300):
         arm.set_tilt(2.0 + n * PERIOD, math.asin(0.6), 0.0)
         answer = arm.step(2.0 + n * PERIOD, POSE)
     assert answer.effort == pytest.approx(Pendulum().torque(POSE, (0.6 * 9.80665, 0.0, -0.8 * 9.80665)), abs=1e-9)
 
 
-def test_a_change_of_settings_fades_in_over_the_transition_time_without_a_step():
-    arm = AnyArm(Pendulum(), settings(max_effort_rate=1000.0))
+def test_a_change_of_settings_fades_in_without_a_step():
+    arm = Compensator(settings(max_effort_rate=1000.0))
     before = steps(arm, 1.0, 1.5)[-1]
-    arm.apply(settings(gain=[2.0, 2.0], transition_time=0.5, max_effort_rate=1000.0))
-    efforts = [before, *steps(arm, 2.5, 0.6)]
+    arm.apply(settings(gain=[2.0, 2.0], max_effort_rate=1000.0))
+    efforts = [before, *steps(arm, 2.5, TRANSITION_TIME + 0.1)]
     assert np.allclose(efforts[-1], np.multiply(2.0, before), rtol=0.0, atol=1e-12)
-    assert np.abs(np.diff(efforts, axis=0)).max() <= np.abs(before).max() * PERIOD / 0.5 + 1e-9
+    assert np.abs(np.diff(efforts, axis=0)).max() <= np.abs(before).max() * PERIOD / TRANSITION_TIME + 1e-9
 
 
 def test_random_changes_of_settings_never_exceed_the_rate_limit():
-    chance, arm, now = random.Random(3), AnyArm(Pendulum(), settings()), 1.0
+    chance, arm, now = random.Random(3), Compensator(settings()), 1.0
     last = (0.0, 0.0)
     for n in range(3000):
         if n % 50 == 0:
             gain = [chance.uniform(0.0, 2.0) for _ in range(2)]
-            arm.apply(settings(gain=gain, gravity=chance.uniform(0.0, 25.0), transition_time=0.2))
+            arm.apply(settings(gain=gain, gravity=chance.uniform(0.0, 25.0)))
         now += PERIOD
         effort = arm.step(now, POSE).effort
         assert all(abs(a - b) <= 50.0 * min(PERIOD, LONGEST_STEP) + 1e-9 for a, b in zip(effort, last, strict=True))
@@ -86,7 +87,7 @@ def test_random_changes_of_settings_never_exceed_the_rate_limit():
 
 
 def test_torque_beyond_the_limit_of_the_urdf_is_clamped_and_named():
-    arm = AnyArm(Pendulum(), settings(max_effort=[3.0, 20.0], max_effort_rate=1000.0))
+    arm = Compensator(settings(max_effort=[3.0, 20.0], max_effort_rate=1000.0))
     for n in range(300):
         answer = arm.step(1.0 + n * PERIOD, (1.5, 0.0))
     assert answer.effort[0] == 3.0 and answer.clamped == (0,)
@@ -94,7 +95,7 @@ def test_torque_beyond_the_limit_of_the_urdf_is_clamped_and_named():
 
 @pytest.mark.parametrize("theta", [(0.0,), (0.0, 0.0, 0.0), (math.nan, 0.0), (0.0, 30.0)])
 def test_impossible_angles_are_refused(theta):
-    assert "are not 2 numbers within 26 rad" in AnyArm(Pendulum(), settings()).step(1.0, theta).reason
+    assert "are not 2 numbers within 26 rad" in Compensator(settings()).step(1.0, theta).reason
 
 
 def test_a_joint_without_any_effort_limit_is_refused():

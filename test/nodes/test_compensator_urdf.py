@@ -21,10 +21,10 @@ from std_srvs.srv import Trigger
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.hardware.urdf_arm import UrdfArm
-from exo_gravity.nodes.compensator import any_arm
-from exo_gravity.nodes.compensator.any_arm import LATCHED
+from exo_gravity.nodes.compensator import arm
 from exo_gravity.nodes.compensator.node import CompensatorNode
-from exo_gravity.nodes.ros.conversions import to_time
+from exo_gravity.nodes.ros.hot_path import LATCHED
+from exo_gravity.nodes.ros.messages import to_time
 from exo_gravity.nodes.ros.run import keep_to_this_machine
 
 keep_to_this_machine()
@@ -39,7 +39,6 @@ PARAMETERS = {
     "use_imu": False,
     "command_interface": "multi_array",
     "multi_array.timeout": 0.15,
-    "multi_array.fade_time": 0.5,
     "max_effort": [200.0] * 6,
     "max_effort_rate": 1000.0,
     "side": "left",  # of the exoskeleton's own arm: ignored
@@ -145,6 +144,22 @@ def make_rig() -> Iterator[Callable[..., Rig]]:
         rig.close()
 
 
+@pytest.fixture(scope="module")
+def running() -> Iterator[Rig]:
+    rig = Rig().start()
+    yield rig
+    rig.close()
+
+
+@pytest.fixture
+def rig(running: Rig) -> Rig:
+    """The node of this module, fed with sound joint states, and carrying the arm."""
+    running.lag, running.names, running.pose = 0.0, ["gripper", *NAMES[::-1]], (float("nan"), *POSE[::-1])
+    running.is_feeding = True
+    running.commands.clear()
+    return carried(running)
+
+
 def carried(rig: Rig) -> Rig:
     """Return the rig once the arm is carried; a fault, such as a busy machine causes, is cleared."""
     while not rig.is_carried():
@@ -154,14 +169,32 @@ def carried(rig: Rig) -> Rig:
     return rig
 
 
-def test_six_joints_among_others_in_any_order_are_carried_in_the_order_of_the_controller(make_rig):
-    rig = carried(make_rig().start())
+def test_the_description_may_come_from_a_latched_topic(make_rig):
+    rig = make_rig(**{"urdf.file": '""', "urdf.topic": "robot_description"})
+    rig.user.create_publisher(String, "robot_description", LATCHED).publish(String(data=URDF.read_text()))
+    carried(rig.start())
+
+
+def test_a_missing_description_is_an_error_at_the_start(make_rig, monkeypatch):
+    monkeypatch.setattr(arm, "DESCRIPTION_TIMEOUT", 0.2)
+    rig = make_rig(**{"urdf.file": '""'})
+    with pytest.raises(ParameterError, match=r"urdf\.topic = '/robot_description': must be published, latched"):
+        rig.start()
+
+
+def test_six_joints_among_others_in_any_order_are_carried_in_the_order_of_the_controller(rig):
     rig.wait_until(lambda: rig.status.message == "compensating" and rig.values["output"] == "active")
     assert rig.values["law"] == "urdf" and rig.values["mass carried (kg)"] == "12.000"
 
 
-def test_without_joint_states_the_torque_fades_to_zeros_until_the_fault_is_cleared(make_rig):
-    rig = carried(make_rig().start())
+def test_gains_and_limits_change_live_and_the_law_does_not(rig):
+    results = rig.node.set_parameters([Parameter("gain", value=[0.5] * 6), Parameter("law", value="exact")])
+    assert [result.successful for result in results] == [True, False]
+    rig.wait_until(lambda: np.allclose(rig.commands[-1], np.multiply(0.5, EXPECTED), rtol=0.0, atol=1e-9))
+    assert rig.node.set_parameters([Parameter("gain", value=[1.0] * 6)])[0].successful
+
+
+def test_without_joint_states_the_torque_fades_to_zeros_until_the_fault_is_cleared(rig):
     rig.is_feeding = False
     rig.commands.clear()
     rig.wait_until(rig.is_zero)
@@ -177,42 +210,19 @@ def test_without_joint_states_the_torque_fades_to_zeros_until_the_fault_is_clear
     carried(rig)
 
 
-def test_joint_states_that_are_old_by_their_stamps_do_not_count(make_rig):
-    rig = carried(make_rig().start())
+def test_joint_states_that_are_old_by_their_stamps_do_not_count(rig):
     rig.lag = 1.0
     rig.wait_until(rig.is_zero)
     rig.wait_until(lambda: "no joint_states younger than 150 ms" in rig.status.message)
     assert "age by its stamp" in rig.values["last refused message"]
 
 
-def test_a_missing_joint_fades_the_torque(make_rig):
-    rig = carried(make_rig().start())
+def test_a_missing_joint_fades_the_torque(rig):
     rig.names, rig.pose = rig.names[:-1], rig.pose[:-1]
     rig.wait_until(rig.is_zero)
     rig.wait_until(lambda: "joint_states: name must be joint_a1" in rig.status.message)
 
 
-def test_the_torque_fades_to_zero_before_the_node_ends(make_rig):
-    rig = carried(make_rig().start())
+def test_the_torque_fades_to_zero_before_the_node_ends(rig):
     rig.node.close()
     rig.wait_until(rig.is_zero)
-
-
-def test_the_description_may_come_from_a_latched_topic(make_rig):
-    rig = make_rig(**{"urdf.file": '""', "urdf.topic": "robot_description"})
-    rig.user.create_publisher(String, "robot_description", LATCHED).publish(String(data=URDF.read_text()))
-    carried(rig.start())
-
-
-def test_a_missing_description_is_an_error_at_the_start(make_rig, monkeypatch):
-    monkeypatch.setattr(any_arm, "DESCRIPTION_TIMEOUT", 0.2)
-    rig = make_rig(**{"urdf.file": '""'})
-    with pytest.raises(ParameterError, match=r"urdf\.topic = '/robot_description': must be published, latched"):
-        rig.start()
-
-
-def test_gains_and_limits_change_live_and_the_law_does_not(make_rig):
-    rig = carried(make_rig(transition_time=0.2).start())
-    results = rig.node.set_parameters([Parameter("gain", value=[0.5] * 6), Parameter("law", value="exact")])
-    assert [result.successful for result in results] == [True, False]
-    rig.wait_until(lambda: np.allclose(rig.commands[-1], np.multiply(0.5, EXPECTED), rtol=0.0, atol=1e-9))

@@ -1,17 +1,23 @@
-"""Declares the parameter tables of `core` on a node, with descriptions for `ros2 param` and rqt."""
+"""A node's own parameters, declared from a table of `core`, and those of another node, read over its services."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.task import Future
 
 from exo_gravity.core.motors.params import OPTIONS
 from exo_gravity.core.params import Param, values_of
+
+ANSWER_TIMEOUT = 5.0  # s after which a request to a node that has died is repeated
 
 
 def declare(node: Node, table: Sequence[Param], free_prefix: str = "") -> dict[str, Any]:
@@ -85,3 +91,73 @@ def _first(default: Any) -> Any:
 def plain(value: Any) -> Any:
     """Return a parameter's value with arrays as lists."""
     return list(value) if isinstance(value, list | tuple) or hasattr(value, "tolist") else value
+
+
+class NodeParameters:
+    """The parameters of another node, in `values` once they are known.
+
+    name: its full name, or its name in `node`'s namespace. on_change: called with `values` on the executor's thread
+    each time that they were read. names: of the parameters to read, all by default; `values` is empty if the node lacks
+    one of them. clock: monotonic s.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        name: str,
+        on_change: Callable[[dict[str, Any]], object] = lambda values: None,
+        names: Sequence[str] = (),
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.values: dict[str, Any] = {}
+        self.is_present = False  #: whether it has its services; a node that has died can stay in ROS's list of names
+        self._node = node
+        self._on_change = on_change
+        self._names = names
+        self._clock = clock
+        self._get = node.create_client(GetParameters, f"{name}/get_parameters")
+        self._list = None if names else node.create_client(ListParameters, f"{name}/list_parameters")
+        self._clients = [self._get] if self._list is None else [self._get, self._list]
+        self._is_due = True
+        self._asked = -math.inf  # s, when the request was sent that has no answer yet
+        self._is_destroyed = False
+
+    def refresh(self) -> None:
+        """Read the parameters again, at the next `update`."""
+        self._is_due = True
+
+    def update(self) -> None:
+        """Read the parameters if they may have changed and the node answers. Call it on the executor's thread."""
+        if self._is_destroyed:
+            return
+        self.is_present = all(client.service_is_ready() for client in self._clients)
+        if not self.is_present:
+            self._is_due = True  # it may return with other values
+            return
+        now = self._clock()
+        if (self._is_due or math.isfinite(self._asked)) and now - self._asked >= ANSWER_TIMEOUT:
+            self._is_due, self._asked = False, now
+            if self._list is None:
+                self._request(self._names)
+            else:
+                listed = self._list.call_async(ListParameters.Request())
+                listed.add_done_callback(lambda done: self._request(done.result().result.names))
+
+    def destroy(self) -> None:
+        """Remove the clients; answers that are still on their way are ignored."""
+        self._is_destroyed = True
+        for client in self._clients:
+            self._node.destroy_client(client)
+
+    def _request(self, names: Sequence[str]) -> None:
+        if not self._is_destroyed:
+            asked = self._get.call_async(GetParameters.Request(names=list(names)))
+            asked.add_done_callback(lambda done: self._on_values(names, done))
+
+    def _on_values(self, names: Sequence[str], future: Future) -> None:
+        if self._is_destroyed:
+            return
+        self._asked = -math.inf
+        values = map(parameter_value_to_python, future.result().values)
+        self.values = {name: plain(value) for name, value in zip(names, values, strict=False) if value is not None}
+        self._on_change(self.values)

@@ -2,19 +2,19 @@
 
 import pytest
 
-from exo_gravity.core.compensation.command_fade import CommandFade, Output
+from exo_gravity.core.compensation.limiter import CommandFade, Output
 
 EFFORT = (2.0, -4.0)
 
 
 def active(now: float = 10.0) -> CommandFade:
-    fade = CommandFade(timeout=0.05, fade_time=2.0)
+    fade = CommandFade(0.05)
     assert fade.take(now, EFFORT)
     return fade
 
 
 def test_nothing_is_sent_before_the_first_effort_nor_while_efforts_arrive():
-    fade = CommandFade(0.05, 2.0)
+    fade = CommandFade(0.05)
     fade.withdraw(1.0, "no trunk tilt yet")
     assert fade.tick(1.0) is None and fade.state is Output.WAITING and not fade.problem
     fade.take(10.0, EFFORT)

@@ -1,0 +1,297 @@
+"""Damping, spring, coupling and soft limits: terms that depend on where the joints are, and how fast they move.
+
+The torque reaches the joint late: the motor's reply, the computation, the bus. DELAY is what every term must bear
+without harm; the tests vary it from 0 to 10 ms. A stiffness or viscosity that the arm cannot bear is refused.
+"""
+
+from __future__ import annotations
+
+import bisect
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.gravity import Torque
+from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.params import check_owned, owned
+
+DELAY = 0.015  # s from a reading to its torque: 10 ms, and half of a 10 ms cycle in which the torque is held
+LATE = 2.0 * DELAY  # s: a spring of k Nm/rad needs the damping LATE k, in Nm s/rad, to be passive despite the delay
+SPRING_EFFORT = (1.0, 2.0, 1.0, 1.0)  # Nm that a spring may give: a hand overcomes it
+COUPLING_EFFORT = 1.0  # Nm on the joint that follows
+EDGE_STIFFNESS = (10.0,) * JOINT_COUNT  # Nm/rad: the whole torque 0.1 and 0.2 rad beyond the edge
+EDGE_SHARE = 0.8  # of the stiffness that the arm can bear, where that is less
+EDGE = 0.05  # rad beyond the edge over which the damping rises, so that it does not set in with a jolt
+FREE = 3.15  # rad: no edge
+MAX_PATH_SPEED = 2.0  # rad/s between two poses of a path
+
+
+class TermState(NamedTuple):
+    """The arm as the terms see it."""
+
+    #: s
+    time: float
+    #: s since the last state, 0 for the first
+    dt: float
+    #: (4,) rad
+    position: Sequence[float]
+    #: (4,) rad/s
+    velocity: Sequence[float]
+    #: (4,) rad/s^2, low-passed
+    acceleration: Sequence[float]
+    #: (4,) Nm of gravity compensation
+    gravity: Sequence[float]
+    #: s since the spring's settings
+    elapsed: float
+
+
+class Term(Protocol):
+    """One contribution to the torque on top of gravity compensation.
+
+    Most are frozen dataclasses of parameters, and `on` if these ask for any torque; by default they do not.
+    """
+
+    def torque(self, state: TermState) -> Torque:
+        """Return the torque (4,) in Nm that the motors add."""
+        ...
+
+
+@dataclass(frozen=True)
+class Damping:
+    """Virtual viscosity, as a therapist sets it for resistance; it takes energy, except for what comes late."""
+
+    viscosity: Sequence[float] = owned((0.0,) * 4, "virtual viscous friction; 0: off", (0.0, 5.0), "Nm s/rad")
+
+    def __post_init__(self) -> None:
+        check_owned(self)
+
+    @property
+    def on(self) -> bool:
+        """Whether the term gives torque."""
+        return any(self.viscosity)
+
+    def check(self, least_inertia: Sequence[float]) -> None:
+        """Raise ParameterError unless the viscosity damps these inertias (4,) kg m^2 although it acts late."""
+        _check_stable("damping.viscosity", self.viscosity, [i / (2.0 * DELAY) for i in least_inertia], "Nm s/rad")
+
+    def torque(self, state: TermState) -> Torque:
+        """Return the torque (4,) in Nm, against the motion."""
+        b, v = self.viscosity, state.velocity
+        return -b[0] * v[0], -b[1] * v[1], -b[2] * v[2], -b[3] * v[3]
+
+
+@dataclass(frozen=True)
+class PosePath:
+    """Poses over time. Raises ParameterError."""
+
+    #: (n,) s from 0 on, rising
+    times: tuple[float, ...]
+    #: (n, 4) rad
+    poses: tuple[tuple[float, ...], ...]
+
+    def __post_init__(self) -> None:
+        rising = all(a < b for a, b in itertools.pairwise(self.times))
+        if not (self.times and rising and self.times[0] == 0.0 and math.isfinite(self.times[-1])):
+            raise ParameterError("times of a path", list(self.times[:3]), "rising from 0")
+        if len(self.poses) != len(self.times) or not all(map(_is_pose, self.poses)):
+            raise ParameterError("poses of a path", len(self.poses), f"{len(self.times)} poses of 4 angles in rad")
+        points = list(zip(self.times, self.poses, strict=True))
+        for (t, a), (u, b) in itertools.pairwise(points):
+            if math.dist(a, b) > MAX_PATH_SPEED * (u - t):
+                expected = f"at most {MAX_PATH_SPEED:g} rad/s"
+                raise ParameterError(f"speed of the path from {t:g} s on", math.dist(a, b) / (u - t), expected)
+
+    @classmethod
+    def of_rows(cls, numbers: Sequence[float]) -> PosePath:
+        """Return the path of rows of the time in s and four angles in rad, one after another. Raises ParameterError."""
+        rows = [tuple(numbers[i : i + 5]) for i in range(0, len(numbers), 5)]
+        return cls(tuple(row[0] for row in rows), tuple(row[1:] for row in rows))
+
+    def at(self, elapsed: float) -> Sequence[float]:
+        """Return the pose (4,) in rad `elapsed` s after the start; the last one after the end."""
+        i = bisect.bisect_right(self.times, elapsed)
+        if i == 0 or i == len(self.times):
+            return self.poses[max(0, i - 1)]
+        share = (elapsed - self.times[i - 1]) / (self.times[i] - self.times[i - 1])
+        return [a + share * (b - a) for a, b in zip(self.poses[i - 1], self.poses[i], strict=True)]
+
+
+@dataclass(frozen=True)
+class Spring:
+    """Pulls the joints towards a pose, or along a recorded path, with a limited torque.
+
+    Towards a pose it returns what energy it took, less its damping. A path moves the pose, and gives at most the
+    limited torque times the way along the path. Raises ParameterError.
+    """
+
+    stiffness: Sequence[float] = owned((0.0,) * 4, "virtual spring towards the pose; 0: off", (0.0, 50.0), "Nm/rad")
+    pose: Sequence[float] = owned(
+        (0.0, 0.3, 0.3, 0.5),
+        "pose that it pulls towards, or a path: rows of s and 4 angles",
+        unit="rad",
+        any_length=True,
+    )
+    #: largest torque, (4,) Nm
+    max_effort: Sequence[float] = SPRING_EFFORT
+    #: in place of `pose`
+    path: PosePath | None = None
+
+    def __post_init__(self) -> None:
+        check_owned(self)
+        object.__setattr__(self, "pose", tuple(self.pose))
+        if self.path is None and len(self.pose) != JOINT_COUNT:
+            object.__setattr__(self, "path", PosePath.of_rows(self.pose))
+        elif not _is_pose(self.pose[:JOINT_COUNT]):
+            raise ParameterError("spring.pose", list(self.pose), "4 angles from -3.15 to 3.15 rad")
+
+    @property
+    def on(self) -> bool:
+        """Whether the term gives torque."""
+        return any(self.stiffness)
+
+    def check(self, least_inertia: Sequence[float]) -> None:
+        """Raise ParameterError unless the spring is stable on these inertias (4,) kg m^2."""
+        _check_stable("spring.stiffness", self.stiffness, stable_stiffness(least_inertia), "Nm/rad")
+
+    def torque(self, state: TermState) -> Torque:
+        """Return the torque (4,) in Nm."""
+        pose = self.path.at(state.elapsed) if self.path else self.pose
+        torque = []
+        columns = zip(self.stiffness, pose, state.position, state.velocity, self.max_effort, strict=True)
+        for k, to, q, v, most in columns:
+            torque.append(clamp(k * (to - q), most) - LATE * k * v)
+        return tuple(torque)
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """One joint follows others by a ratio, as in the shoulder rhythm of the exoskeleton HARMONY.
+
+    A spring between them, of which all feel their part: torque on the follower alone could be turned into energy by
+    moving the joints in a circle. Raises ParameterError.
+    """
+
+    stiffness: Sequence[float] = owned(
+        (0.0,) * 4,
+        "torque per angle of each joint on the joint with the largest entry, which follows: "
+        "[0, -1, 2, 0] pulls flexion to half of abduction; zeros: off",
+        (-50.0, 50.0),
+        "Nm/rad",
+    )
+    #: largest torque on the follower, Nm
+    max_effort: float = COUPLING_EFFORT
+
+    def __post_init__(self) -> None:
+        check_owned(self)
+        if sum(map(bool, self.stiffness)) == 1:
+            raise ParameterError("coupling.stiffness", list(self.stiffness), "of two joints or more, or zeros")
+
+    @property
+    def on(self) -> bool:
+        """Whether the term gives torque."""
+        return any(self.stiffness)
+
+    @property
+    def largest(self) -> float:
+        """Stiffness on the follower, Nm/rad."""
+        return max(map(abs, self.stiffness))
+
+    def check(self, least_inertia: Sequence[float]) -> None:
+        """Raise ParameterError unless the spring is stable on these inertias (4,) kg m^2."""
+        pairs = zip(self.stiffness, least_inertia, strict=True)
+        most = 1.0 / sum((k / self.largest) ** 2 / inertia for k, inertia in pairs) / (4.0 * DELAY**2)
+        if self.largest > most:
+            expected = f"at most {most:.2f} Nm/rad, which {1000 * DELAY:.0f} ms late is stable"
+            raise ParameterError("coupling.stiffness", self.largest, expected)
+
+    def torque(self, state: TermState) -> Torque:
+        """Return the torque (4,) in Nm on the follower and on the joints that it follows."""
+        k, q, v, largest = self.stiffness, state.position, state.velocity, self.largest
+        stretch = k[0] * q[0] + k[1] * q[1] + k[2] * q[2] + k[3] * q[3]
+        damping = LATE * (k[0] * v[0] + k[1] * v[1] + k[2] * v[2] + k[3] * v[3])
+        pull = (clamp(-stretch, self.max_effort) - damping) / largest
+        return k[0] * pull, k[1] * pull, k[2] * pull, k[3] * pull
+
+
+@dataclass(frozen=True)
+class SoftLimits:
+    """Springs at the edge of a workspace that a therapist chooses, within the joint limits of `can_bridge`.
+
+    Raises ParameterError.
+    """
+
+    range: Sequence[float] = owned(
+        (-FREE, FREE) * 4, f"lower and upper edge of each joint's workspace; {FREE:g}: none", (-FREE, FREE), "rad"
+    )
+    #: of the springs beyond the edges, (4,) Nm/rad
+    stiffness: Sequence[float] = EDGE_STIFFNESS
+    #: largest torque of the springs, (4,) Nm
+    max_effort: Sequence[float] = SPRING_EFFORT
+
+    def __post_init__(self) -> None:
+        check_owned(self)
+        if not all(low < high for low, high in zip(self.lower, self.upper, strict=True)):
+            raise ParameterError("limits.range", list(self.range), "lower and upper edge of each joint, rising")
+
+    @property
+    def lower(self) -> Sequence[float]:
+        """Lower edges (4,) in rad."""
+        return self.range[0::2]
+
+    @property
+    def upper(self) -> Sequence[float]:
+        """Upper edges (4,) in rad."""
+        return self.range[1::2]
+
+    @property
+    def on(self) -> bool:
+        """Whether the term gives torque."""
+        return any(abs(edge) < FREE for edge in self.range)
+
+    def on_arm(self, least_inertia: Sequence[float]) -> SoftLimits:
+        """Return these limits as stiff as an arm of these inertias (4,) kg m^2 can bear."""
+        most = [EDGE_SHARE * limit for limit in stable_stiffness(least_inertia)]
+        return replace(self, stiffness=tuple(map(min, self.stiffness, most)))
+
+    def torque(self, state: TermState) -> Torque:
+        """Return the torque (4,) in Nm: none inside, back towards the workspace outside."""
+        torque = []
+        columns = zip(
+            self.stiffness, self.lower, self.upper, state.position, state.velocity, self.max_effort, strict=True
+        )
+        for k, low, high, q, v, most in columns:
+            if low <= q <= high:
+                torque.append(0.0)
+                continue
+            depth = q - high if q > high else q - low
+            damping = LATE * k * min(1.0, abs(depth) / EDGE)
+            torque.append(clamp(-k * depth, most) - damping * v)
+        return tuple(torque)
+
+
+def clamp(value: float, limit: float) -> float:
+    """Return `value` limited to -limit..limit."""
+    return max(-limit, min(limit, value))
+
+
+def stable_stiffness(least_inertia: Sequence[float]) -> list[float]:
+    """Return the stiffness (4,) in Nm/rad that can be damped on these inertias (4,) kg m^2.
+
+    A spring that acts DELAY late gives the energy of a damping of -stiffness * DELAY. Virtual damping acts as late, so
+    inertia / (2 DELAY) is the most that damps: twice what the spring needs.
+    """
+    return [inertia / (4.0 * DELAY**2) for inertia in least_inertia]
+
+
+def _check_stable(name: str, values: Sequence[float], most: Sequence[float], unit: str) -> None:
+    """Raise ParameterError that names `name` unless `values` (4,) are at most `most` (4,), both in `unit`."""
+    if any(value > limit for value, limit in zip(values, most, strict=True)):
+        shown = [round(limit, 3) for limit in most]
+        raise ParameterError(name, list(values), f"at most {shown} {unit}, which {1000 * DELAY:.0f} ms late is stable")
+
+
+def _is_pose(pose: Sequence[float]) -> bool:
+    return len(pose) == JOINT_COUNT and all(abs(angle) <= FREE for angle in pose)

@@ -1,0 +1,259 @@
+"""The arm that `compensator` carries: its parameters, its compensator, and what is reported of it.
+
+The exoskeleton's own arm has its laws, a wearer, terms, an outer loop and a torque budget. With `law: urdf` it is any
+serial arm, whose URDF comes from a file or from `robot_description`, with gravity compensation alone.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+
+from exo_gravity.core.compensation.compensator import Answer, Compensator
+from exo_gravity.core.compensation.params import (
+    COMPENSATOR,
+    MAX_JOINTS,
+    compensator_table,
+    settings_of,
+    urdf_settings_of,
+    urdf_table,
+)
+from exo_gravity.core.compensation.settings import URDF_LAW, Settings, UrdfSettings
+from exo_gravity.core.compensation.terms.assist import AssistInput
+from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.model.anfis import AnfisLaw
+from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.model.budget import BRIDGE_PARAMETERS, BudgetRequest, overload
+from exo_gravity.core.params import values_of
+from exo_gravity.core.safety.params import CAN_BRIDGE
+from exo_gravity.hardware.urdf_arm import UrdfArm
+from exo_gravity.nodes.ros.budget_thread import BudgetThread
+from exo_gravity.nodes.ros.hot_path import LATCHED, HotPath
+from exo_gravity.nodes.ros.messages import row, to_nanoseconds
+from exo_gravity.nodes.ros.parameters import NodeParameters, declare
+from exo_gravity.nodes.ros.sole_publisher import SolePublisher
+
+DESCRIPTION_TIMEOUT = 10.0  # s in which robot_description must arrive
+WITHIN = "within rated torque everywhere"
+
+
+class ControlledArm:
+    """Parameters, control and reports of the node's arm. lock: guards `control`."""
+
+    def __init__(self, node: Node, lock: threading.Lock) -> None:
+        given = node.get_parameters_by_prefix("")
+        self._model: UrdfArm | None = None
+        is_urdf = node.has_parameter("law") and node.get_parameter("law").value == URDF_LAW
+        self.table = urdf_table(len(_joint_names(node)), given) if is_urdf else compensator_table(given)
+        if is_urdf:
+            _forget_unused(node, {param.name for param in self.table})
+        self.values = declare(node, self.table)
+        names = self.values["joint_names"]
+        if is_urdf:
+            self._model = UrdfArm(_description(node, self.values), names)
+        self.control = Compensator(self.read(self.values), names)
+        terms = self.control.terms
+        self._assist = AssistEfforts(node, terms.assist, lock) if terms else None
+        self._budget = BudgetWatch(node, names) if terms else None
+
+    def read(self, values: dict[str, Any]) -> Settings | UrdfSettings:
+        """Return the settings that parameter values describe, with the file they name. Raises ParameterError."""
+        if self._model is not None:
+            return urdf_settings_of(values, self._model)
+        path = values["anfis_file"]
+        try:
+            anfis = AnfisLaw.load(Path(path).read_text(encoding="utf-8")) if path else None
+        except (OSError, UnicodeDecodeError, DataError) as error:
+            raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
+        return settings_of(values, anfis)
+
+    @property
+    def failure(self) -> Exception | None:
+        """The exception that ended the thread of the outer loop's efforts."""
+        return self._assist.messages.failure if self._assist else None
+
+    def start(self) -> None:
+        """Start the thread of the outer loop's efforts."""
+        if self._assist:
+            self._assist.messages.start()
+
+    def stop(self) -> None:
+        """End it, before the node is destroyed."""
+        if self._assist:
+            self._assist.messages.stop()
+
+    def update(self) -> None:
+        """Keep the torque budget up to date."""
+        if self._budget and isinstance(self.control.settings, Settings):
+            self._budget.update(self.control.settings)
+
+    def on_motion(self, *sample: Any) -> None:
+        """Use a sample of the trunk's motion."""
+        if self.control.settings.inertial:
+            self.control.set_motion(*sample)
+
+    def concern(self, answer: Answer) -> str:
+        """Return why the arm is not carried as set; '' if it is."""
+        if answer.fallback:
+            return f"the exact law replaces {self.control.settings.law}: {answer.fallback}"
+        problem = self.control.terms.problem if self.control.terms else ""
+        return f"gravity compensation alone: {problem}" if problem else ""
+
+    def report(self, answer: Answer) -> dict[str, object]:
+        """Return the current values for /diagnostics."""
+        s, terms = self.control.settings, self.control.terms
+        if isinstance(s, UrdfSettings):
+            carried, limits = f"{s.arm.mass:.3f}", row(s.max_effort)
+            return {"law": s.law, "mass carried (kg)": carried, "gain": row(s.gain), "max effort (Nm)": limits}
+        values: dict[str, object] = {
+            "law": s.law,
+            "law in use": "exact" if answer.fallback else s.law,
+            "mode": s.mode,
+            "support": s.support,
+            "robot mass (kg)": "not known" if s.robot.by_moments else row(s.robot.mass),
+            "robot cog (m)": "not known" if s.robot.by_moments else row(s.robot.cog),
+            "robot moments (kg m)": row((*s.robot.first_moment, *s.robot.off_axis)),
+            "wearer mass (kg)": row(s.wearer_mass),
+            "wearer cog (m)": row(s.wearer_cog),
+            "mass carried (kg)": f"{s.arm.total_mass:.3f}",
+            "max effort (Nm)": row(s.max_effort),
+        }
+        if terms and self._budget:
+            values["terms"] = ", ".join(terms.active) or "none"
+            values["assist"] = terms.assist.report
+            values["inertia tank (J)"] = f"{terms.energy:.2f}"
+            values["budget"] = self._budget.text
+        return values
+
+
+def sentence(s: Settings | UrdfSettings) -> str:
+    """Return settings in a sentence for the log."""
+    if isinstance(s, UrdfSettings):
+        return f"law {s.law}, {s.count} joints: compensates {s.arm.mass:.2f} kg, at most {row(s.max_effort)} Nm"
+    of_wearer = f", wearer {row(s.wearer_mass)} kg at {row(s.wearer_cog)} m" if any(s.wearer_mass) else ""
+    return (
+        f"{s.side} arm, law {s.law}, mode {s.mode}, support {s.support:g}: compensates {s.arm.total_mass:.2f} kg, "
+        f"at most {row(s.max_effort)} Nm; robot {_of_robot(s.robot)}{of_wearer}"
+    )
+
+
+def _of_robot(robot: ArmModel) -> str:
+    along = f"{row(robot.mass)} kg at {row(robot.cog)} m"
+    if robot.by_moments:
+        along = f"moments {row(robot.first_moment)} kg m"
+    return f"{along}, across the links {row(robot.off_axis)} kg m" if any(robot.off_axis) else along
+
+
+class AssistEfforts:
+    """Passes each message on the topic `assist_efforts` to `assist` on its own thread, holding `lock`."""
+
+    def __init__(self, node: Node, assist: AssistInput, lock: threading.Lock) -> None:
+        self._clock = node.get_clock()
+        self._assist = assist
+        self._lock = lock
+        self._sole = SolePublisher(node, "assist_efforts")
+        self._sender = 0  # changes whenever a message comes from another publisher than the one before
+        self.messages = HotPath(node, JointState, "assist_efforts", self._on_efforts)
+
+    def _on_efforts(self, message: JointState, info: dict[str, Any]) -> None:
+        now = time.monotonic()
+        age = (self._clock.now().nanoseconds - to_nanoseconds(message.header.stamp)) * 1e-9
+        self._sender += self._sole.is_another(info)
+        with self._lock:
+            self._assist.receive(now, message.name, message.effort, now - age, self._sender)
+
+
+class BudgetWatch:
+    """Checks whether the motors can provide the torque that the settings require, outside the control loop.
+
+    Call `update` regularly; `text` is the result for the newest settings that were checked. Motors and joint limits
+    are parameters of `can_bridge`, which are read once.
+    """
+
+    def __init__(self, node: Node, joint_names: Sequence[str]) -> None:
+        self.text = "unknown: waiting for can_bridge's parameters"
+        self._logger = node.get_logger()
+        self._names = tuple(joint_names)
+        self._bridge: dict[str, Any] = {}
+        self._parameters = NodeParameters(node, "can_bridge", self._on_bridge, BRIDGE_PARAMETERS)
+        self._thread = BudgetThread()
+
+    def update(self, settings: Settings) -> None:
+        """Collect a finished budget, and start one for `settings` if they are new. Never blocks."""
+        self._parameters.update()
+        if not self._bridge:
+            return
+        s = settings
+        support = s.support if s.mode == "zero_g" else 0.0
+        load = s.wearer_mass, s.wearer_cog
+        if self._thread.update(BudgetRequest.of(s.robot, load, support, self._bridge, s.use_imu)):
+            result = self._thread.result or ()
+            if isinstance(result, ParameterError):
+                self._note(f"unknown: can_bridge has {result}")
+            else:
+                self._note(overload(self._names, result) or WITHIN)
+
+    def _on_bridge(self, values: dict[str, Any]) -> None:
+        table = [param for param in CAN_BRIDGE if param.name in BRIDGE_PARAMETERS]
+        try:
+            self._bridge = values_of(table, values)
+        except ParameterError as error:
+            self._note(f"unknown: can_bridge has {error}")
+        self._parameters.destroy()  # the executor then waits for two entities less
+
+    def _note(self, text: str) -> None:
+        self.text = text
+        if text != WITHIN:
+            self._logger.warning(f"{text}; efforts stay clamped to max_effort")
+
+
+def _forget_unused(node: Node, used: set[str]) -> None:
+    """Undeclare the parameters of the exoskeleton's own arm, which a file may have, and log them."""
+    unused = [param.name for param in COMPENSATOR if param.name not in used and node.has_parameter(param.name)]
+    for name in unused:
+        node.undeclare_parameter(name)
+    if unused:
+        node.get_logger().warning(f"law {URDF_LAW} takes the arm from its URDF and ignores {', '.join(unused)}")
+
+
+def _joint_names(node: Node) -> list[str]:
+    names = list(node.get_parameter("joint_names").value or ()) if node.has_parameter("joint_names") else []
+    if not 1 <= len(set(names)) == len(names) <= MAX_JOINTS:
+        raise ParameterError("joint_names", names, f"1 to {MAX_JOINTS} different joints of the URDF")
+    return names
+
+
+def _description(node: Node, values: dict[str, Any]) -> str:
+    """Return the URDF from its file or topic. Raises ParameterError."""
+    path = values["urdf.file"]
+    if not path:
+        return _published(node, values["urdf.topic"])
+    try:
+        return Path(path).expanduser().read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ParameterError("urdf.file", path, f"a URDF file ({error})") from None
+
+
+def _published(node: Node, topic: str) -> str:
+    received: list[String] = []
+    subscription = node.create_subscription(String, topic, received.append, LATCHED)
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    end = time.monotonic() + DESCRIPTION_TIMEOUT
+    while not received and time.monotonic() < end and rclpy.ok(context=node.context):
+        executor.spin_once(timeout_sec=0.1)
+    executor.remove_node(node)
+    executor.shutdown()
+    node.destroy_subscription(subscription)
+    if not received:
+        raise ParameterError("urdf.topic", topic, f"published, latched, within {DESCRIPTION_TIMEOUT:g} s")
+    return received[0].data

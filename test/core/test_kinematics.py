@@ -1,0 +1,123 @@
+"""The arm's inertia against Pinocchio's rnea and crba; the torque that turns it with its base against MuJoCo."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+import exo_gravity.sim.arm
+from exo_gravity.core import ArmModel
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.kinematics import LinkInertia, turning_torque
+from exo_gravity.sim import ArmConfig, SimulatedArm
+from exo_gravity.sim.arm import DEFAULT_LINKS
+from exo_gravity.sim.base_motion import rotation_in_base
+from exo_gravity.tools.inputs.references import OFFSET, pinocchio_model
+
+from .test_gravity_oracles import random_arm
+
+ROUNDING = 1e-10  # Nm; torques reach 100 Nm
+NO_ROTORS = (0.0,) * 4
+
+
+def with_rods(arm: ArmModel) -> tuple[Any, Any, Any]:
+    """Return Pinocchio, and the arm as its model of thin rods without gravity."""
+    pin, model = pinocchio_model(arm)
+    for n in range(4):
+        across = float(arm.mass[n] * arm.length[n] ** 2 / 12.0)
+        at_cog = pin.SE3(pin.utils.rotate("z", OFFSET[n]), np.zeros(3)) * pin.SE3(
+            np.eye(3), np.array((arm.cog[n], 0.0, 0.0))
+        )
+        # Added to the point mass that is there; the vanishing mass keeps the sum regular.
+        rod = pin.Inertia(1e-14, np.zeros(3), np.diag((0.0, across, across)))
+        model.inertias[n + 1] = model.inertias[n + 1] + at_cog.act(rod)
+    model.gravity.linear = np.zeros(3)
+    return pin, model, model.createData()
+
+
+def test_torque_and_mass_matrix_agree_with_pinocchio_for_random_arms_and_motions():
+    rng = np.random.default_rng(1)
+    for _ in range(10):
+        arm = random_arm(rng)
+        pin, model, data = with_rods(arm)
+        links = LinkInertia.of(arm, NO_ROTORS)
+        for theta, velocity, acceleration in rng.uniform(-3.0, 3.0, (30, 3, 4)):
+            expected = pin.rnea(model, data, theta, velocity, acceleration)
+            assert links.torque(theta, velocity, acceleration) == pytest.approx(expected, abs=ROUNDING)
+            upper = np.triu(pin.crba(model, data, theta))
+            assert np.triu(links.matrix(theta)) == pytest.approx(upper, abs=ROUNDING)
+            assert links.matrix(theta) == pytest.approx(links.matrix(theta).T, abs=ROUNDING)
+
+
+def test_each_rotor_turns_with_its_own_joint():
+    arm, theta, acceleration = random_arm(np.random.default_rng(2)), (0.1, 0.2, 0.3, 0.4), (1.0, -2.0, 3.0, 5.0)
+    rotors = (0.1, 0.2, 0.3, 0.4)
+    with_rotors, without = (LinkInertia.of(arm, r).torque(theta, NO_ROTORS, acceleration) for r in (rotors, NO_ROTORS))
+    assert np.subtract(with_rotors, without) == pytest.approx(np.multiply(rotors, acceleration))
+
+
+def test_the_least_inertia_is_below_that_of_any_pose():
+    arm = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
+    links, rng = LinkInertia.of(arm), np.random.default_rng(3)
+    poses = rng.uniform((-1.6, 0.0, 0.0, 0.0), (1.6, 2.6, 2.5, 2.6), (300, 4))
+    felt = np.array([1.0 / np.diag(np.linalg.inv(links.matrix(pose))) for pose in poses])
+    assert np.all(felt > 0.97 * np.array(links.least()))
+
+
+def test_an_arm_given_by_its_moments_is_refused():
+    with pytest.raises(ParameterError, match="needs mass and cog"):
+        LinkInertia.of(ArmModel.from_moments((0.05, 0.13, 0.3, 0.3), (0.1, 0.2, 0.2, 0.03), (0.0,) * 4))
+
+
+def test_a_hanging_pendulum_has_the_inertia_of_a_rod():
+    arm = ArmModel((0.0, 0.0, 0.0, 0.3), (0.0, 0.0, 0.0, 0.15), (0.1, 0.1, 0.1, 0.6))
+    torque = LinkInertia.of(arm, NO_ROTORS).torque(NO_ROTORS, NO_ROTORS, (0.0, 0.0, 0.0, 2.0))
+    assert torque[3] == pytest.approx(2.0 * 0.6 * 0.3**2 / 3.0)
+    assert math.isclose(torque[2], torque[3])
+
+
+FREE = {name: (0.0,) * 4 for name in ("coulomb_friction", "viscous_friction", "rotor_inertia")}
+
+
+def left_behind(side, angular_acceleration, theta, torque):
+    """Return by how much (4,) rad/s^2 the arm's joints accelerate on a base that turns, without gravity."""
+    arm = SimulatedArm(ArmConfig(**FREE))
+    arm.reset(theta)
+    arm.move_base((0.0,) * 3, (0.0,) * 3, rotation_in_base(side, angular_acceleration))
+    arm.step(torque)
+    return arm.data.qacc.copy()
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_the_torque_takes_an_arm_of_slender_rods_along_with_its_base(side, monkeypatch):
+    monkeypatch.setattr(exo_gravity.sim.arm, "_TUBE_RADIUS", 1e-4)
+    rng = np.random.default_rng(5)
+    for _ in range(30):
+        theta, turning = rng.uniform((-1.5, 0, -0.7, 0), (1.5, 3, 2, 3)), rng.uniform(-3, 3, 3)
+        torque = turning_torque(DEFAULT_LINKS, side, theta, turning)
+        np.testing.assert_allclose(left_behind(side, turning, theta, torque), 0.0, atol=1e-4)
+
+
+def test_without_the_torque_the_arm_is_left_behind():
+    assert np.abs(left_behind("left", (1.0, 1.0, 0.0), (0.0, 0.4, 0.5, 1.0), (0.0,) * 4)).max() > 0.5
+
+
+def test_an_arm_given_by_its_moments_needs_about_the_same():
+    arm = ArmModel.from_moments(DEFAULT_LINKS.length, DEFAULT_LINKS.first_moment)
+    rng = np.random.default_rng(6)
+    theta, turning = rng.uniform(0.0, 1.5, (30, 4)), rng.uniform(-3, 3, (30, 3))
+    exact, guessed = (
+        np.array([turning_torque(links, "left", *row) for row in zip(theta, turning, strict=True)])
+        for links in (DEFAULT_LINKS, arm)
+    )
+    assert np.sqrt(np.mean((guessed - exact) ** 2)) < 0.15 * np.sqrt(np.mean(exact**2))
+
+
+def test_the_gains_scale_the_torque():
+    half = ArmModel(DEFAULT_LINKS.length, DEFAULT_LINKS.cog, DEFAULT_LINKS.mass, (0.5,) * 4)
+    pose, turning = (0.1, 0.4, 0.5, 1.0), (1.0, 2.0, 0.0)
+    whole = turning_torque(DEFAULT_LINKS, "left", pose, turning)
+    np.testing.assert_allclose(turning_torque(half, "left", pose, turning), 0.5 * np.array(whole))
