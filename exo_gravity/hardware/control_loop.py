@@ -1,11 +1,11 @@
-"""The control thread of one arm: get the efforts, decide, command all motors, collect replies; at a fixed rate.
+"""The control loop of one arm: get the efforts, decide, command all motors, collect replies; at a fixed rate.
 
-Each cycle fetches the newest efforts from `get_efforts`. Other threads use `call` to run a function on the control
-thread between two cycles. The loop is paced by absolute monotonic deadlines, so that the rate does not drift.
+Each cycle fetches the newest efforts from `get_efforts`. Other threads use `call` to run a function between two cycles.
+The loop is paced by absolute deadlines on the clock of its bus, so that the rate does not drift.
 
-An exception anywhere lets the arm down: one in `get_efforts` counts as withdrawn efforts, one of the bus as a silent
-bus, one in the state machine as a fault. If the state machine keeps failing, the watchdog takes over from the last
-noted drive; without a watchdog, this thread lowers the arm (hardware/ownership/last_resort.py).
+An exception anywhere lets the arm down: one in `get_efforts` is treated as withdrawn efforts, one of the bus as a
+silent bus, one in the state machine as a fault. If the state machine keeps failing, the watchdog takes over from the
+last noted drive; without a watchdog, the loop lowers the arm without the state machine (`lower`).
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from __future__ import annotations
 import contextlib
 import math
 import threading
-import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from queue import Empty, SimpleQueue
@@ -21,38 +20,43 @@ from typing import Any, NamedTuple
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.bus_load import REPLY_SHARE
-from exo_gravity.core.safety.drive import CARRYING, OFF, State
+from exo_gravity.core.safety.drive import CARRYING, OFF, Drive, State
 from exo_gravity.core.safety.faults import FaultCode
 from exo_gravity.core.safety.limits import JointSample
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.ownership import last_resort
 
 EFFORT_WAIT = 0.5  # share of a cycle's idle time for which the loop may wait for late efforts
 SMOOTHING = 0.02  # per cycle, of the measured work time
 MAX_ERRORS = 3  # unexpected exceptions in a row after which the state machine is no longer trusted
 HAND_OVER_TIME = 0.5  # s in which a watchdog that takes over has ended this process
 
+# Lowering an arm without the state machine.
+LOWERING_FADE = 10.0  # s in which the torque fades
+LOWERING_DAMPING = 5.0  # Nm s/rad, the range of kd on the wire
+REST_TIME = 10.0  # s for which the joints must be at rest,
+REST = 0.005  # rad that one may turn in that time
+REPLY_TIMEOUT = 0.1  # s without a reply after which a motor's position is not known
+
 
 class EffortCommand(NamedTuple):
-    """effort: (4,) Nm, or None to withdraw. answered: monotonic s, when the joint states that it answers were taken."""
+    """What the motors are to apply."""
 
-    effort: Sequence[float] | None
-    answered: float
+    effort: Sequence[float] | None  #: (4,) Nm, or None to withdraw.
+    answered: float  #: s, when the joint states that it answers were taken.
 
 
 NO_COMMAND = EffortCommand(None, -math.inf)
 
 
 class ControlLoop:
-    """Owns `bus` and `safety` from `start` until its thread has ended.
+    """Owns `bus` and `safety` until it has ended. Its clock is that of the bus.
+
+    `start` repeats `cycle` on a thread. A loop that was not started is run by its owner, one `cycle` after another.
 
     get_efforts(latest) is called before every exchange and returns the newest efforts, for which it may wait until
-    `latest` (monotonic s). on_cycle(now, samples) is called after every exchange; its errors do not stop the control.
+    `latest` (s). on_cycle(now, samples) is called after every exchange; its errors do not stop the control.
     hand_over(reason) requests the watchdog to end this process and let the arm down; it returns whether one is there.
-    period: s of a cycle; it may change. cycles, late, incomplete: counts of all cycles, of those that began more than a
-    period late, and of those in which not every motor replied in time. failure: the exception that ended the control,
-    if any. cycle_errors: count of exceptions in on_cycle; cycle_error is the last one.
     """
 
     def __init__(
@@ -64,31 +68,56 @@ class ControlLoop:
         get_efforts: Callable[[float], EffortCommand] = lambda latest: NO_COMMAND,
         hand_over: Callable[[str], bool] = lambda reason: False,
     ) -> None:
-        self.cycles = self.late = self.incomplete = self.cycle_errors = 0
-        self.cycle_error = ""
-        self.failure: BaseException | None = None
+        #: The state machine. It starts in its present state, DISABLED unless a `call` changed it.
         self.safety = safety
-        self._bus = bus
+        #: s of a cycle; it may change between two cycles.
         self.period = period
+        #: Counts of all cycles, of those that began more than a period late, and of those in which not every motor
+        #: replied in time.
+        self.cycles = self.late = self.incomplete = 0
+        #: Count of exceptions in on_cycle, and the last one.
+        self.cycle_errors, self.cycle_error = 0, ""
+        #: The exception that ended the control, if any.
+        self.failure: BaseException | None = None
+        self._bus = bus
+        self._clock = bus.clock
+        self._now = bus.clock.monotonic
         self._on_cycle = on_cycle
         self._get_efforts = get_efforts
         self._hand_over = hand_over
+        self._due = self._now()  # of the next cycle
+        self._errors = 0  # in a row
         self._drive = OFF  # last decided
         self._foreign_commands = 0  # so far
         self._work = period  # s per cycle, without waiting for efforts; smoothed
         self._calls: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
-        self._is_stopping = self._is_abandoned = False
+        self._is_stopping = self._is_abandoned = self._has_ended = False
         self._thread = threading.Thread(target=self._run, name="control", daemon=True)
 
     def start(self) -> None:
-        """Start the thread. The state machine starts in its present state, DISABLED unless a `call` changed it."""
+        """Start the thread."""
         self._thread.start()
 
-    def call(self, function: Callable[[], Any]) -> Future[Any]:
-        """Run `function` on the control thread between two cycles; the future has its result.
+    def cycle(self) -> bool:
+        """Run one cycle, and wait until the next one is due; return False once the loop has ended."""
+        if self._has_ended:
+            return False
+        try:
+            if not self._is_abandoned and not (self._is_stopping and self.is_off):
+                self._try_cycle()
+                return True
+        except BaseException as error:  # whatever happened, the arm must come down
+            self.failure = error
+            self._resign(f"{type(error).__name__}: {error}")
+        if self._is_abandoned:
+            self._bus.close()
+        else:
+            self._bus.stop()
+        self._has_ended = True
+        return False
 
-        A future that is cancelled before never runs.
-        """
+    def call(self, function: Callable[[], Any]) -> Future[Any]:
+        """Run `function` between two cycles; the future has its result. If it is cancelled before, it never runs."""
         future: Future[Any] = Future()
         self._calls.put((function, future))
         return future
@@ -104,11 +133,6 @@ class ControlLoop:
         return dict(self._bus.ignored)
 
     @property
-    def is_alive(self) -> bool:
-        """Whether the control thread runs."""
-        return self._thread.is_alive()
-
-    @property
     def is_off(self) -> bool:
         """Whether the arm is down and its motors have confirmed that they are off."""
         safety = self.safety
@@ -121,7 +145,7 @@ class ControlLoop:
 
     def trip(self, code: FaultCode, reason: str) -> None:
         """Let the arm down for a fault detected outside the loop."""
-        self.call(lambda: self.safety.trip(code, reason, time.monotonic()))
+        self.call(lambda: self.safety.trip(code, reason, self._now()))
 
     def trip_if_carried(self, code: FaultCode, reason: str) -> None:
         """Let the arm down for something that is a fault only while torque is applied."""
@@ -131,63 +155,58 @@ class ControlLoop:
     def stop(self, timeout: float | None = None) -> bool:
         """Let the arm down, send the last frames, close the bus; return whether that was done within `timeout` s.
 
-        A motor that cannot be reached may still be on, so the thread tries to reach it without end.
+        The thread keeps trying to reach a motor that does not reply, because it may still be on. Without a thread, the
+        remaining cycles run here, whatever `timeout` is.
         """
         self._is_stopping = True
         return self._join(timeout)
 
     def abandon(self) -> None:
-        """End the thread and close the bus without any further frame: the motors keep what they apply."""
+        """End the loop and close the bus without any further frame: the motors keep what they apply."""
         self._is_abandoned = True
         self._join()
 
     def _join(self, timeout: float | None = None) -> bool:
-        if self._thread.ident is not None:
+        if self._thread.ident is None:
+            while self.cycle():
+                pass
+        else:
             self._thread.join(timeout)
-        if self._thread.is_alive():
-            return False
+            if self._thread.is_alive():
+                return False
         with contextlib.suppress(Empty):
             while True:
                 self._calls.get_nowait()[1].cancel()
         return True
 
     def _run(self) -> None:
-        try:
-            self._control()
-        except BaseException as error:  # whatever happened, the arm must come down
-            self.failure = error
-            self._resign(f"{type(error).__name__}: {error}")
-        if self._is_abandoned:
-            self._bus.close()
-        else:
-            self._bus.stop()
+        self._due = self._now()
+        while self.cycle():
+            pass
 
-    def _control(self) -> None:
-        deadline = time.monotonic()
-        errors = 0
-        while not self._is_abandoned and not (self._is_stopping and self.is_off):
-            try:
-                self._cycle(deadline)
-                errors = 0
-            except Exception as error:
-                errors += 1
-                if errors == MAX_ERRORS:
-                    raise
-                self.safety.trip(FaultCode.INTERNAL_ERROR, f"{type(error).__name__}: {error}", time.monotonic())
-            deadline = self._wait(deadline + self.period)
+    def _try_cycle(self) -> None:
+        try:
+            self._control(self._due)
+            self._errors = 0
+        except Exception as error:
+            self._errors += 1
+            if self._errors == MAX_ERRORS:
+                raise
+            self.safety.trip(FaultCode.INTERNAL_ERROR, f"{type(error).__name__}: {error}", self._now())
+        self._due = self._wait(self._due + self.period)
 
     def _resign(self, reason: str) -> None:
         """Hand the arm over to the watchdog, which ends this process; without one, lower the arm."""
         if self._bus.may_be_powered:
             with contextlib.suppress(Exception):
                 if self._hand_over(f"the control loop failed: {reason}"):
-                    time.sleep(HAND_OVER_TIME)
-            last_resort.lower(self._bus, self._drive, self.period)
+                    self._clock.sleep(HAND_OVER_TIME)
+            lower(self._bus, self._drive, self.period)
 
-    def _cycle(self, due: float) -> None:
+    def _control(self, due: float) -> None:
         efforts = self._efforts(due)
         self._run_calls()
-        now = time.monotonic()
+        now = self._now()
         if self._is_stopping:
             self.safety.disable(now)
         drive = self._drive = self.safety.step(now, tuple(self._bus.samples), *efforts)
@@ -198,15 +217,15 @@ class ControlLoop:
             complete = False
         if self._bus.foreign_commands > self._foreign_commands:
             self._foreign_commands = self._bus.foreign_commands
-            self.safety.trip(FaultCode.FOREIGN_COMMAND, self._bus.foreign_command, time.monotonic())
+            self.safety.trip(FaultCode.FOREIGN_COMMAND, self._bus.foreign_command, self._now())
         self.cycles += 1
         self.incomplete += not complete
         try:
-            self._on_cycle(time.monotonic(), self._bus.samples)
+            self._on_cycle(self._now(), self._bus.samples)
         except Exception as error:
             self.cycle_errors += 1
             self.cycle_error = f"{type(error).__name__}: {error}"
-        self._work += SMOOTHING * (time.monotonic() - now - self._work)
+        self._work += SMOOTHING * (self._now() - now - self._work)
 
     def _efforts(self, due: float) -> EffortCommand:
         is_contested = self._bus.is_contested  # then receiving comes first
@@ -215,7 +234,7 @@ class ControlLoop:
             return self._get_efforts(latest)
         except Exception as error:
             reason = f"efforts cannot be received: {type(error).__name__}: {error}"
-            self.safety.trip(FaultCode.INTERNAL_ERROR, reason, time.monotonic())
+            self.safety.trip(FaultCode.INTERNAL_ERROR, reason, self._now())
             return NO_COMMAND
 
     def _run_calls(self) -> None:
@@ -239,10 +258,39 @@ class ControlLoop:
         if self._bus.is_contested:
             with contextlib.suppress(BusError):
                 self._bus.receive_until(deadline)
-        remaining = deadline - time.monotonic()
+        remaining = deadline - self._now()
         if remaining > 0.0:
-            time.sleep(remaining)
+            self._clock.sleep(remaining)
         elif remaining < -self.period:
             self.late += 1
-            return time.monotonic()
+            return self._now()
         return deadline
+
+
+def lower(bus: MotorBus, drive: Drive, period: float) -> None:
+    """Lower an arm whose motors receive `drive`, without the state machine; return once each has replied to EXIT.
+
+    The torque fades slowly under full damping. The damping stays until the joints have been at rest for a while: a
+    joint under damping creeps, and would fall if it were switched off before it hangs. No exception ends this.
+    """
+    now = bus.clock.monotonic
+    start = rest_since = now()
+    rest: Sequence[JointSample] = tuple(bus.samples)
+    while (time := now()) - rest_since < REST_TIME or time - start < LOWERING_FADE:
+        share = max(0.0, 1.0 - (time - start) / LOWERING_FADE)
+        effort = tuple(share * effort for effort in drive.effort)
+        _exchange(bus, Drive(effort, (LOWERING_DAMPING,) * len(effort), True), time + period)
+        if not all(_is_at_rest(time, joint, last) for joint, last in zip(bus.samples, rest, strict=True)):
+            rest_since, rest = time, tuple(bus.samples)
+    while bus.may_be_powered:
+        _exchange(bus, OFF, now() + period)
+
+
+def _is_at_rest(now: float, joint: JointSample, last: JointSample) -> bool:
+    return now - joint.time <= REPLY_TIMEOUT and abs(joint.position - last.position) <= REST
+
+
+def _exchange(bus: MotorBus, drive: Drive, deadline: float) -> None:
+    with contextlib.suppress(Exception):
+        bus.exchange(drive, deadline)
+    bus.clock.sleep(max(0.0, deadline - bus.clock.monotonic()))

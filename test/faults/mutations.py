@@ -24,7 +24,7 @@ COPIED = ("exo_gravity", "test", "config")
 ROW_LIMIT = 240.0  # s for each row, with the start of its nodes
 SAFETY, DESCENT, LIMITS = (f"exo_gravity/core/safety/{name}.py" for name in ("machine", "descent", "limits"))
 ASSIST = "exo_gravity/core/compensation/terms/assist.py"
-BUS_LOCK, WATCHDOG = "exo_gravity/hardware/ownership/bus_lock.py", "exo_gravity/hardware/ownership/watchdog_process.py"
+BUS_LOCK, WATCHDOG = "exo_gravity/hardware/ownership/bus_lock.py", "exo_gravity/hardware/ownership/watchdog.py"
 
 
 class Edit(NamedTuple):

@@ -1,4 +1,4 @@
-"""A process that carries an arm as a bridge does; `python -m test.hardware.carrier FILE`, FILE a pickled charge.
+"""A process that carries an arm as a bridge does; `python -m test.hardware.carrier FILE`, FILE a pickled arm.
 
 It prints the PID of its watchdog once the motors are on and the watchdog runs. Orders, on its standard input:
 "hand over" requests the watchdog to take over, "off" switches the motors off.
@@ -16,7 +16,7 @@ from pathlib import Path
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.drive import NOTHING, OFF, Drive
 from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.ownership.handover import Charge
+from exo_gravity.hardware.ownership.handover import ArmOnBus
 from exo_gravity.hardware.ownership.owned_bus import OwnedBus
 
 
@@ -24,19 +24,19 @@ def log(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def main(charge: Charge, drive: Drive) -> None:
+def main(arm: ArmOnBus, drive: Drive) -> None:
     try:
-        owned = OwnedBus(charge, f"/right/can_bridge (PID {os.getpid()})", log)
+        owned = OwnedBus(arm, f"/right/can_bridge (PID {os.getpid()})", log)
     except BusError as error:
         log(str(error))
         raise SystemExit(1) from None
-    notes = owned._lock.notes
-    bus = MotorBus(charge.open(), charge.motors, powered=True, note=notes.note)  # the rig has switched the motors on
+    notes = owned.notes
+    bus = MotorBus(arm.open(), arm.motors, powered=True, note=notes.note)  # the rig has switched the motors on
     orders: list[str] = []
     threading.Thread(target=lambda: [orders.append(line) for line in sys.stdin], daemon=True).start()
     is_announced = False
     while True:
-        end = time.monotonic() + charge.period
+        end = time.monotonic() + arm.period
         bus.exchange(OFF if "off\n" in orders else drive, end)
         if "hand over\n" in orders:
             owned.watchdog.hand_over("a test")
@@ -48,5 +48,5 @@ def main(charge: Charge, drive: Drive) -> None:
 
 
 if __name__ == "__main__":
-    charge, effort = pickle.loads(Path(sys.argv[1]).read_bytes())
-    main(charge, Drive(effort, NOTHING, True))
+    arm, effort = pickle.loads(Path(sys.argv[1]).read_bytes())
+    main(arm, Drive(effort, NOTHING, True))

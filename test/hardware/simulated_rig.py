@@ -14,7 +14,7 @@ from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, MOTORS
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.hardware.ownership.handover import Charge
+from exo_gravity.hardware.ownership.handover import ArmOnBus
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 
 from ..support.ports import own_ports
@@ -47,7 +47,7 @@ class SimulatedRig:
         else:
             channel = f"simulated_rig_{port}"
         config = ArmConfig(coulomb_friction=(friction,) * 4)
-        self.charge = Charge((interface, channel, options), MOTORS_OF_ARM, LIMITS, PERIOD)
+        self.arm = ArmOnBus((interface, channel, options), MOTORS_OF_ARM, LIMITS, PERIOD)
         self.device = SimulatedDevice(SimulatedArm(config), [SimulatedMotor(joint) for joint in MOTORS_OF_ARM])
         self.device.arm.reset(pose)
         self.carrying = tuple(gravity_torque(config.links, pose))  # Nm that hold the arm
@@ -55,7 +55,7 @@ class SimulatedRig:
             self._switch_on()
         self.top_speed = 0.0
         self._stop = threading.Event()
-        self._bus = self.charge.open()
+        self._bus = self.arm.open()
         self._thread = threading.Thread(target=self.device.run, args=(self._bus, self._stop.is_set, self._look))
         self._thread.start()
 
@@ -64,7 +64,7 @@ class SimulatedRig:
 
     def open(self) -> can.BusABC:
         """Open another end of the bus."""
-        return self.charge.open()
+        return self.arm.open()
 
     def _switch_on(self) -> None:
         for joint, torque in zip(MOTORS_OF_ARM, self.carrying, strict=True):

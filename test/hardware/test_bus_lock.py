@@ -1,53 +1,61 @@
 """One owner per bus and host."""
 
 import os
-import threading
-import time
+import tempfile
 
 import pytest
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.drive import OFF, Drive
 from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.ownership import bus_lock
-from exo_gravity.hardware.ownership.bus_lock import BusLock, lock_file
-from exo_gravity.hardware.ownership.owned_bus import OwnedBus
+from exo_gravity.hardware.ownership.bus_lock import ATTEMPT_TIME, BusLock, lock_file
+from exo_gravity.hardware.ownership.owned_bus import OwnedBus, recover
 
 from .simulated_rig import MOTORS_OF_ARM
+from .virtual_rig import VirtualRig
+from .virtual_time import Responder, VirtualClock
 
 CAN0 = ("socketcan", "can0", {})
 DRIVE = Drive((0.0, 3.0, 1.0, 0.5), (0.0, 5.0, 0.0, 0.0), True)
+DIED = "the last can_bridge on this bus and its watchdog died while the motors were on: letting the arm down"
+
+pytestmark = pytest.mark.usefixtures("lock_folder")
 
 
-@pytest.fixture(autouse=True)
-def _only_here(lock_folder, monkeypatch):
-    monkeypatch.setattr(bus_lock, "ATTEMPT_TIME", 0.1)
+def lock_of(owner: str) -> BusLock:
+    return BusLock(CAN0, owner, clock=VirtualClock())
 
 
 def test_a_held_bus_is_refused_with_its_owner_and_free_again_after_its_release():
-    lock = BusLock(CAN0, "/right/can_bridge (PID 123)")
+    lock = lock_of("/right/can_bridge (PID 123)")
     with pytest.raises(BusError, match=r"^CAN bus can0 is held by /right/can_bridge \(PID 123\)$"):
-        BusLock(CAN0, "/left/can_bridge (PID 124)")
+        lock_of("/left/can_bridge (PID 124)")
     BusLock(("socketcan", "can1", {}), "another").release()
     lock.release()
-    BusLock(CAN0, "another").release()
+    lock_of("another").release()
+
+
+def test_a_bus_that_its_owner_releases_a_little_later_is_waited_for():
+    lock, clock = lock_of("first"), VirtualClock()
+    clock.later(0.9 * ATTEMPT_TIME, lock.release)
+    BusLock(CAN0, "second", clock=clock).release()
 
 
 def test_a_refused_owner_leaves_the_notes_unchanged():
-    lock = BusLock(CAN0, "first")
+    lock = lock_of("first")
     lock.notes.note(DRIVE)
     with pytest.raises(BusError):
-        BusLock(CAN0, "second")
+        lock_of("second")
     assert (lock.notes.drive, lock.notes.owner) == (DRIVE, "first")
     lock.release()
 
 
 def test_the_notes_outlive_their_owner():
-    lock = BusLock(CAN0, "first")
+    lock = lock_of("first")
     assert lock.notes.drive == OFF
     lock.notes.note(DRIVE)
     lock.release()
-    lock = BusLock(CAN0, "second")
+    lock = lock_of("second")
     assert lock.notes.drive == DRIVE
     lock.release()
 
@@ -62,44 +70,66 @@ def test_buses_on_two_ports_or_channels_have_two_locks():
 def test_without_a_runtime_folder_the_lock_is_in_a_folder_of_this_user(monkeypatch, tmp_path):
     monkeypatch.delenv("XDG_RUNTIME_DIR")
     monkeypatch.setattr(os, "access", lambda folder, mode: False)
-    monkeypatch.setattr(bus_lock.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
     assert lock_file(CAN0).parent == tmp_path / f"exo_gravity-{os.getuid()}"
     BusLock(CAN0, "a test").release()
 
 
-def test_a_second_owner_sends_no_frame_and_the_first_keeps_carrying(make_rig):
-    rig = make_rig()
-    owned = OwnedBus(rig.charge, "/right/can_bridge (PID 1)", print)
+def test_a_second_owner_sends_no_frame_and_the_first_keeps_carrying():
+    rig = VirtualRig()
+    owned = OwnedBus(rig.arm, "/right/can_bridge (PID 1)", print, rig.clock)
     bus = owned.open()
-    bus.exchange(Drive(rig.carrying, (0.0,) * 4, True), time.monotonic() + 1.0)
-    with rig.open() as listener:
-        with pytest.raises(BusError, match="held by /right/can_bridge"):
-            OwnedBus(rig.charge, "/left/can_bridge (PID 2)", print)
-        commands = [m for m in iter(lambda: listener.recv(0.0), None) if m.data[0] != m.arbitration_id]
-        assert commands == []
+    bus.exchange(rig.drive, rig.clock.monotonic() + 1.0)
+    rig.clock.sleep(0.01)  # until the last replies
+    listener = Responder(rig.wire)
+    with pytest.raises(BusError, match="held by /right/can_bridge"):
+        OwnedBus(rig.arm, "/left/can_bridge (PID 2)", print, rig.clock)
+    assert not listener.received
     assert rig.motors_on == [True] * 4
     bus.stop()
     owned.close()
 
 
-def test_a_bus_that_another_host_commands_is_refused_without_a_frame(make_rig):
+def test_a_bus_that_another_host_commands_is_refused_without_a_frame():
     """Another host does not see the lock: its frames show it."""
-    rig = make_rig()
-    other, stop = MotorBus(rig.open(), MOTORS_OF_ARM), threading.Event()
+    rig = VirtualRig(carried=False, pose=(0.0,) * 4)
+    other = MotorBus(rig.wire.open(), MOTORS_OF_ARM, clock=rig.clock)
+    rig.clock.every(0.02, lambda: other.exchange(OFF, rig.clock.monotonic()))
+    owned = OwnedBus(rig.arm, "a test", print, rig.clock)
+    with pytest.raises(BusError, match="is in use: another sender commands motor"):
+        owned.open()
+    assert other.foreign_commands == 0
+    owned.close()
 
-    def command():
-        while not stop.wait(0.02):
-            other.exchange(OFF, time.monotonic() + 0.01)
 
-    thread = threading.Thread(target=command)
-    thread.start()
-    owned = OwnedBus(rig.charge, "a test", print)
-    try:
-        with pytest.raises(BusError, match="is in use: another sender commands motor"):
-            owned.open()
-        assert other.foreign_commands == 0
-    finally:
-        stop.set()
-        thread.join()
-        owned.close()
-        other.close()
+@pytest.mark.parametrize("is_recovery", [True, False], ids=["recovery", "next owner"])
+def test_the_arm_that_a_dead_owner_left_with_its_motors_on_is_let_down_first(is_recovery):
+    rig, log = VirtualRig(), []
+    leave_on(rig)
+    if is_recovery:
+        assert recover(rig.arm, "a recovery", log.append, 1.0, rig.clock)
+    else:
+        OwnedBus(rig.arm, "the next owner", log.append, rig.clock).close()
+    assert log == [DIED, "the arm is down, its motors are off"]
+    rig.assert_let_down()
+    lock = BusLock(rig.arm.address, "a test")
+    assert not lock.notes.drive.powered
+    lock.release()
+
+
+def test_an_owner_is_refused_while_an_arm_left_with_its_motors_on_cannot_be_reached():
+    rig = VirtualRig()
+    leave_on(rig)
+    rig.device.bus_silent = True
+    with pytest.raises(BusError, match="a motor that may be powered does not reply"):
+        OwnedBus(rig.arm, "the next owner", lambda text: None, rig.clock)
+    lock = BusLock(rig.arm.address, "a test")
+    assert lock.notes.drive.powered
+    lock.release()
+
+
+def leave_on(rig: VirtualRig) -> None:
+    """Note that the arm of `rig` is carried, and release its bus."""
+    lock = BusLock(rig.arm.address, "/right/can_bridge (PID 1)")
+    lock.notes.note(rig.drive)
+    lock.release()

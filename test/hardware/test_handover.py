@@ -1,31 +1,37 @@
-"""Letting down an arm that a dead process left with its motors on."""
+"""Letting down an arm that a dead process left with its motors on, in virtual time."""
 
 import itertools
+from dataclasses import replace
 
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, unpack_command
+from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, MotorCommand, unpack_command
 from exo_gravity.core.safety.drive import NOTHING, Drive
-from exo_gravity.hardware.ownership import handover
-from exo_gravity.hardware.ownership.handover import Charge, let_down
+from exo_gravity.hardware.ownership.handover import ArmOnBus, let_down
 
 from .simulated_rig import LIMITS, MOTORS_OF_ARM, PERIOD
+from .virtual_rig import VirtualRig
+from .virtual_time import Responder
 
 
-def commands(listener, can_id):
-    """Return the commands to motor `can_id` on the bus so far; ENTER and EXIT are None."""
-    frames = [bytes(m.data) for m in iter(lambda: listener.recv(0.0), None) if m.arbitration_id == can_id]
+def commands(listener: Responder, can_id: int) -> list[MotorCommand]:
+    """Return the commands to motor `can_id` so far, without ENTER and EXIT."""
+    frames = [bytes(message.data) for message in listener.received if message.arbitration_id == can_id]
     spec = MOTORS_OF_ARM[can_id - 1].spec
-    return [None if f in (ENTER, EXIT) else unpack_command(spec, f) for f in frames if f[0] != can_id]
+    return [unpack_command(spec, data) for data in frames if data[0] != can_id and data not in (ENTER, EXIT)]
 
 
-def test_the_arm_is_lowered_from_the_noted_torques_and_its_motors_are_switched_off(make_rig):
-    rig = make_rig(carried=True)
-    with rig.open() as listener:
-        notes = []
-        assert let_down(rig.charge, Drive(rig.carrying, NOTHING, True), notes.append)
-        torques = [command.torque for command in commands(listener, 2) if command]
+def let_down_of(rig: VirtualRig, drive: Drive | None = None, **options: object) -> bool:
+    return let_down(rig.arm, drive or rig.drive, clock=rig.clock, **options)
+
+
+def test_the_arm_is_lowered_from_the_noted_torques_and_its_motors_are_switched_off():
+    rig, notes = VirtualRig(), []
+    rig.arm = replace(rig.arm, period=PERIOD)
+    listener = Responder(rig.wire)
+    assert let_down_of(rig, note=notes.append)
+    torques = [command.torque for command in commands(listener, 2)]
     assert torques[0] == pytest.approx(rig.carrying[1], abs=0.02)
     largest = max(abs(after - before) for before, after in itertools.pairwise(torques))
     assert largest <= LIMITS.max_effort_rate * PERIOD + 2 * MOTORS["AK80-9"].torque_range / 4095
@@ -33,51 +39,53 @@ def test_the_arm_is_lowered_from_the_noted_torques_and_its_motors_are_switched_o
     rig.assert_let_down()
 
 
-def test_the_noted_damping_is_kept(make_rig):
-    rig = make_rig(carried=True)
-    with rig.open() as listener:
-        assert let_down(rig.charge, Drive(rig.carrying, (5.0,) * 4, True))
-        damping = [command.kd for command in commands(listener, 2)[:50] if command]
-    assert min(damping) == pytest.approx(5.0, abs=0.01)
+def test_the_noted_damping_is_kept():
+    rig = VirtualRig()
+    listener = Responder(rig.wire)
+    assert let_down_of(rig, Drive(rig.carrying, (5.0,) * 4, True))
+    assert min(command.kd for command in commands(listener, 2)[:50]) == pytest.approx(5.0, abs=0.01)
 
 
-def test_a_motor_that_has_lost_its_power_is_not_pushed_by_the_noted_torque(make_rig):
+def test_a_motor_that_has_lost_its_power_is_not_pushed_by_the_noted_torque():
     """The operator cut the supply: the motors are off, and the arm hangs."""
-    rig = make_rig(pose=NOTHING)
-    assert let_down(rig.charge, Drive((0.0, 6.0, 2.0, 1.0), NOTHING, True))
-    assert rig.top_speed < 0.01
+    rig = VirtualRig(pose=NOTHING, carried=False)
+    assert let_down_of(rig, Drive((0.0, 6.0, 2.0, 1.0), NOTHING, True))
+    assert rig.played.top_speed < 0.01
     assert rig.motors_on == [False] * 4
 
 
-def test_a_motor_that_does_not_reply_may_still_be_powered(make_rig):
-    rig = make_rig(carried=True)
+def test_a_motor_that_does_not_reply_may_still_be_powered():
+    rig = VirtualRig()
     rig.device.bus_silent = True
     log, notes = [], []
-    assert not let_down(rig.charge, Drive(rig.carrying, NOTHING, True), notes.append, log.append, is_endless=False)
+    assert not let_down_of(rig, note=notes.append, log=log.append, is_endless=False)
     assert log == ["a motor does not reply; it may still be powered; trying again"]
     assert notes[-1].powered
     assert notes[-1].effort[1] == pytest.approx(rig.carrying[1], abs=0.2)
 
 
-def test_a_bus_that_cannot_be_opened_is_tried_again_and_the_log_is_honest(make_rig, monkeypatch):
-    rig = make_rig(carried=True)
-    failures = iter([BusError("CAN bus can0 cannot be opened"), BusError("CAN bus can0 cannot be opened")])
+def test_a_motor_that_replies_again_late_is_let_down():
+    rig, log = VirtualRig(), []
+    start = rig.clock.monotonic()
+    rig.device.cut_off = (False, True, False, False)
+    rig.clock.later(6.0, lambda: setattr(rig.device, "cut_off", (False,) * 4))
+    assert let_down_of(rig, log=log.append)
+    assert log == ["a motor does not reply; it may still be powered; trying again"]
+    assert rig.clock.monotonic() > start + 6.0
+    rig.assert_let_down()
 
-    def open_late(*address):
-        for error in failures:
-            raise error
-        return open_bus(*address)
 
-    open_bus = handover.open_bus
-    monkeypatch.setattr(handover, "open_bus", open_late)
-    log = []
-    assert let_down(rig.charge, Drive(rig.carrying, NOTHING, True), log=log.append)
+def test_a_bus_that_cannot_be_opened_is_tried_again_and_the_log_is_honest():
+    rig, log = VirtualRig(), []
+    rig.wire.refusal = BusError("CAN bus can0 cannot be opened")
+    rig.clock.later(1.0, lambda: setattr(rig.wire, "refusal", None))
+    assert let_down_of(rig, log=log.append)
     assert log == ["CAN bus can0 cannot be opened; the motors may still be powered; trying again"]
     rig.assert_let_down()
 
 
 def test_a_single_attempt_at_a_bus_that_cannot_be_opened_fails_with_the_reason():
     log = []
-    charge = Charge(("no_such_interface", "x", {}), MOTORS_OF_ARM, LIMITS, PERIOD)
-    assert not let_down(charge, Drive(NOTHING, NOTHING, True), log=log.append, is_endless=False)
+    arm = ArmOnBus(("no_such_interface", "x", {}), MOTORS_OF_ARM, LIMITS, PERIOD)
+    assert not let_down(arm, Drive(NOTHING, NOTHING, True), log=log.append, is_endless=False)
     assert "CAN bus no_such_interface x" in log[0]

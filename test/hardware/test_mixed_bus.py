@@ -1,19 +1,14 @@
 """Motors of V1, V2 and V3 boards on one bus: who is sent what, what counts as a reply, and who may still be on.
 
-Runs on python-can's virtual bus, or on the one that EXO_TEST_CAN_INTERFACE and EXO_TEST_CAN_CHANNEL name.
+In virtual time, or on the bus that EXO_TEST_CAN_INTERFACE and EXO_TEST_CAN_CHANNEL name.
 """
 
 from __future__ import annotations
 
-import itertools
-import os
-import threading
-import time
 from collections.abc import Callable, Iterator
 
 import can
 import pytest
-from can.broadcastmanager import ThreadBasedCyclicSendTask
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.model.arm import ArmModel
@@ -25,47 +20,47 @@ from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedDevice
 
 from ..support.simulated_device import joints_of, make_device
+from .virtual_time import Wire, wire_for_test
 
 MIXED = (MIT, MIT_V3, MIT_V3, MIT)
 V3 = (MIT_V3,) * 4
 ON = Drive((0.0, 0.5, 0.4, 0.0), NOTHING, True)
 LINKS = ArmConfig().links
 WEIGHTLESS = ArmModel(LINKS.length, LINKS.cog, LINKS.mass, gravity=0.0)
-INTERFACE = os.environ.get("EXO_TEST_CAN_INTERFACE", "virtual")
-CHANNELS = (os.environ.get("EXO_TEST_CAN_CHANNEL", f"test_mixed_bus_{n}") for n in itertools.count())
-Wires = tuple[can.BusABC, can.BusABC, can.BusABC]  # the motor bus's end, the device's, the test's
-
-
-def in_1_s() -> float:
-    return time.monotonic() + 1.0
 
 
 @pytest.fixture
-def wires() -> Iterator[Wires]:
-    channel = next(CHANNELS)
-    ends = [can.Bus(interface=INTERFACE, channel=channel) for _ in range(3)]
-    yield ends[0], ends[1], ends[2]
-    for end in ends:
-        end.shutdown()
+def wire() -> Iterator[Wire]:
+    with wire_for_test() as wire:
+        yield wire
 
 
 @pytest.fixture
-def start(wires: Wires) -> Iterator[Callable[..., SimulatedDevice]]:
+def other(wire: Wire) -> can.BusABC:
+    """The test's end of the bus."""
+    return wire.open()
+
+
+@pytest.fixture
+def start(wire: Wire) -> Callable[..., SimulatedDevice]:
     """A function that runs a weightless arm with boards of the given formats on the bus."""
-    stop, threads = threading.Event(), []
 
     def start(formats: tuple[WireFormat, ...]) -> SimulatedDevice:
         config = ArmConfig(links=WEIGHTLESS, coulomb_friction=(5.0,) * 4)
         device = make_device(Firmware(status_rate=100.0), config=config, formats=formats)
         device.arm.reset((0.1, 0.2, 0.3, 0.4))
-        threads.append(threading.Thread(target=device.run, args=(wires[1], stop.is_set)))
-        threads[-1].start()
+        wire.play(device)
         return device
 
-    yield start
-    stop.set()
-    for thread in threads:
-        thread.join()
+    return start
+
+
+def motor_bus(wire: Wire, formats: tuple[WireFormat, ...]) -> MotorBus:
+    return MotorBus(wire.open(), joints_of(formats), clock=wire.clock)
+
+
+def now(bus: MotorBus) -> float:
+    return bus.clock.monotonic()
 
 
 def sent(bus: can.BusABC) -> list[tuple[int, bytes]]:
@@ -80,21 +75,21 @@ def sent(bus: can.BusABC) -> list[tuple[int, bytes]]:
 
 
 @pytest.mark.parametrize("formats", [MIXED, V3], ids=["mixed", "v3"])
-def test_every_motor_is_read_and_a_v3_board_that_is_off_is_sent_nothing_but_its_exit(wires, start, formats) -> None:
+def test_every_motor_is_read_and_a_v3_board_that_is_off_is_sent_only_its_exit(wire, other, start, formats) -> None:
     start(formats)
-    bus = MotorBus(wires[0], joints_of(formats))
+    bus = motor_bus(wire, formats)
     bus.listen()
-    sent(wires[2])
+    sent(other)
     for _ in range(3):
-        assert bus.exchange(OFF, in_1_s())
+        assert bus.exchange(OFF, now(bus) + 1.0)
     for sample, angle in zip(bus.samples, (0.1, 0.2, 0.3, 0.4), strict=True):
         assert sample.position == pytest.approx(angle, abs=0.01)
         assert (sample.temperature, sample.error) == (30, 0)
-    frames, boards = sent(wires[2]), [joint for joint in joints_of(formats) if joint.wire_format is MIT_V3]
-    end = in_1_s()
-    while time.monotonic() < end and not all(frames.count(*joint.exit) > 1 for joint in boards):
-        bus.exchange(OFF, in_1_s())
-        frames += sent(wires[2])
+    frames, boards = sent(other), [joint for joint in joints_of(formats) if joint.wire_format is MIT_V3]
+    end = now(bus) + 1.0
+    while now(bus) < end and not all(frames.count(*joint.exit) > 1 for joint in boards):
+        bus.exchange(OFF, now(bus) + 1.0)
+        frames += sent(other)
     for joint in boards:  # a command would switch it on
         first, *later = [frame for frame in frames if frame[0] >= EXTENDED and frame[0] & 0xFF == joint.can_id]
         assert first == (joint.command_id, joint.command(0.0, 0.0))
@@ -103,36 +98,36 @@ def test_every_motor_is_read_and_a_v3_board_that_is_off_is_sent_nothing_but_its_
     assert not bus.ignored
 
 
-def test_motors_of_both_formats_apply_their_torque_and_are_switched_off(wires, start) -> None:
+def test_motors_of_both_formats_apply_their_torque_and_are_switched_off(wire, other, start) -> None:
     device, joints = start(MIXED), joints_of(MIXED)
-    bus = MotorBus(wires[0], joints)
+    bus = motor_bus(wire, MIXED)
     for _ in range(3):
-        assert bus.exchange(ON, in_1_s())
+        assert bus.exchange(ON, now(bus) + 1.0)
     assert [motor.entered for motor in device.motors] == [True] * 4
     assert [sample.effort for sample in bus.samples] == pytest.approx(ON.effort, abs=0.02)
     assert bus.may_be_powered
-    sent(wires[2])
-    bus.exchange(OFF, in_1_s())
-    off = sent(wires[2])
+    sent(other)
+    bus.exchange(OFF, now(bus) + 1.0)
+    off = sent(other)
     for joint in joints:
         assert set(joint.exit) <= set(off)
-    end = in_1_s()
-    while bus.may_be_powered and time.monotonic() < end:  # a status may have been on its way
-        assert bus.exchange(OFF, in_1_s())
+    end = now(bus) + 1.0
+    while bus.may_be_powered and now(bus) < end:  # a status may have been on its way
+        assert bus.exchange(OFF, now(bus) + 1.0)
     assert not bus.may_be_powered and not device.powered
 
 
-def test_a_v3_board_that_still_reports_torque_counts_as_powered(wires) -> None:
-    bus = MotorBus(wires[0], joints_of(V3))
-    bus.exchange(ON, time.monotonic())
-    bus.exchange(OFF, time.monotonic())
+def test_a_v3_board_that_still_reports_torque_may_be_powered(wire, other) -> None:
+    bus = motor_bus(wire, V3)
+    bus.exchange(ON, now(bus))
+    bus.exchange(OFF, now(bus))
 
     def report(torque: float) -> None:
         for joint in joints_of(V3):
             data = MIT_V3.pack_reply(joint.spec, MotorReply(joint.can_id, 0.0, 0.0, torque, 30, 0))
             status_id = MIT_V3.status_id(joint.can_id) & ID_BITS
-            wires[2].send(can.Message(arbitration_id=status_id, data=data, is_extended_id=True))
-        bus.exchange(OFF, time.monotonic())
+            other.send(can.Message(arbitration_id=status_id, data=data, is_extended_id=True))
+        bus.exchange(OFF, now(bus))
 
     report(1.0)
     assert bus.may_be_powered
@@ -141,44 +136,42 @@ def test_a_v3_board_that_still_reports_torque_counts_as_powered(wires) -> None:
 
 
 @pytest.mark.parametrize("mode", [0, 1, 5, 8])
-def test_a_foreign_command_to_a_v3_board_is_counted_and_opposed(wires, mode) -> None:
+def test_a_foreign_command_to_a_v3_board_is_counted_and_opposed(wire, other, mode) -> None:
     joints = joints_of(MIXED)
-    bus = MotorBus(wires[0], joints)
-    bus.exchange(ON, time.monotonic())
-    sent(wires[2])
-    wires[2].send(can.Message(arbitration_id=mode << 8 | 2, data=bytes(8), is_extended_id=True))
-    bus.receive_until(in_1_s(), lambda: bus.foreign_commands > 0)
+    bus = motor_bus(wire, MIXED)
+    bus.exchange(ON, now(bus))
+    sent(other)
+    other.send(can.Message(arbitration_id=mode << 8 | 2, data=bytes(8), is_extended_id=True))
+    bus.receive_until(now(bus) + 1.0, lambda: bus.foreign_commands > 0)
     assert bus.foreign_commands == 1 and "commands motor 2" in bus.foreign_command
-    assert sent(wires[2]) == [(joints[1].command_id, joints[1].command(0.5, 0.0))]
+    assert sent(other) == [(joints[1].command_id, joints[1].command(0.5, 0.0))]
     assert bus.is_contested
 
 
-def test_status_frames_are_not_taken_for_another_host_but_its_commands_are(wires, start) -> None:
+def test_status_frames_are_not_taken_for_another_host_but_its_commands_are(wire, other, start) -> None:
     start(MIXED)
-    bus = MotorBus(wires[0], joints_of(MIXED))
+    bus = motor_bus(wire, MIXED)
     bus.listen()
     message = can.Message(arbitration_id=0x803, data=bytes(8), is_extended_id=True)
-    task = ThreadBasedCyclicSendTask(wires[2], threading.Lock(), message, 0.01)
+    wire.repeat(message, 0.01)
     with pytest.raises(BusError, match="is in use: another sender commands motor 3"):
-        while True:  # on a busy computer the other host may be silent for longer than this listens
-            bus.listen()
-    task.stop()
+        bus.listen()
 
 
-def test_a_motor_without_a_frame_for_its_zero_refuses_set_zero_for_the_whole_arm(wires) -> None:
-    bus = MotorBus(wires[0], joints_of(MIXED))
+def test_a_motor_without_a_frame_for_its_zero_refuses_set_zero_for_the_whole_arm(wire, other) -> None:
+    bus = motor_bus(wire, MIXED)
     with pytest.raises(BusError, match="set_zero: motor 2 has a board without such a frame"):
         bus.set_zero()
-    assert sent(wires[2]) == []
+    assert sent(other) == []
 
 
-def test_an_exit_that_was_not_ours_is_undone_on_both_kinds_of_board(wires) -> None:
+def test_an_exit_that_was_not_ours_is_undone_on_both_kinds_of_board(wire, other) -> None:
     joints = joints_of(MIXED)
-    bus = MotorBus(wires[0], joints)
-    bus.exchange(ON, time.monotonic())
-    sent(wires[2])
-    wires[2].send(can.Message(arbitration_id=1, data=EXIT, is_extended_id=False))
-    wires[2].send(can.Message(arbitration_id=0x102, data=bytes(4), is_extended_id=True))
-    bus.receive_until(in_1_s(), lambda: bus.foreign_commands == 2)
+    bus = motor_bus(wire, MIXED)
+    bus.exchange(ON, now(bus))
+    sent(other)
+    other.send(can.Message(arbitration_id=1, data=EXIT, is_extended_id=False))
+    other.send(can.Message(arbitration_id=0x102, data=bytes(4), is_extended_id=True))
+    bus.receive_until(now(bus) + 1.0, lambda: bus.foreign_commands == 2)
     first, second = (1, joints[0].command(0.0, 0.0)), (joints[1].command_id, joints[1].command(0.5, 0.0))
-    assert sent(wires[2]) == [first, (1, ENTER), first, second, second]
+    assert sent(other) == [first, (1, ENTER), first, second, second]

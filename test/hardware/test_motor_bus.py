@@ -1,12 +1,7 @@
-"""The motor bus with simulated motors: the order of its frames, and which frames count as replies.
+"""The motor bus with simulated motors: the order of its frames, and which frames are replies.
 
-Runs on python-can's virtual bus, or on the one that EXO_TEST_CAN_INTERFACE and EXO_TEST_CAN_CHANNEL name.
+In virtual time, or on the bus that EXO_TEST_CAN_INTERFACE and EXO_TEST_CAN_CHANNEL name.
 """
-
-import os
-import threading
-import time
-from itertools import count
 
 import can
 import pytest
@@ -16,45 +11,49 @@ from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, SET_ZERO, pack_reply, unpack_command
 from exo_gravity.core.safety.drive import NOTHING, OFF, Drive
-from exo_gravity.hardware.can.motor_bus import MotorBus, open_bus
+from exo_gravity.hardware.can.can_port import open_bus
+from exo_gravity.hardware.can.motor_bus import FOREIGN_COMMAND, FrameFilter, MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
+
+from ..support.simulated_device import frame
+from .virtual_time import wire_for_test
 
 AK60 = MOTORS["AK60-6"]
 MOUNTED = (("AK60-6", 1, 0.0), ("AK80-9", -1, 0.4), ("AK60-6", 1, -0.2), ("AK60-6", 1, 0.0))
 MOTORS_OF_ARM = tuple(JointMotor(MOTORS[name], n, *mounted) for n, (name, *mounted) in enumerate(MOUNTED, 1))
 LINKS = ArmConfig().links
 WEIGHTLESS = ArmModel(LINKS.length, LINKS.cog, LINKS.mass, gravity=0.0)  # stays in place, however slow the machine is
-INTERFACE = os.environ.get("EXO_TEST_CAN_INTERFACE", "virtual")
-CHANNELS = (os.environ.get("EXO_TEST_CAN_CHANNEL", f"test_motor_bus_{n}") for n in count())
 ON = Drive(NOTHING, NOTHING, True)
 
 
-def in_1_s() -> float:
-    return time.monotonic() + 1.0
+@pytest.fixture
+def wire():
+    with wire_for_test() as wire:
+        yield wire
 
 
 @pytest.fixture
-def wires():
-    """Two ends of one bus: one for the motor bus, one for the test. Both pass FD frames."""
-    channel = next(CHANNELS)
-    ours, other = (can.Bus(interface=INTERFACE, channel=channel, fd=True) for _ in range(2))
-    yield ours, other
-    ours.shutdown()
-    other.shutdown()
+def bus(wire):
+    return MotorBus(wire.open(), MOTORS_OF_ARM, clock=wire.clock)
+
+
+@pytest.fixture
+def other(wire):
+    """The test's end of the bus."""
+    return wire.open()
+
+
+def now(bus: MotorBus) -> float:
+    return bus.clock.monotonic()
 
 
 @pytest.fixture(params=[(False, 8), (False, 6), (True, 8), (True, 6)], ids=["own-8", "own-6", "master-8", "master-6"])
-def device(request, wires):
+def device(request, wire):
     arm = SimulatedArm(ArmConfig(links=WEIGHTLESS))
     arm.reset((0.1, 0.2, 0.3, 0.4))
-    motors = [SimulatedMotor(joint, Firmware(*request.param)) for joint in MOTORS_OF_ARM]
-    device = SimulatedDevice(arm, motors)
-    stop = threading.Event()
-    thread = threading.Thread(target=device.run, args=(wires[1], stop.is_set))
-    thread.start()
-    yield device
-    stop.set()
-    thread.join()
+    device = SimulatedDevice(arm, [SimulatedMotor(joint, Firmware(*request.param)) for joint in MOTORS_OF_ARM])
+    wire.play(device)
+    return device
 
 
 def received(bus: can.BusABC) -> list[tuple[int, bytes]]:
@@ -64,52 +63,43 @@ def received(bus: can.BusABC) -> list[tuple[int, bytes]]:
     return frames
 
 
-def test_every_motor_is_read_in_joint_coordinates(wires, device):
-    bus = MotorBus(wires[0], MOTORS_OF_ARM)
-    assert bus.exchange(OFF, in_1_s())
+def test_every_motor_is_read_in_joint_coordinates(bus, device):
+    assert bus.exchange(OFF, now(bus) + 1.0)
     for sample, angle in zip(bus.samples, (0.1, 0.2, 0.3, 0.4), strict=True):
         assert sample.position == pytest.approx(angle, abs=0.01)
 
 
-def test_an_exchange_moves_the_simulated_arm(wires, device):
-    bus = MotorBus(wires[0], MOTORS_OF_ARM)
+def test_an_exchange_moves_the_simulated_arm(bus, device):
     before = device.arm.positions[3]
-    end = time.monotonic() + 5.0
-    while device.arm.positions[3] < before + 0.2 and time.monotonic() < end:
-        bus.exchange(Drive((0.0, 0.0, 0.0, 2.0), NOTHING, True), in_1_s())
+    end = now(bus) + 5.0
+    while device.arm.positions[3] < before + 0.2 and now(bus) < end:
+        bus.exchange(Drive((0.0, 0.0, 0.0, 2.0), NOTHING, True), now(bus) + 1.0)
     assert device.arm.positions[3] > before + 0.2
 
 
-def test_a_zero_torque_command_precedes_switching_on_and_switching_off(wires):
-    bus = MotorBus(wires[0], MOTORS_OF_ARM)
-    bus.exchange(ON, time.monotonic())
-    frames = [data for can_id, data in received(wires[1]) if can_id == 1]
+def test_a_zero_torque_command_precedes_switching_on_and_switching_off(bus, other):
+    bus.exchange(ON, now(bus))
+    frames = [data for can_id, data in received(other) if can_id == 1]
     assert frames.index(ENTER) == 1
     assert unpack_command(AK60, frames[0]).torque == pytest.approx(0.0, abs=0.004)
-    bus.exchange(OFF, time.monotonic())
-    frames = [data for can_id, data in received(wires[1]) if can_id == 1]
+    bus.exchange(OFF, now(bus))
+    frames = [data for can_id, data in received(other) if can_id == 1]
     assert frames[-1] == EXIT
     assert unpack_command(AK60, frames[-2]).torque == pytest.approx(0.0, abs=0.004)
 
 
-def test_stop_switches_every_motor_off_twice(wires):
-    bus = MotorBus(wires[0], MOTORS_OF_ARM)
-    bus.exchange(ON, time.monotonic())
-    received(wires[1])
+def test_stop_switches_every_motor_off_twice(bus, other):
+    bus.exchange(ON, now(bus))
+    received(other)
     bus.stop()
-    assert [can_id for can_id, data in received(wires[1]) if data == EXIT] == [1, 2, 3, 4, 1, 2, 3, 4]
+    assert [can_id for can_id, data in received(other) if data == EXIT] == [1, 2, 3, 4, 1, 2, 3, 4]
 
 
-def test_set_zero_is_refused_while_the_motors_are_on(wires):
-    bus = MotorBus(wires[0], MOTORS_OF_ARM)
-    bus.exchange(ON, time.monotonic())
+def test_set_zero_is_refused_while_the_motors_are_on(bus, other):
+    bus.exchange(ON, now(bus))
     with pytest.raises(BusError, match="motors are on"):
         bus.set_zero()
-    assert SET_ZERO not in [data for _, data in received(wires[1])]
-
-
-def frame(can_id: int, data: bytes, **kind) -> can.Message:
-    return can.Message(arbitration_id=can_id, data=data, **{"is_extended_id": False, **kind})
+    assert SET_ZERO not in [data for _, data in received(other)]
 
 
 REPLY = pack_reply(AK60, 1, 0.25, 0.0, 0.0, 30, 0)
@@ -134,36 +124,56 @@ REPLY = pack_reply(AK60, 1, 0.25, 0.0, 0.0, 30, 0)
         (frame(1, REPLY, is_error_frame=True), "error frame"),
     ],
 )
-def test_a_frame_that_is_not_a_reply_is_counted_and_ignored(wires, message, kind):
-    bus = MotorBus(wires[0], MOTORS_OF_ARM)
-    wires[1].send(message)
-    bus.exchange(OFF, time.monotonic())
+def test_a_frame_that_is_not_a_reply_is_counted_and_ignored(bus, other, message, kind):
+    other.send(message)
+    bus.exchange(OFF, now(bus))
     assert bus.samples[0].time == float("-inf")
     assert bus.ignored == {kind: 1}
 
 
 @pytest.mark.parametrize("can_id", [0, 1])
 @pytest.mark.parametrize("length", [6, 8])
-def test_a_reply_may_have_the_motors_id_or_the_masters(wires, can_id, length):
-    bus = MotorBus(wires[0], MOTORS_OF_ARM)
-    wires[1].send(frame(can_id, REPLY[:length]))
-    bus.exchange(OFF, time.monotonic())
+def test_a_reply_may_have_the_motors_id_or_the_masters(bus, other, can_id, length):
+    other.send(frame(can_id, REPLY[:length]))
+    bus.exchange(OFF, now(bus))
     assert bus.samples[0].position == pytest.approx(0.25, abs=0.0004)
     assert not bus.ignored
 
 
-def test_a_late_reply_does_not_count_for_the_next_cycle(wires):
-    bus = MotorBus(wires[0], MOTORS_OF_ARM)
+def test_a_late_reply_does_not_count_for_the_next_cycle(bus, other):
     for can_id in (1, 2, 3, 4):
-        wires[1].send(frame(can_id, bytes((can_id,)) + REPLY[1:]))
-    assert not bus.exchange(OFF, time.monotonic())
+        other.send(frame(can_id, bytes((can_id,)) + REPLY[1:]))
+    assert not bus.exchange(OFF, now(bus))
 
 
-def test_two_joints_with_the_same_id_are_refused(wires):
+def test_two_joints_with_the_same_id_are_refused(wire):
     with pytest.raises(ParameterError, match="4 different IDs"):
-        MotorBus(wires[0], [JointMotor(AK60, 1)] * 4)
+        MotorBus(wire.open(), [JointMotor(AK60, 1)] * 4)
 
 
 def test_the_error_for_a_bus_that_cannot_be_opened_names_it():
     with pytest.raises(BusError, match="CAN bus nonsense can9"):
         open_bus("nonsense", "can9", {})
+
+
+def test_an_arm_that_answers_another_host_is_noticed_while_listening(wire, bus):
+    wire.repeat(frame(1, REPLY), 0.01)
+    with pytest.raises(BusError, match="is in use: motor 1 replies to another host"):
+        bus.listen()
+
+
+COMMAND = MOTORS_OF_ARM[0].command(1.0, 0.0)
+MARKED = frame(1, COMMAND, is_rx=False)  # as some buses mark an echo, and SocketCAN each frame from this computer
+
+
+def test_a_marked_command_is_an_echo_only_on_a_bus_that_marks_nothing_else() -> None:
+    assert FrameFilter(MOTORS_OF_ARM).sort(MARKED) == ("echo", 0)
+    assert FrameFilter(MOTORS_OF_ARM, marks_echoes=False).sort(MARKED) == (FOREIGN_COMMAND, 1)
+
+
+@pytest.mark.parametrize("marks_echoes", [True, False])
+def test_a_command_that_we_sent_is_an_echo_when_it_comes_back(marks_echoes: bool) -> None:
+    frames = FrameFilter(MOTORS_OF_ARM, marks_echoes)
+    frames.sent((1, COMMAND))
+    assert frames.sort(frame(1, COMMAND)) == ("echo", 0)
+    assert frames.sort(frame(1, COMMAND)) == (FOREIGN_COMMAND, 1)

@@ -9,8 +9,6 @@ test shows how the safety limits treat them.
 from __future__ import annotations
 
 import random
-import threading
-import time
 from collections import Counter
 
 import can
@@ -21,9 +19,10 @@ from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, SET_ZERO
 from exo_gravity.core.safety.drive import OFF
 from exo_gravity.core.safety.limits import JointSample, Limits
-from exo_gravity.hardware.can.frame_filter import TRIAL
-from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.can.motor_bus import TRIAL, MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
+
+from .virtual_time import Responder, Wire, message_of
 
 MOUNTED = (("AK60-6", 1, 0.0), ("AK80-9", -1, 0.4), ("AK60-6", 1, -0.2), ("AK60-6", 1, 0.0))
 JOINTS = tuple(JointMotor(MOTORS[name], n, *mounted) for n, (name, *mounted) in enumerate(MOUNTED, 1))
@@ -72,80 +71,61 @@ def looks_like_reply(message: can.Message) -> bool:
 
 
 class NoisyMotors:
-    """Motors that do not move, on a bus on which other devices send `BURST` frames before every reply.
+    """Motors that do not move, on a wire on which other devices send `BURST` frames before every reply.
 
     foreign: the number of those frames.
     """
 
-    def __init__(self, bus: can.BusABC, firmware: Firmware, seed: int):
+    def __init__(self, wire: Wire, firmware: Firmware) -> None:
         arm = SimulatedArm(ArmConfig(links=WEIGHTLESS))
         arm.reset(POSE)
-        self._device = SimulatedDevice(arm, [SimulatedMotor(joint, firmware) for joint in JOINTS])
-        self._bus = bus
-        self._rng = random.Random(seed)
         self.foreign = 0
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
+        self._device = SimulatedDevice(arm, [SimulatedMotor(joint, firmware) for joint in JOINTS])
+        self._rng = random.Random(7)
+        Responder(wire, self._answer)
 
-    def close(self):
-        self._stop.set()
-        self._thread.join()
-
-    def _run(self):
-        while not self._stop.is_set():
-            command = self._bus.recv(0.05)
-            reply = command and self._device.exchange(command.arbitration_id, bytes(command.data))
-            if reply:
-                self._make_noise()
-                self._bus.send(can.Message(arbitration_id=reply[0], data=reply[1], is_extended_id=False))
-
-    def _make_noise(self):
-        for _ in range(BURST):
-            message = foreign_frame(self._rng)
-            if not looks_like_reply(message):  # the tests below have these
-                self._bus.send(message)
-                self.foreign += 1
+    def _answer(self, command: can.Message) -> list[can.Message]:
+        reply = self._device.exchange(command.arbitration_id, bytes(command.data))
+        if reply is None:
+            return []
+        burst = [foreign_frame(self._rng) for _ in range(BURST)]
+        noise = [message for message in burst if not looks_like_reply(message)]  # the tests below have these
+        self.foreign += len(noise)
+        return [*noise, message_of(reply)]
 
 
 @pytest.fixture
-def wires():
-    ours, other = (can.Bus(interface="virtual", channel="test_motor_bus_hostile", fd=True) for _ in range(2))
-    yield ours, other
-    ours.shutdown()
-    other.shutdown()
+def wire() -> Wire:
+    return Wire()
 
 
-@pytest.fixture(params=[(False, 8), (True, 6)], ids=["own-8", "master-6"])
-def noisy(request, wires):
-    motors = NoisyMotors(wires[1], Firmware(*request.param), seed=7)
-    yield motors
-    motors.close()
+def motor_bus(wire: Wire) -> MotorBus:
+    return MotorBus(wire.open(), JOINTS, clock=wire.clock)
 
 
-def test_among_foreign_frames_of_every_kind_only_the_motors_are_read(wires, noisy):
-    bus = MotorBus(wires[0], JOINTS)
+@pytest.mark.parametrize("firmware", [Firmware(False, 8), Firmware(True, 6)], ids=["own-8", "master-6"])
+def test_among_foreign_frames_of_every_kind_only_the_motors_are_read(wire: Wire, firmware: Firmware) -> None:
+    noisy, bus = NoisyMotors(wire, firmware), motor_bus(wire)
     while noisy.foreign < FRAMES:
-        assert bus.exchange(OFF, time.monotonic() + 10.0)
+        assert bus.exchange(OFF, wire.clock.monotonic() + 1.0)
         for sample, angle in zip(bus.samples, POSE, strict=True):
             assert abs(sample.position - angle) <= POSITION_CODE
             assert sample.temperature in (30, None) and sample.error in (0, None)
-    noisy.close()
-    bus.exchange(OFF, time.monotonic())  # reads the frames after the last reply
+    bus.receive_until(wire.clock.monotonic() + 0.01)  # reads the frames after the last reply
     assert sum(bus.ignored.values()) == noisy.foreign
-    # Until enough frames were sent to show that the bus does not echo, a frame like our own counts as an echo.
+    # Until enough frames were sent to show that the bus does not echo, a frame like our own is taken for an echo.
     assert bus.ignored.pop("echo", 0) <= TRIAL
     assert set(bus.ignored) == {"foreign command", "error frame", "extended, remote or FD frame", "foreign frame"}
 
 
-def test_a_frame_counts_as_a_reply_exactly_if_it_has_the_layout_of_one(wires):
+def test_a_frame_is_a_reply_exactly_if_it_has_the_layout_of_one(wire: Wire) -> None:
     """The manual's layout is the independent reference."""
-    bus, rng, found = MotorBus(wires[0], JOINTS), random.Random(3), Counter()
+    bus, rng, found = motor_bus(wire), random.Random(3), Counter()
     for _ in range(FRAMES // 5):
         message = foreign_frame(rng)
         before, ignored = list(bus.samples), sum(bus.ignored.values())
-        wires[1].send(message)
-        bus.exchange(OFF, time.monotonic())
+        wire.carry(None, message)
+        bus.exchange(OFF, wire.clock.monotonic())
         changed = [joint for joint in range(4) if bus.samples[joint] is not before[joint]]
         if looks_like_reply(message):
             assert changed == [message.data[0] - 1]

@@ -13,18 +13,21 @@ import pytest
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.motors.specs import pack_reply
+from exo_gravity.core.motors.specs import MotorReply
 from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
+from exo_gravity.core.motors.wire_formats.wire_format import ID_BITS
 from exo_gravity.core.safety.drive import NOTHING, OFF, Drive
-from exo_gravity.hardware.can.motor_bus import MotorBus, open_bus
+from exo_gravity.hardware.can.can_port import open_bus
+from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedDevice
 
 from ..support.fake_slcan import FakeSlcan
-from ..support.simulated_device import SPECS, joints_of, make_device
+from ..support.simulated_device import joints_of, make_device
 
 MIXED = (MIT, MIT_V3, MIT_V3, MIT)
 OPTIONS = {"bitrate": 1_000_000, "sleep_after_open": 0.01, "timeout": 0.0002}
 POSE = (0.1, 0.2, 0.3, 0.4)
+FIRST_FRAMES = 8  # to motors that are off: a command and EXIT for each
 ON = Drive((0.0, 0.5, 0.4, 0.0), NOTHING, True)
 LINKS = ArmConfig().links
 WEIGHTLESS = ArmModel(LINKS.length, LINKS.cog, LINKS.mass, gravity=0.0)
@@ -104,18 +107,23 @@ def test_after_the_adapter_was_unplugged_and_plugged_in_again_the_motors_are_rea
 
 
 @pytest.mark.parametrize("acknowledges", [True, False])
-def test_an_acknowledgement_does_not_hide_a_late_reply(adapter, motors, channel, acknowledges) -> None:
+def test_an_acknowledgement_does_not_hide_late_replies_which_are_not_taken_for_new_ones(
+    adapter, motors, channel, acknowledges
+) -> None:
     adapter.acknowledges = acknowledges
+    before = adapter.obeyed
     motors.exchange(OFF, time.monotonic())
+    wait_until(lambda: adapter.obeyed == before + FIRST_FRAMES)
+    unread, lengths = adapter.unread, 0
     with can.Bus(interface="virtual", channel=channel) as other:
-        for spec, can_id in zip(SPECS, (1, 4), strict=False):
-            data = pack_reply(spec, can_id, 0.0, 0.0, 0.0)
-            other.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
-        port = motors._port._bus.serialPortOrig
-        wait_until(lambda: port.in_waiting >= 36)  # both replies, of 18 characters each
+        for joint in joints_of(MIXED):
+            data = joint.wire_format.pack_reply(joint.spec, MotorReply(joint.can_id, 0.0, 0.0, 0.0, 30, 0))
+            reply_id = joint.can_id if joint.wire_format is MIT else MIT_V3.status_id(joint.can_id) & ID_BITS
+            other.send(can.Message(arbitration_id=reply_id, data=data, is_extended_id=joint.wire_format is MIT_V3))
+            lengths += 22 if joint.wire_format is MIT else 27  # characters
+        wait_until(lambda: adapter.unread >= unread + lengths)
         assert not motors.exchange(OFF, time.monotonic())
-    assert [sample.time > 0.0 for sample in motors.samples] == [True, False, False, True]
-    assert not motors._answered
+    assert all(sample.time > 0.0 for sample in motors.samples)
 
 
 def wait_until(condition: Callable[[], bool]) -> None:

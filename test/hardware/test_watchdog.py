@@ -1,4 +1,7 @@
-"""The watchdog: after the bridge has died, its arm is let down, whatever else died or froze."""
+"""The watchdog's process: after the bridge has died, its arm is let down, whatever else died or froze.
+
+What it decides, and how it lets the arm down, is tested in virtual time: test_watchdog_decisions.py.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,13 @@ import pickle
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from exo_gravity.core.errors import BusError
+from exo_gravity.hardware.clock import COMPUTER_CLOCK
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.hardware.ownership.owned_bus import OwnedBus
 from exo_gravity.hardware.ownership.watchdog import Watchdog
@@ -29,8 +32,8 @@ class Carrier:
     """A process that carries the arm of `rig` with a constant torque, and its watchdog."""
 
     def __init__(self, rig: SimulatedRig, folder: Path, stderr: int = subprocess.PIPE) -> None:
-        path = folder / "charge.pickle"
-        path.write_bytes(pickle.dumps((rig.charge, rig.carrying)))
+        path = folder / "arm.pickle"
+        path.write_bytes(pickle.dumps((rig.arm, rig.carrying)))
         command = [sys.executable, "-m", "test.hardware.carrier", str(path)]
         pipe = subprocess.PIPE
         self.process = subprocess.Popen(command, cwd=REPO, stdin=pipe, stdout=pipe, stderr=stderr, text=True)
@@ -82,31 +85,18 @@ def carry(rig: SimulatedRig, tmp_path: Path) -> Iterator[Callable[..., Carrier]]
         carrier.close()
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_the_arm_of_a_killed_or_frozen_bridge_is_let_down(rig, carry, number):
+@pytest.mark.parametrize("end", ["killed", "frozen", "hands its arm over"])
+def test_the_arm_of_a_bridge_that_ends_is_let_down_by_the_watchdog_which_holds_its_bus_meanwhile(rig, carry, end):
     carrier = carry()
-    carrier.kill(number)
+    if end == "hands its arm over":
+        carrier.order("hand over")
+    else:
+        carrier.kill(signal.SIGKILL if end == "killed" else signal.SIGSTOP)
     assert carrier.process.wait(5) == -signal.SIGKILL
+    with pytest.raises(BusError, match=rf"held by the watchdog \(PID {carrier.watchdog}\) of /right/can_bridge"):
+        BusLock(rig.arm.address, "another")
     assert carrier.log().endswith("letting the arm down\nERROR the arm is down, its motors are off\n")
     rig.assert_let_down()
-
-
-def test_a_bridge_can_hand_its_arm_over(rig, carry):
-    carrier = carry()
-    carrier.order("hand over")
-    assert carrier.process.wait(5) == -signal.SIGKILL
-    assert "handed the arm over and has been killed (a test)" in carrier.log()
-    rig.assert_let_down()
-
-
-def test_the_watchdog_of_a_killed_bridge_with_its_motors_off_ends_and_sends_nothing(rig, carry):
-    carrier = carry()
-    carrier.order("off")
-    wait_until(lambda: not any(rig.motors_on))
-    time.sleep(0.1)  # until the motors have confirmed it
-    carrier.kill()
-    assert carrier.log() == ""
-    wait_until(lambda: not is_running(carrier.watchdog))
 
 
 def test_a_full_pipe_of_the_log_does_not_delay_the_watchdog(rig, carry):
@@ -122,15 +112,6 @@ def test_a_full_pipe_of_the_log_does_not_delay_the_watchdog(rig, carry):
     rig.assert_let_down()
 
 
-def test_a_bus_whose_arm_is_being_let_down_is_held_by_the_watchdog(rig, carry):
-    carrier = carry()
-    carrier.kill()
-    with pytest.raises(BusError, match=rf"held by the watchdog \(PID {carrier.watchdog}\) of /right/can_bridge"):
-        BusLock(rig.charge.address, "another")
-    wait_until(lambda: not is_running(carrier.watchdog))
-    rig.assert_let_down()
-
-
 def test_after_bridge_and_watchdog_were_killed_the_next_owner_lets_the_arm_down_first(rig, carry):
     carrier = carry()
     os.kill(carrier.watchdog, signal.SIGSTOP)
@@ -140,37 +121,22 @@ def test_after_bridge_and_watchdog_were_killed_the_next_owner_lets_the_arm_down_
     wait_until(lambda: not is_running(carrier.watchdog))
     assert rig.motors_on == [True] * 4
     log: list[str] = []
-    owned = OwnedBus(rig.charge, "the next owner", log.append)
+    owned = OwnedBus(rig.arm, "the next owner", log.append)
     owned.close()
     assert log[-1] == "the arm is down, its motors are off"
     rig.assert_let_down()
 
 
-def test_a_bridge_lives_on_after_the_whole_machine_has_stalled(carry):
-    carrier = carry()
-    for number in (signal.SIGSTOP, signal.SIGCONT):
-        for pid in (carrier.process.pid, carrier.watchdog):
-            os.kill(pid, number)
-        time.sleep(0.3)  # several times FROZEN, both stopped and running
-    assert carrier.process.poll() is None
-
-
-def test_a_frozen_watchdog_is_noticed_and_recovers(rig):
-    lock = BusLock(rig.charge.address, "a test")
-    watchdog = Watchdog(lock, rig.charge)
-
-    def is_alive_after(seconds: float) -> bool:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end and watchdog.alive:
-            time.sleep(0.05)
-        return watchdog.alive
-
+def test_a_frozen_watchdog_is_noticed_and_recovers_and_ends_with_its_bridge(rig):
+    lock = BusLock(rig.arm.address, "a test")
+    watchdog = Watchdog(lock, rig.arm, COMPUTER_CLOCK)
     wait_until(lambda: lock.notes.heartbeat)
-    assert is_alive_after(0.5)
+    assert watchdog.alive
     os.kill(watchdog.pid, signal.SIGSTOP)
-    assert not is_alive_after(0.5)
+    wait_until(lambda: not watchdog.alive)
     os.kill(watchdog.pid, signal.SIGCONT)
     wait_until(lambda: watchdog.alive)
     watchdog.close()
     assert not watchdog.alive
+    assert not watchdog.hand_over("a test")
     lock.release()

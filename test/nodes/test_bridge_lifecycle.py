@@ -49,8 +49,8 @@ def make_bridge(rig: SimulatedRig, monkeypatch: pytest.MonkeyPatch) -> Iterator[
     def make_bridge(autostart: bool = False) -> CanBridge:
         parameters = {
             "autostart": autostart,
-            "can.interface": rig.charge.address[0],
-            "can.channel": rig.charge.address[1],
+            "can.interface": rig.arm.address[0],
+            "can.channel": rig.arm.address[1],
             "sign_check_torque": 0.0,
             "command_timeout": 0.1,  # the tests share a busy machine
             "reply_timeout": 0.1,
@@ -72,7 +72,7 @@ def state_of(bridge: CanBridge) -> str:
 
 
 def assert_bus_is_free(rig: SimulatedRig) -> None:
-    BusLock(rig.charge.address, "a test").release()
+    BusLock(rig.arm.address, "a test").release()
 
 
 def assert_nothing_runs(bridge: CanBridge, rig: SimulatedRig) -> None:
@@ -96,7 +96,7 @@ def test_configured_activated_deactivated_activated_again_and_cleaned_up(rig, ma
     bridge = make_bridge()
     carry(bridge, rig)
     with pytest.raises(BusError, match="is held by /can_bridge"):
-        BusLock(rig.charge.address, "another")
+        BusLock(rig.arm.address, "another")
     assert bridge.trigger_deactivate() is SUCCESS
     assert_nothing_runs(bridge, rig)
     assert bridge.trigger_activate() is SUCCESS
@@ -120,7 +120,7 @@ def test_a_shutdown_lets_the_arm_down_reports_it_and_releases_the_bus(rig, make_
 
 
 def test_a_held_bus_fails_the_configuration(rig, make_bridge):
-    lock = BusLock(rig.charge.address, "another (PID 1)")
+    lock = BusLock(rig.arm.address, "another (PID 1)")
     bridge = make_bridge()
     assert bridge.trigger_configure() is FAILURE
     assert state_of(bridge) == "unconfigured"
@@ -136,7 +136,7 @@ def test_a_bus_that_cannot_be_opened_fails_the_configuration_and_is_released(rig
 
 
 def test_autostart_without_a_bus_ends_the_node_with_the_reason(rig, make_bridge):
-    lock = BusLock(rig.charge.address, "another (PID 1)")
+    lock = BusLock(rig.arm.address, "another (PID 1)")
     with pytest.raises(BusError, match=r"is held by another \(PID 1\)"):
         make_bridge(autostart=True)
     lock.release()

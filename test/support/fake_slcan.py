@@ -9,6 +9,7 @@ answered with BEL.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import pty
 import select
@@ -28,11 +29,12 @@ OK, REFUSED = b"\r", b"\a"
 class FakeSlcan:
     """The adapter, plugged in at `path` until `close`; `bus` is its wire.
 
-    kbit_s: bit rate that was set. is_open: whether O was received.
+    kbit_s: bit rate that was set. is_open: whether O was received. obeyed: commands carried out and acknowledged.
     """
 
     def __init__(self, path: Path, bus: can.BusABC) -> None:
         self.kbit_s = 0
+        self.obeyed = 0
         self.acknowledges = True
         self._path = path
         self._bus = bus
@@ -66,6 +68,11 @@ class FakeSlcan:
 
     close = unplug
 
+    @property
+    def unread(self) -> int:
+        """Characters that the program has not yet read."""
+        return int.from_bytes(fcntl.ioctl(self._slave, termios.FIONREAD, bytes(4)), sys.byteorder)
+
     def _run(self) -> None:
         rest = b""
         while not self._stop.is_set():
@@ -73,6 +80,7 @@ class FakeSlcan:
                 *lines, rest = (rest + os.read(self._master, 4096)).split(b"\r")
                 for line in lines:
                     self._write(self._obey(line.decode()))
+                    self.obeyed += 1
             message = self._bus.recv(0.0005)
             if message is not None and self.is_open and not message.is_error_frame and not message.is_fd:
                 self._write(_line(message))

@@ -136,7 +136,7 @@ class LaunchedNodes:
         bus = f"{self.bus['channel']}_{self.bus['port']}.bus"
         for process in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
-                if b"watchdog_process" in (process / "cmdline").read_bytes() and any(
+                if b"ownership.watchdog" in (process / "cmdline").read_bytes() and any(
                     bus in os.readlink(descriptor) for descriptor in (process / "fd").iterdir()
                 ):
                     os.kill(int(process.name), signal.SIGKILL)

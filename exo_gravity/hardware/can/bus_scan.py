@@ -11,9 +11,8 @@ V3 boards: they are found by their status frames, and are never sent anything, b
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
 
 import can
 
@@ -23,54 +22,54 @@ from exo_gravity.core.motors.specs import MOTORS, pack_command, unpack_reply
 from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
 from exo_gravity.core.motors.wire_formats.mit import MASTER_ID
 from exo_gravity.core.motors.wire_formats.wire_format import COMMAND, EXTENDED, REPLY, Frame
-from exo_gravity.hardware.can.can_port import CanPort
-from exo_gravity.hardware.can.motor_bus import open_bus
+from exo_gravity.hardware.can.can_port import CanPort, open_bus
+from exo_gravity.hardware.can.motor_bus import LISTEN_TIME, MAX_STALE_FRAMES
+from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.ownership.bus_lock import Address, BusLock
 
 SPEC = next(iter(MOTORS.values()))  # the position range is the same for all
 NOTHING = pack_command(SPEC, 0.0, 0.0, 0.0, 0.0, 0.0)
 ALL_IDS = range(1, MAX_CAN_ID + 1)
-LISTEN_TIME = 0.12  # s before the first frame, as in hardware/can/motor_bus.py
 REPLY_TIME = 0.01  # s: a motor replies within 0.4 ms; a USB adapter and a busy computer add some
 ATTEMPTS = 2  # for each ID, in case a frame is lost
-MAX_STALE_FRAMES = 256  # read before each command; two motors with one ID may never stop answering each other
 STATUS_TIME = 0.12  # s in which the next status frame of a V3 board is awaited
 V3_IDS = frozenset(range(1, 256))
 
 
 class Answer(NamedTuple):
-    """What a motor replied.
-
-    reply_id: arbitration ID, the motor's own or 0, or that of a V3 board's status frames. reply_length: 6 or 8 bytes.
-    position: motor angle in rad. temperature: degC; error: code of MOTOR_ERRORS; both None from 6-byte firmware.
-    wire_format: name of the board's format.
-    """
+    """What a motor replied."""
 
     can_id: int
-    reply_id: int
-    reply_length: int
-    position: float
-    temperature: int | None
-    error: int | None
-    wire_format: str = MIT.name
+    reply_id: int  #: Arbitration ID: the motor's own or 0, or that of a V3 board's status frames.
+    reply_length: int  #: 6 or 8 bytes.
+    position: float  #: Motor angle in rad.
+    temperature: int | None  #: degC; None from 6-byte firmware.
+    error: int | None  #: Code of MOTOR_ERRORS; None from 6-byte firmware.
+    wire_format: str = MIT.name  #: Name of the board's format.
 
 
 class Scan(NamedTuple):
-    """answers: one per motor, by ID. problems: sentences on what is wrong with the bus or an ID."""
+    """Who answered on a bus."""
 
-    answers: tuple[Answer, ...]
-    problems: tuple[str, ...]
+    answers: tuple[Answer, ...]  #: One per motor, by ID.
+    problems: tuple[str, ...]  #: Sentences on what is wrong with the bus or an ID.
 
 
 class BusScan:
     """Owns the bus at `address` until `close`, so that no bridge can start meanwhile.
 
-    Raises BusError if a bridge holds the bus, with its name; if another host commands the motors; if a dead bridge left
-    them on; or if the bus cannot be opened.
+    open_bus: opens the bus. Raises BusError if a bridge holds the bus, with its name; if another host commands the
+    motors; if a dead bridge left them on; or if the bus cannot be opened.
     """
 
-    def __init__(self, address: Address) -> None:
-        self._lock = BusLock(address, f"calibrate motors (PID {os.getpid()})")
+    def __init__(
+        self,
+        address: Address,
+        clock: Clock = COMPUTER_CLOCK,
+        open_bus: Callable[[str, str, Mapping[str, Any]], can.BusABC] = open_bus,
+    ) -> None:
+        self._lock = BusLock(address, f"calibrate motors (PID {os.getpid()})", clock=clock)
+        self._now = clock.monotonic
         self.name = address[1]
         self._v3: dict[int, Answer] = {}  # the newest status of each V3 board
         try:
@@ -79,7 +78,7 @@ class BusScan:
                     f"CAN bus {self.name}: the last can_bridge died and may have left the motors on: start can_bridge, "
                     "which lets the arm down, and stop it"
                 )
-            self._port = CanPort(open_bus(*address))
+            self._port = CanPort(open_bus(*address), clock)
             try:
                 self._listen()
             except BusError:
@@ -132,8 +131,8 @@ class BusScan:
         return answers | self._statuses(reporting)
 
     def _listen(self) -> None:
-        end = time.monotonic() + LISTEN_TIME
-        while (remaining := end - time.monotonic()) > 0.0:
+        end = self._now() + LISTEN_TIME
+        while (remaining := end - self._now()) > 0.0:
             message = self._port.receive(remaining)
             if message is None or message.is_error_frame or message.is_remote_frame:
                 continue
@@ -149,8 +148,8 @@ class BusScan:
         """Return the next status of each of these V3 boards; a silent one is missing."""
         self._drain()
         before = dict(self._v3)
-        end = time.monotonic() + STATUS_TIME
-        while (remaining := end - time.monotonic()) > 0.0 and any(self._v3[i] is before[i] for i in can_ids):
+        end = self._now() + STATUS_TIME
+        while (remaining := end - self._now()) > 0.0 and any(self._v3[i] is before[i] for i in can_ids):
             message = self._port.receive(remaining)
             if message is not None and message.is_extended_id:
                 self._note_status(message)
@@ -167,6 +166,7 @@ class BusScan:
         return kind
 
     def _drain(self) -> None:
+        """Read the frames that have arrived, but not forever: two motors with one ID may keep answering each other."""
         for _ in range(MAX_STALE_FRAMES):
             if self._port.waiting() is None:
                 break
@@ -180,8 +180,8 @@ class BusScan:
         self._port.send((can_id, NOTHING))
         replies: list[Answer] = []
         others: list[Frame] = []
-        end = time.monotonic() + REPLY_TIME
-        while (remaining := end - time.monotonic()) > 0.0 and (is_alone or not replies):
+        end = self._now() + REPLY_TIME
+        while (remaining := end - self._now()) > 0.0 and (is_alone or not replies):
             message = self._port.receive(remaining)
             if message is None or message.is_extended_id or message.is_error_frame or message.is_remote_frame:
                 continue

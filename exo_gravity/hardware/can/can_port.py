@@ -1,15 +1,14 @@
 """A python-can bus that survives its adapter: every error becomes a BusError, and a failed bus is opened again.
 
 Backends raise more than `can.CanError`: slcan raises ValueError on a garbled line. A USB adapter that is plugged in
-again is a new device, which only a newly opened bus can reach. Opening may block, so a helper thread does it.
+again is a new device, which only a newly opened bus can reach. Opening may block, so another thread does it.
 """
 
 from __future__ import annotations
 
 import contextlib
-import threading
-import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import can
@@ -17,6 +16,7 @@ from can.interfaces.socketcan import SocketcanBus
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.wire_formats.wire_format import EXTENDED, ID_BITS, Frame
+from exo_gravity.hardware.clock import Clock
 
 REOPEN_AFTER = 0.02  # s of failures in a row after which the bus is opened again
 REOPEN_PERIOD = 0.1  # s between two attempts
@@ -37,19 +37,21 @@ class CanPort:
     """Sends and receives classic CAN frames. Not thread-safe: one thread owns it.
 
     reopen: opens the bus again and raises BusError if it cannot; None if a failed bus must stay failed.
-    name: of the bus. marks_echoes: whether `is_rx` is false only for frames that this port sent.
     """
 
-    def __init__(self, bus: can.BusABC, reopen: Callable[[], can.BusABC] | None = None) -> None:
-        self._bus = bus
+    def __init__(self, bus: can.BusABC, clock: Clock, reopen: Callable[[], can.BusABC] | None = None) -> None:
+        #: Name of the bus.
         self.name = str(bus.channel_info)
+        #: Whether `is_rx` is false only for frames that this port sent.
         self.marks_echoes = not isinstance(bus, SocketcanBus)
+        self._bus = bus
+        self._clock = clock
         self._reopen = reopen
         self._failing_since: float | None = None
         self._error = ""
         self._is_open = True
         self._is_closing = False
-        self._reopened: can.BusABC | None = None
+        self._reopened: can.BusABC | None = None  # by the other thread, not yet in use
 
     def send(self, frame: Frame) -> None:
         """Send one frame. Raises BusError."""
@@ -105,27 +107,30 @@ class CanPort:
         return self._bus
 
     def _failure(self, error: Exception) -> BusError:
-        now = time.monotonic()
+        now = self._clock.monotonic()
         self._error = f"{error}" if isinstance(error, (can.CanError, OSError)) else f"{type(error).__name__}: {error}"
         if self._failing_since is None:
             self._failing_since = now
         elif self._reopen is not None and now - self._failing_since > REOPEN_AFTER:
             self._is_open = False
-            threading.Thread(target=self._open_again, args=(self._reopen,), name="reopen", daemon=True).start()
+            self._clock.later(0.0, partial(self._replace, self._bus, self._reopen))
         return BusError(f"CAN bus {self.name}: {self._error}")
 
-    def _open_again(self, reopen: Callable[[], can.BusABC]) -> None:
-        _close(self._bus)
-        while not self._is_closing:
-            try:
-                bus = reopen()
-            except BusError:
-                time.sleep(REOPEN_PERIOD)
-                continue
-            if self._is_closing:
-                _close(bus)
-            self._reopened = bus
+    def _replace(self, failed: can.BusABC, reopen: Callable[[], can.BusABC]) -> None:
+        _close(failed)
+        self._try_to_open(reopen)
+
+    def _try_to_open(self, reopen: Callable[[], can.BusABC]) -> None:
+        if self._is_closing:
             return
+        try:
+            bus = reopen()
+        except BusError:
+            self._clock.later(REOPEN_PERIOD, partial(self._try_to_open, reopen))
+            return
+        if self._is_closing:
+            _close(bus)
+        self._reopened = bus
 
 
 def _close(bus: can.BusABC) -> None:

@@ -4,7 +4,11 @@ The wire formats of the boards (core/wire_formats) may differ. A motor of V1 and
 200-400 us later. A V3 board sends status frames on its own timer: the first one after a command counts as its reply.
 Frames of other devices are ignored and counted by kind.
 
-A motor obeys every sender. A command to one of our motors that we did not send is answered at once with our own.
+A motor obeys every sender. A command to one of our motors that we did not send is answered at once with our own. To
+know it, echoes of our own frames are set apart: most buses return none. Some return them and mark them (`is_rx` is
+false). udp_multicast returns them unmarked, in order. The first frames show whether a bus echoes. SocketCAN sets the
+same mark on every frame from this computer, also on those of another process (Documentation/networking/can.rst of
+Linux, MSG_DONTROUTE): there it does not show an echo.
 
 A zero command precedes the frames that switch a V1 or V2 board on or off: the motor remembers its last command, and
 ENTER would carry it out. A command switches a V3 board on, so it gets none while the arm is off.
@@ -14,8 +18,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from itertools import chain
 
@@ -23,12 +26,13 @@ import can
 
 from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.wire_formats.wire_format import REPLY, Frame
+from exo_gravity.core.motors.wire_formats import WireFormat
+from exo_gravity.core.motors.wire_formats.wire_format import COMMAND, EXTENDED, REPLY, Frame
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import OFF, Drive
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample
 from exo_gravity.hardware.can.can_port import CanPort, open_bus
-from exo_gravity.hardware.can.frame_filter import FOREIGN_COMMAND, FrameFilter
+from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
 __all__ = ["MotorBus", "open_bus"]
 
@@ -41,16 +45,18 @@ LISTEN_TIME = 0.12  # s before the first frame
 SETTLING_TIME = 0.02  # s of it in which late replies to the previous owner may still arrive
 CORRECTION_PERIOD = 0.001  # s between two corrections of a motor: two correcting hosts must not fill the bus
 CONTEST_TIME = 0.5  # s after a foreign command in which another one is expected
+FOREIGN_COMMAND = "foreign command"
+TRIAL = 32  # frames sent until it is known whether the bus echoes
+MOST_AWAITED = 512  # twice the frames that a udp_multicast socket keeps unread
+
+Group = tuple[WireFormat, frozenset[int]]  # the motors of one format
 
 
 class MotorBus:
     """Four motors on one bus. Not thread-safe: one thread owns it.
 
     powered: whether the motors are already on. note: called with each drive before its frames are sent. reopen: opens
-    the bus again after a failure.
-    samples: the newest JointSample of each joint, UNKNOWN before the first reply; times are `time.monotonic`.
-    ignored: count of frames that were not replies of these motors, by kind.
-    foreign_commands: count of commands to these motors from another sender; foreign_command describes the last one.
+    the bus again after a failure. clock: of all times.
     """
 
     def __init__(
@@ -60,15 +66,22 @@ class MotorBus:
         powered: bool = False,
         note: Callable[[Drive], None] = lambda drive: None,
         reopen: Callable[[], can.BusABC] | None = None,
+        clock: Clock = COMPUTER_CLOCK,
     ) -> None:
         ids = [motor.can_id for motor in motors]
         if len(motors) != JOINT_COUNT or len(set(ids)) != JOINT_COUNT:
             raise ParameterError("can_id", ids, "4 different IDs")
+        #: The newest reading of each joint, UNKNOWN before the first reply.
         self.samples: list[JointSample] = [UNKNOWN] * JOINT_COUNT
+        #: Count of frames that were not replies of these motors, by kind.
         self.ignored: Counter[str] = Counter()
+        #: Count of commands to these motors from another sender.
         self.foreign_commands = 0
+        #: The last of them, in words.
         self.foreign_command = ""
-        self._port = CanPort(bus, reopen)
+        self.clock = clock
+        self._now = clock.monotonic
+        self._port = CanPort(bus, clock, reopen)
         self._filter = FrameFilter(motors, self._port.marks_echoes)
         self._motors = tuple(motors)
         self._asked = frozenset(joint for joint, motor in enumerate(motors) if motor.wire_format.replies)
@@ -92,11 +105,11 @@ class MotorBus:
     @property
     def is_contested(self) -> bool:
         """Whether another sender commands these motors."""
-        return time.monotonic() - self._foreign_time < CONTEST_TIME
+        return self._now() - self._foreign_time < CONTEST_TIME
 
     def listen(self) -> None:
         """Listen before the first frame. Raises BusError if another host commands these motors."""
-        end = time.monotonic() + LISTEN_TIME
+        end = self._now() + LISTEN_TIME
         self.receive_until(end - LISTEN_TIME + SETTLING_TIME)
         self._answered.clear()
         self.foreign_commands = 0
@@ -107,7 +120,7 @@ class MotorBus:
             raise BusError(f"CAN bus {self._port.name} is in use: {heard}; stop the other commander first")
 
     def exchange(self, drive: Drive, deadline: float) -> bool:
-        """Send every motor its part of `drive`, then collect replies until all arrived or `deadline` (monotonic s).
+        """Send every motor its part of `drive`, then collect replies until all arrived or `deadline` (s).
 
         Switches the motors on or off when `drive.powered` changes. Returns whether all motors replied in time. Raises
         BusError if the bus fails.
@@ -122,7 +135,7 @@ class MotorBus:
             self._switch_off()
         self._answered.clear()
         while len(self._answered) < JOINT_COUNT:
-            remaining = deadline - time.monotonic()
+            remaining = deadline - self._now()
             message = self._port.receive(max(0.0, remaining))
             if message is not None:
                 self._take(message)
@@ -132,8 +145,8 @@ class MotorBus:
         return len(self._answered) == JOINT_COUNT
 
     def receive_until(self, deadline: float, is_done: Callable[[], bool] = lambda: False) -> None:
-        """Receive until `deadline` (monotonic s) or `is_done()`, and answer foreign commands. Raises BusError."""
-        while not is_done() and (remaining := deadline - time.monotonic()) > 0.0:
+        """Receive until `deadline` (s) or `is_done()`, and answer foreign commands. Raises BusError."""
+        while not is_done() and (remaining := deadline - self._now()) > 0.0:
             message = self._port.receive(remaining)
             if message is not None:
                 self._take(message)
@@ -161,7 +174,7 @@ class MotorBus:
                         self._send(frame)
                     except BusError:
                         self.ignored["unsent"] += 1
-            self._powered, self._exit_sent = False, time.monotonic()
+            self._powered, self._exit_sent = False, self._now()
             end = self._exit_sent + LAST_REPLIES
             with contextlib.suppress(BusError):
                 self.receive_until(end, lambda: not self._unconfirmed)
@@ -183,11 +196,11 @@ class MotorBus:
 
     def _switch_off(self) -> None:
         period = UNCONFIRMED_EXIT_PERIOD if self._unconfirmed else EXIT_PERIOD
-        if self._powered or time.monotonic() - self._exit_sent > period:
+        if self._powered or self._now() - self._exit_sent > period:
             for joint, motor in enumerate(self._motors):
                 zero = () if joint in self._asked else self._zero_command(joint)
                 self._send_each((zero, motor.exit))
-            self._exit_sent = time.monotonic()
+            self._exit_sent = self._now()
         self._powered = False
 
     def _zero_command(self, joint: int) -> tuple[Frame, ...]:
@@ -233,11 +246,11 @@ class MotorBus:
         self._answered.add(joint)
         if self._is_confirming and (joint in self._asked or abs(reply.torque) < OFF_EFFORT):
             self._unconfirmed.discard(joint)
-        self.samples[joint] = JointSample(*reply[1:], time.monotonic())
+        self.samples[joint] = JointSample(*reply[1:], self._now())
 
     def _oppose(self, joint: int, foreign: bytes) -> None:
         """Send our last command again after a foreign one, so that the motor obeys it for less than a millisecond."""
-        now = time.monotonic()
+        now = self._now()
         motor, command = self._motors[joint], self._commands[joint]
         self.foreign_commands += 1
         self._foreign_time = now
@@ -248,3 +261,55 @@ class MotorBus:
         if is_exit or now - self._corrected[joint] >= CORRECTION_PERIOD:
             self._send_each([(command, *motor.enter) if is_exit else (), (command,)])
             self._corrected[joint] = now
+
+
+class FrameFilter:
+    """Knows `motors` and which frames were sent. marks_echoes: whether `is_rx` is false for echoes only."""
+
+    def __init__(self, motors: Sequence[JointMotor], marks_echoes: bool = True) -> None:
+        self._standard = _groups(motors, is_extended=False)
+        self._extended = _groups(motors, is_extended=True)
+        self._marks_echoes = marks_echoes
+        self._awaited: deque[Frame] = deque(maxlen=MOST_AWAITED)  # sent, their echoes not yet received
+        self._sent = self._returned = 0
+        self._is_echoing: bool | None = None  # None: not yet known
+
+    def sent(self, frame: Frame) -> None:
+        """Note a frame that is being sent."""
+        if self._is_echoing is False:
+            return
+        if self._is_echoing is None and self._sent >= TRIAL:
+            self._is_echoing = self._returned >= TRIAL // 2
+        self._sent += 1
+        self._awaited.append(frame)
+
+    def sort(self, message: can.Message) -> tuple[str, int]:
+        """Return REPLY or FOREIGN_COMMAND with the motor's ID, or the kind of a frame that does not matter with 0."""
+        if message.is_error_frame:
+            return "error frame", 0
+        is_extended = message.is_extended_id
+        groups = self._extended if is_extended else self._standard
+        if message.is_remote_frame or message.is_fd or (is_extended and not groups):
+            return "extended, remote or FD frame", 0
+        frame_id = message.arbitration_id | EXTENDED if is_extended else message.arbitration_id
+        for wire_format, motor_ids in groups:
+            kind, motor_id = wire_format.classify(frame_id, message.data, motor_ids)
+            if kind == REPLY:
+                return kind, motor_id
+            if kind == COMMAND:
+                is_echo = (self._marks_echoes and not message.is_rx) or self._is_echo((frame_id, bytes(message.data)))
+                return ("echo", 0) if is_echo else (FOREIGN_COMMAND, motor_id)
+        return "foreign frame", 0
+
+    def _is_echo(self, frame: Frame) -> bool:
+        if self._is_echoing is False or frame not in self._awaited:
+            return False
+        while self._awaited.popleft() != frame:
+            pass  # echoes come in order, so those before it are lost
+        self._returned += 1
+        return True
+
+
+def _groups(motors: Sequence[JointMotor], is_extended: bool) -> tuple[Group, ...]:
+    formats = {motor.wire_format for motor in motors if motor.wire_format.is_extended is is_extended}
+    return tuple((each, frozenset(m.can_id for m in motors if m.wire_format == each)) for each in formats)

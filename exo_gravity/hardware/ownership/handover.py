@@ -5,9 +5,8 @@ The watchdog does it for a bridge that has died, and a new bridge does it if bot
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import can
 
@@ -17,22 +16,25 @@ from exo_gravity.core.safety.delivery import ABSOLUTE, RELATIVE
 from exo_gravity.core.safety.drive import Drive
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.hardware.can.motor_bus import MotorBus, open_bus
+from exo_gravity.hardware.can.can_port import open_bus
+from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
+from exo_gravity.hardware.ownership.bus_lock import Address
 
 OPEN_PERIOD = 0.05  # s between two attempts to open the bus
 FIRST_REPLIES = 0.05  # s in which the motors must reply to the first commands
-CHECK_PERIOD = 0.05  # s
 RETRY_PERIOD = 0.25  # s between two attempts to reach a motor that does not reply, however long it takes
 
 
-class Charge(NamedTuple):
-    """The arm to let down: its bus (interface, channel, options), motors, limits, and control period in s."""
+@dataclass(frozen=True)
+class ArmOnBus:
+    """An arm that may have to be let down, and how to reach it."""
 
-    address: tuple[str, str, Mapping[str, Any]]
+    address: Address
     motors: Sequence[JointMotor]
     limits: Limits
-    period: float
+    period: float  #: s of a control cycle.
 
     def open(self) -> can.BusABC:
         """Open the python-can bus. Raises BusError."""
@@ -40,11 +42,12 @@ class Charge(NamedTuple):
 
 
 def let_down(
-    charge: Charge,
+    arm: ArmOnBus,
     drive: Drive,
     note: Callable[[Drive], None] = lambda drive: None,
     log: Callable[[str], None] = lambda text: None,
     is_endless: bool = True,
+    clock: Clock = COMPUTER_CLOCK,
 ) -> bool:
     """Let down an arm whose motors apply `drive`; return whether its motors have confirmed that they are off.
 
@@ -52,55 +55,56 @@ def let_down(
     the bus or a motor cannot be reached.
     """
     try:
-        bus = _open(charge, log, is_endless)
+        bus = _open(arm, log, is_endless, clock)
     except BusError as error:
         log(str(error))
         return False
-    motors = MotorBus(bus, charge.motors, powered=True, note=note, reopen=charge.open)
-    machine = SafetyMachine(charge.limits, charge.period, peaks_of(charge.motors))
-    machine.take_over(*_applied(motors, drive, charge.period), time.monotonic())
-    loop = ControlLoop(motors, machine, charge.period)
-    loop.start()
-    was_unreached = False
-    while loop.is_alive and not loop.is_off:
+    motors = MotorBus(bus, arm.motors, powered=True, note=note, reopen=arm.open, clock=clock)
+    machine = SafetyMachine(arm.limits, arm.period, peaks_of(arm.motors))
+    machine.take_over(*_applied(motors, drive, arm.period), clock.monotonic())
+    loop = ControlLoop(motors, machine, arm.period)
+    was_unreached, incomplete = False, 0
+    while not loop.is_off and loop.cycle():
         if machine.is_unreached and not was_unreached:
             log("a motor does not reply; it may still be powered; trying again")
         was_unreached = machine.is_unreached
         if was_unreached and not is_endless:
             loop.abandon()
             return False
-        loop.period = RETRY_PERIOD if was_unreached else charge.period
-        time.sleep(CHECK_PERIOD)
+        # Once every motor has replied, the next cycle must come before their replies are too old.
+        loop.period = RETRY_PERIOD if was_unreached and loop.incomplete > incomplete else arm.period
+        incomplete = loop.incomplete
     loop.stop()
     return not motors.may_be_powered
 
 
-def _open(charge: Charge, log: Callable[[str], None], is_endless: bool) -> can.BusABC:
+def _open(arm: ArmOnBus, log: Callable[[str], None], is_endless: bool, clock: Clock) -> can.BusABC:
     is_first = True
     while True:
         try:
-            return charge.open()
+            return arm.open()
         except BusError as error:
             if not is_endless:
                 raise
             if is_first:
                 log(f"{error}; the motors may still be powered; trying again")
             is_first = False
-            time.sleep(OPEN_PERIOD)
+            clock.sleep(OPEN_PERIOD)
 
 
 def _applied(motors: MotorBus, drive: Drive, period: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return the effort (4,) in Nm and damping (4,) in Nm s/rad that the motors apply, which received `drive`.
 
-    A motor that replies another torque has been switched off or obeyed another sender. Then its reply counts.
+    A motor that replies another torque has been switched off or obeyed another sender. Then its reply is used.
     """
-    end = time.monotonic() + FIRST_REPLIES
+    clock = motors.clock
+    end = clock.monotonic() + FIRST_REPLIES
     is_complete = False
-    while not is_complete and time.monotonic() < end:
+    while not is_complete and clock.monotonic() < end:
         try:
-            is_complete = motors.exchange(drive._replace(powered=True), time.monotonic() + period)
+            is_complete = motors.exchange(drive._replace(powered=True), clock.monotonic() + period)
         except BusError:
-            time.sleep(period)
+            clock.sleep(period)
     effort, damping = list(drive.effort), list(drive.damping)
     for i, joint in enumerate(motors.samples):
         if not _is_as_noted(joint, effort[i], damping[i]):

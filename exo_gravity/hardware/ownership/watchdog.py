@@ -1,51 +1,84 @@
-"""The bridge's end of the watchdog: starts its process, checks that it runs, and can hand the arm over to it.
+"""The watchdog: a process that lets the arm down when its bridge dies, freezes or hands it over. Both ends of it.
 
-The watchdog is a separate process (watchdog_process.py). It shares the notes of the bus with the bridge, and a
-pipe, which breaks when the bridge dies for any reason. It inherits the lock of the bus.
+It shares the notes of the bus with the bridge, and a pipe, which breaks when the bridge dies for any reason. It
+inherits the lock of the bus. If the motors were on, it continues from the last noted drive. A bridge that is alive but
+has noted nothing for `FROZEN` is killed first: two processes must never command one motor.
+
+The process acts first and logs afterwards, on a thread: the pipe of its log may be full, because its reader is frozen.
+Its exit code is 0 if the motors were off, or have confirmed that they are; 1 if they may still be powered.
 """
 
 from __future__ import annotations
 
 import contextlib
+import importlib
+import mmap
 import os
+import signal
 import subprocess
 import sys
-import time
+import threading
+from collections.abc import Callable
 from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from queue import SimpleQueue
 
-from exo_gravity.hardware.ownership.bus_lock import BusLock
-from exo_gravity.hardware.ownership.handover import Charge
+import can
 
+from exo_gravity.core.safety.checks import FROZEN
+from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
+from exo_gravity.hardware.ownership.bus_lock import BusLock, DriveNotes
+from exo_gravity.hardware.ownership.handover import ArmOnBus, let_down
+
+# In the bridge.
 START_TIME = 15.0  # s until the first heartbeat: the process must import its modules on a busy machine
 HEARTBEAT_TIMEOUT = 0.3  # s without a heartbeat, while this process itself runs
-LONGEST_LOOK = 0.15  # s between two looks that count; longer ones show that this process did not run
+LONGEST_LOOK = 0.15  # s between two looks of a process that runs
 END_TIME = 2.0  # s for the process to end after `close`
+# In the watchdog's process.
+POLL = 0.01  # s
+LOG_TIME = 1.0  # s for the last lines of the log
+
+
+class Silence:
+    """How long another process has given no sign of life, seen by a process that may have stood still itself.
+
+    now: s. longest_look: s between two looks of a process that runs. If more time has passed, the whole machine may
+    have stood still, and the other process gets another chance: only `longest_look` is added.
+    """
+
+    def __init__(self, now: float, longest_look: float) -> None:
+        self._last_look = now
+        self._longest_look = longest_look
+        self._sign = 0.0
+        self._duration = 0.0
+
+    def look(self, now: float, sign: float, is_due: bool = True) -> float:
+        """Return the silence in s at `now`, 0 if `sign` is new. is_due: whether the other process must give signs."""
+        is_silent = is_due and sign == self._sign
+        self._duration = self._duration + min(now - self._last_look, self._longest_look) if is_silent else 0.0
+        self._last_look, self._sign = now, sign
+        return self._duration
 
 
 class Watchdog:
-    """A watchdog process for the arm `charge`, on the bus that `lock` holds."""
+    """The bridge's end: the watchdog process of `arm`, on the bus that `lock` holds."""
 
-    def __init__(self, lock: BusLock, charge: Charge) -> None:
+    def __init__(self, lock: BusLock, arm: ArmOnBus, clock: Clock) -> None:
         self._notes = lock.notes
-        self._start = self._last_look = time.monotonic()
-        self._heartbeat = 0.0
-        self._silence = 0.0
+        self._clock = clock
+        self._start = clock.monotonic()
+        self._silence = Silence(self._start, LONGEST_LOOK)
         receiver, self._sender = Pipe(duplex=False)
         shared = (lock.descriptor, receiver.fileno())
         self._process = subprocess.Popen(
-            [
-                sys.executable,
-                "-m",
-                "exo_gravity.hardware.ownership.watchdog_process",
-                str(os.getpid()),
-                *map(str, shared),
-            ],
+            [sys.executable, "-m", "exo_gravity.hardware.ownership.watchdog", *map(str, (os.getpid(), *shared))],
             pass_fds=shared,
             stdin=subprocess.DEVNULL,
             start_new_session=True,  # keeps Ctrl-C and Ctrl-Z in the terminal away from it
         )
         receiver.close()
-        self._sender.send(charge)
+        self._sender.send(arm)
 
     @property
     def pid(self) -> int:
@@ -57,13 +90,10 @@ class Watchdog:
         """Whether the watchdog process runs. Read it several times a second: it must also notice a frozen process."""
         if self._process.poll() is not None:
             return False
-        now, heartbeat = time.monotonic(), self._notes.heartbeat
+        now, heartbeat = self._clock.monotonic(), self._notes.heartbeat
         if heartbeat == 0.0:
             return now - self._start < START_TIME
-        is_new = heartbeat != self._heartbeat
-        self._silence = 0.0 if is_new else self._silence + min(now - self._last_look, LONGEST_LOOK)
-        self._heartbeat, self._last_look = heartbeat, now
-        return self._silence < HEARTBEAT_TIMEOUT
+        return self._silence.look(now, heartbeat) < HEARTBEAT_TIMEOUT
 
     def hand_over(self, reason: str) -> bool:
         """Request the watchdog to kill this process and let the arm down; return whether it is alive."""
@@ -84,3 +114,103 @@ class Watchdog:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+
+
+def guard(
+    kill: Callable[[], None], notes: DriveNotes, receiver: Connection, log: Callable[[str], None], clock: Clock
+) -> int:
+    """Watch the bridge until it has ended, let its arm down if necessary, and return the exit code.
+
+    kill: kills the bridge. receiver: the watchdog's end of the pipe.
+    """
+    arm, why = _watch(kill, notes, receiver, clock)
+    drive = notes.drive
+    if not drive.powered:
+        return 0
+    if arm is None:
+        log(f"can_bridge {why}: its motors may still be powered")
+        return 1
+    notes.owner = f"the watchdog (PID {os.getpid()}) of {notes.owner}; it is letting the arm down, wait until it ends"
+    log(f"can_bridge {why}: letting the arm down")
+    if let_down(arm, drive, notes.note, log, clock=clock):
+        log("the arm is down, its motors are off")
+        return 0
+    log("the motors may still be powered: cut their supply")
+    return 1
+
+
+def _watch(
+    kill: Callable[[], None], notes: DriveNotes, receiver: Connection, clock: Clock
+) -> tuple[ArmOnBus | None, str]:
+    """Watch the bridge until it has ended; return the arm that it had, and why it ended."""
+    arm: ArmOnBus | None = None
+    silence = Silence(clock.monotonic(), 2 * POLL)
+    with contextlib.suppress(EOFError, ConnectionError):
+        while True:
+            if receiver.poll(POLL):
+                message = receiver.recv()
+                if isinstance(message, str):
+                    kill()
+                    return arm, f"handed the arm over and has been killed ({message})"
+                arm = message
+                _load(message.address[0])
+            is_powered, noted, now = notes.drive.powered, notes.time, clock.monotonic()
+            if arm:
+                notes.beat(now)
+            if silence.look(now, noted, is_powered) > FROZEN:
+                kill()  # it sends nothing from here on, even if it takes long to die
+                return arm, f"was frozen for {FROZEN * 1000:.0f} ms and has been killed"
+    return arm, "has died"
+
+
+def _load(interface: str) -> None:
+    """Import the bus's module ahead of time."""
+    with contextlib.suppress(KeyError, ImportError):
+        importlib.import_module(can.interfaces.BACKENDS[interface][0])
+
+
+class Log:
+    """Writes lines to the standard error output without ever blocking the caller."""
+
+    def __init__(self) -> None:
+        self._lines: SimpleQueue[str | None] = SimpleQueue()
+        self._thread = threading.Thread(target=self._write, daemon=True)
+        self._thread.start()
+
+    def write(self, text: str) -> None:
+        """Log one line."""
+        self._lines.put(f"ERROR {text}\n")
+
+    def close(self) -> None:
+        """Wait for the last lines, but not for a reader that is frozen."""
+        self._lines.put(None)
+        self._thread.join(LOG_TIME)
+
+    def _write(self) -> None:
+        with contextlib.suppress(OSError):
+            while (line := self._lines.get()) is not None:
+                os.write(2, line.encode())
+
+
+def main() -> None:
+    """Entry point of the process; arguments: the bridge's PID, and the descriptors of lock file and pipe."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    with contextlib.suppress(PermissionError):
+        os.setpriority(os.PRIO_PROCESS, 0, -20)
+    bridge, lock, receiver = map(int, sys.argv[1:])
+    notes = DriveNotes(mmap.mmap(lock, mmap.PAGESIZE), COMPUTER_CLOCK)
+    log = Log()
+    code = guard(
+        lambda: os.kill(bridge, signal.SIGKILL),
+        notes,
+        Connection(receiver, writable=False),
+        log.write,
+        COMPUTER_CLOCK,
+    )
+    log.close()
+    os._exit(code)  # the log's thread may be blocked
+
+
+if __name__ == "__main__":
+    main()

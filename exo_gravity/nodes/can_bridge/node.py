@@ -23,7 +23,7 @@ from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.params import CAN_BRIDGE, limits_of
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.hardware.ownership.handover import Charge
+from exo_gravity.hardware.ownership.handover import ArmOnBus
 from exo_gravity.hardware.ownership.owned_bus import OwnedBus
 from exo_gravity.hardware.scheduling import request_real_time
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
@@ -54,7 +54,7 @@ class CanBridge(LifecycleNode):
         address = bus_of(self, values)
         traffic = traffic_of(values, address[2])
         traffic.check(values["rate"])
-        self._charge = Charge(address, self._motors, self._limits, self._period)
+        self._arm = ArmOnBus(address, self._motors, self._limits, self._period)
         self._owner = f"{self.get_fully_qualified_name()} (PID {os.getpid()})"
         self._real_time = values["thread_priority"], values["thread_priority"] > 0
         self._owned: OwnedBus | None = None  # while configured
@@ -151,7 +151,7 @@ class CanBridge(LifecycleNode):
         return TransitionCallbackReturn.FAILURE
 
     def _configure(self) -> None:
-        self._owned = OwnedBus(self._charge, self._owner, self.get_logger().error)
+        self._owned = OwnedBus(self._arm, self._owner, self.get_logger().error)
         try:
             self._bus = self._owned.open()
         except BaseException:

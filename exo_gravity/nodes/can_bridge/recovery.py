@@ -10,7 +10,7 @@ from rclpy.signals import SignalHandlerOptions
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.motors.params import OPTIONS, motors_of
 from exo_gravity.core.safety.params import CAN_BRIDGE, limits_of
-from exo_gravity.hardware.ownership.handover import Charge
+from exo_gravity.hardware.ownership.handover import ArmOnBus
 from exo_gravity.hardware.ownership.owned_bus import recover
 from exo_gravity.nodes.ros.parameters import bus_of, declare
 from exo_gravity.nodes.ros.run import keep_to_this_machine
@@ -31,9 +31,9 @@ def run_recovery() -> int:
     node = rclpy.create_node("can_bridge", automatically_declare_parameters_from_overrides=True)
     try:
         values = declare(node, CAN_BRIDGE, free_prefix=OPTIONS)
-        charge = Charge(bus_of(node, values), motors_of(values), limits_of(values), 1.0 / values["rate"])
+        arm = ArmOnBus(bus_of(node, values), motors_of(values), limits_of(values), 1.0 / values["rate"])
         owner = f"{node.get_fully_qualified_name()} (PID {os.getpid()})"
-        return 0 if recover(charge, owner, node.get_logger().error, float(os.environ[RECOVER])) else 1
+        return 0 if recover(arm, owner, node.get_logger().error, float(os.environ[RECOVER])) else 1
     except ExoGravityError as error:
         node.get_logger().error(str(error))
         return 1
