@@ -1,12 +1,5 @@
 """calibrate COMMAND --params FILE --output NEW.yaml: finds what differs between an arm and its parameter file.
 
-    motors     each joint's motor, direction and zero: the person moves the joints by hand, nothing is switched on
-    gravity    the robot's first moments: the arm, on a stand and without a wearer, moves slowly through chosen poses
-    friction   Coulomb, viscous and Stribeck friction of each joint, from slow sweeps
-    scale      real torque per commanded torque of each motor, from a known weight on the last link
-    wearer     the moments of the wearer's relaxed arm
-    imu        how the IMU is mounted on the trunk, from standing upright and bowing
-
 The new file is the old one with new values, their uncertainty and the date. Beside it are a page (NEW.html) and
 what was measured (NEW.jsonl). No existing file is ever overwritten.
 

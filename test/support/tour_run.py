@@ -10,11 +10,11 @@ import mujoco
 import numpy as np
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.calibration.guess import TorqueGuess
 from exo_gravity.core.calibration.poses import BestPoses, Itinerary
 from exo_gravity.core.calibration.tour import Tour
-from exo_gravity.core.calibration.tracking import MassMatrix
+from exo_gravity.core.calibration.tracking import TorqueGuess
 from exo_gravity.core.model.gravity import Torque
+from exo_gravity.core.model.kinematics import LinkInertia
 from exo_gravity.core.model.moments import load_moments, moments_of
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.motors.joint_motor import JointMotor, peaks_of
@@ -139,10 +139,10 @@ def worst_error(tour: Tour, truth: ArmModel) -> float:
     )
 
 
-def assert_close_to_device(matrix: MassMatrix, arm: SimulatedArm, atol: float) -> None:
-    """`matrix` is within `atol` kg m^2 of the mass matrix of the simulated arm in three poses."""
+def assert_close_to_device(inertia: LinkInertia, arm: SimulatedArm, atol: float) -> None:
+    """`inertia` is within `atol` kg m^2 of the mass matrix of the simulated arm in three poses."""
     for theta in ((0.0,) * 4, (0.3, 0.8, 0.7, 0.5), (-0.5, 1.5, 1.2, 1.0)):
         arm.reset(theta)
         true = np.zeros((4, 4))
         mujoco.mj_fullM(arm.model, arm.data, true)
-        np.testing.assert_allclose(matrix.at(theta), true, atol=atol)
+        np.testing.assert_allclose(inertia.matrix(theta), true, atol=atol)

@@ -93,7 +93,7 @@ class Line:
         return is_steady and abs(2.0 * travelled / self._length - 1.0) <= WINDOW
 
 
-class Sweep(NamedTuple):
+class SweepSamples(NamedTuple):
     """The samples of one sweep."""
 
     forward: bool  #: on the way there
@@ -111,7 +111,7 @@ class Average(NamedTuple):
     unrest: np.ndarray  #: (4,) Nm, largest change of the effort from one cycle to another
 
 
-def average(sweeps: Sequence[Sweep], slope: np.ndarray, bend: np.ndarray | None = None) -> Average:
+def average(sweeps: Sequence[SweepSamples], slope: np.ndarray, bend: np.ndarray | None = None) -> Average:
     """Return the average of `sweeps`, which alternate between there and back.
 
     slope: (4, 4) Nm/rad, change of the expected torque with each angle, which relates efforts at different angles.
@@ -147,7 +147,7 @@ class Visit:
         self.stuck_joints: dict[int, float] = {}
         self._failures = 0
         self._slope, self._bend = slope, bend
-        self._sweeps: list[Sweep] = []
+        self._sweeps: list[SweepSamples] = []
         self._samples: list[tuple[Sequence[float], Torque]] = []
         self._directions: list[tuple[float, float, float]] = []
 
@@ -175,7 +175,7 @@ class Visit:
     def end_sweep(self) -> np.ndarray | None:
         """End a sweep. Return the friction (4,) in Nm that it and the one before show, None after a way there."""
         position, effort = (np.array(column) for column in zip(*self._samples, strict=True))
-        self._sweeps.append(Sweep(len(self._sweeps) % 2 == 0, position, effort))
+        self._sweeps.append(SweepSamples(len(self._sweeps) % 2 == 0, position, effort))
         self._samples = []
         if len(self._sweeps) % 2:
             return None

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.calibration.friction import friction_stations
-from exo_gravity.core.calibration.guess import TorqueGuess
 from exo_gravity.core.calibration.poses import BestPoses, FixedStations, Itinerary
 from exo_gravity.core.calibration.tour import Tour
+from exo_gravity.core.calibration.tracking import TorqueGuess
 from exo_gravity.core.compensation.params import COMPENSATOR
 from exo_gravity.core.model.arm import MAX_LENGTH, MAX_MASS, MAX_MOMENT
 from exo_gravity.core.model.moments import load_moments

@@ -8,9 +8,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from exo_gravity.core.calibration.guess import TorqueGuess
 from exo_gravity.core.calibration.motion import AMPLITUDE, Station, durations
 from exo_gravity.core.calibration.pose_fit import COUNT, MOMENT, NATURAL, START, TYPICAL_MOMENTS, Rows
+from exo_gravity.core.calibration.tracking import TorqueGuess
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.model.moments import regressor

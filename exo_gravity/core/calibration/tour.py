@@ -13,13 +13,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from exo_gravity.core.calibration.guess import TorqueGuess
 from exo_gravity.core.calibration.identification import Observation
 from exo_gravity.core.calibration.motion import FOLLOWED, LEAD, Line, Station, Visit
 from exo_gravity.core.calibration.poses import Itinerary
-from exo_gravity.core.calibration.tracking import MassMatrix, Tracker
+from exo_gravity.core.calibration.tracking import TorqueGuess, Tracker, inertia_of
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.model.gravity import Torque
+from exo_gravity.core.model.kinematics import LinkInertia
 from exo_gravity.core.model.tilt import Tilt, angle_between
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.limits import Limits
@@ -120,7 +120,7 @@ class Tour:
         self._load = load
         self._most = np.array(limits.max_effort)
         self._tracker = Tracker(rate, limits.max_effort)
-        self._masses = self._mass_matrix()
+        self._inertia = self._known_inertia()
         self._matrix = np.eye(JOINT_COUNT)
         self._watch = TourWatch(limits, guess.tilt)
         self._now = -math.inf
@@ -182,7 +182,7 @@ class Tour:
         if self._now - self._refreshed > REFRESH_PERIOD:
             self._refreshed = self._now
             self._uncertain = self._guess.torques(np.array([position]))[1][0].tolist()
-            self._matrix = self._masses.at(position)
+            self._matrix = self._inertia.matrix(position)
         expected = self._guess.torque(position)
         self._effort = self._tracker.step(dt, error, speed_error, heading, expected, self._matrix)
         return self._watch.torque(dt, self._tracker, self._uncertain, self._friction)
@@ -242,10 +242,10 @@ class Tour:
         before = self._guess.torque(here)
         self._guess.learn(theta, effort, spread)
         self._tracker.shift(np.subtract(self._guess.torque(here), before))
-        self._masses = self._mass_matrix()
+        self._inertia = self._known_inertia()
 
-    def _mass_matrix(self) -> MassMatrix:
-        return MassMatrix(self._guess.length, self._guess.common_moments[:JOINT_COUNT], self._load)
+    def _known_inertia(self) -> LinkInertia:
+        return inertia_of(self._guess.length, self._guess.common_moments[:JOINT_COUNT], self._load)
 
     def _shape(self, station: Station) -> tuple[np.ndarray, np.ndarray]:
         """Return how the expected torque changes at a station: slope and bend, as for `average`."""

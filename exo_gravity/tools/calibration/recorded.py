@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.bag.storage import Storage
 from exo_gravity.core.calibration.identification import Observation
-from exo_gravity.core.calibration.motion import BINS, Sweep, average
+from exo_gravity.core.calibration.motion import BINS, SweepSamples, average
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.trial.recording import Recording, in_blocks, still_spans
@@ -150,7 +150,7 @@ def _there_and_back(recording: Recording, there: slice, back: slice, direction: 
             return None
         ends = inside[[0, -1]]
         speeds.append(np.abs(np.diff(position[ends], axis=0)[0]) / np.diff(recording.time[ends]))
-        sweeps.append(Sweep(forward, position[inside], _effort(recording, inside).astype(float)))
+        sweeps.append(SweepSamples(forward, position[inside], _effort(recording, inside).astype(float)))
     result = average(sweeps, np.zeros((4, 4)))
     sign = np.sign(position[there.stop - 1] - position[there.start])
     speed = np.mean(speeds, axis=0)

@@ -131,14 +131,13 @@ def _moment(arm: ConfiguredArm, mass: np.ndarray, cog: np.ndarray) -> tuple[floa
 def _compared(arm: ConfiguredArm, mass: np.ndarray, cog: np.ndarray) -> tuple[str, tuple[str, ...]]:
     """Return how the masses compare with the body-mass table, and why they would be implausible."""
     given, body_mass = arm.compensator, arm.compensator["wearer.body_mass"]
-    table = given.get("wearer.table", "de_leva")
-    person = Wearer(body_mass or TYPICAL_BODY_MASS, given["wearer.sex"], table, given["wearer.segment_length"])
+    person = Wearer(body_mass or TYPICAL_BODY_MASS, given["wearer.sex"], segment_length=given["wearer.segment_length"])
     load = person.on_links(arm.robot.length)
     tabled = np.array(_moment(arm, load.mass[2:], load.cog[2:]))
     ratio = np.array(_moment(arm, mass, cog)) / tabled
     if not body_mass:
-        return f"a person of {TYPICAL_BODY_MASS * ratio[0]:.0f} kg has this M3 by the table {table}", ()
-    sentence = f"{ratio[0]:.0%} of M3 and {ratio[1]:.0%} of M4 by the table {table} for {body_mass:g} kg"
+        return f"a person of {TYPICAL_BODY_MASS * ratio[0]:.0f} kg has this M3 by the table {person.table}", ()
+    sentence = f"{ratio[0]:.0%} of M3 and {ratio[1]:.0%} of M4 by the table {person.table} for {body_mass:g} kg"
     low, high = TABLE_RATIO
     is_plausible = np.all((ratio >= low) & (ratio <= high))
     return sentence, () if is_plausible else (f"implausible: {sentence}: must be from {low:.0%} to {high:.0%}",)

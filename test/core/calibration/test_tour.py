@@ -10,11 +10,10 @@ import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.calibration.friction import fit_friction
-from exo_gravity.core.calibration.guess import TorqueGuess
-from exo_gravity.core.calibration.motion import ACCELERATION, MAX_SPEED, Line, Station, Sweep, average
+from exo_gravity.core.calibration.motion import ACCELERATION, MAX_SPEED, Line, Station, SweepSamples, average
 from exo_gravity.core.calibration.poses import BestPoses, FixedStations, candidates, measurable
 from exo_gravity.core.calibration.tour import Tour
-from exo_gravity.core.calibration.tracking import MassMatrix
+from exo_gravity.core.calibration.tracking import TorqueGuess, inertia_of
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.moments import load_moments, moments_of
 from exo_gravity.core.model.tilt import Tilt
@@ -191,7 +190,7 @@ def test_the_average_of_sweeps_separates_gravity_and_friction_at_different_angle
         sign = 1.0 if forward else -1.0
         offset = sign * np.linspace(-0.03, 0.03, 60)[:, None] - sign * 0.01  # behind the reference
         position = np.array((0.1, 0.2, 0.3, 0.4)) + offset
-        sweeps.append(Sweep(forward, position, 1.0 + position @ slope.T + sign * friction))
+        sweeps.append(SweepSamples(forward, position, 1.0 + position @ slope.T + sign * friction))
     result = average(sweeps, slope)
     np.testing.assert_allclose(result.friction, friction, atol=1e-9)
     np.testing.assert_allclose(result.effort, 1.0 + slope @ result.theta, atol=1e-9)
@@ -213,7 +212,7 @@ def test_the_expected_torque_learns_scale_and_moments_of_each_joint():
 
 
 def test_the_mass_matrix_is_close_to_that_of_the_device():
-    arm, matrix = SimulatedArm(), MassMatrix(DEFAULT_LINKS.length, DEFAULT_LINKS.first_moment)
+    arm, matrix = SimulatedArm(), inertia_of(DEFAULT_LINKS.length, DEFAULT_LINKS.first_moment)
     assert_close_to_device(matrix, arm, 0.012)
 
 
@@ -233,7 +232,7 @@ def test_chosen_poses_are_within_the_limits_and_can_be_held():
 
 def test_the_mass_matrix_with_a_weight_is_close_to_that_of_the_device():
     arm = SimulatedArm(ArmConfig(wearer_mass=(0, 0, 0, WEIGHT[0]), wearer_cog=(0, 0, 0, WEIGHT[1])))
-    assert_close_to_device(MassMatrix(DEFAULT_LINKS.length, WEIGHED[:4], WEIGHT), arm, 0.025)
+    assert_close_to_device(inertia_of(DEFAULT_LINKS.length, WEIGHED[:4], WEIGHT), arm, 0.025)
 
 
 def test_the_sweeps_of_a_chosen_pose_and_the_way_home_with_a_weight_need_no_more_than_the_motors_may_give():
