@@ -39,7 +39,7 @@ PARAMETERS = {
     "recorder": RECORDER,
     "robot_model": ROBOT_MODEL,
     "panel": PANEL,
-    "calibrator": [param for param in CALIBRATOR if param.name.startswith("tour.")],
+    "calibrator": CALIBRATOR,
 }
 HEAD = ("parameter", "default", "unit", "range", "change", "meaning")
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end of table -->)", re.DOTALL)

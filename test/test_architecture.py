@@ -22,7 +22,6 @@ MAY_IMPORT = {
 EXCEPTIONS = {
     "exo_gravity/tools/trials/offline.py": {"sim", "hardware"},
     "exo_gravity/tools/calibration/motors.py": {"hardware"},
-    "exo_gravity/tools/calibration/motor_watch.py": {"hardware"},
 }
 # The rooms of core from the bottom up: each imports only those before it, and itself.
 FLOORS = (

@@ -18,8 +18,7 @@ from matplotlib.figure import Figure
 from exo_gravity.core.trial.recording import Recording, ScriptedStep
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.tools import calibrate
-from exo_gravity.tools.calibration.outcome import Change
-from exo_gravity.tools.calibration.yaml_file import write_changes
+from exo_gravity.tools.calibration.result import Change, write_changes
 from exo_gravity.tools.inputs.parameter_file import packaged_config
 from exo_gravity.tools.reporting.colours import FAINT, INK, JOINT_COLOURS, make_plain
 from exo_gravity.tools.reporting.table import degrees, joint_labels

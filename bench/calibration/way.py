@@ -12,7 +12,6 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 from unittest.mock import patch
 
@@ -24,10 +23,9 @@ from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.model.tilt import rotation_matrix
 from exo_gravity.sim.params import SIMULATOR, device_of
 from exo_gravity.tools import calibrate
-from exo_gravity.tools.calibration import gravity, motors, scale
-from exo_gravity.tools.calibration.live import LiveTour
-from exo_gravity.tools.calibration.outcome import Outcome
-from exo_gravity.tools.calibration.person import Person
+from exo_gravity.tools.calibration import live, motors, tours
+from exo_gravity.tools.calibration.live import LiveTour, Person
+from exo_gravity.tools.calibration.result import CalibrationResult
 from exo_gravity.tools.inputs.arms import ConfiguredArm, configured_arm, node_values
 from exo_gravity.tools.inputs.parameter_file import load
 
@@ -90,15 +88,15 @@ def go(device: Device, folder: Path, fewer_poses: int = 0) -> Result:
     bow = write_bow(folder / "bow", device.quaternion, rng)
     _calibrate("imu", folder, 1, "--bag", str(bow))
     players: list[Player] = []
-    with _offline(gravity, players):
+    with _offline(players):
         _calibrate("gravity", folder, 2, "--poses", str(12 - fewer_poses))
     tour = players[0].tour
-    outcomes: list[Outcome] = []
+    results: list[CalibrationResult] = []
     lever = rng.uniform(*LEVER)
-    with _offline(scale, players, device.leant), _noted(scale, outcomes):
+    with _offline(players, device.leant), _noted(results):
         _calibrate("scale", folder, 3, "--mass", f"{MASS:g}", "--lever", f"{lever:.4f}")
     old, new = configured_arm(folder / "2.yaml"), configured_arm(folder / "4.yaml")
-    found = outcomes[0].identified
+    found = results[0].identified
     assert found is not None
     right = [new.can_bridge["can_id"] == device.can_id, new.can_bridge["direction"] == device.direction]
     zero_error = np.degrees(np.subtract(new.can_bridge["zero"], device.zero))
@@ -124,8 +122,8 @@ def _calibrate(command: str, folder: Path, step: int, *more: str) -> None:
 
 
 @contextlib.contextmanager
-def _offline(module: ModuleType, players: list[Player], leant: Sequence[float] = ()) -> Iterator[None]:
-    """Let tours of `module` run without nodes; leant: pitch and roll in rad of the stand while the weight hangs."""
+def _offline(players: list[Player], leant: Sequence[float] = ()) -> Iterator[None]:
+    """Let tours run without nodes; leant: pitch and roll in rad of the stand while the weight hangs."""
     play = run_tour(players)
 
     def run(options: argparse.Namespace, nodes: Mapping[str, Any], *more: object) -> LiveTour:
@@ -134,20 +132,20 @@ def _offline(module: ModuleType, players: list[Player], leant: Sequence[float] =
             simulator["trunk"] = dict(zip(("pitch", "roll"), leant, strict=True))
         return play(options, nodes, *more)
 
-    with patch.object(module, "run_tour", run):
+    with patch.object(live, "run_tour", run):
         yield
 
 
 @contextlib.contextmanager
-def _noted(module: ModuleType, outcomes: list[Outcome]) -> Iterator[None]:
-    """Append the outcomes of the command in `module` to `outcomes`."""
-    run: Callable[..., Outcome] = module.run
+def _noted(results: list[CalibrationResult]) -> Iterator[None]:
+    """Append the results of `calibrate scale` to `results`."""
+    calibrate_scale = tours.calibrate_scale
 
-    def noting(options: argparse.Namespace, arm: ConfiguredArm, say: Callable[[object], None]) -> Outcome:
-        outcomes.append(run(options, arm, say))
-        return outcomes[-1]
+    def noting(options: argparse.Namespace, arm: ConfiguredArm, say: Callable[[object], None]) -> CalibrationResult:
+        results.append(calibrate_scale(options, arm, say))
+        return results[-1]
 
-    with patch.object(module, "run", noting):
+    with patch.object(tours, "calibrate_scale", noting):
         yield
 
 
@@ -164,12 +162,12 @@ def _hanging(device: Device, rng: np.random.Generator) -> tuple[bool, np.ndarray
     with _hand(device, rng, hanging(device.links)) as hand:
         hand.rotor_jump = [2.0 * math.pi / m.spec.gear_ratio * t for m, t in zip(arm.motors, turns, strict=True)]
         options = argparse.Namespace(params=device.params, wait=hand.wait, pose=(0.0,) * 4)
-        outcome = motors.run(options, arm, lambda what: None)
+        found = motors.calibrate_motors(options, arm, lambda what: None)
     signed = turns * device.direction
     told = {name: f"{turn:+d} rotor turns" for name, turn in zip(arm.joint_names, signed, strict=True) if turn}
-    names = [refusal.partition(":")[0] for refusal in outcome.refusals]
-    is_told = names == list(told) and all(told[n] in r for n, r in zip(names, outcome.refusals, strict=True))
-    zero = next(change.value for change in outcome.changes if change.name == "zero")
+    names = [refusal.partition(":")[0] for refusal in found.refusals]
+    is_told = names == list(told) and all(told[n] in r for n, r in zip(names, found.refusals, strict=True))
+    zero = next(change.value for change in found.changes if change.name == "zero")
     return is_told, np.degrees(np.subtract(zero, device.zero))
 
 

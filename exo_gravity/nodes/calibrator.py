@@ -21,8 +21,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
+from exo_gravity.core.calibration.identification import Observation
 from exo_gravity.core.calibration.params import CALIBRATOR, tour_of
-from exo_gravity.core.calibration.tour import Measured
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.safety.drive import State
@@ -51,7 +51,7 @@ class CalibratorNode(Node):
         self._bridge = f"{self.get_namespace().strip('/')}/can_bridge".lstrip("/")
         self._bridge_state, self._bridge_message = "", ""
         self._began = False
-        self._reported: dict[str, Any] = {"progress": "", "trouble": "", "done": False}
+        self._reported: dict[str, Any] = {"progress": "", "trouble": "", "done": False}  # printed last
         self._printed = 0  # observations
         self._trouble = ""  # outside the tour
         self._diagnostics = Diagnostics(self)
@@ -146,11 +146,10 @@ class CalibratorNode(Node):
             self._diagnostics.report(OK if self._began else WARN, progress)
 
 
-def as_json(measured: Measured) -> dict[str, Any]:
-    """Return what was measured at a pose as values for JSON."""
-    fields = measured.observation._asdict()
-    plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in fields.items()}
-    return {**plain, "speed": measured.speed}
+def as_json(observation: Observation) -> dict[str, Any]:
+    """Return an observation as values for JSON."""
+    fields = observation._asdict().items()
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in fields}
 
 
 def _print(event: dict[str, Any]) -> None:

@@ -1,12 +1,5 @@
 """calibrate COMMAND --params FILE --output NEW.yaml: finds what differs between an arm and its parameter file.
 
-    motors     each joint's motor, direction and zero: the person moves the joints by hand, nothing is switched on
-    gravity    the robot's first moments: the arm, on a stand and without a wearer, moves slowly through chosen poses
-    friction   Coulomb, viscous and Stribeck friction of each joint, from slow sweeps
-    scale      real torque per commanded torque of each motor, from a known weight on the last link
-    wearer     the moments of the wearer's relaxed arm
-    imu        how the IMU is mounted on the trunk, from standing upright and bowing
-
 The new file is the old one with new values, their uncertainty and the date. Beside it are a page (NEW.html) and
 what was measured (NEW.jsonl). No existing file is ever overwritten.
 
@@ -28,15 +21,16 @@ from exo_gravity.tools.cli import extras, require_ros
 from exo_gravity.tools.inputs.arms import configured_arm
 
 if TYPE_CHECKING:
-    from exo_gravity.tools.calibration.outcome import Outcome
+    from exo_gravity.tools.calibration.result import CalibrationResult
 
+# Module in tools/calibration, and what the command finds.
 COMMANDS = {
-    "motors": "each joint's motor, direction and zero, found by moving the joints by hand",
-    "gravity": "the robot's first moments, from a slow tour of poses",
-    "friction": "friction of each joint, from slow sweeps",
-    "scale": "torque scale of each motor, from a known weight on the last link",
-    "wearer": "the moments of the wearer's relaxed arm",
-    "imu": "the mounting of the IMU, from standing upright and bowing",
+    "motors": ("motors", "each joint's motor, direction and zero, found by moving the joints by hand"),
+    "gravity": ("tours", "the robot's first moments, from a slow tour of poses"),
+    "friction": ("tours", "friction of each joint, from slow sweeps"),
+    "scale": ("tours", "torque scale of each motor, from a known weight on the last link"),
+    "wearer": ("wearer", "the moments of the wearer's relaxed arm"),
+    "imu": ("imu", "the mounting of the IMU, from standing upright and bowing"),
 }
 MAX_POSES = 12
 
@@ -44,7 +38,7 @@ MAX_POSES = 12
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="calibrate", description="Find what differs between an arm and its file.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name, description in COMMANDS.items():
+    for name, (_, description) in COMMANDS.items():
         command = commands.add_parser(name, help=description, description=f"calibrate {name}: {description}.")
         option = command.add_argument
         option("--params", required=True, type=Path, metavar="FILE", help="ROS 2 parameter file of the device")
@@ -86,11 +80,12 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from exo_gravity.tools.calibration.gravity_direction import with_mounting
+    from exo_gravity.tools.calibration.imu import with_mounting
+    from exo_gravity.tools.calibration.live import Person
     from exo_gravity.tools.calibration.page import page_of
-    from exo_gravity.tools.calibration.person import Person
-    from exo_gravity.tools.calibration.yaml_file import check_output, write_changes
+    from exo_gravity.tools.calibration.result import check_output, write_changes
 
+    command: str = options.command
     options.record, page = options.output.with_suffix(".jsonl"), options.output.with_suffix(".html")
     for path in (options.output, options.record, page):
         check_output(path)
@@ -100,19 +95,20 @@ def _run(options: argparse.Namespace) -> int:
             raise ParameterError("bag", str(path), "a recording that exists")
     person = Person()
     options.wait, options.ask = person.wait, person.ask
-    arm = None if options.command == "imu" else configured_arm(options.params, options.side)
-    if bag is None and options.command != "motors":
+    arm = None if command == "imu" else configured_arm(options.params, options.side)
+    if bag is None and command != "motors":
         require_ros("calibrate")
-    run: Callable[..., Outcome] = import_module(f"exo_gravity.tools.calibration.{options.command}").run
-    outcome = with_mounting(run(options, arm, person.say), options.params)
-    for line in outcome.lines:
+    module = import_module(f"exo_gravity.tools.calibration.{COMMANDS[command][0]}")
+    calibrate: Callable[..., CalibrationResult] = getattr(module, f"calibrate_{command}")
+    result = with_mounting(calibrate(options, arm, person.say), options.params)
+    for line in result.lines:
         person.say(line)
-    if outcome.changes and not outcome.refusals:
-        write_changes(options.params, options.output, outcome.changes, f"calibrate {options.command}")
+    if result.changes and not result.refusals:
+        write_changes(options.params, options.output, result.changes, f"calibrate {command}")
         person.say(f"Written: {options.output}")
-    if not outcome.refusals or outcome.observations:
-        page.write_text(page_of(outcome, options.command, str(options.params)), encoding="utf-8")
+    if not result.refusals or result.observations:
+        page.write_text(page_of(result, command, str(options.params)), encoding="utf-8")
         person.say(f"Written: {page}")
-    for refusal in outcome.refusals:
+    for refusal in result.refusals:
         print(f"calibrate: not calibrated: {refusal}", file=sys.stderr)
-    return 1 if outcome.refusals else 0
+    return 1 if result.refusals else 0

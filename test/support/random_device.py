@@ -8,8 +8,9 @@ from functools import cache
 import numpy as np
 
 from exo_gravity.core import ArmModel, Tilt
-from exo_gravity.core.calibration.identification import Observation, next_pose
-from exo_gravity.core.calibration.pose_choice import TYPICAL_MOMENTS
+from exo_gravity.core.calibration.identification import Observation
+from exo_gravity.core.calibration.pose_fit import TYPICAL_MOMENTS
+from exo_gravity.core.calibration.poses import next_pose
 from exo_gravity.core.model.moments import load_moments, moments_of, off_axis_of, regressor
 from exo_gravity.core.numbers import Vector
 

@@ -10,11 +10,11 @@ import mujoco
 import numpy as np
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.calibration.guess import TorqueGuess
 from exo_gravity.core.calibration.poses import BestPoses, Itinerary
 from exo_gravity.core.calibration.tour import Tour
-from exo_gravity.core.calibration.tracking import MassMatrix
+from exo_gravity.core.calibration.tracking import TorqueGuess
 from exo_gravity.core.model.gravity import Torque
+from exo_gravity.core.model.kinematics import LinkInertia
 from exo_gravity.core.model.moments import load_moments, moments_of
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.motors.joint_motor import JointMotor, peaks_of
@@ -135,15 +135,14 @@ def worst_error(tour: Tour, truth: ArmModel) -> float:
     from exo_gravity.core import gravity_torque
 
     return max(
-        float(np.abs(np.subtract(o.effort, gravity_torque(truth, o.theta, o.direction))).max())
-        for o, _ in tour.measured
+        float(np.abs(np.subtract(o.effort, gravity_torque(truth, o.theta, o.direction))).max()) for o in tour.measured
     )
 
 
-def assert_close_to_device(matrix: MassMatrix, arm: SimulatedArm, atol: float) -> None:
-    """`matrix` is within `atol` kg m^2 of the mass matrix of the simulated arm in three poses."""
+def assert_close_to_device(inertia: LinkInertia, arm: SimulatedArm, atol: float) -> None:
+    """`inertia` is within `atol` kg m^2 of the mass matrix of the simulated arm in three poses."""
     for theta in ((0.0,) * 4, (0.3, 0.8, 0.7, 0.5), (-0.5, 1.5, 1.2, 1.0)):
         arm.reset(theta)
         true = np.zeros((4, 4))
         mujoco.mj_fullM(arm.model, arm.data, true)
-        np.testing.assert_allclose(matrix.at(theta), true, atol=atol)
+        np.testing.assert_allclose(inertia.matrix(theta), true, atol=atol)

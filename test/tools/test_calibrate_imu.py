@@ -59,7 +59,7 @@ def test_the_mounting_goes_into_the_new_file_and_onto_the_page(
     assert "rotation_trunk_from_imu" in capsys.readouterr().out
 
 
-def test_six_rests_are_told_and_noted_in_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_six_rests_are_shown_and_noted_in_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bow = bag_of(tmp_path / "bow", record(MOUNTED))
     sides = bag_of(tmp_path / "rests", rests(6, np.array((1.02, 0.97, 1.01)), np.array((0.2, -0.3, 0.1))))
     assert calibrate(tmp_path, "--bag", str(bow), "--rests", str(sides)) == 0
@@ -91,7 +91,7 @@ def test_the_samples_of_a_recording_are_read_in_order(tmp_path: Path) -> None:
     assert read.angular_velocity == pytest.approx(samples.angular_velocity)
 
 
-def test_wrong_use_is_told_with_exit_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_use_ends_with_exit_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert calibrate(tmp_path, "--bag", str(tmp_path / "none")) == 2
     assert "must be a recording that exists" in capsys.readouterr().err
     (tmp_path / "new.html").touch()

@@ -16,9 +16,8 @@ from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.model.moments import load_moments, regressor
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.tools.calibration.outcome import Change, Curve, Outcome
-from exo_gravity.tools.calibration.page import page_of
-from exo_gravity.tools.calibration.torque_table import torque_table
+from exo_gravity.tools.calibration.page import TorqueTable, page_of
+from exo_gravity.tools.calibration.result import CalibrationResult, Change, Curve
 from exo_gravity.tools.inputs.arms import configured_arm
 
 DAY = datetime.date(2026, 11, 22)
@@ -53,10 +52,10 @@ def observations(poses: np.ndarray = POSES, outlier: int | None = None) -> tuple
     return tuple(taken)
 
 
-def outcome(outlier: int | None = None, **changes: object) -> Outcome:
+def outcome(outlier: int | None = None, **changes: object) -> CalibrationResult:
     taken, arm = observations(outlier=outlier), configured_arm()
     result = identify(taken, arm.robot.length)
-    found = Outcome(
+    found = CalibrationResult(
         (Change("/right/compensator", "robot.first_moment", result.moments[:4].tolist(), "kg m, <±0.001>"),),
         ("M4 is 20 % larger than in the file.",),
         (),
@@ -70,7 +69,7 @@ def outcome(outlier: int | None = None, **changes: object) -> Outcome:
 
 def test_the_table_compares_the_old_and_the_new_file_with_what_was_measured() -> None:
     found = outcome()
-    table = torque_table(found)
+    table = TorqueTable.of(found)
     assert table is not None
     assert table.measured == pytest.approx(np.array([o.effort for o in found.observations]))
     unloaded = slice(0, None, 2)
@@ -88,7 +87,7 @@ def test_the_table_compares_the_old_and_the_new_file_with_what_was_measured() ->
 
 def test_the_arm_creeps_where_the_remainder_exceeds_friction() -> None:
     found = outcome()
-    table = torque_table(found)
+    table = TorqueTable.of(found)
     assert table is not None and found.identified is not None
     before = np.abs(table.measured - table.before) > 0.1 * FRICTION
     after = np.abs(found.identified.held_out + found.identified.offset) > 0.1 * FRICTION
@@ -97,10 +96,10 @@ def test_the_arm_creeps_where_the_remainder_exceeds_friction() -> None:
     assert (table.margin > 1.0).all()
 
 
-def test_the_page_says_what_was_found_and_what_was_not_told() -> None:
+def test_the_page_says_what_was_found_and_what_does_not_show() -> None:
     found = outcome()
     page = page_of(found, "gravity", "old.yaml", DAY)
-    assert "<h1>calibrate gravity, right arm</h1><p class='when'>2026-11-22, from old.yaml</p>" in page
+    assert '<h1>calibrate gravity, right arm</h1><p class="when">2026-11-22, from old.yaml</p>' in page
     assert "<b>Calibrated.</b>" in page
     assert "robot.first_moment" in page and "kg m, &lt;±0.001&gt;" in page
     assert "M4 is 20 % larger than in the file." in page
@@ -109,7 +108,7 @@ def test_the_page_says_what_was_found_and_what_was_not_told() -> None:
     for sentence in found.identified.unknown:
         assert escape(sentence) in page
     assert "Singular values" in page
-    assert "Next best pose</b>, if more is wanted: 0 40 29 57 degrees" in page
+    assert "<b>Next best pose, if more is wanted:</b> 0 40 29 57 degrees" in page
     assert page.count("<tbody><tr><td rowspan=") == len(POSES)
     assert ", in 0 with the new" in page
 
@@ -117,7 +116,7 @@ def test_the_page_says_what_was_found_and_what_was_not_told() -> None:
 def test_a_pose_that_was_left_out_is_marked_with_its_reason() -> None:
     found = outcome(outlier=5)
     page = page_of(found, "gravity", "old.yaml", DAY)
-    table = torque_table(found)
+    table = TorqueTable.of(found)
     assert table is not None and found.identified is not None
     ((index, reason),) = found.identified.rejected
     assert index == 5 and not table.used[5]
@@ -133,11 +132,11 @@ def test_a_refusal_is_on_the_page_without_new_values() -> None:
 def test_friction_is_drawn_over_speed() -> None:
     speed = np.array((0.3, 0.05, 0.1))
     curves = [Curve(speed, 0.1 + 0.02 * speed, 0.1 + 0.02 * speed) for _ in range(4)]
-    page = page_of(Outcome((), ("friction found",), curves=tuple(curves)), "friction", "old.yaml", DAY)
+    page = page_of(CalibrationResult((), ("friction found",), curves=tuple(curves)), "friction", "old.yaml", DAY)
     assert page.count("<img") == 1 and "Friction over speed" in page
 
 
 def test_without_poses_the_page_holds_the_values_alone() -> None:
     changes: Sequence[Change] = (Change("/imu", "rotation_trunk_from_imu", [0.0, 0.0, 0.0, 1.0]),)
-    page = page_of(Outcome(tuple(changes), ()), "imu", "old.yaml", DAY)
+    page = page_of(CalibrationResult(tuple(changes), ()), "imu", "old.yaml", DAY)
     assert "[0.0, 0.0, 0.0, 1.0]" in page and "<img" not in page

@@ -15,8 +15,9 @@ from exo_gravity.core.trial.recording import Recording
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.tools import calibrate
-from exo_gravity.tools.calibration import friction, gravity, recorded
+from exo_gravity.tools.calibration import recorded
 from exo_gravity.tools.calibration.recorded import TILT_TOPIC, TILT_TYPE
+from exo_gravity.tools.calibration.tours import friction_from, moments_from
 from exo_gravity.tools.inputs.arms import configured_arm
 from exo_gravity.tools.inputs.parameter_file import packaged_config
 
@@ -47,15 +48,15 @@ def tours():
 
 def test_two_tours_with_and_without_a_weight_give_kilograms_and_true_scales(tours):
     assert [tour.trouble for _, tour in tours] == ["", ""]
-    outcome = gravity.solve(ARM, [one.observation for _, tour in tours for one in tour.measured])
-    assert outcome.refusals == ()
-    found = outcome.identified
+    result = moments_from(ARM, [one for _, tour in tours for one in tour.measured])
+    assert result.refusals == ()
+    found = result.identified
     error = np.abs(found.moments[1:4] - TRUTH.first_moment[1:])
     assert np.all(error < np.maximum(0.02 * np.array(TRUTH.first_moment[1:]), 2.0 * found.error[1:4]))
     np.testing.assert_allclose(found.scale[1:], SCALES[1:], rtol=0.02)
     # The remainder is a small part of friction: an arm with these values stays where it is let go.
     poses = np.random.default_rng(2).uniform((-1.0, 0.1, -0.3, 0.1), (1.0, 1.4, 1.4, 1.6), (50, 4))
-    direction = tours[0][1].measured[0].observation.direction
+    direction = tours[0][1].measured[0].direction
     new = ArmModel.from_moments(ARM.robot.length, found.moments[:4], found.moments[4:])
     remainder = gravity_torque(TRUTH, poses, direction) - gravity_torque(new, poses, direction)
     assert np.abs(remainder).max() < 0.2 * FRICTION.min()
@@ -85,14 +86,24 @@ def test_the_recording_of_a_tour_gives_the_same_torques(tours, tmp_path):
     run, tour = tours[0]
     found = recorded.sweeps_of(recorded_by(run, tmp_path / "bag"), ARM)
     assert len(found) >= 10  # up to two for each pose; none where a joint sticks for a moment
-    for one, speed in found:
-        poses = [measured.observation for measured in tour.measured]
-        same = min(poses, key=lambda o: np.abs(np.subtract(o.theta, one.theta)).max())
+    for one in found:
+        same = min(tour.measured, key=lambda o: np.abs(np.subtract(o.theta, one.theta)).max())
         np.testing.assert_allclose(one.theta, same.theta, atol=0.02)
         np.testing.assert_allclose(one.direction, same.direction, atol=1e-6)
         np.testing.assert_allclose(one.effort, same.effort, atol=0.06)
         np.testing.assert_allclose(one.friction, same.friction, atol=0.06)
-        assert np.all((speed > 0.03) & (speed < 0.3))
+        assert np.all((one.speed > 0.03) & (one.speed < 0.3))
+
+
+def test_held_poses_are_as_uncertain_as_friction(tmp_path):
+    poses = np.random.default_rng(5).uniform((-1.0, 0.2, -0.3, 0.2), (1.0, 1.6, 1.5, 1.8), (6, 4))
+    position, time = np.repeat(poses, 300, axis=0), 0.01 * np.arange(1800) + np.repeat(5.0 * np.arange(6), 300)
+    nothing = np.full_like(position, np.nan)
+    holds = Recording("right", ARM.joint_names, time, position, nothing, gravity_torque(TRUTH, position), nothing)
+    upright = replace(ARM, compensator={**ARM.compensator, "use_imu": False})
+    found = recorded.observations_of(write_bag(tmp_path / "bag", messages(holds)), upright)
+    np.testing.assert_allclose([o.theta for o in found], poses, atol=1e-3)
+    assert np.min([o.spread for o in found]) > 0.2
 
 
 def test_recordings_without_and_with_the_weight_give_kilograms_and_true_scales(tours, tmp_path):
@@ -114,9 +125,9 @@ def test_sweeps_at_five_speeds_give_the_friction_of_each_joint_live_and_recorded
     tour = run.run(FixedStations(friction_stations(run.limits)))
     assert tour.trouble == ""
     for measured in (tour.measured, recorded.sweeps_of(recorded_by(run, tmp_path / "bag"), ARM)):
-        outcome = friction.solve(ARM, measured)
-        assert outcome.refusals == ()
-        for joint, curve in enumerate(outcome.curves):
+        result = friction_from(ARM, measured)
+        assert result.refusals == ()
+        for joint, curve in enumerate(result.curves):
             steady = curve.speed >= 0.05
             true = truth.coulomb_friction[joint] + truth.viscous_friction[joint] * curve.speed[steady]
             np.testing.assert_allclose(curve.fit[steady], true, atol=0.02)

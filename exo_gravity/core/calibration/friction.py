@@ -25,17 +25,14 @@ LEAST_RATIO = 2.0  # of the fastest to the slowest speed
 RESOLUTION = 0.003  # Nm: standard error of a friction that was measured once
 
 
-class Friction(NamedTuple):
-    """coulomb in Nm, viscous in Nm s/rad, stribeck in Nm (0 if the data show none), stribeck_speed in rad/s.
+class FrictionCurve(NamedTuple):
+    """Friction of a joint over its speed."""
 
-    error: standard errors of coulomb, viscous and stribeck.
-    """
-
-    coulomb: float
-    viscous: float
-    stribeck: float
-    stribeck_speed: float
-    error: tuple[float, float, float]
+    coulomb: float  #: Nm
+    viscous: float  #: Nm s/rad
+    stribeck: float  #: Nm, 0 if the data show none
+    stribeck_speed: float  #: rad/s
+    error: tuple[float, float, float]  #: standard errors of coulomb, viscous and stribeck
 
     def at(self, speed: np.ndarray) -> np.ndarray:
         """Return the friction (n,) in Nm at `speed` (n,) rad/s, above 0."""
@@ -53,7 +50,7 @@ def friction_stations(limits: Limits) -> list[Station]:
     return stations
 
 
-def fit_friction(speed: np.ndarray, torque: np.ndarray) -> Friction:
+def fit_friction(speed: np.ndarray, torque: np.ndarray) -> FrictionCurve:
     """Return the friction that fits `torque` (n,) in Nm at `speed` (n,) rad/s.
 
     Raises DataError for fewer than 3 speeds, or less than a factor of 2 between them.
@@ -73,7 +70,7 @@ def fit_friction(speed: np.ndarray, torque: np.ndarray) -> Friction:
     return best
 
 
-def _fit(speed: np.ndarray, torque: np.ndarray, stribeck_speed: float, with_stribeck: bool) -> Friction:
+def _fit(speed: np.ndarray, torque: np.ndarray, stribeck_speed: float, with_stribeck: bool) -> FrictionCurve:
     columns = np.stack((np.ones_like(speed), speed, np.exp(-((speed / stribeck_speed) ** 2))), axis=1)
     used = columns if with_stribeck else columns[:, :2]
     values, *_ = np.linalg.lstsq(used, torque, rcond=None)
@@ -82,4 +79,4 @@ def _fit(speed: np.ndarray, torque: np.ndarray, stribeck_speed: float, with_stri
     variance = max(scatter, RESOLUTION**2) * np.diag(np.linalg.pinv(used.T @ used))
     coulomb, viscous, stribeck = (*values.tolist(), 0.0)[:3]
     errors = (*np.sqrt(variance).tolist(), 0.0)
-    return Friction(coulomb, viscous, stribeck, stribeck_speed, (errors[0], errors[1], errors[2]))
+    return FrictionCurve(coulomb, viscous, stribeck, stribeck_speed, (errors[0], errors[1], errors[2]))

@@ -1,40 +1,34 @@
-"""Held poses -> the arm's moments, the torque scale of each motor, and what the poses do not tell.
+"""Held poses -> the arm's moments, the torque scale of each motor, and what the poses do not show.
 
 The commanded effort that holds the arm in a pose is, without friction, which averages out over both directions,
 
     effort = torque(moments + load) / scale + offset          torque: `core.model.moments.regressor` times the moments
 
 A pose that does not fit the others (a hand on the arm, a slipping joint) is left out. A result that no arm can have is
-refused, with the pose that is missing. Held poses do not tell a common factor of all scales and moments without a known
-weight; nor a moment across link 3 or 4 from an error of that joint's zero.
+refused, with the pose that is missing. Held poses do not show a common factor of all scales and moments without a known
+weight; nor can they tell a moment across link 3 or 4 from an error of that joint's zero.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.calibration.identification_check import (
-    check_fit,
-    check_motors,
-    check_physical,
-    check_told,
-    checked,
-    untold,
-)
-from exo_gravity.core.calibration.pose_choice import TYPICAL_MOMENTS, next_pose
 from exo_gravity.core.calibration.pose_fit import (
     ANGLE,
     COUNT,
+    DISTURBED,
     FACTOR,
     MOMENT,
     OFFSET,
     SCALE,
+    START,
     TILT,
+    TYPICAL_MOMENTS,
     Rows,
     Solution,
     final,
@@ -42,11 +36,11 @@ from exo_gravity.core.calibration.pose_fit import (
     without_each_pose,
     without_outliers,
 )
+from exo_gravity.core.calibration.poses import missing_pose
+from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.moments import load_moments, regressor
-from exo_gravity.core.numbers import Vector
-
-__all__ = ["Identified", "Observation", "identify", "next_pose"]
+from exo_gravity.core.model.moments import MOMENTS, load_moments, regressor
+from exo_gravity.core.numbers import JOINT_COUNT, Vector
 
 LEAST_SPREAD = 0.003  # Nm; about half a code of an AK motor's 12-bit torque
 # Moments across and along the links between which an angle turns a weight: Y3 and M3, Y4 and M4, Z and M4.
@@ -55,101 +49,85 @@ BESIDE_ERROR = 0.05  # rad, of a weight's place; 3 degrees
 TILT_ERROR = 0.05  # rad about each axis, of gravity's measured direction: an IMU's mounting, mostly its heading
 EXACT = 1e-6  # error of a value that is held
 HIDDEN = 0.1  # share of an unknown, in combinations that are not known, from which it is not known itself
+SCALES = (0.3, 3.0)  # true torque per commanded torque; users report 0.75
+SILENT = 0.01  # Nm by which the effort must differ between poses where gravity's torque differs by `EXPECTED`
+EXPECTED = 0.3  # Nm
+MISFIT = 0.1  # of the peak effort
+LEAST_MISFIT = 0.1  # Nm
+LEAST_ZERO_ERROR = 0.5  # deg worth a sentence
+LEAST_TILT = 1.0  # deg worth a sentence
+# Unknowns of joint 1, which carries nothing while its axis is vertical.
+FIRST_JOINT = (0, MOMENTS.index("W"), SCALE.start, OFFSET.start)
+PER_JOINT = tuple(f"{what} {n + 1}" for what in ("torque scale", "offset") for n in range(JOINT_COUNT))
+NAMES = (*MOMENTS, *PER_JOINT)
+LEAN = "lean the stand by 10 to 14 degrees to the arm's side, where the arm still hangs close to its home"
 
 
 class Observation(NamedTuple):
-    """One pose, passed in both directions of motion.
+    """One pose, passed in both directions of motion."""
 
-    theta: (4,) rad. direction: (3,), gravity's unit vector in the base frame. effort: (4,) Nm as commanded, mean of
-    both directions. friction: (4,) Nm, half of their difference. spread: (4,) Nm, standard error of `effort`.
-    load_mass, load_lever: a weight in kg on link 4, and its distance in m from the elbow; 0 for none.
-    """
-
-    theta: Vector
-    direction: Vector
-    effort: Vector
-    friction: Vector
-    spread: Vector
-    load_mass: float = 0.0
-    load_lever: float = 0.0
+    theta: Vector  #: (4,) rad
+    direction: Vector  #: (3,), gravity's unit vector in the base frame
+    effort: Vector  #: (4,) Nm as commanded, mean of both directions
+    friction: Vector  #: (4,) Nm, half of their difference
+    spread: Vector  #: (4,) Nm, standard error of `effort`
+    load_mass: float = 0.0  #: kg, a weight on link 4; 0 for none
+    load_lever: float = 0.0  #: m, its distance from the elbow
+    speed: float | Vector = 0.0  #: rad/s at which the joints passed the pose, one for all or (4,)
 
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """The result of `identify`; n is the number of observations.
+    """The result of `identify` from n observations. Two standard errors cover 95 %, also for few poses."""
 
-    moments: (8,) kg m in the order of `MOMENTS`. covariance: (8, 8), infinite on the diagonal for a moment that the
-    poses do not tell, which is then that of `known`, or 0. scale: (4,), true torque per commanded torque. relative: no
-    weight was hung, so the product of the scales of joints 2 to 4 is taken as 1, and the moments are in commanded
-    torque, not in kilograms. scale_error: (4,), standard error, infinite if not known; 0 if the scale was not solved.
-    Two standard errors cover 95 %, also for few poses. offset, friction: (4,) Nm as commanded. residual: (n, 4) Nm,
-    effort minus prediction. held_out: (n, 4) Nm, the same predicted without that pose, NaN where the others do not
-    suffice. singular_values: of the information in the poses, the largest first; below 1: combinations that are not
-    known. unknown: sentences on what the poses do not tell, and what would. rejected: index and reason of each
-    observation that is not used. tilt: (3,) rad in the base frame, rotation of gravity from the measured to the true
-    direction, and tilt_covariance (3, 3). One lean of the stand does not tell the turn about gravity, two do.
+    moments: np.ndarray  #: (8,) kg m in the order of `MOMENTS`
+    error: np.ndarray  #: (8,) kg m, their standard errors, infinite where the poses do not show a moment, which is 0
+    scale: np.ndarray  #: (4,), true torque per commanded torque
+    scale_error: np.ndarray  #: (4,), standard errors, infinite where not known
+    offset: np.ndarray  #: (4,) Nm as commanded
+    friction: np.ndarray  #: (4,) Nm as commanded
+    residual: np.ndarray  #: (n, 4) Nm, effort minus prediction
+    held_out: np.ndarray  #: (n, 4) Nm, the same predicted without that pose, NaN where the others do not suffice
+    singular_values: np.ndarray  #: of the information in the poses, the largest first; below 1: not known
+    unknown: tuple[str, ...]  #: sentences on what the poses do not show, and what would
+    rejected: tuple[tuple[int, str], ...]  #: index and reason of each observation that is not used
+    #: No weight was hung: the product of the scales of joints 2 to 4 is taken as 1, moments are in commanded torque.
+    relative: bool
+    tilt: np.ndarray  #: (3,) rad in the base frame, rotation of gravity from the measured to the true direction
+    tilt_covariance: np.ndarray  #: (3, 3); one lean of the stand does not show the turn about gravity, two do
+
+
+def identify(observations: Sequence[Observation], length: Vector, gravity: float = STANDARD_GRAVITY) -> Identified:
+    """Return what the observations show of an arm with links of `length` (4,) m.
+
+    Raises DataError if the result would be unphysical, naming the missing pose, and if an observation is impossible.
     """
-
-    moments: np.ndarray
-    covariance: np.ndarray
-    scale: np.ndarray
-    scale_error: np.ndarray
-    offset: np.ndarray
-    friction: np.ndarray
-    residual: np.ndarray
-    held_out: np.ndarray
-    singular_values: np.ndarray
-    unknown: tuple[str, ...]
-    rejected: tuple[tuple[int, str], ...] = ()
-    relative: bool = False
-    tilt: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    tilt_covariance: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
-
-    @property
-    def error(self) -> np.ndarray:
-        """Standard error (8,) of the moments in kg m."""
-        return np.sqrt(np.diag(self.covariance))
-
-
-def identify(
-    observations: Sequence[Observation],
-    length: Vector,
-    gravity: float = STANDARD_GRAVITY,
-    known: Identified | None = None,
-    solve_scale: bool = True,
-) -> Identified:
-    """Return what the observations tell about an arm with links of `length` (4,) m.
-
-    known: an earlier result of the same arm. With `solve_scale`, its moments and scales count according to their
-    errors. Without, scale and offset are held at those of `known` (at 1 and 0 if there is none), and the moments are
-    found anew: those of the arm with its wearer. Raises DataError if the result would be unphysical, naming the missing
-    pose, and if an observation is impossible.
-    """
-    start = _start(known, solve_scale)
-    rows = _with_conditions(_rows(observations, length, gravity), start, known if solve_scale else None, solve_scale)
-    check_motors(rows.effort, rows.regressor @ np.array(TYPICAL_MOMENTS))
-    keep, rejected = without_outliers(rows, start)
-    used, solution = _bounded(rows.only(keep), start)
-    check_fit(solution.residual, used.effort)
+    rows = _rows(observations, length, gravity)
+    _check_motors(rows)
+    keep, rejected = without_outliers(rows)
+    used, solution = _bounded(rows.only(keep))
+    _check_fit(solution.residual, used.effort)
     direction, hidden = np.asarray(observations[-1].direction, dtype=float), solution.hidden > HIDDEN
-    check_told(hidden, len(observations), direction, gravity)
-    is_loaded = solve_scale and bool(np.any(used.load))
-    told = replace(solution, unknowns=np.where(hidden, start, solution.unknowns))
-    unknowns, covariance = _in_kilograms(told, known if solve_scale else None, is_loaded)
+    _check_known(hidden, len(observations), direction, gravity)
+    unknowns, covariance = _in_kilograms(solution, np.where(hidden, START, solution.unknowns))
     error = np.where(hidden, np.inf, np.sqrt(np.diag(covariance)))
     moments, scale = unknowns[MOMENT], np.exp(unknowns[SCALE])
     check_physical(moments, error[MOMENT], scale, direction, gravity)
-    is_relative = not is_loaded and (solve_scale if known is None else known.relative)
+    residual = rows.effort - rows.predicted(solution.unknowns)
+    held_out = residual.copy()
+    held_out[keep], _ = without_each_pose(solution, used.sigma)
+    is_relative = not np.any(used.load)
     return Identified(
         moments,
-        np.where(np.diag(hidden[MOMENT]), np.inf, covariance[MOMENT, MOMENT]),
+        error[MOMENT],
         scale,
         scale * error[SCALE],
         unknowns[OFFSET],
         np.median([observation.friction for observation in observations], axis=0),
-        *_residuals(rows, keep, used, solution),
+        residual,
+        held_out,
         solution.singular_values,
-        untold(unknowns, covariance, hidden, is_relative),
+        _unknown(unknowns, covariance, hidden, is_relative),
         rejected,
         is_relative,
         unknowns[TILT],
@@ -158,12 +136,22 @@ def identify(
 
 
 def _rows(observations: Sequence[Observation], length: Vector, gravity: float) -> Rows:
-    """Return the observations as arrays, with every unknown free."""
-    theta, direction, effort, spread, weights = checked(observations)
-    load = np.array([load_moments(length, *weight) for weight in weights])
-    beside = np.zeros((*load.shape, 3))
+    """Return the observations as arrays, with what is held. Raises DataError that names the observation."""
+    if not observations:
+        raise DataError("no pose was observed")
+    theta, direction, effort, spread = columns(observations)
+    for name, values in (("theta", theta), ("direction", direction), ("effort", effort), ("spread", spread)):
+        for index in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
+            raise DataError(f"pose {index + 1}: {name} = {values[index].tolist()}: must be finite numbers")
+    load = np.array([load_moments(length, one.load_mass, one.load_lever) for one in observations])
+    beside = np.zeros((*load.shape, len(BESIDE)))
     for angle, (across, along) in enumerate(BESIDE):
         beside[:, across, angle] = load[:, along]
+    free = np.ones(COUNT, dtype=bool)
+    free[FACTOR] = free[ANGLE] = bool(np.any(load))
+    one = np.eye(COUNT)
+    product = one[SCALE][1:].sum(axis=0, keepdims=True)  # of the scales of joints 2 to 4: 1, the weight gives the rest
+    anchor = np.vstack((one[ANGLE] / BESIDE_ERROR, one[TILT] / TILT_ERROR, product / EXACT))
     return Rows(
         regressor(theta, direction, gravity),
         turned_regressor(theta, direction, gravity),
@@ -171,67 +159,33 @@ def _rows(observations: Sequence[Observation], length: Vector, gravity: float) -
         beside,
         effort,
         np.hypot(spread, LEAST_SPREAD),
-        np.ones(COUNT, dtype=bool),
-        np.zeros((0, COUNT)),
-        np.zeros(0),
+        free,
+        anchor,
     )
 
 
-def _common(known: Identified) -> float:
-    """Return the logarithm of the factor that moments and scales have in common."""
-    return float(np.log(known.scale[1:]).mean())
+def columns(observations: Sequence[Observation]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return theta (n, 4) rad, direction (n, 3), effort and spread (n, 4) Nm of the observations."""
+    theta, direction, effort, spread = (
+        np.array([getattr(one, name) for one in observations], dtype=float)
+        for name in ("theta", "direction", "effort", "spread")
+    )
+    return theta, direction, effort, spread
 
 
-def _start(known: Identified | None, solve_scale: bool) -> np.ndarray:
-    """Return the unknowns (23,) at which the search starts; if scales are solved, with the common factor removed."""
-    start = np.zeros(COUNT)
-    start[FACTOR] = 1.0
-    start[1:4] = TYPICAL_MOMENTS[1:4]
-    if known is not None:
-        common = _common(known) if solve_scale else 0.0
-        start[MOMENT] = known.moments * math.exp(-common)
-        start[SCALE] = np.log(known.scale) - common
-        start[OFFSET] = known.offset
-    return start
-
-
-def _with_conditions(rows: Rows, start: np.ndarray, known: Identified | None, solve_scale: bool) -> Rows:
-    """Return `rows` with what is held, and with `known` as linear conditions."""
-    free = np.ones(COUNT, dtype=bool)
-    free[SCALE] = free[OFFSET] = free[TILT] = solve_scale
-    free[ANGLE] = bool(np.any(rows.load))
-    free[FACTOR] = solve_scale and free[ANGLE.start]
-    anchor = np.vstack((np.eye(COUNT)[ANGLE] / BESIDE_ERROR, np.eye(COUNT)[TILT] / TILT_ERROR))
-    if solve_scale:
-        common = np.zeros((1, COUNT))
-        common[0, SCALE] = np.array((0.0, 1.0, 1.0, 1.0)) / EXACT  # the common factor is the weight's
-        anchor = np.vstack((anchor, common))
-    if known is not None:
-        relative_error = np.maximum(known.scale_error / known.scale, EXACT)
-        error = np.append(known.error * math.exp(-_common(known)), relative_error)
-        anchor = np.vstack((anchor, np.eye(SCALE.stop, COUNT) / np.maximum(error, EXACT)[:, None]))
-    return replace(rows, free=free, anchor=anchor, anchor_value=anchor @ (start * (np.arange(COUNT) < SCALE.stop)))
-
-
-def _bounded(rows: Rows, start: np.ndarray) -> tuple[Rows, Solution]:
+def _bounded(rows: Rows) -> tuple[Rows, Solution]:
     """Return the solution with M1, the least certain moment, at least 0, and the rows with their estimated errors."""
-    used, solution = final(rows, start)
+    used, solution = final(rows)
     if solution.unknowns[0] >= 0.0:
         return used, solution
-    others = np.arange(COUNT) != 0
-    used, bounded = final(replace(rows, free=rows.free & others), start * others)
+    used, bounded = final(replace(rows, free=rows.free & (np.arange(COUNT) != 0)))
     covariance = bounded.covariance.copy()
     covariance[0, 0] = solution.covariance[0, 0]
     return used, replace(bounded, covariance=covariance)
 
 
-def _in_kilograms(solution: Solution, known: Identified | None, is_loaded: bool) -> tuple[np.ndarray, np.ndarray]:
+def _in_kilograms(solution: Solution, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the unknowns (23,) and their covariance (23, 23) without the factor by which a weight seems too heavy."""
-    unknowns, covariance = solution.unknowns.copy(), solution.covariance.copy()
-    if known is not None and not known.relative and not is_loaded:
-        unknowns[FACTOR] = math.exp(-_common(known))
-        share = np.min(known.scale_error[1:] / known.scale[1:])
-        covariance[FACTOR, FACTOR] = (share * unknowns[FACTOR]) ** 2
     factor = unknowns[FACTOR]
     change = np.eye(COUNT)
     change[MOMENT, MOMENT] /= factor
@@ -240,12 +194,82 @@ def _in_kilograms(solution: Solution, known: Identified | None, is_loaded: bool)
     unknowns[MOMENT] /= factor
     unknowns[SCALE] -= math.log(factor)
     # Student's distribution: for few poses two standard errors would cover less than 95 %.
-    return unknowns, (1.0 + 1.25 / (solution.freedom.min() + 6.0)) ** 2 * change @ covariance @ change.T
+    return unknowns, (1.0 + 1.25 / (solution.freedom.min() + 6.0)) ** 2 * change @ solution.covariance @ change.T
 
 
-def _residuals(rows: Rows, keep: np.ndarray, used: Rows, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
-    """Return residual and held-out residual (n, 4) in Nm of all observations, also of those that were left out."""
-    residual = rows.effort - rows.predicted(solution.unknowns)
-    held_out = residual.copy()
-    held_out[keep], _ = without_each_pose(solution, used.sigma)
-    return residual, held_out
+def _check_motors(rows: Rows) -> None:
+    """Raise DataError if a motor's effort stays the same where gravity's torque does not."""
+    typical, effort = rows.regressor @ np.array(TYPICAL_MOMENTS), rows.effort
+    for joint in range(JOINT_COUNT):
+        if np.ptp(typical[:, joint]) > EXPECTED and np.ptp(effort[:, joint]) < SILENT:
+            value = effort[0, joint] + 0.0
+            raise DataError(f"joint {joint + 1}: the effort is {value:.2f} Nm in every pose: a silent motor")
+
+
+def _check_fit(residual: np.ndarray, effort: np.ndarray) -> None:
+    """Raise DataError if half of the residuals (n, 4) in Nm of a joint are large compared with its efforts (n, 4)."""
+    typical, peak = np.median(np.abs(residual), axis=0), np.abs(effort).max(axis=0)
+    for joint in np.flatnonzero(typical > np.maximum(MISFIT * peak, LEAST_MISFIT)):
+        misfit = f"joint {joint + 1} is {typical[joint]:.2f} Nm off in half of the poses"
+        raise DataError(f"the poses do not fit one arm: {misfit}. {DISTURBED}")
+
+
+def _check_known(hidden: np.ndarray, count: int, direction: np.ndarray, gravity: float) -> None:
+    """Raise DataError that names the missing pose if `count` poses do not show `hidden` (23,) of joints 2 to 4."""
+    missing = hidden.copy()
+    missing[list(FIRST_JOINT)] = False
+    if missing[FACTOR]:
+        raise DataError("the weight shows no common factor: hang a heavier one, or hold it with a horizontal forearm")
+    if np.any(missing):
+        names = ", ".join(NAMES[index] for index in np.flatnonzero(missing))
+        pose = missing_pose(missing, direction, gravity)
+        raise DataError(f"{count} poses do not show {names}: add the pose {pose}")
+
+
+def check_physical(
+    moments: np.ndarray, error: np.ndarray, scale: np.ndarray, direction: np.ndarray, gravity: float
+) -> None:
+    """Raise DataError unless an arm can have the moments (8,) kg m and scales (4,), and their `error` (8,) is small."""
+    low, high = SCALES
+    for joint in np.flatnonzero((scale < low) | (scale > high)):
+        expected = f"from {low:g} to {high:g}: is joint {joint + 1}'s direction or motor type wrong, or did it slip?"
+        raise DataError(f"torque scale {joint + 1} = {scale[joint]:.3g}: must be {expected}")
+    for index in (1, 2, 3):
+        moment, uncertain = f"{MOMENTS[index]} = {moments[index]:.3f} kg m", error[index]
+        if uncertain > abs(moments[index]):
+            pose = missing_pose(np.arange(COUNT) == index, direction, gravity)
+            raise DataError(f"{moment} is not known better than {uncertain:.3f}: add the pose {pose}")
+        if moments[index] <= 0.0:
+            raise DataError(f"{moment}: must be positive: check direction and zero of joint {index + 1}")
+    for across, along in ((6, 2), (7, 3)):
+        if abs(moments[across]) > moments[along]:
+            angle = math.degrees(math.atan2(moments[across], moments[along]))
+            raise DataError(
+                f"{MOMENTS[across]} = {moments[across]:.3f} kg m exceeds {MOMENTS[along]}: "
+                f"the zero of joint {along + 1} seems {angle:.0f} degrees off"
+            )
+
+
+def _unknown(unknowns: np.ndarray, covariance: np.ndarray, hidden: np.ndarray, relative: bool) -> tuple[str, ...]:
+    """Return what the poses do not show, and what would, in sentences; unknowns and `hidden`: (23,)."""
+    sentences = []
+    if relative:
+        sentences.append("A common factor of all torque scales and moments: hang a known weight on link 4.")
+    if np.any(hidden[:FACTOR]):
+        names = ", ".join(NAMES[index] for index in np.flatnonzero(hidden[:FACTOR]))
+        sentences.append(f"{names}: joint 1 carries nothing while its axis is vertical: {LEAN}.")
+    for joint, along, across in ((4, 3, 7), (3, 2, 6)):
+        angle = math.degrees(math.atan2(unknowns[across], unknowns[along]))
+        sentences.append(
+            f"{MOMENTS[across]} of link {joint} from an error of joint {joint}'s zero: it looks like one of "
+            f"{angle:+.1f} degrees; check the zero with a level or at a stop."
+        )
+    elbow, elbow_error = math.degrees(unknowns[ANGLE][0]), math.degrees(math.sqrt(covariance[ANGLE, ANGLE][0, 0]))
+    if elbow and abs(elbow) > max(3.0 * elbow_error, LEAST_ZERO_ERROR):
+        sentences.append(f"The weight shows joint 3's zero {elbow:+.1f} +- {elbow_error:.1f} degrees off.")
+    square, axes = np.linalg.eigh(covariance[TILT, TILT])  # the least known turn, the last, is the one about gravity
+    tilt = math.degrees(float(np.linalg.norm(unknowns[TILT] @ axes[:, :2])))
+    tilt_error = math.degrees(math.sqrt(max(0.0, float(square[:2].sum()))))
+    if tilt > max(3.0 * tilt_error, LEAST_TILT):
+        sentences.append(f"Gravity seems {tilt:.1f} degrees off what the IMU says: check rotation_trunk_from_imu.")
+    return tuple(sentences)

@@ -37,33 +37,30 @@ DISTINCT = math.radians(30.0)  # between two rests on different sides
 
 
 class ImuRecord(NamedTuple):
-    """Samples in the IMU's axes. time: (n,) s. angular_velocity: (n, 3) rad/s. acceleration: (n, 3) m/s^2."""
+    """Samples in the IMU's axes."""
 
-    time: np.ndarray
-    angular_velocity: np.ndarray
-    acceleration: np.ndarray
+    time: np.ndarray  #: (n,) s
+    angular_velocity: np.ndarray  #: (n, 3) rad/s
+    acceleration: np.ndarray  #: (n, 3) m/s^2
 
 
 class Mounting(NamedTuple):
-    """quaternion: trunk from IMU, (x, y, z, w). error: (3,) rad, standard error about the trunk's x, y and z.
+    """How an IMU is mounted on the trunk."""
 
-    bows: how many. bow: rad, the deepest. gyroscope_bias: (3,) rad/s, with its standard error.
-    """
-
-    quaternion: np.ndarray
-    error: np.ndarray
-    bow: float
-    bows: int
-    gyroscope_bias: np.ndarray
-    gyroscope_bias_error: np.ndarray
+    quaternion: np.ndarray  #: trunk from IMU, (x, y, z, w)
+    error: np.ndarray  #: (3,) rad, standard error about the trunk's x, y and z
+    bow: float  #: rad, the deepest
+    bows: int  #: how many
+    gyroscope_bias: np.ndarray  #: (3,) rad/s
+    gyroscope_bias_error: np.ndarray  #: (3,) rad/s, standard error
 
 
 class AccelerometerFit(NamedTuple):
-    """true = scale * (shown - bias). scale: (3,). bias: (3,) m/s^2. residual: RMS in m/s^2 of the rests' magnitude."""
+    """An accelerometer's scale and bias: true = scale * (shown - bias)."""
 
-    scale: np.ndarray
-    bias: np.ndarray
-    residual: float
+    scale: np.ndarray  #: (3,)
+    bias: np.ndarray  #: (3,) m/s^2
+    residual: float  #: m/s^2, RMS of the rests' magnitude
 
 
 class _Phase(NamedTuple):

@@ -1,39 +1,41 @@
 """The parameters of `calibrator`, and the tour that they describe.
 
-`calibrator` stands in the compensator's place. It takes the compensator's parameters and the bridge's limits, so that a
-parameter file for it follows from that of the arm.
+`calibrate` writes its parameter file: what the arm is expected to be, and the tour. Its limits are the arm's own.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
-from exo_gravity.core.calibration.guess import TorqueGuess
-from exo_gravity.core.calibration.motion import MAX_SPEED, Station
-from exo_gravity.core.calibration.poses import BestPoses, FixedStations, Itinerary, measurable
+import numpy as np
+
+from exo_gravity.core.calibration.friction import friction_stations
+from exo_gravity.core.calibration.poses import BestPoses, FixedStations, Itinerary
 from exo_gravity.core.calibration.tour import Tour
-from exo_gravity.core.compensation.params import COMPENSATOR, settings_of
-from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import MAX_LENGTH, MAX_MASS
-from exo_gravity.core.model.moments import load_moments, moments_of
+from exo_gravity.core.calibration.tracking import TorqueGuess
+from exo_gravity.core.compensation.params import COMPENSATOR
+from exo_gravity.core.model.arm import MAX_LENGTH, MAX_MASS, MAX_MOMENT
+from exo_gravity.core.model.moments import load_moments
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.numbers import JOINT_COUNT, one_float
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.safety.params import CAN_BRIDGE, LIMIT_PARAMETERS, limits_of
+from exo_gravity.core.safety.params import CAN_BRIDGE
 
-_SHARED = {param.name for param in COMPENSATOR}
+ARM = ("side", "joint_names", "link_length", "gravity", "use_imu", "tilt_timeout")  # as the compensator's
+LIMITS = ("position_min", "position_max", "max_effort", "home")
+BRIDGE = ("rate", *LIMITS)  # as can_bridge's
 # fmt: off
 CALIBRATOR = (
-    *COMPENSATOR,
-    *(param for param in LIMIT_PARAMETERS if param.name not in _SHARED),
-    next(param for param in CAN_BRIDGE if param.name == "rate"),
+    *(replace(param, fixed=True) for param in COMPENSATOR if param.name in ARM),
+    Param("first_moment", [0.0] * 4, "M1 to M4 as far as known, with the wearer", (0.0, MAX_MOMENT), "kg m",
+          fixed=True),
+    Param("off_axis", [0.0] * 4, "W, Z, Y3, Y4 as far as known", (-MAX_MOMENT, MAX_MOMENT), "kg m", fixed=True),
+    *(param for param in CAN_BRIDGE if param.name in BRIDGE),
     Param("tour.poses", 12, "number of poses that are chosen", (1, 100), fixed=True),
     Param("tour.duration", 230.0, "time that the poses are chosen for", (30.0, 3600.0), "s", fixed=True),
-    Param("tour.stations", "", "JSON list of [[4 angles], speed, amplitude, cycles], in place of chosen poses",
-          fixed=True),
+    Param("tour.friction", False, "sweep the hanging arm at several speeds, in place of chosen poses", fixed=True),
     Param("tour.load_mass", 0.0, "weight that hangs on link 4", (0.0, MAX_MASS), "kg", fixed=True),
     Param("tour.load_lever", 0.0, "its distance from the elbow", (0.0, MAX_LENGTH), "m", fixed=True),
 )
@@ -42,38 +44,11 @@ CALIBRATOR = (
 
 def tour_of(values: Mapping[str, Any]) -> Tour:
     """Return the tour that parameter values describe. Raises ParameterError."""
-    settings = settings_of({**values, "law": "exact"})
-    limits = limits_of(values)
+    limits = Limits(tuple(values["joint_names"]), **{name: values[name] for name in LIMITS})
     load = values["tour.load_mass"], values["tour.load_lever"]
-    moments = moments_of(settings.arm) + load_moments(settings.arm.length.tolist(), *load)
-    guess = TorqueGuess(settings.arm.length, moments, Tilt.of(settings.side), settings.robot.gravity)
-    return Tour(limits, guess, _itinerary(values, limits), values["rate"], load)
-
-
-def _itinerary(values: Mapping[str, Any], limits: Limits) -> Itinerary:
-    if not values["tour.stations"]:
-        return BestPoses(limits, values["tour.poses"], values["tour.duration"])
-    return FixedStations(stations_of(values["tour.stations"], limits))
-
-
-def stations_of(text: str, limits: Limits) -> list[Station]:
-    """Return the stations in the JSON `text`. Raises ParameterError if one leaves the limits or is too fast."""
-    try:
-        given = [Station(tuple(map(float, theta)), *rest) for theta, *rest in json.loads(text)]
-    except (ValueError, TypeError):
-        raise ParameterError("tour.stations", text, "JSON: [[[4 angles], speed, amplitude, cycles], ...]") from None
-    for station in given:
-        one_float("tour.stations speed", station.speed, 0.005, MAX_SPEED, "rad/s")
-        one_float("tour.stations amplitude", station.amplitude, 0.01, 1.0, "rad")
-        one_float("tour.stations cycles", station.cycles, 1, 20)
-        low, high = measurable(limits, station.amplitude)
-        if len(station.theta) != JOINT_COUNT or any(
-            not below <= angle <= above for angle, below, above in zip(station.theta, low, high, strict=True)
-        ):
-            raise ParameterError("tour.stations", list(station.theta), f"from {low.tolist()} to {high.tolist()} rad")
-    return given
-
-
-def as_text(stations: Sequence[Station]) -> str:
-    """Return stations as the parameter `tour.stations`."""
-    return json.dumps([list(station) for station in stations])
+    moments = np.array((*values["first_moment"], *values["off_axis"])) + load_moments(values["link_length"], *load)
+    guess = TorqueGuess(values["link_length"], moments, Tilt.of(values["side"]), values["gravity"])
+    itinerary: Itinerary = BestPoses(limits, values["tour.poses"], values["tour.duration"])
+    if values["tour.friction"]:
+        itinerary = FixedStations(friction_stations(limits))
+    return Tour(limits, guess, itinerary, values["rate"], load)

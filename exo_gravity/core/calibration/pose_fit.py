@@ -2,11 +2,11 @@
 
 The unknowns are the eight moments in kg m, the logarithm of the four torque scales, the four offsets in Nm, the factor
 by which moments and scales are too large in common, by which a known weight seems too heavy, three angles by which the
-weight seems to lie beside the links (a zero of joint 3 or 4 that is off by a degree moves a weight by more than a light
-forearm's own moment), and the rotation of gravity's direction from the measured to the true one: nobody mounts an IMU,
-or stands upright, to better than a degree. The commanded effort is `torque(moments + factor * load) / scale + offset`:
-nearly linear, so a few Gauss-Newton steps solve it. Each step leaves alone what the poses do not tell: the combinations
-whose standard error exceeds `NATURAL`.
+weight seems to lie off the links (a zero of joint 3 or 4 that is off by a degree moves a weight by more than a light
+forearm's own moment), and the rotation of gravity's direction from the measured to the true one: an IMU is mounted, and
+a stand placed, to no better than a degree. The commanded effort is `torque(moments + factor * load) / scale + offset`:
+nearly linear, so a few Gauss-Newton steps solve it. Each step leaves out the combinations of unknowns that the poses do
+not show: those whose standard error exceeds `NATURAL`.
 
 Errors are larger in some joints than the observations state (gear friction is not the same in every pose), so each
 joint gets a factor of its own, estimated from its residuals and pooled with the others where poses are few.
@@ -14,7 +14,7 @@ joint gets a factor of its own, estimated from its residuals and pooled with the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -31,8 +31,10 @@ TILT = slice(20, 23)  # rotation vector of gravity in the base frame
 COUNT = 23
 # kg m, logarithm, Nm, 1, rad, rad: a combination of unknowns that may be wrong by this much is not known.
 NATURAL = np.repeat((0.1, 0.3, 0.3, 0.3, 0.3, 0.1), (len(MOMENTS), JOINT_COUNT, JOINT_COUNT, 1, 3, 3))
-NOTHING_KNOWN = np.repeat((0.0, 1.0, 0.0), (FACTOR, 1, COUNT - FACTOR - 1))
-HUBER = 2.0  # standard errors beyond which a residual counts linearly
+# kg m, of a robot arm with the motors of this package; only the share of noise and scale in a pose depends on it.
+TYPICAL_MOMENTS = (0.08, 0.15, 0.2, 0.026, 0.0, 0.0, 0.0, 0.0)
+START = np.array((0.0, *TYPICAL_MOMENTS[1:4], *np.zeros(12), 1.0, *np.zeros(6)))  # of the search
+HUBER = 2.0  # standard errors beyond which a residual's weight falls
 POOLING = 6.0  # degrees of freedom with which all joints together inform the error of each
 STEPS = 40
 MEDIAN_SQUARE = 0.455  # of a standard normal variable
@@ -46,22 +48,17 @@ OUTLIER = 32.0  # such a sum from which a pose is left out: of good poses, one i
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """What is fitted, for n poses: `regressor` (n, 4, 8), `load` (n, 8) kg m, `effort` and its error `sigma` (n, 4) Nm.
+    """What is fitted, for n poses."""
 
-    turned: (n, 4, 8, 3), change of `regressor` with each component of the tilt. beside: (n, 8, 3), change of `load`
-    with each angle. free: (23,), the unknowns to be solved. anchor: (k, 23) and anchor_value: (k,), linear conditions
-    on the unknowns, already divided by their standard errors.
-    """
-
-    regressor: np.ndarray
-    turned: np.ndarray
-    load: np.ndarray
-    beside: np.ndarray
-    effort: np.ndarray
-    sigma: np.ndarray
-    free: np.ndarray
-    anchor: np.ndarray
-    anchor_value: np.ndarray
+    regressor: np.ndarray  #: (n, 4, 8) Nm per kg m
+    turned: np.ndarray  #: (n, 4, 8, 3), change of `regressor` with each component of the tilt
+    load: np.ndarray  #: (n, 8) kg m, moments of the weight
+    beside: np.ndarray  #: (n, 8, 3), change of `load` with each angle
+    effort: np.ndarray  #: (n, 4) Nm
+    sigma: np.ndarray  #: (n, 4) Nm, standard error of `effort`
+    free: np.ndarray = field(default_factory=lambda: np.ones(COUNT, dtype=bool))  #: (23,), the unknowns to be solved
+    #: (k, 23), linear combinations of the unknowns that are 0, divided by their standard errors
+    anchor: np.ndarray = field(default_factory=lambda: np.zeros((0, COUNT)))
 
     def only(self, keep: np.ndarray) -> Rows:
         """Return the poses that `keep` (n,) selects."""
@@ -94,20 +91,15 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """unknowns: (23,). covariance: (23, 23) of what is known. hidden: (23,), share 0..1 of each that is not known.
+    """The fit of `Rows`."""
 
-    singular_values: of the poses alone, in units of `NATURAL`, the largest first. residual: (n, 4) Nm. hat: (n, 4, n,
-    4), derivative of the predicted by the measured effort, both divided by sigma. inverse: (23, 4 n + k), change of the
-    unknowns with each measured effort and condition, divided by its error.
-    """
-
-    unknowns: np.ndarray
-    covariance: np.ndarray
-    hidden: np.ndarray
-    singular_values: np.ndarray
-    residual: np.ndarray
-    hat: np.ndarray
-    inverse: np.ndarray
+    unknowns: np.ndarray  #: (23,)
+    covariance: np.ndarray  #: (23, 23) of what is known
+    hidden: np.ndarray  #: (23,), share 0..1 of each unknown that is not known
+    singular_values: np.ndarray  #: of the poses alone, in units of `NATURAL`, the largest first
+    residual: np.ndarray  #: (n, 4) Nm
+    hat: np.ndarray  #: (n, 4, n, 4), derivative of the predicted by the measured effort, both divided by sigma
+    inverse: np.ndarray  #: (23, 4 n + k), change of the unknowns with each effort and condition, divided by its error
 
     @property
     def freedom(self) -> np.ndarray:
@@ -122,15 +114,13 @@ def turned_regressor(theta: np.ndarray, direction: np.ndarray, gravity: float) -
     return np.asarray(np.einsum("njka,nat->njkt", along, turn))
 
 
-def solve(rows: Rows, start: np.ndarray, weight: np.ndarray | None = None) -> Solution:
+def solve(rows: Rows, start: np.ndarray = START, weight: np.ndarray | None = None) -> Solution:
     """Return the least-squares solution from `start` (23,); weight: (n, 4) of the squared residuals, 1 by default."""
     root = np.sqrt(np.ones_like(rows.effort) if weight is None else weight) / rows.sigma
     unknowns, step = start.copy(), np.full(COUNT, np.inf)
     for _ in range(STEPS):
         jacobian = (rows.jacobian(unknowns) * root[..., None]).reshape(-1, COUNT)
-        residual = np.append(
-            (root * (rows.effort - rows.predicted(unknowns))).ravel(), rows.anchor_value - rows.anchor @ unknowns
-        )
+        residual = np.append(root * (rows.effort - rows.predicted(unknowns)), -rows.anchor @ unknowns)
         inverse = _inverse(np.vstack((jacobian, rows.anchor)), rows.free)
         step = inverse @ residual
         # A scale that jumps by more than a factor of 1.6 in one step has left the range of the linear model.
@@ -144,8 +134,8 @@ def _inverse(whitened: np.ndarray, free: np.ndarray) -> np.ndarray:
     """Return the pseudo-inverse (23, m) of `whitened` (m, 23), without what is not known."""
     natural = NATURAL * free
     left, size, right = np.linalg.svd(whitened * natural, full_matrices=False)
-    told = size > 1.0
-    return np.asarray(natural[:, None] * (right[told].T / size[told]) @ left[:, told].T)
+    known = size > 1.0
+    return np.asarray(natural[:, None] * (right[known].T / size[known]) @ left[:, known].T)
 
 
 def _solution(rows: Rows, unknowns: np.ndarray, root: np.ndarray) -> Solution:
@@ -163,9 +153,9 @@ def _solution(rows: Rows, unknowns: np.ndarray, root: np.ndarray) -> Solution:
     return Solution(unknowns, covariance, hidden, singular_values, residual, hat, inverse)
 
 
-def robust(rows: Rows, start: np.ndarray) -> tuple[Rows, Solution]:
-    """Return a solution in which large residuals count little, and the rows with at least the error that they state."""
-    solution = solve(rows, start)
+def robust(rows: Rows) -> tuple[Rows, Solution]:
+    """Return a solution that gives large residuals little weight, and the rows with at least the error they state."""
+    solution = solve(rows)
     for _ in range(4):
         squares = (solution.residual / rows.sigma) ** 2
         share = np.maximum(0.2, 1.0 - np.einsum("njnj->nj", solution.hat))
@@ -176,12 +166,12 @@ def robust(rows: Rows, start: np.ndarray) -> tuple[Rows, Solution]:
     return replace(rows, sigma=rows.sigma * np.sqrt(factor)), solution
 
 
-def final(rows: Rows, start: np.ndarray) -> tuple[Rows, Solution]:
+def final(rows: Rows) -> tuple[Rows, Solution]:
     """Return the plain least-squares solution, and the rows with the error that its residuals show.
 
     The covariance includes a relative error of `COMMON` that all poses of a joint with the same weight share.
     """
-    scaled, solution = rows, solve(rows, start)
+    scaled, solution = rows, solve(rows)
     for _ in range(3):
         freedom = np.maximum(solution.freedom, 0.0)
         squares = ((solution.residual / rows.sigma) ** 2).sum(axis=0)
@@ -225,7 +215,7 @@ def without_each_pose(solution: Solution, sigma: np.ndarray) -> tuple[np.ndarray
     return held_out * sigma, caused
 
 
-def without_outliers(rows: Rows, start: np.ndarray) -> tuple[np.ndarray, tuple[tuple[int, str], ...]]:
+def without_outliers(rows: Rows) -> tuple[np.ndarray, tuple[tuple[int, str], ...]]:
     """Return which poses (n,) fit one arm, and index and reason of each that does not.
 
     Raises DataError if more than a third does not fit.
@@ -234,7 +224,7 @@ def without_outliers(rows: Rows, start: np.ndarray) -> tuple[np.ndarray, tuple[t
     rejected: list[tuple[int, str]] = []
     least = np.maximum(LEAST_OUTLIER, SHARE_OF_PEAK * np.abs(rows.effort).max(axis=0))
     while True:
-        used, solution = robust(rows.only(keep), start)
+        used, solution = robust(rows.only(keep))
         held_out, caused = without_each_pose(solution, used.sigma)
         matters = np.nanmax(np.abs(held_out) / least, axis=1, initial=0.0) > 1.0
         worst = int(np.argmax(caused * matters))
@@ -246,5 +236,5 @@ def without_outliers(rows: Rows, start: np.ndarray) -> tuple[np.ndarray, tuple[t
         rejected.append((index, off))
         keep[index] = False
         if len(rejected) > len(keep) // 3:
-            said = "; ".join(f"pose {index + 1}: {why}" for index, why in rejected)
-            raise DataError(f"the poses do not fit one arm: {said}. {DISTURBED}")
+            reasons = "; ".join(f"pose {index + 1}: {why}" for index, why in rejected)
+            raise DataError(f"the poses do not fit one arm: {reasons}. {DISTURBED}")

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from exo_gravity.core.calibration.guess import TorqueGuess
-from exo_gravity.core.calibration.identification import next_pose
-from exo_gravity.core.calibration.motion import Station, durations
-from exo_gravity.core.errors import DataError
-from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.calibration.motion import AMPLITUDE, Station, durations
+from exo_gravity.core.calibration.pose_fit import COUNT, MOMENT, NATURAL, START, TYPICAL_MOMENTS, Rows
+from exo_gravity.core.calibration.tracking import TorqueGuess
+from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.model.arm import STANDARD_GRAVITY
+from exo_gravity.core.model.moments import regressor
+from exo_gravity.core.numbers import JOINT_COUNT, Vector
 from exo_gravity.core.safety.limits import WALL_WIDTH, Limits
 
 CANDIDATES = 800
@@ -24,28 +26,10 @@ WAYPOINTS = 8  # of the way to a pose, at which the motors must hold the arm too
 FIRST_EDGE = 0.1  # rad in addition, at the first pose
 EDGE = 0.02  # rad between a sweep's end and the soft wall
 TIME_SHARE = 1.5  # of the time left for each pose, that the next one may take
-
-
-class Progress(NamedTuple):
-    """Where the arm is: position (4,) rad, and the time since the start of the tour in s."""
-
-    position: np.ndarray
-    elapsed: float
-
-
-class Itinerary(Protocol):
-    """Chooses the poses of a tour, one after the other."""
-
-    count: int  # of all poses
-
-    def next(
-        self, taken: np.ndarray, progress: Progress, guess: TorqueGuess, friction: Sequence[float]
-    ) -> Station | None:
-        """Return the next station, None after the last. Raises DataError if no pose can be held.
-
-        taken: (n, 4) rad, the poses measured so far. friction: (4,) Nm, 0 if unknown.
-        """
-        ...
+NOISE = 0.03  # Nm in any pose
+NOISE_SHARE = 0.02  # of the torque
+# deg of each joint, within the paper's ranges: from these a missing pose is suggested.
+GRID = ((-60, 0, 60), (15, 45, 75, 105, 135), (-30, 0, 30, 60, 90, 120), (0, 30, 60, 90, 120, 150))
 
 
 class FixedStations:
@@ -56,85 +40,94 @@ class FixedStations:
         self._left: Iterator[Station] = iter(stations)
 
     def next(
-        self, taken: np.ndarray, progress: Progress, guess: TorqueGuess, friction: Sequence[float]
+        self, taken: np.ndarray, position: np.ndarray, elapsed: float, guess: TorqueGuess, friction: Sequence[float]
     ) -> Station | None:
         """Return the next of the given stations."""
         return next(self._left, None)
 
 
-@dataclass
 class BestPoses:
     """Visits `count` poses, each the one with the most information that is still missing.
 
-    duration: s, of the whole tour, which the choice keeps within. seed: of the candidates.
+    duration: s, of the whole tour, which the choice keeps within.
     """
 
-    limits: Limits
-    count: int
-    duration: float
-    seed: int = 1
-
-    def __post_init__(self) -> None:
-        low, high = measurable(self.limits, Station((0.0,) * JOINT_COUNT).amplitude)
+    def __init__(self, limits: Limits, count: int, duration: float) -> None:
+        self.count = count
+        self._limits = limits
+        self._duration = duration
+        low, high = measurable(limits, AMPLITUDE)
         # Friction is not known at first: the first pose keeps a distance from the soft walls.
-        self._home = np.clip(self.limits.home, low + FIRST_EDGE, high - FIRST_EDGE)
-        self._candidates = candidates(self.limits, self.seed)
+        self._home = np.clip(limits.home, low + FIRST_EDGE, high - FIRST_EDGE)
+        self._candidates = candidates(limits)
         self._is_started = False
 
     def next(
-        self, taken: np.ndarray, progress: Progress, guess: TorqueGuess, friction: Sequence[float]
+        self, taken: np.ndarray, position: np.ndarray, elapsed: float, guess: TorqueGuess, friction: Sequence[float]
     ) -> Station | None:
-        """Return the best of the candidates that can be held and reached; the first is the hanging arm."""
+        """Return the best of the candidates that can be held and reached; the first is the hanging arm.
+
+        taken: (n, 4) rad, the poses measured so far. position: (4,) rad, where the arm is. elapsed: s since the start
+        of the tour. friction: (4,) Nm, 0 if unknown. Returns None after the last; raises DataError if no pose can be
+        held.
+        """
         if len(taken) >= self.count:
             return None
         if not len(taken) and not self._is_started:
             self._is_started = True
             return Station(tuple(self._home.tolist()))
-        in_time = np.flatnonzero(self._is_in_time(len(taken), progress))
+        in_time = np.flatnonzero(self._is_in_time(self.count - len(taken), position, elapsed))
         for deviations in DEVIATIONS:
-            can = self._is_holdable(self._candidates[in_time], progress.position, guess, friction, deviations)
+            can = self._is_holdable(self._candidates[in_time], position, guess, friction, deviations)
             possible = in_time[can]
             if len(possible):
                 break
         else:
             raise DataError("no further pose can be held within max_effort: is it too small for the arm?")
-        seen = list(taken) or [self._home]
-        poses = self._candidates[possible]
+        seen, poses = list(taken) or [self._home], self._candidates[possible]
         index = possible[next_pose(seen, poses, guess.tilt.direction, guess.common_moments, guess.gravity)]
         pose = self._candidates[index]
         self._candidates = np.delete(self._candidates, index, axis=0)  # chosen once, even if a joint sticks there
         return Station(tuple(pose.tolist()))
 
-    def _is_in_time(self, count: int, progress: Progress) -> np.ndarray:
-        """Return which candidates (n,) leave enough time for the others and for the way home."""
+    def _is_in_time(self, left: int, position: np.ndarray, elapsed: float) -> np.ndarray:
+        """Return which candidates (n,) leave enough time for the others of the `left` poses and for the way home."""
         sweeps = Station(tuple(self._home.tolist())).duration
-        home, way = (durations(self._candidates - pose) for pose in (self._home, progress.position))
-        left = self.count - count
-        budget = (self.duration - progress.elapsed - home) / left
+        home, way = (durations(self._candidates - pose) for pose in (self._home, position))
+        budget = (self._duration - elapsed - home) / left
         fits = way + sweeps <= budget * (TIME_SHARE if left > 1 else 1.0)
         return np.asarray(fits if fits.any() else way + home <= (way + home).min() + 1.0)
 
     def _is_holdable(
         self, poses: np.ndarray, start: np.ndarray, guess: TorqueGuess, friction: Sequence[float], deviations: float
     ) -> np.ndarray:
-        """Return which poses (n,) the motors can hold, reach from `start`, and leave for the hanging arm."""
+        """Return which poses (n,) the motors can hold, reach from `start`, and leave for the hanging arm.
+
+        friction: (4,) Nm, against which the arm is moved. deviations: standard deviations of the expected torque for
+        which there must be room.
+        """
         shares = np.linspace(0.0, 1.0, WAYPOINTS + 1)[1:, None, None]
-        sweep = Station((0.0,) * JOINT_COUNT).amplitude * np.array((-1.0, 1.0))[:, None, None]
-        start, home = start + shares * (poses - start), self.limits.home + shares * (poses - self.limits.home)
+        sweep = AMPLITUDE * np.array((-1.0, 1.0))[:, None, None]
+        start, home = start + shares * (poses - start), self._limits.home + shares * (poses - self._limits.home)
+        slide = [own or USUAL_FRICTION for own in friction]
         result = np.ones(len(poses), dtype=bool)
         for way, room in ((start, deviations), (poses + sweep, deviations), (home, 0.0)):
-            can = holdable(way.reshape(-1, JOINT_COUNT), self.limits, guess, friction, room)
+            mean, deviation = guess.torques(way.reshape(-1, JOINT_COUNT))
+            needed = np.abs(mean) + room * deviation + slide
+            can = np.all(needed <= SHARE * np.array(self._limits.max_effort), axis=1)
             result &= can.reshape(len(way), -1).all(axis=0)
         return result
 
 
-def candidates(limits: Limits, seed: int = 1) -> np.ndarray:
+Itinerary = FixedStations | BestPoses
+
+
+def candidates(limits: Limits) -> np.ndarray:
     """Return random poses (n, 4) in rad within `limits` in which no link points far upwards.
 
     Above the shoulder gravity tips the arm over: what is wrong with the expected torque grows with each movement.
     """
-    low, high = measurable(limits, Station((0.0,) * JOINT_COUNT).amplitude)
-    poses = np.random.default_rng(seed).uniform(low, high, (CANDIDATES, JOINT_COUNT))
+    poses = np.random.default_rng(1).uniform(*measurable(limits, AMPLITUDE), (CANDIDATES, JOINT_COUNT))
     down = np.cos(poses[:, 1:2]) * np.cos(np.stack((poses[:, 2], poses[:, 2] + poses[:, 3]), axis=1))
     return np.asarray(poses[down.min(axis=1) >= -MOST_UPWARDS])
 
@@ -145,19 +138,44 @@ def measurable(limits: Limits, amplitude: float) -> tuple[np.ndarray, np.ndarray
     return np.array(limits.position_min) + margin, np.array(limits.position_max) - margin
 
 
-def holdable(
-    poses: np.ndarray,
-    limits: Limits,
-    guess: TorqueGuess,
-    friction: Sequence[float],
-    deviations: float = DEVIATIONS[0],
-) -> np.ndarray:
-    """Return at which of `poses` (n, 4) rad the motors can hold the arm, and move it against `friction` (4,) Nm.
+def next_pose(
+    taken: Sequence[Vector],
+    candidates: np.ndarray,
+    direction: Vector = (0.0, 0.0, 1.0),
+    moments: Vector = TYPICAL_MOMENTS,
+    gravity: float = STANDARD_GRAVITY,
+) -> int:
+    """Return the index of the candidate that adds the most information to the poses `taken`, by D-optimality.
 
-    deviations: standard deviations of the expected torque for which there must be room.
+    taken: (4,) rad each, none at the start. candidates: (n, 4) rad. direction: (3,), gravity's unit vector in the base
+    frame. moments: (8,) kg m, a guess. Raises ParameterError if there is no candidate.
     """
-    mean, deviation = guess.torques(poses)
-    slide = [own or USUAL_FRICTION for own in friction]
-    return np.asarray(
-        np.all(np.abs(mean) + deviations * deviation + slide <= SHARE * np.array(limits.max_effort), axis=1)
-    )
+    if len(candidates) == 0:
+        raise ParameterError("candidates", [], "at least one pose")
+    information = np.diag(NATURAL**-2.0)
+    if len(taken):
+        rows = _sensitivity(np.asarray(taken, dtype=float), direction, moments, gravity).reshape(-1, COUNT)
+        information += rows.T @ rows
+    rows = _sensitivity(candidates, direction, moments, gravity)
+    added = np.eye(JOINT_COUNT) + rows @ np.linalg.inv(information) @ rows.transpose(0, 2, 1)
+    return int(np.argmax(np.linalg.slogdet(added)[1]))
+
+
+def missing_pose(hidden: np.ndarray, direction: Vector, gravity: float) -> str:
+    """Return, in words, the pose of `GRID` that shows most of the unknowns of which `hidden` (23,) are not known."""
+    poses = np.radians(list(itertools.product(*GRID)))
+    shown = _sensitivity(poses, direction, TYPICAL_MOMENTS, gravity) * NATURAL * hidden
+    best = poses[int(np.argmax((shown**2).sum(axis=(1, 2))))]
+    return f"[{', '.join(f'{math.degrees(angle):.0f}' for angle in best)}] degrees"
+
+
+def _sensitivity(theta: np.ndarray, direction: Vector, moments: Vector, gravity: float) -> np.ndarray:
+    """Return the derivative of the efforts in the poses (n, 4) by the unknowns, divided by their noise: (n, 4, 23)."""
+    rows = regressor(theta, direction, gravity)
+    torque = rows @ np.asarray(moments)
+    noise = np.hypot(NOISE, NOISE_SHARE * torque)
+    no_load = np.zeros((len(theta), rows.shape[2]))
+    poses = Rows(rows, np.zeros((*rows.shape, 3)), no_load, np.zeros((*no_load.shape, 3)), torque, noise)
+    unknowns = START.copy()
+    unknowns[MOMENT] = moments
+    return np.asarray(poses.jacobian(unknowns) / noise[..., None])

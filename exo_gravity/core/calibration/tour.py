@@ -2,27 +2,25 @@
 
 Pure: time is an argument. At each pose all joints sweep through it there and back: the mean of both directions is
 gravity, half of the difference is friction. What was measured improves the expected torque, which carries the arm and
-tells a hand on it from its weight. The tour begins and ends at the hanging arm; after trouble it withdraws its efforts.
+distinguishes a hand on it from its weight. The tour begins and ends at the hanging arm; after trouble it withdraws its
+efforts.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.calibration.guess import TorqueGuess
 from exo_gravity.core.calibration.identification import Observation
-from exo_gravity.core.calibration.motion import LEAD, Line, Station
-from exo_gravity.core.calibration.poses import Itinerary, Progress
-from exo_gravity.core.calibration.tracking import MassMatrix, Tracker
-from exo_gravity.core.calibration.visit import FOLLOWED, Visit
-from exo_gravity.core.calibration.watch import Watch
+from exo_gravity.core.calibration.motion import FOLLOWED, LEAD, Line, Station, Visit
+from exo_gravity.core.calibration.poses import Itinerary
+from exo_gravity.core.calibration.tracking import TorqueGuess, Tracker, inertia_of
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.model.gravity import Torque
-from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.model.kinematics import LinkInertia
+from exo_gravity.core.model.tilt import Tilt, angle_between
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.limits import Limits
 
@@ -33,13 +31,72 @@ MAX_SKIPPED = 2  # poses in which a joint may stick
 STEADY_SPEED = 0.05  # rad/s of a sweep, from which on its friction is that of the motion between poses
 REFRESH_PERIOD = 0.1  # s between two estimates of the mass matrix, and of how uncertain the expected torque is
 ANGLE_STEP = 0.01  # rad, for the slope of the expected torque
+# What stops a tour.
+MAX_ERROR = 0.12  # rad between a joint and the slow reference
+FASTEST = 1.0  # rad/s of a joint; a light joint that leaves its friction reaches 0.5
+MAX_CORRECTION = 0.5  # Nm, of the controllers, in addition to what is unknown of weight and friction
+DEVIATIONS = 3.0  # of the expected torque
+UNKNOWN_FRICTION = 1.0  # Nm, until it is measured
+PERSISTENCE = 0.25  # s for which a torque must be unexplained
+SATURATION = 0.1  # s for which a joint may want more than its max_effort
+MAX_GAP = 0.1  # s between two joint states; as long as can_bridge's longest time-out
+MAX_TILT = 0.1  # rad by which the stand or the trunk may tilt during the tour
+MAX_UNREST = (0.12, 0.25, 0.05)  # Nm, share of friction, share of the torque: between two passes of the same pose
 
 
-class Measured(NamedTuple):
-    """What was measured at a station; speed: rad/s, of the sweeps."""
+class TourWatch:
+    """Finds the first trouble of a tour, as a sentence that names joint, value and limit; '' while all is well.
 
-    observation: Observation
-    speed: float
+    tilt: of the trunk or the stand at the start.
+    """
+
+    def __init__(self, limits: Limits, tilt: Tilt) -> None:
+        self._names = limits.joint_names
+        self._max_effort = limits.max_effort
+        self._tilt = tilt
+        self._unexplained = [0.0] * JOINT_COUNT  # s
+
+    def motion(
+        self, dt: float, position: Sequence[float], velocity: Sequence[float], wanted: Sequence[float], tilt: Tilt
+    ) -> str:
+        """Return what is wrong with the motion: position, wanted (4,) rad, velocity (4,) rad/s, after `dt` s."""
+        if dt > MAX_GAP:
+            return f"no joint states for {dt * 1000:.0f} ms, the limit is {MAX_GAP * 1000:.0f}: is a motor silent?"
+        if (moved := angle_between(tilt.direction, self._tilt.direction)) > MAX_TILT:
+            return f"the trunk tilted by {moved:.2f} rad during the measurement, the limit is {MAX_TILT:g}"
+        for name, angle, speed, goal in zip(self._names, position, velocity, wanted, strict=True):
+            if not abs(goal - angle) <= MAX_ERROR:
+                reason = "a hand is on the arm, or the joint is blocked"
+                return f"{name}: {abs(goal - angle):.2f} rad off its path, the limit is {MAX_ERROR:g}: {reason}"
+            if not abs(speed) <= FASTEST:
+                return f"{name}: {speed:.2f} rad/s, the limit is {FASTEST:g}: it slipped or was pushed"
+        return ""
+
+    def torque(self, dt: float, tracker: Tracker, uncertain: Sequence[float], friction: Sequence[float]) -> str:
+        """Return which joint is saturated, or needs a torque that neither weight nor friction explains.
+
+        uncertain: (4,) Nm, standard deviation of the expected torque. friction: (4,) Nm, 0 while it is unknown.
+        """
+        for name, time, most in zip(self._names, tracker.saturated.tolist(), self._max_effort, strict=True):
+            if time > SATURATION:
+                return f"{name}: saturated: the pose needs more than max_effort = {most:g} Nm"
+        columns = zip(self._names, tracker.correction.tolist(), uncertain, friction, strict=True)
+        for i, (name, torque, deviation, slide) in enumerate(columns):
+            limit = MAX_CORRECTION + DEVIATIONS * deviation + (0.5 * slide if slide else UNKNOWN_FRICTION)
+            self._unexplained[i] = self._unexplained[i] + dt if abs(torque) > limit else 0.0
+            if self._unexplained[i] > PERSISTENCE:
+                reason = "is a hand on the arm?"
+                return f"{name}: {torque:.2f} Nm beyond its weight and friction, the limit is {limit:.2f}: {reason}"
+        return ""
+
+    def unrest(self, change: Sequence[float], effort: Sequence[float], friction: Sequence[float]) -> str:
+        """Return which joint's torque changed between two passes of a pose: change, effort, friction (4,) Nm."""
+        for name, between, torque, slide in zip(self._names, change, effort, friction, strict=True):
+            limit = MAX_UNREST[0] + MAX_UNREST[1] * abs(slide) + MAX_UNREST[2] * abs(torque)
+            if between > limit:
+                reason = "the arm was touched, or the joint slips"
+                return f"{name}: {between:.2f} Nm between two passes of a pose, the limit is {limit:.2f}: {reason}"
+        return ""
 
 
 class Tour:
@@ -52,7 +109,7 @@ class Tour:
     def __init__(
         self, limits: Limits, guess: TorqueGuess, itinerary: Itinerary, rate: float, load: tuple[float, float] = (0, 0)
     ) -> None:
-        self.measured: list[Measured] = []
+        self.measured: list[Observation] = []
         self.trouble = ""
         self.done = False
         self.progress = "waiting for the arm to be carried"
@@ -63,9 +120,9 @@ class Tour:
         self._load = load
         self._most = np.array(limits.max_effort)
         self._tracker = Tracker(rate, limits.max_effort)
-        self._masses = self._mass_matrix()
+        self._inertia = self._known_inertia()
         self._matrix = np.eye(JOINT_COUNT)
-        self._watch = Watch(limits.joint_names, limits.max_effort, guess.tilt)
+        self._watch = TourWatch(limits, guess.tilt)
         self._now = -math.inf
         self._line = Line(np.zeros(JOINT_COUNT), np.zeros(JOINT_COUNT))
         self._line_time = 0.0  # s
@@ -95,14 +152,13 @@ class Tour:
         if self.done:  # the bridge lets the arm down: it is no longer watched
             torque = self._guess.torque(position) + self._tracker.correction
             return tuple(np.clip(torque, -self._most, self._most).tolist())
+        self._guess.tilt = tilt
         if self._now == -math.inf:
-            self._watch = Watch(self._limits.joint_names, self._limits.max_effort, tilt)
+            self._watch = TourWatch(self._limits, tilt)
             self._now = now
-            self._guess.tilt = tilt
             self._await_plan(np.array(position))
         dt, self._now = now - self._now, now
         self.elapsed += dt
-        self._guess.tilt = tilt
         if self._line_time > self._line.duration + self._pause:
             self._next_line()
         goal, heading = self._line.at(self._line_time)
@@ -123,14 +179,13 @@ class Tour:
         self, dt: float, position: Sequence[float], speed_error: np.ndarray, error: np.ndarray, heading: np.ndarray
     ) -> str:
         """Set the effort of this cycle; return what is wrong with it, or ''."""
-        tracker, watch = self._tracker, self._watch
         if self._now - self._refreshed > REFRESH_PERIOD:
             self._refreshed = self._now
             self._uncertain = self._guess.torques(np.array([position]))[1][0].tolist()
-            self._matrix = self._masses.at(position)
-        self._effort = tracker.step(dt, error, speed_error, heading, self._guess.torque(position), self._matrix)
-        rows = (tracker.correction.tolist(), self._uncertain, self._friction)
-        return watch.saturation(tracker.saturated.tolist()) or watch.torque(dt, *rows)
+            self._matrix = self._inertia.matrix(position)
+        expected = self._guess.torque(position)
+        self._effort = self._tracker.step(dt, error, speed_error, heading, expected, self._matrix)
+        return self._watch.torque(dt, self._tracker, self._uncertain, self._friction)
 
     def _next_line(self) -> None:
         """Begin the next sweep, or after the last one the way to the next pose."""
@@ -140,8 +195,7 @@ class Tour:
                 self._go_on(end, *self._plan)
             return
         if self._visit is None:
-            if not self.done:
-                self.done, self.progress = True, "done"
+            self.done, self.progress = True, "done"
             return
         if self._is_sweeping:
             self._end_sweep(self._visit)
@@ -165,7 +219,7 @@ class Tour:
             self.trouble = f"{name}: it sticks: it follows {share:.0%} of a slow motion, must be {FOLLOWED:.0%}"
 
     def _end_sweep(self, visit: Visit) -> None:
-        """Improve what is known of friction; sweeps without it, and those that a joint did not follow, do not count."""
+        """Improve what is known of friction; sweep again what passed without it, or what a joint did not follow."""
         friction = visit.end_sweep()
         if friction is None:
             return
@@ -178,20 +232,20 @@ class Tour:
 
     def _finish(self, visit: Visit) -> None:
         """Keep what was measured, and improve the expected torque with it."""
-        theta, effort, friction, spread, unrest = visit.result()
+        (theta, effort, friction, spread, unrest), direction = visit.result()
         self.trouble = self._watch.unrest(unrest.tolist(), effort.tolist(), friction.tolist())
         if self.trouble:
             return
-        observation = Observation(theta, visit.direction, effort, friction, spread, *self._load)
-        self.measured.append(Measured(observation, visit.station.speed))
+        found = Observation(theta, direction, effort, friction, spread, *self._load, visit.station.speed)
+        self.measured.append(found)
         here = theta.tolist()
         before = self._guess.torque(here)
         self._guess.learn(theta, effort, spread)
         self._tracker.shift(np.subtract(self._guess.torque(here), before))
-        self._masses = self._mass_matrix()
+        self._inertia = self._known_inertia()
 
-    def _mass_matrix(self) -> MassMatrix:
-        return MassMatrix(self._guess.length, self._guess.common_moments[:JOINT_COUNT], self._load)
+    def _known_inertia(self) -> LinkInertia:
+        return inertia_of(self._guess.length, self._guess.common_moments[:JOINT_COUNT], self._load)
 
     def _shape(self, station: Station) -> tuple[np.ndarray, np.ndarray]:
         """Return how the expected torque changes at a station: slope and bend, as for `average`."""
@@ -202,15 +256,21 @@ class Tour:
         return (after - before).T / (2.0 * ANGLE_STEP), (low - 2.0 * middle + high) / ANGLE_STEP**2
 
     def plan(self) -> None:
-        """Choose the next pose if one is due. It takes 0.1 s and more: not on the thread of `step`."""
+        """Choose the next pose if one is due. It takes 0.1 s and more: not on the thread of `step`.
+
+        Any error of the choice ends the tour: without a next pose the arm would be held for ever.
+        """
         if not self._awaits_plan or self._plan:
             return
-        taken = np.array([measured.observation.theta for measured in self.measured]).reshape(-1, JOINT_COUNT)
-        progress = Progress(self._line.at(math.inf)[0], self.elapsed)
         try:
-            self._plan = (self._itinerary.next(taken, progress, self._guess, self._friction), "")
+            taken = np.array([measured.theta for measured in self.measured]).reshape(-1, JOINT_COUNT)
+            position = self._line.at(math.inf)[0]
+            station = self._itinerary.next(taken, position, self.elapsed, self._guess, self._friction)
+            self._plan = (station, "")
         except ExoGravityError as error:
             self._plan = (None, str(error))
+        except Exception as error:
+            self._plan = (None, f"the next pose could not be chosen: {type(error).__name__}: {error}")
 
     def _await_plan(self, position: np.ndarray) -> None:
         """Hold the arm at `position` until the next pose is chosen."""

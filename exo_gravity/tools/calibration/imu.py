@@ -1,6 +1,9 @@
 """calibrate imu: the mounting of the IMU, from a recording of its samples or from the running driver.
 
-The file's `/imu` names the topic. Live, the recorder alone is started, beside the user's own IMU driver.
+The file's `/imu` names the topic. Live, only the recorder is started, while the user's own IMU driver runs.
+
+Posture leaves an error of a degree. The arm's weight shows the mounting to a tenth of one (`with_mounting`): from one
+lean of the stand the rotation that moves gravity, from two leans the heading as well.
 """
 
 from __future__ import annotations
@@ -8,7 +11,8 @@ from __future__ import annotations
 import argparse
 import math
 import tempfile
-from collections.abc import Callable
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +24,10 @@ from rosbags.typesys import Stores, get_typestore
 from exo_gravity.bag.storage import Storage
 from exo_gravity.core.calibration.imu_mounting import AccelerometerFit, ImuRecord, Mounting, mounting, six_rests
 from exo_gravity.core.errors import DataError
+from exo_gravity.core.model.rotation import Quaternion, product
 from exo_gravity.core.trunk.params import IMU
-from exo_gravity.tools.calibration.outcome import Change, Outcome
+from exo_gravity.tools.calibration.live import Say
+from exo_gravity.tools.calibration.result import CalibrationResult, Change
 from exo_gravity.tools.inputs.arms import ConfiguredArm, node_values
 from exo_gravity.tools.inputs.parameter_file import load
 from exo_gravity.tools.launcher import Launcher
@@ -33,9 +39,15 @@ REQUEST = (
     "stand upright for 3 s, bow straight ahead by 45 degrees or so, stay there for 3 s, stand upright again for 3 s; "
     "bow three times in all"
 )
+LARGEST_ERROR = math.radians(0.5)  # of the two directions in which gravity can be off
+LARGEST_HEADING_ERROR = math.radians(1.0)
+NO_HEADING = (
+    "The IMU's heading does not show from one lean of the stand: `calibrate scale` shows it if the stand is leant "
+    "forward or back by about 10 degrees when the weight is hung."
+)
 
 
-def run(options: argparse.Namespace, arm: ConfiguredArm | None, say: Callable[[object], None]) -> Outcome:
+def calibrate_imu(options: argparse.Namespace, arm: ConfiguredArm | None, say: Say) -> CalibrationResult:
     """Calibrate the IMU of the file options.params from options.bag, or live.
 
     options.rests: a recording of six rests, None for none. options.ask: waits for the person. Raises DataError.
@@ -46,12 +58,12 @@ def run(options: argparse.Namespace, arm: ConfiguredArm | None, say: Callable[[o
         found = mounting(read_imu(bag, topic))
         fit = six_rests(read_imu(options.rests, topic)) if options.rests else None
     except DataError as error:
-        return Outcome((), (), (str(error),), None)
+        return CalibrationResult(refusals=(str(error),))
     changes, lines = _mounting_result(found)
     if fit is not None:
         line = _accelerometer_line(fit)
         changes, lines = (*changes, Change(NODE, "", 0, line)), (*lines, line)
-    return Outcome(changes, lines)
+    return CalibrationResult(changes, lines)
 
 
 def read_imu(bag: Path, topic: str) -> ImuRecord:
@@ -78,7 +90,7 @@ def _mounting_result(found: Mounting) -> tuple[tuple[Change, ...], tuple[str, ..
     bias = " ".join(f"{value:+.4f}" for value in found.gyroscope_bias)
     bias_error = " ".join(f"{value:.4f}" for value in found.gyroscope_bias_error)
     quaternion = [round(float(value), 6) for value in found.quaternion]
-    accuracy = f"±{error} degrees about the trunk's x, y, z, of which posture is the larger part"
+    accuracy = f"±{error} degrees about the trunk's x, y and z, most of which is posture"
     bows = f"{found.bows} {'bow' if found.bows == 1 else 'bows'} of up to {math.degrees(found.bow):.0f} degrees"
     lines = (
         f"{ROTATION}: {' '.join(f'{value:.4f}' for value in quaternion)} (x, y, z, w), {accuracy}",
@@ -91,12 +103,13 @@ def _mounting_result(found: Mounting) -> tuple[tuple[Change, ...], tuple[str, ..
 
 def _accelerometer_line(fit: AccelerometerFit) -> str:
     scale, bias = (" ".join(f"{value:.4f}" for value in values) for values in (fit.scale, fit.bias))
-    return f"accelerometer: true = scale (shown - bias), scale {scale}, bias {bias} m/s^2, for the driver; " + (
+    return (
+        f"accelerometer: true = scale (shown - bias), scale {scale}, bias {bias} m/s^2, for the driver; "
         f"{fit.residual:.3f} m/s^2 remain"
     )
 
 
-def _record(options: argparse.Namespace, say: Callable[[object], None]) -> Path:
+def _record(options: argparse.Namespace, say: Say) -> Path:
     """Record while the person stands and bows; return the recording's folder."""
     bag = Path(options.output).with_suffix(".bag").resolve()
     if bag.exists():
@@ -113,3 +126,46 @@ def _record(options: argparse.Namespace, say: Callable[[object], None]) -> Path:
             launcher.stop()
     say(f"Recorded: {bag}")
     return bag
+
+
+def with_mounting(result: CalibrationResult, params: Path) -> CalibrationResult:
+    """Return `result` with a better mounting of the IMU in the file `params`, if the arm's weight showed one."""
+    found, arm = result.identified, result.arm
+    rotation = load(params).get(NODE, {}).get(ROTATION)
+    if found is None or arm is None or not result.changes or not rotation or not arm.compensator["use_imu"]:
+        return result
+    square, axes = np.linalg.eigh(found.tilt_covariance)  # the last is nearly gravity's own axis
+    error, heading_error = math.sqrt(max(0.0, square[0] + square[1])), math.sqrt(max(0.0, square[2]))
+    if not 0.0 < error < LARGEST_ERROR:
+        return result
+    is_whole = heading_error < LARGEST_HEADING_ERROR
+    turn = found.tilt if is_whole else axes[:, :2] @ axes[:, :2].T @ found.tilt
+    angle, quaternion = math.degrees(float(np.linalg.norm(turn))), turned(rotation, turn_in_trunk(arm.side, turn))
+    heading = f"heading ±{math.degrees(heading_error):.2f}" if is_whole else "heading unchanged"
+    accuracy = f"±{math.degrees(error):.2f} degrees, {heading}"
+    note = f"{accuracy}, from the arm's weight: {angle:.1f} degrees from the value before"
+    lines = (f"{ROTATION}: corrected by {angle:.1f} degrees, {accuracy}", *(() if is_whole else (NO_HEADING,)))
+    change = Change(NODE, ROTATION, [round(value, 6) for value in quaternion], note)
+    return replace(result, changes=(*result.changes, change), lines=(*result.lines, *lines))
+
+
+def turned(rotation: Sequence[float], turn: np.ndarray) -> Quaternion:
+    """Return the mounting `rotation`, trunk from IMU (x, y, z, w), after `turn`, a rotation vector (3,)."""
+    angle = float(np.linalg.norm(turn))
+    x, y, z = (turn * 0.5 * float(np.sinc(angle / (2.0 * math.pi)))).tolist()
+    a, b, c, d = rotation
+    return product((x, y, z, math.cos(angle / 2.0)), (a, b, c, d))
+
+
+def turn_in_trunk(side: str, turn: np.ndarray) -> np.ndarray:
+    """Return a rotation vector in an arm's base frame in the trunk's axes.
+
+    The right arm's base frame is the left one's mirror image, so that the sense of rotation changes.
+    """
+    return in_trunk(side, turn) * (1.0 if side == "left" else -1.0)
+
+
+def in_trunk(side: str, direction: np.ndarray) -> np.ndarray:
+    """Return a direction in an arm's base frame in the trunk's axes, as in `core.model.tilt`."""
+    outward, forward, down = direction
+    return np.array((forward, outward if side == "left" else -outward, -down))

@@ -1,4 +1,4 @@
-"""A calibration on the device: starts the arm's nodes with `calibrator` in the compensator's place, and follows it.
+"""A calibration on the device: the person at the terminal, and the arm's nodes with `calibrator` for the compensator.
 
 Every observation is written to the record as it comes, so that Ctrl-C and faults lose nothing. On Ctrl-C, after the
 last pose and after any trouble the launcher stops the bridge first, which lets the arm down.
@@ -9,60 +9,119 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import select
+import sys
 import tempfile
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
+import numpy as np
 import yaml
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.text import Text
 
 from exo_gravity.core.calibration.identification import Observation
-from exo_gravity.core.calibration.tour import Measured
-from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.safety.params import LIMIT_PARAMETERS
+from exo_gravity.core.calibration.params import ARM, BRIDGE
+from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.model.moments import moments_of
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.launcher import Launcher, Stopping, stop_on_signals
 
 KEPT = ("can_bridge", "simulator")  # the arm's nodes that run during a calibration, with the shared /imu
+REFRESH_PERIOD = 0.1  # s, of what the person is shown
 POLL_PERIOD = 0.05  # s
 STOPPED = "stopped by Ctrl-C"
 ATTEMPTS = 3  # of a tour on the simulated device
 # Parts of the lines of nodes on a busy computer: the simulated device itself is never late.
 LATE = ("command_stale", "motor_silent", "no joint states for", "trunk tilt older", "was frozen for", "stalled for")
 
-Say = Callable[[str], None]
+Say = Callable[[Any], None]
+
+
+class Person:
+    """The person at the terminal: talks through `console` and reads `keys`, by default the terminal."""
+
+    def __init__(self, console: Console | None = None, keys: IO[str] | None = None) -> None:
+        self._console = console or Console(highlight=False)
+        self._keys = keys or sys.stdin
+
+    def say(self, what: RenderableType) -> None:
+        """Print a line or a table."""
+        self._console.print(what, markup=False, soft_wrap=isinstance(what, str))
+
+    def ask(self, request: str) -> None:
+        """Print `request` and wait for Enter. Raises DataError if standard input has ended."""
+        self.wait(request, lambda: "")
+
+    def wait(self, request: str, watch: Callable[[], RenderableType]) -> None:
+        """Print `request`, and show what `watch()` returns until Enter is pressed. Raises DataError as `ask` does."""
+        self._console.print(Text(f"{request}; then press Enter", style="bold"))
+        with Live(console=self._console, auto_refresh=False, transient=True) as live:
+            while not select.select([self._keys], [], [], REFRESH_PERIOD)[0]:
+                live.update(Group(watch()), refresh=self._console.is_terminal)
+        if not self._keys.readline():
+            raise DataError("standard input has ended: a person must press Enter")
 
 
 @dataclass
 class LiveTour:
-    """What a tour measured so far. trouble: why it ended early, or ''. done: whether it is complete.
+    """What a tour measured so far."""
 
-    was_late: whether this computer did not run the nodes in time.
-    """
+    measured: list[Observation] = field(default_factory=list)
+    trouble: str = ""  #: why it ended early, or ''
+    done: bool = False  #: whether it is complete
+    was_late: bool = False  #: whether this computer did not run the nodes in time
 
-    measured: list[Measured] = field(default_factory=list)
-    trouble: str = ""
-    done: bool = False
-    was_late: bool = False
+    def follow(self, line: str, record: Path, say: Say) -> None:
+        """Take one line of `calibrator`; ignore half a line, which a killed node leaves."""
+        with contextlib.suppress(json.JSONDecodeError):
+            event = json.loads(line)
+            if "observation" in event:
+                with record.open("a", encoding="utf-8") as file:
+                    file.write(line + "\n")
+                self.measured.append(Observation(**event["observation"]))
+            elif event.get("progress"):
+                say(event["progress"])
+            elif event.get("trouble") and not self.done:
+                self.trouble = self.trouble or event["trouble"]
+                self.was_late = self.was_late or any(sign in line for sign in LATE)
+            elif event.get("done"):
+                self.done = True
+
+    def refusals(self, record: Path) -> tuple[str, ...]:
+        """Return why the tour did not complete, and where its observations are; () if it did."""
+        kept = f"; {len(self.measured)} observations are kept in {record}" if self.measured else ""
+        return (f"{self.trouble}{kept}",) if self.trouble else ()
 
 
-def tour_parameters(params: Path, arm: ConfiguredArm, changes: Mapping[str, Any]) -> dict[str, Any]:
+def tour_parameters(
+    params: Path, arm: ConfiguredArm, changes: Mapping[str, Any], moments: np.ndarray | None = None
+) -> dict[str, Any]:
     """Return the content of a parameter file in which `calibrator` replaces the compensator of `arm`.
 
-    changes: parameters of `calibrator` that differ from the arm's.
+    changes: parameters of `calibrator` that differ from the arm's. moments: (8,) kg m as far as known, by default those
+    of the robot alone.
     """
     content = yaml.safe_load(params.read_text(encoding="utf-8"))
     own = [f"{arm.namespace}/{name}" for name in KEPT]
     nodes = {node: entry for node, entry in content.items() if node == "/imu" or node in own}
-    limits = {param.name: arm.can_bridge[param.name] for param in LIMIT_PARAMETERS}
-    most = [min(pair) for pair in zip(arm.can_bridge["max_effort"], arm.compensator["max_effort"], strict=True)]
-    values = {**arm.compensator, **limits, "rate": arm.can_bridge["rate"], "max_effort": most, "law": "exact"}
     if list(arm.compensator["joint_names"]) != list(arm.can_bridge["joint_names"]):
         raise ParameterError("joint_names", arm.compensator["joint_names"], f"{arm.can_bridge['joint_names']}")
-    nodes[f"{arm.namespace}/calibrator"] = {"ros__parameters": {**values, "anfis_file": "", **changes}}
+    expected = (moments_of(arm.robot) if moments is None else moments).tolist()
+    most = [min(pair) for pair in zip(arm.can_bridge["max_effort"], arm.compensator["max_effort"], strict=True)]
+    values = {
+        **{name: arm.compensator[name] for name in ARM},
+        **{name: arm.can_bridge[name] for name in BRIDGE},
+        "max_effort": most,
+        "first_moment": expected[:4],
+        "off_axis": expected[4:],
+    }
+    nodes[f"{arm.namespace}/calibrator"] = {"ros__parameters": {**values, **changes}}
     return nodes
 
 
@@ -76,8 +135,8 @@ def run_tour(
 ) -> LiveTour:
     """Run `nodes`, the content of a parameter file, until the tour is done or has failed; the arm is then down.
 
-    options: output (the log is beside it) and record. A tour of the simulated device that this computer was too busy
-    for is repeated. Raises ParameterError for a wrong file.
+    options: output (the log goes into the same folder) and record. A tour of the simulated device for which this
+    computer was too busy is repeated. Raises ParameterError for a wrong file.
     """
     stopping = stopping or stop_on_signals()
     is_simulated = any(node.endswith("/simulator") for node in nodes)
@@ -97,7 +156,7 @@ def _run_once(options: argparse.Namespace, nodes: Mapping[str, Any], say: Say, s
 
         def on_line(node: str, line: str) -> None:
             if node.endswith("/calibrator") and line.startswith("{"):
-                follow(tour, line, options.record, say)
+                tour.follow(line, options.record, say)
                 return
             log.write(f"{datetime.now():%H:%M:%S.%f} {node.lstrip('/')} {line}\n")
             tour.was_late = tour.was_late or any(sign in line for sign in LATE)
@@ -126,35 +185,3 @@ def _run(launcher: Launcher, tour: LiveTour, stopping: Stopping, last_errors: Ma
     if launcher.maybe_powered:
         powered = f"the motors of {', '.join(launcher.maybe_powered)} may still be powered: cut their supply"
         tour.trouble = f"{tour.trouble}; {powered}" if tour.trouble else powered
-
-
-def follow(tour: LiveTour, line: str, record: Path, say: Say) -> None:
-    """Take one line of `calibrator`; ignore half a line, which a killed node leaves."""
-    with contextlib.suppress(json.JSONDecodeError):
-        event = json.loads(line)
-        if "observation" in event:
-            with record.open("a", encoding="utf-8") as file:
-                file.write(line + "\n")
-            tour.measured.append(measured_of(event["observation"]))
-        elif event.get("progress"):
-            say(event["progress"])
-        elif event.get("trouble") and not tour.done:
-            tour.trouble = tour.trouble or event["trouble"]
-            tour.was_late = tour.was_late or any(sign in line for sign in LATE)
-        elif event.get("done"):
-            tour.done = True
-
-
-def measured_of(values: Mapping[str, Any]) -> Measured:
-    """Return what was measured at a pose from its JSON values."""
-    fields = dict(values)
-    speed = fields.pop("speed")
-    return Measured(Observation(**fields), speed)
-
-
-def refusals_of(tour: LiveTour, record: Path) -> tuple[str, ...]:
-    """Return why the tour did not complete, and where its observations are; () if it did."""
-    if not tour.trouble:
-        return ()
-    kept = f"; {len(tour.measured)} observations are kept in {record}" if tour.measured else ""
-    return (f"{tour.trouble}{kept}",)

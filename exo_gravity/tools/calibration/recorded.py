@@ -1,7 +1,7 @@
 """Observations from a recording: poses that were passed slowly in both directions, and poses that were held.
 
-A pose that was passed there and back gives gravity and friction. A held pose only gives gravity give or take friction:
-the arm would stay with any torque within it.
+A pose that was passed there and back gives gravity and friction. A held pose gives gravity to within friction only: the
+arm would stay with any torque inside it.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.bag.storage import Storage
-from exo_gravity.core.calibration.average import BINS, Sweep, average
 from exo_gravity.core.calibration.identification import Observation
+from exo_gravity.core.calibration.motion import BINS, SweepSamples, average
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.trial.recording import Recording, in_blocks, still_spans
@@ -35,24 +35,17 @@ HELD_TIME = 1.0  # s
 UNKNOWN_FRICTION = 0.4  # Nm, of a joint of which no sweep was recorded
 
 
-class Swept(NamedTuple):
-    """What two sweeps, there and back, show, and the mean speed (4,) in rad/s at which each joint turned."""
-
-    observation: Observation
-    speed: np.ndarray
-
-
 def observations_of(path: Path, arm: ConfiguredArm) -> list[Observation]:
     """Return the observations in the recording of `arm` at `path`. Raises DataError if there are none."""
     recording, _, tilts = _recorded(path, arm)
-    sweeps = [swept.observation for swept in _sweeps(recording, arm, tilts)]
+    sweeps = list(_sweeps(recording, arm, tilts))
     observations = sweeps + list(_held(recording, arm, tilts, sweeps))
     if not observations:
         raise DataError(f"{path}: no pose of {arm.name} was held for {HELD_TIME:g} s, or passed slowly there and back")
     return observations
 
 
-def sweeps_of(path: Path, arm: ConfiguredArm) -> list[Swept]:
+def sweeps_of(path: Path, arm: ConfiguredArm) -> list[Observation]:
     """Return the sweeps there and back in the recording of `arm` at `path`. Raises DataError if there are none."""
     sweeps = list(_sweeps(*_recorded(path, arm)))
     if not sweeps:
@@ -108,7 +101,7 @@ def _effort(recording: Recording, part: slice | np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(commanded), commanded, measured)
 
 
-def _sweeps(recording: Recording, arm: ConfiguredArm, tilts: np.ndarray | None) -> Iterator[Swept]:
+def _sweeps(recording: Recording, arm: ConfiguredArm, tilts: np.ndarray | None) -> Iterator[Observation]:
     """Yield an observation for every two runs one after the other in which all joints turn to and fro."""
     runs = [run for span in recording.while_carried(-math.inf, math.inf) for run in _runs(recording, *span)]
     last_end = -math.inf
@@ -118,12 +111,11 @@ def _sweeps(recording: Recording, arm: ConfiguredArm, tilts: np.ndarray | None) 
         if np.any(way[0] * way[1] >= 0.0) or turn > LONGEST_TURN:
             continue
         if recording.time[there.start] < last_end:
-            continue  # each run counts once
+            continue  # each run is used once
         direction = _direction(arm, tilts, *recording.time[[there.start, back.stop - 1]])
-        swept = _there_and_back(recording, there, back, direction)
-        if swept:
+        if observation := _there_and_back(recording, there, back, direction):
             last_end = recording.time[back.stop - 1]
-            yield swept
+            yield observation
 
 
 def _runs(recording: Recording, start: float, end: float) -> Iterator[slice]:
@@ -143,7 +135,7 @@ def _runs(recording: Recording, start: float, end: float) -> Iterator[slice]:
             yield slice(first + int(low), first + int(high))
 
 
-def _there_and_back(recording: Recording, there: slice, back: slice, direction: np.ndarray) -> Swept | None:
+def _there_and_back(recording: Recording, there: slice, back: slice, direction: np.ndarray) -> Observation | None:
     """Return what is seen in the middle of the way that both runs have in common; None if that is short."""
     position = recording.position.astype(float)
     spans = [np.sort(position[[run.start, run.stop - 1]], axis=0) for run in (there, back)]
@@ -158,11 +150,11 @@ def _there_and_back(recording: Recording, there: slice, back: slice, direction: 
             return None
         ends = inside[[0, -1]]
         speeds.append(np.abs(np.diff(position[ends], axis=0)[0]) / np.diff(recording.time[ends]))
-        sweeps.append(Sweep(forward, position[inside], _effort(recording, inside).astype(float)))
+        sweeps.append(SweepSamples(forward, position[inside], _effort(recording, inside).astype(float)))
     result = average(sweeps, np.zeros((4, 4)))
     sign = np.sign(position[there.stop - 1] - position[there.start])
-    observation = Observation(result.theta, direction, result.effort, sign * result.friction, result.spread)
-    return Swept(observation, np.mean(speeds, axis=0))
+    speed = np.mean(speeds, axis=0)
+    return Observation(result.theta, direction, result.effort, sign * result.friction, result.spread, speed=speed)
 
 
 def _held(

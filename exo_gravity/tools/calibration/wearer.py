@@ -1,24 +1,26 @@
 """calibrate wearer: the weight of the wearer's relaxed arm, from supported poses.
 
 The robot is calibrated already: what it needs beyond its own moments is the wearer's. Two masses explain them, one on
-link 3 and one on link 4, at the centres of gravity of the body-mass table; torques do not tell mass from distance.
+link 3 and one on link 4, at the centres of gravity of the body-mass table: torque shows only mass times distance.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.calibration.identification import Observation
+from exo_gravity.core.calibration.identification import Observation, columns
 from exo_gravity.core.compensation.params import wearer_of
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.moments import moments_of, regressor
 from exo_gravity.core.model.wearer import Wearer
-from exo_gravity.tools.calibration.live import Say, is_simulated, refusals_of, run_tour, tour_parameters
-from exo_gravity.tools.calibration.outcome import Change, Outcome
+from exo_gravity.tools.calibration import live
+from exo_gravity.tools.calibration.live import Say, is_simulated, tour_parameters
+from exo_gravity.tools.calibration.recorded import observations_of
+from exo_gravity.tools.calibration.result import CalibrationResult, Change
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 
 POSES = 4  # the hanging arm and three others
@@ -32,48 +34,40 @@ TABLE_RATIO = (0.6, 1.6)  # measured to tabled moments that are plausible
 
 
 class WornArm(NamedTuple):
-    """mass (2,) kg on links 3 and 4, their standard errors (2,), and the remainder (n, 4) Nm of each pose."""
+    """The masses that explain the torque beyond the robot's."""
 
-    mass: np.ndarray
-    error: np.ndarray
-    remainder: np.ndarray
+    mass: np.ndarray  #: (2,) kg on links 3 and 4
+    error: np.ndarray  #: (2,) kg, standard errors
+    remainder: np.ndarray  #: (n, 4) Nm of each pose
 
 
-def run(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> Outcome:
+def calibrate_wearer(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
     """Measure the wearer's relaxed arm, or take it from `options.bag`. Raises ParameterError."""
-    refusals: tuple[str, ...] = ()
     if options.bag:
-        from exo_gravity.tools.calibration.recorded import observations_of
-
-        observations = observations_of(options.bag, arm)
-    else:
-        if not is_simulated(options.params, arm):
-            options.ask("Wear the arm, sit upright and relax: it will be moved slowly. Pull to stop it")
-        tour = run_tour(options, tour_parameters(options.params, arm, _plan(arm)), say)
-        observations = [measured.observation for measured in tour.measured]
-        refusals = refusals_of(tour, options.record)
-    return solve(arm, observations, refusals)
-
-
-def _plan(arm: ConfiguredArm) -> dict[str, Any]:
-    """Return the parameters of the tour: few poses, a comfortable range, and the weight that the table expects."""
-    low = np.maximum(arm.low, COMFORTABLE[0]).tolist()
-    high = np.minimum(arm.high, COMFORTABLE[1]).tolist()
-    plan: dict[str, Any] = {"mode": "zero_g", "support": 1.0, "tour.poses": POSES, "position_min": low}
-    plan |= {"position_max": high}
-    if not any(wearer_of(arm.compensator)[0]):
-        plan["wearer.body_mass"] = TYPICAL_BODY_MASS
-    return plan
+        return wearer_from(arm, observations_of(options.bag, arm))
+    if not is_simulated(options.params, arm):
+        options.ask("Wear the arm, sit upright and relax: it will be moved slowly. Pull to stop it")
+    # Few poses, in a comfortable range, with the weight that the table expects.
+    low, high = np.maximum(arm.low, COMFORTABLE[0]), np.minimum(arm.high, COMFORTABLE[1])
+    changes = {"tour.poses": POSES, "position_min": low.tolist(), "position_max": high.tolist()}
+    mass, cog = wearer_of(arm.compensator)
+    if not any(mass):
+        mass, cog = wearer_of({**arm.compensator, "wearer.body_mass": TYPICAL_BODY_MASS})
+    moments = moments_of(arm.robot.with_wearer(mass, cog))
+    tour = live.run_tour(options, tour_parameters(options.params, arm, changes, moments), say)
+    return wearer_from(arm, tour.measured, tour.refusals(options.record))
 
 
-def solve(arm: ConfiguredArm, observations: Sequence[Observation], refusals: tuple[str, ...] = ()) -> Outcome:
+def wearer_from(
+    arm: ConfiguredArm, observations: Sequence[Observation], refusals: tuple[str, ...] = ()
+) -> CalibrationResult:
     """Return the wearer's masses that `observations` show; refusals: why they are incomplete."""
-    kept = tuple(observations)
+    observations = tuple(observations)
     cog = _cog(arm)
     try:
         worn = worn_arm(arm, observations, cog)
     except DataError as error:
-        return Outcome((), (), (*refusals, str(error)), arm, kept)
+        return CalibrationResult(refusals=(*refusals, str(error)), arm=arm, observations=observations)
     node = f"{arm.namespace}/compensator"
     mass = [0.0, 0.0, *np.round(worn.mass, 3).tolist()]
     note = f"kg, +-{worn.error[0]:.2f} and {worn.error[1]:.2f}"
@@ -87,20 +81,17 @@ def solve(arm: ConfiguredArm, observations: Sequence[Observation], refusals: tup
         f"largest remainder of a pose: {np.abs(worn.remainder).max():.2f} Nm",
     )
     comparison, implausible = _compared(arm, worn.mass, cog)
-    return Outcome(changes, (*lines, comparison), refusals + implausible, arm, kept)
+    return CalibrationResult(changes, (*lines, comparison), refusals + implausible, arm, observations)
 
 
 def worn_arm(arm: ConfiguredArm, observations: Sequence[Observation], cog: np.ndarray) -> WornArm:
     """Return the masses on links 3 and 4, at `cog` (2,) m, that explain what the robot alone does not.
 
-    Raises DataError if the poses do not tell them.
+    Raises DataError if the poses do not show them.
     """
     if len(observations) < 3:
         raise DataError(f"{len(observations)} poses were measured, must be at least 3")
-    theta, direction, effort, spread = (
-        np.array([getattr(one, name) for one in observations], dtype=float)
-        for name in ("theta", "direction", "effort", "spread")
-    )
+    theta, direction, effort, spread = columns(observations)
     rows = regressor(theta, direction, arm.robot.gravity)
     length = arm.robot.length
     per_mass = np.zeros((8, 2))
@@ -139,15 +130,14 @@ def _moment(arm: ConfiguredArm, mass: np.ndarray, cog: np.ndarray) -> tuple[floa
 
 def _compared(arm: ConfiguredArm, mass: np.ndarray, cog: np.ndarray) -> tuple[str, tuple[str, ...]]:
     """Return how the masses compare with the body-mass table, and why they would be implausible."""
-    body_mass = arm.compensator["wearer.body_mass"]
-    keys = ("sex", "table", "segment_length")
-    person = {key: arm.compensator[f"wearer.{key}"] for key in keys}
-    load = Wearer(body_mass or TYPICAL_BODY_MASS, **person).on_links(arm.robot.length)
+    given, body_mass = arm.compensator, arm.compensator["wearer.body_mass"]
+    person = Wearer(body_mass or TYPICAL_BODY_MASS, given["wearer.sex"], segment_length=given["wearer.segment_length"])
+    load = person.on_links(arm.robot.length)
     tabled = np.array(_moment(arm, load.mass[2:], load.cog[2:]))
     ratio = np.array(_moment(arm, mass, cog)) / tabled
     if not body_mass:
-        return f"a person of {TYPICAL_BODY_MASS * ratio[0]:.0f} kg has this M3 by the table {person['table']}", ()
-    sentence = f"{ratio[0]:.0%} of M3 and {ratio[1]:.0%} of M4 by the table {person['table']} for {body_mass:g} kg"
+        return f"a person of {TYPICAL_BODY_MASS * ratio[0]:.0f} kg has this M3 by the table {person.table}", ()
+    sentence = f"{ratio[0]:.0%} of M3 and {ratio[1]:.0%} of M4 by the table {person.table} for {body_mass:g} kg"
     low, high = TABLE_RATIO
     is_plausible = np.all((ratio >= low) & (ratio <= high))
     return sentence, () if is_plausible else (f"implausible: {sentence}: must be from {low:.0%} to {high:.0%}",)

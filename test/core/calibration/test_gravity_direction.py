@@ -7,8 +7,8 @@ import pytest
 
 from exo_gravity.core.calibration.identification import identify
 from exo_gravity.core.model.tilt import SIDES, Tilt, gravity_in_trunk, rotation_matrix
-from exo_gravity.tools.calibration import gravity, gravity_direction
-from exo_gravity.tools.calibration.gravity_direction import turned
+from exo_gravity.tools.calibration.imu import NO_HEADING, in_trunk, turn_in_trunk, turned, with_mounting
+from exo_gravity.tools.calibration.tours import moments_from
 from exo_gravity.tools.inputs.arms import configured_arm
 from exo_gravity.tools.inputs.parameter_file import packaged_config
 
@@ -41,7 +41,7 @@ def test_an_imu_that_is_two_degrees_off_does_no_harm_and_is_found(seed):
 @pytest.mark.parametrize("side", SIDES)
 def test_a_direction_in_the_arms_base_is_that_of_the_trunk(side):
     direction = np.array(Tilt.of(side, 0.2, 0.1).direction)
-    np.testing.assert_allclose(gravity_direction._in_trunk(side, direction), gravity_in_trunk(0.2, 0.1), atol=1e-12)
+    np.testing.assert_allclose(in_trunk(side, direction), gravity_in_trunk(0.2, 0.1), atol=1e-12)
 
 
 def test_the_corrected_mounting_is_the_old_one_after_the_turn():
@@ -58,9 +58,8 @@ def test_the_corrected_mounting_is_the_old_one_after_the_turn():
 @pytest.mark.parametrize("side", SIDES)
 def test_a_turn_in_the_arms_base_moves_gravity_as_in_the_trunk(side):
     turn, direction = np.array((0.01, -0.02, 0.03)), np.array(Tilt.of(side, 0.2, 0.1).direction)
-    in_trunk = gravity_direction._in_trunk(side, np.cross(turn, direction))
-    moved = np.cross(gravity_direction._turn_in_trunk(side, turn), gravity_in_trunk(0.2, 0.1))
-    np.testing.assert_allclose(moved, in_trunk, atol=1e-12)
+    moved = np.cross(turn_in_trunk(side, turn), gravity_in_trunk(0.2, 0.1))
+    np.testing.assert_allclose(moved, in_trunk(side, np.cross(turn, direction)), atol=1e-12)
 
 
 HEADING = np.radians(4.0)
@@ -95,13 +94,13 @@ def test_the_heading_is_corrected_only_if_it_shows(tmp_path):
     params.write_text(FILE, encoding="utf-8")
     for pitches, is_told in (((0.07, 0.07), False), ((0.07, -0.09), True)):
         observations = tours(Device(2), pitches)
-        outcome = gravity_direction.with_mounting(gravity.solve(arm, observations), params)
+        outcome = with_mounting(moments_from(arm, observations), params)
         (mounting,) = [change.value for change in outcome.changes if change.name == "rotation_trunk_from_imu"]
         for observation in observations[0], observations[-1]:
             pitch = pitches[bool(observation.load_mass)]
-            moved = rotation_matrix(mounting) @ gravity_direction._in_trunk("right", observation.direction)
+            moved = rotation_matrix(mounting) @ in_trunk("right", observation.direction)
             wrong = np.linalg.norm(moved - gravity_in_trunk(pitch, 0.2))
             assert wrong < np.radians(0.3)
         heading = np.arctan2(rotation_matrix(mounting)[1, 0], rotation_matrix(mounting)[0, 0])
         assert (abs(heading) > HEADING / 2.0) == is_told
-        assert (gravity_direction.NO_HEADING in outcome.lines) != is_told
+        assert (NO_HEADING in outcome.lines) != is_told

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.tools.calibration.outcome import Change
-from exo_gravity.tools.calibration.yaml_file import write_changes
+from exo_gravity.tools.calibration.result import Change, write_changes
 from exo_gravity.tools.inputs.arms import configured_arms
 from exo_gravity.tools.inputs.parameter_file import load, packaged_config
 

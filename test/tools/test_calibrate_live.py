@@ -1,18 +1,20 @@
-"""What the person at the terminal is shown, and how the program waits for them."""
+"""What the person at the terminal is shown, how the program waits for them, and how it follows the calibrator."""
 
 from __future__ import annotations
 
 import io
+import json
 import os
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import IO
 
 import pytest
 from rich.console import Console
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.tools.calibration.person import Person
+from exo_gravity.tools.calibration.live import LiveTour, Person
 
 
 @pytest.fixture
@@ -41,7 +43,7 @@ def test_the_motors_are_watched_until_enter_is_pressed(keys: tuple[IO[str], IO[s
 
 def test_a_program_without_a_person_ends_with_the_reason(keys: tuple[IO[str], IO[str]]) -> None:
     keys[1].close()
-    with pytest.raises(DataError, match="nobody is there to press Enter"):
+    with pytest.raises(DataError, match="standard input has ended"):
         Person(Console(file=io.StringIO()), keys[0]).ask("bow")
 
 
@@ -50,3 +52,16 @@ def test_lines_are_printed_as_they_are(keys: tuple[IO[str], IO[str]]) -> None:
     line = "pose [3] of 12: " + 20 * "long "
     Person(Console(file=shown, width=40), keys[0]).say(line)
     assert shown.getvalue() == f"{line}\n"
+
+
+def test_lines_of_the_calibrator_are_followed_and_observations_are_kept(tmp_path: Path) -> None:
+    record, said, tour = tmp_path / "new.jsonl", list[str](), LiveTour()
+    values = {"theta": [0.0] * 4, "direction": [0, 0, 1], "effort": [1.0] * 4, "friction": [0.1] * 4}
+    values |= {"spread": [0.01] * 4, "load_mass": 0.0, "load_lever": 0.0, "speed": 0.1}
+    for event in ({"progress": "pose 1"}, {"observation": values}, {"trouble": "elbow: a hand"}, {"done": True}):
+        tour.follow(json.dumps(event), record, said.append)
+    tour.follow('{"half": ', record, said.append)
+    assert said == ["pose 1"] and tour.trouble == "elbow: a hand" and tour.done
+    assert tour.measured[0].speed == 0.1 and json.loads(record.read_text())["observation"] == values
+    (refusal,) = tour.refusals(record)
+    assert "1 observations are kept" in refusal

@@ -1,0 +1,197 @@
+"""What a calibration found, and the parameter file that it writes.
+
+The new file is a copy of the old one in which everything else stays as it is, comments and order included. Each value
+is replaced in the text, at the place that PyYAML's parser reports. A line above it says when it was measured, and how
+exactly. The copy is read again before it is kept: it must differ in the new values only.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+import textwrap
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+
+from exo_gravity.core.calibration.identification import Identified, Observation
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.tools.inputs.arms import ConfiguredArm
+from exo_gravity.tools.inputs.parameter_file import load
+
+PARAMETERS = "ros__parameters"
+WIDTH = 118  # characters of a comment line
+DIGITS = 7  # significant
+
+Value = bool | int | float | str | list[int] | list[float] | list[str]
+Edit = tuple[int, int, str]
+"""(start, end, text): replace the characters from start to end by text."""
+
+
+class Change(NamedTuple):
+    """A new value of a parameter, or a comment alone."""
+
+    node: str  #: '/right/compensator'
+    name: str  #: dotted, 'robot.first_moment'; '' for a comment alone
+    value: Value
+    note: str = ""  #: uncertainty and unit, for a comment in the file
+
+
+class Curve(NamedTuple):
+    """Friction of one joint."""
+
+    speed: np.ndarray  #: (n,) rad/s
+    torque: np.ndarray  #: (n,) Nm, measured
+    fit: np.ndarray  #: (n,) Nm
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationResult:
+    """The result of one subcommand of `calibrate`."""
+
+    changes: tuple[Change, ...] = ()  #: written unless there are `refusals`
+    lines: tuple[str, ...] = ()  #: the result in sentences
+    refusals: tuple[str, ...] = ()  #: why it is not calibrated, in sentences
+    arm: ConfiguredArm | None = None  #: as configured before
+    observations: tuple[Observation, ...] = ()
+    identified: Identified | None = None
+    suggestion: tuple[float, ...] | None = None  #: the next best pose, (4,) rad, None if none is wanted
+    curves: tuple[Curve, ...] = ()  #: of each joint
+
+
+def check_output(path: Path) -> None:
+    """Raise ParameterError unless `path` is new, in an existing folder."""
+    if path.exists():
+        raise ParameterError("output", str(path), "a new file: an existing one is never overwritten")
+    if not path.parent.is_dir():
+        raise ParameterError("output", str(path), "in a folder that exists")
+
+
+def write_changes(
+    params: Path, output: Path, changes: Sequence[Change], command: str, today: datetime.date | None = None
+) -> None:
+    """Write a copy of `params` with `changes` to `output`.
+
+    command: 'calibrate gravity', for the comments. Raises ParameterError if `output` exists, if a node is not in
+    `params`, or if a value cannot be set alone, because an anchor shares it with another entry.
+    """
+    check_output(output)
+    wanted = load(params)
+    text = params.read_text(encoding="utf-8")
+    origin = f"{today or datetime.date.today()} {command}"
+    for change in changes:
+        change = change._replace(value=plain(change.value), note=": ".join(filter(None, (origin, change.note))))
+        text = _changed(text, change)
+        if change.name:
+            wanted[change.node][change.name] = change.value
+    with output.open("x", encoding="utf-8") as stream:
+        stream.write(text)
+    if load(output) != wanted:
+        output.unlink()
+        names = ", ".join(f"{change.node} {change.name}" for change in changes)
+        raise ParameterError("params", str(params), f"without anchors and repeated keys, to set {names} alone")
+
+
+def plain(value: Any) -> Any:
+    """Return a value in Python's own types, floats rounded to DIGITS."""
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [plain(item) for item in value]
+    if isinstance(value, (float, np.floating)):
+        return float(f"{value:.{DIGITS}g}")
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def value_text(value: Value) -> str:
+    """Return a plain value as YAML on one line, floats always with a decimal point: ROS refuses [1, 2.5]."""
+    return yaml.safe_dump([value], default_flow_style=True, width=math.inf).strip()[1:-1]
+
+
+def _changed(text: str, change: Change) -> str:
+    """Return the text with one change, in the node's mapping of parameters or in a mapping inside it."""
+    heading, mapping = _parameters(text, change.node)
+    if not change.name:
+        return _edited(text, [_above(text, heading, change.note)])
+    path = change.name.split(".")
+    while found := _entry(mapping, path):
+        key, value, path = found
+        if not path:
+            return _replaced(text, key, value, change)
+        if not isinstance(value, yaml.MappingNode):
+            raise ParameterError(f"{change.node} {change.name}", value.value, "a mapping, to add a value to it")
+        mapping = value
+    return _added(text, mapping, ".".join(path), change)
+
+
+def _entry(mapping: yaml.MappingNode, path: list[str]) -> tuple[yaml.Node, yaml.Node, list[str]] | None:
+    """Return key and value of the entry that begins the dotted `path`, and the rest of the path."""
+    for length in range(len(path), 0, -1):
+        for key, value in mapping.value:
+            if key.value == ".".join(path[:length]):
+                return key, value, path[length:]
+    return None
+
+
+def _parameters(text: str, node: str) -> tuple[yaml.Node, yaml.MappingNode]:
+    """Return the key `ros__parameters` of `node` and its value as parsed: their marks are positions in `text`."""
+    root = yaml.compose(text, yaml.SafeLoader)
+    for key, entry in root.value if isinstance(root, yaml.MappingNode) else ():
+        if key.value != node or not isinstance(entry, yaml.MappingNode):
+            continue
+        for name, parameters in entry.value:
+            if name.value == PARAMETERS and isinstance(parameters, yaml.MappingNode) and parameters.value:
+                return name, parameters
+    raise ParameterError("params", node, "a node of the file that has parameters")
+
+
+def _replaced(text: str, key: yaml.Node, value: yaml.Node, change: Change) -> str:
+    """Replace a value; a list of the same length entry by entry, which keeps the comments between them."""
+    old = value.value if isinstance(value, yaml.SequenceNode) else [value]
+    items = change.value if isinstance(change.value, list) else [change.value]
+    if len(old) == len(items):
+        marks = ((node.start_mark.index, node.end_mark.index) for node in old)
+        edits = [(*mark, value_text(item)) for mark, item in zip(marks, items, strict=True)]
+    else:
+        edits = [(key.end_mark.index, _end(value), f": {value_text(change.value)}")]
+    return _edited(text, [_above(text, key, change.note), *edits])
+
+
+def _added(text: str, mapping: yaml.MappingNode, name: str, change: Change) -> str:
+    """Add a value at the end of `mapping`; name: the key in it, dotted."""
+    last_key, last_value = mapping.value[-1]
+    entry, end = f"{name}: {value_text(change.value)}", _end(last_value)
+    if mapping.flow_style:
+        return _edited(text, [_above(text, last_key, change.note), (end, end, f", {entry}")])
+    at = text.find("\n", end) + 1 or len(text)
+    column = mapping.value[0][0].start_mark.column
+    line_break = "" if at == 0 or text[at - 1] == "\n" else "\n"
+    return _edited(text, [(at, at, f"{line_break}{_comment(column, change.note)}{' ' * column}{entry}\n")])
+
+
+def _end(value: yaml.Node) -> int:
+    """Return where the text of a value ends, without the comments after it, which PyYAML adds to a block."""
+    if isinstance(value, yaml.CollectionNode) and not value.flow_style:
+        last = value.value[-1]
+        return _end(last[1] if isinstance(value, yaml.MappingNode) else last)
+    return int(value.end_mark.index)
+
+
+def _above(text: str, key: yaml.Node, note: str) -> Edit:
+    """Return the edit that puts a comment above the line of `key`, as far in as that line's first character."""
+    at = text.rfind("\n", 0, key.start_mark.index) + 1
+    line = text[at : key.start_mark.index]
+    return at, at, _comment(len(line) - len(line.lstrip()), note)
+
+
+def _comment(column: int, note: str) -> str:
+    lines = textwrap.wrap(note, WIDTH - column, break_long_words=False, break_on_hyphens=False)
+    return "".join(f"{' ' * column}# {line}\n" for line in lines)
+
+
+def _edited(text: str, edits: Iterable[Edit]) -> str:
+    for start, end, new in sorted(edits, reverse=True):
+        text = text[:start] + new + text[end:]
+    return text
