@@ -24,7 +24,6 @@ from exo_gravity.core.trunk.imu_checks import Agreement, ClockCheck, EqualValues
 from exo_gravity.core.trunk.imu_sample import ACCELEROMETER_RANGE, GYROSCOPE_RANGE, ImuSample, Ranges, three_floats
 from exo_gravity.core.trunk.uncertainty import OVERSHOOT, SETTLE_TIME, TiltUncertainty
 
-LEAST_OFFSET = 0.005  # s of the clock that matter
 MAX_GAP = 0.1  # s between two samples, after which the estimate begins anew
 CHECK_PERIOD = 0.0095  # s between two comparisons of gyroscope and accelerometer
 REPORTED_SIGMA = math.radians(1.0)  # rad; data sheets of fused sensors state 1 to 2 degrees
@@ -200,12 +199,8 @@ class TiltEstimator:
         self._up = up_in_body(quaternion)
         if acceleration:
             self._check(dt, quaternion, acceleration)
-        contradiction = self._agreement.contradiction
-        if self._clock.offset > LEAST_OFFSET:
-            self._speed = max(math.hypot(*rate), self._speed)
-            contradiction += self._speed * self._clock.offset
-        else:
-            self._speed = 0.0
+        self._speed = max(abs(rate[0]) + abs(rate[1]) + abs(rate[2]), self._speed * (1.0 - dt))
+        contradiction = self._agreement.contradiction + self._speed * self._clock.offset
         uncertainty.combine(fusion.bias_sigma, self._agreement.square, contradiction)
         return quaternion
 
@@ -263,7 +258,7 @@ class TiltEstimator:
         self._why = why
         self._age = 0.0  # s of a reported orientation
         self._unchecked = NOTHING
-        self._speed = 0.0  # rad/s, the highest since the clock has been off
+        self._speed = 0.0  # rad/s, the highest in the last second
         self._up: Floats3 | None = None  # the world's z axis in the IMU's axes, by the last sample
         self._last_rate: Floats3 | None = None
         self._last_acceleration: Floats3 | None = None
