@@ -111,8 +111,12 @@ class TiltEstimator:
         self._clock = ClockCheck()
         self._is_fused: bool | None = None  # None before the first sample
         self._time = -math.inf
-        self._why = "no sample yet"
-        self._restart(self._why)
+        self._up: Floats3 | None = None  # the world's z axis in the IMU's axes, by the last sample
+        self._last_rate: Floats3 | None = None
+        self._last_acceleration: Floats3 | None = None
+        self._unchecked = NOTHING
+        self._speed = 0.0  # rad/s, the highest in the last second
+        self._restart("no sample yet")
 
     @property
     def gyroscope_bias(self) -> np.ndarray:
@@ -206,6 +210,7 @@ class TiltEstimator:
 
     def _check(self, dt: float, quaternion: Quaternion, acceleration: Floats3) -> None:
         """Compare gyroscope and accelerometer, whose mean since the last comparison is taken."""
+        assert self._up
         x, y, z, span, count = self._unchecked
         a, b, c = acceleration
         x, y, z, span, count = x + a, y + b, z + c, span + dt, count + 1
@@ -257,8 +262,5 @@ class TiltEstimator:
         self._gravity = GravityCheck()
         self._why = why
         self._age = 0.0  # s of a reported orientation
-        self._unchecked = NOTHING
-        self._speed = 0.0  # rad/s, the highest in the last second
-        self._up: Floats3 | None = None  # the world's z axis in the IMU's axes, by the last sample
-        self._last_rate: Floats3 | None = None
-        self._last_acceleration: Floats3 | None = None
+        self._unchecked, self._speed = NOTHING, 0.0
+        self._up = self._last_rate = self._last_acceleration = None
