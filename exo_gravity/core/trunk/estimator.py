@@ -24,7 +24,6 @@ from exo_gravity.core.trunk.imu_checks import Agreement, ClockCheck, EqualValues
 from exo_gravity.core.trunk.imu_sample import ACCELEROMETER_RANGE, GYROSCOPE_RANGE, ImuSample, Ranges, three_floats
 from exo_gravity.core.trunk.uncertainty import OVERSHOOT, SETTLE_TIME, TiltUncertainty
 
-LEAST_OFFSET = 0.005  # s of the clock that matter
 MAX_GAP = 0.1  # s between two samples, after which the estimate begins anew
 CHECK_PERIOD = 0.0095  # s between two comparisons of gyroscope and accelerometer
 REPORTED_SIGMA = math.radians(1.0)  # rad; data sheets of fused sensors state 1 to 2 degrees
@@ -112,8 +111,12 @@ class TiltEstimator:
         self._clock = ClockCheck()
         self._is_fused: bool | None = None  # None before the first sample
         self._time = -math.inf
-        self._why = "no sample yet"
-        self._restart(self._why)
+        self._up: Floats3 | None = None  # the world's z axis in the IMU's axes, by the last sample
+        self._last_rate: Floats3 | None = None
+        self._last_acceleration: Floats3 | None = None
+        self._unchecked = NOTHING
+        self._speed = 0.0  # rad/s, the highest in the last second
+        self._restart("no sample yet")
 
     @property
     def gyroscope_bias(self) -> np.ndarray:
@@ -200,17 +203,14 @@ class TiltEstimator:
         self._up = up_in_body(quaternion)
         if acceleration:
             self._check(dt, quaternion, acceleration)
-        contradiction = self._agreement.contradiction
-        if self._clock.offset > LEAST_OFFSET:
-            self._speed = max(math.hypot(*rate), self._speed)
-            contradiction += self._speed * self._clock.offset
-        else:
-            self._speed = 0.0
+        self._speed = max(abs(rate[0]) + abs(rate[1]) + abs(rate[2]), self._speed * (1.0 - dt))
+        contradiction = self._agreement.contradiction + self._speed * self._clock.offset
         uncertainty.combine(fusion.bias_sigma, self._agreement.square, contradiction)
         return quaternion
 
     def _check(self, dt: float, quaternion: Quaternion, acceleration: Floats3) -> None:
         """Compare gyroscope and accelerometer, whose mean since the last comparison is taken."""
+        assert self._up
         x, y, z, span, count = self._unchecked
         a, b, c = acceleration
         x, y, z, span, count = x + a, y + b, z + c, span + dt, count + 1
@@ -262,8 +262,5 @@ class TiltEstimator:
         self._gravity = GravityCheck()
         self._why = why
         self._age = 0.0  # s of a reported orientation
-        self._unchecked = NOTHING
-        self._speed = 0.0  # rad/s, the highest since the clock has been off
-        self._up: Floats3 | None = None  # the world's z axis in the IMU's axes, by the last sample
-        self._last_rate: Floats3 | None = None
-        self._last_acceleration: Floats3 | None = None
+        self._unchecked, self._speed = NOTHING, 0.0
+        self._up = self._last_rate = self._last_acceleration = None

@@ -42,7 +42,7 @@ class ImuDevice:
             lambda self_test: open_source(values, lambda: clock.now().nanoseconds * 1e-9, self_test)
         )
         self._number = 0  # of the last message
-        self._lost = 0  # samples, as last told
+        self._lost = 0  # samples, as last logged
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=values["source"], daemon=True)
         self._poll()
