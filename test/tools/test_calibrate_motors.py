@@ -15,7 +15,7 @@ import yaml
 
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
-from exo_gravity.hardware.can.bus_scan import Answer, BusScan, Scan
+from exo_gravity.hardware.can.bus_scan import BusScan, MotorAnswer, Scan
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice, simulated_motor
 from exo_gravity.tools.calibrate import main
@@ -71,12 +71,12 @@ class Arm(BusScan):
         """Return who answers."""
         return Scan(tuple(sorted(self.poll(self.ids).values())), self.problems)
 
-    def poll(self, can_ids: Iterable[int]) -> dict[int, Answer]:
+    def poll(self, can_ids: Iterable[int]) -> dict[int, MotorAnswer]:
         """Return the answers of the motors that are not silent."""
         self._now += CYCLE
         shaken = self.pose + np.array((0.0, 0.0, 0.0, self.shaking * math.sin(20.0 * self._now)))
         angles = dict(zip(self.ids, self.zeros + np.array(self.directions) * shaken, strict=True))
-        return {i: Answer(i, i, 8, float(angles[i]), 25, 0) for i in can_ids if i not in self.silent}
+        return {i: MotorAnswer(i, i, 8, float(angles[i]), 25, 0) for i in can_ids if i not in self.silent}
 
     def _move(self, target: Iterable[float], watch: Callable[[], object]) -> None:
         start, end = self.pose, np.array(list(target))

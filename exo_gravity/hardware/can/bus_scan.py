@@ -34,7 +34,7 @@ STATUS_TIME = 0.12  # s in which the next status frame of a V3 board is awaited
 V3_IDS = frozenset(range(1, 256))
 
 
-class Answer(NamedTuple):
+class MotorAnswer(NamedTuple):
     """What a motor replied."""
 
     can_id: int
@@ -49,7 +49,7 @@ class Answer(NamedTuple):
 class Scan(NamedTuple):
     """Who answered on a bus."""
 
-    answers: tuple[Answer, ...]  #: One per motor, by ID.
+    answers: tuple[MotorAnswer, ...]  #: One per motor, by ID.
     problems: tuple[str, ...]  #: Sentences on what is wrong with the bus or an ID.
 
 
@@ -69,7 +69,7 @@ class BusScan:
         self._lock = BusLock(address, f"calibrate motors (PID {os.getpid()})", clock=clock)
         self._now = clock.monotonic
         self.name = address[1]
-        self._v3: dict[int, Answer] = {}  # the newest status of each V3 board
+        self._v3: dict[int, MotorAnswer] = {}  # the newest status of each V3 board
         try:
             if self._lock.notes.drive.powered:
                 raise BusError(
@@ -118,7 +118,7 @@ class BusScan:
             problems[f"ID {can_id}: a V3 board; its ID must be from 1 to {MAX_CAN_ID}"] = None
         return Scan(tuple(found[can_id] for can_id in sorted(found)), tuple(problems))
 
-    def poll(self, can_ids: Iterable[int]) -> dict[int, Answer]:
+    def poll(self, can_ids: Iterable[int]) -> dict[int, MotorAnswer]:
         """Return the newest answer of each of these motors; a silent one is missing. Raises BusError."""
         answers = {}
         reporting = set(can_ids) & set(self._v3)
@@ -142,7 +142,7 @@ class BusScan:
                 "none, two motors with one ID answer each other: switch their power off"
             )
 
-    def _statuses(self, can_ids: set[int]) -> dict[int, Answer]:
+    def _statuses(self, can_ids: set[int]) -> dict[int, MotorAnswer]:
         """Return the next status of each of these V3 boards; a silent one is missing."""
         self._drain()
         before = dict(self._v3)
@@ -160,7 +160,7 @@ class BusScan:
         if kind == REPLY:
             reply = MIT_V3.unpack_reply(SPEC, can_id, message.data)
             state = reply.position, reply.temperature, reply.error
-            self._v3[can_id] = Answer(can_id, message.arbitration_id, 8, *state, MIT_V3.name)
+            self._v3[can_id] = MotorAnswer(can_id, message.arbitration_id, 8, *state, MIT_V3.name)
         return kind
 
     def _drain(self) -> None:
@@ -169,14 +169,14 @@ class BusScan:
             if self._port.waiting() is None:
                 break
 
-    def _ask(self, can_id: int, is_alone: bool = True) -> tuple[list[Answer], list[Frame]]:
+    def _ask(self, can_id: int, is_alone: bool = True) -> tuple[list[MotorAnswer], list[Frame]]:
         """Send one command; return the replies of this motor, and other short frames.
 
         is_alone: whether to wait for further replies after the first.
         """
         self._drain()
         self._port.send((can_id, NOTHING))
-        replies: list[Answer] = []
+        replies: list[MotorAnswer] = []
         others: list[Frame] = []
         end = self._now() + REPLY_TIME
         while (remaining := end - self._now()) > 0.0 and (is_alone or not replies):
@@ -205,11 +205,11 @@ def _problem(can_id: int, reply_id: int, data: bytes) -> str:
     return ""
 
 
-def _answer(reply_id: int, data: bytes) -> Answer:
+def _answer(reply_id: int, data: bytes) -> MotorAnswer:
     reply = unpack_reply(SPEC, data)
-    return Answer(reply.motor_id, reply_id, len(data), reply.position, reply.temperature, reply.error)
+    return MotorAnswer(reply.motor_id, reply_id, len(data), reply.position, reply.temperature, reply.error)
 
 
-def _shared(replies: list[Answer]) -> str:
+def _shared(replies: list[MotorAnswer]) -> str:
     angles = " and ".join(sorted({f"{reply.position:.2f} rad" for reply in replies}))
     return f"two motors share it ({angles}); give one of them another ID with the vendor's tool, alone on the bus"

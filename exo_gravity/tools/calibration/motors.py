@@ -22,7 +22,7 @@ from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, OPTIONS, JointMotor
 from exo_gravity.core.motors.specs import MOTOR_ERRORS
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.hardware.can.bus_scan import Answer, BusScan
+from exo_gravity.hardware.can.bus_scan import BusScan, MotorAnswer
 from exo_gravity.tools.calibration.live import Say
 from exo_gravity.tools.calibration.result import CalibrationResult, Change
 from exo_gravity.tools.inputs.arms import ConfiguredArm
@@ -74,7 +74,7 @@ class MotorWatch:
         self._joints = joints
         self._clock = clock
         self._first: dict[int, float] = {}
-        self._last: dict[int, Answer] = {}
+        self._last: dict[int, MotorAnswer] = {}
         self._answered = dict.fromkeys(can_ids, clock())  # s, when each answered last
         self.furthest: dict[int, float] = dict.fromkeys(can_ids, 0.0)  # rad, signed
         self.back: dict[int, float] = dict.fromkeys(can_ids, 0.0)  # rad, the largest turn the other way, 0 or more
@@ -100,7 +100,7 @@ class MotorWatch:
 
 
 def motor_table(
-    answers: Iterable[Answer],
+    answers: Iterable[MotorAnswer],
     joints: dict[int, str] | None = None,
     turns: dict[int, float] | None = None,
     silent: Iterable[int] = (),
@@ -245,7 +245,7 @@ class MotorSearch:
         watch = self._watch()
         request = "let the arm hang as before, switch the motors' power off and on, and wait until all answer again"
         self._wait(f"{request} (or go on at once, without this check)", watch)
-        answers: dict[int, Answer] = {}
+        answers: dict[int, MotorAnswer] = {}
         for _ in range(REST_SAMPLES):
             answers |= self._bus.poll(ids)
         if missing := [can_id for can_id in ids if can_id not in answers]:
