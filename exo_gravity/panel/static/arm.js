@@ -13,6 +13,7 @@ export class ArmCard {
     this.name = name;
     this.actions = actions;
     this.setup = null;
+    this.limit = null; // the largest support 0..1 within the motors' rated torque
     this.root = document.getElementById("arm").content.cloneNode(true).firstElementChild;
     this.root.dataset.arm = name;
     this.find = (selector) => this.root.querySelector(selector);
@@ -101,9 +102,9 @@ export class ArmCard {
 
   showSupport() {
     const value = Number(this.slider.value);
-    const limit = this.setup?.support_limit;
+    const limit = this.limit;
     const now = this.stepped;
-    const known = limit !== null && limit !== undefined;
+    const known = limit !== null;
     const mark = this.find(".mark");
     mark.hidden = !known;
     if (known) mark.style.left = `${100 * limit}%`;
@@ -128,7 +129,8 @@ export class ArmCard {
     this.showRemedy(bridge);
     write(this.find(".detail"), bridge?.message ? t("detail", bridge.message) : "");
     const other = alive ? state.compensator : null;
-    write(this.find(".compensator"), other ? (other.level ? t("compensator_detail", other.message) : t("carried", other["mass carried"])) : t("compensator_silent"));
+    write(this.find(".compensator"), other ? (other.level ? t("compensator_detail", other.message) : t("carried", other.mass_carried)) : t("compensator_silent"));
+    this.limit = other?.largest_support ?? null;
     this.root.classList.toggle("stale", !alive);
     this.find(".enable").disabled = !operates || name !== "disabled";
     this.find(".clear").disabled = !operates || name !== "fault";
