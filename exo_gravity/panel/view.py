@@ -51,8 +51,8 @@ def arm_state(now: float, joints: Joints, bridge: Status, compensator: Status) -
         state["bridge"] = {"level": bridge.level, "message": bridge.message, **values}
     if now - compensator.time < SILENT:
         carried = compensator.values.get("mass carried (kg)")
-        values = {"mass_carried": carried, "largest_support": _number(compensator.values.get("largest support"))}
-        state["compensator"] = {"level": compensator.level, "message": compensator.message, **values}
+        shown = {"mass_carried": carried, "largest_support": _number(compensator.values.get("largest support"))}
+        state["compensator"] = {"level": compensator.level, "message": compensator.message, **shown}
     if now - joints.time < SILENT:
         state["joints"] = [
             {

@@ -68,22 +68,21 @@ class CompensatorNode(Node):
         self._changed = self.create_guard_condition(self._report_changes)
         self.create_timer(REPORT_PERIOD, self._report_current)
         self.get_logger().info(sentence(self._control.settings))
-        self._arm.start()
-        self._interface.start()
-        self._joint_states.start()
+        self._threads = (*self._arm.threads, self._interface, self._joint_states)
+        for thread in self._threads:
+            thread.start()
         for refused in request_real_time(values["thread_priority"], values["thread_priority"] > 0):
             self.get_logger().warning(refused)
 
     @property
     def failure(self) -> Exception | None:
         """The exception that ended the thread of the joint states, of the assistance, or of a fade."""
-        return self._joint_states.failure or self._arm.failure or self._interface.failure
+        return next((thread.failure for thread in self._threads if thread.failure), None)
 
     def close(self) -> None:
         """Stop answering joint states."""
-        self._joint_states.stop()
-        self._interface.stop()
-        self._arm.stop()
+        for thread in reversed(self._threads):
+            thread.stop()
 
     def _on_joint_states(self, message: JointState, info: dict[str, Any]) -> None:
         now = time.monotonic()

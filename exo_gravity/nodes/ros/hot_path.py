@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.callback_groups import CallbackGroup
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -26,19 +26,12 @@ MAX_PUBLISHERS = 4  # of one topic whose messages are counted
 Callback = Callable[[Any, dict[str, Any]], None]
 
 
-class Unexecuted(CallbackGroup):
+class Unexecuted(ReentrantCallbackGroup):
     """Keeps its subscriptions out of the executor's wait set."""
 
     def can_execute(self, entity: Any) -> bool:
         """Return that no entity may be executed."""
         return False
-
-    def beginning_execution(self, entity: Any) -> bool:
-        """Return that no entity may be executed."""
-        return False
-
-    def ending_execution(self, entity: Any) -> None:
-        """Do nothing: no entity is executed."""
 
 
 class HotPath:
