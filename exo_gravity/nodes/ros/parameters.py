@@ -118,13 +118,12 @@ class NodeParameters:
         self._get = node.create_client(GetParameters, f"{name}/get_parameters")
         self._list = None if names else node.create_client(ListParameters, f"{name}/list_parameters")
         self._clients = [self._get] if self._list is None else [self._get, self._list]
-        self._is_due = True
-        self._asked = -math.inf  # s, when the request was sent that has no answer yet
+        self._due = -math.inf  # s, when to ask; infinite while the values are known
         self._is_destroyed = False
 
     def refresh(self) -> None:
         """Read the parameters again, at the next `update`."""
-        self._is_due = True
+        self._due = -math.inf
 
     def update(self) -> None:
         """Read the parameters if they may have changed and the node answers. Call it on the executor's thread."""
@@ -132,11 +131,11 @@ class NodeParameters:
             return
         self.is_present = all(client.service_is_ready() for client in self._clients)
         if not self.is_present:
-            self._is_due = True  # it may return with other values
+            self._due = -math.inf  # it may return with other values
             return
         now = self._clock()
-        if (self._is_due or math.isfinite(self._asked)) and now - self._asked >= ANSWER_TIMEOUT:
-            self._is_due, self._asked = False, now
+        if now >= self._due:
+            self._due = now + ANSWER_TIMEOUT
             if self._list is None:
                 self._request(self._names)
             else:
@@ -157,7 +156,8 @@ class NodeParameters:
     def _on_values(self, names: Sequence[str], future: Future) -> None:
         if self._is_destroyed:
             return
-        self._asked = -math.inf
+        if math.isfinite(self._due):  # else they have changed since
+            self._due = math.inf
         values = map(parameter_value_to_python, future.result().values)
         self.values = {name: plain(value) for name, value in zip(names, values, strict=False) if value is not None}
         self._on_change(self.values)
