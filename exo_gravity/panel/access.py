@@ -77,19 +77,18 @@ class Access:
         return self.is_open or _equal(session, self.session)
 
     def is_token(self, given: str, address: str) -> bool:
-        """Return whether `given` is the token, in constant time, and note a wrong one of `address`."""
-        if self.is_blocked(address):
+        """Return whether `given` is the token, in constant time, and note a wrong one of `address`.
+
+        After too many wrong ones, from `address` or from all, none is compared for a while.
+        """
+        now = self._clock()
+        recent = [origin for time, origin in self._failures if now - time <= ATTEMPT_WINDOW]
+        if recent.count(address) >= ATTEMPTS or len(recent) >= 10 * ATTEMPTS:
             return False
         right = not self.is_open and _equal(given, self.token)
         if not right:
-            self._failures.append((self._clock(), address))
+            self._failures.append((now, address))
         return right
-
-    def is_blocked(self, address: str) -> bool:
-        """Return whether so many wrong tokens came from `address`, or from all, that none is compared now."""
-        now = self._clock()
-        recent = [origin for time, origin in self._failures if now - time <= ATTEMPT_WINDOW]
-        return recent.count(address) >= ATTEMPTS or len(recent) >= 10 * ATTEMPTS
 
 
 def is_same_origin(origin: str, host: str) -> bool:
@@ -153,7 +152,7 @@ class Guard:
         given = connection.query_params.get("token", "") if scope["type"] == "http" else ""
         if given and self._access.is_token(given, address_of(connection)):
             return self._opened(connection)  # the address with the token, as the log shows it
-        return self._ask(self._access.is_blocked(address_of(connection)))
+        return self._ask(failed=bool(given))
 
     async def _login(self, request: Request) -> Response:
         if request.method != "POST":
@@ -161,7 +160,7 @@ class Guard:
         body = await body_of(request)
         given = parse_qs(body.decode("utf-8", "replace")).get("token", [""])[0]
         right = len(body) <= MAX_BODY and self._access.is_token(given, address_of(request))
-        return self._opened(request) if right else self._ask(True)
+        return self._opened(request) if right else self._ask(failed=True)
 
     def _opened(self, connection: HTTPConnection) -> Response:
         answer = RedirectResponse("/", 303)
