@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from exo_gravity.core.errors import ExoGravityError
@@ -14,68 +14,29 @@ from exo_gravity.panel.params import SETTABLE
 
 Values = Mapping[str, Any]
 SILENT = 1.5  # s without diagnostics or joint states after which the last ones are not shown any more
-OF_BRIDGE = {
-    "state": "state",
-    "fault": "fault",
-    "limits": "limits acting",
-    "rate": "rate (Hz)",
-    "answered": "age of efforts (ms)",
-}
 
 
-@dataclass
-class Joints:
-    """The newest message with joint values."""
+@dataclass(frozen=True)
+class Newest:
+    """The newest message of one kind, as the page gets it."""
 
-    time: float = -math.inf  #: monotonic s of its arrival
-    names: Sequence[str] = ()
-    position: Sequence[float] = ()
-    effort: Sequence[float] = ()
-
-
-@dataclass
-class Status:
-    """The newest diagnostics of one node."""
-
-    level: int = 0  #: 0 OK, 1 warning, 2 error
-    message: str = ""
-    values: Mapping[str, str] = field(default_factory=dict)
+    content: Any = None
     time: float = -math.inf  #: monotonic s of its arrival
 
-
-def arm_state(now: float, joints: Joints, bridge: Status, compensator: Status) -> dict[str, Any]:
-    """Return the state of one arm for the page; None in the place of what is old."""
-    state: dict[str, Any] = {"bridge": None, "compensator": None, "joints": None}
-    if now - bridge.time < SILENT:
-        values = {key: bridge.values.get(name, "") for key, name in OF_BRIDGE.items()}
-        state["bridge"] = {"level": bridge.level, "message": bridge.message, **values}
-    if now - compensator.time < SILENT:
-        carried = compensator.values.get("mass carried (kg)")
-        shown = {"mass_carried": carried, "largest_support": _number(compensator.values.get("largest support"))}
-        state["compensator"] = {"level": compensator.level, "message": compensator.message, **shown}
-    if now - joints.time < SILENT:
-        state["joints"] = [
-            {
-                "name": name,
-                "position": _rounded(joints.position, n),
-                "effort": _rounded(joints.effort, n),
-                "temperature": _number(bridge.values.get(f"{name} temperature (degC)")) if state["bridge"] else None,
-            }
-            for n, name in enumerate(joints.names)
-        ]
-    return state
+    def at(self, now: float) -> Any:
+        """Return the content; None if it is old."""
+        return self.content if now - self.time < SILENT else None
 
 
-def _rounded(values: Sequence[float], index: int) -> float | None:
-    return round(values[index], 4) if index < len(values) and math.isfinite(values[index]) else None
+def joint_rows(names: Sequence[str], position: Sequence[float], effort: Sequence[float]) -> list[dict[str, Any]]:
+    """Return name, angle in rad and torque in Nm of each joint; None for a number that is missing or not finite."""
 
+    def rounded(values: Sequence[float], index: int) -> float | None:
+        return round(values[index], 4) if index < len(values) and math.isfinite(values[index]) else None
 
-def _number(text: str | None) -> float | None:
-    try:
-        value = float(text or "nan")
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None
+    return [
+        {"name": name, "position": rounded(position, n), "effort": rounded(effort, n)} for n, name in enumerate(names)
+    ]
 
 
 def setup_of(nodes: Mapping[str, tuple[Values, Values]]) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.params import CAN_BRIDGE
 from exo_gravity.panel.control import Control
 from exo_gravity.panel.server import PanelServer
-from exo_gravity.panel.view import Joints, Status, arm_state, setup_of
+from exo_gravity.panel.view import joint_rows, setup_of
 
 from .ports import free_port
 
@@ -76,14 +76,13 @@ class PlayedArms:
         names = [f"{name}_{leaf}" for leaf in LEAVES]
         position = [0.3 * math.sin(0.5 * now + n) for n in range(4)]
         effort = [0.8 * math.sin(0.5 * now + n) for n in range(4)]
-        joints = Joints(now, names, position, effort)
         state, fault = self.states[name], self.faults.get(name, "none")
         values = {"state": state, "fault": fault, "rate (Hz)": "250.0", "age of efforts (ms)": "4.1"}
         values |= {"limits acting": "none", **{f"{joint} temperature (degC)": "31" for joint in names}}
         message = f"fault: {fault}: {name} elbow" if fault != "none" else state
-        bridge = Status(2 if fault != "none" else 0, message, values, now)
-        carried = {"mass carried (kg)": "1.854", "largest support": "0.068"}
-        return arm_state(now, joints, bridge, Status(0, "compensating", carried, now))
+        bridge = {**values, "level": 2 if fault != "none" else 0, "message": message}
+        carried = {"mass carried (kg)": "1.854", "largest support": "0.068", "level": 0, "message": "compensating"}
+        return {"bridge": bridge, "compensator": carried, "joints": joint_rows(names, position, effort)}
 
 
 @dataclass

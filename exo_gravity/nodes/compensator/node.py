@@ -67,7 +67,7 @@ class CompensatorNode(Node):
         self._threads.append(HotPath(self, JointState, topic, self._on_joint_states, NEWEST))
         if values["use_imu"]:
             TiltSubscription(self, self._control, self._lock, self._refused, self._withdraw, self._arm.on_motion)
-        self.add_pre_set_parameters_callback(lambda changes: with_floats(self, self._arm.table, changes))
+        self.add_pre_set_parameters_callback(lambda changes: with_floats(self, changes))
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         # Only the executor's thread reports: diagnostics and budget are not for two threads.

@@ -36,7 +36,7 @@ from exo_gravity.nodes.ros.run import run
 from exo_gravity.panel.control import Control
 from exo_gravity.panel.params import PANEL, scripts_folder
 from exo_gravity.panel.recordings import Recordings
-from exo_gravity.panel.view import SILENT, Joints, Status, Values, arm_state, setup_of
+from exo_gravity.panel.view import Newest, Values, joint_rows, setup_of
 
 STATE_PERIOD = 0.1  # s between two states that the pages get
 DISCOVERY_PERIOD = 0.5  # s between two searches for nodes
@@ -50,19 +50,19 @@ class ArmClient:
     """One arm, in the namespace `/name`."""
 
     def __init__(self, node: Node, name: str) -> None:
-        self.joints, self.bridge, self.compensator = Joints(), Status(), Status()
+        self.joints, self.bridge, self.compensator = Newest(), Newest(), Newest()
         self.enable = node.create_client(SetBool, f"/{name}/{BRIDGE}/enable")
         self.clear_fault = node.create_client(Trigger, f"/{name}/{BRIDGE}/clear_fault")
         self.set = parameter_client(node, f"/{name}/{COMPENSATOR}")
         self._states = HotPath(node, JointState, f"/{name}/joint_states", self._on_states)
 
     def state(self, now: float) -> dict[str, Any]:
-        """Take the newest joint states, and return what the page shows."""
+        """Take the newest joint states, and return what the page shows; None in the place of what is old."""
         self._states.poll()
-        return arm_state(now, self.joints, self.bridge, self.compensator)
+        return {kind: getattr(self, kind).at(now) for kind in ("joints", "bridge", "compensator")}
 
     def _on_states(self, message: JointState, _info: dict[str, Any]) -> None:
-        self.joints = Joints(time.monotonic(), *map(list, (message.name, message.position, message.effort)))
+        self.joints = Newest(joint_rows(message.name, message.position, message.effort), time.monotonic())
 
 
 class Arms:
@@ -122,8 +122,7 @@ class Arms:
     def states(self) -> dict[str, str | None]:
         """Return the state that each bridge reports; None if it is silent."""
         now = time.monotonic()
-        of_arms = {name: client.bridge for name, client in self.clients.items()}
-        return {name: s.values.get("state") if now - s.time < SILENT else None for name, s in of_arms.items()}
+        return {name: (client.bridge.at(now) or {}).get("state") for name, client in self.clients.items()}
 
     async def perform(self, script: str) -> str:
         """Let the virtual wearers perform the script at this path; return '' or why not."""
@@ -158,7 +157,8 @@ class Arms:
             if arm not in self.clients:
                 continue
             values = {pair.key: pair.value for pair in status.values}
-            newest = Status(int.from_bytes(status.level, "big"), status.message, values, time.monotonic())
+            level = int.from_bytes(status.level, "big")
+            newest = Newest({**values, "level": level, "message": status.message}, time.monotonic())
             if leaf == BRIDGE:
                 self.clients[arm].bridge = newest
             elif leaf == COMPENSATOR:
@@ -214,7 +214,7 @@ class Panel(Node):
         self._diagnostics = Diagnostics(self)
         self._noted = 0
         self._arms = Arms(self)
-        self._tilt: tuple[float, Vector3Stamped] | None = None
+        self._tilt = Newest()
         self._tilts = HotPath(self, Vector3Stamped, TILT, self._on_tilt)
         scripts = scripts_folder(values["trials"])
         self._recordings = Recordings(values["output"], scripts, self._arms, self._note, time.monotonic)
@@ -263,16 +263,12 @@ class Panel(Node):
         if nodes != self._shown:
             self._shown = nodes
             self._server.setup = {**self._own_setup, **setup_of(nodes)}
-        self._server.state = {"arms": self._arms.state(), "tilt": self._tilt_state(), **self._recordings.state()}
-
-    def _tilt_state(self) -> dict[str, float] | None:
-        if self._tilt is None or time.monotonic() - self._tilt[0] > SILENT:
-            return None
-        vector = self._tilt[1].vector
-        return {"pitch": vector.y, "roll": vector.x} if math.isfinite(vector.x + vector.y) else None
+        tilt = self._tilt.at(time.monotonic())
+        self._server.state = {"arms": self._arms.state(), "tilt": tilt, **self._recordings.state()}
 
     def _on_tilt(self, message: Vector3Stamped, _info: dict[str, Any]) -> None:
-        self._tilt = time.monotonic(), message
+        pitch, roll = message.vector.y, message.vector.x
+        self._tilt = Newest({"pitch": pitch, "roll": roll} if math.isfinite(pitch + roll) else None, time.monotonic())
 
 
 def main() -> None:

@@ -43,7 +43,7 @@ def values_after(node: Node, table: Sequence[Param], changes: Sequence[Parameter
     return values_of(table, {name: plain(value) for name, value in values.items()})
 
 
-def with_floats(node: Node, table: Sequence[Param], changes: Sequence[Parameter]) -> list[Parameter]:
+def with_floats(node: Node, changes: Sequence[Parameter]) -> list[Parameter]:
     """Return `changes` with whole numbers converted to float where needed, as in `ros2 param set ... support 1`.
 
     Raises ParameterNotDeclaredException with the unknown names, which rclpy itself leaves out.
@@ -51,8 +51,7 @@ def with_floats(node: Node, table: Sequence[Param], changes: Sequence[Parameter]
     unknown = [change.name for change in changes if not node.has_parameter(change.name)]
     if unknown:
         raise ParameterNotDeclaredException(unknown)
-    floats = {param.name for param in table if isinstance(_first(param.default), float)}
-    return [_with_float(change) if change.name in floats else change for change in changes]
+    return [_with_floats(change, node.get_parameter(change.name).type_) for change in changes]
 
 
 def bus_of(node: Node, values: dict[str, Any]) -> tuple[str, str, dict[str, Any]]:
@@ -76,16 +75,12 @@ def descriptor_of(param: Param) -> ParameterDescriptor:
     return descriptor
 
 
-def _with_float(change: Parameter) -> Parameter:
-    if change.type_ == Parameter.Type.INTEGER:
+def _with_floats(change: Parameter, declared: Parameter.Type) -> Parameter:
+    if (change.type_, declared) == (Parameter.Type.INTEGER, Parameter.Type.DOUBLE):
         return Parameter(change.name, value=float(change.value))
-    if change.type_ == Parameter.Type.INTEGER_ARRAY:
+    if (change.type_, declared) == (Parameter.Type.INTEGER_ARRAY, Parameter.Type.DOUBLE_ARRAY):
         return Parameter(change.name, value=[float(number) for number in change.value])
     return change
-
-
-def _first(default: Any) -> Any:
-    return next(iter(default), None) if isinstance(default, list) else default
 
 
 def plain(value: Any) -> Any:
