@@ -113,12 +113,7 @@ class Control:
     """
 
     def __init__(
-        self,
-        arms: Any,
-        files: Any,
-        note: Callable[[str], object],
-        clock: Callable[[], float],
-        dead_man: bool = False,
+        self, arms: Any, files: Any, note: Callable[[str], object], clock: Callable[[], float], dead_man: bool = False
     ) -> None:
         self.holder: Page | None = None  #: the page that holds control
         self._arms = arms
