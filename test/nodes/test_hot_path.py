@@ -16,6 +16,7 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import String
 
+from exo_gravity.nodes.ros import hot_path
 from exo_gravity.nodes.ros.hot_path import Drain, HotPath, LossCounter
 from exo_gravity.nodes.ros.run import keep_to_this_machine
 
@@ -132,6 +133,16 @@ def test_an_exception_in_the_callback_ends_the_thread_and_is_kept(pair):
     pair.send("a", "b")
     pair.wait_until(lambda: pair.hot.failure)
     assert pair.hot.failure is pair.error
+    assert pair.texts() == ["a"]
+
+
+def test_with_an_unknown_rclpy_the_executor_calls_back(executor, monkeypatch):
+    monkeypatch.setattr(hot_path, "rclpy_implementation", object())
+    pair = Pair(executor.get_nodes()[0])
+    pair.hot.start()
+    pair.hot.poll()
+    pair.send("a")
+    pair.wait_until(lambda: pair.received, lambda: executor.spin_once(timeout_sec=0.1))
     assert pair.texts() == ["a"]
 
 
