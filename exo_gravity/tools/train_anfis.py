@@ -48,8 +48,7 @@ def _check_output(path: Path) -> None:
 
 def _run(options: argparse.Namespace) -> None:
     """Train, save the law and print its errors."""
-    from exo_gravity.tools.anfis.samples import from_bag, from_gravload
-    from exo_gravity.tools.anfis.training import RIDGE, train_law
+    from exo_gravity.tools.anfis import RIDGE, from_bag, from_gravload, train_law
 
     output = Path(options.output)
     _check_output(output)

@@ -34,8 +34,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
 
 def _run(options: argparse.Namespace) -> bool:
     """Run the comparison and print it; return whether all checks held."""
-    from exo_gravity.tools.comparison import report
-    from exo_gravity.tools.comparison.validation import Validation
+    from exo_gravity.tools.comparison import Validation, report
 
     configured = configured_arm(options.params, options.side)
     output = Path(options.output)

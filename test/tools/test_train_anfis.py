@@ -10,8 +10,7 @@ import yaml
 from exo_gravity.core import gravity_torque
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.anfis import AnfisLaw, scaled
-from exo_gravity.tools.anfis.samples import TILT_TOPIC, TILT_TYPE, from_bag, from_gravload
-from exo_gravity.tools.anfis.training import RIDGE, Projection, train, train_law
+from exo_gravity.tools.anfis import RIDGE, TILT_TOPIC, TILT_TYPE, Projection, from_bag, from_gravload, train, train_law
 from exo_gravity.tools.inputs.arms import configured_arm
 from exo_gravity.tools.inputs.references import PAPER_ANFIS
 from exo_gravity.tools.train_anfis import main
@@ -199,7 +198,7 @@ def test_wrong_use_ends_with_2_and_one_sentence(arguments, tmp_path, capsys):
 
 @pytest.mark.parametrize("output", ["file/law.json", "folder"])
 def test_an_output_that_cannot_be_written_ends_with_2_before_the_training(output, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("exo_gravity.tools.anfis.training.train", lambda *_, **__: pytest.fail("trained"))
+    monkeypatch.setattr("exo_gravity.tools.anfis.train", lambda *_, **__: pytest.fail("trained"))
     (tmp_path / "file").write_text("", encoding="utf-8")
     (tmp_path / "folder").mkdir()
     with pytest.raises(SystemExit) as ended:
@@ -209,7 +208,7 @@ def test_an_output_that_cannot_be_written_ends_with_2_before_the_training(output
 
 
 def test_a_missing_package_is_named_with_the_extra_that_installs_it(capsys, monkeypatch):
-    monkeypatch.delitem(sys.modules, "exo_gravity.tools.anfis.training")
+    monkeypatch.delitem(sys.modules, "exo_gravity.tools.anfis")
     monkeypatch.setitem(sys.modules, "threadpoolctl", None)
     with pytest.raises(SystemExit) as ended:
         main([])
