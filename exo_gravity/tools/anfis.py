@@ -44,22 +44,27 @@ from exo_gravity.tools.inputs.references import gravload
 GRID = (13, 9, 9)  # positions of joints 2, 3, 4: 1,053 as in the paper
 HELD_OUT = 5  # every fifth hold
 TILT_TOPIC, TILT_TYPE = "/imu/pitch_yaw", "geometry_msgs/msg/Vector3Stamped"
+RIDGE = 1e-6  # keeps consequents that the data do not determine near 0; noisy data need more
+# In units of half the training box. Narrow functions overfit the sampled positions: at a width of 0.4 the held-out
+# error is up to ten times that at 0.8.
+NARROWEST, WIDEST = 0.8, 4.0
+FARTHEST = 2.0  # largest distance of a centre from the middle of the box, in the same units
+MAX_EVALUATIONS = 100
+
+OnEvaluation = Callable[[int, float], None]  # (number of the evaluation, RMSE)
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
     """Training and held-out samples of joints 2 to 4."""
 
-    #: (n, 3) rad in the box low..high, and (n, 3) Nm.
-    angle: np.ndarray
-    torque: np.ndarray
+    angle: np.ndarray  #: (n, 3) rad in the box low..high
+    torque: np.ndarray  #: (n, 3) Nm
     held_out_angle: np.ndarray
     held_out_torque: np.ndarray
-    #: (3,) rad.
-    low: np.ndarray
+    low: np.ndarray  #: (3,) rad
     high: np.ndarray
-    #: What the samples are from, in words.
-    source: str
+    source: str  #: what the samples are from, in words
 
 
 def from_gravload(configured: ConfiguredArm) -> Samples:
@@ -148,28 +153,14 @@ def _check_coverage(inputs: np.ndarray, functions: int) -> None:
         )
 
 
-RIDGE = 1e-6  # keeps consequents that the data do not determine near 0; noisy data need more
-# In units of half the training box. Narrow functions overfit the sampled positions: at a width of 0.4 the held-out
-# error is up to ten times that at 0.8.
-NARROWEST, WIDEST = 0.8, 4.0
-FARTHEST = 2.0  # largest distance of a centre from the middle of the box, in the same units
-
-MAX_EVALUATIONS = 100
-
-OnEvaluation = Callable[[int, float], None]  # (number of the evaluation, RMSE)
-
-
 @dataclass(frozen=True, eq=False)
 class Trained:
     """A model of one output, trained."""
 
     model: Anfis
-    #: On the training data, in the output's unit.
-    rmse: float
-    #: Of the premises.
-    evaluations: int
-    #: Training time in s.
-    seconds: float
+    rmse: float  #: on the training data, in the output's unit
+    evaluations: int  #: of the premises
+    seconds: float  #: training time
 
 
 class Projection:
@@ -290,14 +281,13 @@ def train_law(
     """Return the law for `arm` trained on `samples`, and the training results of joints 2, 3 and 4."""
     inputs = scaled(samples.angle, samples.low, samples.high)
     results = []
-    for joint, torque in zip(JOINTS, samples.torque.T, strict=True):
-        with Progress(console=Console(stderr=True), transient=True) as progress:
+    # Threads gain nothing on matrices this small, and wait for each other on busy cores: 73 s instead of 2 s.
+    with threadpool_limits(1), Progress(console=Console(stderr=True), transient=True) as progress:
+        for joint, torque in zip(JOINTS, samples.torque.T, strict=True):
             show = _progress_line(progress, joint)
-            # Threads gain nothing on matrices this small, and wait for each other on busy cores: 73 s instead of 2 s.
-            with threadpool_limits(1):
-                results.append(
-                    train(inputs, torque, functions, ridge=ridge, max_evaluations=MAX_EVALUATIONS, on_evaluation=show)
-                )
+            results.append(
+                train(inputs, torque, functions, ridge=ridge, max_evaluations=MAX_EVALUATIONS, on_evaluation=show)
+            )
     parts = (np.concatenate([getattr(r.model, part) for r in results]) for part in ("centre", "sigma", "consequent"))
     model = Anfis(*parts)
     held_out = model.output(scaled(samples.held_out_angle, samples.low, samples.high)) - samples.held_out_torque

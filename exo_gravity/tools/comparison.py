@@ -33,22 +33,26 @@ TILTS = (0, 5, 10, 20, 30)  # degrees
 CHUNK = 2_000  # poses between two updates of the progress bar
 ROUNDING = 1e-12  # Nm; the exact law may differ this much from a reference
 LINK_ENDS, CONFIGURED = "at the link ends", "as configured"
+FLOOR, CEILING = 1e-7, 1.0  # Nm, ends of the colour scale
+FIGURE_GRID = (56, 56, 7)  # positions of joints 2, 3, 4 in the workspace figure
+# Overlapping lines stay visible, because the wider ones are drawn first.
+STYLES: dict[str, dict[str, Any]] = {
+    "EQ2-EQ5": {"color": "tab:orange", "marker": "s", "linewidth": 4, "markersize": 7},
+    "EQ1m-EQ4m": {"color": "tab:red", "marker": "D", "linewidth": 2},
+    "ANFIS": {"color": "tab:blue", "marker": "^", "linestyle": "--"},
+    "exact": {"color": "tab:green", "marker": "o"},
+}
 
 
 class Case(NamedTuple):
     """Poses of an arm, each with a trunk tilt."""
 
-    #: Which centres of gravity.
-    cog: str
-    #: 'workspace' or 'random'.
-    positions: str
-    #: Of the tilt, degrees.
-    limit: int
+    cog: str  #: which centres of gravity
+    positions: str  #: 'workspace' or 'random'
+    limit: int  #: of the tilt, degrees
     arm: ArmModel
-    #: (n, 4) rad.
-    theta: np.ndarray
-    #: (n, 3), and (n,) rad: as in `core.model.tilt.Tilt`.
-    direction: np.ndarray
+    theta: np.ndarray  #: (n, 4) rad
+    direction: np.ndarray  #: (n, 3); this and the following (n,) rad as in `core.model.tilt.Tilt`
     axis_angle: np.ndarray
     beta: np.ndarray
     phi: np.ndarray
@@ -87,13 +91,19 @@ class Row:
 
 def cases(cog: str, configured: ConfiguredArm, count: int) -> Iterator[Case]:
     """Yield the 1,053 positions, then `count` random poses for each of `TILTS`."""
-    box = zip(configured.low[1:], configured.high[1:], GRID, strict=True)
-    theta = np.array(list(product((0.0,), *(np.linspace(low, high, n) for low, high, n in box))))
-    yield _case(cog, "workspace", 0, configured, theta, np.zeros((len(theta), 2)))
+    yield _upright(cog, configured, GRID)[0]
     for limit in TILTS:
         rng, bound = np.random.default_rng(limit), math.radians(limit)
         theta = rng.uniform(configured.low, configured.high, (count, 4))
         yield _case(cog, "random", limit, configured, theta, rng.uniform(-bound, bound, (count, 2)))
+
+
+def _upright(cog: str, configured: ConfiguredArm, counts: Sequence[int]) -> tuple[Case, list[np.ndarray]]:
+    """Return a grid of positions of joints 2 to 4 with the trunk upright, and the angles of each joint."""
+    box = zip(configured.low[1:], configured.high[1:], counts, strict=True)
+    angles = [np.linspace(low, high, n) for low, high, n in box]
+    theta = np.array(list(product((0.0,), *angles)))
+    return _case(cog, "workspace", 0, configured, theta, np.zeros((len(theta), 2))), angles
 
 
 def _case(cog: str, positions: str, limit: int, configured: ConfiguredArm, theta: np.ndarray, tilt: np.ndarray) -> Case:
@@ -154,10 +164,8 @@ def evaluate(cog: str, configured: ConfiguredArm, count: int) -> Part:
 class Validation:
     """The comparison as a whole."""
 
-    #: With the paper's assumptions, d_n = l_n.
-    link_ends: Part
-    #: With the configured centres of gravity.
-    as_configured: Part
+    link_ends: Part  #: with the paper's assumptions, d_n = l_n
+    as_configured: Part  #: with the configured centres of gravity
 
     @classmethod
     def of(cls, configured: ConfiguredArm, count: int) -> Validation:
@@ -187,19 +195,6 @@ class Validation:
             ratios = [paper / ours for ours, paper in zip(self.link_ends.law.error[kind], PAPER_ANFIS, strict=True)]
             shares = ", ".join(f"1/{ratio:.0f}" for ratio in ratios)
             yield min(ratios) >= 1.0, f"ANFIS {where}: RMSE {shares} of the paper's, joints 2, 3, 4"
-
-
-FLOOR, CEILING = 1e-7, 1.0  # Nm, ends of the colour scale
-FIGURE_GRID = (56, 56, 7)  # positions of joints 2, 3, 4 in the workspace figure
-# Overlapping lines stay visible, because the wider ones are drawn first.
-STYLES: dict[str, dict[str, Any]] = {
-    "EQ2-EQ5": {"color": "tab:orange", "marker": "s", "linewidth": 4, "markersize": 7},
-    "EQ1m-EQ4m": {"color": "tab:red", "marker": "D", "linewidth": 2},
-    "ANFIS": {"color": "tab:blue", "marker": "^", "linestyle": "--"},
-    "exact": {"color": "tab:green", "marker": "o"},
-}
-
-Torque = Callable[[np.ndarray], np.ndarray]  # theta (n, 4) rad -> torque (n, 4) Nm
 
 
 def tables(validation: Validation) -> Iterator[str]:
@@ -247,37 +242,29 @@ def _cell(row: Row) -> str:
 
 def write(validation: Validation, output: Path) -> list[str]:
     """Write the rows as CSV, one column per field in Nm (`limit` in degrees), and the figures; return the names."""
-    rows, part = validation.rows, validation.as_configured
+    rows = validation.rows
     with (output / "laws.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=list(asdict(rows[0])))
         writer.writeheader()
         writer.writerows(asdict(row) for row in rows)
-    arm, law = part.configured.robot, part.law
-    torques: dict[str, Torque] = {
-        "exact": lambda theta: gravity_torque(arm, theta),
-        "EQ2-EQ5": lambda theta: paper_static_torque(arm, theta),
-        "ANFIS": lambda theta: arm.gain * np.pad(law.torques(theta[:, 1:]), ((0, 0), (1, 0))),
-    }
-    _workspace_figure(part, torques).savefig(output / "workspace.png", dpi=130)
+    _workspace_figure(validation.as_configured).savefig(output / "workspace.png", dpi=130)
     _tilt_figure(rows).savefig(output / "tilt.png", dpi=130)
     return ["laws.csv", "workspace.png", "tilt.png"]
 
 
-def _workspace_figure(part: Part, torques: Mapping[str, Torque]) -> Figure:
+def _workspace_figure(part: Part) -> Figure:
     """Draw the RMSE over the elbow of joints 2 to 4 (rows) and each law (columns) over abduction and flexion."""
-    box = zip(part.configured.low[1:], part.configured.high[1:], FIGURE_GRID, strict=True)
-    axes = [np.linspace(low, high, n) for low, high, n in box]
-    theta = np.array(list(product((0.0,), *axes)))
-    expected = gravload(part.configured.robot)(theta, np.tile((0.0, 0.0, 1.0), (len(theta), 1)))
-    degrees = [np.degrees(axis) for axis in axes[:2]]
+    case, (abduction, flexion, _) = _upright(CONFIGURED, part.configured, FIGURE_GRID)
+    expected, torques = gravload(case.arm)(case.theta, case.direction), case.torques(part.law)
     figure = Figure(figsize=(3.2 * len(torques) + 1.6, 8.4), layout="constrained")
     grid = figure.subplots(3, len(torques), sharex=True, sharey=True)
     for column, (name, torque) in zip(grid.T, torques.items(), strict=True):
-        error = (torque(theta) - expected).reshape(*FIGURE_GRID, 4)
-        values = rms(np.moveaxis(error, 2, 0))
+        error = rms(np.moveaxis((torque - expected).reshape(*FIGURE_GRID, 4), 2, 0))
         for joint, axis in enumerate(column, start=2):
-            shown = np.clip(values[..., joint - 1].T, FLOOR, CEILING)
-            image = axis.pcolormesh(*degrees, shown, norm=LogNorm(FLOOR, CEILING), cmap="viridis", rasterized=True)
+            image = axis.pcolormesh(
+                np.degrees(abduction), np.degrees(flexion), np.clip(error[..., joint - 1].T, FLOOR, CEILING),
+                norm=LogNorm(FLOOR, CEILING), cmap="viridis", rasterized=True,
+            )  # fmt: skip
             axis.set_title(f"{name}: joint {joint}", fontsize=10)
     for axis in grid[-1]:
         axis.set_xlabel("joint 2, abduction (degrees)")

@@ -12,9 +12,7 @@ import yaml
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.tools import validate
-from exo_gravity.tools.anfis import training
-from exo_gravity.tools.comparison import report, validation
+from exo_gravity.tools import anfis, comparison, validate
 from exo_gravity.tools.inputs.arms import configured_arm, with_cog_at_link_ends
 from exo_gravity.tools.inputs.references import REFERENCES, gravload
 
@@ -25,16 +23,16 @@ DOWN = np.array(((0.0, 0.0, 1.0),))
 def quick(tmp_path_factory):
     """Exit code, printed text, folder and parts of a run with few poses and short training."""
     folder = tmp_path_factory.mktemp("validation")
-    lines, parts, evaluate = [], [], validation.evaluate
+    lines, parts, evaluate = [], [], comparison.evaluate
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(validate, "QUICK_COUNT", 60)
-        patch.setattr(report, "FIGURE_GRID", (8, 8, 3))
-        patch.setattr(training, "MAX_EVALUATIONS", 4)
-        patch.setattr(validation, "evaluate", lambda *given: parts.append(evaluate(*given)) or parts[-1])
+        patch.setattr(comparison, "FIGURE_GRID", (8, 8, 3))
+        patch.setattr(anfis, "MAX_EVALUATIONS", 4)
+        patch.setattr(comparison, "evaluate", lambda *given: parts.append(evaluate(*given)) or parts[-1])
         patch.setattr("builtins.print", lambda *parts, **_: lines.append(" ".join(map(str, parts))))
         with pytest.raises(SystemExit) as ended:
             validate.main(["--quick", "--output", str(folder)])
-    return ended.value.code, "\n".join(lines), folder, validation.Validation(*parts)
+    return ended.value.code, "\n".join(lines), folder, comparison.Validation(*parts)
 
 
 def write_params(folder, arm, bridge=None):
@@ -76,7 +74,7 @@ def test_a_reference_that_is_not_installed_is_named_with_what_installs_it(name, 
 
 
 def test_the_first_case_is_the_1053_positions_with_an_upright_trunk():
-    case = next(validation.cases("", configured_arm(), 10))
+    case = next(comparison.cases("", configured_arm(), 10))
     assert case.theta.shape == (13 * 9 * 9, 4)
     assert len(np.unique(case.theta, axis=0)) == 1053
     assert np.all(case.axis_angle == 0) and np.all(case.theta[:, 0] == 0)
@@ -84,7 +82,7 @@ def test_the_first_case_is_the_1053_positions_with_an_upright_trunk():
 
 def test_the_random_cases_turn_joint_1_and_tilt_the_trunk_within_their_limits():
     configured = configured_arm()
-    cases = list(validation.cases("", configured, 500))[1:]
+    cases = list(comparison.cases("", configured, 500))[1:]
     assert [case.limit for case in cases] == [0, 5, 10, 20, 30]
     for case in cases:
         assert np.all((case.theta >= configured.low) & (case.theta <= configured.high)) and np.ptp(case.theta[:, 0]) > 3
@@ -93,18 +91,18 @@ def test_the_random_cases_turn_joint_1_and_tilt_the_trunk_within_their_limits():
 
 
 def test_rmse_largest_error_and_share_are_those_of_a_known_error():
-    case = next(validation.cases("", configured_arm(), 10))
+    case = next(comparison.cases("", configured_arm(), 10))
     expected = np.full((1053, 4), 2.0)
     given = expected + 0.1
     given[0, 2] += 1.0
-    rows = validation.compare(case, {"law": given}, "reference", expected)
+    rows = comparison.compare(case, {"law": given}, "reference", expected)
     assert (rows[0].rmse, rows[0].largest, rows[0].share) == pytest.approx((0.1, 0.1, 0.05))
     assert rows[2].largest == pytest.approx(1.1)
 
 
 def test_a_joint_that_needs_no_torque_has_no_share():
-    case = next(validation.cases("", configured_arm(), 10))
-    assert math.isnan(validation.compare(case, {"law": np.ones((1053, 4))}, "", np.zeros((1053, 4)))[0].share)
+    case = next(comparison.cases("", configured_arm(), 10))
+    assert math.isnan(comparison.compare(case, {"law": np.ones((1053, 4))}, "", np.zeros((1053, 4)))[0].share)
 
 
 def test_the_papers_assumptions_are_cog_at_link_ends_gain_1_and_its_own_gravity():
