@@ -38,7 +38,7 @@ from exo_gravity.core.model.wearer import SEX, TABLES, TYPICAL_LENGTH, LinkLoad,
 from exo_gravity.core.numbers import one_float
 from exo_gravity.tools.cli import missing
 from exo_gravity.tools.inputs.arms import ConfiguredArm, configured_arms, named
-from exo_gravity.tools.reporting.colours import INK
+from exo_gravity.tools.reporting.html import INK
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -59,7 +59,6 @@ MOTIONS = (
     Column("residual_deg", "Residual\ndeg", 1, lambda motion: degrees(motion.residual)),
     Column("peak_speed_deg_per_s", "Peak speed\ndeg/s", 0, lambda motion: degrees(motion.speed), spare=1),
 )
-HOLD_HEADS, MOTION_HEADS = ("Hold", "At\ns", "For\ns"), ("Motion", "At\ns", "Still after\ns")
 # What the columns mean
 TERMS = {
     "Drift": "is the slope of a robust line (Huber) through the hold. Its uncertainty is at least one position code "
@@ -130,17 +129,19 @@ def _shared(number: int, one: Hold | Motion) -> tuple[str, str, str]:
     return one.kind, shown(one.start, 1), "never" if never else shown(one.until_still, 1)
 
 
+def _tables(analysis: TrialAnalysis) -> Iterator[tuple[str, Sequence[Hold | Motion], Sequence[str], Sequence[Column]]]:
+    """Yield title, content, first headings and columns of both tables."""
+    yield "Holds", analysis.holds, ("Hold", "At\ns", "For\ns"), HOLDS
+    yield "Motions between holds", analysis.motions, ("Motion", "At\ns", "Still after\ns"), MOTIONS
+
+
 def arm_section(recording: Recording, analysis: TrialAnalysis, figures: Iterable[str]) -> Iterator[str]:
-    """Yield the page's section of one arm: its key numbers, figures and tables."""
+    """Yield the page's section of one arm: its figures and tables."""
     yield html.heading(f"Arm: {recording.name}", 2)
-    yield html.key_numbers(_key_numbers(recording, analysis))
     yield from figures
     if not analysis.holds:
         yield html.paragraph("No hold was found.")
-    for title, found, heads, columns in (
-        ("Holds", analysis.holds, HOLD_HEADS, HOLDS),
-        ("Motions between holds", analysis.motions, MOTION_HEADS, MOTIONS),
-    ):
+    for title, found, heads, columns in _tables(analysis):
         groups = []
         for number, one in enumerate(found, 1):
             cells = [[shown(value, column.digits) for value in column.of(one)] for column in columns]
@@ -150,25 +151,12 @@ def arm_section(recording: Recording, analysis: TrialAnalysis, figures: Iterable
             yield html.joint_table((*heads, "", *(column.heading for column in columns)), groups)
 
 
-def _key_numbers(recording: Recording, analysis: TrialAnalysis) -> Iterator[tuple[str, str]]:
-    """Yield the holds, their total time and the fastest drift."""
-    yield str(len(analysis.holds)), "holds"
-    yield f"{sum(hold.duration for hold in analysis.holds):.0f} s", "total hold time"
-    if analysis.holds:
-        rates = np.array([hold.drift_rate for hold in analysis.holds])
-        number, joint = divmod(int(np.argmax(np.abs(rates))), rates.shape[1])
-        error = per_minute(analysis.holds[number].drift_rate_uncertainty[joint])
-        label = f"fastest drift: {joint_labels(recording)[joint]}, hold {number + 1}"
-        yield f"{shown(per_minute(rates[number, joint]), 2)} ± {shown(error, 2)} deg/min", label
-
-
 def print_tables(console: Console, recording: Recording, analysis: TrialAnalysis) -> None:
     """Print the holds and motions of one arm; a cell holds the four joints in order."""
     console.print(f"\n[bold]{recording.name}[/], joints in order: {', '.join(joint_labels(recording))}")
-    pushes = [motion for motion in analysis.motions if motion.kind != "move"]
-    for found, heads, columns in ((analysis.holds, HOLD_HEADS, HOLDS), (pushes, MOTION_HEADS, MOTIONS)):
-        if found:
-            console.print(_terminal_table(found, heads, columns, console.width))
+    for _, found, heads, columns in _tables(analysis):
+        if shown_here := [one for one in found if isinstance(one, Hold) or one.kind != "move"]:
+            console.print(_terminal_table(shown_here, heads, columns, console.width))
 
 
 def _terminal_table(
