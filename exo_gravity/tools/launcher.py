@@ -27,9 +27,9 @@ from datetime import datetime
 from pathlib import Path
 
 from exo_gravity.core.errors import ExoGravityError
+from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.tools.cli import require_ros
 from exo_gravity.tools.inputs.parameter_file import (
-    DESCENT_TIMEOUT,
     ENDED_WELL,
     RECOVERY,
     RECOVERY_TIMEOUT,
