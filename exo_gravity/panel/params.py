@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from pathlib import Path
 
 from exo_gravity.core.compensation.params import COMPENSATOR
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.params import Param
+from exo_gravity.core.params import Param, packaged
 
 # fmt: off
 PANEL = (
@@ -31,7 +29,7 @@ SETTABLE = {
 
 
 def scripts_folder(given: str) -> Path | None:
-    """Return the folder of trial scripts: `given`, or that of the package in a checkout, an environment or a workspace.
+    """Return the folder of trial scripts: `given`, or that of the package; None if it has none.
 
     Raises ParameterError if `given` is not a folder.
     """
@@ -39,6 +37,4 @@ def scripts_folder(given: str) -> Path | None:
         if not Path(given).is_dir():
             raise ParameterError("trials", given, "a folder")
         return Path(given)
-    shares = [Path(p, "share/exo_gravity") for p in os.environ.get("AMENT_PREFIX_PATH", "").split(":") if p]
-    roots = (Path(__file__).parents[2], *shares, Path(sys.prefix, "share/exo_gravity"))
-    return next((folder for root in roots if (folder := root / "config" / "trials").is_dir()), None)
+    return packaged("trials")
