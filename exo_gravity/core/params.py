@@ -7,11 +7,8 @@ takes them from there (`param_of`). These dataclasses also check the rules that 
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
 from typing import Any
 
 from exo_gravity.core.errors import ParameterError
@@ -198,11 +195,3 @@ REAL_TIME_PARAMETERS = (
         expert=True,
     ),
 )
-
-
-def packaged(name: str) -> Path | None:
-    """Return a file or folder of `config/`, in a checkout, a workspace or a virtual environment; None if in none."""
-    prefixes = filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(":"))
-    shares = (Path(prefix, "share/exo_gravity") for prefix in (*prefixes, sys.prefix))
-    roots = (Path(__file__).parents[2], *shares)
-    return next((path for root in roots if (path := root / "config" / name).exists()), None)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from exo_gravity import packaged
 from exo_gravity.core.compensation.params import COMPENSATOR
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.params import Param, packaged
+from exo_gravity.core.params import Param
 
 # fmt: off
 PANEL = (

@@ -22,8 +22,8 @@ from typing import Any, NamedTuple
 
 import yaml
 
+from exo_gravity import packaged
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.params import packaged
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 
 FORM = "/namespace/executable: {ros__parameters: {...}}"
