@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.bus_load import BITRATE, Traffic
-from exo_gravity.core.motors.specs import MOTORS, WIRE_RANGE_BOUNDS, MotorReply, MotorSpec, standstill
+from exo_gravity.core.motors.specs import MOTORS, WIRE_RANGE_BOUNDS, MotorReply, MotorSpec
 from exo_gravity.core.motors.wire_formats import FORMATS, MIT, Frame, WireFormat
 from exo_gravity.core.params import Param
 
@@ -97,7 +97,7 @@ class JointMotor:
         torque = self.direction * effort / self.torque_scale
         kd = min(damping / self.torque_scale, spec.kd_max)
         if kd:  # no code is exactly 0 rad/s: the nearest one would push with kd times its velocity
-            torque -= kd * standstill(spec)
+            torque -= kd * spec.standstill
         most = spec.torque_range
         if not -most <= torque <= most and math.isfinite(torque):
             torque = math.copysign(most, torque)
@@ -106,26 +106,14 @@ class JointMotor:
     def joint_reply(self, data: bytes | bytearray) -> MotorReply:
         """Return the content of a reply or status frame in the joint's rad, rad/s and Nm. Raises FrameError."""
         reply = self.wire_format.unpack_reply(self.spec, self.can_id, data)
-        return MotorReply(
-            reply.motor_id,
-            self.joint_position(reply.position),
-            self.direction * reply.velocity,
-            self.joint_effort(reply.torque),
-            reply.temperature,
-            reply.error,
-        )
-
-    def joint_position(self, motor_position: float) -> float:
-        """Return the joint angle in rad for a motor angle in rad."""
-        return self.direction * (motor_position - self.zero)
+        motor_id, position, velocity, torque, temperature, error = reply
+        sign = self.direction
+        torque = sign * torque * self.torque_scale
+        return MotorReply(motor_id, sign * (position - self.zero), sign * velocity, torque, temperature, error)
 
     def motor_position(self, joint_position: float) -> float:
         """Return the motor angle in rad for a joint angle in rad."""
         return self.direction * joint_position + self.zero
-
-    def joint_effort(self, motor_torque: float) -> float:
-        """Return the joint torque in Nm for a torque in the motor's Nm."""
-        return self.direction * motor_torque * self.torque_scale
 
 
 class Peaks(NamedTuple):

@@ -16,6 +16,7 @@ code is exactly 0 Nm.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 from exo_gravity.core.errors import FrameError, ParameterError
@@ -60,6 +61,12 @@ class MotorSpec:
     #: Nm/rad, Nm s/rad: the wire range starts at 0
     kp_max: float = 500.0
     kd_max: float = 5.0
+
+    @cached_property
+    def standstill(self) -> float:
+        """The velocity in rad/s that the motor decodes from a command of 0 rad/s."""
+        span = self.velocity_range
+        return from_code(to_code("velocity", 0.0, -span, span, 0xFFF), -span, span, 0xFFF)
 
     def with_ranges(self, velocity_range: float, torque_range: float) -> MotorSpec:
         """Return this motor with another firmware's wire ranges in rad/s and Nm, which no CAN message reports."""
@@ -184,12 +191,6 @@ def unpack_reply(spec: MotorSpec, data: bytes | bytearray) -> MotorReply:
         data[6] - 40 if len(data) == 8 else None,
         data[7] if len(data) == 8 else None,
     )
-
-
-def standstill(spec: MotorSpec) -> float:
-    """Return the velocity in rad/s that a motor decodes from a command of 0 rad/s."""
-    span = spec.velocity_range
-    return from_code(to_code("velocity", 0.0, -span, span, 0xFFF), -span, span, 0xFFF)
 
 
 def to_code(name: str, value: float, low: float, high: float, codes: int) -> int:
