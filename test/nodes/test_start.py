@@ -88,7 +88,7 @@ def test_real_time_threads_and_locked_memory_are_used_or_the_log_states_that_the
     memory_is_locked = "VmLck:\t       0 kB" not in (process / "status").read_text()
     log = "\n".join(nodes.log)
     assert bool(real_time_threads) != ("thread_priority 10 is not permitted" in log)
-    assert memory_is_locked != ("lock_memory is not permitted" in log)
+    assert memory_is_locked != ("locked memory is not permitted" in log)
     if real_time_threads:
         assert process.name not in real_time_threads  # the main thread, which serves parameters
         assert any(name.startswith("dds.") for name in real_time_threads.values())

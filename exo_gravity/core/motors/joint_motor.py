@@ -20,8 +20,6 @@ from exo_gravity.core.params import Param
 # because their position is always 0. With IDs below 0x7f a command echoed by the bus cannot look like a reply.
 MAX_CAN_ID = 126
 TORQUE_SCALE_BOUNDS = (0.2, 2.0)
-
-
 OPTIONS = "can.options"  # parameters below this prefix go to python-can unchanged
 # python-can's interfaces that open a bus at another bit rate than the motors' unless they are given one.
 NEED_BITRATE = ("cantact", "gs_usb", "ixxat", "kvaser", "pcan", "slcan", "usb2can", "vector")
@@ -48,8 +46,8 @@ class JointMotor:
             raise ParameterError("can_id", self.can_id, f"a whole number from 1 to {MAX_CAN_ID}")
         if self.direction not in (1, -1):
             raise ParameterError("direction", self.direction, "1 or -1")
-        if not abs(self.zero) <= self.spec.position_range - math.pi:
-            limit = self.spec.position_range - math.pi
+        limit = self.spec.position_range - math.pi
+        if not abs(self.zero) <= limit:
             raise ParameterError("zero", self.zero, f"from {-limit:.2f} to {limit:.2f} rad, or the angle would wrap")
         low, high = TORQUE_SCALE_BOUNDS
         if not low <= self.torque_scale <= high:

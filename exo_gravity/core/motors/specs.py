@@ -77,9 +77,10 @@ class MotorSpec:
         return replace(self, velocity_range=velocity_range, torque_range=torque_range)
 
 
-_AK60 = MotorSpec("AK60-6", 45.0, 15.0, 3.0, 9.0, gear_ratio=6, pole_pairs=14, torque_per_ampere=3.0 / 7.4)
-_AK80 = MotorSpec("AK80-9", 50.0, 18.0, 9.0, 18.0, gear_ratio=9, pole_pairs=21, torque_per_ampere=9.0 / 10.3)
-MOTORS = {spec.name: spec for spec in (_AK60, _AK80)}
+MOTORS = {
+    "AK60-6": MotorSpec("AK60-6", 45.0, 15.0, 3.0, 9.0, gear_ratio=6, pole_pairs=14, torque_per_ampere=3.0 / 7.4),
+    "AK80-9": MotorSpec("AK80-9", 50.0, 18.0, 9.0, 18.0, gear_ratio=9, pole_pairs=21, torque_per_ampere=9.0 / 10.3),
+}
 
 
 class MotorCommand(NamedTuple):

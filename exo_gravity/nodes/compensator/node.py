@@ -71,7 +71,7 @@ class CompensatorNode(Node):
         self._arm.start()
         self._interface.start()
         self._joint_states.start()
-        for refused in request_real_time(values["thread_priority"], values["thread_priority"] > 0):
+        for refused in request_real_time(values["thread_priority"]):
             self.get_logger().warning(refused)
 
     @property
