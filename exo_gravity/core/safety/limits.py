@@ -33,8 +33,8 @@ MAX_EFFORT_RATE = 50.0  # Nm/s; the full torque of an AK60-6 in 60 ms, slow enou
 MAX_TEMPERATURE = 80.0  # degC, an assumption: a motor whose own protection switches it off would drop the arm
 DERATING = 10.0  # degC below MAX_TEMPERATURE over which the permitted torque falls to half
 JUMP = 0.05  # rad that two readings may differ by in addition to what max_velocity allows
-# rad from the hanging arm at the first start. The zero of a motor with a single encoder may be off by whole turns of the rotor (60
-# degrees of an AK60-6's output, 40 of an AK80-9's): less than half of that shows it.
+# rad from the hanging arm at the first start. The zero of a motor with a single encoder may be off by whole turns of
+# the rotor (60 degrees of an AK60-6's output, 40 of an AK80-9's): less than half of that shows it.
 HOME_TOLERANCE = {"AK60-6": 0.5, "AK80-9": 0.34}
 
 

@@ -131,8 +131,7 @@ def log_limits(node: Node, limits: Limits, traffic: Traffic, rate: float) -> Non
     )
     if warning := traffic.warning(rate):
         log.warning(warning)
-    opening = open_to_others()
-    if opening:
+    if opening := open_to_others():
         log.warning(f"{opening}: other hosts can command this arm; unset it, or enforce SROS2")
 
 
@@ -160,9 +159,7 @@ class BridgeReport:
             self._diagnostics.report(WARN, "inactive")
             return
         now, safety = time.monotonic(), loop.safety
-        acting = ", ".join(
-            sorted(limit for limit, time_acted in tuple(safety.acted.items()) if time_acted > now - RECENT)
-        )
+        acting = ", ".join(sorted(limit for limit, acted in tuple(safety.acted.items()) if acted > now - RECENT))
         rate = self._rate.update(now, loop.cycles)
         self._motors.update(now, loop.samples)
         values: dict[str, object] = {
@@ -179,17 +176,6 @@ class BridgeReport:
             "publishing errors": f"{loop.cycle_errors}, last: {loop.cycle_error}" if loop.cycle_errors else "none",
             "last refused message": refusal,
         }
-        values |= self._of_joints(loop)
-        warnings = [f"limited by {acting}"] if acting else []
-        hot = [name for name, share in zip(self._names, self._motors.share, strict=True) if share > 1.0]
-        if hot:
-            warnings.append(f"above rated torque for too long: {', '.join(hot)}")
-        if 0.0 < rate < self._slow:
-            warnings.append(f"slower than {self._slow:.0f} Hz")
-        self._diagnostics.report(*_headline(loop, ", ".join(warnings)), values)
-
-    def _of_joints(self, loop: ControlLoop) -> dict[str, object]:
-        values: dict[str, object] = {}
         columns = self._names, loop.samples, self._motors.power, self._motors.rms, self._motors.share
         for name, joint, power, rms, share in zip(*columns, strict=True):
             values[f"{name} temperature (degC)"] = joint.temperature
@@ -197,7 +183,13 @@ class BridgeReport:
             values[f"{name} power (W)"] = row([power], 1)
             values[f"{name} RMS torque (Nm)"] = row([rms], 2)
             values[f"{name} RMS of rated torque (%)"] = row([100.0 * share], 0)
-        return values
+        warnings = [f"limited by {acting}"] if acting else []
+        hot = [name for name, share in zip(self._names, self._motors.share, strict=True) if share > 1.0]
+        if hot:
+            warnings.append(f"above rated torque for too long: {', '.join(hot)}")
+        if 0.0 < rate < self._slow:
+            warnings.append(f"slower than {self._slow:.0f} Hz")
+        self._diagnostics.report(*_headline(loop, ", ".join(warnings)), values)
 
 
 def _headline(loop: ControlLoop, warnings: str) -> tuple[bytes, str]:
