@@ -120,13 +120,9 @@ class BusScan:
 
     def poll(self, can_ids: Iterable[int]) -> dict[int, MotorAnswer]:
         """Return the newest answer of each of these motors; a silent one is missing. Raises BusError."""
-        answers = {}
         reporting = set(can_ids) & set(self._v3)
-        for can_id in can_ids:
-            replies = [] if can_id in reporting else self._ask(can_id, is_alone=False)[0]
-            if replies:
-                answers[can_id] = replies[-1]
-        return answers | self._statuses(reporting)
+        replies = {i: self._ask(i, is_alone=False)[0] for i in can_ids if i not in reporting}
+        return {i: found[-1] for i, found in replies.items() if found} | self._statuses(reporting)
 
     def _listen(self) -> None:
         end = self._now() + LISTEN_TIME

@@ -66,20 +66,16 @@ class BridgeServices:
         since = time.monotonic()
         self._on_control_thread(self._set_zero, response)
         loop = self._get_loop()
-        if response.success and loop is not None and not self._is_zeroed(loop, since):
-            columns = zip(loop.safety.limits.joint_names, loop.samples, strict=True)
-            positions = ", ".join(f"{name} at {joint.position:.3f} rad" for name, joint in columns)
-            response.success, response.message = False, f"the motors did not set their zero: {positions}"
-        return response
-
-    def _is_zeroed(self, loop: ControlLoop, since: float) -> bool:
-        """Wait until every motor has replied again; return whether all then report 0."""
-        end = since + ZERO_TIMEOUT
-        while time.monotonic() < end:
-            if all(joint.time > since and abs(joint.position) <= ZERO_TOLERANCE for joint in loop.samples):
-                return True
+        if not response.success or loop is None:
+            return response
+        while not all(joint.time > since and abs(joint.position) <= ZERO_TOLERANCE for joint in loop.samples):
+            if time.monotonic() > since + ZERO_TIMEOUT:
+                columns = zip(loop.safety.limits.joint_names, loop.samples, strict=True)
+                positions = ", ".join(f"{name} at {joint.position:.3f} rad" for name, joint in columns)
+                response.success, response.message = False, f"the motors did not set their zero: {positions}"
+                break
             time.sleep(0.005)
-        return False
+        return response
 
     def _set_zero(self, loop: ControlLoop) -> str:
         safety = loop.safety
