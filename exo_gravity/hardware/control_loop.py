@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.bus_load import REPLY_SHARE
+from exo_gravity.core.safety.descent import DAMPING
 from exo_gravity.core.safety.drive import CARRYING, OFF, Drive, FaultCode, State
 from exo_gravity.core.safety.limits import JointSample
 from exo_gravity.core.safety.machine import SafetyMachine
@@ -32,7 +33,6 @@ HAND_OVER_TIME = 0.5  # s in which a watchdog that takes over has ended this pro
 
 # Lowering an arm without the state machine.
 LOWERING_FADE = 10.0  # s in which the torque fades
-LOWERING_DAMPING = 5.0  # Nm s/rad, the range of kd on the wire
 REST_TIME = 10.0  # s for which the joints must be at rest,
 REST = 0.005  # rad that one may turn in that time
 REPLY_TIMEOUT = 0.1  # s without a reply after which a motor's position is not known
@@ -278,7 +278,7 @@ def lower(bus: MotorBus, drive: Drive, period: float) -> None:
     while (time := now()) - rest_since < REST_TIME or time - start < LOWERING_FADE:
         share = max(0.0, 1.0 - (time - start) / LOWERING_FADE)
         effort = tuple(share * effort for effort in drive.effort)
-        _exchange(bus, Drive(effort, (LOWERING_DAMPING,) * len(effort), True), time + period)
+        _exchange(bus, Drive(effort, (DAMPING,) * len(effort), True), time + period)
         if not all(_is_at_rest(time, joint, last) for joint, last in zip(bus.samples, rest, strict=True)):
             rest_since, rest = time, tuple(bus.samples)
     while bus.may_be_powered:

@@ -1,6 +1,6 @@
 """Requests to the operating system: nice values, precise timers, real-time threads, locked memory.
 
-Real-time threads and locked memory are options, off by default. A SCHED_FIFO thread runs at once, whatever else is
+Real-time threads and locked memory are an option, off by default. A SCHED_FIFO thread runs at once, whatever else is
 ready; but while other threads wait for its processor, Linux sometimes throttles it, on some kernels for up to 50 ms
 (measured, 6.18), which lets the arm down.
 """
@@ -27,20 +27,21 @@ def favour(priority: int) -> None:
         os.setpriority(os.PRIO_PROCESS, 0, -priority)
 
 
-def request_real_time(priority: int, lock_memory: bool) -> list[str]:
+def request_real_time(priority: int) -> list[str]:
     """Request real-time scheduling and locked memory; return one sentence for each request that was not permitted.
 
     priority: SCHED_FIFO priority for all threads of this process except the caller's. It includes the middleware's
-    threads, which deliver the messages. 0 leaves them unchanged.
+    threads, which deliver the messages. 0 requests nothing.
     """
-    refused = []
-    if priority:
-        try:
-            for thread in map(int, os.listdir("/proc/self/task")):
-                if thread != threading.get_native_id():
-                    os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
-        except PermissionError:
-            refused.append(f"thread_priority {priority} is not permitted: raise the rtprio limit in limits.conf")
-    if lock_memory and ctypes.CDLL(None).mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT):
-        refused.append("lock_memory is not permitted: raise the memlock limit in limits.conf")
+    refused: list[str] = []
+    if not priority:
+        return refused
+    try:
+        for thread in map(int, os.listdir("/proc/self/task")):
+            if thread != threading.get_native_id():
+                os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
+    except PermissionError:
+        refused.append(f"thread_priority {priority} is not permitted: raise the rtprio limit in limits.conf")
+    if ctypes.CDLL(None).mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT):
+        refused.append("locked memory is not permitted: raise the memlock limit in limits.conf")
     return refused

@@ -1,26 +1,40 @@
-"""The motors' frames in the format `mit`, and a motor on a joint.
+"""The motors' frames in every wire format, and a motor on a joint.
 
-Every code survives a round trip, no command is a special frame, and any bytes or numbers give a value within the wire
-range or a clear error.
+Every code survives a round trip, the scaling is the manual's, no frame has two meanings, and any bytes or numbers give
+a value within the wire range or a clear error.
 """
 
 from __future__ import annotations
 
 import math
+import pickle
 
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from exo_gravity.core.errors import FrameError, ParameterError
-from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MOTORS, SPECIAL_FRAMES, pack_command, pack_reply, unpack_command, unpack_reply
+from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, JointMotor, motors_of
+from exo_gravity.core.motors.specs import (
+    MOTORS,
+    SPECIAL_FRAMES,
+    MotorReply,
+    pack_command,
+    pack_reply,
+    unpack_command,
+    unpack_reply,
+)
+from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, FORMATS, MIT, MIT_V3, OTHER, REPLY
+from exo_gravity.core.params import values_of
+from exo_gravity.core.safety.params import CAN_BRIDGE
 
 AK60 = MOTORS["AK60-6"]
+V3_AK60, V3_AK80 = MIT_V3.ranged(AK60), MIT_V3.ranged(MOTORS["AK80-9"])
 SPECS = pytest.mark.parametrize("spec", MOTORS.values(), ids=MOTORS)
-COMMAND, REPLY = ("position", "velocity", "kp", "kd", "torque"), ("position", "velocity", "torque")
+OF_COMMAND, OF_REPLY = ("position", "velocity", "kp", "kd", "torque"), ("position", "velocity", "torque")
 SPECIAL_NUDGE = 3  # codes by which the torque is reduced at most if the command would spell a special frame
 LONGEST = 80  # bytes; CAN FD has up to 64
+IDS = frozenset((1, 2, 3, 126))
 
 seeded = settings(max_examples=200, derandomize=True, database=None, deadline=None)
 BYTES = st.binary(max_size=LONGEST) | st.binary(min_size=6, max_size=6) | st.binary(min_size=8, max_size=8)
@@ -34,6 +48,19 @@ def specs(draw):
     """A motor with its default ranges or with those of another firmware."""
     spec = draw(st.sampled_from(list(MOTORS.values())))
     return draw(st.just(spec) | st.builds(spec.with_ranges, st.floats(1.0, 100.0), st.floats(1.0, 100.0)))
+
+
+@st.composite
+def boards(draw):
+    """A format, and a motor with its ranges."""
+    return draw(st.tuples(st.just(MIT), specs()) | st.tuples(st.just(MIT_V3), st.sampled_from((V3_AK60, V3_AK80))))
+
+
+@st.composite
+def joints(draw):
+    board, spec = draw(boards())
+    mounting = draw(st.integers(1, 126)), draw(st.sampled_from((1, -1))), draw(st.floats(-9.0, 9.0))
+    return JointMotor(spec, *mounting, draw(st.floats(0.2, 2.0)), board)
 
 
 def bounds(spec, field):
@@ -54,45 +81,61 @@ def assert_within(spec, fields, values):
         assert low - 1e-9 * code <= value <= high + 1e-9 * code
 
 
-def scaled(spec, field, share):
-    low, high, _ = bounds(spec, field)
-    return min(high, max(low, (low + high) / 2.0 + share * (high - low) / 2.0))
+def scaled(spec, fields, shares):
+    """Values of `fields`: the shares -1..1 of their ranges."""
+    values = []
+    for field, share in zip(fields, shares, strict=True):
+        low, high, _ = bounds(spec, field)
+        values.append(min(high, max(low, (low + high) / 2.0 + share * (high - low) / 2.0)))
+    return values
 
 
 @seeded
-@given(specs(), st.tuples(*[NUMBERS] * 5))
-def test_any_numbers_give_a_command_of_8_bytes_or_an_error_that_names_the_field(spec, values):
-    inside = [bounds(spec, f)[0] <= v <= bounds(spec, f)[1] for f, v in zip(COMMAND, values, strict=True)]
+@given(boards(), st.tuples(*[NUMBERS] * 5))
+def test_any_numbers_give_a_command_of_8_bytes_or_an_error_that_names_the_field(board, values):
+    wire_format, spec = board
+    inside = [bounds(spec, f)[0] <= v <= bounds(spec, f)[1] for f, v in zip(OF_COMMAND, values, strict=True)]
     if all(inside):
-        assert len(pack_command(spec, *values)) == 8
+        assert len(wire_format.pack_command(spec, *values)) == 8
         return
     with pytest.raises(ParameterError) as caught:
-        pack_command(spec, *values)
-    assert caught.value.name == COMMAND[inside.index(False)]
+        wire_format.pack_command(spec, *values)
+    assert caught.value.name == OF_COMMAND[inside.index(False)]
 
 
 @seeded
-@given(specs(), st.tuples(*[SHARES] * 5))
-def test_a_command_survives_a_round_trip_within_half_a_code(spec, shares):
-    sent = [scaled(spec, field, share) for field, share in zip(COMMAND, shares, strict=True)]
-    data = pack_command(spec, *sent)
-    assert data not in SPECIAL_FRAMES
-    got = unpack_command(spec, data)
-    top = all(g >= bounds(spec, f)[1] - 1e-9 for f, g in zip(COMMAND[:4], got[:4], strict=True))
-    for field, wanted, value in zip(COMMAND, sent, got, strict=True):
-        codes = 0.5 + (SPECIAL_NUDGE if top and field == "torque" else 0)
+@given(boards(), st.tuples(*[SHARES] * 5), st.integers(1, MAX_CAN_ID))
+def test_a_command_survives_a_round_trip_within_half_a_code_and_is_a_command(board, shares, can_id):
+    wire_format, spec = board
+    sent = scaled(spec, OF_COMMAND, shares)
+    data = wire_format.pack_command(spec, *sent)
+    assert wire_format is MIT_V3 or data not in SPECIAL_FRAMES
+    got = wire_format.unpack_command(spec, data)
+    top = all(g >= bounds(spec, f)[1] - 1e-9 for f, g in zip(OF_COMMAND[:4], got[:4], strict=True))
+    for field, wanted, value in zip(OF_COMMAND, sent, got, strict=True):
+        codes = 0.5 + (SPECIAL_NUDGE if wire_format is MIT and top and field == "torque" else 0)
         assert abs(value - wanted) <= (codes + 1e-6) * bounds(spec, field)[2]
+    if data[0] != can_id:  # in the format mit only if the position is not 0: JointMotor never sends such a command
+        assert wire_format.classify(wire_format.command_id(can_id), data, frozenset((can_id,))) == (COMMAND, can_id)
 
 
 @seeded
-@given(specs(), st.tuples(*[SHARES] * 3), st.integers(0, 255), st.integers(-40, 215) | st.none(), st.integers(0, 255))
-def test_a_reply_survives_a_round_trip_within_half_a_code(spec, shares, motor_id, temperature, error):
-    sent = [scaled(spec, field, share) for field, share in zip(REPLY, shares, strict=True)]
-    got = unpack_reply(spec, pack_reply(spec, motor_id, *sent, temperature, error))
-    assert (got.motor_id, got.temperature) == (motor_id, temperature)
-    assert got.error == (None if temperature is None else error)
-    for field, wanted, value in zip(REPLY, sent, got[1:4], strict=True):
-        assert abs(value - wanted) <= (0.5 + 1e-6) * bounds(spec, field)[2]
+@given(boards(), st.tuples(*[SHARES] * 3), st.integers(1, MAX_CAN_ID), st.integers(-40, 127), st.integers(0, 255))
+def test_a_reply_survives_a_round_trip_and_is_a_reply(board, shares, can_id, temperature, error):
+    wire_format, spec = board
+    sent = MotorReply(can_id, *scaled(spec, OF_REPLY, shares), temperature, error)
+    data = wire_format.pack_reply(spec, sent)
+    got = wire_format.unpack_reply(spec, can_id, data)
+    assert (got.motor_id, got.temperature, got.error) == (can_id, temperature, error)
+    for field, wanted, value in zip(OF_REPLY, sent[1:4], got[1:4], strict=True):
+        assert abs(value - wanted) <= ((0.5 + 1e-6) * bounds(spec, field)[2] if wire_format is MIT else 0.02)
+    reply_id = can_id if wire_format is MIT else MIT_V3.status_id(can_id)
+    assert wire_format.classify(reply_id, data, frozenset((can_id,))) == (REPLY, can_id)
+
+
+@pytest.mark.parametrize("temperature", [-40, 215])
+def test_a_reply_of_a_v1_board_has_any_temperature_of_a_byte(temperature):
+    assert unpack_reply(AK60, pack_reply(AK60, 255, 0.0, 0.0, 0.0, temperature, 0)).temperature == temperature
 
 
 @seeded
@@ -104,20 +147,21 @@ def test_any_bytes_decode_to_a_reply_within_range_or_an_error_that_shows_them(sp
         assert len(data) not in (6, 8) and error.data == data
         return
     assert len(data) in (6, 8) and 0 <= reply.motor_id <= 255
-    assert_within(spec, REPLY, reply[1:4])
+    assert_within(spec, OF_REPLY, reply[1:4])
     assert (reply.temperature is None) == (reply.error is None) == (len(data) == 6)
 
 
 @seeded
-@given(specs(), BYTES | st.sampled_from(SPECIAL_FRAMES))
-def test_any_bytes_decode_to_a_command_within_range_or_an_error_that_shows_them(spec, data):
+@given(boards(), BYTES | st.sampled_from(SPECIAL_FRAMES))
+def test_any_bytes_decode_to_a_command_within_range_or_an_error_that_shows_them(board, data):
+    wire_format, spec = board
     try:
-        command = unpack_command(spec, data)
+        command = wire_format.unpack_command(spec, data)
     except FrameError as error:
-        assert (len(data) != 8 or data in SPECIAL_FRAMES) and error.data == data
+        assert (len(data) != 8 or (wire_format is MIT and data in SPECIAL_FRAMES)) and error.data == data
         return
     assert len(data) == 8
-    assert_within(spec, COMMAND, command)
+    assert_within(spec, OF_COMMAND, command)
 
 
 @seeded
@@ -130,31 +174,33 @@ def test_decoded_bytes_are_packed_to_the_same_bytes(spec, data):
     assert pack_reply(spec, *reply) == data
 
 
-@st.composite
-def joints(draw):
-    return JointMotor(
-        draw(specs()),
-        draw(st.integers(1, 126)),
-        draw(st.sampled_from((1, -1))),
-        draw(st.floats(-9.0, 9.0)),
-        draw(st.floats(0.2, 2.0)),
-    )
+@seeded
+@given(boards(), st.integers(0, 2047) | st.integers(0, 0x2FFF).map(lambda i: i | EXTENDED), st.binary(max_size=64))
+def test_any_frame_is_a_reply_that_can_be_read_or_a_command_or_neither(board, frame_id, data):
+    wire_format, spec = board
+    assume((frame_id >= EXTENDED) is wire_format.is_extended)
+    kind, can_id = wire_format.classify(frame_id, data, IDS)
+    assert (kind, can_id) == (OTHER, 0) or (kind in (REPLY, COMMAND) and can_id in IDS)
+    if kind == REPLY:
+        assert all(map(math.isfinite, wire_format.unpack_reply(spec, can_id, data)[1:4]))
 
 
 @seeded
 @given(joints(), NUMBERS, NUMBERS)
-def test_a_joint_packs_any_effort_without_stiffness_or_rejects_it(motor, effort, damping):
+def test_a_joint_at_rest_gets_any_effort_without_stiffness_within_its_range_or_rejects_it(motor, effort, damping):
+    spec = motor.spec
     try:
-        command = unpack_command(motor.spec, motor.command(effort, damping))
+        command = motor.wire_format.unpack_command(spec, motor.command(effort, damping))
     except ParameterError:
-        assert not (math.isfinite(effort) and abs(effort) < 1e100 and 0.0 <= damping <= motor.spec.kd_max)
+        assert not (math.isfinite(effort) and abs(effort) < 1e100 and 0.0 <= damping <= spec.kd_max)
         return
-    assert_within(motor.spec, COMMAND, command)
-    kd = min(damping / motor.torque_scale, motor.spec.kd_max)
-    assert command.kp == 0.0 and abs(command.kd - kd) <= bounds(motor.spec, "kd")[2]
+    assert_within(spec, OF_COMMAND, command)
+    kd = min(damping / motor.torque_scale, spec.kd_max)
+    assert command.kp == 0.0 and abs(command.kd - kd) <= bounds(spec, "kd")[2]
     torque = motor.direction * effort / motor.torque_scale
-    slack = (1.5 + kd) * max(bounds(motor.spec, field)[2] for field in ("torque", "velocity"))
-    assert abs(command.torque - max(-motor.spec.torque_range, min(motor.spec.torque_range, torque))) <= slack
+    applied = command.torque + command.kd * command.velocity  # at rest
+    slack = 1.5 * bounds(spec, "torque")[2] + command.kd * bounds(spec, "velocity")[2]
+    assert abs(applied - max(-spec.torque_range, min(spec.torque_range, torque))) <= slack
 
 
 @seeded
@@ -163,34 +209,45 @@ def test_a_joint_decodes_any_bytes_to_finite_numbers_or_rejects_them(motor, data
     try:
         reply = motor.joint_reply(data)
     except FrameError:
-        assert len(data) not in (6, 8)
+        assert len(data) not in ((6, 8) if motor.wire_format is MIT else (8,))
         return
     assert all(map(math.isfinite, reply[1:4]))
-    assert abs(reply.position) <= motor.spec.position_range + abs(motor.zero) + 1e-9
+    limit = motor.spec.position_range if motor.wire_format is MIT else math.radians(0.1) * 0x8000
+    assert abs(reply.position) <= limit + abs(motor.zero) + 1e-9
 
 
 @seeded
 @given(joints(), st.floats(-3.0, 3.0))
-def test_a_joint_angle_survives_a_round_trip_within_one_code(motor, angle):
-    data = pack_reply(motor.spec, motor.can_id, motor.motor_position(angle), 0.0, 0.0)
-    assert motor.joint_reply(data).position == pytest.approx(angle, abs=bounds(motor.spec, "position")[2])
+def test_a_joint_angle_survives_a_round_trip(motor, angle):
+    reply = MotorReply(motor.can_id, motor.motor_position(angle), 0.0, 0.0, 30, 0)
+    got = motor.joint_reply(motor.wire_format.pack_reply(motor.spec, reply))
+    assert got.position == pytest.approx(angle, abs=0.001)
 
 
-def command_word(**codes) -> bytes:
-    """A command built from the manual's table, independent of the code under test."""
-    bits = "".join(f"{codes[name]:0{width}b}" for name, width in LAYOUT)
-    return int(bits, 2).to_bytes(8, "big")
+def test_a_reversed_motor_has_reversed_angle_and_torque():
+    motor = JointMotor(AK60, 1, direction=-1, zero=0.5, torque_scale=0.75)
+    commanded = unpack_command(AK60, motor.command(1.5, 0.0)).torque
+    assert commanded == pytest.approx(-2.0, abs=0.004)
+    reply = motor.joint_reply(pack_reply(AK60, 1, 0.2, 1.0, commanded))
+    assert reply[1:4] == pytest.approx((0.3, -1.0, 1.5), abs=0.02)
 
 
-LAYOUT = (("position", 16), ("velocity", 12), ("kp", 12), ("kd", 12), ("torque", 12))
+@SPECS
+def test_damping_alone_does_not_push_an_arm_at_rest(spec):
+    command = unpack_command(spec, JointMotor(spec, 1).command(0.0, 5.0))
+    assert abs(command.torque + command.kd * command.velocity) < spec.torque_range / 4095 * 1.01
+
+
+LAYOUT = (("position", 16), ("velocity", 12), ("kp", 12), ("kd", 12), ("torque", 12))  # as in the manual's table
 
 
 @SPECS
 @pytest.mark.parametrize(("field", "width"), LAYOUT)
 def test_every_code_of_every_command_field_survives_unpack_and_pack(spec, field, width):
-    middle = {"position": 0x1234, "velocity": 0x567, "kp": 0x89A, "kd": 0xBC, "torque": 0xDEF}
-    for code in range(1 << width):
-        data = command_word(**{**middle, field: code})
+    codes = {"position": 0x1234, "velocity": 0x567, "kp": 0x89A, "kd": 0xBC, "torque": 0xDEF}
+    for codes[field] in range(1 << width):
+        bits = "".join(f"{codes[name]:0{size}b}" for name, size in LAYOUT)
+        data = int(bits, 2).to_bytes(8, "big")
         assert pack_command(spec, *unpack_command(spec, data)) == data
 
 
@@ -199,8 +256,7 @@ def test_every_code_of_every_command_field_survives_unpack_and_pack(spec, field,
 def test_every_code_of_every_reply_field_survives_unpack_and_pack(spec, offset, width):
     for code in range(1 << width):
         data = (5 << 40 | (0x123456789 & ~(((1 << width) - 1) << offset)) | code << offset).to_bytes(6, "big")
-        reply = unpack_reply(spec, data)
-        assert pack_reply(spec, reply.motor_id, reply.position, reply.velocity, reply.torque) == data
+        assert pack_reply(spec, *unpack_reply(spec, data)) == data
 
 
 @pytest.mark.parametrize("codes_below_top", [1, 2, 3])
@@ -217,21 +273,6 @@ def test_a_reply_out_of_range_or_not_finite_is_rejected(value):
         pack_reply(AK60, 1, value, 0.0, 0.0)
 
 
-def test_a_reversed_motor_has_reversed_angle_and_torque():
-    motor = JointMotor(AK60, 1, direction=-1, zero=0.5, torque_scale=0.75)
-    assert motor.joint_position(0.2) == pytest.approx(0.3)
-    assert motor.motor_position(motor.joint_position(0.2)) == pytest.approx(0.2)
-    commanded = unpack_command(AK60, motor.command(1.5, 0.0)).torque
-    assert commanded == pytest.approx(-2.0, abs=0.004)
-    assert motor.joint_effort(commanded) == pytest.approx(1.5, abs=0.003)
-
-
-@pytest.mark.parametrize("spec", MOTORS.values(), ids=MOTORS)
-def test_damping_alone_does_not_push_an_arm_at_rest(spec):
-    command = unpack_command(spec, JointMotor(spec, 1).command(0.0, 5.0))
-    assert abs(command.torque + command.kd * command.velocity) < spec.torque_range / 4095 * 1.01
-
-
 @pytest.mark.parametrize(
     ("field", "value"),
     [("can_id", 0), ("can_id", 127), ("direction", 0), ("zero", 11.0), ("zero", math.nan), ("torque_scale", 0.0)],
@@ -240,3 +281,60 @@ def test_an_impossible_motor_is_rejected_by_name(field, value):
     with pytest.raises(ParameterError) as caught:
         JointMotor(AK60, **{"can_id": 1, field: value})
     assert caught.value.name == field
+
+
+def test_a_v3_command_has_the_bytes_worked_out_by_hand():
+    # kp 0, kd 4095/4095, position 0 -> 32767.5 -> 32768, velocity 0 -> 2047.5 -> 2048, torque 12 -> 4095
+    assert MIT_V3.pack_command(V3_AK60, 0.0, 0.0, 0.0, 5.0, 12.0) == bytes.fromhex("000fff8000800fff")
+    assert MIT_V3.command_id(0x7E) == EXTENDED | 0x87E
+
+
+def test_a_v3_status_frame_has_the_values_worked_out_by_hand():
+    # 90.0 deg, 840 x 10 electrical rpm / 14 pole pairs / gear 6 = 100 rpm, -2 A x 3 Nm / 7.4 A, -5 degC, error 7
+    data = bytes.fromhex("0384 0348 ff38 fb 07")
+    reply = MIT_V3.unpack_reply(V3_AK60, 3, data)
+    assert reply[:3] == (3, pytest.approx(math.pi / 2), pytest.approx(100.0 * 2.0 * math.pi / 60.0))
+    assert reply[3:] == (pytest.approx(-2.0 * 3.0 / 7.4), -5, 7)
+    assert MIT_V3.status_id(3) == EXTENDED | 0x2903
+    assert MIT_V3.unpack_reply(V3_AK80, 3, data).velocity == pytest.approx(8400.0 / 21 / 9 * 2.0 * math.pi / 60.0)
+
+
+def test_a_v3_board_is_switched_off_by_a_current_of_0():
+    assert MIT_V3.exit(5) == ((EXTENDED | 0x105, bytes(4)),)
+    assert MIT_V3.enter(5) == MIT_V3.set_zero(5) == ()
+
+
+@pytest.mark.parametrize("mode", range(16))
+def test_a_frame_of_any_control_mode_is_a_command_to_a_v3_board(mode):
+    assert MIT_V3.classify(EXTENDED | mode << 8 | 2, bytes(4), IDS) == (COMMAND, 2)
+    assert MIT_V3.classify(EXTENDED | mode << 8 | 9, bytes(4), IDS) == (OTHER, 0)
+
+
+@pytest.mark.parametrize("length", [0, 7, 9])
+def test_a_v3_status_frame_of_another_length_is_none(length):
+    assert MIT_V3.classify(MIT_V3.status_id(1), bytes(length), IDS) == (OTHER, 0)
+
+
+def test_a_motor_keeps_its_wire_format_on_the_way_to_the_watchdog():
+    for board in FORMATS.values():
+        motor = JointMotor(board.ranged(MOTORS["AK80-9"]), 4, wire_format=board)
+        assert pickle.loads(pickle.dumps(motor)) == motor
+
+
+def parameters(**given: object) -> dict[str, object]:
+    return values_of(CAN_BRIDGE, {"can.interface": "virtual", "can.channel": "c", **given})
+
+
+def test_each_joint_has_the_ranges_of_its_own_wire_format():
+    motors = motors_of(parameters(wire_format=["mit", "mit_v3", "mit_v3", "mit"]))
+    assert [motor.wire_format.name for motor in motors] == ["mit", "mit_v3", "mit_v3", "mit"]
+    assert [motor.spec.torque_range for motor in motors] == [15.0, 18.0, 12.0, 15.0]
+    assert [motor.spec.velocity_range for motor in motors] == [45.0, 65.0, 60.0, 45.0]
+    assert motors_of(parameters(torque_per_ampere=[0.5, 0.0, 0.0, 0.0]))[0].spec.torque_per_ampere == 0.5
+
+
+def test_the_torque_range_of_a_v1_board_is_refused_for_a_v3_board():
+    given = {"wire_format": ["mit_v3"] * 4, "torque_range": [15.0, 0.0, 0.0, 0.0]}
+    with pytest.raises(ParameterError, match=r"torque_range = 15\.0: must be 12 or 0 for an AK60-6 with wire_format"):
+        motors_of(parameters(**given))
+    assert motors_of(parameters(**{**given, "torque_range": [9.0, 0.0, 0.0, 0.0]}))[0].spec.torque_range == 9.0

@@ -8,18 +8,18 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import can
-
 from exo_gravity.core.model.gravity import gravity_torque
-from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import ENTER, MOTORS
+from exo_gravity.core.motors.specs import ENTER
+from exo_gravity.core.motors.wire_formats import MIT
 from exo_gravity.core.safety.limits import Limits
+from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.ownership.handover import ArmOnBus
-from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
+from exo_gravity.sim import ArmConfig
 
 from ..support.ports import own_ports
+from ..support.simulated_device import joints_of, make_device
 
-MOTORS_OF_ARM = tuple(JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1))
+MOTORS_OF_ARM = joints_of((MIT,) * 4)
 LIMITS = Limits(("a", "b", "c", "d"), (-1.6,) * 4, (3.1,) * 4, (6.0,) * 4, (3.0, 9.0, 3.0, 3.0))
 PERIOD = 0.004
 POSE = (0.0, 0.6, 0.3, 0.3)
@@ -29,11 +29,45 @@ AFTER_EXIT = 0.5  # s for which a joint that was dropped would turn
 _PORTS = own_ports(30_000)
 
 
-class SimulatedRig:
-    """An arm on a bus of its own. It starts at rest in `pose`.
+class Rig:
+    """A simulated arm at rest in `pose`. carried: its motors are on and hold it, as if a dead process had left them.
 
-    interface: 'virtual', or 'udp_multicast' to share it with processes. carried: its motors are on and hold it, as if a
-    dead process had left them. top_speed: rad/s, the largest true speed of a joint so far.
+    carrying: (4,) Nm, what holds it in `POSE`. top_speed: rad/s, the largest true speed of a joint so far.
+    """
+
+    def __init__(self, friction: float, pose: Sequence[float], carried: bool, clock: Clock) -> None:
+        config = ArmConfig(coulomb_friction=(friction,) * 4)
+        self.clock = clock
+        self.device = make_device(config=config)
+        self.device.arm.reset(pose)
+        self.links = config.links
+        self.carrying = tuple(gravity_torque(self.links, POSE))
+        self.top_speed = 0.0
+        if carried:
+            for joint, torque in zip(MOTORS_OF_ARM, self.carrying, strict=True):
+                self.device.exchange(joint.can_id, joint.command(torque, 0.0))
+                self.device.exchange(joint.can_id, ENTER)
+
+    @property
+    def motors_on(self) -> list[bool]:
+        """Whether each motor is on."""
+        return [motor.entered for motor in self.device.motors]
+
+    def note_speed(self, _now: float = 0.0) -> None:
+        self.top_speed = max(self.top_speed, *map(abs, self.device.arm.velocities))
+
+    def assert_let_down(self) -> None:
+        """The motors are off, and no joint turned fast, not even once nothing held it."""
+        assert self.motors_on == [False] * 4
+        self.clock.sleep(AFTER_EXIT)
+        assert self.top_speed < SAFE_SPEED
+        assert abs(self.device.arm.positions[1]) < 0.4  # from 0.6
+
+
+class SimulatedRig(Rig):
+    """A simulated arm on a bus of its own, in real time.
+
+    interface: 'virtual', or 'udp_multicast' to share it with processes.
     """
 
     def __init__(
@@ -46,42 +80,12 @@ class SimulatedRig:
             channel, options = "239.74.163.2", {"port": port, "hop_limit": 0}
         else:
             channel = f"simulated_rig_{port}"
-        config = ArmConfig(coulomb_friction=(friction,) * 4)
+        super().__init__(friction, pose, carried, COMPUTER_CLOCK)
         self.arm = ArmOnBus((interface, channel, options), MOTORS_OF_ARM, LIMITS, PERIOD)
-        self.device = SimulatedDevice(SimulatedArm(config), [SimulatedMotor(joint) for joint in MOTORS_OF_ARM])
-        self.device.arm.reset(pose)
-        self.carrying = tuple(gravity_torque(config.links, pose))  # Nm that hold the arm
-        if carried:
-            self._switch_on()
-        self.top_speed = 0.0
         self._stop = threading.Event()
         self._bus = self.arm.open()
-        self._thread = threading.Thread(target=self.device.run, args=(self._bus, self._stop.is_set, self._look))
+        self._thread = threading.Thread(target=self.device.run, args=(self._bus, self._stop.is_set, self.note_speed))
         self._thread.start()
-
-    def _look(self, _now: float) -> None:
-        self.top_speed = max(self.top_speed, *map(abs, self.device.arm.velocities))
-
-    def open(self) -> can.BusABC:
-        """Open another end of the bus."""
-        return self.arm.open()
-
-    def _switch_on(self) -> None:
-        for joint, torque in zip(MOTORS_OF_ARM, self.carrying, strict=True):
-            self.device.exchange(joint.can_id, joint.command(torque, 0.0))
-            self.device.exchange(joint.can_id, ENTER)
-
-    @property
-    def motors_on(self) -> list[bool]:
-        """Whether each motor is on."""
-        return [motor.entered for motor in self.device.motors]
-
-    def assert_let_down(self) -> None:
-        """The motors are off, and no joint turned fast, not even once nothing held it."""
-        assert self.motors_on == [False] * 4
-        time.sleep(AFTER_EXIT)
-        assert self.top_speed < SAFE_SPEED
-        assert abs(self.device.arm.positions[1]) < 0.4  # from 0.6
 
     def close(self) -> None:
         self._stop.set()

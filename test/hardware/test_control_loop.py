@@ -192,7 +192,7 @@ def test_foreign_commands_are_opposed_at_once_and_the_arm_is_let_down(data: byte
     assert "another sender commands motor 2" in arm.safety.fault.reason
     arm.run(1.0)
     assert arm.safety.state is State.LETTING_DOWN
-    assert arm.rig.played.top_speed < OPPOSED_SPEED
+    assert arm.rig.top_speed < OPPOSED_SPEED
 
 
 @pytest.mark.parametrize("echoes", [False, True])

@@ -51,7 +51,7 @@ def test_a_motor_that_has_lost_its_power_is_not_pushed_by_the_noted_torque():
     """The operator cut the supply: the motors are off, and the arm hangs."""
     rig = VirtualRig(pose=NOTHING, carried=False)
     assert let_down_of(rig, Drive((0.0, 6.0, 2.0, 1.0), NOTHING, True))
-    assert rig.played.top_speed < 0.01
+    assert rig.top_speed < 0.01
     assert rig.motors_on == [False] * 4
 
 

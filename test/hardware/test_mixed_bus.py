@@ -11,7 +11,6 @@ import can
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.motors.specs import ENTER, EXIT, MotorReply
 from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, MIT, MIT_V3, WireFormat
 from exo_gravity.core.safety.drive import NOTHING, OFF, Drive
@@ -19,13 +18,12 @@ from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedDevice
 
 from ..support.simulated_device import joints_of, make_device
+from .test_motor_bus import WEIGHTLESS, now
 from .virtual_time import Wire, wire_for_test
 
 MIXED = (MIT, MIT_V3, MIT_V3, MIT)
 V3 = (MIT_V3,) * 4
 ON = Drive((0.0, 0.5, 0.4, 0.0), NOTHING, True)
-LINKS = ArmConfig().links
-WEIGHTLESS = ArmModel(LINKS.length, LINKS.cog, LINKS.mass, gravity=0.0)
 
 
 @pytest.fixture
@@ -56,10 +54,6 @@ def start(wire: Wire) -> Callable[..., SimulatedDevice]:
 
 def motor_bus(wire: Wire, formats: tuple[WireFormat, ...]) -> MotorBus:
     return MotorBus(wire.open(), joints_of(formats), clock=wire.clock)
-
-
-def now(bus: MotorBus) -> float:
-    return bus.clock.monotonic()
 
 
 def sent(bus: can.BusABC) -> list[tuple[int, bytes]]:

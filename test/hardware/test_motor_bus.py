@@ -6,7 +6,7 @@ In virtual time, or on the bus that EXO_TEST_CAN_INTERFACE and EXO_TEST_CAN_CHAN
 import can
 import pytest
 
-from exo_gravity.core.errors import BusError, ParameterError
+from exo_gravity.core.errors import BusError
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, SET_ZERO, pack_reply, unpack_command
@@ -144,11 +144,6 @@ def test_a_late_reply_does_not_count_for_the_next_cycle(bus, other):
     for can_id in (1, 2, 3, 4):
         other.send(frame(can_id, bytes((can_id,)) + REPLY[1:]))
     assert not bus.exchange(OFF, now(bus))
-
-
-def test_two_joints_with_the_same_id_are_refused(wire):
-    with pytest.raises(ParameterError, match="4 different IDs"):
-        MotorBus(wire.open(), [JointMotor(AK60, 1)] * 4)
 
 
 def test_the_error_for_a_bus_that_cannot_be_opened_names_it():

@@ -14,24 +14,20 @@ from collections import Counter
 import can
 import pytest
 
-from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, SET_ZERO
+from exo_gravity.core.motors.specs import ENTER, EXIT, SET_ZERO
 from exo_gravity.core.safety.drive import OFF
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.hardware.can.motor_bus import TRIAL, MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 
+from .test_motor_bus import MOTORS_OF_ARM as JOINTS
+from .test_motor_bus import WEIGHTLESS
 from .virtual_time import Responder, Wire, message_of
 
-MOUNTED = (("AK60-6", 1, 0.0), ("AK80-9", -1, 0.4), ("AK60-6", 1, -0.2), ("AK60-6", 1, 0.0))
-JOINTS = tuple(JointMotor(MOTORS[name], n, *mounted) for n, (name, *mounted) in enumerate(MOUNTED, 1))
 IDS = {joint.can_id for joint in JOINTS}
 MASTER = 0
 POSE = (0.1, 0.2, 0.3, 0.4)
 POSITION_CODE = 25.0 / 65535
-LINKS = ArmConfig().links
-WEIGHTLESS = ArmModel(LINKS.length, LINKS.cog, LINKS.mass, gravity=0.0)
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 FRAMES = 100_000  # in total
 BURST = 10  # frames before each reply

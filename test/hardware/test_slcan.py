@@ -5,14 +5,13 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import can
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.motors.specs import MotorReply
 from exo_gravity.core.motors.wire_formats import ID_BITS, MIT, MIT_V3
 from exo_gravity.core.safety.drive import NOTHING, OFF, Drive
@@ -22,14 +21,14 @@ from exo_gravity.sim import ArmConfig, Firmware, SimulatedDevice
 
 from ..support.fake_slcan import FakeSlcan
 from ..support.simulated_device import joints_of, make_device
+from .simulated_rig import wait_until
+from .test_motor_bus import WEIGHTLESS
 
 MIXED = (MIT, MIT_V3, MIT_V3, MIT)
 OPTIONS = {"bitrate": 1_000_000, "sleep_after_open": 0.01, "timeout": 0.0002}
 POSE = (0.1, 0.2, 0.3, 0.4)
 FIRST_FRAMES = 8  # to motors that are off: a command and EXIT for each
 ON = Drive((0.0, 0.5, 0.4, 0.0), NOTHING, True)
-LINKS = ArmConfig().links
-WEIGHTLESS = ArmModel(LINKS.length, LINKS.cog, LINKS.mass, gravity=0.0)
 CHANNELS = itertools.count()
 
 
@@ -123,10 +122,3 @@ def test_an_acknowledgement_does_not_hide_late_replies_which_are_not_taken_for_n
         wait_until(lambda: adapter.unread >= unread + lengths)
         assert not motors.exchange(OFF, time.monotonic())
     assert all(sample.time > 0.0 for sample in motors.samples)
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + 10.0
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.001)

@@ -1,6 +1,7 @@
-"""The watchdog's process: after the bridge has died, its arm is let down, whatever else died or froze.
+"""The watchdog's process: after the bridge has died, its arm is let down, whatever else froze.
 
-What it decides, and how it lets the arm down, is tested in virtual time: test_watchdog_decisions.py.
+What it decides, and how it lets the arm down, is tested in virtual time: test_watchdog_decisions.py. What happens after
+both have died: test_bus_lock.py in virtual time, nodes/test_bridge_death.py with processes.
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ import pytest
 from exo_gravity.core.errors import BusError
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
 from exo_gravity.hardware.ownership.bus_lock import BusLock
-from exo_gravity.hardware.ownership.owned_bus import OwnedBus
 from exo_gravity.hardware.ownership.watchdog import Watchdog
 
 from .simulated_rig import SimulatedRig, wait_until
@@ -111,21 +111,6 @@ def test_a_full_pipe_of_the_log_does_not_delay_the_watchdog(rig, carry):
     wait_until(lambda: not is_running(carrier.watchdog))
     os.close(reader)
     os.close(writer)
-    rig.assert_let_down()
-
-
-def test_after_bridge_and_watchdog_were_killed_the_next_owner_lets_the_arm_down_first(rig, carry):
-    carrier = carry()
-    os.kill(carrier.watchdog, signal.SIGSTOP)
-    carrier.kill()
-    os.kill(carrier.watchdog, signal.SIGKILL)
-    carrier.process.wait(5)
-    wait_until(lambda: not is_running(carrier.watchdog))
-    assert rig.motors_on == [True] * 4
-    log: list[str] = []
-    owned = OwnedBus(rig.arm, "the next owner", log.append)
-    owned.close()
-    assert log[-1] == "the arm is down, its motors are off"
     rig.assert_let_down()
 
 

@@ -10,15 +10,13 @@ import can
 
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.motors.joint_motor import peaks_of
-from exo_gravity.core.motors.specs import ENTER
 from exo_gravity.core.safety.drive import NOTHING, Drive, State
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop, EffortCommand
 from exo_gravity.hardware.ownership.handover import ArmOnBus
-from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 
-from .simulated_rig import AFTER_EXIT, LIMITS, MOTORS_OF_ARM, POSE, SAFE_SPEED
+from .simulated_rig import LIMITS, MOTORS_OF_ARM, POSE, Rig
 from .virtual_time import Wire
 
 CYCLE = 0.008  # s
@@ -35,38 +33,21 @@ class VirtualArm(ArmOnBus):
         return self.wire.open()
 
 
-class VirtualRig:
-    """An arm at rest in `pose`. carried: its motors are on and hold it, as if a dead process had left them.
-
-    carrying: (4,) Nm, what holds it in `POSE`.
-    """
+class VirtualRig(Rig):
+    """A simulated arm on a wire in virtual time."""
 
     def __init__(
         self, friction: float = 0.1, pose: Sequence[float] = POSE, carried: bool = True, echoes: bool = False
     ) -> None:
-        config = ArmConfig(coulomb_friction=(friction,) * 4)
-        self.device = SimulatedDevice(SimulatedArm(config), [SimulatedMotor(joint) for joint in MOTORS_OF_ARM])
-        self.device.arm.reset(pose)
-        self.carrying = tuple(gravity_torque(config.links, POSE))
-        if carried:
-            for joint, torque in zip(MOTORS_OF_ARM, self.carrying, strict=True):
-                self.device.exchange(joint.can_id, joint.command(torque, 0.0))
-                self.device.exchange(joint.can_id, ENTER)
         self.wire = Wire(echoes=echoes)
-        self.clock = self.wire.clock
-        self.played = self.wire.play(self.device)
+        super().__init__(friction, pose, carried, self.wire.clock)
+        self.wire.play(self.device, self.note_speed)
         self.arm = VirtualArm(("wire", "in virtual time", {}), MOTORS_OF_ARM, LIMITS, CYCLE, self.wire)
-        self._links = config.links
 
     @property
     def drive(self) -> Drive:
         """What holds the arm in `POSE`."""
         return Drive(self.carrying, NOTHING, True)
-
-    @property
-    def motors_on(self) -> list[bool]:
-        """Whether each motor is on."""
-        return [motor.entered for motor in self.device.motors]
 
     @property
     def is_raised(self) -> bool:
@@ -77,16 +58,9 @@ class VirtualRig:
     def raising(self) -> tuple[float, ...]:
         """Return the torque (4,) in Nm that carries the arm where it is, and moves it to `POSE`."""
         arm = self.device.arm
-        carrying = gravity_torque(self._links, arm.positions)
+        carrying = gravity_torque(self.links, arm.positions)
         columns = zip(carrying, POSE, arm.positions, arm.velocities, strict=True)
         return tuple(effort + 4.0 * (to - angle) - 1.0 * speed for effort, to, angle, speed in columns)
-
-    def assert_let_down(self) -> None:
-        """The motors are off, and no joint turned fast, not even once nothing held it."""
-        assert self.motors_on == [False] * 4
-        self.clock.sleep(AFTER_EXIT)
-        assert self.played.top_speed < SAFE_SPEED
-        assert abs(self.device.arm.positions[1]) < 0.4  # from 0.6
 
 
 class Carried:
@@ -107,7 +81,7 @@ class Carried:
         self.run_until(lambda: self.safety.fault or self.rig.is_raised)
         assert self.safety.state is State.ACTIVE, self.safety.fault
         self._is_raised = True
-        self.rig.played.top_speed = 0.0
+        self.rig.top_speed = 0.0
 
     def _get_efforts(self, latest: float) -> EffortCommand:
         if self.failure_of_efforts:

@@ -124,11 +124,10 @@ class Responder:
 
 
 class Played:
-    """A simulated device on `wire`. top_speed: rad/s, the largest true speed of a joint so far."""
+    """A simulated device on `wire`; `look` is called after every step of it."""
 
-    def __init__(self, wire: Wire, device: SimulatedDevice) -> None:
-        self.top_speed = 0.0
-        self._wire, self._device = wire, device
+    def __init__(self, wire: Wire, device: SimulatedDevice, look: Callable[[], None]) -> None:
+        self._wire, self._device, self._look = wire, device, look
         self._last = wire.clock.monotonic()
         self._random = random.Random(0)
         wire.ends.append(self)
@@ -157,7 +156,7 @@ class Played:
         now = self._wire.clock.monotonic()
         self._device.advance(now - self._last)
         self._last = now
-        self.top_speed = max(self.top_speed, *map(abs, self._device.arm.velocities))
+        self._look()
 
 
 class Wire:
@@ -184,9 +183,9 @@ class Wire:
         self.ends.append(bus)
         return bus
 
-    def play(self, device: SimulatedDevice) -> Played:
-        """Connect a simulated device."""
-        return Played(self, device)
+    def play(self, device: SimulatedDevice, look: Callable[[], None] = lambda: None) -> None:
+        """Connect a simulated device; call `look` after every step of it."""
+        Played(self, device, look)
 
     def break_down(self, error: Exception) -> None:
         """Let every end that is open now raise `error` from now on."""

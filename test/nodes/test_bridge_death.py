@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import signal
-import time
 from collections.abc import Callable, Iterator
 
 import pytest
 
 from exo_gravity.tools import launcher
 
+from ..hardware.simulated_rig import wait_until
 from ..support.launched_nodes import NO_IMU, LaunchedNodes, children
 from ..support.ros_probe import RosProbe
 
@@ -31,7 +31,7 @@ def test_an_arm_whose_bridge_and_watchdog_were_killed_is_let_down_by_the_launche
     (watchdog,) = children(bridge)
     os.kill(watchdog, signal.SIGKILL)
     os.kill(bridge, signal.SIGKILL)
-    wait_until(lambda: nodes.have_ended)
+    wait_until(lambda: nodes.have_ended, 90.0)
     assert nodes.ended_node == ("/right/can_bridge", -signal.SIGKILL)
     assert nodes.launcher.maybe_powered == []
     assert any("the arm is down, its motors are off" in line for line in nodes.log)
@@ -44,13 +44,6 @@ def test_the_launcher_states_that_motors_may_still_be_powered(nodes, probe, monk
     (watchdog,) = children(nodes.process("can_bridge").pid)
     assert probe.set_parameters("simulator", fault__bus_silent=True).successful
     nodes.stopping.set()
-    wait_until(lambda: nodes.have_ended)
+    wait_until(lambda: nodes.have_ended, 90.0)
     assert nodes.launcher.maybe_powered == ["/right/can_bridge"]
     os.kill(watchdog, signal.SIGKILL)  # it would try without end
-
-
-def wait_until(condition: Callable[[], object], timeout: float = 90.0) -> None:
-    end = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < end, "the condition did not hold in time"
-        time.sleep(0.05)

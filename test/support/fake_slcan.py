@@ -16,7 +16,6 @@ import select
 import sys
 import termios
 import threading
-import time
 import tty
 from pathlib import Path
 
@@ -110,20 +109,3 @@ class FakeSlcan:
 def _line(message: can.Message) -> bytes:
     head = f"T{message.arbitration_id:08X}" if message.is_extended_id else f"t{message.arbitration_id:03X}"
     return f"{head}{message.dlc}{bytes(message.data).hex().upper()}\r".encode()
-
-
-def main() -> None:
-    """Bridge a pseudo-terminal and a udp_multicast bus; arguments: path, channel, port, and times to (un)plug in s."""
-    path, channel, port, *times = sys.argv[1:]
-    with can.Bus(interface="udp_multicast", channel=channel, port=int(port), hop_limit=0) as bus:
-        adapter = FakeSlcan(Path(path), bus)
-        start = time.monotonic()
-        for index, moment in enumerate(map(float, times)):
-            time.sleep(max(0.0, start + moment - time.monotonic()))
-            (adapter.unplug, adapter.plug_in)[index % 2]()
-            print(f"{time.monotonic() - start:.1f} s: {('unplugged', 'plugged in')[index % 2]}", flush=True)
-        adapter.close()
-
-
-if __name__ == "__main__":
-    main()

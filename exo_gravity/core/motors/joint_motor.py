@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.bus_load import BITRATE, Traffic
-from exo_gravity.core.motors.specs import MOTORS, WIRE_RANGE_BOUNDS, MotorReply, MotorSpec, standstill
+from exo_gravity.core.motors.specs import MOTORS, WIRE_RANGE_BOUNDS, MotorReply, MotorSpec
 from exo_gravity.core.motors.wire_formats import FORMATS, MIT, Frame, WireFormat
 from exo_gravity.core.params import Param
 
@@ -20,8 +20,6 @@ from exo_gravity.core.params import Param
 # because their position is always 0. With IDs below 0x7f a command echoed by the bus cannot look like a reply.
 MAX_CAN_ID = 126
 TORQUE_SCALE_BOUNDS = (0.2, 2.0)
-
-
 OPTIONS = "can.options"  # parameters below this prefix go to python-can unchanged
 # python-can's interfaces that open a bus at another bit rate than the motors' unless they are given one.
 NEED_BITRATE = ("cantact", "gs_usb", "ixxat", "kvaser", "pcan", "slcan", "usb2can", "vector")
@@ -48,8 +46,8 @@ class JointMotor:
             raise ParameterError("can_id", self.can_id, f"a whole number from 1 to {MAX_CAN_ID}")
         if self.direction not in (1, -1):
             raise ParameterError("direction", self.direction, "1 or -1")
-        if not abs(self.zero) <= self.spec.position_range - math.pi:
-            limit = self.spec.position_range - math.pi
+        limit = self.spec.position_range - math.pi
+        if not abs(self.zero) <= limit:
             raise ParameterError("zero", self.zero, f"from {-limit:.2f} to {limit:.2f} rad, or the angle would wrap")
         low, high = TORQUE_SCALE_BOUNDS
         if not low <= self.torque_scale <= high:
@@ -97,7 +95,7 @@ class JointMotor:
         torque = self.direction * effort / self.torque_scale
         kd = min(damping / self.torque_scale, spec.kd_max)
         if kd:  # no code is exactly 0 rad/s: the nearest one would push with kd times its velocity
-            torque -= kd * standstill(spec)
+            torque -= kd * spec.standstill
         most = spec.torque_range
         if not -most <= torque <= most and math.isfinite(torque):
             torque = math.copysign(most, torque)
@@ -106,26 +104,14 @@ class JointMotor:
     def joint_reply(self, data: bytes | bytearray) -> MotorReply:
         """Return the content of a reply or status frame in the joint's rad, rad/s and Nm. Raises FrameError."""
         reply = self.wire_format.unpack_reply(self.spec, self.can_id, data)
-        return MotorReply(
-            reply.motor_id,
-            self.joint_position(reply.position),
-            self.direction * reply.velocity,
-            self.joint_effort(reply.torque),
-            reply.temperature,
-            reply.error,
-        )
-
-    def joint_position(self, motor_position: float) -> float:
-        """Return the joint angle in rad for a motor angle in rad."""
-        return self.direction * (motor_position - self.zero)
+        motor_id, position, velocity, torque, temperature, error = reply
+        sign = self.direction
+        torque = sign * torque * self.torque_scale
+        return MotorReply(motor_id, sign * (position - self.zero), sign * velocity, torque, temperature, error)
 
     def motor_position(self, joint_position: float) -> float:
         """Return the motor angle in rad for a joint angle in rad."""
         return self.direction * joint_position + self.zero
-
-    def joint_effort(self, motor_torque: float) -> float:
-        """Return the joint torque in Nm for a torque in the motor's Nm."""
-        return self.direction * motor_torque * self.torque_scale
 
 
 class Peaks(NamedTuple):
@@ -187,8 +173,7 @@ def _motor_of(given: Mapping[str, Any]) -> JointMotor:
     ranges = (given[name] or getattr(usual, name) for name in ("velocity_range", "torque_range"))
     per_ampere = given["torque_per_ampere"] or usual.torque_per_ampere
     spec = replace(usual.with_ranges(*ranges), torque_per_ampere=per_ampere)
-    can_id, direction, zero, scale = (given[name] for name in ("can_id", "direction", "zero", "torque_scale"))
-    return JointMotor(spec, can_id, direction, zero, scale, board)
+    return JointMotor(spec, *(given[name] for name in ("can_id", "direction", "zero", "torque_scale")), board)
 
 
 def traffic_of(values: Mapping[str, Any], options: Mapping[str, Any]) -> Traffic:

@@ -16,6 +16,7 @@ code is exactly 0 Nm.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 from exo_gravity.core.errors import FrameError, ParameterError
@@ -61,6 +62,12 @@ class MotorSpec:
     kp_max: float = 500.0
     kd_max: float = 5.0
 
+    @cached_property
+    def standstill(self) -> float:
+        """The velocity in rad/s that the motor decodes from a command of 0 rad/s."""
+        span = self.velocity_range
+        return from_code(to_code("velocity", 0.0, -span, span, 0xFFF), -span, span, 0xFFF)
+
     def with_ranges(self, velocity_range: float, torque_range: float) -> MotorSpec:
         """Return this motor with another firmware's wire ranges in rad/s and Nm, which no CAN message reports."""
         for name, value in (("velocity_range", velocity_range), ("torque_range", torque_range)):
@@ -70,9 +77,10 @@ class MotorSpec:
         return replace(self, velocity_range=velocity_range, torque_range=torque_range)
 
 
-_AK60 = MotorSpec("AK60-6", 45.0, 15.0, 3.0, 9.0, gear_ratio=6, pole_pairs=14, torque_per_ampere=3.0 / 7.4)
-_AK80 = MotorSpec("AK80-9", 50.0, 18.0, 9.0, 18.0, gear_ratio=9, pole_pairs=21, torque_per_ampere=9.0 / 10.3)
-MOTORS = {spec.name: spec for spec in (_AK60, _AK80)}
+MOTORS = {
+    "AK60-6": MotorSpec("AK60-6", 45.0, 15.0, 3.0, 9.0, gear_ratio=6, pole_pairs=14, torque_per_ampere=3.0 / 7.4),
+    "AK80-9": MotorSpec("AK80-9", 50.0, 18.0, 9.0, 18.0, gear_ratio=9, pole_pairs=21, torque_per_ampere=9.0 / 10.3),
+}
 
 
 class MotorCommand(NamedTuple):
@@ -184,12 +192,6 @@ def unpack_reply(spec: MotorSpec, data: bytes | bytearray) -> MotorReply:
         data[6] - 40 if len(data) == 8 else None,
         data[7] if len(data) == 8 else None,
     )
-
-
-def standstill(spec: MotorSpec) -> float:
-    """Return the velocity in rad/s that a motor decodes from a command of 0 rad/s."""
-    span = spec.velocity_range
-    return from_code(to_code("velocity", 0.0, -span, span, 0xFFF), -span, span, 0xFFF)
 
 
 def to_code(name: str, value: float, low: float, high: float, codes: int) -> int:

@@ -68,15 +68,9 @@ class WireFormat:
         """Return the arbitration ID of commands to a motor."""
         return motor_id
 
-    def pack_command(
-        self, spec: MotorSpec, position: float, velocity: float, kp: float, kd: float, torque: float
-    ) -> bytes:
-        """Return the data of a command: rad, rad/s, Nm/rad, Nm s/rad, Nm. Raises ParameterError beyond the ranges."""
-        return specs.pack_command(spec, position, velocity, kp, kd, torque)
-
-    def unpack_command(self, spec: MotorSpec, data: bytes | bytearray) -> MotorCommand:
-        """Return the content of a command. Raises FrameError."""
-        return specs.unpack_command(spec, data)
+    # Data of a command, as in `core.motors.specs`.
+    pack_command = staticmethod(specs.pack_command)
+    unpack_command = staticmethod(specs.unpack_command)
 
     def pack_reply(self, spec: MotorSpec, reply: MotorReply) -> bytes:
         """Return the data of a reply or status frame. Raises ParameterError on NaN or a value that does not fit."""
@@ -146,7 +140,8 @@ class V3Format(WireFormat):
 
     def pack_reply(self, spec: MotorSpec, reply: MotorReply) -> bytes:
         numbers = []
-        for name, value, step in zip(("position", "velocity", "torque"), reply[1:4], _steps(spec), strict=True):
+        steps = POSITION_STEP, _speed_step(spec), CURRENT_STEP * spec.torque_per_ampere
+        for name, value, step in zip(("position", "velocity", "torque"), reply[1:4], steps, strict=True):
             limit = 0x7FFF * step
             if not abs(value) <= limit:
                 raise ParameterError(name, value, f"from {-limit:g} to {limit:g}")
@@ -157,9 +152,8 @@ class V3Format(WireFormat):
         if len(data) != 8:
             raise FrameError(data, "a status frame of 8 bytes")
         position, speed, current, temperature, error = _STATUS.unpack(data)
-        rad, rad_per_s, newton_metres = _steps(spec)
-        reply = position * rad, speed * rad_per_s, current * newton_metres
-        return MotorReply(motor_id, *reply, temperature, error)
+        torque = current * (CURRENT_STEP * spec.torque_per_ampere)
+        return MotorReply(motor_id, position * POSITION_STEP, speed * _speed_step(spec), torque, temperature, error)
 
     def enter(self, motor_id: int) -> tuple[Frame, ...]:
         return ()  # a command does it
@@ -180,9 +174,9 @@ class V3Format(WireFormat):
         return (COMMAND, motor_id) if kind <= LAST_MODE else (OTHER, 0)
 
 
-def _steps(spec: MotorSpec) -> tuple[float, float, float]:
-    """Return the output's angle (rad), speed (rad/s) and torque (Nm) that one step of a status frame means."""
-    return POSITION_STEP, SPEED_STEP / (spec.pole_pairs * spec.gear_ratio), CURRENT_STEP * spec.torque_per_ampere
+def _speed_step(spec: MotorSpec) -> float:
+    """Return the output's speed in rad/s that one step of a status frame means."""
+    return SPEED_STEP / (spec.pole_pairs * spec.gear_ratio)
 
 
 MIT, MIT_V3 = WireFormat(), V3Format()

@@ -167,9 +167,7 @@ class SignCheck:
         self._next_joint()
 
     def step(self, dt: float, joints: Sequence[JointSample]) -> Fault | None:
-        """Advance by `dt` s with the joints' readings; return the fault that they show, if any."""
-        if self.done:
-            return None
+        """Advance by `dt` s with the joints' readings, until `done`; return the fault that they show, if any."""
         position = joints[self._joint].position
         if self._still_time < STILL_TIME:
             self._release(dt)

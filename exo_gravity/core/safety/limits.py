@@ -29,14 +29,12 @@ WALL_DAMPING = 5.0  # Nm s/rad, from WALL_EDGE on
 WALL_EDGE = 0.02  # rad into the wall over which the damping rises
 WALL_RELEASE = 0.03  # rad/s out of the wall, from which on the spring no longer pushes
 OVERSHOOT = 0.1  # rad past a joint limit that is not yet a fault, because mechanical stops are not infinitely stiff
-# What was once a parameter, and what no user has a reason to change.
 MAX_EFFORT_RATE = 50.0  # Nm/s; the full torque of an AK60-6 in 60 ms, slow enough not to jolt the arm
 MAX_TEMPERATURE = 80.0  # degC, an assumption: a motor whose own protection switches it off would drop the arm
 DERATING = 10.0  # degC below MAX_TEMPERATURE over which the permitted torque falls to half
 JUMP = 0.05  # rad that two readings may differ by in addition to what max_velocity allows
-HOME = (0.0, 0.0, 0.0, 0.0)  # rad; joint angles are measured from the hanging arm
-# rad from HOME at the first start. The zero of a motor with a single encoder may be off by whole turns of the rotor (60
-# degrees of an AK60-6's output, 40 of an AK80-9's): less than half of that shows it.
+# rad from the hanging arm at the first start. The zero of a motor with a single encoder may be off by whole turns of
+# the rotor (60 degrees of an AK60-6's output, 40 of an AK80-9's): less than half of that shows it.
 HOME_TOLERANCE = {"AK60-6": 0.5, "AK80-9": 0.34}
 
 
@@ -79,10 +77,10 @@ class Limits:
     sign_check_torque: float = owned(
         1.5, "largest test torque of the sign check; 0 skips the check", (0.0, 3.0), "Nm", expert=True
     )
-    #: (4,) rad from HOME at the first start; `limits_of` takes it from the motors
+    #: (4,) rad from `home` at the first start; `limits_of` takes it from the motors
     home_tolerance: Sequence[float] = tuple(HOME_TOLERANCE[name] for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6"))
-    #: (4,) rad, the hanging arm
-    home: ClassVar[tuple[float, ...]] = HOME
+    #: (4,) rad, the hanging arm, from which joint angles are measured
+    home: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         if len(set(self.joint_names)) != JOINT_COUNT or not all(self.joint_names):
@@ -130,8 +128,8 @@ class Limits:
         return abs(joint.position - last.position) > JUMP + self.max_velocity[i] * (joint.time - last.time)
 
     def find_wrong_zero(self, joints: Sequence[JointSample]) -> Fault | None:
-        """Return the fault of the first joint that is not near HOME, where the arm must hang, or None."""
-        for name, joint, home, tolerance in zip(self.joint_names, joints, HOME, self.home_tolerance, strict=True):
+        """Return the fault of the first joint that is not near `home`, or None."""
+        for name, joint, home, tolerance in zip(self.joint_names, joints, self.home, self.home_tolerance, strict=True):
             if not abs(joint.position - home) <= tolerance:
                 reason = (
                     f"{name}: {joint.position:.3f} rad at the start, must be within {tolerance:g} of {home:g}: "

@@ -10,6 +10,7 @@ V3 boards: they are found by their status frames, and are never sent anything, b
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
@@ -66,30 +67,25 @@ class BusScan:
         clock: Clock = COMPUTER_CLOCK,
         open_bus: Callable[[str, str, Mapping[str, Any]], can.BusABC] = open_bus,
     ) -> None:
-        self._lock = BusLock(address, f"calibrate motors (PID {os.getpid()})", clock=clock)
         self._now = clock.monotonic
         self.name = address[1]
         self._v3: dict[int, MotorAnswer] = {}  # the newest status of each V3 board
-        try:
-            if self._lock.notes.drive.powered:
+        with contextlib.ExitStack() as held:
+            lock = BusLock(address, f"calibrate motors (PID {os.getpid()})", clock=clock)
+            held.callback(lock.release)
+            if lock.notes.drive.powered:
                 raise BusError(
                     f"CAN bus {self.name}: the last can_bridge died and may have left the motors on: start can_bridge, "
                     "which lets the arm down, and stop it"
                 )
             self._port = CanPort(open_bus(*address), clock)
-            try:
-                self._listen()
-            except BusError:
-                self._port.close()
-                raise
-        except BaseException:
-            self._lock.release()
-            raise
+            held.callback(self._port.close)
+            self._listen()
+            self._held = held.pop_all()
 
     def close(self) -> None:
         """Release the bus."""
-        self._port.close()
-        self._lock.release()
+        self._held.close()
 
     def __enter__(self) -> BusScan:
         return self
@@ -110,7 +106,11 @@ class BusScan:
                     elif data[0] < can_id:
                         found.setdefault(data[0], _answer(reply_id, data))  # a late reply
                 if len(replies) > sent:  # a late reply to the first command may arrive after the second
-                    problems[f"ID {can_id}: several replies to one command: {_shared(replies)}"] = None
+                    angles = " and ".join(sorted({f"{reply.position:.2f} rad" for reply in replies}))
+                    problems[
+                        f"ID {can_id}: several replies to one command: two motors share it ({angles}); give one of "
+                        "them another ID with the vendor's tool, alone on the bus"
+                    ] = None
                 if replies:
                     found[can_id] = replies[0]
                     break
@@ -120,13 +120,9 @@ class BusScan:
 
     def poll(self, can_ids: Iterable[int]) -> dict[int, MotorAnswer]:
         """Return the newest answer of each of these motors; a silent one is missing. Raises BusError."""
-        answers = {}
         reporting = set(can_ids) & set(self._v3)
-        for can_id in can_ids:
-            replies = [] if can_id in reporting else self._ask(can_id, is_alone=False)[0]
-            if replies:
-                answers[can_id] = replies[-1]
-        return answers | self._statuses(reporting)
+        replies = {i: self._ask(i, is_alone=False)[0] for i in can_ids if i not in reporting}
+        return {i: found[-1] for i, found in replies.items() if found} | self._statuses(reporting)
 
     def _listen(self) -> None:
         end = self._now() + LISTEN_TIME
@@ -208,8 +204,3 @@ def _problem(can_id: int, reply_id: int, data: bytes) -> str:
 def _answer(reply_id: int, data: bytes) -> MotorAnswer:
     reply = unpack_reply(SPEC, data)
     return MotorAnswer(reply.motor_id, reply_id, len(data), reply.position, reply.temperature, reply.error)
-
-
-def _shared(replies: list[MotorAnswer]) -> str:
-    angles = " and ".join(sorted({f"{reply.position:.2f} rad" for reply in replies}))
-    return f"two motors share it ({angles}); give one of them another ID with the vendor's tool, alone on the bus"

@@ -24,7 +24,7 @@ from itertools import chain
 
 import can
 
-from exo_gravity.core.errors import BusError, ParameterError
+from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, REPLY, Frame, WireFormat
 from exo_gravity.core.numbers import JOINT_COUNT
@@ -50,7 +50,7 @@ Group = tuple[WireFormat, frozenset[int]]  # the motors of one format
 
 
 class MotorBus:
-    """Four motors on one bus. Not thread-safe: one thread owns it.
+    """Four motors with different IDs on one bus. Not thread-safe: one thread owns it.
 
     powered: whether the motors are already on. note: called with each drive before its frames are sent. reopen: opens
     the bus again after a failure. clock: of all times.
@@ -65,9 +65,6 @@ class MotorBus:
         reopen: Callable[[], can.BusABC] | None = None,
         clock: Clock = COMPUTER_CLOCK,
     ) -> None:
-        ids = [motor.can_id for motor in motors]
-        if len(motors) != JOINT_COUNT or len(set(ids)) != JOINT_COUNT:
-            raise ParameterError("can_id", ids, "4 different IDs")
         #: The newest reading of each joint, UNKNOWN before the first reply.
         self.samples: list[JointSample] = [UNKNOWN] * JOINT_COUNT
         #: Count of frames that were not replies of these motors, by kind.

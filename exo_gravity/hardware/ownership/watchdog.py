@@ -153,7 +153,8 @@ def _watch(
                     kill()
                     return arm, f"handed the arm over and has been killed ({message})"
                 arm = message
-                _load(message.address[0])
+                with contextlib.suppress(KeyError, ImportError):  # imports the bus's module ahead of time
+                    importlib.import_module(can.interfaces.BACKENDS[message.address[0]][0])
             is_powered, noted, now = notes.drive.powered, notes.time, clock.monotonic()
             if arm:
                 notes.beat(now)
@@ -161,12 +162,6 @@ def _watch(
                 kill()  # it sends nothing from here on, even if it takes long to die
                 return arm, f"was frozen for {FROZEN * 1000:.0f} ms and has been killed"
     return arm, "has died"
-
-
-def _load(interface: str) -> None:
-    """Import the bus's module ahead of time."""
-    with contextlib.suppress(KeyError, ImportError):
-        importlib.import_module(can.interfaces.BACKENDS[interface][0])
 
 
 class Log:
@@ -200,14 +195,8 @@ def main() -> None:
         os.setpriority(os.PRIO_PROCESS, 0, -20)
     bridge, lock, receiver = map(int, sys.argv[1:])
     notes = DriveNotes(mmap.mmap(lock, mmap.PAGESIZE), COMPUTER_CLOCK)
-    log = Log()
-    code = guard(
-        lambda: os.kill(bridge, signal.SIGKILL),
-        notes,
-        Connection(receiver, writable=False),
-        log.write,
-        COMPUTER_CLOCK,
-    )
+    log, pipe = Log(), Connection(receiver, writable=False)
+    code = guard(lambda: os.kill(bridge, signal.SIGKILL), notes, pipe, log.write, COMPUTER_CLOCK)
     log.close()
     os._exit(code)  # the log's thread may be blocked
 

@@ -150,7 +150,7 @@ class CanBridge(LifecycleNode):
         loop = ControlLoop(bus, safety, period, self._exchange.publish, self._exchange.get_efforts, hand_over)
         loop.start()
         try:
-            for refused in request_real_time(self._thread_priority, self._thread_priority > 0):
+            for refused in request_real_time(self._thread_priority):
                 self.get_logger().warning(refused)
         except BaseException:
             loop.stop()

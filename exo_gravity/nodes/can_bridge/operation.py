@@ -66,20 +66,16 @@ class BridgeServices:
         since = time.monotonic()
         self._on_control_thread(self._set_zero, response)
         loop = self._get_loop()
-        if response.success and loop is not None and not self._is_zeroed(loop, since):
-            columns = zip(loop.safety.limits.joint_names, loop.samples, strict=True)
-            positions = ", ".join(f"{name} at {joint.position:.3f} rad" for name, joint in columns)
-            response.success, response.message = False, f"the motors did not set their zero: {positions}"
-        return response
-
-    def _is_zeroed(self, loop: ControlLoop, since: float) -> bool:
-        """Wait until every motor has replied again; return whether all then report 0."""
-        end = since + ZERO_TIMEOUT
-        while time.monotonic() < end:
-            if all(joint.time > since and abs(joint.position) <= ZERO_TOLERANCE for joint in loop.samples):
-                return True
+        if not response.success or loop is None:
+            return response
+        while not all(joint.time > since and abs(joint.position) <= ZERO_TOLERANCE for joint in loop.samples):
+            if time.monotonic() > since + ZERO_TIMEOUT:
+                columns = zip(loop.safety.limits.joint_names, loop.samples, strict=True)
+                positions = ", ".join(f"{name} at {joint.position:.3f} rad" for name, joint in columns)
+                response.success, response.message = False, f"the motors did not set their zero: {positions}"
+                break
             time.sleep(0.005)
-        return False
+        return response
 
     def _set_zero(self, loop: ControlLoop) -> str:
         safety = loop.safety
@@ -131,8 +127,7 @@ def log_limits(node: Node, limits: Limits, traffic: Traffic, rate: float) -> Non
     )
     if warning := traffic.warning(rate):
         log.warning(warning)
-    opening = open_to_others()
-    if opening:
+    if opening := open_to_others():
         log.warning(f"{opening}: other hosts can command this arm; unset it, or enforce SROS2")
 
 
@@ -160,9 +155,7 @@ class BridgeReport:
             self._diagnostics.report(WARN, "inactive")
             return
         now, safety = time.monotonic(), loop.safety
-        acting = ", ".join(
-            sorted(limit for limit, time_acted in tuple(safety.acted.items()) if time_acted > now - RECENT)
-        )
+        acting = ", ".join(sorted(limit for limit, acted in tuple(safety.acted.items()) if acted > now - RECENT))
         rate = self._rate.update(now, loop.cycles)
         self._motors.update(now, loop.samples)
         values: dict[str, object] = {
@@ -179,17 +172,6 @@ class BridgeReport:
             "publishing errors": f"{loop.cycle_errors}, last: {loop.cycle_error}" if loop.cycle_errors else "none",
             "last refused message": refusal,
         }
-        values |= self._of_joints(loop)
-        warnings = [f"limited by {acting}"] if acting else []
-        hot = [name for name, share in zip(self._names, self._motors.share, strict=True) if share > 1.0]
-        if hot:
-            warnings.append(f"above rated torque for too long: {', '.join(hot)}")
-        if 0.0 < rate < self._slow:
-            warnings.append(f"slower than {self._slow:.0f} Hz")
-        self._diagnostics.report(*_headline(loop, ", ".join(warnings)), values)
-
-    def _of_joints(self, loop: ControlLoop) -> dict[str, object]:
-        values: dict[str, object] = {}
         columns = self._names, loop.samples, self._motors.power, self._motors.rms, self._motors.share
         for name, joint, power, rms, share in zip(*columns, strict=True):
             values[f"{name} temperature (degC)"] = joint.temperature
@@ -197,7 +179,13 @@ class BridgeReport:
             values[f"{name} power (W)"] = row([power], 1)
             values[f"{name} RMS torque (Nm)"] = row([rms], 2)
             values[f"{name} RMS of rated torque (%)"] = row([100.0 * share], 0)
-        return values
+        warnings = [f"limited by {acting}"] if acting else []
+        hot = [name for name, share in zip(self._names, self._motors.share, strict=True) if share > 1.0]
+        if hot:
+            warnings.append(f"above rated torque for too long: {', '.join(hot)}")
+        if 0.0 < rate < self._slow:
+            warnings.append(f"slower than {self._slow:.0f} Hz")
+        self._diagnostics.report(*_headline(loop, ", ".join(warnings)), values)
 
 
 def _headline(loop: ControlLoop, warnings: str) -> tuple[bytes, str]:

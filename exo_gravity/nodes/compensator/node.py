@@ -76,7 +76,7 @@ class CompensatorNode(Node):
         self.get_logger().info(sentence(self._control.settings))
         for thread in self._threads:
             thread.start()
-        for refused in request_real_time(values["thread_priority"], values["thread_priority"] > 0):
+        for refused in request_real_time(values["thread_priority"]):
             self.get_logger().warning(refused)
 
     @property
