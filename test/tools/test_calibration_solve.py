@@ -17,8 +17,7 @@ from exo_gravity.core.model.moments import load_moments, moments_of, regressor
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.params import values_of
 from exo_gravity.tools.calibration import live
-from exo_gravity.tools.calibration.tours import calibrate_scale, friction_from, moments_from
-from exo_gravity.tools.calibration.wearer import wearer_from, worn_arm
+from exo_gravity.tools.calibration.tours import calibrate_scale, friction_from, moments_from, wearer_from, worn_arm
 from exo_gravity.tools.inputs.arms import configured_arm
 from exo_gravity.tools.inputs.parameter_file import load, packaged_config
 
