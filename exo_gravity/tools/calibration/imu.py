@@ -51,14 +51,9 @@ def calibrate_imu(options: argparse.Namespace, arm: ConfiguredArm | None, say: S
     """
     topic = node_values(load(options.params), NODE, IMU)["input_topic"]
     bag = options.bag or _record(options, say)
-    try:
-        found = mounting(read_imu(bag, topic))
-        fit = six_rests(read_imu(options.rests, topic)) if options.rests else None
-    except DataError as error:
-        return CalibrationResult(refusals=(str(error),))
-    changes, lines = _mounting_result(found)
-    if fit is not None:
-        line = _accelerometer_line(fit)
+    changes, lines = _mounting_result(mounting(read_imu(bag, topic)))
+    if options.rests:
+        line = _accelerometer_line(six_rests(read_imu(options.rests, topic)))
         changes, lines = (*changes, Change(NODE, "", 0, line)), (*lines, line)
     return CalibrationResult(changes, lines)
 

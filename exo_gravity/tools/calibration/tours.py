@@ -53,8 +53,8 @@ def calibrate_gravity(options: argparse.Namespace, arm: ConfiguredArm, say: Say)
     """Measure the poses, or take them from `options.bag`, and solve for the moments. Raises ParameterError."""
     if options.bag:
         return moments_from(arm, observations_of(options.bag, arm))
-    tour = live.run_tour(options, tour_parameters(options.params, arm, {"tour.poses": options.poses}), say)
-    return moments_from(arm, tour.measured, tour.refusals(options.record))
+    nodes = tour_parameters(options.params, arm, {"tour.poses": options.poses})
+    return moments_from(arm, live.run_tour(options, nodes, say).complete(options.record))
 
 
 def calibrate_scale(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
@@ -69,8 +69,7 @@ def calibrate_scale(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -
         return moments_from(arm, [*bare, *loaded])
     stopping, poses = stop_on_signals(), {"tour.poses": SCALE_POSES}
     without = live.run_tour(options, tour_parameters(options.params, arm, poses), say, stopping)
-    if refusals := without.refusals(options.record):
-        return moments_from(arm, without.measured, refusals)
+    bare = without.complete(options.record)
     load = {"tour.load_mass": options.mass, "tour.load_lever": options.lever}
     nodes = tour_parameters(options.params, arm, {**poses, **load})
     if is_simulated(options.params, arm):
@@ -79,20 +78,12 @@ def calibrate_scale(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -
         nodes[f"{arm.namespace}/simulator"]["ros__parameters"]["wearer"] = wearer
     else:
         options.ask(f"Hang {options.mass:g} kg on link 4, {options.lever:g} m from the elbow. {LEAN}")
-    tour = live.run_tour(options, nodes, say, stopping)
-    return moments_from(arm, without.measured + tour.measured, tour.refusals(options.record))
+    return moments_from(arm, bare + live.run_tour(options, nodes, say, stopping).complete(options.record))
 
 
-def moments_from(
-    arm: ConfiguredArm, observations: Sequence[Observation], refusals: tuple[str, ...] = ()
-) -> CalibrationResult:
-    """Return moments and torque scales of `arm` as `observations` show them; refusals: why they are incomplete."""
-    observations = tuple(observations)
-    try:
-        identified = identify(observations, arm.robot.length, arm.robot.gravity)
-    except DataError as error:
-        reasons = (*refusals, str(error)) if observations or not refusals else refusals
-        return CalibrationResult(refusals=reasons, arm=arm, observations=observations)
+def moments_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
+    """Return moments and torque scales of `arm` as `observations` show them. Raises DataError as `identify` does."""
+    identified = identify(observations, arm.robot.length, arm.robot.gravity)
     factor = np.where(np.isfinite(identified.scale_error), identified.scale, 1.0)
     scale = [round(old * float(new), 4) for old, new in zip(arm.can_bridge["torque_scale"], factor, strict=True)]
     low, high = TORQUE_SCALE_BOUNDS
@@ -107,9 +98,9 @@ def moments_from(
     return CalibrationResult(
         _changes(arm, identified, scale),
         (*_lines(arm, identified), *identified.unknown),
-        refusals + impossible,
+        impossible,
         arm,
-        observations,
+        tuple(observations),
         identified,
         tuple(suggestion.tolist()),
     )
@@ -158,21 +149,15 @@ def calibrate_friction(options: argparse.Namespace, arm: ConfiguredArm, say: Say
     """Sweep all joints of the hanging arm, and fit the friction of each. Raises ParameterError."""
     if options.bag:
         return friction_from(arm, sweeps_of(options.bag, arm))
-    tour = live.run_tour(options, tour_parameters(options.params, arm, {"tour.friction": True}), say)
-    return friction_from(arm, tour.measured, tour.refusals(options.record))
+    nodes = tour_parameters(options.params, arm, {"tour.friction": True})
+    return friction_from(arm, live.run_tour(options, nodes, say).complete(options.record))
 
 
-def friction_from(
-    arm: ConfiguredArm, observations: Sequence[Observation], refusals: tuple[str, ...] = ()
-) -> CalibrationResult:
-    """Return the friction of each joint that `observations` show; refusals: why they are incomplete."""
-    observations = tuple(observations)
+def friction_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
+    """Return the friction of each joint that `observations` show. Raises DataError as `fit_friction` does."""
     speed = np.array([np.broadcast_to(one.speed, JOINT_COUNT) for one in observations]).reshape(-1, JOINT_COUNT)
     torque = np.array([one.friction for one in observations]).reshape(-1, JOINT_COUNT)
-    try:
-        fits = [fit_friction(*joint) for joint in zip(speed.T, torque.T, strict=True)]
-    except DataError as error:
-        return CalibrationResult(refusals=(*refusals, str(error)), arm=arm, observations=observations)
+    fits = [fit_friction(*joint) for joint in zip(speed.T, torque.T, strict=True)]
     named = list(zip(arm.joint_names, fits, strict=True))
     lines = tuple(f"{name}: {_sentence(fit)}" for name, fit in named)
     negative = tuple(
@@ -182,7 +167,7 @@ def friction_from(
     )
     changes = tuple(Change(f"{arm.namespace}/can_bridge", "", 0, f"friction of {line}") for line in lines)
     curves = tuple(Curve(v, slide, fit.at(v)) for v, slide, fit in zip(speed.T, torque.T, fits, strict=True))
-    return CalibrationResult(changes, lines, refusals + negative, arm, observations, curves=curves)
+    return CalibrationResult(changes, lines, negative, arm, tuple(observations), curves=curves)
 
 
 def _sentence(fit: FrictionCurve) -> str:
@@ -214,20 +199,14 @@ def calibrate_wearer(options: argparse.Namespace, arm: ConfiguredArm, say: Say) 
     if not any(mass):
         mass, cog = wearer_of({**arm.compensator, "wearer.body_mass": TYPICAL_BODY_MASS})
     moments = moments_of(arm.robot.with_wearer(mass, cog))
-    tour = live.run_tour(options, tour_parameters(options.params, arm, changes, moments), say)
-    return wearer_from(arm, tour.measured, tour.refusals(options.record))
+    nodes = tour_parameters(options.params, arm, changes, moments)
+    return wearer_from(arm, live.run_tour(options, nodes, say).complete(options.record))
 
 
-def wearer_from(
-    arm: ConfiguredArm, observations: Sequence[Observation], refusals: tuple[str, ...] = ()
-) -> CalibrationResult:
-    """Return the wearer's masses that `observations` show; refusals: why they are incomplete."""
-    observations = tuple(observations)
+def wearer_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
+    """Return the wearer's masses that `observations` show. Raises DataError as `worn_arm` does."""
     cog = _cog(arm)
-    try:
-        worn = worn_arm(arm, observations, cog)
-    except DataError as error:
-        return CalibrationResult(refusals=(*refusals, str(error)), arm=arm, observations=observations)
+    worn = worn_arm(arm, observations, cog)
     node = f"{arm.namespace}/compensator"
     mass = [0.0, 0.0, *np.round(worn.mass, 3).tolist()]
     note = f"kg, +-{worn.error[0]:.2f} and {worn.error[1]:.2f}"
@@ -241,7 +220,7 @@ def wearer_from(
         f"largest remainder of a pose: {np.abs(worn.remainder).max():.2f} Nm",
     )
     comparison, implausible = _compared(arm, worn.mass, cog)
-    return CalibrationResult(changes, (*lines, comparison), refusals + implausible, arm, observations)
+    return CalibrationResult(changes, (*lines, comparison), implausible, arm, tuple(observations))
 
 
 def worn_arm(arm: ConfiguredArm, observations: Sequence[Observation], cog: np.ndarray) -> WornArm:
