@@ -125,11 +125,6 @@ def tour_parameters(
     return nodes
 
 
-def is_simulated(params: Path, arm: ConfiguredArm) -> bool:
-    """Return whether the parameter file has a simulator for `arm`."""
-    return f"{arm.namespace}/simulator" in yaml.safe_load(params.read_text(encoding="utf-8"))
-
-
 def run_tour(
     options: argparse.Namespace, nodes: Mapping[str, Any], say: Say, stopping: Stopping | None = None
 ) -> LiveTour:

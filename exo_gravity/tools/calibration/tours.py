@@ -30,7 +30,7 @@ from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.tools.calibration import live
-from exo_gravity.tools.calibration.live import Say, is_simulated, tour_parameters
+from exo_gravity.tools.calibration.live import Say, tour_parameters
 from exo_gravity.tools.calibration.recorded import observations_of, sweeps_of
 from exo_gravity.tools.calibration.result import CalibrationResult, Change, Curve
 from exo_gravity.tools.inputs.arms import ConfiguredArm
@@ -72,10 +72,10 @@ def calibrate_scale(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -
     bare = without.complete(options.record)
     load = {"tour.load_mass": options.mass, "tour.load_lever": options.lever}
     nodes = tour_parameters(options.params, arm, {**poses, **load})
-    if is_simulated(options.params, arm):
+    if (simulator := f"{arm.namespace}/simulator") in nodes:
         # The simulated device cannot be reached by hand: it carries the weight as a wearer's forearm would.
         wearer = {"mass": [0.0, 0.0, 0.0, options.mass], "cog": [0.0, 0.0, 0.0, options.lever]}
-        nodes[f"{arm.namespace}/simulator"]["ros__parameters"]["wearer"] = wearer
+        nodes[simulator]["ros__parameters"]["wearer"] = wearer
     else:
         options.ask(f"Hang {options.mass:g} kg on link 4, {options.lever:g} m from the elbow. {LEAN}")
     return moments_from(arm, bare + live.run_tour(options, nodes, say, stopping).complete(options.record))
@@ -190,22 +190,19 @@ def calibrate_wearer(options: argparse.Namespace, arm: ConfiguredArm, say: Say) 
     """Measure the wearer's relaxed arm, or take it from `options.bag`. Raises ParameterError."""
     if options.bag:
         return wearer_from(arm, observations_of(options.bag, arm))
-    if not is_simulated(options.params, arm):
-        options.ask("Wear the arm, sit upright and relax: it will be moved slowly. Pull to stop it")
     # Few poses, in a comfortable range, with the weight that the table expects.
     low, high = np.maximum(arm.low, COMFORTABLE[0]), np.minimum(arm.high, COMFORTABLE[1])
     changes = {"tour.poses": WEARER_POSES, "position_min": low.tolist(), "position_max": high.tolist()}
-    mass, cog = wearer_of(arm.compensator)
-    if not any(mass):
-        mass, cog = wearer_of({**arm.compensator, "wearer.body_mass": TYPICAL_BODY_MASS})
-    moments = moments_of(arm.robot.with_wearer(mass, cog))
+    moments = moments_of(arm.robot.with_wearer(*_expected_wearer(arm)))
     nodes = tour_parameters(options.params, arm, changes, moments)
+    if f"{arm.namespace}/simulator" not in nodes:
+        options.ask("Wear the arm, sit upright and relax: it will be moved slowly. Pull to stop it")
     return wearer_from(arm, live.run_tour(options, nodes, say).complete(options.record))
 
 
 def wearer_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
     """Return the wearer's masses that `observations` show. Raises DataError as `worn_arm` does."""
-    cog = _cog(arm)
+    cog = np.array(_expected_wearer(arm)[1][2:])
     worn = worn_arm(arm, observations, cog)
     node = f"{arm.namespace}/compensator"
     mass = [0.0, 0.0, *np.round(worn.mass, 3).tolist()]
@@ -254,12 +251,12 @@ def worn_arm(arm: ConfiguredArm, observations: Sequence[Observation], cog: np.nd
     return WornArm(mass, error, remainder)
 
 
-def _cog(arm: ConfiguredArm) -> np.ndarray:
-    """Return the centres of gravity (2,) in m on links 3 and 4: those of the file's wearer, or of a typical one."""
+def _expected_wearer(arm: ConfiguredArm) -> tuple[Sequence[float], Sequence[float]]:
+    """Return mass (4,) in kg and cog (4,) in m on each link: of the file's wearer, or else of a typical one."""
     mass, cog = wearer_of(arm.compensator)
     if mass[2] and mass[3]:
-        return np.array(cog[2:], dtype=float)
-    return Wearer(TYPICAL_BODY_MASS).on_links(arm.robot.length).cog[2:]
+        return mass, cog
+    return wearer_of({**arm.compensator, "wearer.mass": (0.0,) * 4, "wearer.body_mass": TYPICAL_BODY_MASS})
 
 
 def _moment(arm: ConfiguredArm, mass: np.ndarray, cog: np.ndarray) -> tuple[float, float]:
