@@ -112,39 +112,28 @@ def value_text(value: Value) -> str:
 
 def _changed(text: str, change: Change) -> str:
     """Return the text with one change, in the node's mapping of parameters or in a mapping inside it."""
-    heading, mapping = _parameters(text, change.node)
-    if not change.name:
-        return _edited(text, [_above(text, heading, change.note)])
-    path = change.name.split(".")
-    while found := _entry(mapping, path):
-        key, value, path = found
+    node: yaml.Node = yaml.compose(text, yaml.SafeLoader)
+    path = [change.node, PARAMETERS, *filter(None, change.name.split("."))]
+    while found := _entry(node, path):
+        key, node, path = found
         if not path:
-            return _replaced(text, key, value, change)
-        if not isinstance(value, yaml.MappingNode):
-            raise ParameterError(f"{change.node} {change.name}", value.value, "a mapping, to add a value to it")
-        mapping = value
-    return _added(text, mapping, ".".join(path), change)
+            return (
+                _replaced(text, key, node, change) if change.name else _edited(text, [_above(text, key, change.note)])
+            )
+        if not isinstance(node, yaml.MappingNode) or not node.value:
+            raise ParameterError(f"{change.node} {change.name}", node.value, "a mapping, to add a value to it")
+    if PARAMETERS in path:
+        raise ParameterError("params", change.node, "a node of the file that has parameters")
+    return _added(text, node, ".".join(path), change)
 
 
-def _entry(mapping: yaml.MappingNode, path: list[str]) -> tuple[yaml.Node, yaml.Node, list[str]] | None:
+def _entry(mapping: yaml.Node, path: list[str]) -> tuple[yaml.Node, yaml.Node, list[str]] | None:
     """Return key and value of the entry that begins the dotted `path`, and the rest of the path."""
     for length in range(len(path), 0, -1):
         for key, value in mapping.value:
             if key.value == ".".join(path[:length]):
                 return key, value, path[length:]
     return None
-
-
-def _parameters(text: str, node: str) -> tuple[yaml.Node, yaml.MappingNode]:
-    """Return the key `ros__parameters` of `node` and its value as parsed: their marks are positions in `text`."""
-    root = yaml.compose(text, yaml.SafeLoader)
-    for key, entry in root.value if isinstance(root, yaml.MappingNode) else ():
-        if key.value != node or not isinstance(entry, yaml.MappingNode):
-            continue
-        for name, parameters in entry.value:
-            if name.value == PARAMETERS and isinstance(parameters, yaml.MappingNode) and parameters.value:
-                return name, parameters
-    raise ParameterError("params", node, "a node of the file that has parameters")
 
 
 def _replaced(text: str, key: yaml.Node, value: yaml.Node, change: Change) -> str:
@@ -159,7 +148,7 @@ def _replaced(text: str, key: yaml.Node, value: yaml.Node, change: Change) -> st
     return _edited(text, [_above(text, key, change.note), *edits])
 
 
-def _added(text: str, mapping: yaml.MappingNode, name: str, change: Change) -> str:
+def _added(text: str, mapping: yaml.Node, name: str, change: Change) -> str:
     """Add a value at the end of `mapping`; name: the key in it, dotted."""
     last_key, last_value = mapping.value[-1]
     entry, end = f"{name}: {value_text(change.value)}", _end(last_value)
