@@ -112,14 +112,13 @@ def value_text(value: Value) -> str:
 
 def _changed(text: str, change: Change) -> str:
     """Return the text with one change, in the node's mapping of parameters or in a mapping inside it."""
-    node: yaml.Node = yaml.compose(text, yaml.SafeLoader)
+    node: Any = yaml.compose(text, yaml.SafeLoader)
     path = [change.node, PARAMETERS, *filter(None, change.name.split("."))]
     while found := _entry(node, path):
         key, node, path = found
         if not path:
-            return (
-                _replaced(text, key, node, change) if change.name else _edited(text, [_above(text, key, change.note)])
-            )
+            edits = _replacing(key, node, change.value) if change.name else []
+            return _edited(text, [_above(text, key, change.note), *edits])
         if not isinstance(node, yaml.MappingNode) or not node.value:
             raise ParameterError(f"{change.node} {change.name}", node.value, "a mapping, to add a value to it")
     if PARAMETERS in path:
@@ -127,7 +126,7 @@ def _changed(text: str, change: Change) -> str:
     return _added(text, node, ".".join(path), change)
 
 
-def _entry(mapping: yaml.Node, path: list[str]) -> tuple[yaml.Node, yaml.Node, list[str]] | None:
+def _entry(mapping: yaml.MappingNode, path: list[str]) -> tuple[yaml.Node, yaml.Node, list[str]] | None:
     """Return key and value of the entry that begins the dotted `path`, and the rest of the path."""
     for length in range(len(path), 0, -1):
         for key, value in mapping.value:
@@ -136,19 +135,16 @@ def _entry(mapping: yaml.Node, path: list[str]) -> tuple[yaml.Node, yaml.Node, l
     return None
 
 
-def _replaced(text: str, key: yaml.Node, value: yaml.Node, change: Change) -> str:
-    """Replace a value; a list of the same length entry by entry, which keeps the comments between them."""
-    old = value.value if isinstance(value, yaml.SequenceNode) else [value]
-    items = change.value if isinstance(change.value, list) else [change.value]
-    if len(old) == len(items):
-        marks = ((node.start_mark.index, node.end_mark.index) for node in old)
-        edits = [(*mark, value_text(item)) for mark, item in zip(marks, items, strict=True)]
-    else:
-        edits = [(key.end_mark.index, _end(value), f": {value_text(change.value)}")]
-    return _edited(text, [_above(text, key, change.note), *edits])
+def _replacing(key: yaml.Node, old: yaml.Node, value: Value) -> list[Edit]:
+    """Return the edits that replace a value; a list of the same length by entries, with the comments between them."""
+    nodes = old.value if isinstance(old, yaml.SequenceNode) else [old]
+    items = value if isinstance(value, list) else [value]
+    if len(nodes) != len(items):
+        return [(key.end_mark.index, _end(old), f": {value_text(value)}")]
+    return [(n.start_mark.index, n.end_mark.index, value_text(item)) for n, item in zip(nodes, items, strict=True)]
 
 
-def _added(text: str, mapping: yaml.Node, name: str, change: Change) -> str:
+def _added(text: str, mapping: yaml.MappingNode, name: str, change: Change) -> str:
     """Add a value at the end of `mapping`; name: the key in it, dotted."""
     last_key, last_value = mapping.value[-1]
     entry, end = f"{name}: {value_text(change.value)}", _end(last_value)
