@@ -67,10 +67,14 @@ def outcome(outlier: int | None = None, **changes: object) -> CalibrationResult:
     return replace(found, **changes)  # type: ignore[arg-type]
 
 
+def table_of(result: CalibrationResult) -> TorqueTable:
+    assert result.identified and result.arm
+    return TorqueTable.of(result.identified, result.arm, result.observations)
+
+
 def test_the_table_compares_the_old_and_the_new_file_with_what_was_measured() -> None:
     found = outcome()
-    table = TorqueTable.of(found)
-    assert table is not None
+    table = table_of(found)
     assert table.measured == pytest.approx(np.array([o.effort for o in found.observations]))
     unloaded = slice(0, None, 2)
     expected = gravity_torque(configured_arm().robot, POSES[unloaded], DOWN)
@@ -87,8 +91,8 @@ def test_the_table_compares_the_old_and_the_new_file_with_what_was_measured() ->
 
 def test_the_arm_creeps_where_the_remainder_exceeds_friction() -> None:
     found = outcome()
-    table = TorqueTable.of(found)
-    assert table is not None and found.identified is not None
+    table = table_of(found)
+    assert found.identified is not None
     before = np.abs(table.measured - table.before) > 0.2 * FRICTION
     after = np.abs(found.identified.held_out + found.identified.offset) > 0.2 * FRICTION
     creeping = [int(creeps.any(axis=1).sum()) for creeps in (before, after)]
@@ -115,8 +119,8 @@ def test_the_page_says_what_was_found_and_what_does_not_show() -> None:
 
 def test_a_pose_that_was_left_out_is_not_counted() -> None:
     found = outcome(outlier=5)
-    table = TorqueTable.of(found)
-    assert table is not None and np.flatnonzero(~table.used).tolist() == [5]
+    table = table_of(found)
+    assert np.flatnonzero(~table.used).tolist() == [5]
     assert " of 11 poses with the old file" in page_of(found, "gravity", "old.yaml", DAY)
 
 

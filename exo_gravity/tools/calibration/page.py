@@ -14,10 +14,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from exo_gravity.core.calibration.identification import columns
+from exo_gravity.core.calibration.identification import Identified, Observation, columns
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.model.moments import load_moments, regressor
 from exo_gravity.tools.calibration.result import CalibrationResult, Curve, plain, value_text
+from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.reporting import html
 from exo_gravity.tools.reporting.colours import FAINT, HOLD_COLOUR, INK, JOINT_COLOURS, make_plain
 
@@ -40,11 +41,8 @@ class TorqueTable(NamedTuple):
     used: np.ndarray  #: (n,), false for poses left out
 
     @classmethod
-    def of(cls, result: CalibrationResult) -> TorqueTable | None:
-        """Return the table of a result, None if it has no poses or nothing was identified."""
-        found, arm, poses = result.identified, result.arm, result.observations
-        if found is None or arm is None or not poses:
-            return None
+    def of(cls, found: Identified, arm: ConfiguredArm, poses: Sequence[Observation]) -> TorqueTable:
+        """Return the table of what was identified of `arm` from `poses`."""
         theta, direction, measured, spread = columns(poses)
         loads = np.array([load_moments(arm.robot.length, pose.load_mass, pose.load_lever) for pose in poses])
         weight = np.einsum("ijk,ik->ij", regressor(theta, direction, arm.robot.gravity), loads)
@@ -68,14 +66,15 @@ def _sections(result: CalibrationResult) -> Iterator[str]:
         yield html.verdict("Not calibrated; no file was written.", result.refusals, good=False)
     else:
         yield html.verdict("Calibrated.")
-    found, table = result.identified, TorqueTable.of(result)
+    found = result.identified
     unknown = found.unknown if found else ()
     yield html.bullets("Result", [line for line in result.lines if line not in unknown])
     if result.changes and not result.refusals:
         yield html.heading("New values")
         rows = ((c.node, c.name, value_text(plain(c.value)), c.note) for c in result.changes if c.name)
         yield html.table(("node", "parameter", "value", "note"), rows)
-    if found is not None and table is not None:
+    if found and result.arm:
+        table = TorqueTable.of(found, result.arm, result.observations)
         caption = "Predicted against measured torque: on the line, the file is right."
         yield _figure(prediction_figure(table, labels), caption)
         caption = "The torque that remains in each pose. Inside the band, friction holds the arm; outside, it creeps."

@@ -36,26 +36,23 @@ HELD_TIME = 1.0  # s
 UNKNOWN_FRICTION = 0.4  # Nm, of a joint of which no sweep was recorded
 
 
-def observations_of(path: Path, arm: ConfiguredArm) -> list[Observation]:
-    """Return the observations in the recording of `arm` at `path`. Raises DataError if there are none."""
-    recording, _, tilts = _recorded(path, arm)
-    sweeps = list(_sweeps(recording, arm, tilts))
-    observations = sweeps + list(_held(recording, arm, tilts, sweeps))
+def observations_of(path: Path, arm: ConfiguredArm, with_held: bool = True) -> list[Observation]:
+    """Return the observations in the recording of `arm` at `path`: sweeps there and back, and poses held.
+
+    with_held: False for sweeps alone, which show friction. Raises DataError if there are none.
+    """
+    recording, tilts = _recorded(path, arm)
+    observations = list(_sweeps(recording, arm, tilts))
+    if with_held:
+        observations += list(_held(recording, arm, tilts, observations))
     if not observations:
-        raise DataError(f"{path}: no pose of {arm.name} was held for {HELD_TIME:g} s, or passed slowly there and back")
+        held = f", or held one for {HELD_TIME:g} s" if with_held else ""
+        raise DataError(f"{path}: {arm.name} never passed a pose slowly there and back, all joints turning{held}")
     return observations
 
 
-def sweeps_of(path: Path, arm: ConfiguredArm) -> list[Observation]:
-    """Return the sweeps there and back in the recording of `arm` at `path`. Raises DataError if there are none."""
-    sweeps = list(_sweeps(*_recorded(path, arm)))
-    if not sweeps:
-        raise DataError(f"{path}: {arm.name} never passed a pose slowly there and back, all joints turning")
-    return sweeps
-
-
-def _recorded(path: Path, arm: ConfiguredArm) -> tuple[Recording, ConfiguredArm, np.ndarray | None]:
-    """Return the recording of `arm`, the arm, and the trunk's tilts (n, 3), None where it uses none.
+def _recorded(path: Path, arm: ConfiguredArm) -> tuple[Recording, np.ndarray | None]:
+    """Return the recording of `arm`, and the trunk's tilts (n, 3), None where it uses none.
 
     The columns are time in s, pitch and roll in rad.
     """
@@ -68,7 +65,7 @@ def _recorded(path: Path, arm: ConfiguredArm) -> tuple[Recording, ConfiguredArm,
     if arm.compensator["use_imu"]:
         vectors = ((stamp, message.vector) for stamp, message in messages_of(path, TILT_TOPIC, TILT_TYPE))
         tilts = np.array([((stamp - bag.start) / 1e9, vector.y, vector.x) for stamp, vector in vectors])
-    return _in_order_of(found[0], arm), arm, tilts
+    return _in_order_of(found[0], arm), tilts
 
 
 def _in_order_of(recording: Recording, arm: ConfiguredArm) -> Recording:

@@ -31,7 +31,7 @@ from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.tools.calibration import live
 from exo_gravity.tools.calibration.live import Say, tour_parameters
-from exo_gravity.tools.calibration.recorded import observations_of, sweeps_of
+from exo_gravity.tools.calibration.recorded import observations_of
 from exo_gravity.tools.calibration.result import CalibrationResult, Change, Curve
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.launcher import stop_on_signals
@@ -148,7 +148,7 @@ def _row(values: np.ndarray) -> str:
 def calibrate_friction(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
     """Sweep all joints of the hanging arm, and fit the friction of each. Raises ParameterError."""
     if options.bag:
-        return friction_from(arm, sweeps_of(options.bag, arm))
+        return friction_from(arm, observations_of(options.bag, arm, with_held=False))
     nodes = tour_parameters(options.params, arm, {"tour.friction": True})
     return friction_from(arm, live.run_tour(options, nodes, say).complete(options.record))
 
