@@ -21,7 +21,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from exo_gravity.core.calibration.identification import Observation
 from exo_gravity.core.calibration.params import CALIBRATOR, tour_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.gravity import Torque
@@ -132,7 +131,7 @@ class CalibratorNode(Node):
     def _report(self) -> None:
         tour = self._tour
         while self._printed < len(tour.measured):
-            _print({"observation": as_json(tour.measured[self._printed])})
+            _print({"observation": tour.measured[self._printed]._asdict()})
             self._printed += 1
         trouble = tour.trouble or self._trouble
         progress = tour.progress if self._began else f"waiting for the arm to be carried: {self._bridge_message}"
@@ -146,14 +145,8 @@ class CalibratorNode(Node):
             self._diagnostics.report(OK if self._began else WARN, progress)
 
 
-def as_json(observation: Observation) -> dict[str, Any]:
-    """Return an observation as values for JSON."""
-    fields = observation._asdict().items()
-    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in fields}
-
-
 def _print(event: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(event) + "\n")
+    sys.stdout.write(json.dumps(event, default=np.ndarray.tolist) + "\n")
     sys.stdout.flush()
 
 

@@ -29,7 +29,7 @@ COMMANDS = {
     "gravity": ("tours", "the robot's first moments, from a slow tour of poses"),
     "friction": ("tours", "friction of each joint, from slow sweeps"),
     "scale": ("tours", "torque scale of each motor, from a known weight on the last link"),
-    "wearer": ("wearer", "the moments of the wearer's relaxed arm"),
+    "wearer": ("tours", "the moments of the wearer's relaxed arm"),
     "imu": ("imu", "the mounting of the IMU, from standing upright and bowing"),
 }
 MAX_POSES = 12

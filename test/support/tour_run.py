@@ -130,15 +130,6 @@ class TourRun:
         return drive.powered
 
 
-def worst_error(tour: Tour, truth: ArmModel) -> float:
-    """Return the largest difference in Nm between a measured torque and that of the true arm."""
-    from exo_gravity.core import gravity_torque
-
-    return max(
-        float(np.abs(np.subtract(o.effort, gravity_torque(truth, o.theta, o.direction))).max()) for o in tour.measured
-    )
-
-
 def assert_close_to_device(inertia: LinkInertia, arm: SimulatedArm, atol: float) -> None:
     """`inertia` is within `atol` kg m^2 of the mass matrix of the simulated arm in three poses."""
     for theta in ((0.0,) * 4, (0.3, 0.8, 0.7, 0.5), (-0.5, 1.5, 1.2, 1.0)):

@@ -63,5 +63,5 @@ def test_lines_of_the_calibrator_are_followed_and_observations_are_kept(tmp_path
     tour.follow('{"half": ', record, said.append)
     assert said == ["pose 1"] and tour.trouble == "elbow: a hand" and tour.done
     assert tour.measured[0].speed == 0.1 and json.loads(record.read_text())["observation"] == values
-    (refusal,) = tour.refusals(record)
-    assert "1 observations are kept" in refusal
+    with pytest.raises(DataError, match=r"elbow: a hand; what was measured is kept in .*new.jsonl"):
+        tour.complete(record)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 import yaml
 
+from exo_gravity.core.errors import DataError
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
 from exo_gravity.hardware.can.bus_scan import BusScan, MotorAnswer, Scan
@@ -133,11 +135,11 @@ def test_a_jig_gives_the_zero_at_its_own_angles(tmp_path: Path) -> None:
 def test_a_silent_motor_and_a_problem_of_the_bus_are_reported_before_anything_is_asked(tmp_path: Path) -> None:
     arm = Arm(5)
     arm.silent, arm.problems = {arm.ids[3]}, ("ID 3: several replies to one command",)
-    result = arm.calibrate(tmp_path)
     others = ", ".join(map(str, sorted(arm.ids[:3])))
-    assert result.refusals[0] == "ID 3: several replies to one command"
-    assert result.refusals[1].startswith(f"IDs that answer: {others}. An arm has 4 motors: check power")
-    assert result.changes == () and arm.requests == []
+    missing = f"IDs that answer: {others}. An arm has 4 motors: check power"
+    with pytest.raises(DataError, match=f"ID 3: several replies to one command; {missing}"):
+        arm.calibrate(tmp_path)
+    assert arm.requests == []
 
 
 @pytest.mark.parametrize(
@@ -153,8 +155,8 @@ def test_an_unclear_motion_is_asked_for_again_and_then_refused(
 ) -> None:
     arm = Arm(6)
     arm.motions["elbow"] = motion
-    (refusal,) = arm.calibrate(tmp_path).refusals
-    assert refusal.startswith(sentence.format(ids=arm.ids))
+    with pytest.raises(DataError, match=re.escape(sentence.format(ids=arm.ids))):
+        arm.calibrate(tmp_path)
     assert sum(request.startswith("elbow") for request in arm.requests) == 3
 
 
@@ -169,8 +171,8 @@ def test_a_joint_moved_both_ways_is_asked_for_again(tmp_path: Path) -> None:
 def test_an_arm_that_swings_gives_no_zero(tmp_path: Path) -> None:
     arm = Arm(8)
     arm.shaking = 0.05
-    (refusal,) = arm.calibrate(tmp_path).refusals
-    assert refusal.startswith("elbow moved by") and refusal.endswith("the arm must be still")
+    with pytest.raises(DataError, match=r"^elbow moved by .* the arm must be still$"):
+        arm.calibrate(tmp_path)
 
 
 def test_a_zero_that_does_not_survive_a_power_up_is_refused(tmp_path: Path) -> None:

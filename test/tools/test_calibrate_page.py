@@ -67,10 +67,14 @@ def outcome(outlier: int | None = None, **changes: object) -> CalibrationResult:
     return replace(found, **changes)  # type: ignore[arg-type]
 
 
+def table_of(result: CalibrationResult) -> TorqueTable:
+    assert result.identified and result.arm
+    return TorqueTable.of(result.identified, result.arm, result.observations)
+
+
 def test_the_table_compares_the_old_and_the_new_file_with_what_was_measured() -> None:
     found = outcome()
-    table = TorqueTable.of(found)
-    assert table is not None
+    table = table_of(found)
     assert table.measured == pytest.approx(np.array([o.effort for o in found.observations]))
     unloaded = slice(0, None, 2)
     expected = gravity_torque(configured_arm().robot, POSES[unloaded], DOWN)
@@ -87,13 +91,14 @@ def test_the_table_compares_the_old_and_the_new_file_with_what_was_measured() ->
 
 def test_the_arm_creeps_where_the_remainder_exceeds_friction() -> None:
     found = outcome()
-    table = TorqueTable.of(found)
-    assert table is not None and found.identified is not None
-    before = np.abs(table.measured - table.before) > 0.1 * FRICTION
-    after = np.abs(found.identified.held_out + found.identified.offset) > 0.1 * FRICTION
-    assert table.creeping(0.1) == (int(before.any(axis=1).sum()), int(after.any(axis=1).sum()))
-    assert table.creeping(100.0) == (0, 0)
-    assert (table.margin > 1.0).all()
+    table = table_of(found)
+    assert found.identified is not None
+    before = np.abs(table.measured - table.before) > 0.2 * FRICTION
+    after = np.abs(found.identified.held_out + found.identified.offset) > 0.2 * FRICTION
+    creeping = [int(creeps.any(axis=1).sum()) for creeps in (before, after)]
+    page = page_of(found, "gravity", "old.yaml", DAY)
+    count = f"in {creeping[0]} of 12 poses with the old file, in {creeping[1]} with the new"
+    assert f"With 0.2 times that the arm creeps {count}" in page
 
 
 def test_the_page_says_what_was_found_and_what_does_not_show() -> None:
@@ -108,19 +113,15 @@ def test_the_page_says_what_was_found_and_what_does_not_show() -> None:
     for sentence in found.identified.unknown:
         assert escape(sentence) in page
     assert "Singular values" in page
-    assert "<b>Next best pose, if more is wanted:</b> 0 40 29 57 degrees" in page
-    assert page.count("<tbody><tr><td rowspan=") == len(POSES)
+    assert "Next best pose, if more is wanted</h3><ul><li>0 40 29 57 degrees" in page
     assert ", in 0 with the new" in page
 
 
-def test_a_pose_that_was_left_out_is_marked_with_its_reason() -> None:
+def test_a_pose_that_was_left_out_is_not_counted() -> None:
     found = outcome(outlier=5)
-    page = page_of(found, "gravity", "old.yaml", DAY)
-    table = TorqueTable.of(found)
-    assert table is not None and found.identified is not None
-    ((index, reason),) = found.identified.rejected
-    assert index == 5 and not table.used[5]
-    assert f"pose 6: {reason}" in page and "<br>left out" in page
+    table = table_of(found)
+    assert np.flatnonzero(~table.used).tolist() == [5]
+    assert " of 11 poses with the old file" in page_of(found, "gravity", "old.yaml", DAY)
 
 
 def test_a_refusal_is_on_the_page_without_new_values() -> None:

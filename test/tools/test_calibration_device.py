@@ -84,7 +84,7 @@ def vector(tilt):
 
 def test_the_recording_of_a_tour_gives_the_same_torques(tours, tmp_path):
     run, tour = tours[0]
-    found = recorded.sweeps_of(recorded_by(run, tmp_path / "bag"), ARM)
+    found = recorded.observations_of(recorded_by(run, tmp_path / "bag"), ARM, with_held=False)
     assert len(found) >= 10  # up to two for each pose; none where a joint sticks for a moment
     for one in found:
         same = min(tour.measured, key=lambda o: np.abs(np.subtract(o.theta, one.theta)).max())
@@ -124,7 +124,7 @@ def test_sweeps_at_five_speeds_give_the_friction_of_each_joint_live_and_recorded
     run = TourRun(truth=truth)
     tour = run.run(FixedStations(friction_stations(run.limits)))
     assert tour.trouble == ""
-    for measured in (tour.measured, recorded.sweeps_of(recorded_by(run, tmp_path / "bag"), ARM)):
+    for measured in (tour.measured, recorded.observations_of(recorded_by(run, tmp_path / "bag"), ARM, with_held=False)):
         result = friction_from(ARM, measured)
         assert result.refusals == ()
         for joint, curve in enumerate(result.curves):

@@ -28,7 +28,6 @@ from exo_gravity.core.calibration.pose_fit import (
     SCALE,
     START,
     TILT,
-    TYPICAL_MOMENTS,
     Rows,
     Solution,
     final,
@@ -50,8 +49,6 @@ TILT_ERROR = 0.05  # rad about each axis, of gravity's measured direction: an IM
 EXACT = 1e-6  # error of a value that is held
 HIDDEN = 0.1  # share of an unknown, in combinations that are not known, from which it is not known itself
 SCALES = (0.3, 3.0)  # true torque per commanded torque; users report 0.75
-SILENT = 0.01  # Nm by which the effort must differ between poses where gravity's torque differs by `EXPECTED`
-EXPECTED = 0.3  # Nm
 MISFIT = 0.1  # of the peak effort
 LEAST_MISFIT = 0.1  # Nm
 LEAST_ZERO_ERROR = 0.5  # deg worth a sentence
@@ -103,7 +100,6 @@ def identify(observations: Sequence[Observation], length: Vector, gravity: float
     Raises DataError if the result would be unphysical, naming the missing pose, and if an observation is impossible.
     """
     rows = _rows(observations, length, gravity)
-    _check_motors(rows)
     keep, rejected = without_outliers(rows)
     used, solution = _bounded(rows.only(keep))
     _check_fit(solution.residual, used.effort)
@@ -195,15 +191,6 @@ def _in_kilograms(solution: Solution, unknowns: np.ndarray) -> tuple[np.ndarray,
     unknowns[SCALE] -= math.log(factor)
     # Student's distribution: for few poses two standard errors would cover less than 95 %.
     return unknowns, (1.0 + 1.25 / (solution.freedom.min() + 6.0)) ** 2 * change @ solution.covariance @ change.T
-
-
-def _check_motors(rows: Rows) -> None:
-    """Raise DataError if a motor's effort stays the same where gravity's torque does not."""
-    typical, effort = rows.regressor @ np.array(TYPICAL_MOMENTS), rows.effort
-    for joint in range(JOINT_COUNT):
-        if np.ptp(typical[:, joint]) > EXPECTED and np.ptp(effort[:, joint]) < SILENT:
-            value = effort[0, joint] + 0.0
-            raise DataError(f"joint {joint + 1}: the effort is {value:.2f} Nm in every pose: a silent motor")
 
 
 def _check_fit(residual: np.ndarray, effort: np.ndarray) -> None:

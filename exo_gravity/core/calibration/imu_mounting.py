@@ -51,8 +51,6 @@ class Mounting(NamedTuple):
     error: np.ndarray  #: (3,) rad, standard error about the trunk's x, y and z
     bow: float  #: rad, the deepest
     bows: int  #: how many
-    gyroscope_bias: np.ndarray  #: (3,) rad/s
-    gyroscope_bias_error: np.ndarray  #: (3,) rad/s, standard error
 
 
 class AccelerometerFit(NamedTuple):
@@ -103,15 +101,8 @@ def mounting(record: ImuRecord) -> Mounting:
     level = math.hypot(SENSOR, max(POSTURE, *(angle_between(up, z) for up in others)))
     sideways = level / math.sin(min(bow, math.pi / 2)), float(np.mean(off_axis)) / 2.0
     heading = max(level, math.hypot(*sideways) / math.sqrt(len(bows)))
-    return Mounting(
-        _quaternion(np.stack((np.cross(y, z), y, z))),
-        np.array((level, level, heading)),
-        bow,
-        len(bows),
-        bias,
-        # The sway is correlated over about a second: as many independent samples as seconds.
-        resting.std(axis=0) / math.sqrt(max(1.0, len(resting) * float(np.median(np.diff(record.time))))),
-    )
+    rotation = np.stack((np.cross(y, z), y, z))
+    return Mounting(_quaternion(rotation), np.array((level, level, heading)), bow, len(bows))
 
 
 def _bows(phases: Sequence[_Phase], standing: Sequence[_Phase]) -> list[tuple[_Phase, _Phase]]:

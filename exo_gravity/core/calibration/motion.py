@@ -50,14 +50,6 @@ class Station(NamedTuple):
         return 2 * self.cycles * (Line(self.low, self.high, self.speed).duration + LEAD)
 
 
-def durations(ways: np.ndarray) -> np.ndarray:
-    """Return the time (n,) in s of motions by `ways` (n, 4) rad, with the rest before them."""
-    length = np.abs(ways).max(axis=1)
-    speed = np.minimum(MAX_SPEED, np.sqrt(length * ACCELERATION))
-    steady = np.divide(length, speed, out=np.zeros_like(length), where=length > 0.0)
-    return np.asarray(steady + speed / ACCELERATION + LEAD)
-
-
 class Line:
     """The motion from `start` to `end`, (4,) rad; the joint with the longest way turns at `speed` rad/s at most.
 
@@ -93,12 +85,7 @@ class Line:
         return is_steady and abs(2.0 * travelled / self._length - 1.0) <= WINDOW
 
 
-class SweepSamples(NamedTuple):
-    """The samples of one sweep."""
-
-    forward: bool  #: on the way there
-    position: np.ndarray  #: (n, 4) rad
-    effort: np.ndarray  #: (n, 4) Nm
+Sweep = tuple[np.ndarray, np.ndarray]  # position (n, 4) rad and effort (n, 4) Nm of its samples
 
 
 class Average(NamedTuple):
@@ -111,21 +98,22 @@ class Average(NamedTuple):
     unrest: np.ndarray  #: (4,) Nm, largest change of the effort from one cycle to another
 
 
-def average(sweeps: Sequence[SweepSamples], slope: np.ndarray, bend: np.ndarray | None = None) -> Average:
+def average(sweeps: Sequence[Sweep], slope: np.ndarray, bend: np.ndarray | None = None) -> Average:
     """Return the average of `sweeps`, which alternate between there and back.
 
     slope: (4, 4) Nm/rad, change of the expected torque with each angle, which relates efforts at different angles.
     bend: (4,) Nm/rad^2, second derivative while all joints turn alike. Without it a sweep of 0.07 rad shows up to 0.3 %
     less than the torque at its middle.
     """
-    theta = np.mean([sweep.position.mean(axis=0) for sweep in sweeps], axis=0)
+    theta = np.mean([position.mean(axis=0) for position, _ in sweeps], axis=0)
     bins = np.zeros((len(sweeps), BINS, JOINT_COUNT))  # mean effort in order of the angle, reduced to `theta`
-    for row, sweep in zip(bins, sweeps, strict=True):
-        away = sweep.position - theta
-        reduced = sweep.effort - away @ slope.T
+    for number, (position, effort) in enumerate(sweeps):
+        away = position - theta
+        reduced = effort - away @ slope.T
         if bend is not None:
             reduced -= np.outer(away.mean(axis=1) ** 2 / 2.0, bend)
-        row[:] = [part.mean(axis=0) for part in np.array_split(reduced if sweep.forward else reduced[::-1], BINS)]
+        in_order = reduced[::-1] if number % 2 else reduced
+        bins[number] = [part.mean(axis=0) for part in np.array_split(in_order, BINS)]
     there, back = bins[0::2], bins[1::2]
     gravity = (there + back) / 2.0
     cycles = gravity.mean(axis=1)
@@ -147,7 +135,7 @@ class Visit:
         self.stuck_joints: dict[int, float] = {}
         self._failures = 0
         self._slope, self._bend = slope, bend
-        self._sweeps: list[SweepSamples] = []
+        self._sweeps: list[Sweep] = []
         self._samples: list[tuple[Sequence[float], Torque]] = []
         self._directions: list[tuple[float, float, float]] = []
 
@@ -175,11 +163,11 @@ class Visit:
     def end_sweep(self) -> np.ndarray | None:
         """End a sweep. Return the friction (4,) in Nm that it and the one before show, None after a way there."""
         position, effort = (np.array(column) for column in zip(*self._samples, strict=True))
-        self._sweeps.append(SweepSamples(len(self._sweeps) % 2 == 0, position, effort))
+        self._sweeps.append((position, effort))
         self._samples = []
         if len(self._sweeps) % 2:
             return None
-        ways = [np.abs(sweep.position[-1] - sweep.position[0]) for sweep in self._sweeps[-2:]]
+        ways = [np.abs(way[-1] - way[0]) for way, _ in self._sweeps[-2:]]
         shares = np.min(ways, axis=0) / (2.0 * WINDOW * self.station.amplitude)
         self.stuck_joints = {joint: float(share) for joint, share in enumerate(shares) if share < FOLLOWED}
         return average(self._sweeps[-2:], self._slope, self._bend).friction

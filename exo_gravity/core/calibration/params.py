@@ -26,6 +26,7 @@ from exo_gravity.core.safety.params import CAN_BRIDGE
 ARM = ("side", "joint_names", "link_length", "gravity", "use_imu", "tilt_timeout")  # as the compensator's
 LIMITS = ("position_min", "position_max", "max_effort")
 BRIDGE = ("rate", *LIMITS)  # as can_bridge's
+DURATION = 230.0  # s of a tour, for which the poses are chosen
 # fmt: off
 CALIBRATOR = (
     *(replace(param, fixed=True) for param in COMPENSATOR if param.name in ARM),
@@ -34,7 +35,6 @@ CALIBRATOR = (
     Param("off_axis", [0.0] * 4, "W, Z, Y3, Y4 as far as known", (-MAX_MOMENT, MAX_MOMENT), "kg m", fixed=True),
     *(param for param in CAN_BRIDGE if param.name in BRIDGE),
     Param("tour.poses", 12, "number of poses that are chosen", (1, 100), fixed=True),
-    Param("tour.duration", 230.0, "time that the poses are chosen for", (30.0, 3600.0), "s", fixed=True),
     Param("tour.friction", False, "sweep the hanging arm at several speeds, in place of chosen poses", fixed=True),
     Param("tour.load_mass", 0.0, "weight that hangs on link 4", (0.0, MAX_MASS), "kg", fixed=True),
     Param("tour.load_lever", 0.0, "its distance from the elbow", (0.0, MAX_LENGTH), "m", fixed=True),
@@ -48,7 +48,7 @@ def tour_of(values: Mapping[str, Any]) -> Tour:
     load = values["tour.load_mass"], values["tour.load_lever"]
     moments = np.array((*values["first_moment"], *values["off_axis"])) + load_moments(values["link_length"], *load)
     guess = TorqueGuess(values["link_length"], moments, Tilt.of(values["side"]), values["gravity"])
-    itinerary: Itinerary = BestPoses(limits, values["tour.poses"], values["tour.duration"])
+    itinerary: Itinerary = BestPoses(limits, values["tour.poses"], DURATION)
     if values["tour.friction"]:
         itinerary = FixedStations(friction_stations(limits))
     return Tour(limits, guess, itinerary, values["rate"], load)

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from exo_gravity.core.calibration.motion import AMPLITUDE, Station, durations
+from exo_gravity.core.calibration.motion import AMPLITUDE, LEAD, Line, Station
 from exo_gravity.core.calibration.pose_fit import COUNT, MOMENT, NATURAL, START, TYPICAL_MOMENTS, Rows
 from exo_gravity.core.calibration.tracking import TorqueGuess
 from exo_gravity.core.errors import DataError, ParameterError
@@ -93,7 +93,10 @@ class BestPoses:
     def _is_in_time(self, left: int, position: np.ndarray, elapsed: float) -> np.ndarray:
         """Return which candidates (n,) leave enough time for the others of the `left` poses and for the way home."""
         sweeps = Station(tuple(self._home.tolist())).duration
-        home, way = (durations(self._candidates - pose) for pose in (self._home, position))
+        home, way = (
+            np.array([Line(pose, candidate).duration + LEAD for candidate in self._candidates])
+            for pose in (self._home, position)
+        )
         budget = (self._duration - elapsed - home) / left
         fits = way + sweeps <= budget * (TIME_SHARE if left > 1 else 1.0)
         return np.asarray(fits if fits.any() else way + home <= (way + home).min() + 1.0)

@@ -57,11 +57,6 @@ class TorqueGuess:
         self._arms = self._as_arms()
 
     @property
-    def moments(self) -> np.ndarray:
-        """The moments (4, 8) in kg m that each joint shows, in its commanded torque."""
-        return self._mean
-
-    @property
     def common_moments(self) -> np.ndarray:
         """The moments (8,) in kg m as the joints show them on average; M_n is that of joint n."""
         return np.append(np.diag(self._mean[:, :JOINT_COUNT]), self._mean[:, JOINT_COUNT:].mean(axis=0))

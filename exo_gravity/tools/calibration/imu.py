@@ -14,19 +14,16 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
-from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_typestore
 
-from exo_gravity.bag.storage import Storage
 from exo_gravity.core.calibration.imu_mounting import AccelerometerFit, ImuRecord, Mounting, mounting, six_rests
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.rotation import Quaternion, product
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.tools.calibration.live import Say
+from exo_gravity.tools.calibration.recorded import messages_of
 from exo_gravity.tools.calibration.result import CalibrationResult, Change
 from exo_gravity.tools.inputs.arms import ConfiguredArm, node_values
 from exo_gravity.tools.inputs.parameter_file import load
@@ -54,51 +51,33 @@ def calibrate_imu(options: argparse.Namespace, arm: ConfiguredArm | None, say: S
     """
     topic = node_values(load(options.params), NODE, IMU)["input_topic"]
     bag = options.bag or _record(options, say)
-    try:
-        found = mounting(read_imu(bag, topic))
-        fit = six_rests(read_imu(options.rests, topic)) if options.rests else None
-    except DataError as error:
-        return CalibrationResult(refusals=(str(error),))
-    changes, lines = _mounting_result(found)
-    if fit is not None:
-        line = _accelerometer_line(fit)
+    changes, lines = _mounting_result(mounting(read_imu(bag, topic)))
+    if options.rests:
+        line = _accelerometer_line(six_rests(read_imu(options.rests, topic)))
         changes, lines = (*changes, Change(NODE, "", 0, line)), (*lines, line)
     return CalibrationResult(changes, lines)
 
 
 def read_imu(bag: Path, topic: str) -> ImuRecord:
     """Return the samples of `topic` in a recording, in order of their stamps. Raises DataError."""
-    storage, types = Storage(bag), get_typestore(Stores.ROS2_JAZZY)
-    rows: list[tuple[float, ...]] = []
-    for batch in storage.batches(lambda name, kind: name == topic and kind == IMU_TYPE):
-        for data in batch.data:
-            try:
-                message: Any = types.deserialize_cdr(data, batch.msgtype)
-            except (SerdeError, ValueError) as error:
-                raise DataError(f"{bag}: {topic}: {error}") from None
-            stamp, rate, force = message.header.stamp, message.angular_velocity, message.linear_acceleration
-            rows.append((stamp.sec + stamp.nanosec * 1e-9, rate.x, rate.y, rate.z, force.x, force.y, force.z))
-    if not rows:
-        topics = ", ".join(sorted(storage.topics)) or "none"
-        raise DataError(f"{bag}: no samples of {topic} ({IMU_TYPE}); its topics: {topics}")
+    rows = []
+    for _, message in messages_of(bag, topic, IMU_TYPE):
+        stamp, rate, force = message.header.stamp, message.angular_velocity, message.linear_acceleration
+        rows.append((stamp.sec + stamp.nanosec * 1e-9, rate.x, rate.y, rate.z, force.x, force.y, force.z))
     values = np.array(sorted(rows))
     return ImuRecord(values[:, 0] - values[0, 0], values[:, 1:4], values[:, 4:7])
 
 
 def _mounting_result(found: Mounting) -> tuple[tuple[Change, ...], tuple[str, ...]]:
     error = " ".join(f"{math.degrees(angle):.1f}" for angle in found.error)
-    bias = " ".join(f"{value:+.4f}" for value in found.gyroscope_bias)
-    bias_error = " ".join(f"{value:.4f}" for value in found.gyroscope_bias_error)
     quaternion = [round(float(value), 6) for value in found.quaternion]
     accuracy = f"±{error} degrees about the trunk's x, y and z, most of which is posture"
     bows = f"{found.bows} {'bow' if found.bows == 1 else 'bows'} of up to {math.degrees(found.bow):.0f} degrees"
     lines = (
         f"{ROTATION}: {' '.join(f'{value:.4f}' for value in quaternion)} (x, y, z, w), {accuracy}",
         f"from {bows}",
-        f"gyroscope bias {bias} rad/s, ±{bias_error}; the imu node estimates it by itself",
     )
-    note = f"{accuracy}, from {bows}; gyroscope bias {bias} rad/s"
-    return (Change(NODE, ROTATION, quaternion, note),), lines
+    return (Change(NODE, ROTATION, quaternion, f"{accuracy}, from {bows}"),), lines
 
 
 def _accelerometer_line(fit: AccelerometerFit) -> str:
@@ -158,14 +137,9 @@ def turned(rotation: Sequence[float], turn: np.ndarray) -> Quaternion:
 
 
 def turn_in_trunk(side: str, turn: np.ndarray) -> np.ndarray:
-    """Return a rotation vector in an arm's base frame in the trunk's axes.
+    """Return a rotation vector (3,) in an arm's base frame in the trunk's axes.
 
     The right arm's base frame is the left one's mirror image, so that the sense of rotation changes.
     """
-    return in_trunk(side, turn) * (1.0 if side == "left" else -1.0)
-
-
-def in_trunk(side: str, direction: np.ndarray) -> np.ndarray:
-    """Return a direction in an arm's base frame in the trunk's axes, as in `core.model.tilt`."""
-    outward, forward, down = direction
-    return np.array((forward, outward if side == "left" else -outward, -down))
+    outward, forward, down = turn
+    return np.array((forward, outward, -down) if side == "left" else (-forward, outward, down))

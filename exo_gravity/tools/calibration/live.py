@@ -89,14 +89,14 @@ class LiveTour:
                 say(event["progress"])
             elif event.get("trouble") and not self.done:
                 self.trouble = self.trouble or event["trouble"]
-                self.was_late = self.was_late or any(sign in line for sign in LATE)
             elif event.get("done"):
                 self.done = True
 
-    def refusals(self, record: Path) -> tuple[str, ...]:
-        """Return why the tour did not complete, and where its observations are; () if it did."""
-        kept = f"; {len(self.measured)} observations are kept in {record}" if self.measured else ""
-        return (f"{self.trouble}{kept}",) if self.trouble else ()
+    def complete(self, record: Path) -> list[Observation]:
+        """Return what was measured. Raises DataError if the tour ended early, with the reason."""
+        if self.trouble:
+            raise DataError(self.trouble + (f"; what was measured is kept in {record}" if self.measured else ""))
+        return self.measured
 
 
 def tour_parameters(
@@ -125,11 +125,6 @@ def tour_parameters(
     return nodes
 
 
-def is_simulated(params: Path, arm: ConfiguredArm) -> bool:
-    """Return whether the parameter file has a simulator for `arm`."""
-    return f"{arm.namespace}/simulator" in yaml.safe_load(params.read_text(encoding="utf-8"))
-
-
 def run_tour(
     options: argparse.Namespace, nodes: Mapping[str, Any], say: Say, stopping: Stopping | None = None
 ) -> LiveTour:
@@ -150,38 +145,32 @@ def run_tour(
 
 def _run_once(options: argparse.Namespace, nodes: Mapping[str, Any], say: Say, stopping: Stopping) -> LiveTour:
     tour, last_errors = LiveTour(), dict[str, str]()
+    ending, dead = threading.Event(), list[tuple[str, int] | None]()
     with tempfile.TemporaryDirectory() as folder, options.output.with_suffix(".log").open("a", 1) as log:
         path = Path(folder, "params.yaml")
         path.write_text(yaml.safe_dump(dict(nodes), sort_keys=False), encoding="utf-8")
 
         def on_line(node: str, line: str) -> None:
+            tour.was_late = tour.was_late or any(sign in line for sign in LATE)
             if node.endswith("/calibrator") and line.startswith("{"):
                 tour.follow(line, options.record, say)
                 return
             log.write(f"{datetime.now():%H:%M:%S.%f} {node.lstrip('/')} {line}\n")
-            tour.was_late = tour.was_late or any(sign in line for sign in LATE)
             if line.startswith(("FATAL ", "ERROR ")):
                 last_errors[node] = line.partition(" ")[2]
 
-        _run(Launcher(path, on_line), tour, stopping, last_errors)
-    return tour
-
-
-def _run(launcher: Launcher, tour: LiveTour, stopping: Stopping, last_errors: Mapping[str, str]) -> None:
-    """Run the nodes until the tour has ended or `stopping` is set."""
-    ending = threading.Event()
-    dead: list[tuple[str, int] | None] = []
-    nodes = threading.Thread(target=lambda: dead.append(launcher.run(ending)))
-    nodes.start()
-    while nodes.is_alive() and not (tour.done or tour.trouble) and not stopping.wait(POLL_PERIOD):
-        pass
-    if stopping.is_set() and not tour.done:
-        tour.trouble = tour.trouble or STOPPED
-    ending.set()
-    nodes.join()
-    if dead and dead[0]:
-        node, code = dead[0]
+        launcher = Launcher(path, on_line)
+        running = threading.Thread(target=lambda: dead.append(launcher.run(ending)))
+        running.start()
+        while running.is_alive() and not (tour.done or tour.trouble) and not stopping.wait(POLL_PERIOD):
+            pass
+        if stopping.is_set() and not tour.done:
+            tour.trouble = tour.trouble or STOPPED
+        ending.set()
+        running.join()
+    for node, code in filter(None, dead):
         tour.trouble = f"{node.lstrip('/')} ended with exit code {code}: {last_errors.get(node, 'see the log')}"
     if launcher.maybe_powered:
         powered = f"the motors of {', '.join(launcher.maybe_powered)} may still be powered: cut their supply"
         tour.trouble = f"{tour.trouble}; {powered}" if tour.trouble else powered
+    return tour

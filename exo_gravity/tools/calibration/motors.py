@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from statistics import fmean
 
 from rich.table import Table
@@ -100,10 +100,7 @@ class MotorWatch:
 
 
 def motor_table(
-    answers: Iterable[MotorAnswer],
-    joints: dict[int, str] | None = None,
-    turns: dict[int, float] | None = None,
-    silent: Iterable[int] = (),
+    answers: Iterable[MotorAnswer], joints: Mapping[int, str], turns: Mapping[int, float], silent: Collection[int]
 ) -> Table:
     """Return the table of the motors that answer; turns: rad by ID, since the person was asked to move a joint."""
     columns = ("ID", "joint", "angle deg", "turned deg", "degC", "error", "reply", "reply ID", "wire format")
@@ -112,9 +109,9 @@ def motor_table(
         error = "-" if answer.error is None else MOTOR_ERRORS.get(answer.error, str(answer.error))
         table.add_row(
             str(answer.can_id),
-            (joints or {}).get(answer.can_id, "?"),
+            joints.get(answer.can_id, "?"),
             "silent" if answer.can_id in silent else f"{math.degrees(answer.position):.1f}",
-            f"{math.degrees((turns or {}).get(answer.can_id, 0.0)):+.1f}",
+            f"{math.degrees(turns.get(answer.can_id, 0.0)):+.1f}",
             "-" if answer.temperature is None else str(answer.temperature),
             error,
             f"{answer.reply_length} bytes",
@@ -137,43 +134,35 @@ class MotorSearch:
         self._ids: list[int] = []
 
     def result(self, pose: Sequence[float]) -> CalibrationResult:
-        """Return the result; pose: (4,) deg in which `zero` is measured."""
+        """Return the result; pose: (4,) deg in which `zero` is measured. Raises DataError if a motor is not found."""
         arm = self._arm
         answers, problems = self._bus.scan()
-        self._say(motor_table(answers))
+        self._say(motor_table(answers, {}, {}, ()))
         if len(answers) < JOINT_COUNT:
             listed = ", ".join(str(answer.can_id) for answer in answers) or "none"
             count = f"IDs that answer: {listed}. An arm has {JOINT_COUNT} motors"
             problems = (*problems, f"{count}: check power, plugs, terminators and the bit rate")
         if problems:
-            return CalibrationResult(refusals=problems, arm=arm)
+            raise DataError("; ".join(problems))
         self._ids = [answer.can_id for answer in answers]
-        errors = tuple(
-            f"motor {answer.can_id} reports the error {MOTOR_ERRORS.get(answer.error, answer.error)}"
-            for answer in answers
-            if answer.error
-        )
         where = "" if not any(pose) else f"{' '.join(f'{angle:g}' for angle in pose)} deg"
-        try:
-            found = [self._motor_of(*joint) for joint in zip(arm.joint_names, MOTIONS, strict=True)]
-            ids, directions = [motor[0] for motor in found], [motor[1] for motor in found]
-            angles, unrest = self._at_rest(f"bring the arm to {where}" if where else "let the arm hang", ids)
-        except DataError as error:
-            return CalibrationResult(lines=errors, refusals=(str(error),), arm=arm)
+        found = [self._motor_of(*joint) for joint in zip(arm.joint_names, MOTIONS, strict=True)]
+        ids, directions = zip(*found, strict=True)
+        angles, unrest = self._at_rest(f"bring the arm to {where}" if where else "let the arm hang", ids)
         zeros = [a - d * math.radians(p) for a, d, p in zip(angles, directions, pose, strict=True)]
         survival, jumps = self._after_power_up(ids, angles)
         node, formats = f"{arm.namespace}/can_bridge", {answer.can_id: answer.wire_format for answer in answers}
         exactly = f"rad, measured {f'at {where}' if where else 'hanging'}, ±{unrest:.4f} and as exact as that pose"
         changes = (
-            Change(node, "can_id", ids, "found by moving each joint by hand"),
+            Change(node, "can_id", list(ids), "found by moving each joint by hand"),
             Change(node, "wire_format", [formats[i] for i in ids], "as each board answers"),
-            Change(node, "direction", directions, "found by moving each joint by hand in its positive direction"),
+            Change(node, "direction", list(directions), "found by moving each joint by hand in its positive direction"),
             Change(node, "zero", [round(zero, 4) for zero in zeros], f"{exactly}; {survival}"),
         )
         columns = zip(arm.joint_names, ids, directions, zeros, strict=True)
         lines = [f"{name}: motor {i}, direction {d:+d}, zero {zero:.4f} rad" for name, i, d, zero in columns]
         refusals = (*self._impossible(ids, directions, zeros), *jumps)
-        return CalibrationResult(changes, (*lines, survival, *errors), refusals, arm)
+        return CalibrationResult(changes, (*lines, survival), refusals, arm)
 
     def _watch(self) -> MotorWatch:
         return MotorWatch(self._bus, self._ids, self._joints, self._clock)

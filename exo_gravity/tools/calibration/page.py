@@ -7,18 +7,18 @@ torque balances the rest.
 from __future__ import annotations
 
 import datetime
-import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from exo_gravity.core.calibration.identification import Identified, columns
+from exo_gravity.core.calibration.identification import Identified, Observation, columns
 from exo_gravity.core.model.gravity import gravity_torque
-from exo_gravity.core.model.moments import MOMENTS, load_moments, regressor
-from exo_gravity.tools.calibration.result import CalibrationResult, Change, Curve, plain, value_text
+from exo_gravity.core.model.moments import load_moments, regressor
+from exo_gravity.tools.calibration.result import CalibrationResult, Curve, plain, value_text
+from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.reporting import html
 from exo_gravity.tools.reporting.html import FAINT, HOLD_COLOUR, INK, JOINT_COLOURS, make_plain
 
@@ -26,13 +26,6 @@ DPI = 130
 FIGURE_WIDTH = 11.0  # inches
 ROOM = 0.08  # of the data's range, around it
 SMALL_FRICTION = 0.2  # of the friction that was measured: a well-run-in gear
-MOST_SHOWN = 99.0  # margins above are not worth a figure
-POSE_COLUMNS = ("measured", "old file", "new file", "held out", "friction")  # Nm
-LEGEND = {
-    "Measured": "is the effort that holds the arm, the mean of both directions of motion, as commanded.",
-    "Held out": "is measured minus predicted, by a result that was found without that pose.",
-    "Margin": ("is friction divided by that remainder: above 1 the arm stays where it is let go, below 1 it creeps."),
-}
 
 
 class TorqueTable(NamedTuple):
@@ -48,11 +41,8 @@ class TorqueTable(NamedTuple):
     used: np.ndarray  #: (n,), false for poses left out
 
     @classmethod
-    def of(cls, result: CalibrationResult) -> TorqueTable | None:
-        """Return the table of a result, None if it has no poses or nothing was identified."""
-        found, arm, poses = result.identified, result.arm, result.observations
-        if found is None or arm is None or not poses:
-            return None
+    def of(cls, found: Identified, arm: ConfiguredArm, poses: Sequence[Observation]) -> TorqueTable:
+        """Return the table of what was identified of `arm` from `poses`."""
         theta, direction, measured, spread = columns(poses)
         loads = np.array([load_moments(arm.robot.length, pose.load_mass, pose.load_lever) for pose in poses])
         weight = np.einsum("ijk,ik->ij", regressor(theta, direction, arm.robot.gravity), loads)
@@ -61,19 +51,6 @@ class TorqueTable(NamedTuple):
         before = gravity_torque(arm.robot, theta, direction) + weight
         after, held_out = measured - found.residual - found.offset, found.held_out + found.offset
         return cls(theta, measured, spread, before, after, held_out, found.friction, used)
-
-    @property
-    def margin(self) -> np.ndarray:
-        """Friction divided by the torque that remains, (n, 4): above 1 the arm stays."""
-        with np.errstate(divide="ignore"):
-            return np.asarray(self.friction / np.abs(self.held_out))
-
-    def creeping(self, share: float = 1.0) -> tuple[int, int]:
-        """Return in how many poses the arm creeps before and after, if friction is `share` of the measured one."""
-        limit = share * self.friction
-        wrong = (self.measured - self.before, self.held_out)
-        before, after = (int(np.any(np.abs(error[self.used]) > limit, axis=1).sum()) for error in wrong)
-        return before, after
 
 
 def page_of(result: CalibrationResult, command: str, params: str, today: datetime.date | None = None) -> str:
@@ -89,27 +66,24 @@ def _sections(result: CalibrationResult) -> Iterator[str]:
         yield html.verdict("Not calibrated; no file was written.", result.refusals, good=False)
     else:
         yield html.verdict("Calibrated.")
-    yield html.bullets("Result", result.lines)
+    found = result.identified
+    unknown = found.unknown if found else ()
+    yield html.bullets("Result", [line for line in result.lines if line not in unknown])
     if result.changes and not result.refusals:
         yield html.heading("New values")
-        yield html.table(("node", "parameter", "value", "note"), map(_row, result.changes))
-    found, table = result.identified, TorqueTable.of(result)
-    if found is not None and table is not None:
+        rows = ((c.node, c.name, value_text(plain(c.value)), c.note) for c in result.changes if c.name)
+        yield html.table(("node", "parameter", "value", "note"), rows)
+    if found and result.arm:
+        table = TorqueTable.of(found, result.arm, result.observations)
         caption = "Predicted against measured torque: on the line, the file is right."
         yield _figure(prediction_figure(table, labels), caption)
         caption = "The torque that remains in each pose. Inside the band, friction holds the arm; outside, it creeps."
         yield _figure(remainder_figure(table, labels), caption)
         yield html.bullets("Drift to expect", _drift(table))
-        yield from _moments(found)
         values = " ".join(f"{value:.3g}" for value in found.singular_values)
-        lines = [*found.unknown, f"Singular values of the information: {values}"]
-        yield html.bullets("What these poses do not show", lines)
-        yield html.bullets("Poses left out", [f"pose {index + 1}: {reason}" for index, reason in found.rejected])
-        if result.suggestion is not None:
-            yield html.paragraph(f"{_degrees(result.suggestion)} degrees.", "Next best pose, if more is wanted:")
-        yield html.heading("Poses")
-        yield _poses(table, labels)
-        yield html.explained(LEGEND)
+        yield html.bullets("What these poses do not show", [*unknown, f"Singular values of the information: {values}"])
+    if result.suggestion is not None:
+        yield html.bullets("Next best pose, if more is wanted", [f"{_degrees(result.suggestion)} degrees"])
     if result.curves:
         caption = "Friction over speed, half the difference between both directions."
         yield _figure(friction_figure(result.curves, labels), caption)
@@ -119,51 +93,17 @@ def _figure(figure: Figure, caption: str) -> str:
     return html.picture(html.png_of(figure, DPI), caption)
 
 
-def _row(change: Change) -> tuple[str, str, str, str]:
-    value = value_text(plain(change.value)) if change.name else ""
-    return change.node, change.name or "(comment)", value, change.note
-
-
 def _drift(table: TorqueTable) -> Iterator[str]:
+    """Yield in how many poses the arm creeps, with all of the measured friction and with little of it."""
+    wrong = np.abs((table.measured - table.before, table.held_out))[:, table.used]
     for share, friction in ((1.0, "the friction measured"), (SMALL_FRICTION, f"{SMALL_FRICTION:g} times that")):
-        before, after = table.creeping(share)
-        count = f"in {before} of {int(table.used.sum())} poses with the old file, in {after} with the new"
+        before, after = np.any(wrong > share * table.friction, axis=2).sum(axis=1)
+        count = f"in {before} of {wrong.shape[1]} poses with the old file, in {after} with the new"
         yield f"With {friction} the arm creeps {count}."
-    peak = np.maximum(np.abs(table.measured).max(axis=0), 1e-9)
-    error = np.sqrt(np.mean(table.held_out[table.used] ** 2, axis=0)) / peak
-    yield f"Held-out error, RMS, of each joint's peak torque: {' '.join(f'{e:.1%}' for e in error)}."
 
 
-def _moments(found: Identified) -> Iterator[str]:
-    rows = (
-        (name, f"{value:.4f}", f"±{error:.5f}" if math.isfinite(error) else "not known")
-        for name, value, error in zip(MOMENTS, found.moments, found.error, strict=True)
-    )
-    scales = " ".join(f"{s:.3f} ±{e:.3f}" for s, e in zip(found.scale, found.scale_error, strict=True))
-    offsets = " ".join(f"{offset:+.3f}" for offset in found.offset)
-    yield html.heading("First moments")
-    yield html.table(("", "kg m, of commanded torque" if found.relative else "kg m", "standard error"), rows)
-    yield html.paragraph(f"True torque per commanded torque{', relative' if found.relative else ''}: {scales}")
-    yield html.paragraph(f"Constant offset of the motors, for which there is no parameter: {offsets} Nm")
-
-
-def _poses(table: TorqueTable, labels: Sequence[str]) -> str:
-    groups = []
-    for number, theta in enumerate(table.theta):
-        values = [column[number] for column in (table.measured, table.before, table.after, table.held_out)]
-        rows = []
-        for joint, (label, margin) in enumerate(zip(labels, table.margin[number], strict=True)):
-            shown = f"{margin:.1f}" if margin < MOST_SHOWN else f"> {MOST_SHOWN:g}"
-            verdict = "" if np.isnan(margin) else "stays" if margin > 1.0 else "creeps"
-            torques = [f"{torque:.3f}" for torque in (*(row[joint] for row in values), table.friction[joint])]
-            rows.append((label, *torques, shown, verdict))
-        angles = _degrees(theta) if table.used[number] else f"{_degrees(theta)}\nleft out"
-        groups.append(((f"{number + 1}", angles), rows))
-    return html.joint_table(("Pose", "deg", "", *(f"{name}\nNm" for name in POSE_COLUMNS), "margin", ""), groups)
-
-
-def _degrees(theta: Iterable[float]) -> str:
-    return " ".join(str(round(math.degrees(angle))) for angle in theta)
+def _degrees(theta: Sequence[float]) -> str:
+    return " ".join(f"{angle:.0f}" for angle in np.degrees(theta))
 
 
 def prediction_figure(table: TorqueTable, labels: Sequence[str]) -> Figure:
@@ -203,8 +143,10 @@ def remainder_figure(table: TorqueTable, labels: Sequence[str]) -> Figure:
         )  # fmt: skip
         _finish(axis, joint, labels)
     axes[1].set_ylabel("Measured minus predicted torque (Nm)", y=0.0)
-    axes[-1].set_xlabel("Pose")
-    axes[-1].set_xticks(numbers, [f"{n}" if used[n - 1] else f"{n}\nleft out" for n in numbers])
+    axes[-1].set_xlabel("Pose, with its four angles in degrees")
+    poses = [[str(n), *_degrees(theta).split()] for n, theta in zip(numbers, table.theta, strict=True)]
+    ticks = ["\n".join(pose if kept else [*pose, "left out"]) for pose, kept in zip(poses, used, strict=True)]
+    axes[-1].set_xticks(numbers, ticks, fontsize=8)
     axes[-1].set_xlim(0.4, len(numbers) + 0.6)
     handles, names = axes[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside upper center", ncols=3, frameon=False, fontsize=9)

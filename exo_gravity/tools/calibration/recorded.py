@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.bag.storage import Storage
 from exo_gravity.core.calibration.identification import Observation
-from exo_gravity.core.calibration.motion import BINS, SweepSamples, average
+from exo_gravity.core.calibration.motion import BINS, average
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.trial.recording import Recording, in_blocks, still_spans
@@ -35,33 +36,36 @@ HELD_TIME = 1.0  # s
 UNKNOWN_FRICTION = 0.4  # Nm, of a joint of which no sweep was recorded
 
 
-def observations_of(path: Path, arm: ConfiguredArm) -> list[Observation]:
-    """Return the observations in the recording of `arm` at `path`. Raises DataError if there are none."""
-    recording, _, tilts = _recorded(path, arm)
-    sweeps = list(_sweeps(recording, arm, tilts))
-    observations = sweeps + list(_held(recording, arm, tilts, sweeps))
+def observations_of(path: Path, arm: ConfiguredArm, with_held: bool = True) -> list[Observation]:
+    """Return the observations in the recording of `arm` at `path`: sweeps there and back, and poses held.
+
+    with_held: False for sweeps alone, which show friction. Raises DataError if there are none.
+    """
+    recording, tilts = _recorded(path, arm)
+    observations = list(_sweeps(recording, arm, tilts))
+    if with_held:
+        observations += list(_held(recording, arm, tilts, observations))
     if not observations:
-        raise DataError(f"{path}: no pose of {arm.name} was held for {HELD_TIME:g} s, or passed slowly there and back")
+        held = f", or held one for {HELD_TIME:g} s" if with_held else ""
+        raise DataError(f"{path}: {arm.name} never passed a pose slowly there and back, all joints turning{held}")
     return observations
 
 
-def sweeps_of(path: Path, arm: ConfiguredArm) -> list[Observation]:
-    """Return the sweeps there and back in the recording of `arm` at `path`. Raises DataError if there are none."""
-    sweeps = list(_sweeps(*_recorded(path, arm)))
-    if not sweeps:
-        raise DataError(f"{path}: {arm.name} never passed a pose slowly there and back, all joints turning")
-    return sweeps
+def _recorded(path: Path, arm: ConfiguredArm) -> tuple[Recording, np.ndarray | None]:
+    """Return the recording of `arm`, and the trunk's tilts (n, 3), None where it uses none.
 
-
-def _recorded(path: Path, arm: ConfiguredArm) -> tuple[Recording, ConfiguredArm, np.ndarray | None]:
-    """Return the recording of `arm`, the arm, and the trunk's tilts, None where it uses none."""
+    The columns are time in s, pitch and roll in rad.
+    """
     bag = read_bag(path)
     found = [recording for recording in bag.recordings if recording.name == arm.name]
     if not found:
         names = ", ".join(recording.name for recording in bag.recordings)
         raise DataError(f"{path}: no arm {arm.name}; it has {names}")
-    tilts = _tilts(path, bag.start) if arm.compensator["use_imu"] else None
-    return _in_order_of(found[0], arm), arm, tilts
+    tilts = None
+    if arm.compensator["use_imu"]:
+        vectors = ((stamp, message.vector) for stamp, message in messages_of(path, TILT_TOPIC, TILT_TYPE))
+        tilts = np.array([((stamp - bag.start) / 1e9, vector.y, vector.x) for stamp, vector in vectors])
+    return _in_order_of(found[0], arm), tilts
 
 
 def _in_order_of(recording: Recording, arm: ConfiguredArm) -> Recording:
@@ -73,17 +77,20 @@ def _in_order_of(recording: Recording, arm: ConfiguredArm) -> Recording:
     return replace(recording, joint_names=arm.joint_names, **columns)
 
 
-def _tilts(path: Path, start: int) -> np.ndarray:
-    """Return time in s, pitch and roll in rad, (n, 3). Raises DataError if the recording has none."""
-    types, rows = get_typestore(Stores.ROS2_JAZZY), []
-    for batch in Storage(path).batches(lambda topic, msgtype: (topic, msgtype) == (TILT_TOPIC, TILT_TYPE)):
+def messages_of(path: Path, topic: str, msgtype: str) -> Iterator[tuple[int, Any]]:
+    """Yield stamp in ns and message of each message of `topic` in a recording. Raises DataError if there are none."""
+    storage, types = Storage(path), get_typestore(Stores.ROS2_JAZZY)
+    found = False
+    for batch in storage.batches(lambda name, kind: (name, kind) == (topic, msgtype)):
         for stamp, data in zip(batch.stamps, batch.data, strict=True):
-            message: Any = types.deserialize_cdr(data, batch.msgtype)
-            vector = message.vector
-            rows.append(((stamp - start) / 1e9, vector.y, vector.x))
-    if not rows:
-        raise DataError(f"{path}: {TILT_TOPIC} was not recorded: the direction of gravity is unknown")
-    return np.array(rows)
+            try:
+                yield stamp, types.deserialize_cdr(data, batch.msgtype)
+            except (SerdeError, ValueError) as error:
+                raise DataError(f"{path}: {topic}: {error}") from None
+            found = True
+    if not found:
+        topics = ", ".join(sorted(storage.topics)) or "none"
+        raise DataError(f"{path}: no samples of {topic} ({msgtype}); its topics: {topics}")
 
 
 def _direction(arm: ConfiguredArm, tilts: np.ndarray | None, start: float, end: float) -> np.ndarray:
@@ -144,13 +151,13 @@ def _there_and_back(recording: Recording, there: slice, back: slice, direction: 
         return None
     middle, reach = (low + high) / 2.0, (high - low) * (0.5 - EDGE)
     sweeps, speeds = [], []
-    for forward, run in ((True, there), (False, back)):
+    for run in (there, back):
         inside = np.flatnonzero(np.all(np.abs(position[run] - middle) <= reach, axis=1)) + run.start
         if len(inside) < 2 * BINS:
             return None
         ends = inside[[0, -1]]
         speeds.append(np.abs(np.diff(position[ends], axis=0)[0]) / np.diff(recording.time[ends]))
-        sweeps.append(SweepSamples(forward, position[inside], _effort(recording, inside).astype(float)))
+        sweeps.append((position[inside], _effort(recording, inside).astype(float)))
     result = average(sweeps, np.zeros((4, 4)))
     sign = np.sign(position[there.stop - 1] - position[there.start])
     speed = np.mean(speeds, axis=0)

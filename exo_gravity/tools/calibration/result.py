@@ -112,18 +112,18 @@ def value_text(value: Value) -> str:
 
 def _changed(text: str, change: Change) -> str:
     """Return the text with one change, in the node's mapping of parameters or in a mapping inside it."""
-    heading, mapping = _parameters(text, change.node)
-    if not change.name:
-        return _edited(text, [_above(text, heading, change.note)])
-    path = change.name.split(".")
-    while found := _entry(mapping, path):
-        key, value, path = found
+    node: Any = yaml.compose(text, yaml.SafeLoader)
+    path = [change.node, PARAMETERS, *filter(None, change.name.split("."))]
+    while found := _entry(node, path):
+        key, node, path = found
         if not path:
-            return _replaced(text, key, value, change)
-        if not isinstance(value, yaml.MappingNode):
-            raise ParameterError(f"{change.node} {change.name}", value.value, "a mapping, to add a value to it")
-        mapping = value
-    return _added(text, mapping, ".".join(path), change)
+            edits = _replacing(key, node, change.value) if change.name else []
+            return _edited(text, [_above(text, key, change.note), *edits])
+        if not isinstance(node, yaml.MappingNode) or not node.value:
+            raise ParameterError(f"{change.node} {change.name}", node.value, "a mapping, to add a value to it")
+    if PARAMETERS in path:
+        raise ParameterError("params", change.node, "a node of the file that has parameters")
+    return _added(text, node, ".".join(path), change)
 
 
 def _entry(mapping: yaml.MappingNode, path: list[str]) -> tuple[yaml.Node, yaml.Node, list[str]] | None:
@@ -135,28 +135,13 @@ def _entry(mapping: yaml.MappingNode, path: list[str]) -> tuple[yaml.Node, yaml.
     return None
 
 
-def _parameters(text: str, node: str) -> tuple[yaml.Node, yaml.MappingNode]:
-    """Return the key `ros__parameters` of `node` and its value as parsed: their marks are positions in `text`."""
-    root = yaml.compose(text, yaml.SafeLoader)
-    for key, entry in root.value if isinstance(root, yaml.MappingNode) else ():
-        if key.value != node or not isinstance(entry, yaml.MappingNode):
-            continue
-        for name, parameters in entry.value:
-            if name.value == PARAMETERS and isinstance(parameters, yaml.MappingNode) and parameters.value:
-                return name, parameters
-    raise ParameterError("params", node, "a node of the file that has parameters")
-
-
-def _replaced(text: str, key: yaml.Node, value: yaml.Node, change: Change) -> str:
-    """Replace a value; a list of the same length entry by entry, which keeps the comments between them."""
-    old = value.value if isinstance(value, yaml.SequenceNode) else [value]
-    items = change.value if isinstance(change.value, list) else [change.value]
-    if len(old) == len(items):
-        marks = ((node.start_mark.index, node.end_mark.index) for node in old)
-        edits = [(*mark, value_text(item)) for mark, item in zip(marks, items, strict=True)]
-    else:
-        edits = [(key.end_mark.index, _end(value), f": {value_text(change.value)}")]
-    return _edited(text, [_above(text, key, change.note), *edits])
+def _replacing(key: yaml.Node, old: yaml.Node, value: Value) -> list[Edit]:
+    """Return the edits that replace a value; a list of the same length by entries, with the comments between them."""
+    nodes = old.value if isinstance(old, yaml.SequenceNode) else [old]
+    items = value if isinstance(value, list) else [value]
+    if len(nodes) != len(items):
+        return [(key.end_mark.index, _end(old), f": {value_text(value)}")]
+    return [(n.start_mark.index, n.end_mark.index, value_text(item)) for n, item in zip(nodes, items, strict=True)]
 
 
 def _added(text: str, mapping: yaml.MappingNode, name: str, change: Change) -> str:

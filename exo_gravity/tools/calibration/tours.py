@@ -1,4 +1,4 @@
-"""calibrate gravity, scale and friction: what slow tours of the bare arm show, live or from a recording.
+"""calibrate gravity, scale, friction and wearer: what slow tours of the arm show, live or from a recording.
 
 gravity    the robot's moments and the ratio of its motors' torque scales
 scale      the real torque per commanded torque of each motor, from a known weight on the last link: two tours, without
@@ -6,26 +6,32 @@ scale      the real torque per commanded torque of each motor, from a known weig
            IMU's heading shows too. A recording (`--bag`) is one with the weight, of an arm that `calibrate gravity` has
            calibrated: what it holds without is known.
 friction   Coulomb, viscous and Stribeck friction of each joint, from sweeps at several slow speeds
+wearer     the weight of the wearer's relaxed arm, from supported poses: what the calibrated robot needs beyond its own
+           moments. Two masses explain it, one on link 3 and one on link 4, at the centres of gravity of the body-mass
+           table: torque shows only mass times distance.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from exo_gravity.core.calibration.friction import FrictionCurve, fit_friction
-from exo_gravity.core.calibration.identification import Identified, Observation, identify
+from exo_gravity.core.calibration.identification import Identified, Observation, columns, identify
 from exo_gravity.core.calibration.poses import candidates, next_pose
+from exo_gravity.core.compensation.params import wearer_of
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.gravity import gravity_torque
-from exo_gravity.core.model.moments import MOMENTS, load_moments, moments_of
+from exo_gravity.core.model.moments import MOMENTS, load_moments, moments_of, regressor
+from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.tools.calibration import live
-from exo_gravity.tools.calibration.live import Say, is_simulated, tour_parameters
-from exo_gravity.tools.calibration.recorded import observations_of, sweeps_of
+from exo_gravity.tools.calibration.live import Say, tour_parameters
+from exo_gravity.tools.calibration.recorded import observations_of
 from exo_gravity.tools.calibration.result import CalibrationResult, Change, Curve
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.launcher import stop_on_signals
@@ -33,14 +39,22 @@ from exo_gravity.tools.launcher import stop_on_signals
 SCALE_POSES = 8  # of each tour of `calibrate scale`
 LEAN = "Lean the stand forward or back by about 10 degrees (12 at most from upright): this shows the IMU's heading"
 LEAST_MOMENT = 0.03  # kg m: a lighter weight is lost in the torque's resolution
+WEARER_POSES = 4  # the hanging arm and three others
+BREATHING = 0.1  # Nm: standard deviation by which a relaxed, breathing person differs from pose to pose
+TYPICAL_BODY_MASS = 70.0  # kg
+# rad: a comfortable part of the joints' ranges.
+COMFORTABLE = ((-0.4, -0.17, -0.5, -0.17), (0.6, 1.2, 1.3, 1.7))
+LARGEST_ERROR = 0.25  # of a mass, as a standard error
+MOST = 15.0  # kg of a person's arm
+TABLE_RATIO = (0.6, 1.6)  # measured to tabled moments that are plausible
 
 
 def calibrate_gravity(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
     """Measure the poses, or take them from `options.bag`, and solve for the moments. Raises ParameterError."""
     if options.bag:
         return moments_from(arm, observations_of(options.bag, arm))
-    tour = live.run_tour(options, tour_parameters(options.params, arm, {"tour.poses": options.poses}), say)
-    return moments_from(arm, tour.measured, tour.refusals(options.record))
+    nodes = tour_parameters(options.params, arm, {"tour.poses": options.poses})
+    return moments_from(arm, live.run_tour(options, nodes, say).complete(options.record))
 
 
 def calibrate_scale(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
@@ -55,30 +69,21 @@ def calibrate_scale(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -
         return moments_from(arm, [*bare, *loaded])
     stopping, poses = stop_on_signals(), {"tour.poses": SCALE_POSES}
     without = live.run_tour(options, tour_parameters(options.params, arm, poses), say, stopping)
-    if refusals := without.refusals(options.record):
-        return moments_from(arm, without.measured, refusals)
+    bare = without.complete(options.record)
     load = {"tour.load_mass": options.mass, "tour.load_lever": options.lever}
     nodes = tour_parameters(options.params, arm, {**poses, **load})
-    if is_simulated(options.params, arm):
+    if (simulator := f"{arm.namespace}/simulator") in nodes:
         # The simulated device cannot be reached by hand: it carries the weight as a wearer's forearm would.
         wearer = {"mass": [0.0, 0.0, 0.0, options.mass], "cog": [0.0, 0.0, 0.0, options.lever]}
-        nodes[f"{arm.namespace}/simulator"]["ros__parameters"]["wearer"] = wearer
+        nodes[simulator]["ros__parameters"]["wearer"] = wearer
     else:
         options.ask(f"Hang {options.mass:g} kg on link 4, {options.lever:g} m from the elbow. {LEAN}")
-    tour = live.run_tour(options, nodes, say, stopping)
-    return moments_from(arm, without.measured + tour.measured, tour.refusals(options.record))
+    return moments_from(arm, bare + live.run_tour(options, nodes, say, stopping).complete(options.record))
 
 
-def moments_from(
-    arm: ConfiguredArm, observations: Sequence[Observation], refusals: tuple[str, ...] = ()
-) -> CalibrationResult:
-    """Return moments and torque scales of `arm` as `observations` show them; refusals: why they are incomplete."""
-    observations = tuple(observations)
-    try:
-        identified = identify(observations, arm.robot.length, arm.robot.gravity)
-    except DataError as error:
-        reasons = (*refusals, str(error)) if observations or not refusals else refusals
-        return CalibrationResult(refusals=reasons, arm=arm, observations=observations)
+def moments_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
+    """Return moments and torque scales of `arm` as `observations` show them. Raises DataError as `identify` does."""
+    identified = identify(observations, arm.robot.length, arm.robot.gravity)
     factor = np.where(np.isfinite(identified.scale_error), identified.scale, 1.0)
     scale = [round(old * float(new), 4) for old, new in zip(arm.can_bridge["torque_scale"], factor, strict=True)]
     low, high = TORQUE_SCALE_BOUNDS
@@ -93,9 +98,9 @@ def moments_from(
     return CalibrationResult(
         _changes(arm, identified, scale),
         (*_lines(arm, identified), *identified.unknown),
-        refusals + impossible,
+        impossible,
         arm,
-        observations,
+        tuple(observations),
         identified,
         tuple(suggestion.tolist()),
     )
@@ -125,9 +130,10 @@ def _lines(arm: ConfiguredArm, identified: Identified) -> tuple[str, ...]:
         f"{name}: {new:.4f} +- {e:.4f} kg m (was {old:.4f})" if np.isfinite(e) else f"{name}: unknown, still {old:.4f}"
         for name, old, new, e in zip(MOMENTS, moments_of(arm.robot), found.moments, found.error, strict=True)
     ]
-    columns = zip(arm.joint_names, found.scale, found.scale_error, found.friction, strict=True)
+    rows = zip(arm.joint_names, found.scale, found.scale_error, found.friction, found.offset, strict=True)
     lines += [
-        f"{name}: {new:.3f} +- {e:.3f} Nm per commanded Nm, friction {slide:.2f} Nm" for name, new, e, slide in columns
+        f"{name}: {new:.3f} +- {e:.3f} Nm per commanded Nm, friction {slide:.2f} Nm, offset {offset:+.3f} Nm"
+        for name, new, e, slide, offset in rows
     ]
     worst = float(np.nanmax(np.abs(found.held_out), initial=0.0))
     lines.append(f"largest torque error of a pose that was left out: {worst:.3f} Nm")
@@ -142,22 +148,16 @@ def _row(values: np.ndarray) -> str:
 def calibrate_friction(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
     """Sweep all joints of the hanging arm, and fit the friction of each. Raises ParameterError."""
     if options.bag:
-        return friction_from(arm, sweeps_of(options.bag, arm))
-    tour = live.run_tour(options, tour_parameters(options.params, arm, {"tour.friction": True}), say)
-    return friction_from(arm, tour.measured, tour.refusals(options.record))
+        return friction_from(arm, observations_of(options.bag, arm, with_held=False))
+    nodes = tour_parameters(options.params, arm, {"tour.friction": True})
+    return friction_from(arm, live.run_tour(options, nodes, say).complete(options.record))
 
 
-def friction_from(
-    arm: ConfiguredArm, observations: Sequence[Observation], refusals: tuple[str, ...] = ()
-) -> CalibrationResult:
-    """Return the friction of each joint that `observations` show; refusals: why they are incomplete."""
-    observations = tuple(observations)
+def friction_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
+    """Return the friction of each joint that `observations` show. Raises DataError as `fit_friction` does."""
     speed = np.array([np.broadcast_to(one.speed, JOINT_COUNT) for one in observations]).reshape(-1, JOINT_COUNT)
     torque = np.array([one.friction for one in observations]).reshape(-1, JOINT_COUNT)
-    try:
-        fits = [fit_friction(*joint) for joint in zip(speed.T, torque.T, strict=True)]
-    except DataError as error:
-        return CalibrationResult(refusals=(*refusals, str(error)), arm=arm, observations=observations)
+    fits = [fit_friction(*joint) for joint in zip(speed.T, torque.T, strict=True)]
     named = list(zip(arm.joint_names, fits, strict=True))
     lines = tuple(f"{name}: {_sentence(fit)}" for name, fit in named)
     negative = tuple(
@@ -167,7 +167,7 @@ def friction_from(
     )
     changes = tuple(Change(f"{arm.namespace}/can_bridge", "", 0, f"friction of {line}") for line in lines)
     curves = tuple(Curve(v, slide, fit.at(v)) for v, slide, fit in zip(speed.T, torque.T, fits, strict=True))
-    return CalibrationResult(changes, lines, refusals + negative, arm, observations, curves=curves)
+    return CalibrationResult(changes, lines, negative, arm, tuple(observations), curves=curves)
 
 
 def _sentence(fit: FrictionCurve) -> str:
@@ -176,3 +176,104 @@ def _sentence(fit: FrictionCurve) -> str:
     if not fit.stribeck:
         return f"{text}, no Stribeck friction"
     return f"{text}, Stribeck {fit.stribeck:.3f} +- {stribeck:.3f} Nm below {fit.stribeck_speed:.2f} rad/s"
+
+
+class WornArm(NamedTuple):
+    """The masses that explain the torque beyond the robot's."""
+
+    mass: np.ndarray  #: (2,) kg on links 3 and 4
+    error: np.ndarray  #: (2,) kg, standard errors
+    remainder: np.ndarray  #: (n, 4) Nm of each pose
+
+
+def calibrate_wearer(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
+    """Measure the wearer's relaxed arm, or take it from `options.bag`. Raises ParameterError."""
+    if options.bag:
+        return wearer_from(arm, observations_of(options.bag, arm))
+    # Few poses, in a comfortable range, with the weight that the table expects.
+    low, high = np.maximum(arm.low, COMFORTABLE[0]), np.minimum(arm.high, COMFORTABLE[1])
+    changes = {"tour.poses": WEARER_POSES, "position_min": low.tolist(), "position_max": high.tolist()}
+    moments = moments_of(arm.robot.with_wearer(*_expected_wearer(arm)))
+    nodes = tour_parameters(options.params, arm, changes, moments)
+    if f"{arm.namespace}/simulator" not in nodes:
+        options.ask("Wear the arm, sit upright and relax: it will be moved slowly. Pull to stop it")
+    return wearer_from(arm, live.run_tour(options, nodes, say).complete(options.record))
+
+
+def wearer_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
+    """Return the wearer's masses that `observations` show. Raises DataError as `worn_arm` does."""
+    cog = np.array(_expected_wearer(arm)[1][2:])
+    worn = worn_arm(arm, observations, cog)
+    node = f"{arm.namespace}/compensator"
+    mass = [0.0, 0.0, *np.round(worn.mass, 3).tolist()]
+    note = f"kg, +-{worn.error[0]:.2f} and {worn.error[1]:.2f}"
+    changes = (
+        Change(node, "wearer.mass", mass, note),
+        Change(node, "wearer.cog", [0.0, 0.0, *np.round(cog, 4).tolist()], "m, of the body-mass table"),
+    )
+    lines = (
+        f"upper arm: {worn.mass[0]:.2f} +- {worn.error[0]:.2f} kg, M3 {_moment(arm, worn.mass, cog)[0]:.3f} kg m",
+        f"forearm and hand: {worn.mass[1]:.2f} +- {worn.error[1]:.2f} kg, M4 {worn.mass[1] * cog[1]:.3f} kg m",
+        f"largest remainder of a pose: {np.abs(worn.remainder).max():.2f} Nm",
+    )
+    comparison, implausible = _compared(arm, worn.mass, cog)
+    return CalibrationResult(changes, (*lines, comparison), implausible, arm, tuple(observations))
+
+
+def worn_arm(arm: ConfiguredArm, observations: Sequence[Observation], cog: np.ndarray) -> WornArm:
+    """Return the masses on links 3 and 4, at `cog` (2,) m, that explain what the robot alone does not.
+
+    Raises DataError if the poses do not show them.
+    """
+    if len(observations) < 3:
+        raise DataError(f"{len(observations)} poses were measured, must be at least 3")
+    theta, direction, effort, spread = columns(observations)
+    rows = regressor(theta, direction, arm.robot.gravity)
+    length = arm.robot.length
+    per_mass = np.zeros((8, 2))
+    per_mass[:3, 0] = length[0], length[1], cog[0]
+    per_mass[:4, 1] = *length[:3], cog[1]
+    extra = effort - rows @ moments_of(arm.robot)
+    weight = 1.0 / np.hypot(spread, BREATHING).ravel()
+    matrix = (rows @ per_mass).reshape(-1, 2) * weight[:, None]
+    covariance = np.linalg.pinv(matrix.T @ matrix)
+    mass = covariance @ matrix.T @ (extra.ravel() * weight)
+    remainder = extra - rows @ per_mass @ mass
+    chi = float(np.sum((remainder.ravel() * weight) ** 2)) / (remainder.size - 2)
+    error = np.sqrt(np.diag(covariance) * max(1.0, chi))
+    for name, own, deviation in zip(("upper arm", "forearm and hand"), mass, error, strict=True):
+        if not 0.0 < own < MOST:
+            raise DataError(
+                f"{name}: {own:.2f} kg: must be from 0 to {MOST:g}: is the arm relaxed, the robot calibrated?"
+            )
+        if deviation > LARGEST_ERROR * own:
+            raise DataError(f"{name}: {own:.2f} +- {deviation:.2f} kg: add a pose with the arm further forward")
+    return WornArm(mass, error, remainder)
+
+
+def _expected_wearer(arm: ConfiguredArm) -> tuple[Sequence[float], Sequence[float]]:
+    """Return mass (4,) in kg and cog (4,) in m on each link: of the file's wearer, or else of a typical one."""
+    mass, cog = wearer_of(arm.compensator)
+    if mass[2] and mass[3]:
+        return mass, cog
+    return wearer_of({**arm.compensator, "wearer.mass": (0.0,) * 4, "wearer.body_mass": TYPICAL_BODY_MASS})
+
+
+def _moment(arm: ConfiguredArm, mass: np.ndarray, cog: np.ndarray) -> tuple[float, float]:
+    """Return M3 and M4 in kg m of masses (2,) on links 3 and 4."""
+    return float(mass[0] * cog[0] + mass[1] * arm.robot.length[2]), float(mass[1] * cog[1])
+
+
+def _compared(arm: ConfiguredArm, mass: np.ndarray, cog: np.ndarray) -> tuple[str, tuple[str, ...]]:
+    """Return how the masses compare with the body-mass table, and why they would be implausible."""
+    given, body_mass = arm.compensator, arm.compensator["wearer.body_mass"]
+    person = Wearer(body_mass or TYPICAL_BODY_MASS, given["wearer.sex"], segment_length=given["wearer.segment_length"])
+    load = person.on_links(arm.robot.length)
+    tabled = np.array(_moment(arm, load.mass[2:], load.cog[2:]))
+    ratio = np.array(_moment(arm, mass, cog)) / tabled
+    if not body_mass:
+        return f"a person of {TYPICAL_BODY_MASS * ratio[0]:.0f} kg has this M3 by the table {person.table}", ()
+    sentence = f"{ratio[0]:.0%} of M3 and {ratio[1]:.0%} of M4 by the table {person.table} for {body_mass:g} kg"
+    low, high = TABLE_RATIO
+    is_plausible = np.all((ratio >= low) & (ratio <= high))
+    return sentence, () if is_plausible else (f"implausible: {sentence}: must be from {low:.0%} to {high:.0%}",)

@@ -65,9 +65,9 @@ def heading(text: str, level: int = 3) -> str:
     return f"<h{level}>{escape(text)}</h{level}>"
 
 
-def paragraph(text: str, term: str = "") -> str:
-    """Return a paragraph; term: bold words at its beginning."""
-    return f"<p>{f'<b>{escape(term)}</b> ' if term else ''}{escape(text)}</p>"
+def paragraph(text: str) -> str:
+    """Return a paragraph."""
+    return f"<p>{escape(text)}</p>"
 
 
 def bullets(title: str, lines: Iterable[str]) -> str:
