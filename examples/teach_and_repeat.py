@@ -11,8 +11,8 @@ from exo_gravity.core import ArmModel
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.friction_inertia import Friction
-from exo_gravity.core.compensation.terms.settings import TermSettings
 from exo_gravity.core.compensation.terms.springs import PosePath, Spring
+from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, MOTORS
 from exo_gravity.core.trial.script import TrialScript

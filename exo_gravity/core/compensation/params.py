@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from exo_gravity.core.compensation.settings import URDF_LAW, GravityModel, Settings, UrdfSettings
-from exo_gravity.core.compensation.terms.settings import term_parameters, term_settings_of
+from exo_gravity.core.compensation.terms.terms import term_parameters, term_settings_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.anfis import AnfisLaw
 from exo_gravity.core.model.arm import (

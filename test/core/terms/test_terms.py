@@ -20,7 +20,6 @@ from exo_gravity.core.compensation.terms.friction_inertia import (
     Friction,
     Inertia,
 )
-from exo_gravity.core.compensation.terms.settings import TermSettings, term_parameters, term_settings_of
 from exo_gravity.core.compensation.terms.springs import (
     Coupling,
     Damping,
@@ -30,9 +29,16 @@ from exo_gravity.core.compensation.terms.springs import (
     TermState,
     stable_stiffness,
 )
-from exo_gravity.core.compensation.terms.terms import MAX_EFFORT, MAX_EFFORT_RATE, Terms
+from exo_gravity.core.compensation.terms.terms import (
+    MAX_EFFORT,
+    MAX_EFFORT_RATE,
+    Terms,
+    TermSettings,
+    term_parameters,
+    term_settings_of,
+)
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.kinematics import LinkInertia
+from exo_gravity.core.model.kinematics import LinkInertia, least_inertia
 from exo_gravity.core.params import values_of
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
@@ -232,7 +238,7 @@ def test_a_spring_or_damper_that_would_be_unstable_when_late_is_refused_with_the
 
 def test_soft_limits_are_no_stiffer_than_the_arm_can_bear():
     stiff = TermSettings(limits=SoftLimits(EDGES)).on_arm(DEFAULT_LINKS).limits.stiffness
-    most = stable_stiffness(LinkInertia.of(DEFAULT_LINKS).least())
+    most = stable_stiffness(least_inertia(LinkInertia.of(DEFAULT_LINKS)))
     assert stiff == pytest.approx(np.minimum(10.0, 0.8 * np.array(most)))
 
 
