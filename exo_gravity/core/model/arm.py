@@ -19,7 +19,6 @@ STANDARD_GRAVITY = 9.80665  # m/s^2, ISO 80000-3; the paper rounds to 9.8
 # These bounds catch wrong units (grams for kilograms, millimetres for metres), not unusual designs.
 MAX_LENGTH = 1.0  # m
 MAX_MASS = 20.0  # kg per link; the whole arm of a 150 kg person weighs about 8 kg
-MAX_TOTAL_MASS = 40.0  # kg, all links together
 MAX_MOMENT = 10.0  # kg m; it takes 98 Nm to hold, several times a motor's peak torque
 MAX_GAIN = 2.0
 MAX_GRAVITY = 25.0  # m/s^2
@@ -27,7 +26,6 @@ MAX_GRAVITY = 25.0  # m/s^2
 ONES = (1.0,) * JOINT_COUNT
 ZEROS = (0.0,) * JOINT_COUNT
 UNKNOWN = np.full(JOINT_COUNT, np.nan)  # masses and centres of gravity of an arm given by its moments
-UNKNOWN.setflags(write=False)
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -104,11 +102,6 @@ class ArmModel:
         for own_field, value in zip(fields(self), values, strict=True):
             object.__setattr__(self, own_field.name, value)
 
-    def __repr__(self) -> str:
-        own = ("length", "first_moment") if self.by_moments else ("length", "cog", "mass")
-        shown = (f"{name}={getattr(self, name)!r}" for name in (*own, "off_axis", "gain", "gravity"))
-        return f"{type(self).__name__}({', '.join(shown)})"
-
     def __eq__(self, other: object) -> bool:
         return isinstance(other, ArmModel) and self._key() == other._key()
 
@@ -116,8 +109,8 @@ class ArmModel:
         return hash(self._key())
 
     def _key(self) -> tuple[object, ...]:
-        arrays = (self.length, self.gain) if self.by_moments else (self.length, self.gain, self.cog, self.mass)
-        return (*(tuple(a.tolist()) for a in arrays), self.first_moment, self.off_axis, self.gravity)
+        arrays = (self.length, self.gain, self.cog, self.mass)
+        return (*(a.tobytes() for a in arrays), self.first_moment, self.off_axis, self.gravity)
 
     @property
     def total_mass(self) -> float:
