@@ -123,7 +123,7 @@ class LinkInertia(NamedTuple):
         x4u = c4 * uu + s4 * tu + g4 * c4 * du_t - a4 * s4 - k4 * c4
         x4n = c4 * un + s4 * tn + g4 * (c4 * dn_t - s4 * dn)
         x4t = c4 * ut + s4 * tt - g4 * s4 * dt + a4 * c4 - k4 * s4
-        (w1, w2, w3, w4), (w12, w13, w14, w23, w24, w34) = self.own, self.between
+        (w1, w2, w3, w4), (w12, w13, w14, w23, w24, w34), (r1, r2, r3, r4) = self
         f1t = w1 * x1t + w12 * ut + w13 * x3t + w14 * x4t
         f2n = w12 * x1n + w2 * un + w23 * x3n + w24 * x4n
         f2t = w12 * x1t + w2 * ut + w23 * x3t + w24 * x4t
@@ -133,7 +133,6 @@ class LinkInertia(NamedTuple):
         f4u = w14 * x1u + w24 * uu + w34 * x3u + w4 * x4u
         f4n = w14 * x1n + w24 * un + w34 * x3n + w4 * x4n
         f4t = w14 * x1t + w24 * ut + w34 * x3t + w4 * x4t
-        r1, r2, r3, r4 = self.rotors
         forearm = c4 * f4t - s4 * f4u
         across = s3 * (s2 * f3u + c2 * f3n) + s4 * (s2 * f4u + c2 * f4n)
         return (

@@ -99,6 +99,7 @@ def test_a_spring_follows_a_recorded_path_and_stays_at_its_end():
     path = (0.0, *ZERO, 1.0, 1.0, 0.0, 0.0, 0.5, 3.0, 1.0, 1.0, 0.0, 0.5)
     spring = Spring((2.0,) * 4, path, max_effort=(9.0 / 2,) * 4)
     halfway = {-1.0: ZERO, 0.5: (0.5, 0.0, 0.0, 0.25), 2.0: (1.0, 0.5, 0.0, 0.5), 9.0: path[-4:]}
+    assert Spring((2.0,) * 4, path[:5]).torque(STATE) == Spring((2.0,) * 4, ZERO).torque(STATE)
     for elapsed, pose in halfway.items():
         torque = spring.torque(STATE._replace(position=ZERO, elapsed=elapsed))
         assert torque == pytest.approx(2.0 * np.array(pose))

@@ -122,10 +122,9 @@ class Spring(TermParameters):
 
     def torque(self, state: TermState) -> Torque:
         """Return the torque (4,) in Nm."""
+        pose = self.poses[0] if len(self.times) == 1 else self._pose_at(state.elapsed)
         torque = []
-        columns = zip(
-            self.stiffness, self._pose_at(state.elapsed), state.position, state.velocity, self.max_effort, strict=True
-        )
+        columns = zip(self.stiffness, pose, state.position, state.velocity, self.max_effort, strict=True)
         for k, to, q, v, most in columns:
             torque.append(clamp(k * (to - q), most) - LATE * k * v)
         return tuple(torque)
