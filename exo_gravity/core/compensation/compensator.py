@@ -53,8 +53,8 @@ class Compensator(Tilted):
         self.terms = Terms(names, settings.terms, settings.moving) if isinstance(settings, Settings) else None
         super().__init__(settings.side, settings.tilt_timeout)
         self._motion = FeltMotion()
-        self._nothing = (0.0,) * settings.count
-        self._limiter = EffortLimiter(settings.count)
+        self._nothing = (0.0,) * len(settings.max_effort)
+        self._limiter = EffortLimiter(len(settings.max_effort))
         self._transition = Transition()  # of the last change of law or settings
         self._torque: Torque = self._nothing  # before ramp and limits
         self._pending: Settings | UrdfSettings | None = None

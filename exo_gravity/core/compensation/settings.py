@@ -13,7 +13,6 @@ from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import LAWS, NO_TORQUE, Torque
 from exo_gravity.core.model.rotation import Floats3
 from exo_gravity.core.model.tilt import SIDES, Tilt
-from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import check_owned, owned
 from exo_gravity.core.safety.limits import MAX_COMMAND
 
@@ -31,8 +30,6 @@ class Settings:
 
     Raises ParameterError.
     """
-
-    count: ClassVar[int] = JOINT_COUNT
 
     side: str  #: 'left' or 'right'
     robot: ArmModel  #: the exoskeleton's own arm
@@ -116,11 +113,6 @@ class UrdfSettings:
     max_effort_rate: float  #: Nm/s
     tilt_timeout: float  #: s
     use_imu: bool  #: False assumes that the root link's z axis points up
-
-    @property
-    def count(self) -> int:
-        """Number of joints."""
-        return len(self.gain)
 
     def torque(self, theta: Sequence[float], tilt: Tilt) -> Torque:
         """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad."""

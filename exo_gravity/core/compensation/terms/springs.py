@@ -196,18 +196,8 @@ class SoftLimits(TermParameters):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not all(low < high for low, high in zip(self.lower, self.upper, strict=True)):
+        if not all(low < high for low, high in zip(self.range[0::2], self.range[1::2], strict=True)):
             raise ParameterError("limits.range", list(self.range), "lower and upper edge of each joint, rising")
-
-    @property
-    def lower(self) -> Sequence[float]:
-        """Lower edges (4,) in rad."""
-        return self.range[0::2]
-
-    @property
-    def upper(self) -> Sequence[float]:
-        """Upper edges (4,) in rad."""
-        return self.range[1::2]
 
     def on_arm(self, least_inertia: Sequence[float]) -> SoftLimits:
         """Return these limits as stiff as an arm of these inertias (4,) kg m^2 can bear."""
@@ -217,9 +207,8 @@ class SoftLimits(TermParameters):
     def torque(self, state: TermState) -> Torque:
         """Return the torque (4,) in Nm: none inside, back towards the workspace outside."""
         torque = []
-        columns = zip(
-            self.stiffness, self.lower, self.upper, state.position, state.velocity, self.max_effort, strict=True
-        )
+        edges = self.range[0::2], self.range[1::2]
+        columns = zip(self.stiffness, *edges, state.position, state.velocity, self.max_effort, strict=True)
         for k, low, high, q, v, most in columns:
             if low <= q <= high:
                 torque.append(0.0)
