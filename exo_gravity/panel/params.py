@@ -10,7 +10,6 @@ from exo_gravity.core.compensation.params import COMPENSATOR
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import Param
 
-LANGUAGES = ("en", "de")
 # fmt: off
 PANEL = (
     Param("host", "127.0.0.1", "address of the page; other than loopback only with a token", fixed=True),
@@ -18,7 +17,7 @@ PANEL = (
     Param("token", "", "secret that opens the page; empty: none on loopback, elsewhere a random one in the log",
           fixed=True),
     Param("dead_man", False, "let the arms down when the page that holds control has been gone for 2 s", fixed=True),
-    Param("language", "en", "language of the page until its user chooses another", choices=LANGUAGES, fixed=True),
+    Param("language", "en", "language of the page until its user chooses another", choices=("en", "de"), fixed=True),
     Param("trials", "", "folder with trial scripts; empty: those of the package", fixed=True),
     Param("output", "recordings", "folder for recordings, trials and saved parameters", fixed=True),
 )
