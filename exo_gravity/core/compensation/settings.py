@@ -78,13 +78,13 @@ class Settings:
 
     def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = False) -> Torque:
         """Return the torque (4,) in Nm that holds the arm at `theta` (4,) rad; exact: by the exact law."""
-        if self.anfis and self.law == "anfis" and not exact:
+        if self.law == "anfis" and self.anfis and not exact:
             return self.anfis.torque(self.arm, theta, tilt)
         return LAWS["exact" if exact else self.law](self.arm, theta, tilt)
 
     def outside(self, theta: Sequence[float], tilt: Tilt) -> str:
         """Return why the law does not apply to this pose or tilt, as `AnfisLaw.outside`; '' if it does."""
-        return self.anfis.outside(self.arm, theta, tilt) if self.anfis and self.law == "anfis" else ""
+        return self.anfis.outside(self.arm, theta, tilt) if self.law == "anfis" and self.anfis else ""
 
 
 class GravityModel(Protocol):
