@@ -36,7 +36,7 @@ class DirectArm:
 
     def law(self, theta: Sequence[float]) -> Torque:
         """Return the torque (4,) in Nm for joint angles (4,) in rad."""
-        return self._law.torque(self._model, theta, self._tilt)
+        return self._law(self._model, theta, self._tilt)
 
     def open(self) -> MotorBus:
         """Open the bus."""

@@ -26,7 +26,7 @@ def measure_laws(quick: bool) -> Iterator[Row]:
     pin, model = pinocchio_model(arm)
     model.gravity.linear = np.array((0.0, 0.0, arm.gravity))
     data, robot = model.createData(), toolbox_robot(arm)
-    law, tilt = LAWS["exact"].torque, Tilt.of("right")
+    law, tilt = LAWS["exact"], Tilt.of("right")
     pose = poses[0]
     theta = tuple(pose.tolist())
     np.testing.assert_allclose(law(arm, theta, tilt), pin.computeGeneralizedGravity(model, data, pose), atol=1e-12)

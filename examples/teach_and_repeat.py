@@ -11,8 +11,8 @@ from exo_gravity.core import ArmModel
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.friction_inertia import Friction
-from exo_gravity.core.compensation.terms.settings import TermSettings
-from exo_gravity.core.compensation.terms.springs import PosePath, Spring
+from exo_gravity.core.compensation.terms.springs import Spring
+from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, MOTORS
 from exo_gravity.core.trial.script import TrialScript
@@ -45,9 +45,9 @@ for motor in motors:
 script = TrialScript.parse({"name": "teach", "steps": [{"move": pose, "over": 2.0} for pose in LED]})
 device.start(VirtualWearer(script), delay=1.0)
 poses = [cycle() for _ in range(round((1.0 + script.duration) / PERIOD))]
-path = PosePath(tuple(0.02 * n for n in range(len(poses[::5]))), tuple(map(tuple, poses[::5])))
+path = [number for row, pose in enumerate(poses[::5]) for number in (0.02 * row, *pose)]  # rows of s and four angles
 
-spring = Spring(stiffness=(3.5, 9.0, 6.0, 3.3), max_effort=(1.0, 2.0, 1.0, 1.0), path=path)
+spring = Spring(stiffness=(3.5, 9.0, 6.0, 3.3), pose=path)
 friction = Friction(share=0.8, coulomb=(0.2, 0.4, 0.2, 0.2))  # as identified: else the spring must overcome it
 compensator.apply(replace(settings, terms=TermSettings(spring=spring, friction=friction)))
 repeated = [cycle() for _ in poses]

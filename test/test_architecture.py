@@ -27,7 +27,6 @@ EXCEPTIONS = {
 FLOORS = (
     "errors",
     "numbers",
-    "rate",
     "params",
     "motors",
     "model",

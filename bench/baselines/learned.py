@@ -110,7 +110,7 @@ class Workspace:
         """Return the torque (1, 4) of one pose, computed as the compensator does."""
         *theta, pitch, roll = (self.middle + inputs[0] * self.half).tolist()
         tilt = Tilt.of(self._configured.side, pitch, roll)
-        return np.array([LAWS["exact"].torque(self._configured.robot, theta, tilt)])
+        return np.array([LAWS["exact"](self._configured.robot, theta, tilt)])
 
     def inside(self, count: int, seed: int) -> np.ndarray:
         """Return `count` random inputs (n, 6) within the training box."""

@@ -21,11 +21,11 @@ import numpy as np
 
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.friction_inertia import Friction, Inertia
-from exo_gravity.core.compensation.terms.settings import TermSettings
 from exo_gravity.core.compensation.terms.springs import DELAY, Coupling, Damping, SoftLimits, Spring
+from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import gravity_torque
-from exo_gravity.core.model.kinematics import LinkInertia
+from exo_gravity.core.model.kinematics import LinkInertia, least_inertia
 from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.sim.params import SIMULATOR, device_of
 from exo_gravity.tools.inputs.arms import ConfiguredArm, node_values, read_arm
@@ -53,7 +53,7 @@ def settings_by_name(base: Settings, coulomb: Sequence[float], viscous: Sequence
     base: of the arm and its wearer. coulomb Nm, viscous Nm s/rad: the friction that the terms know, (4,) each.
     """
     known = Friction(coulomb=coulomb, viscous=viscous)
-    least = LinkInertia.of(base.robot_by_mass or base.robot).least()
+    least = least_inertia(LinkInertia.of(base.robot_by_mass or base.robot))
     soft = [min(20.0, SOFT * inertia / (4.0 * DELAY**2)) for inertia in least]  # Nm/rad
     terms = {
         "friction": TermSettings(friction=replace(known, share=0.4)),

@@ -1,12 +1,5 @@
 """The errors that the package raises.
 
-    ExoGravityError
-    ├── ParameterError    a parameter or argument is invalid; nothing was changed
-    ├── FrameError        bytes are not a valid frame of an AK motor
-    ├── BusError          the CAN bus cannot be opened, or has failed
-    ├── DeviceError       a sensor does not answer, is another one, or has failed
-    └── DataError         a recording or a model file is missing, truncated or invalid
-
 Each message names the item, its value and what would be valid.
 """
 

@@ -51,9 +51,6 @@ GONE: dict[str, str] = {
     "assist.max_effort_rate": "always 10 Nm/s",
     "multi_array.fade_time": "always 2 s",
     "lock_memory": "thread_priority, which also locks the memory where it is above 0",
-    # imu
-    # calibrator
-    # simulator
 }
 
 
@@ -121,18 +118,11 @@ class Param:
 
 
 def owned(
-    default: Any,
-    description: str,
-    bounds: tuple[float, float] | None = None,
-    unit: str = "",
-    choices: tuple[str, ...] = (),
-    expert: bool = False,
-    any_length: bool = False,
+    default: Any, description: str, bounds: tuple[float, float] | None = None, unit: str = "", **other: Any
 ) -> Any:
-    """Return a dataclass field that owns a parameter; a tuple as default makes it a list."""
+    """Return a dataclass field that owns a parameter; a tuple as default makes it a list. other: as in `Param`."""
     plain = list(default) if isinstance(default, tuple) else default
-    param = Param("", plain, description, bounds, unit, choices, expert=expert, any_length=any_length)
-    return field(default=default, metadata={"param": param})
+    return field(default=default, metadata={"param": Param("", plain, description, bounds, unit, **other)})
 
 
 def param_of(owner: type, name: str, fixed: bool = False) -> Param:
@@ -179,19 +169,14 @@ def values_of(table: Sequence[Param], given: Mapping[str, Any], free_prefix: str
 
 
 # Shared by several nodes.
+# fmt: off
 JOINT_NAMES = Param(
     "joint_names",
     ["right_shoulder_rotation", "right_shoulder_abduction", "right_shoulder_flexion", "right_elbow_flexion"],
-    "the four joints from the shoulder to the elbow, as in joint_states",
-    fixed=True,
-)
+    "the four joints from the shoulder to the elbow, as in joint_states", fixed=True)
 REAL_TIME_PARAMETERS = (
-    Param(
-        "thread_priority",
-        0,
-        "above 0: SCHED_FIFO priority of the control loop's threads, and locked memory, where permitted",
-        (0, 99),
-        fixed=True,
-        expert=True,
-    ),
+    Param("thread_priority", 0,
+          "above 0: SCHED_FIFO priority of the control loop's threads, and locked memory, where permitted", (0, 99),
+          fixed=True, expert=True),
 )
+# fmt: on

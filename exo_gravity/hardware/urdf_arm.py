@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -32,9 +31,13 @@ class UrdfArm:
         for name in joint_names:
             if types.get(name) not in TURNING:
                 found = f"; it is {types[name]}" if name in types else ""
-                expected = f"turning joints of the URDF ({', '.join(_turning(types)) or 'it has none'}){found}"
+                turning = ", ".join(name for name, kind in types.items() if kind in TURNING)
+                expected = f"turning joints of the URDF ({turning or 'it has none'}){found}"
                 raise ParameterError("joint_names", name, expected)
-        pin = _pinocchio()
+        try:
+            import pinocchio as pin
+        except ImportError:
+            raise ParameterError("law", "urdf", "used with Pinocchio: pip install 'exo_gravity[urdf]'") from None
         try:
             self._model = pin.buildModelFromXML(text)
         except (RuntimeError, ValueError) as error:
@@ -70,29 +73,18 @@ class UrdfArm:
         return tuple(float(torque[index]) for index in self._order)
 
 
-def _pinocchio() -> Any:
-    try:
-        import pinocchio
-    except ImportError:
-        raise ParameterError("law", "urdf", "used with Pinocchio: pip install 'exo_gravity[urdf]'") from None
-    return pinocchio
-
-
 def _joint_types(text: str) -> dict[str, str]:
     """Return the type of each joint in the URDF `text` by name. Raises ParameterError."""
     try:
         robot = ElementTree.fromstring(text)
+        problem = "" if robot.tag == "robot" else "a URDF, whose outermost element is robot"
     except ElementTree.ParseError as error:
-        raise ParameterError("urdf", _beginning(text), f"the XML of a URDF ({error})") from None
-    if robot.tag != "robot":
-        raise ParameterError("urdf", _beginning(text), "a URDF, whose outermost element is robot")
-    if any("xacro" in element.tag for element in robot.iter()):
-        raise ParameterError("urdf", _beginning(text), "a URDF without xacro elements: run xacro first")
+        problem = f"the XML of a URDF ({error})"
+    if not problem and any("xacro" in element.tag for element in robot.iter()):
+        problem = "a URDF without xacro elements: run xacro first"
+    if problem:
+        raise ParameterError("urdf", _beginning(text), problem)
     return {joint.get("name", ""): joint.get("type", "") for joint in robot.findall("joint")}
-
-
-def _turning(types: dict[str, str]) -> list[str]:
-    return [name for name, kind in types.items() if kind in TURNING]
 
 
 def _beginning(text: str) -> str:

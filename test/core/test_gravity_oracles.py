@@ -82,7 +82,7 @@ def test_a_single_pose_in_plain_floats_agrees_with_the_arrays(name, side):
             "paper_static": lambda on_axis=on_axis: paper_static_torque(arm, on_axis),
             "paper_mobile": lambda on_axis=on_axis, tilt=tilt: paper_mobile_torque(arm, on_axis, tilt.beta, tilt.phi),
         }
-        assert LAWS[name].torque(arm, theta.tolist(), tilt) == pytest.approx(arrays[name](), abs=ROUNDING)
+        assert LAWS[name](arm, theta.tolist(), tilt) == pytest.approx(arrays[name](), abs=ROUNDING)
 
 
 @pytest.mark.parametrize("law", ["exact", "static", "mobile"])

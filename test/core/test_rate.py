@@ -1,6 +1,6 @@
 """The rate of counted events."""
 
-from exo_gravity.core.rate import Rate
+from exo_gravity.core.numbers import Rate
 
 
 def test_a_rate_is_averaged_over_a_second_or_more_and_restarts_with_its_counter():

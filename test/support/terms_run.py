@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from exo_gravity.core import LAWS, ArmModel, Tilt
-from exo_gravity.core.compensation.terms.settings import TermSettings
-from exo_gravity.core.compensation.terms.terms import Terms
+from exo_gravity.core.compensation.terms.terms import Terms, TermSettings
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, MOTORS
 from exo_gravity.core.numbers import Vector
@@ -71,7 +70,7 @@ class TermsRun:
         self.given = self.most_given = self.rubbed = self.worst_balance = 0.0
         self.positions: list[list[float]] = []
         self.applied: list[np.ndarray] = []
-        self._gravity: deque[Sequence[float]] = deque([LAWS["exact"].torque(self.links, self.pose, UPRIGHT)])
+        self._gravity: deque[Sequence[float]] = deque([LAWS["exact"](self.links, self.pose, UPRIGHT)])
         self._extra: deque[Sequence[float]] = deque([(0.0,) * 4])
         self._late = max(1, round(self.delay / self.period))
         for motor in MOTORS_OF_ARM:
@@ -92,7 +91,7 @@ class TermsRun:
             reply = motor.joint_reply(answer[1])
             theta.append(reply.position)
             velocity.append(reply.velocity)
-        self._gravity.append(LAWS["exact"].torque(self.links, theta, UPRIGHT))
+        self._gravity.append(LAWS["exact"](self.links, theta, UPRIGHT))
         self._extra.append(self.terms.torque(100.0 + device.time, theta, velocity, self._gravity[-1]))
         while len(self._extra) > self._late:
             self._extra.popleft()

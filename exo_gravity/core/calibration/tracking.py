@@ -16,7 +16,7 @@ import numpy as np
 
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import LAWS, Torque
-from exo_gravity.core.model.kinematics import ROTORS, LinkInertia, weights_of_moments
+from exo_gravity.core.model.kinematics import ROTORS, LinkInertia
 from exo_gravity.core.model.moments import regressor
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
@@ -64,7 +64,7 @@ class TorqueGuess:
     def torque(self, theta: Sequence[float]) -> Torque:
         """Return the expected torque (4,) in Nm at `theta` (4,) rad, in plain floats for the control loop."""
         law = LAWS["exact"]
-        return tuple(law.torque(arm, theta, self.tilt)[joint] for joint, arm in enumerate(self._arms))
+        return tuple(law(arm, theta, self.tilt)[joint] for joint, arm in enumerate(self._arms))
 
     def torques(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the expected torque and its standard deviation, both (n, 4) Nm, at `theta` (n, 4) rad."""
@@ -91,8 +91,8 @@ class TorqueGuess:
 
 
 def inertia_of(length: Vector, moment: Vector, load: tuple[float, float] = (0.0, 0.0)) -> LinkInertia:
-    """Return the approximate inertia of an arm that is known by its moments; arguments: as in `weights_of_moments`."""
-    return LinkInertia(weights_of_moments(length, moment, load), [rotor + ADDED for rotor in ROTORS])
+    """Return the approximate inertia of an arm that is known by its moments: as `LinkInertia.of_moments`."""
+    return LinkInertia.of_moments(length, moment, load)._replace(rotors=tuple(rotor + ADDED for rotor in ROTORS))
 
 
 class Tracker:

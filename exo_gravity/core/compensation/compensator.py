@@ -22,6 +22,7 @@ from exo_gravity.core.compensation.terms.terms import Terms
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.model.gravity import Torque
+from exo_gravity.core.model.kinematics import turning_torque
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.trunk.felt_motion import FeltMotion
 from exo_gravity.core.trunk.tilt_input import Tilted
@@ -52,8 +53,8 @@ class Compensator(Tilted):
         self.terms = Terms(names, settings.terms, settings.moving) if isinstance(settings, Settings) else None
         super().__init__(settings.side, settings.tilt_timeout)
         self._motion = FeltMotion()
-        self._nothing = (0.0,) * settings.count
-        self._limiter = EffortLimiter(settings.count)
+        self._nothing = (0.0,) * len(settings.max_effort)
+        self._limiter = EffortLimiter(len(settings.max_effort))
         self._transition = Transition()  # of the last change of law or settings
         self._torque: Torque = self._nothing  # before ramp and limits
         self._pending: Settings | UrdfSettings | None = None
@@ -98,6 +99,8 @@ class Compensator(Tilted):
     def _law(self, now: float, theta: Sequence[float]) -> Torque:
         """Return the torque of the chosen law, or of the exact law while the chosen one does not apply."""
         settings, tilt = self.settings, self._tilt.at(now)
+        if not isinstance(settings, Settings):
+            return settings.torque(theta, tilt)
         felt = self._motion.at(now, settings.shoulder_from_imu) if settings.inertial and settings.use_imu else None
         if felt:
             magnitude = math.hypot(*felt.gravity) / STANDARD_GRAVITY
@@ -110,12 +113,18 @@ class Compensator(Tilted):
         torque = settings.torque(theta, tilt, exact=bool(self._fallback))
         if felt is None:
             return torque
-        turning = settings.turning_torque(theta, felt.angular_acceleration)
+        turning = turning_torque(settings.arm, settings.side, theta, felt.angular_acceleration)
         return tuple(map(operator.add, torque, turning))
 
     def _without_step(self, now: float, theta: Sequence[float]) -> Torque:
         """Return the law's torque plus the remainder of the last change of settings or law."""
-        torque = self._current(now, theta)
+        replaced = bool(self._fallback)
+        torque = self._law(now, theta)
+        if bool(self._fallback) != replaced and 0.0 <= now - self._limiter.last_answer <= BREAK:
+            # Continue from the last torque: the replaced law may not apply at `theta`.
+            torque = self._transition.begin(now, self._torque, torque)
+        else:
+            torque = self._transition.blended(now, torque)
         if self._pending is not None:
             if self._pending.law != self.settings.law:
                 self._fallback, self._fallback_until = "", -math.inf
@@ -124,12 +133,3 @@ class Compensator(Tilted):
             torque = self._transition.begin(now, torque, self._law(now, theta))
         self._torque = torque
         return torque
-
-    def _current(self, now: float, theta: Sequence[float]) -> Torque:
-        """Return the torque by the current settings."""
-        replaced = bool(self._fallback)
-        torque = self._law(now, theta)
-        if bool(self._fallback) != replaced and 0.0 <= now - self._limiter.last_answer <= BREAK:
-            # Continue from the last torque: the replaced law may not apply at `theta`.
-            return self._transition.begin(now, self._torque, torque)
-        return self._transition.blended(now, torque)

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from exo_gravity.core.compensation.settings import URDF_LAW, GravityModel, Settings, UrdfSettings
-from exo_gravity.core.compensation.terms.settings import term_parameters, term_settings_of
+from exo_gravity.core.compensation.terms.terms import term_parameters, term_settings_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.anfis import AnfisLaw
 from exo_gravity.core.model.arm import (
@@ -77,13 +77,10 @@ URDF = (
 # fmt: on
 
 
-def compensator_table(given: Collection[str]) -> tuple[Param, ...]:
-    """Return the parameters of `compensator` for a file that gives the names `given`."""
-    return (*COMPENSATOR, *_command_parameters(given))
-
-
-def _command_parameters(given: Collection[str]) -> tuple[Param, ...]:
-    return COMMAND_PARAMETERS if any(param.name in given for param in COMMAND_PARAMETERS) else ()
+def compensator_table(given: Collection[str], table: Sequence[Param] = COMPENSATOR) -> tuple[Param, ...]:
+    """Return `table` and what is declared beside it where a file gives the names `given`."""
+    is_command = any(param.name in given for param in COMMAND_PARAMETERS)
+    return (*table, *(COMMAND_PARAMETERS if is_command else ()))
 
 
 def urdf_table(count: int, given: Collection[str]) -> tuple[Param, ...]:
@@ -103,7 +100,7 @@ def urdf_table(count: int, given: Collection[str]) -> tuple[Param, ...]:
         "thread_priority": {},
     }  # fmt: skip
     shared = [replace(param, **other[param.name]) for param in COMPENSATOR if param.name in other]  # type: ignore[arg-type]
-    return (*shared, *URDF, *_command_parameters(given))
+    return compensator_table(given, (*shared, *URDF))
 
 
 def settings_of(values: Mapping[str, Any], anfis: AnfisLaw | None = None) -> Settings:

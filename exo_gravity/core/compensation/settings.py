@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
 
-from exo_gravity.core.compensation.terms.settings import TermSettings
+from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.anfis import AnfisLaw
 from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.model.gravity import LAWS, NO_TORQUE, Law, Torque
-from exo_gravity.core.model.kinematics import turning_torque
+from exo_gravity.core.model.gravity import LAWS, NO_TORQUE, Torque
 from exo_gravity.core.model.rotation import Floats3
 from exo_gravity.core.model.tilt import SIDES, Tilt
-from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import check_owned, owned
 from exo_gravity.core.safety.limits import MAX_COMMAND
 
@@ -32,8 +30,6 @@ class Settings:
 
     Raises ParameterError.
     """
-
-    count: ClassVar[int] = JOINT_COUNT
 
     side: str  #: 'left' or 'right'
     robot: ArmModel  #: the exoskeleton's own arm
@@ -56,14 +52,12 @@ class Settings:
     #: what is compensated: the robot in One-G, the robot plus `support` times the wearer in Zero-G
     arm: ArmModel = field(init=False)
     moving: ArmModel = field(init=False)  #: the same by its masses
-    active_law: Law = field(init=False)  #: the law in use
 
     def __post_init__(self) -> None:
         if self.side not in SIDES:
             raise ParameterError("side", self.side, f"one of {', '.join(SIDES)}")
         check_owned(self)
-        law = self.anfis if self.law == "anfis" else LAWS[self.law]
-        if law is None:
+        if self.law == "anfis" and self.anfis is None:
             raise ParameterError("law", self.law, "used with anfis_file, a model from train_anfis")
         if self.law != "exact":
             self.robot.check_masses(f"law {self.law}")
@@ -81,20 +75,16 @@ class Settings:
         object.__setattr__(self, "terms", self.terms.on_arm(by_mass))
         object.__setattr__(self, "arm", whole if self.mode == "zero_g" else self.robot)
         object.__setattr__(self, "moving", carried if self.mode == "zero_g" else by_mass)
-        object.__setattr__(self, "active_law", law)
 
     def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = False) -> Torque:
         """Return the torque (4,) in Nm that holds the arm at `theta` (4,) rad; exact: by the exact law."""
-        law = LAWS["exact"] if exact else self.active_law
-        return law.torque(self.arm, theta, tilt)
+        if self.law == "anfis" and self.anfis and not exact:
+            return self.anfis.torque(self.arm, theta, tilt)
+        return LAWS["exact" if exact else self.law](self.arm, theta, tilt)
 
     def outside(self, theta: Sequence[float], tilt: Tilt) -> str:
-        """Return why the law does not apply to this pose or tilt, as `Law.outside`; '' if it does."""
-        return self.active_law.outside(self.arm, theta, tilt)
-
-    def turning_torque(self, theta: Sequence[float], angular_acceleration: Sequence[float]) -> Torque:
-        """Return the torque (4,) in Nm that turns the arm with the trunk, whose acceleration (3,) is in rad/s^2."""
-        return turning_torque(self.arm, self.side, theta, angular_acceleration)
+        """Return why the law does not apply to this pose or tilt, as `AnfisLaw.outside`; '' if it does."""
+        return self.anfis.outside(self.arm, theta, tilt) if self.law == "anfis" and self.anfis else ""
 
 
 class GravityModel(Protocol):
@@ -104,10 +94,7 @@ class GravityModel(Protocol):
     mass: float  #: kg that the joints carry
 
     def torque(self, theta: Sequence[float], gravity: Sequence[float]) -> Torque:
-        """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad.
-
-        gravity: (3,) m/s^2 in the axes of the arm's root link.
-        """
+        """Return the torque (n,) in Nm at `theta` (n,) rad; gravity: (3,) m/s^2 in the root link's axes."""
         ...
 
 
@@ -116,10 +103,8 @@ class UrdfSettings:
     """Settings of any serial arm of n joints, whose torques come from `arm`."""
 
     law: ClassVar[str] = URDF_LAW
-    side: ClassVar[str] = "left"  # the root link's axes are not mirrored
     inertial: ClassVar[bool] = False
-    shoulder_from_imu: ClassVar[Floats3] = (0.0, 0.0, 0.0)
-    terms: ClassVar[None] = None
+    side: ClassVar[str] = "left"  # the root link's axes are not mirrored
 
     arm: GravityModel
     gain: Sequence[float]  #: scales the torque, (n,)
@@ -129,22 +114,7 @@ class UrdfSettings:
     tilt_timeout: float  #: s
     use_imu: bool  #: False assumes that the root link's z axis points up
 
-    @property
-    def count(self) -> int:
-        """Number of joints."""
-        return len(self.gain)
-
-    def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = False) -> Torque:
+    def torque(self, theta: Sequence[float], tilt: Tilt) -> Torque:
         """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad."""
-        x, y, z = tilt.gravity_in_trunk
-        g = self.gravity
-        torque = self.arm.torque(theta, (g * x, g * y, g * z))
+        torque = self.arm.torque(theta, [self.gravity * component for component in tilt.gravity_in_trunk])
         return tuple([gain * tau for gain, tau in zip(self.gain, torque, strict=True)])
-
-    def outside(self, theta: Sequence[float], tilt: Tilt) -> str:
-        """Return '': the law applies everywhere."""
-        return ""
-
-    def turning_torque(self, theta: Sequence[float], angular_acceleration: Sequence[float]) -> Torque:
-        """Return zeros (n,): the root link is taken as at rest."""
-        return (0.0,) * self.count

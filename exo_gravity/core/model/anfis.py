@@ -18,11 +18,10 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.arm import ArmModel
@@ -39,7 +38,7 @@ UPRIGHT = math.radians(0.5)
 FORMAT = "exo_gravity ANFIS law 1"
 
 
-@dataclass(frozen=True, eq=False, init=False)
+@dataclass(frozen=True, eq=False)
 class Anfis:
     """m models with one output each, on the same d inputs, with k membership functions per input.
 
@@ -50,9 +49,16 @@ class Anfis:
     sigma: np.ndarray  #: premises, (m, d, k), > 0, in the inputs' units
     consequent: np.ndarray  #: (m, k^d, d + 1), p_0..p_d of each rule; the function of the last input varies fastest
 
-    def __init__(self, centre: ArrayLike, sigma: ArrayLike, consequent: ArrayLike) -> None:
-        for field, value in zip(fields(self), (centre, sigma, consequent), strict=True):
-            object.__setattr__(self, field.name, _array(field.name, value))
+    def __post_init__(self) -> None:
+        for name in ("centre", "sigma", "consequent"):
+            try:
+                array = np.array(getattr(self, name), dtype=float)
+            except (TypeError, ValueError):
+                array = np.array(())
+            if array.ndim != 3 or not np.all(np.isfinite(array)):
+                raise DataError(f"ANFIS: {name}: must be an array of finite numbers with 3 axes")
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
         models, inputs, functions = self.centre.shape
         rules = functions**inputs
         if not 0 < rules <= MAX_RULES:
@@ -97,22 +103,9 @@ def grades(centre: np.ndarray, sigma: np.ndarray, inputs: np.ndarray) -> np.ndar
     return normalised
 
 
-def _array(name: str, value: ArrayLike) -> np.ndarray:
-    try:
-        array = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        raise DataError(f"ANFIS: {name}: must be a rectangular array of numbers") from None
-    if array.ndim != 3:
-        raise DataError(f"ANFIS: shape of {name} = {array.shape}: must have 3 axes")
-    if not np.all(np.isfinite(array)):
-        raise DataError(f"ANFIS: {name} has NaN or infinite entries: must be finite")
-    array.setflags(write=False)
-    return array
-
-
 @dataclass(frozen=True, eq=False)
 class AnfisLaw:
-    """Torques of an arm on an upright trunk, learned over a box of joint angles."""
+    """Torques of an arm on an upright trunk, learned over a box of joint angles. Raises DataError."""
 
     #: one output in Nm for each of joints 2, 3 and 4 at gain 1; its inputs are theta_2..theta_4, -1..1 over the box
     model: Anfis
@@ -122,6 +115,18 @@ class AnfisLaw:
     gravity: float  #: m/s^2
     source: str  #: a sentence on the training data
     error: Mapping[str, Sequence[float]]  #: RMSE of joints 2 to 4: {'training': (3,) Nm, 'held_out': (3,) Nm}
+
+    def __post_init__(self) -> None:
+        inputs = self.model.centre.shape[1]
+        if inputs != len(INPUTS):
+            raise DataError(f"ANFIS file: {inputs} inputs: must be {len(INPUTS)}, {', '.join(INPUTS)}")
+        for name, low, high in zip(INPUTS, self.low, self.high, strict=True):
+            if not -2 * math.pi <= low < high <= 2 * math.pi:
+                raise DataError(f"ANFIS file: box of {name} = {[low, high]}: must be [low, high] in rad")
+        if len(self.first_moment) != len(JOINTS) or not all(0 <= moment < math.inf for moment in self.first_moment):
+            raise DataError(f"ANFIS file: first_moment = {list(self.first_moment)}: must be M2, M3, M4 in kg m")
+        if not 0 < self.gravity < math.inf:
+            raise DataError(f"ANFIS file: gravity = {self.gravity}: must be greater than 0 m/s^2")
 
     @classmethod
     def load(cls, content: str | Mapping[str, Any]) -> AnfisLaw:
@@ -133,8 +138,9 @@ class AnfisLaw:
             joints = [content["joints"][joint] for joint in JOINTS]
             box = [tuple(float(bound) for bound in content["box"][name]) for name in INPUTS]
             low, high = zip(*box, strict=True)
-            law = cls(
-                Anfis(*([joint[part] for joint in joints] for part in ("centre", "sigma", "consequent"))),
+            parts: Any = ([joint[part] for joint in joints] for part in ("centre", "sigma", "consequent"))
+            return cls(
+                Anfis(*parts),
                 low,
                 high,
                 tuple(float(moment) for moment in content["arm"]["first_moment"]),
@@ -146,20 +152,6 @@ class AnfisLaw:
             raise DataError(f"ANFIS file: the key {error.args[0]} is missing") from None
         except (TypeError, ValueError) as error:
             raise DataError(f"ANFIS file: {error}: must be a file from train_anfis") from None
-        law._check()
-        return law
-
-    def _check(self) -> None:
-        inputs = self.model.centre.shape[1]
-        if inputs != len(INPUTS):
-            raise DataError(f"ANFIS file: {inputs} inputs: must be {len(INPUTS)}, {', '.join(INPUTS)}")
-        for name, low, high in zip(INPUTS, self.low, self.high, strict=True):
-            if not -2 * math.pi <= low < high <= 2 * math.pi:
-                raise DataError(f"ANFIS file: box of {name} = {[low, high]}: must be [low, high] in rad")
-        if len(self.first_moment) != len(JOINTS) or not all(0 <= moment < math.inf for moment in self.first_moment):
-            raise DataError(f"ANFIS file: first_moment = {list(self.first_moment)}: must be M2, M3, M4 in kg m")
-        if not 0 < self.gravity < math.inf:
-            raise DataError(f"ANFIS file: gravity = {self.gravity}: must be greater than 0 m/s^2")
 
     def dump(self) -> str:
         """Return the JSON text that `load` reads, one line per rule."""

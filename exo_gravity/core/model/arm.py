@@ -19,7 +19,6 @@ STANDARD_GRAVITY = 9.80665  # m/s^2, ISO 80000-3; the paper rounds to 9.8
 # These bounds catch wrong units (grams for kilograms, millimetres for metres), not unusual designs.
 MAX_LENGTH = 1.0  # m
 MAX_MASS = 20.0  # kg per link; the whole arm of a 150 kg person weighs about 8 kg
-MAX_TOTAL_MASS = 40.0  # kg, all links together
 MAX_MOMENT = 10.0  # kg m; it takes 98 Nm to hold, several times a motor's peak torque
 MAX_GAIN = 2.0
 MAX_GRAVITY = 25.0  # m/s^2
@@ -27,7 +26,6 @@ MAX_GRAVITY = 25.0  # m/s^2
 ONES = (1.0,) * JOINT_COUNT
 ZEROS = (0.0,) * JOINT_COUNT
 UNKNOWN = np.full(JOINT_COUNT, np.nan)  # masses and centres of gravity of an arm given by its moments
-UNKNOWN.setflags(write=False)
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -59,13 +57,25 @@ class ArmModel:
         gain: Vector = ONES,
         gravity: float = STANDARD_GRAVITY,
         off_axis: Vector = ZEROS,
+        first_moment: Vector | None = None,
     ) -> None:
         lengths = four_floats("length", length, 0.0, MAX_LENGTH, "m")
-        cogs = four_floats("cog", cog, 0.0, MAX_LENGTH, "m")
-        if np.any(cogs > lengths):
-            raise ParameterError("cog", cog, f"within its link, at most length = {lengths.tolist()} m")
-        masses = four_floats("mass", mass, 0.0, MAX_MASS, "kg")
-        self._set(lengths, cogs, masses, moments_along(lengths, cogs, masses), gain, gravity, off_axis)
+        if first_moment is None:
+            cogs = four_floats("cog", cog, 0.0, MAX_LENGTH, "m")
+            if np.any(cogs > lengths):
+                raise ParameterError("cog", cog, f"within its link, at most length = {lengths.tolist()} m")
+            masses = four_floats("mass", mass, 0.0, MAX_MASS, "kg")
+            moments = moments_along(lengths, cogs, masses)
+        else:
+            cogs = masses = UNKNOWN
+            moments = four_floats("first_moment", first_moment, 0.0, MAX_MOMENT, "kg m")
+        gains = four_floats("gain", gain, 0.0, MAX_GAIN)
+        gravity = one_float("gravity", gravity, 0.0, MAX_GRAVITY, "m/s^2")
+        across = tuple(four_floats("off_axis", off_axis, -MAX_MOMENT, MAX_MOMENT, "kg m").tolist())
+        scale = tuple((gains * gravity).tolist())
+        values = (lengths, cogs, masses, gains, gravity, across, tuple(moments.tolist()), scale, masses is UNKNOWN)
+        for own_field, value in zip(fields(self), values, strict=True):
+            object.__setattr__(self, own_field.name, value)
 
     @classmethod
     def from_moments(
@@ -80,34 +90,7 @@ class ArmModel:
 
         first_moment: M1..M4, 0..MAX_MOMENT. The other arguments are those of the constructor. Raises ParameterError.
         """
-        lengths = four_floats("length", length, 0.0, MAX_LENGTH, "m")
-        moment = four_floats("first_moment", first_moment, 0.0, MAX_MOMENT, "kg m")
-        arm = cls.__new__(cls)
-        arm._set(lengths, UNKNOWN, UNKNOWN, moment, gain, gravity, off_axis)
-        return arm
-
-    def _set(
-        self,
-        length: np.ndarray,
-        cog: np.ndarray,
-        mass: np.ndarray,
-        moment: np.ndarray,
-        gain: Vector,
-        gravity: float,
-        off_axis: Vector,
-    ) -> None:
-        gains = four_floats("gain", gain, 0.0, MAX_GAIN)
-        gravity = one_float("gravity", gravity, 0.0, MAX_GRAVITY, "m/s^2")
-        across = tuple(four_floats("off_axis", off_axis, -MAX_MOMENT, MAX_MOMENT, "kg m").tolist())
-        scale = tuple((gains * gravity).tolist())
-        values = (length, cog, mass, gains, gravity, across, tuple(moment.tolist()), scale, mass is UNKNOWN)
-        for own_field, value in zip(fields(self), values, strict=True):
-            object.__setattr__(self, own_field.name, value)
-
-    def __repr__(self) -> str:
-        own = ("length", "first_moment") if self.by_moments else ("length", "cog", "mass")
-        shown = (f"{name}={getattr(self, name)!r}" for name in (*own, "off_axis", "gain", "gravity"))
-        return f"{type(self).__name__}({', '.join(shown)})"
+        return cls(length, UNKNOWN, UNKNOWN, gain, gravity, off_axis, first_moment)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, ArmModel) and self._key() == other._key()
@@ -116,8 +99,8 @@ class ArmModel:
         return hash(self._key())
 
     def _key(self) -> tuple[object, ...]:
-        arrays = (self.length, self.gain) if self.by_moments else (self.length, self.gain, self.cog, self.mass)
-        return (*(tuple(a.tolist()) for a in arrays), self.first_moment, self.off_axis, self.gravity)
+        arrays = (self.length, self.gain, self.cog, self.mass)
+        return (*(a.tobytes() for a in arrays), self.first_moment, self.off_axis, self.gravity)
 
     @property
     def total_mass(self) -> float:

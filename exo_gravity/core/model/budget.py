@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -70,9 +69,7 @@ class Workspace:
         high = four_floats("position_max", self.position_max, -3.15, 3.15, "rad")
         if np.any(low >= high):
             raise ParameterError("position_max", self.position_max, f"above position_min = {low.tolist()} rad")
-        object.__setattr__(self, "position_min", tuple(low.tolist()))
-        object.__setattr__(self, "position_max", tuple(high.tolist()))
-        object.__setattr__(self, "max_tilt", one_float("max_tilt", self.max_tilt, 0.0, np.pi / 2, "rad"))
+        one_float("max_tilt", self.max_tilt, 0.0, np.pi / 2, "rad")
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -182,55 +179,47 @@ def budget(
     rated, peak: (4,) Nm at the joints. pause: called about 500 times, before each chunk of about a millisecond of
     computation. Raises ParameterError if the load does not fit the robot.
     """
-    torques = partial(_torques, robot, robot.with_wearer(*load), pause)
+    full = robot.with_wearer(*load)
+
+    def torques(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the torques (n, 4) in Nm of the robot, and what the wearer's whole arm adds, at points (n, 6)."""
+        chunks = []
+        for chunk in np.array_split(points, len(points) // CHUNK + 1):
+            pause()
+            chunks.append((torque_at(robot, chunk), torque_at(full, chunk)))
+        own, with_all = map(np.concatenate, zip(*chunks, strict=True))
+        return own, with_all - own
+
     points = workspace.points()
     starts = np.vstack((points[: SAMPLES // 5] * (1, 1, 1, 1, 0, 0), points))  # those with an upright trunk first
-    at_starts = torques(starts)
+    own, added = torques(starts)
+    needs = np.abs(own + support * added)
 
     def of_joint(joint: int) -> JointBudget:
-        def need(own: np.ndarray, with_all: np.ndarray) -> np.ndarray:
-            torque: np.ndarray = np.abs(own + support * (with_all - own))
+        def need(at: np.ndarray) -> np.ndarray:
+            own, added = torques(at)
+            torque: np.ndarray = np.abs(own + support * added)
             return torque[:, joint]
 
-        def shortage(own: np.ndarray, with_all: np.ndarray) -> np.ndarray:
-            return -_support(own[:, joint], with_all[:, joint], rated[joint])
+        def shortage(at: np.ndarray) -> np.ndarray:
+            own, added = torques(at)
+            return -_support(own[:, joint], added[:, joint], rated[joint])
 
-        needs = need(*at_starts)
-        worst, torque = _worst(lambda at: need(*torques(at)), workspace, starts, needs)
-        _, short = _worst(lambda at: shortage(*torques(at)), workspace, starts, shortage(*at_starts))
-
-        def share_within(limit: float) -> float:
-            # The search can find an overloaded pose that no sample shows. Then the share must not be 1.
-            return min(float(np.mean(needs[-len(points) :] <= limit)), 0.9999 if torque > limit else 1.0)
-
-        return JointBudget(
-            rated=float(rated[joint]),
-            peak=float(peak[joint]),
-            torque=torque,
-            worst=worst,
-            within_rated=share_within(rated[joint]),
-            within_peak=share_within(peak[joint]),
-            support=None if short > 0.0 else -short,
+        worst, torque = _worst(need, workspace, starts, needs[:, joint])
+        _, short = _worst(shortage, workspace, starts, -_support(own[:, joint], added[:, joint], rated[joint]))
+        # The search can find an overloaded pose that no sample shows. Then the share must not be 1.
+        within_rated, within_peak = (
+            min(float(np.mean(needs[-len(points) :, joint] <= limit)), 0.9999 if torque > limit else 1.0)
+            for limit in (rated[joint], peak[joint])
         )
+        largest = None if short > 0.0 else -short
+        return JointBudget(float(rated[joint]), float(peak[joint]), torque, worst, within_rated, within_peak, largest)
 
     return tuple(map(of_joint, range(JOINT_COUNT)))
 
 
-def _torques(
-    robot: ArmModel, full: ArmModel, pause: Callable[[], None], points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the torques (n, 4) in Nm of `robot` and of `full`, the robot with the wearer's arm, at points (n, 6)."""
-    chunks = []
-    for chunk in np.array_split(points, len(points) // CHUNK + 1):
-        pause()
-        chunks.append((torque_at(robot, chunk), torque_at(full, chunk)))
-    own, with_all = map(np.concatenate, zip(*chunks, strict=True))
-    return own, with_all
-
-
-def _support(own: np.ndarray, with_all: np.ndarray, limit: float) -> np.ndarray:
-    """Return the largest support (n,), at most 1, with |own + support (with_all - own)| <= limit; negative if none."""
-    added = with_all - own
+def _support(own: np.ndarray, added: np.ndarray, limit: float) -> np.ndarray:
+    """Return the largest support (n,), at most 1, with |own + support added| <= limit; negative if there is none."""
     room = limit - np.sign(added) * own  # in the direction of the wearer's torque
     support = np.divide(room, np.abs(added), out=np.ones_like(room), where=np.abs(added) > 1e-9)
     return np.where(np.abs(own) > limit, -1.0, np.minimum(support, 1.0))
@@ -244,7 +233,15 @@ def _worst(cost: Cost, workspace: Workspace, starts: np.ndarray, costs: np.ndarr
     """
     low, high = workspace.bounds
     chosen = sorted({*np.argsort(costs)[-STARTS:].tolist(), int(np.argmax(costs[: SAMPLES // 5]))})
-    points, values = _climb(cost, starts[chosen], low, high)
+    points, values, width = starts[chosen], costs[chosen], (high - low) / 8
+    while np.any(width > 1e-4):  # climb from each of the points along one coordinate at a time
+        for axis in range(points.shape[1]):
+            lines = np.repeat(points[:, None], len(STEPS), axis=1)
+            lines[:, :, axis] = np.clip(lines[:, :, axis] + STEPS * width[axis], low[axis], high[axis])
+            found = cost(lines.reshape(-1, points.shape[1])).reshape(len(points), len(STEPS))
+            best_step = np.arange(len(points)), np.argmax(found, axis=1)
+            points, values = lines[best_step], found[best_step]
+        width = width / 4
     best, largest = points[np.argmax(values >= values.max() - TOLERANCE)], float(values.max())
     for axis in range(len(best)):
         simpler = best.copy()
@@ -252,18 +249,3 @@ def _worst(cost: Cost, workspace: Workspace, starts: np.ndarray, costs: np.ndarr
         if cost(simpler[None])[0] >= largest - TOLERANCE:
             best = simpler
     return best, largest
-
-
-def _climb(cost: Cost, points: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Climb from each of the points (n, 6) along one coordinate at a time; return the maxima and their costs."""
-    width = (high - low) / 8
-    values = cost(points)
-    while np.any(width > 1e-4):
-        for axis in range(points.shape[1]):
-            lines = np.repeat(points[:, None], len(STEPS), axis=1)
-            lines[:, :, axis] = np.clip(lines[:, :, axis] + STEPS * width[axis], low[axis], high[axis])
-            costs = cost(lines.reshape(-1, points.shape[1])).reshape(len(points), len(STEPS))
-            chosen = np.arange(len(points)), np.argmax(costs, axis=1)
-            points, values = lines[chosen], costs[chosen]
-        width = width / 4
-    return points, values

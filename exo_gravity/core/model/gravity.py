@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from types import ModuleType
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,6 +26,7 @@ from exo_gravity.core.numbers import JOINT_COUNT
 
 Torque = tuple[float, ...]  # (4,) Nm in joint order
 NO_TORQUE: Torque = (0.0, 0.0, 0.0, 0.0)
+Law = Callable[[ArmModel, Sequence[float], Tilt], Torque]  # arm, theta (4,) rad, tilt -> the torque that holds the arm
 Values = Iterable[Any]  # plain floats if xp is `math`, arrays (n,) if it is `numpy`
 BLOCK = 4096  # poses computed at once, so that intermediate arrays fit the processor's cache
 
@@ -145,41 +146,18 @@ def _in_blocks(
     return torque.reshape(theta.shape)
 
 
-class Law(Protocol):
-    """A law as the control loop uses it: one pose in plain floats."""
-
-    def torque(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
-        """Return the torque (4,) in Nm that holds `arm` at `theta` (4,) rad."""
-        ...
-
-    def outside(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> str:
-        """Return why the law does not apply to this arm, pose or tilt, in a sentence; '' if it does.
-
-        The sentence contains no measured value, so it stays the same as long as the reason does.
-        """
-        ...
-
-
-class ClosedForm(NamedTuple):
-    """A law given by a formula that applies everywhere: `unscaled(arm, theta, tilt)` returns torque / (c_n g)."""
-
-    unscaled: Callable[[ArmModel, Sequence[float], Tilt], Torque]
-
-    def torque(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
-        """Return the torque (4,) in Nm."""
+def _law(formula: Callable[..., Torque]) -> Law:
+    def torque(arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
         a, b, c, d = arm.scale
-        tau, felt = self.unscaled(arm, theta, tilt), tilt.magnitude
+        tau, felt = formula(arm, theta, tilt), tilt.magnitude
         return felt * a * tau[0], felt * b * tau[1], felt * c * tau[2], felt * d * tau[3]
 
-    def outside(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> str:
-        """Return '': a closed form applies everywhere."""
-        return ""
+    return torque
 
 
+#: the closed forms for the control loop, one pose in plain floats; they apply in every pose at any tilt
 LAWS: dict[str, Law] = {
-    "exact": ClosedForm(lambda arm, t, tilt: _exact(math, arm, t, tilt.direction)),
-    "paper_static": ClosedForm(lambda arm, t, tilt: _paper_static(math, arm, (tilt.axis_angle, *t[1:]))),
-    "paper_mobile": ClosedForm(
-        lambda arm, t, tilt: _paper_mobile(math, arm, (tilt.axis_angle, *t[1:]), tilt.beta, tilt.phi)
-    ),
+    "exact": _law(lambda arm, t, tilt: _exact(math, arm, t, tilt.direction)),
+    "paper_static": _law(lambda arm, t, tilt: _paper_static(math, arm, (tilt.axis_angle, *t[1:]))),
+    "paper_mobile": _law(lambda arm, t, tilt: _paper_mobile(math, arm, (tilt.axis_angle, *t[1:]), tilt.beta, tilt.phi)),
 }

@@ -19,23 +19,15 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.numbers import Vector, four_floats, one_float
-
-
-class Segment(NamedTuple):
-    """One segment of a body."""
-
-    mass: float  #: share of body mass
-    cog: float  #: centre of gravity from the proximal joint, as a share of the segment's length
-
+from exo_gravity.core.numbers import Vector, floats, one_float
 
 SEX = ("female", "male")
-_WINTER = (Segment(0.028, 0.436), Segment(0.016, 0.430), Segment(0.006, 0.506))
-# Table -> sex -> upper arm, forearm, hand.
+_WINTER = ((0.028, 0.436), (0.016, 0.430), (0.006, 0.506))
+# Table -> sex -> upper arm, forearm, hand: mass as a share of body mass, centre of gravity as a share of the length.
 TABLES = {
     "de_leva": {
-        "female": (Segment(0.0255, 0.5754), Segment(0.0138, 0.4559), Segment(0.0056, 0.7474)),
-        "male": (Segment(0.0271, 0.5772), Segment(0.0162, 0.4574), Segment(0.0061, 0.7900)),
+        "female": ((0.0255, 0.5754), (0.0138, 0.4559), (0.0056, 0.7474)),
+        "male": ((0.0271, 0.5772), (0.0162, 0.4574), (0.0061, 0.7900)),
     },
     "winter": {"female": _WINTER, "male": _WINTER},
 }
@@ -64,11 +56,7 @@ class Wearer:
         for name, value, choices in (("sex", self.sex, SEX), ("table", self.table, tuple(TABLES))):
             if value not in choices:
                 raise ParameterError(name, value, f"one of {', '.join(choices)}")
-        try:
-            upper_arm, forearm, hand = (float(length) for length in self.segment_length)
-        except (TypeError, ValueError):
-            raise ParameterError("segment_length", self.segment_length, "3 lengths in m") from None
-        lengths = four_floats("segment_length", (upper_arm, forearm, hand, 0.0), 0.0, 0.6, "m")[:3]
+        lengths = floats("segment_length", self.segment_length, 3, 0.0, 0.6, "m")
         object.__setattr__(self, "segment_length", tuple(lengths.tolist()))
 
     def on_links(self, link_length: Vector) -> LinkLoad:
@@ -90,8 +78,5 @@ class Wearer:
     @property
     def segments(self) -> tuple[tuple[float, float], ...]:
         """Mass in kg and centre of gravity in m from the proximal joint of the upper arm, forearm and hand."""
-        table = TABLES[self.table][self.sex]
-        return tuple(
-            (self.body_mass * segment.mass, length * segment.cog)
-            for segment, length in zip(table, self.segment_length, strict=True)
-        )
+        rows = zip(TABLES[self.table][self.sex], self.segment_length, strict=True)
+        return tuple((self.body_mass * mass, length * cog) for (mass, cog), length in rows)

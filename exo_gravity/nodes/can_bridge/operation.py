@@ -16,7 +16,7 @@ from std_srvs.srv import SetBool, Trigger
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.bus_load import Traffic
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.rate import Rate
+from exo_gravity.core.numbers import Rate
 from exo_gravity.core.safety.delivery import MotorLoad
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, MAX_TEMPERATURE, Limits

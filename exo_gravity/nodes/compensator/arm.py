@@ -121,7 +121,7 @@ class ControlledArm:
 def sentence(s: Settings | UrdfSettings) -> str:
     """Return settings in a sentence for the log."""
     if isinstance(s, UrdfSettings):
-        return f"law {s.law}, {s.count} joints: compensates {s.arm.mass:.2f} kg, at most {row(s.max_effort)} Nm"
+        return f"law {s.law}, {len(s.gain)} joints: compensates {s.arm.mass:.2f} kg, at most {row(s.max_effort)} Nm"
     of_wearer = f", wearer {row(s.wearer_mass)} kg at {row(s.wearer_cog)} m" if any(s.wearer_mass) else ""
     return (
         f"{s.side} arm, law {s.law}, mode {s.mode}, support {s.support:g}: compensates {s.arm.total_mass:.2f} kg, "

@@ -21,7 +21,7 @@ from sensor_msgs.msg import JointState
 
 from exo_gravity.core.compensation.compensator import Answer
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.rate import Rate
+from exo_gravity.core.numbers import Rate
 from exo_gravity.hardware.scheduling import request_real_time
 from exo_gravity.nodes.compensator.arm import ControlledArm, sentence
 from exo_gravity.nodes.compensator.command_interface import JointStateInterface, MultiArrayInterface

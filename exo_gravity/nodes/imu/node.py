@@ -18,7 +18,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.rate import Rate
+from exo_gravity.core.numbers import Rate
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator, TrunkOrientation
 from exo_gravity.nodes.imu.device import ImuDevice

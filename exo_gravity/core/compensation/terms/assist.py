@@ -96,8 +96,9 @@ class AssistInput:
         interval, self._arrival = now - self._arrival, now
         if interval < SLOWEST * PERIODS:
             self._period += PERIOD_SMOOTHING * (min(interval, SLOWEST) - self._period)
-        problem = self._problem(now, names, efforts, stamp, publisher, interval)
+        second = publisher != self._publisher and interval < SLOWEST * PERIODS
         self._publisher = publisher
+        problem = self._problem(now, names, efforts, stamp, second)
         if problem:
             self._refused, self.reason = now, problem
             return
@@ -105,21 +106,13 @@ class AssistInput:
         order = efforts if list(names) == self._names else [efforts[names.index(name)] for name in self._names]
         self._target = tuple(clamp(float(tau), most) for tau, most in zip(order, self.assist.max_effort, strict=True))
 
-    def _problem(
-        self,
-        now: float,
-        names: Sequence[str],
-        efforts: Sequence[float],
-        stamp: float,
-        publisher: Hashable,
-        interval: float,
-    ) -> str:
+    def _problem(self, now: float, names: Sequence[str], efforts: Sequence[float], stamp: float, second: bool) -> str:
         """Return what is wrong with a message, without a measured value; '' if nothing is."""
         if sorted(names) != sorted(self._names) or len(efforts) != len(names):
             return f"assist_efforts must name {', '.join(self._names)}, each once, with one effort each"
         if not all(-MAX_COMMAND <= tau <= MAX_COMMAND for tau in efforts):
             return f"assist_efforts must be numbers within {MAX_COMMAND:g} Nm"
-        if publisher != self._publisher and interval < SLOWEST * PERIODS:
+        if second:
             return "more than one publisher of assist_efforts"
         if self._period < FASTEST:
             return f"assist_efforts come more often than {1 / FASTEST:g} times a second"

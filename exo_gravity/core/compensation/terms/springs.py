@@ -80,40 +80,6 @@ class Damping(TermParameters):
 
 
 @dataclass(frozen=True)
-class PosePath:
-    """Poses over time. Raises ParameterError."""
-
-    times: tuple[float, ...]  #: (n,) s from 0 on, rising
-    poses: tuple[tuple[float, ...], ...]  #: (n, 4) rad
-
-    def __post_init__(self) -> None:
-        rising = all(a < b for a, b in itertools.pairwise(self.times))
-        if not (self.times and rising and self.times[0] == 0.0 and math.isfinite(self.times[-1])):
-            raise ParameterError("times of a path", list(self.times[:3]), "rising from 0")
-        if len(self.poses) != len(self.times) or not all(map(_is_pose, self.poses)):
-            raise ParameterError("poses of a path", len(self.poses), f"{len(self.times)} poses of 4 angles in rad")
-        points = list(zip(self.times, self.poses, strict=True))
-        for (t, a), (u, b) in itertools.pairwise(points):
-            if math.dist(a, b) > MAX_PATH_SPEED * (u - t):
-                expected = f"at most {MAX_PATH_SPEED:g} rad/s"
-                raise ParameterError(f"speed of the path from {t:g} s on", math.dist(a, b) / (u - t), expected)
-
-    @classmethod
-    def of_rows(cls, numbers: Sequence[float]) -> PosePath:
-        """Return the path of rows of the time in s and four angles in rad, one after another. Raises ParameterError."""
-        rows = [tuple(numbers[i : i + 5]) for i in range(0, len(numbers), 5)]
-        return cls(tuple(row[0] for row in rows), tuple(row[1:] for row in rows))
-
-    def at(self, elapsed: float) -> Sequence[float]:
-        """Return the pose (4,) in rad `elapsed` s after the start; the last one after the end."""
-        i = bisect.bisect_right(self.times, elapsed)
-        if i == 0 or i == len(self.times):
-            return self.poses[max(0, i - 1)]
-        share = (elapsed - self.times[i - 1]) / (self.times[i] - self.times[i - 1])
-        return [a + share * (b - a) for a, b in zip(self.poses[i - 1], self.poses[i], strict=True)]
-
-
-@dataclass(frozen=True)
 class Spring(TermParameters):
     """Pulls the joints towards a pose, or along a recorded path, with a limited torque.
 
@@ -129,15 +95,26 @@ class Spring(TermParameters):
         any_length=True,
     )
     max_effort: Sequence[float] = SPRING_EFFORT  #: largest torque, (4,) Nm
-    path: PosePath | None = None  #: in place of `pose`
+    #: rows of the path: (n,) s from 0 on, and (n, 4) rad
+    times: tuple[float, ...] = field(init=False, repr=False, compare=False)
+    poses: tuple[tuple[float, ...], ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "pose", tuple(self.pose))
-        if self.path is None and len(self.pose) != JOINT_COUNT:
-            object.__setattr__(self, "path", PosePath.of_rows(self.pose))
-        elif not _is_pose(self.pose[:JOINT_COUNT]):
-            raise ParameterError("spring.pose", list(self.pose), "4 angles from -3.15 to 3.15 rad")
+        numbers = tuple(self.pose)
+        path = (0.0, *numbers) if len(numbers) == JOINT_COUNT else numbers
+        times = path[:: JOINT_COUNT + 1]
+        poses = tuple(path[i + 1 : i + JOINT_COUNT + 1] for i in range(0, len(path), JOINT_COUNT + 1))
+        if not (poses and all(map(_is_pose, poses))):
+            raise ParameterError("spring.pose", list(numbers), f"4 angles within {FREE:g} rad, or a path of rows")
+        if times[0] != 0.0 or times[-1] == math.inf or not all(a < b for a, b in itertools.pairwise(times)):
+            raise ParameterError("times of the path in spring.pose", list(times[:3]), "rising from 0 s")
+        for (t, a), (u, b) in itertools.pairwise(zip(times, poses, strict=True)):
+            if math.dist(a, b) > MAX_PATH_SPEED * (u - t):
+                expected = f"at most {MAX_PATH_SPEED:g} rad/s"
+                raise ParameterError(f"speed of the path from {t:g} s on", math.dist(a, b) / (u - t), expected)
+        for name, value in (("pose", numbers), ("times", times), ("poses", poses)):
+            object.__setattr__(self, name, value)
 
     def check(self, least_inertia: Sequence[float]) -> None:
         """Raise ParameterError unless the spring is stable on these inertias (4,) kg m^2."""
@@ -145,12 +122,19 @@ class Spring(TermParameters):
 
     def torque(self, state: TermState) -> Torque:
         """Return the torque (4,) in Nm."""
-        pose = self.path.at(state.elapsed) if self.path else self.pose
+        pose = self.poses[0] if len(self.times) == 1 else self._pose_at(state.elapsed)
         torque = []
         columns = zip(self.stiffness, pose, state.position, state.velocity, self.max_effort, strict=True)
         for k, to, q, v, most in columns:
             torque.append(clamp(k * (to - q), most) - LATE * k * v)
         return tuple(torque)
+
+    def _pose_at(self, elapsed: float) -> Sequence[float]:
+        i = bisect.bisect_right(self.times, elapsed)
+        if i == 0 or i == len(self.times):
+            return self.poses[max(0, i - 1)]
+        share = (elapsed - self.times[i - 1]) / (self.times[i] - self.times[i - 1])
+        return [a + share * (b - a) for a, b in zip(self.poses[i - 1], self.poses[i], strict=True)]
 
 
 @dataclass(frozen=True)
@@ -212,18 +196,8 @@ class SoftLimits(TermParameters):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not all(low < high for low, high in zip(self.lower, self.upper, strict=True)):
+        if not all(low < high for low, high in zip(self.range[0::2], self.range[1::2], strict=True)):
             raise ParameterError("limits.range", list(self.range), "lower and upper edge of each joint, rising")
-
-    @property
-    def lower(self) -> Sequence[float]:
-        """Lower edges (4,) in rad."""
-        return self.range[0::2]
-
-    @property
-    def upper(self) -> Sequence[float]:
-        """Upper edges (4,) in rad."""
-        return self.range[1::2]
 
     def on_arm(self, least_inertia: Sequence[float]) -> SoftLimits:
         """Return these limits as stiff as an arm of these inertias (4,) kg m^2 can bear."""
@@ -233,9 +207,8 @@ class SoftLimits(TermParameters):
     def torque(self, state: TermState) -> Torque:
         """Return the torque (4,) in Nm: none inside, back towards the workspace outside."""
         torque = []
-        columns = zip(
-            self.stiffness, self.lower, self.upper, state.position, state.velocity, self.max_effort, strict=True
-        )
+        edges = self.range[0::2], self.range[1::2]
+        columns = zip(self.stiffness, *edges, state.position, state.velocity, self.max_effort, strict=True)
         for k, low, high, q, v, most in columns:
             if low <= q <= high:
                 torque.append(0.0)

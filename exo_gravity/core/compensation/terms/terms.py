@@ -1,32 +1,86 @@
-"""The terms at work: their bounded sum, plus the outer loop's input.
+"""The terms at work: their parameters, their bounded sum, plus the outer loop's input.
 
 The sum is bounded, rate-limited, and never steps: the difference that a change of parameters makes fades. Whatever is
-wrong with the sum, gravity compensation goes on beneath it.
+wrong with the sum, gravity compensation goes on beneath it. A new term is a field of `TermSettings` and an item in
+`Terms._build`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 from exo_gravity.core.compensation.limiter import LONGEST_STEP, Transition, limited
-from exo_gravity.core.compensation.terms.assist import AssistInput
+from exo_gravity.core.compensation.terms.assist import Assist, AssistInput
 from exo_gravity.core.compensation.terms.friction_inertia import (
     MAX_FRICTION_SHARE,
     AccelerationFilter,
     EnergyTank,
+    Friction,
+    Inertia,
     InertiaTerm,
 )
-from exo_gravity.core.compensation.terms.settings import GROUPS, TermSettings
-from exo_gravity.core.compensation.terms.springs import Term, TermState
+from exo_gravity.core.compensation.terms.springs import Coupling, Damping, SoftLimits, Spring, Term, TermState
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import NO_TORQUE, Torque
-from exo_gravity.core.model.kinematics import LinkInertia
+from exo_gravity.core.model.kinematics import LinkInertia, least_inertia
+from exo_gravity.core.params import Param, params_of
 
 MAX_GAP = 0.2  # s between two cycles, beyond which the terms begin again from no torque
-NO_ACCELERATION = (0.0,) * 4
 MAX_EFFORT = (2.0, 4.0, 2.0, 2.0)  # Nm of all terms: well below the motors' rated torque, which gravity needs
 MAX_EFFORT_RATE = 50.0  # Nm/s
+
+
+@dataclass(frozen=True)
+class TermSettings:
+    """The parameters of every term; the name of a field is the prefix of its parameters."""
+
+    friction: Friction = field(default_factory=Friction)
+    inertia: Inertia = field(default_factory=Inertia)
+    damping: Damping = field(default_factory=Damping)
+    spring: Spring = field(default_factory=Spring)
+    coupling: Coupling = field(default_factory=Coupling)
+    limits: SoftLimits = field(default_factory=SoftLimits)
+    assist: Assist = field(default_factory=Assist)
+
+    def on_arm(self, robot: ArmModel) -> TermSettings:
+        """Return these settings with limits as stiff as `robot` can bear.
+
+        Raises ParameterError unless every spring and damper is stable on `robot`, without a wearer in it.
+        """
+        on = [term for term in (self.damping, self.spring, self.coupling) if term.on]
+        if not (on or self.limits.on or self.inertia.on):
+            return self
+        least = least_inertia(LinkInertia.of(robot))
+        for term in on:
+            term.check(least)
+        return replace(self, limits=self.limits.on_arm(least))
+
+
+#: the parameters of each term by the prefix of their names
+GROUPS: dict[str, Any] = {own.name: own.default_factory for own in fields(TermSettings)}
+
+
+def term_parameters() -> tuple[Param, ...]:
+    """Return the parameters of all terms, with their prefixes."""
+    return tuple(
+        replace(param, name=f"{prefix}.{param.name}") for prefix, owner in GROUPS.items() for param in params_of(owner)
+    )
+
+
+def term_settings_of(values: Mapping[str, Any]) -> TermSettings:
+    """Return the settings that parameter values describe, or raise ParameterError."""
+    groups: dict[str, Any] = {}
+    for prefix, owner in GROUPS.items():
+        try:
+            groups[prefix] = owner(**{param.name: values[f"{prefix}.{param.name}"] for param in params_of(owner)})
+        except ParameterError as error:
+            name = error.name if "." in error.name else f"{prefix}.{error.name}"
+            raise ParameterError(name, error.value, error.expected) from None
+    return TermSettings(**groups)
 
 
 class Terms:
@@ -81,7 +135,7 @@ class Terms:
             return NO_TORQUE
         if not 0.0 <= dt <= MAX_GAP:
             self._output, self._transition, dt = NO_TORQUE, Transition(), 0.0
-        acceleration = self._acceleration.update(velocity, dt) if self.settings.inertia.on else NO_ACCELERATION
+        acceleration = self._acceleration.update(velocity, dt) if self.settings.inertia.on else NO_TORQUE
         state = TermState(now, dt, theta, velocity, acceleration, gravity, now - self._spring_start)
         total = self._transition.blended(now, self._sum(state))
         if self._pending is not None:
