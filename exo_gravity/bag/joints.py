@@ -69,14 +69,12 @@ class Layout:
 
     def matches(self, rows: np.ndarray) -> np.ndarray:
         """Return which messages have this layout, (n,) bool; rows: their bytes (n, length)."""
-        matching: np.ndarray = np.all(rows[:, self.fixed] == self.content, axis=1)
-        return matching
+        return np.asarray(np.all(rows[:, self.fixed] == self.content, axis=1))
 
     def stamps(self, rows: np.ndarray) -> np.ndarray:
         """Return the stamps in ns since 1970, (n,) int64."""
-        seconds, nanoseconds = (self._extract(rows, place, kind) for place, kind in ((4, "i4"), (8, "u4")))
-        stamps: np.ndarray = seconds[:, 0].astype(np.int64) * 1_000_000_000 + nanoseconds[:, 0]
-        return stamps
+        seconds, nanoseconds = self._extract(rows, 4, "i4")[:, 0], self._extract(rows, 8, "u4")[:, 0]
+        return np.asarray(seconds.astype(np.int64) * 1_000_000_000 + nanoseconds)
 
     def values(self, rows: np.ndarray, names: Sequence[str], fields: Sequence[str]) -> np.ndarray:
         """Return (n, fields, joints) in the order of `names`; float32 is 1000 times finer than a position code."""
@@ -111,9 +109,8 @@ class JointArrays:
         values = np.empty((0, 0, 0), np.float32)
         for length in lengths[np.sort(np.unique(lengths, return_index=True)[1])]:  # in order of appearance
             chosen = np.flatnonzero(lengths == length)
-            rows = np.frombuffer(b"".join([messages[i] for i in chosen.tolist()]), np.uint8).reshape(
-                len(chosen), length
-            )
+            joined = b"".join([messages[i] for i in chosen.tolist()])
+            rows = np.frombuffer(joined, np.uint8).reshape(len(chosen), length)
             while len(chosen):
                 layout = self._layout(rows[0].tobytes())
                 same = layout.matches(rows)
@@ -137,14 +134,13 @@ class JointArrays:
         layout = Layout.of(message)
         self.names = self.names or layout.names
         if sorted(layout.names) != sorted(self.names):
-            raise DataError(
-                f"{self.topic}: joint names differ: {', '.join(layout.names)}; must be {', '.join(self.names)}"
-            )
+            differing, expected = ", ".join(layout.names), ", ".join(self.names)
+            raise DataError(f"{self.topic}: joint names differ: {differing}; must be {expected}")
         self._layouts.append(layout)
         return layout
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return times of arrival (n,) and stamps (n,) in ns, values (n, fields, joints); forget them."""
-        parts, self._parts = self._parts, []
-        arrival, stamp, values = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        arrival, stamp, values = (np.concatenate(columns) for columns in zip(*self._parts, strict=True))
+        self._parts.clear()
         return arrival, stamp, values
