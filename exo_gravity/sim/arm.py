@@ -144,14 +144,12 @@ class SimulatedArm:
     @property
     def positions(self) -> list[float]:
         """Joint angles (4,) in rad."""
-        positions: list[float] = self._theta.tolist()
-        return positions
+        return list(self._theta.tolist())
 
     @property
     def velocities(self) -> list[float]:
         """Joint velocities (4,) in rad/s."""
-        velocities: list[float] = self._velocity.tolist()
-        return velocities
+        return list(self._velocity.tolist())
 
     def reset(self, theta: Sequence[float]) -> None:
         """Put the arm at rest at `theta`, (4,) rad."""

@@ -12,8 +12,7 @@ from exo_gravity.core.model.budget import BudgetRequest, largest_support
 from exo_gravity.core.motors.joint_motor import OPTIONS
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.params import CAN_BRIDGE
-from exo_gravity.core.view.arm_description import described
-from exo_gravity.core.view.urdf import urdf
+from exo_gravity.core.view.urdf import described, urdf
 from exo_gravity.nodes.ros.budget_thread import BudgetThread
 from exo_gravity.panel.view import arm_setup, scene_of
 

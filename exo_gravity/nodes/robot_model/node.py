@@ -26,9 +26,17 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.tilt import gravity_in_trunk
-from exo_gravity.core.view.arm_description import OF_BRIDGE, OF_COMPENSATOR, ROBOT_MODEL, ArmDescription, described
 from exo_gravity.core.view.scene import ARROW, LINE, SPHERE, TEXT, ArmView, Shape, arm_shapes, gravity_shapes
-from exo_gravity.core.view.urdf import ROOT, joint_names, urdf
+from exo_gravity.core.view.urdf import (
+    OF_BRIDGE,
+    OF_COMPENSATOR,
+    ROBOT_MODEL,
+    ROOT,
+    ArmDescription,
+    described,
+    joint_names,
+    urdf,
+)
 from exo_gravity.nodes.ros.hot_path import LATCHED, NEWEST, HotPath
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics, by_name
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
