@@ -28,10 +28,9 @@ class Layout:
     """Where the numbers of a message are."""
 
     names: tuple[str, ...]
-    order: str  #: '<' or '>', the byte order
     fixed: np.ndarray  #: (n,) offsets of the bytes that identify this layout
     content: np.ndarray  #: (n,) those bytes
-    offset: tuple[int | None, ...]  #: of the first number of each of `FIELDS`, None for an empty field
+    numbers: np.dtype[np.void]  #: of a message: sec, nanosec, and those of `FIELDS` that are not empty, (joints,) each
 
     @classmethod
     def of(cls, message: bytes) -> Layout:
@@ -42,30 +41,30 @@ class Layout:
             raise DataError("a message is damaged, or is not a sensor_msgs/msg/JointState in CDR") from None
         is_fixed = np.zeros(len(message), bool)  # the header, lengths and texts; not the stamp, numbers and padding
         is_fixed[:4] = True
-        at = 12
-
-        def take(size: int) -> None:
-            nonlocal at
+        at, order, count = 12, "<" if message[1] == 1 else ">", len(decoded.name)
+        texts = [len(text.encode()) + 1 for text in (decoded.header.frame_id, *decoded.name)]
+        for size in (4 + texts[0], 4, *(4 + length for length in texts[1:])):
             at += -at % 4
             is_fixed[at : at + size] = True
             at += size
-
-        take(4 + len(decoded.header.frame_id.encode()) + 1)
-        take(4)
-        for name in decoded.name:
-            take(4 + len(name.encode()) + 1)
-        offset: list[int | None] = []
+        offsets = {"sec": 4, "nanosec": 8}
+        formats: dict[str, Any] = {"sec": f"{order}i4", "nanosec": f"{order}u4"}
         for field in FIELDS:
-            count = len(getattr(decoded, field))
-            if count not in (0, len(decoded.name)):
-                raise DataError(f"a joint state has {count} values of {field} for {len(decoded.name)} names")
-            take(4)
-            at += -(at - 4) % 8 if count else 0  # alignment counts from the end of the header
-            offset.append(at if count else None)
-            at += 8 * count
-        fixed = np.flatnonzero(is_fixed)
-        order = "<" if message[1] == 1 else ">"
-        return cls(tuple(decoded.name), order, fixed, np.frombuffer(message, np.uint8)[fixed], tuple(offset))
+            given = len(getattr(decoded, field))
+            if given not in (0, count):
+                raise DataError(f"a joint state has {given} values of {field} for {count} names")
+            at += -at % 4
+            is_fixed[at : at + 4] = True
+            at += 4
+            if given:
+                at += -(at - 4) % 8  # alignment counts from the end of the header
+                offsets[field], formats[field] = at, (f"{order}f8", (count,))
+                at += 8 * count
+        fixed, places = np.flatnonzero(is_fixed), list(offsets.values())
+        numbers = np.dtype(
+            {"names": list(offsets), "formats": list(formats.values()), "offsets": places, "itemsize": len(message)}
+        )
+        return cls(tuple(decoded.name), fixed, np.frombuffer(message, np.uint8)[fixed], numbers)
 
     def matches(self, rows: np.ndarray) -> np.ndarray:
         """Return which messages have this layout, (n,) bool; rows: their bytes (n, length)."""
@@ -73,22 +72,17 @@ class Layout:
 
     def stamps(self, rows: np.ndarray) -> np.ndarray:
         """Return the stamps in ns since 1970, (n,) int64."""
-        seconds, nanoseconds = self._extract(rows, 4, "i4")[:, 0], self._extract(rows, 8, "u4")[:, 0]
-        return np.asarray(seconds.astype(np.int64) * 1_000_000_000 + nanoseconds)
+        numbers = rows.view(self.numbers)[:, 0]
+        return np.asarray(numbers["sec"].astype(np.int64) * 1_000_000_000 + numbers["nanosec"])
 
     def values(self, rows: np.ndarray, names: Sequence[str], fields: Sequence[str]) -> np.ndarray:
         """Return (n, fields, joints) in the order of `names`; float32 is 1000 times finer than a position code."""
         result = np.full((len(rows), len(fields), len(names)), np.nan, np.float32)
-        chosen = [self.names.index(name) for name in names]
+        chosen, numbers = [self.names.index(name) for name in names], rows.view(self.numbers)[:, 0]
         for field, name in enumerate(fields):
-            if (offset := self.offset[FIELDS.index(name)]) is not None:
-                result[:, field] = self._extract(rows, offset, "f8", len(self.names))[:, chosen]
+            if name in self.numbers.fields:
+                result[:, field] = numbers[name][:, chosen]
         return result
-
-    def _extract(self, rows: np.ndarray, offset: int, kind: str, count: int = 1) -> np.ndarray:
-        """Return `count` numbers of type `kind` at `offset` of each message, (n, count)."""
-        part = np.ascontiguousarray(rows[:, offset : offset + int(kind[1]) * count])
-        return part.view(np.dtype(self.order + kind))
 
 
 class JointArrays:

@@ -28,7 +28,7 @@ import numpy as np
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import MAX_LENGTH, MAX_MASS, ArmModel
 from exo_gravity.core.model.moments import MAX_OFFSET
-from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.model.tilt import gravity_in_trunk
 from exo_gravity.core.numbers import JOINT_COUNT, four_floats
 from exo_gravity.core.params import check_owned, owned
 from exo_gravity.sim.trunk_motion import TrunkState, Vector
@@ -114,13 +114,9 @@ def felt_in_base(side: str, state: TrunkState, gravity: float) -> tuple[Vector, 
 
     Gravity less acceleration in m/s^2, angular velocity in rad/s, angular acceleration in rad/s^2. gravity: m/s^2.
     """
-    down, acceleration = Tilt.of(side, state.pitch, state.roll).direction, in_base(side, state.acceleration)
-    x, y, z = (gravity * component - a for component, a in zip(down, acceleration, strict=True))
-    return (
-        (x, y, z),
-        rotation_in_base(side, state.angular_velocity),
-        rotation_in_base(side, state.angular_acceleration),
-    )
+    felt = gravity * gravity_in_trunk(state.pitch, state.roll) - state.acceleration
+    turning, spin_up = state.angular_velocity, state.angular_acceleration
+    return in_base(side, felt.tolist()), rotation_in_base(side, turning), rotation_in_base(side, spin_up)
 
 
 class SimulatedArm:

@@ -89,7 +89,9 @@ class CanLink:
         if message is None or message.is_error_frame or message.is_fd:
             return None, 0.0
         frame = message.arbitration_id | (EXTENDED if message.is_extended_id else 0), bytes(message.data)
-        if self._is_echo(frame):
+        if frame in self._pending:
+            self._pending.remove(frame)
+            self._echo_seen = True
             return None, 0.0
         return frame, max(0.0, time.time() - message.timestamp)
 
@@ -101,19 +103,11 @@ class CanLink:
                 self._no_echo = not self._echo_seen
                 self._pending.clear()
         frame_id, data = frame
+        message = can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED)
         try:
-            self._bus.send(
-                can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED)
-            )
+            self._bus.send(message)
         except can.CanError as error:
             raise BusError(f"sending on {self._bus.channel_info} failed: {error}") from error
-
-    def _is_echo(self, frame: Frame) -> bool:
-        if frame not in self._pending:
-            return False
-        self._pending.remove(frame)
-        self._echo_seen = True
-        return True
 
 
 class SimulatedDevice:
@@ -278,11 +272,10 @@ class SimulatedDevice:
                 motor.unplugged = False
         torque = list(map(SimulatedMotor.torque, self.motors, theta, velocity))
         given: Torque = NO_TORQUE
-        step = -1
+        step = None
         if self._trial is not None:
             wearer, start = self._trial
-            given = wearer.torque(self.time - start, theta, velocity)
-            step = -1 if wearer.step is None else wearer.step
+            given, step = wearer.torque(self.time - start, theta, velocity), wearer.step
             self._follow_trunk(wearer.script, self.time - start)
         if self.truth:
             self.truth.note(self.time, theta, velocity, torque, self.motors, self._frames, (given, step))

@@ -201,7 +201,8 @@ class StatusTimer:
         """Yield each joint whose status frame is due at `now` (s), once; frames that were missed are not made up."""
         for joint, period in self._periods.items():
             if self._next[joint] <= now:
-                self._next[joint] = max(self._next[joint], now - period) + period
+                following = self._next[joint] + period
+                self._next[joint] = following if following > now else now + period
                 yield joint
 
 
