@@ -113,7 +113,7 @@ class CanLink:
 class SimulatedDevice:
     """An arm with four motors, on a trunk that moves, and optionally a wearer who moves both.
 
-    motors: shoulder to elbow, with different CAN IDs. side: 'left' or 'right'. seed: of the reply delays.
+    motors: shoulder to elbow, with different CAN IDs. side: 'left' or 'right'.
 
     May be set from any thread: `pitch` and `roll` of the trunk in rad; `bus_silent` (frames pass in neither direction,
     and the motors keep their last commands); `cut_off`, the same for each motor (4,); `encoder_error` (4,) rad, added
@@ -122,7 +122,7 @@ class SimulatedDevice:
     of `run`.
     """
 
-    def __init__(self, arm: SimulatedArm, motors: Sequence[SimulatedMotor], side: str = "right", seed: int = 0) -> None:
+    def __init__(self, arm: SimulatedArm, motors: Sequence[SimulatedMotor], side: str = "right") -> None:
         ids = [motor.joint.can_id for motor in motors]
         if len(ids) != JOINT_COUNT or len(set(ids)) != JOINT_COUNT:
             raise ParameterError("can_id", ids, f"{JOINT_COUNT} different IDs, one per joint")
@@ -138,7 +138,7 @@ class SimulatedDevice:
         self.slip = 0.0
         self.gaps = GapMeter()
         self._joint_of_id = {can_id: joint for joint, motor in enumerate(motors) for can_id in motor.received_ids}
-        self._random = random.Random(seed)
+        self._random = random.Random(0)  # of the delays of replies
         self._steps = 0
         self._clock = 0.0  # s elapsed, of which `time` is the part in whole steps
         self._trial: tuple[VirtualWearer, float] | None = None  # the wearer, and the time at which the script starts
