@@ -61,10 +61,9 @@ class Layout:
                 offsets[field], formats[field] = at, (f"{order}f8", (count,))
                 at += 8 * count
         fixed, places = np.flatnonzero(is_fixed), list(offsets.values())
-        numbers = np.dtype(
-            {"names": list(offsets), "formats": list(formats.values()), "offsets": places, "itemsize": len(message)}
-        )
-        return cls(tuple(decoded.name), fixed, np.frombuffer(message, np.uint8)[fixed], numbers)
+        kinds = list(formats.values())
+        form: Any = {"names": list(offsets), "formats": kinds, "offsets": places, "itemsize": len(message)}
+        return cls(tuple(decoded.name), fixed, np.frombuffer(message, np.uint8)[fixed], np.dtype(form))
 
     def matches(self, rows: np.ndarray) -> np.ndarray:
         """Return which messages have this layout, (n,) bool; rows: their bytes (n, length)."""
@@ -80,7 +79,7 @@ class Layout:
         result = np.full((len(rows), len(fields), len(names)), np.nan, np.float32)
         chosen, numbers = [self.names.index(name) for name in names], rows.view(self.numbers)[:, 0]
         for field, name in enumerate(fields):
-            if name in self.numbers.fields:
+            if name in (self.numbers.names or ()):
                 result[:, field] = numbers[name][:, chosen]
         return result
 

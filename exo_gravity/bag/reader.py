@@ -102,13 +102,14 @@ class _Contents:
             stamped = bool(np.all(np.diff(stamp) >= 0) and abs(np.median(arrival - stamp)) < MAX_CLOCK_OFFSET)
             clock, values = _in_order(stamp if stamped else arrival, values)
             command = self._commands(states, names, clock, stamped)
+            position, velocity, effort = np.moveaxis(values, 1, 0)
             time = (clock - start) / 1e9
             end = float(time[-1])
             if open_end := self.log.open_end(name, start, end, self.is_cut):
                 self.notes.append(open_end)
                 self.is_open = True
             steps, carried = self.log.steps(name, start), self.log.carried(name, start, end)
-            return Recording(name, names, time, *np.moveaxis(values, 1, 0), command, steps, carried)
+            return Recording(name, names, time, position, velocity, effort, command, steps, carried)
         except DataError as error:
             self.problems.append(str(error))
             return None

@@ -46,6 +46,7 @@ class ImuConfig:
     accelerometer_range: float = 16.0 * STANDARD_GRAVITY
     #: Of the sensor's filters: MPU-6050 register map, low-pass of 94 Hz.
     delay: float = owned(0.003, "delay of the IMU's readings behind their stamps", (0.0, 0.1), "s")
+    position: Sequence[float] = (0.0, 0.0, 0.0)  #: (3,) m from the shoulder, in the trunk's axes
     gravity: float = STANDARD_GRAVITY  #: m/s^2
     seed: int = 0
 
@@ -67,6 +68,7 @@ class SimulatedImu:
         self._noise = config.gyroscope_noise * bandwidth, config.accelerometer_noise * bandwidth
         self._walk = config.gyroscope_walk / root, config.accelerometer_walk / root
         self._range = np.array(((config.gyroscope_range,), (config.accelerometer_range,)))
+        self._place = np.array(config.position)
         # True readings, the newest last: as many as the delay spans.
         self._past: deque[np.ndarray] = deque(maxlen=math.ceil(config.delay * config.rate) + 1)
 
@@ -83,9 +85,12 @@ class SimulatedImu:
         return angular_velocity, acceleration
 
     def _readings(self, state: TrunkState) -> np.ndarray:
-        """Return the true readings, (2, 3), of an IMU at the shoulder."""
-        force = state.acceleration - self.config.gravity * gravity_in_trunk(state.pitch, state.roll)
-        return np.array((self._imu_from_trunk @ state.angular_velocity, self._imu_from_trunk @ force))
+        """Return the true readings, (2, 3)."""
+        turning, spin_up = np.array(state.angular_velocity), np.array(state.angular_acceleration)
+        force = np.array(state.acceleration) - self.config.gravity * gravity_in_trunk(state.pitch, state.roll)
+        if self._place.any():
+            force += np.cross(spin_up, self._place) + np.cross(turning, np.cross(turning, self._place))
+        return np.array((self._imu_from_trunk @ turning, self._imu_from_trunk @ force))
 
     def _delayed(self) -> np.ndarray:
         """Return the readings `delay` s ago, interpolated; the oldest until that time has passed."""

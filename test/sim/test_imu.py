@@ -10,7 +10,7 @@ import pytest
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.tilt import pitch_roll, rotation_matrix
 from exo_gravity.sim import ImuConfig, SimulatedImu
-from exo_gravity.sim.trunk_motion import Walk
+from exo_gravity.sim.trunk_motion import HIP_TO_SHOULDER, Turn, Walk
 
 from ..support.trunk import orientation
 
@@ -98,6 +98,15 @@ def test_the_accelerometer_measures_the_trunks_acceleration_less_gravity():
         force = orientation(state) @ state.acceleration + (0.0, 0.0, G)
         np.testing.assert_allclose(orientation(state) @ accelerometer, force, atol=1e-9)
         np.testing.assert_allclose(gyroscope, state.angular_velocity)
+
+
+def test_an_imu_away_from_the_shoulder_feels_the_acceleration_of_its_own_place():
+    # At the hips, about which a bow turns, there is none.
+    bow = Turn((0.0, 0.0), (0.7, 0.2), 1.0).at(0.4)
+    at_hips = SimulatedImu(ImuConfig(**EXACT, position=(0.0, 0.0, -HIP_TO_SHOULDER[2]))).sample_of(bow)[1]
+    still = SimulatedImu(ImuConfig(**EXACT)).sample(bow.pitch, bow.roll)[1]
+    assert np.linalg.norm(bow.acceleration) > 0.5
+    np.testing.assert_allclose(at_hips, still, atol=1e-9)
 
 
 def test_readings_beyond_the_range_are_cut_off():

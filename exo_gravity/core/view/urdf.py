@@ -57,7 +57,7 @@ COLOURS = {
 }
 TUBE_RADIUS = 0.03  # m; each link has the inertia of a thin tube
 DRAWN_RADIUS = 0.0125  # m, of the carbon tubes (the paper, appendix A)
-MOTOR = {"radius": 0.042, "length": 0.04}  # m, between AK60-6 and AK80-9
+MOTOR: dict[str, Any] = {"radius": 0.042, "length": 0.04}  # m, between AK60-6 and AK80-9
 COG_RADIUS = 0.018  # m
 CHEST, HEAD_RADIUS, HEAD_HEIGHT = (0.14, 0.26, 0.48), 0.10, 0.20  # m
 
