@@ -8,6 +8,7 @@ how many messages were lost, if any were. A topic that fails is reported, and th
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import time
@@ -218,24 +219,21 @@ class LiveLine:
         """Write the line to standard output."""
         line: dict[str, Any] = {}
         for topic, data in self._latest.items():
-            if (name := leaf(topic)) in ARM_TOPICS:
-                line.setdefault(arm_of(topic), {}).update(_summary(name, deserialize_message(data, ARM_TOPICS[name])))
+            if (name := leaf(topic)) not in ARM_TOPICS:
+                continue
+            arm, message = line.setdefault(arm_of(topic), {}), deserialize_message(data, ARM_TOPICS[name])
+            if name == content.STEPS:
+                with contextlib.suppress(ValueError):  # the report states it
+                    arm["step"] = json.loads(message.data)
+            elif name == content.COMMANDS:
+                arm["command"] = list(message.effort)
+            else:
+                arm["names"] = list(message.name)
+                arm |= {field: list(getattr(message, field)) for field in ("position", "velocity", "effort")}
         line["recorder"] = recorder
         line["status"] = self._status
         line["faults"] = [f"{name}: {status['message']}" for name, status in self._status.items() if status["level"]]
         print(json.dumps(line), flush=True)
-
-
-def _summary(name: str, message: JointState | String) -> dict[str, Any]:
-    if name == content.STEPS:
-        try:
-            return {"step": json.loads(message.data)}
-        except ValueError:  # the report states it
-            return {}
-    if name == content.COMMANDS:
-        return {"command": list(message.effort)}
-    fields = {field: list(getattr(message, field)) for field in ("position", "velocity", "effort")}
-    return {"names": list(message.name), **fields}
 
 
 def main() -> None:
