@@ -16,8 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.tools.anfis.samples import from_gravload
-from exo_gravity.tools.anfis.training import train_law
+from exo_gravity.tools.anfis import from_gravload, train_law
 from exo_gravity.tools.inputs.arms import configured_arm
 from exo_gravity.tools.inputs.parameter_file import packaged_config
 from exo_gravity.tools.reporting import trial_report

@@ -22,9 +22,9 @@ from launch.events.process import ProcessExited, ProcessStarted, SignalProcess
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
+from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.tools.inputs.parameter_file import (
     ABSOLUTE_TOPICS,
-    DESCENT_TIMEOUT,
     ENDED_WELL,
     RECOVERY,
     RECOVERY_TIMEOUT,

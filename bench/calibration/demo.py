@@ -20,7 +20,7 @@ from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.tools import calibrate
 from exo_gravity.tools.calibration.result import Change, write_changes
 from exo_gravity.tools.inputs.parameter_file import packaged_config
-from exo_gravity.tools.reporting.colours import FAINT, INK, JOINT_COLOURS, make_plain
+from exo_gravity.tools.reporting.html import FAINT, INK, JOINT_COLOURS, make_plain
 from exo_gravity.tools.reporting.table import degrees, joint_labels
 from exo_gravity.tools.trials.offline import OfflineTrial, simulated_trials
 

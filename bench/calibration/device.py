@@ -22,7 +22,6 @@ SPREAD = 0.3  # of masses, centres of gravity and torque scales
 LARGEST_OFFSET = 0.015  # m, the largest offset of a centre of gravity from its link
 COULOMB = (0.1, 0.4)  # Nm
 VISCOUS = (0.02, 0.1)  # Nm s/rad
-DAMPING = 3.4  # Nm s/rad: what the weakest motor can apply; the bridge takes a lack of it for a lack of torque
 CURRENT_NOISE = 0.02  # of the torque, in replies
 ZERO = 3.0  # rad, and whole turns of the rotor in addition
 ROTOR_TURNS = 2
@@ -74,7 +73,7 @@ def draw(seed: int, folder: Path) -> Device:
     quaternion /= np.linalg.norm(quaternion)
     stand = rng.uniform(*STAND).tolist()
     bridge["can"] = {"interface": "virtual", "channel": f"study-{seed}"}
-    bridge.update(can_id=[1, 2, 3, 4], direction=[1] * 4, zero=[0.0] * 4, damping=DAMPING)
+    bridge.update(can_id=[1, 2, 3, 4], direction=[1] * 4, zero=[0.0] * 4)
     simulator["imu"]["rotation_trunk_from_imu"] = quaternion.tolist()
     simulator.update(
         can_id=can_id, direction=direction, zero=zero, torque_scale=scale, current_noise=CURRENT_NOISE,

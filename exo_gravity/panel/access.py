@@ -1,4 +1,4 @@
-"""Who may open the panel: a token, the session that it opens, and the guard in front of every request.
+"""Who may open the panel: a token, the cookie that replaces it, and the guard in front of every request.
 
 On loopback no token is needed. A page from elsewhere could still reach it through the operator's browser, so the header
 `Host` must then name this machine: a foreign name that resolves to 127.0.0.1 (DNS rebinding) is refused. Every request
@@ -14,13 +14,12 @@ from collections import deque
 from collections.abc import Callable
 from urllib.parse import SplitResult, parse_qs, urlsplit
 
-from starlette.datastructures import Headers, MutableHeaders
-from starlette.requests import HTTPConnection
+from starlette.datastructures import MutableHeaders
+from starlette.requests import HTTPConnection, Request
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 ATTEMPTS, ATTEMPT_WINDOW = 5, 60.0  # wrong tokens of one address, and of all addresses ten times as many, in s
-SESSIONS = 64  # open sessions; a further one replaces the oldest
 COOKIE = "exo_gravity_panel"
 MAX_BODY = 4096  # bytes of a request
 POLICY_VIOLATION = 1008  # why a live connection was closed
@@ -51,7 +50,7 @@ def is_loopback(host: str) -> bool:
 
 
 class Access:
-    """The token and the sessions that it opened.
+    """The token, and the cookie of those who gave it.
 
     host: the address at which the panel listens. token: '' for none on loopback, and for a random one elsewhere.
     clock: monotonic s.
@@ -61,7 +60,7 @@ class Access:
         self.on_loopback = is_loopback(host)
         self.token = token or ("" if self.on_loopback else secrets.token_urlsafe(24))
         self._clock = clock
-        self._sessions: deque[str] = deque(maxlen=SESSIONS)
+        self.session = secrets.token_urlsafe(24)  #: the cookie's value: not the token, and another after each start
         self._failures: deque[tuple[float, str]] = deque(maxlen=10 * ATTEMPTS)
 
     @property
@@ -74,28 +73,22 @@ class Access:
         return not self.is_open or is_loopback(_split(f"//{host}").hostname or "")
 
     def allows(self, session: str) -> bool:
-        """Return whether a request with this session may see anything."""
-        return self.is_open or any(_equal(session, known) for known in self._sessions)
+        """Return whether a request with this cookie may see anything."""
+        return self.is_open or _equal(session, self.session)
 
     def is_token(self, given: str, address: str) -> bool:
-        """Return whether `given` is the token, in constant time, and note a wrong one of `address`."""
-        if self.is_blocked(address):
+        """Return whether `given` is the token, in constant time, and note a wrong one of `address`.
+
+        After too many wrong ones, from `address` or from all, none is compared for a while.
+        """
+        now = self._clock()
+        recent = [origin for time, origin in self._failures if now - time <= ATTEMPT_WINDOW]
+        if recent.count(address) >= ATTEMPTS or len(recent) >= 10 * ATTEMPTS:
             return False
         right = not self.is_open and _equal(given, self.token)
         if not right:
-            self._failures.append((self._clock(), address))
+            self._failures.append((now, address))
         return right
-
-    def is_blocked(self, address: str) -> bool:
-        """Return whether so many wrong tokens came from `address`, or from all, that none is compared now."""
-        now = self._clock()
-        recent = [origin for time, origin in self._failures if now - time <= ATTEMPT_WINDOW]
-        return recent.count(address) >= ATTEMPTS or len(recent) >= 10 * ATTEMPTS
-
-    def open_session(self) -> str:
-        """Return the secret of a new session."""
-        self._sessions.append(secrets.token_urlsafe(24))
-        return self._sessions[-1]
 
 
 def is_same_origin(origin: str, host: str) -> bool:
@@ -124,18 +117,15 @@ class Guard:
         self._form = form
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request."""
-        if scope["type"] == "lifespan":
-            await self._app(scope, receive, send)
-            return
-        headers = Headers(scope=scope)
-        refusal = self._refusal(scope, headers)
+        """Serve one request or live connection."""
+        connection = HTTPConnection(scope)
+        refusal = self._refusal(connection)
         if scope["type"] == "websocket":
-            if refusal:
+            if refusal is None:
+                await self._app(scope, receive, send)
+            else:
                 await receive()
                 await send({"type": "websocket.close", "code": POLICY_VIOLATION})
-                return
-            await self._app(scope, receive, send)
             return
 
         async def confined(message: Message) -> None:
@@ -146,42 +136,36 @@ class Guard:
             await send(message)
 
         if refusal is None and scope["path"] == "/login":
-            refusal = await self._login(scope, headers, receive)
+            refusal = await self._login(Request(scope, receive))
         await (refusal or self._app)(scope, receive, confined)
 
-    def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
+    def _refusal(self, connection: HTTPConnection) -> Response | None:
         """Return the answer to a request that must not pass, None if it may."""
-        host = headers.get("host", "")
+        scope, host = connection.scope, connection.headers.get("host", "")
         if not self._access.allows_host(host):
             return PlainTextResponse("403: the panel answers on loopback only: see docs/panel.md", 403)
         changes = scope["type"] == "websocket" or scope["method"] not in ("GET", "HEAD")
-        if changes and not is_same_origin(headers.get("origin", ""), host):
+        if changes and not is_same_origin(connection.headers.get("origin", ""), host):
             return PlainTextResponse("403: this request does not come from the panel's page", 403)
-        if scope["path"] == "/login" or self._access.allows(HTTPConnection(scope).cookies.get(COOKIE, "")):
+        if scope["path"] == "/login" or self._access.allows(connection.cookies.get(COOKIE, "")):
             return None
-        address = _address(scope)
-        given = parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [""])[0]
-        if scope["type"] == "http" and given and self._access.is_token(given, address):
-            return self._opened(scope)  # the address with the token, as the log shows it
-        return self._ask(self._access.is_blocked(address))
+        given = connection.query_params.get("token", "") if scope["type"] == "http" else ""
+        if given and self._access.is_token(given, address_of(connection)):
+            return self._opened(connection)  # the address with the token, as the log shows it
+        return self._ask(failed=bool(given))
 
-    async def _login(self, scope: Scope, headers: Headers, receive: Receive) -> Response:
-        if scope["method"] != "POST":
+    async def _login(self, request: Request) -> Response:
+        if request.method != "POST":
             return RedirectResponse("/", 303)
-        body = b""
-        while len(body) <= MAX_BODY:
-            message = await receive()
-            body += message.get("body", b"")
-            if not message.get("more_body"):
-                break
-        address = _address(scope)
-        given = parse_qs(body[:MAX_BODY].decode("utf-8", "replace")).get("token", [""])[0]
-        return self._opened(scope) if self._access.is_token(given, address) else self._ask(True)
+        body = await body_of(request)
+        given = parse_qs(body.decode("utf-8", "replace")).get("token", [""])[0]
+        right = len(body) <= MAX_BODY and self._access.is_token(given, address_of(request))
+        return self._opened(request) if right else self._ask(failed=True)
 
-    def _opened(self, scope: Scope) -> Response:
+    def _opened(self, connection: HTTPConnection) -> Response:
         answer = RedirectResponse("/", 303)
-        secure = Headers(scope=scope).get("origin", "").startswith("https:")
-        answer.set_cookie(COOKIE, self._access.open_session(), httponly=True, samesite="strict", secure=secure)
+        secure = connection.headers.get("origin", "").startswith("https:")
+        answer.set_cookie(COOKIE, self._access.session, httponly=True, samesite="strict", secure=secure)
         return answer
 
     def _ask(self, failed: bool) -> Response:
@@ -189,6 +173,16 @@ class Guard:
         return Response(self._form.replace("<!-- note -->", note), 401, media_type="text/html")
 
 
-def _address(scope: Scope) -> str:
-    client = scope.get("client")
-    return client[0] if client else "unknown"
+def address_of(connection: HTTPConnection) -> str:
+    """Return the address of the client."""
+    return connection.client.host if connection.client else "unknown"
+
+
+async def body_of(request: Request) -> bytes:
+    """Return the body; more than MAX_BODY bytes, and not all of them, if it is too long."""
+    body = b""
+    async for part in request.stream():
+        body += part
+        if len(body) > MAX_BODY:
+            break
+    return body

@@ -59,9 +59,7 @@ class Action:
 
 def parse(body: Any, arms: Collection[str], trials: Collection[str]) -> Action:
     """Return the action that the JSON value `body` describes. Raises ParameterError."""
-    if not isinstance(body, dict):
-        raise ParameterError("request", body, "an object")
-    kind = body.get("do")
+    kind = body.get("do") if isinstance(body, dict) else None
     if not isinstance(kind, str) or kind not in KEYS:
         raise ParameterError("do", kind, f"one of {', '.join(KEYS)}")
     allowed = {"do", *KEYS[kind]}
@@ -72,15 +70,12 @@ def parse(body: Any, arms: Collection[str], trials: Collection[str]) -> Action:
         raise ParameterError("arm", arm, f"one of {', '.join(sorted(arms)) or 'none: no arm is present'}")
     if kind == "trial" and name not in trials:
         raise ParameterError("trial", name, f"one of {', '.join(sorted(trials))}")
-    return Action(kind, arm, _checked(body.get("values")) if kind == "set" else {}, name)
-
-
-def _checked(values: Any) -> dict[str, Any]:
-    if not isinstance(values, dict) or not values:
-        raise ParameterError("values", values, "an object of parameters")
-    if unknown := [name for name in values if name not in SETTABLE]:
-        raise ParameterError("values", unknown, f"some of {', '.join(SETTABLE)}")
-    return {name: SETTABLE[name].check(value) for name, value in values.items()}
+    if kind != "set":
+        return Action(kind, arm, name=name)
+    values = body.get("values") if isinstance(body.get("values"), dict) else {}
+    if not values or not values.keys() <= SETTABLE.keys():  # the error has no values: they may be the wearer's
+        raise ParameterError("values", list(values), f"an object with some of {', '.join(SETTABLE)}")
+    return Action(kind, arm, {key: SETTABLE[key].check(value) for key, value in values.items()})
 
 
 @dataclass
@@ -118,12 +113,7 @@ class Control:
     """
 
     def __init__(
-        self,
-        arms: Any,
-        files: Any,
-        note: Callable[[str], object],
-        clock: Callable[[], float],
-        dead_man: bool = False,
+        self, arms: Any, files: Any, note: Callable[[str], object], clock: Callable[[], float], dead_man: bool = False
     ) -> None:
         self.holder: Page | None = None  #: the page that holds control
         self._arms = arms
@@ -187,13 +177,14 @@ class Control:
         return Reply(status, text)
 
     async def _carry_out(self, action: Action, page: Page | None) -> str:
+        problem = ""
         if action.kind == "let_down":
-            return await self._let_down([action.arm] if action.arm else self._arms.names)
-        if action.kind in ("take", "release"):
+            problem = await self._let_down([action.arm] if action.arm else self._arms.names)
+        elif action.kind in ("take", "release"):
             self.holder = page if action.kind == "take" else None
-            return ""
-        function = getattr(self._arms if action.arm else self._files, action.kind)
-        problem: str = await function(*filter(None, (action.arm, action.values, action.name)))
+        else:
+            function = getattr(self._arms if action.arm else self._files, action.kind)
+            problem = await function(*filter(None, (action.arm, action.values, action.name)))
         return problem
 
     async def _let_down(self, arms: Collection[str]) -> str:

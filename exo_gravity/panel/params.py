@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from pathlib import Path
 
+from exo_gravity import packaged
 from exo_gravity.core.compensation.params import COMPENSATOR
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import Param
 
-LANGUAGES = ("en", "de")
 # fmt: off
 PANEL = (
     Param("host", "127.0.0.1", "address of the page; other than loopback only with a token", fixed=True),
@@ -18,7 +16,7 @@ PANEL = (
     Param("token", "", "secret that opens the page; empty: none on loopback, elsewhere a random one in the log",
           fixed=True),
     Param("dead_man", False, "let the arms down when the page that holds control has been gone for 2 s", fixed=True),
-    Param("language", "en", "language of the page until its user chooses another", choices=LANGUAGES, fixed=True),
+    Param("language", "en", "language of the page until its user chooses another", choices=("en", "de"), fixed=True),
     Param("trials", "", "folder with trial scripts; empty: those of the package", fixed=True),
     Param("output", "recordings", "folder for recordings, trials and saved parameters", fixed=True),
 )
@@ -32,7 +30,7 @@ SETTABLE = {
 
 
 def scripts_folder(given: str) -> Path | None:
-    """Return the folder of trial scripts: `given`, or that of the package in a checkout, an environment or a workspace.
+    """Return the folder of trial scripts: `given`, or that of the package; None if it has none.
 
     Raises ParameterError if `given` is not a folder.
     """
@@ -40,6 +38,4 @@ def scripts_folder(given: str) -> Path | None:
         if not Path(given).is_dir():
             raise ParameterError("trials", given, "a folder")
         return Path(given)
-    shares = [Path(p, "share/exo_gravity") for p in os.environ.get("AMENT_PREFIX_PATH", "").split(":") if p]
-    roots = (Path(__file__).parents[2], *shares, Path(sys.prefix, "share/exo_gravity"))
-    return next((folder for root in roots if (folder := root / "config" / "trials").is_dir()), None)
+    return packaged("trials")

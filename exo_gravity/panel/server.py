@@ -1,7 +1,7 @@
 """The web server: the page and its files, its actions, and the live connection that carries the state to every page.
 
-It runs uvicorn on a separate thread. `publish` may be called from any thread. A page that is slow or asleep gets the
-newest state only, so that nothing queues up.
+It runs uvicorn on a separate thread. A page that is slow or asleep gets the newest state only, so that nothing queues
+up.
 
     GET  /               the page            GET /static/...   its files       GET /strings     its texts
     GET  /parameters     those in force
@@ -16,8 +16,8 @@ import asyncio
 import json
 import socket
 import threading
-from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import asynccontextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -30,37 +30,16 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.panel.access import MAX_BODY, Access, Guard
+from exo_gravity.panel.access import MAX_BODY, Access, Guard, address_of, body_of
 from exo_gravity.panel.control import Control, Page
 
 FOLDER = Path(__file__).parent
 WATCH_PERIOD = 0.1  # s
+SEND_PERIOD = 0.05  # s between two looks for news
 HELLO_TIMEOUT = 5.0  # s for a page to send its first message
 STOP_TIMEOUT = 3.0  # s
+NONE_YET: Mapping[str, Any] = {}
 FULL, REPLACED = 4000, 4001  # why a live connection was closed: too many pages; the page was opened again
-
-
-class LivePage:
-    """One live connection; holds the newest messages that it has not sent yet, by type."""
-
-    def __init__(self, connection: WebSocket) -> None:
-        self.connection = connection
-        self._news = asyncio.Event()
-        self._waiting: dict[str, str] = {}
-
-    def put(self, kind: str, text: str) -> None:
-        """Send `text` soon, in place of an older message of this kind."""
-        self._waiting[kind] = text
-        self._news.set()
-
-    async def send(self) -> None:
-        """Send what `put` gets, until it is cancelled."""
-        while True:
-            await self._news.wait()
-            self._news.clear()
-            waiting, self._waiting = self._waiting, {}
-            for text in waiting.values():
-                await self.connection.send_text(text)
 
 
 class PanelServer:
@@ -81,12 +60,11 @@ class PanelServer:
         clock: Callable[[], float],
     ) -> None:
         self.access = Access(host, token, clock)
+        self.state = NONE_YET  #: what the pages show, replaced by a new object in any thread
+        self.setup = NONE_YET  #: what changes rarely, replaced likewise
         self._control = control
         self._report = report
-        self._pages: dict[str, LivePage] = {}  # by secret
-        self._setup = ""  # none yet
-        self._number = 0  # of the newest state
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self._connections: dict[str, WebSocket] = {}  # by the page's secret
         routes = [
             Route("/", lambda request: FileResponse(FOLDER / "static" / "index.html")),
             Route("/strings", lambda request: FileResponse(FOLDER / "strings.json")),
@@ -97,14 +75,15 @@ class PanelServer:
             Mount("/static", StaticFiles(directory=FOLDER / "static")),
         ]
         form = (FOLDER / "static" / "login.html").read_text(encoding="utf-8")
-        app = Guard(Starlette(routes=routes, lifespan=self._lifespan), self.access, form)
         self._socket = _listen(host, port)
         config = uvicorn.Config(
-            app, log_level="warning", access_log=False, server_header=False, proxy_headers=False, ws_max_size=1024,
-            ws_per_message_deflate=False, ws_ping_interval=5.0, ws_ping_timeout=10.0, timeout_graceful_shutdown=1,
+            Guard(Starlette(routes=routes), self.access, form),
+            log_level="warning", access_log=False, server_header=False, proxy_headers=False, lifespan="off",
+            ws_max_size=1024, ws_per_message_deflate=False, ws_ping_interval=5.0, ws_ping_timeout=10.0,
+            timeout_graceful_shutdown=1,
         )  # fmt: skip
         self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(target=self._server.run, args=([self._socket],), name="panel", daemon=True)
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._serve()), name="panel", daemon=True)
 
     def start(self) -> None:
         """Start to serve, on a thread."""
@@ -121,26 +100,9 @@ class PanelServer:
         """Whether it still serves."""
         return self._thread.is_alive()
 
-    def publish(self, state: Mapping[str, Any]) -> None:
-        """Send the state to all pages."""
-        self._on_loop(self._send_state, state)
-
-    def publish_setup(self, setup: Mapping[str, Any]) -> None:
-        """Send what changes rarely to all pages, and to those that open later."""
-        self._setup = json.dumps({"type": "setup", **setup})
-        self._on_loop(self._send, "setup", self._setup)
-
-    def _on_loop(self, function: Callable[..., None], *args: Any) -> None:
-        if self._loop is not None:
-            with suppress(RuntimeError):  # the loop has just been closed
-                self._loop.call_soon_threadsafe(function, *args)
-
-    @asynccontextmanager
-    async def _lifespan(self, _app: Starlette) -> AsyncIterator[None]:
-        self._loop = asyncio.get_running_loop()
+    async def _serve(self) -> None:
         watch = asyncio.create_task(self._watch())
-        yield
-        self._loop = None
+        await self._server.serve([self._socket])
         watch.cancel()
 
     async def _watch(self) -> None:
@@ -148,59 +110,57 @@ class PanelServer:
             await asyncio.sleep(WATCH_PERIOD)
             await self._control.watch()
 
-    def _send_state(self, state: Mapping[str, Any]) -> None:
-        self._number += 1
-        if not self._pages:
-            return
-        holder, gone = self._control.holder, self._control.is_gone()
-        of_holder = {"page": holder.number, "address": holder.address, "gone": gone} if holder else None
-        self._send("state", json.dumps({"type": "state", "number": self._number, "control": of_holder, **state}))
-
-    def _send(self, kind: str, text: str) -> None:
-        for page in self._pages.values():
-            page.put(kind, text)
-
     async def _on_live(self, connection: WebSocket) -> None:
         await connection.accept()
         with suppress(WebSocketDisconnect, asyncio.TimeoutError, ValueError, KeyError):
             hello = await asyncio.wait_for(connection.receive_json(), HELLO_TIMEOUT)
-            address = connection.client.host if connection.client else "unknown"
-            page = self._control.open(_given(hello, "page", str), address)
+            page = self._control.open(_given(hello, "page", str), address_of(connection))
             if page is None:
                 await connection.close(FULL)
                 return
-            await self._serve(connection, page)
+            await self._attend(connection, page)
 
-    async def _serve(self, connection: WebSocket, page: Page) -> None:
-        if page.secret in self._pages:
-            await self._pages[page.secret].connection.close(REPLACED)
-        live = self._pages[page.secret] = LivePage(connection)
-        live.put("page", json.dumps({"type": "page", "page": page.secret, "number": page.number}))
-        if self._setup:
-            live.put("setup", self._setup)
-        sender = asyncio.create_task(live.send())
+    async def _attend(self, connection: WebSocket, page: Page) -> None:
+        """Send to a page and receive its confirmations until it closes."""
+        if page.secret in self._connections:
+            await self._connections[page.secret].close(REPLACED)
+        self._connections[page.secret] = connection
+        sender = asyncio.create_task(self._send(connection, page))
         try:
             while True:
                 _given(await connection.receive_json(), "seen", int)
                 self._control.confirm(page)
         finally:
             sender.cancel()
-            if self._pages.get(page.secret) is live:
-                del self._pages[page.secret]
+            if self._connections.get(page.secret) is connection:
+                del self._connections[page.secret]
                 page.connected = False
 
+    async def _send(self, connection: WebSocket, page: Page) -> None:
+        """Send the page's number, then setup and state whenever they are new, until it is cancelled."""
+        await connection.send_json({"type": "page", "page": page.secret, "number": page.number})
+        setup, state, number = NONE_YET, NONE_YET, 0
+        while True:
+            if self.setup is not setup:
+                setup = self.setup
+                await connection.send_json({"type": "setup", **setup})
+            if self.state is not state:
+                state, number = self.state, number + 1
+                holder, gone = self._control.holder, self._control.is_gone()
+                of_holder = {"page": holder.number, "address": holder.address, "gone": gone} if holder else None
+                await connection.send_json({"type": "state", "number": number, "control": of_holder, **state})
+            await asyncio.sleep(SEND_PERIOD)
+
     async def _on_action(self, request: Request) -> Response:
-        body = b""
-        async for part in request.stream():
-            body += part
-            if len(body) > MAX_BODY:
-                return PlainTextResponse("413: too long", 413)
+        body = await body_of(request)
+        if len(body) > MAX_BODY:
+            return PlainTextResponse("413: too long", 413)
         try:
             content = json.loads(body)
         except ValueError:
             return JSONResponse({"error": "the request is not JSON"}, 400)
-        address = request.client.host if request.client else "unknown"
-        status, text = await self._control.perform(content, request.headers.get("x-panel-page", ""), address)
+        secret = request.headers.get("x-panel-page", "")
+        status, text = await self._control.perform(content, secret, address_of(request))
         return JSONResponse({"error": text}, status)
 
     async def _on_report(self, request: Request) -> Response:

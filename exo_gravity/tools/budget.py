@@ -38,10 +38,9 @@ from exo_gravity.core.model.wearer import SEX, TABLES, TYPICAL_LENGTH, LinkLoad,
 from exo_gravity.core.numbers import one_float
 from exo_gravity.tools.cli import missing
 from exo_gravity.tools.inputs.arms import ConfiguredArm, configured_arms, named
-from exo_gravity.tools.reporting.colours import INK, JOINT_COLOURS
+from exo_gravity.tools.reporting.html import INK
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 DPI = 150
@@ -50,8 +49,6 @@ HEADINGS = (
     ("", "", "rated", "peak", "needs", "within", "within", "", "support"),
     ("joint", "motor", "Nm", "Nm", "Nm", "rated", "peak", "worst pose; pitch, roll (deg)", "within rated"),
 )
-ALONE_COLOUR, CARRYING_COLOUR, RATED_COLOUR, PEAK_COLOUR = JOINT_COLOURS
-RED, YELLOW, PLAIN = "\033[31m", "\033[33m", "\033[0m"
 CELLS = 31  # of a map, along each axis
 REST = 60  # random settings of the angles that a map does not show, the same for each cell
 OTHER = (1, 2, 3, 2)  # the second axis of each joint's map: the angle that affects it most
@@ -89,13 +86,13 @@ def arm_budget(configured: ConfiguredArm, wearer: Wearer, support: float, max_ti
     return ArmBudget(configured.namespace, configured.robot, motors, workspace, load, support, joints)
 
 
-def table_lines(arm: ArmBudget, colour: bool = False) -> Iterator[str]:
-    """Yield the lines of a table with one row per joint; colour: for a terminal, mark joints beyond rated torque."""
+def table_lines(arm: ArmBudget) -> Iterator[str]:
+    """Yield the lines of a table with one row per joint."""
     yield f"{arm.name} at support {arm.support:g}, trunk tilt up to {math.degrees(arm.workspace.max_tilt):g} deg"
     yield from (_line(*heading) for heading in HEADINGS)
     for number, joint in enumerate(arm.joints):
         *pose, pitch, roll = (f"{angle:.0f}" for angle in np.degrees(joint.worst) + 0.0)  # + 0.0: no minus zero
-        line = _line(
+        yield _line(
             f"{number + 1} {JOINTS[number]}",
             arm.motors[number],
             f"{joint.rated:.3g}",
@@ -106,8 +103,6 @@ def table_lines(arm: ArmBudget, colour: bool = False) -> Iterator[str]:
             f"{', '.join(pose)}; {pitch}, {roll}",
             "none" if joint.support is None else f"{rounded_down(joint.support):.3f}",
         )
-        mark = RED if joint.torque > joint.peak else YELLOW
-        yield f"{mark}{line}{PLAIN}" if colour and joint.overloaded else line
 
 
 def _line(*cells: str) -> str:
@@ -166,41 +161,8 @@ def _write_figures(arms: Sequence[ArmBudget], folder: Path) -> str:
 
 
 def _joint_figure(arm: ArmBudget, joint: int) -> Figure:
-    """Return the figure of one joint (0..3)."""
+    """Map the largest torque of a joint (0..3) over two angles: the maximum over the others and the trunk's tilt."""
     from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11.0, 4.6), layout="constrained")
-    title = f"{arm.name} joint {joint + 1}, {JOINTS[joint]}: {arm.motors[joint]}"
-    figure.suptitle(title, x=0.01, ha="left", weight="bold")
-    shares, where = figure.subplots(1, 2, width_ratios=(1.1, 1.0))
-    _shares(shares, arm, joint)
-    _where(figure, where, arm, joint)
-    return figure
-
-
-def _shares(axis: Axes, arm: ArmBudget, joint: int) -> None:
-    """Draw the share of the workspace that needs at most a torque, for the robot alone and at the chosen support."""
-    points = arm.workspace.points()
-    carrying = arm.robot.with_wearer(*arm.load, arm.support)
-    percent = np.linspace(0.0, 100.0, len(points))
-    for model, colour, label in (
-        (arm.robot, ALONE_COLOUR, "robot alone (One-G)"),
-        (carrying, CARRYING_COLOUR, f"with the wearer's arm at support {arm.support:g}"),
-    ):
-        axis.plot(np.sort(np.abs(torque_at(model, points)[:, joint])), percent, color=colour, lw=1.8, label=label)
-    rated, peak = arm.joints[joint].rated, arm.joints[joint].peak
-    for limit, colour, label in ((rated, RATED_COLOUR, "rated"), (peak, PEAK_COLOUR, "peak")):
-        axis.axvline(limit, color=colour, lw=1.2, ls="--", label=f"{label}: {limit:g} Nm")
-    axis.set_xlim(0.0, 1.05 * max(arm.joints[joint].torque, peak))
-    axis.set_ylim(0.0, 102.0)
-    axis.set_xlabel("Torque (Nm)")
-    axis.set_ylabel("Share of the workspace that needs at most this (%)")
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.legend(loc="lower right", edgecolor="none", framealpha=0.9)
-
-
-def _where(figure: Figure, axis: Axes, arm: ArmBudget, joint: int) -> None:
-    """Map the largest torque over two joint angles, the maximum over the other angles and the trunk's tilt."""
     from matplotlib.patheffects import withStroke
 
     other = OTHER[joint]
@@ -214,18 +176,22 @@ def _where(figure: Figure, axis: Axes, arm: ArmBudget, joint: int) -> None:
     points[:, [joint, other]] = np.repeat(grid, len(rest), axis=0)
     torque = np.abs(torque_at(arm.robot.with_wearer(*arm.load, arm.support), points)[:, joint])
     largest = torque.reshape(CELLS, CELLS, len(rest)).max(axis=-1)
-    mesh = axis.pcolormesh(np.degrees(across), np.degrees(up), largest, cmap="cividis", vmin=0.0, shading="gouraud")
+    figure = Figure(figsize=(6.5, 5.2), layout="constrained")
+    axis = figure.subplots()
+    angles = np.degrees(across), np.degrees(up)
+    mesh = axis.pcolormesh(*angles, largest, cmap="cividis", vmin=0.0, shading="gouraud")
     figure.colorbar(mesh, ax=axis, label=f"Largest torque at support {arm.support:g} (Nm)")
     for limit, style in ((arm.joints[joint].rated, "-"), (arm.joints[joint].peak, ":")):
         if largest.min() < limit < largest.max():
-            lines = axis.contour(np.degrees(across), np.degrees(up), largest, [limit], colors="white", linestyles=style)
+            lines = axis.contour(*angles, largest, [limit], colors="white", linestyles=style)
             outline: list[Any] = [withStroke(linewidth=2.5, foreground=INK)]
             lines.set_path_effects(outline)
             for text in axis.clabel(lines, fmt=f"{limit:g} Nm"):
                 text.set_path_effects(outline)
-    axis.set_title("maximum over the other joints and the trunk's tilt", fontsize=10)
+    axis.set_title(f"{arm.name} joint {joint + 1}, {JOINTS[joint]}: {arm.motors[joint]}", loc="left", weight="bold")
     axis.set_xlabel(f"Joint {joint + 1} (deg)")
-    axis.set_ylabel(f"Joint {other + 1} (deg)")
+    axis.set_ylabel(f"Joint {other + 1} (deg); maximum over the other joints and the trunk's tilt")
+    return figure
 
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
@@ -262,6 +228,6 @@ def main(args: Sequence[str] | None = None) -> int:
     segments = ", ".join(f"{name} {mass:.2f} kg at {cog:.3f} m" for name, (mass, cog) in masses)
     print(f"Wearer: {wearer.body_mass:g} kg, {wearer.sex}, table {wearer.table}: {segments}")
     for arm in arms:
-        print("", *table_lines(arm, sys.stdout.isatty()), "", *verdict(arm, wearer), sep="\n")
+        print("", *table_lines(arm), "", *verdict(arm, wearer), sep="\n")
     print(f"\n{written}")
     return int(any(arm.beyond for arm in arms))

@@ -23,12 +23,13 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
 
 from exo_gravity.core.errors import ExoGravityError
+from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.tools.cli import require_ros
 from exo_gravity.tools.inputs.parameter_file import (
-    DESCENT_TIMEOUT,
     ENDED_WELL,
     RECOVERY,
     RECOVERY_TIMEOUT,
@@ -51,9 +52,8 @@ OnLine = Callable[[str, str], None]  # (node, line of its log)
 
 def print_line(node: str, line: str) -> None:
     """Print one line of a node's log, with the time of day and the node's name."""
-    now = time.time()
-    clock = time.strftime("%H:%M:%S", time.localtime(now))
-    print(f"{clock}.{int(now % 1 * 1000):03d} {node.lstrip('/'):<18} {line}", flush=True)
+    clock = datetime.now().time().isoformat("milliseconds")
+    print(f"{clock} {node.lstrip('/'):<18} {line}", flush=True)
 
 
 class Launcher:
@@ -103,13 +103,14 @@ class Launcher:
         """Return the process of a node by its full name."""
         return self._processes[node]
 
+    def exit_code(self, node: str) -> int | None:
+        """Return the exit code of a node that was started and has ended, else None."""
+        return self._processes[node].poll() if node in self._processes else None
+
     def dead(self) -> tuple[str, int] | None:
-        """Return the name and exit code of a node that has ended, None while all run. Observers do not count."""
-        for node, process in self._processes.items():
-            code = process.poll()
-            if code is not None and not is_observer(node):
-                return node, code
-        return None
+        """Return the name and exit code of a node that has ended, None while all run. An observer may end alone."""
+        codes = ((node, self.exit_code(node)) for node in list(self._processes) if not is_observer(node))
+        return next(((node, code) for node, code in codes if code is not None), None)
 
     def stop(self) -> None:
         """Stop every node: first the bridges, which let the arms down, then the rest, and the recorder last.
@@ -136,7 +137,7 @@ class Launcher:
                 process.kill()
                 process.wait()
         for node in nodes:
-            if _has_ended_well(self._processes[node]):
+            if self.exit_code(node) in ENDED_WELL:
                 self._readers[node].join(STOP_TIMEOUT)
 
     def _is_off(self, node: str) -> bool:
@@ -144,7 +145,7 @@ class Launcher:
 
         The bridge's executable waits for the watchdog of the dead bridge, and lets the arm down if that has died too.
         """
-        if _has_ended_well(self._processes[node]):
+        if self.exit_code(node) in ENDED_WELL:
             return True
         recovery, reader = self._start(node, RECOVERY)
         try:
@@ -175,11 +176,6 @@ class Launcher:
     def _read(self, node: str, process: subprocess.Popen[str]) -> None:
         for line in process.stdout or ():
             self._on_line(node, line.rstrip())
-
-
-def _has_ended_well(process: subprocess.Popen[str]) -> bool:
-    """Return whether a node has ended by itself."""
-    return process.poll() in ENDED_WELL
 
 
 class StopFlag:

@@ -9,12 +9,11 @@ Exit code 0: saved. 2: wrong use, wrong file, or too few samples.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from exo_gravity.core.errors import ExoGravityError, ParameterError
+from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.model.anfis import JOINTS
 from exo_gravity.core.model.tilt import SIDES
 from exo_gravity.tools.cli import extras
@@ -36,23 +35,11 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(args)
 
 
-def _check_output(path: Path) -> None:
-    """Create the folder of `path`, before the training. Raises ParameterError if the file can't be written."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ParameterError("output", str(path), f"a file in a folder that can be made ({error.strerror})") from None
-    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise ParameterError("output", str(path), "a file that can be written")
-
-
 def _run(options: argparse.Namespace) -> None:
     """Train, save the law and print its errors."""
-    from exo_gravity.tools.anfis.samples import from_bag, from_gravload
-    from exo_gravity.tools.anfis.training import RIDGE, train_law
+    from exo_gravity.tools.anfis import RIDGE, from_bag, from_gravload, train_law
 
     output = Path(options.output)
-    _check_output(output)
     configured = configured_arm(options.params, options.side)
     functions = options.functions or (2 if options.bag else 4)
     if options.bag:
@@ -60,6 +47,7 @@ def _run(options: argparse.Namespace) -> None:
     else:
         samples, ridge = from_gravload(configured), RIDGE
     law, results = train_law(samples, configured.robot, functions, ridge)
+    output.parent.mkdir(parents=True, exist_ok=True)
     output.write_text(law.dump(), encoding="utf-8")
     print(f"{law.source}; {law.model.rules} rules, {law.model.parameters} parameters per joint")
     print(f"{'joint':<6}{'training RMSE':>16}{'held-out RMSE':>16}{'the paper':>16}{'steps':>8}{'time':>9}")

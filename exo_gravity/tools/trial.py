@@ -28,7 +28,7 @@ import yaml
 from exo_gravity.core.errors import DataError, ExoGravityError, ParameterError
 from exo_gravity.core.trial.analysis import MIN_HOLD, HoldCriteria
 from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.tools.cli import extras, non_negative
+from exo_gravity.tools.cli import extras
 from exo_gravity.tools.inputs.parameter_file import packaged_config
 from exo_gravity.tools.launcher import Stopping, stop_on_signals
 from exo_gravity.tools.reporting import video
@@ -65,10 +65,8 @@ def read_script(name: str) -> tuple[Path, TrialScript]:
         raise ParameterError("trial", name, f"a readable YAML file ({reason})") from None
 
 
-def criteria_for(script: TrialScript, max_rate: float | None) -> HoldCriteria:
-    """Return the criteria for a script; max_rate: deg/min over a hold, None for the default."""
-    if max_rate is not None:
-        return HoldCriteria(max_rate=math.radians(max_rate) / 60.0)
+def criteria_for(script: TrialScript) -> HoldCriteria:
+    """Return the criteria for a script: if every hold is long enough, they limit the drift rate."""
     rate = MAX_RATE if min(_hold_durations(script), default=0.0) >= LONG_HOLD else math.inf
     # A person at a real arm may also hold it still at other times, and only briefly.
     return HoldCriteria(max_rate=math.radians(rate) / 60.0, rated_from=LONG_HOLD)
@@ -126,7 +124,7 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
     trouble, code = end.trouble, end.code
     if bag is not None:
         guided = options.attach == "guided" if options.attach else is_guided(params)
-        report = trial_report.analyse(bag, criteria_for(script, options.max_rate), shortest_hold(script, guided))
+        report = trial_report.analyse(bag, criteria_for(script), shortest_hold(script, guided))
         if guided and not trouble:
             trouble = missing_holds(script, report)
             code = int(bool(trouble))
@@ -190,12 +188,6 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     option("--params", metavar="FILE", help="parameter file (default: the simulated right arm)")
     option("--output", metavar="DIR", default="trials", help="where to create the trial's folder (%(default)s)")
     option("--offline", action="store_true", help="on the simulated device, without ROS and faster than real time")
-    option(
-        "--max-rate",
-        type=non_negative,
-        metavar="DEG/MIN",
-        help="drift rate allowed over a hold (default: 0.2 if every hold lasts 30 s, else no limit)",
-    )
     attach = "on arms that are carried already, a person or a simulator moving them; prints JSON"
     option("--attach", choices=("guided", "simulated"), help=attach)
     video.add_arguments(parser)

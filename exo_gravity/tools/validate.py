@@ -34,15 +34,14 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
 
 def _run(options: argparse.Namespace) -> bool:
     """Run the comparison and print it; return whether all checks held."""
-    from exo_gravity.tools.comparison import report
-    from exo_gravity.tools.comparison.validation import Validation
+    from exo_gravity.tools.comparison import Validation, tables, write
 
     configured = configured_arm(options.params, options.side)
     output = Path(options.output)
     output.mkdir(parents=True, exist_ok=True)
     validation = Validation.of(configured, QUICK_COUNT if options.quick else COUNT)
-    print("\n".join(report.tables(validation)))
-    written = report.write(validation, output)
+    print("\n".join(tables(validation)))
+    written = write(validation, output)
     print()
     verdicts = list(validation.checks())
     for held, sentence in verdicts:

@@ -22,7 +22,7 @@ from .simulated_rig import AFTER_EXIT, LIMITS, MOTORS_OF_ARM, POSE, SAFE_SPEED
 from .virtual_time import Wire
 
 CYCLE = 0.008  # s
-QUICK = replace(LIMITS, sign_check_torque=0.0, ramp_time=0.5)
+QUICK = replace(LIMITS, sign_check_torque=0.0)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from exo_gravity.core import ArmModel
 from exo_gravity.core.model.budget import BRIDGE_PARAMETERS, BudgetRequest, overload
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.params import CAN_BRIDGE
-from exo_gravity.nodes.ros.budget_thread import compute
+from exo_gravity.nodes.compensator.budget_watch import compute
 
 ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
 BRIDGE = values_of([param for param in CAN_BRIDGE if param.name in BRIDGE_PARAMETERS], {})

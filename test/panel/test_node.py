@@ -25,6 +25,7 @@ from ..support.ros_probe import RosProbe
 
 TOKEN = "a token for this test"
 NAMES = [f"joint_{n}" for n in range(4)]
+MAX_EFFORT = [9.0, 18.0, 9.0, 9.0]
 
 
 class PanelProcess:
@@ -59,7 +60,7 @@ class PlayedArm:
         self.bridge, self.compensator = (
             rclpy.create_node(name, namespace="right", context=self.context) for name in ("can_bridge", "compensator")
         )
-        self.bridge.declare_parameter("joint_names", NAMES)
+        self.bridge.declare_parameter("max_effort", MAX_EFFORT)
         self.compensator.declare_parameter("support", 0.1)
         self.bridge.create_service(SetBool, "~/enable", self._on_enable)
         self.bridge.create_service(Trigger, "~/clear_fault", self._on_clear_fault)
@@ -121,7 +122,7 @@ def message(connection: ClientConnection, kind: str, condition: Callable[[dict[s
 
 def is_known(setup: dict[str, Any], support: float = 0.1) -> bool:
     arm = setup["arms"].get("right")
-    return bool(arm) and arm["joint_names"] == NAMES and arm["settings"]["support"] == support
+    return bool(arm) and arm["max_effort"] == MAX_EFFORT and arm["settings"]["support"] == support
 
 
 def test_the_page_shows_and_operates_an_arm_that_comes_and_goes(panel):

@@ -13,10 +13,9 @@ from typing import Any
 from exo_gravity.core.compensation.params import COMPENSATOR
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.params import CAN_BRIDGE
-from exo_gravity.nodes.panel.setup import Setup
 from exo_gravity.panel.control import Control
 from exo_gravity.panel.server import PanelServer
-from exo_gravity.panel.view import Joints, Status, arm_state
+from exo_gravity.panel.view import joint_rows, setup_of
 
 from .ports import free_port
 
@@ -77,13 +76,13 @@ class PlayedArms:
         names = [f"{name}_{leaf}" for leaf in LEAVES]
         position = [0.3 * math.sin(0.5 * now + n) for n in range(4)]
         effort = [0.8 * math.sin(0.5 * now + n) for n in range(4)]
-        joints = Joints(now, names, position, effort)
         state, fault = self.states[name], self.faults.get(name, "none")
         values = {"state": state, "fault": fault, "rate (Hz)": "250.0", "age of efforts (ms)": "4.1"}
         values |= {"limits acting": "none", **{f"{joint} temperature (degC)": "31" for joint in names}}
         message = f"fault: {fault}: {name} elbow" if fault != "none" else state
-        bridge = Status(2 if fault != "none" else 0, message, values, now)
-        return arm_state(now, joints, bridge, Status(0, "compensating", {"mass carried (kg)": "1.854"}, now))
+        bridge = {**values, "level": 2 if fault != "none" else 0, "message": message}
+        carried = {"mass carried (kg)": "1.854", "largest support": "0.068", "level": 0, "message": "compensating"}
+        return {"bridge": bridge, "compensator": carried, "joints": joint_rows(names, position, effort)}
 
 
 @dataclass
@@ -142,7 +141,7 @@ class Stage:
         self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}/"
         self.server = PanelServer(host, self.port, token, self.control, self.reports.get, dict, clock)
-        self.setup = Setup({"language": "en", "dead_man": dead_man, "trials": list(self.files.trials)})
+        self._own_setup = {"language": "en", "dead_man": dead_man, "trials": list(self.files.trials)}
         self._bridge = values_of(CAN_BRIDGE, BUS, "can.options")
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._play, daemon=True)
@@ -153,17 +152,17 @@ class Stage:
         self._stopping.set()
         self._thread.join()
         self.server.stop()
-        self.setup.close()
 
     def _play(self) -> None:
+        shown: Any = None
         while not self._stopping.wait(PERIOD):
-            parameters: dict[str, dict[str, Any]] = {}
-            for arm, settings in self.arms.settings.items():
-                parameters[f"/{arm}/compensator"] = dict(settings)
-                parameters[f"/{arm}/can_bridge"] = {**self._bridge, "joint_names": settings["joint_names"]}
-            news = self.setup.news(self.arms.names, parameters)
-            if news is not None:
-                self.server.publish_setup(news)
+            nodes = {
+                arm: ({**self._bridge, "joint_names": settings["joint_names"]}, dict(settings))
+                for arm, settings in self.arms.settings.items()
+            }
+            if nodes != shown:
+                shown = nodes
+                self.server.setup = {**self._own_setup, **setup_of(nodes)}
             now = time.monotonic()
             arms = {arm: self.arms.state(arm, now) for arm in self.arms.names}
-            self.server.publish({"arms": arms, "tilt": {"pitch": 0.2, "roll": -0.1}, **self.files.content})
+            self.server.state = {"arms": arms, "tilt": {"pitch": 0.2, "roll": -0.1}, **self.files.content}

@@ -70,12 +70,11 @@ def test_an_unknown_name_is_answered_with_the_packaged_trials():
     )
 
 
-def test_only_holds_of_a_minute_are_judged_by_their_rate_unless_the_user_sets_one():
+def test_only_holds_of_a_minute_are_judged_by_their_rate():
     _, demo = read_script("demo")
     _, thirteen_poses = read_script("thirteen_poses")
-    assert criteria_for(demo, None).max_rate == math.inf
-    assert criteria_for(thirteen_poses, None).max_rate == pytest.approx(math.radians(0.2) / 60)
-    assert criteria_for(demo, 1.0).max_rate == pytest.approx(math.radians(1.0) / 60)
+    assert criteria_for(demo).max_rate == math.inf
+    assert criteria_for(thirteen_poses).max_rate == pytest.approx(math.radians(0.2) / 60)
 
 
 def report_with(holds: int) -> trial_report.Report:

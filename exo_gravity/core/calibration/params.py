@@ -24,7 +24,7 @@ from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.params import CAN_BRIDGE
 
 ARM = ("side", "joint_names", "link_length", "gravity", "use_imu", "tilt_timeout")  # as the compensator's
-LIMITS = ("position_min", "position_max", "max_effort", "home")
+LIMITS = ("position_min", "position_max", "max_effort")
 BRIDGE = ("rate", *LIMITS)  # as can_bridge's
 # fmt: off
 CALIBRATOR = (

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,22 +30,21 @@ from exo_gravity.core.compensation.terms.assist import AssistInput
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.anfis import AnfisLaw
 from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.model.budget import BRIDGE_PARAMETERS, BudgetRequest, overload
-from exo_gravity.core.params import values_of
-from exo_gravity.core.safety.params import CAN_BRIDGE
 from exo_gravity.hardware.urdf_arm import UrdfArm
-from exo_gravity.nodes.ros.budget_thread import BudgetThread
+from exo_gravity.nodes.compensator.budget_watch import BudgetWatch
 from exo_gravity.nodes.ros.hot_path import LATCHED, HotPath
 from exo_gravity.nodes.ros.messages import row, to_nanoseconds
-from exo_gravity.nodes.ros.parameters import NodeParameters, declare
+from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.sole_publisher import SolePublisher
 
 DESCRIPTION_TIMEOUT = 10.0  # s in which robot_description must arrive
-WITHIN = "within rated torque everywhere"
 
 
 class ControlledArm:
-    """Parameters, control and reports of the node's arm. lock: guards `control`."""
+    """Parameters, control and reports of the node's arm.
+
+    lock: guards `control`. threads: those that the node starts and stops.
+    """
 
     def __init__(self, node: Node, lock: threading.Lock) -> None:
         given = node.get_parameters_by_prefix("")
@@ -61,7 +59,7 @@ class ControlledArm:
             self._model = UrdfArm(_description(node, self.values), names)
         self.control = Compensator(self.read(self.values), names)
         terms = self.control.terms
-        self._assist = AssistEfforts(node, terms.assist, lock) if terms else None
+        self.threads = [AssistEfforts(node, terms.assist, lock)] if terms else []
         self._budget = BudgetWatch(node, names) if terms else None
 
     def read(self, values: dict[str, Any]) -> Settings | UrdfSettings:
@@ -74,21 +72,6 @@ class ControlledArm:
         except (OSError, UnicodeDecodeError, DataError) as error:
             raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
         return settings_of(values, anfis)
-
-    @property
-    def failure(self) -> Exception | None:
-        """The exception that ended the thread of the outer loop's efforts."""
-        return self._assist.messages.failure if self._assist else None
-
-    def start(self) -> None:
-        """Start the thread of the outer loop's efforts."""
-        if self._assist:
-            self._assist.messages.start()
-
-    def stop(self) -> None:
-        """End it, before the node is destroyed."""
-        if self._assist:
-            self._assist.messages.stop()
 
     def update(self) -> None:
         """Keep the torque budget up to date."""
@@ -131,6 +114,7 @@ class ControlledArm:
             values["assist"] = terms.assist.report
             values["inertia tank (J)"] = f"{terms.energy:.2f}"
             values["budget"] = self._budget.text
+            values["largest support"] = self._budget.largest_support
         return values
 
 
@@ -152,16 +136,16 @@ def _of_robot(robot: ArmModel) -> str:
     return f"{along}, across the links {row(robot.off_axis)} kg m" if any(robot.off_axis) else along
 
 
-class AssistEfforts:
-    """Passes each message on the topic `assist_efforts` to `assist` on its own thread, holding `lock`."""
+class AssistEfforts(HotPath):
+    """Passes each message on the topic `assist_efforts` to `assist` on a thread, holding `lock`."""
 
     def __init__(self, node: Node, assist: AssistInput, lock: threading.Lock) -> None:
+        super().__init__(node, JointState, "assist_efforts", self._on_efforts)
         self._clock = node.get_clock()
         self._assist = assist
         self._lock = lock
         self._sole = SolePublisher(node, "assist_efforts")
         self._sender = 0  # changes whenever a message comes from another publisher than the one before
-        self.messages = HotPath(node, JointState, "assist_efforts", self._on_efforts)
 
     def _on_efforts(self, message: JointState, info: dict[str, Any]) -> None:
         now = time.monotonic()
@@ -169,50 +153,6 @@ class AssistEfforts:
         self._sender += self._sole.is_another(info)
         with self._lock:
             self._assist.receive(now, message.name, message.effort, now - age, self._sender)
-
-
-class BudgetWatch:
-    """Checks whether the motors can provide the torque that the settings require, outside the control loop.
-
-    Call `update` regularly; `text` is the result for the newest settings that were checked. Motors and joint limits
-    are parameters of `can_bridge`, which are read once.
-    """
-
-    def __init__(self, node: Node, joint_names: Sequence[str]) -> None:
-        self.text = "unknown: waiting for can_bridge's parameters"
-        self._logger = node.get_logger()
-        self._names = tuple(joint_names)
-        self._bridge: dict[str, Any] = {}
-        self._parameters = NodeParameters(node, "can_bridge", self._on_bridge, BRIDGE_PARAMETERS)
-        self._thread = BudgetThread()
-
-    def update(self, settings: Settings) -> None:
-        """Collect a finished budget, and start one for `settings` if they are new. Never blocks."""
-        self._parameters.update()
-        if not self._bridge:
-            return
-        s = settings
-        support = s.support if s.mode == "zero_g" else 0.0
-        load = s.wearer_mass, s.wearer_cog
-        if self._thread.update(BudgetRequest.of(s.robot, load, support, self._bridge, s.use_imu)):
-            result = self._thread.result or ()
-            if isinstance(result, ParameterError):
-                self._note(f"unknown: can_bridge has {result}")
-            else:
-                self._note(overload(self._names, result) or WITHIN)
-
-    def _on_bridge(self, values: dict[str, Any]) -> None:
-        table = [param for param in CAN_BRIDGE if param.name in BRIDGE_PARAMETERS]
-        try:
-            self._bridge = values_of(table, values)
-        except ParameterError as error:
-            self._note(f"unknown: can_bridge has {error}")
-        self._parameters.destroy()  # the executor then waits for two entities less
-
-    def _note(self, text: str) -> None:
-        self.text = text
-        if text != WITHIN:
-            self._logger.warning(f"{text}; efforts stay clamped to max_effort")
 
 
 def _forget_unused(node: Node, used: set[str]) -> None:

@@ -32,7 +32,6 @@ class JointStateInterface:
 
     topic = "joint_states"
     problem = ""
-    failure: Exception | None = None
 
     def __init__(self, node: Node, names: Sequence[str]) -> None:
         self._names = names
@@ -49,12 +48,6 @@ class JointStateInterface:
         self._command.header.stamp = message.header.stamp
         self._command.effort = answer.effort or ()
         self._publisher.publish(self._command)
-
-    def start(self) -> None:
-        """Do nothing: the joint states set the pace."""
-
-    def stop(self) -> None:
-        """Do nothing: `can_bridge` lets the arm down."""
 
 
 class MultiArrayInterface:
@@ -143,13 +136,3 @@ class MultiArrayInterface:
             response.success = self._fade.clear()
         response.message = "cleared: the torque ramps in" if response.success else "nothing to clear, or still fading"
         return response
-
-
-CommandInterface = JointStateInterface | MultiArrayInterface
-
-
-def interface_of(node: Node, names: Sequence[str], values: Mapping[str, Any]) -> CommandInterface:
-    """Return the interface that the parameter `command_interface` names."""
-    if values.get("command_interface") == "multi_array":
-        return MultiArrayInterface(node, names, values)
-    return JointStateInterface(node, names)

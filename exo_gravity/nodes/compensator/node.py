@@ -24,7 +24,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.rate import Rate
 from exo_gravity.hardware.scheduling import request_real_time
 from exo_gravity.nodes.compensator.arm import ControlledArm, sentence
-from exo_gravity.nodes.compensator.command_interface import interface_of
+from exo_gravity.nodes.compensator.command_interface import JointStateInterface, MultiArrayInterface
 from exo_gravity.nodes.ros.hot_path import NEWEST, HotPath
 from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row
 from exo_gravity.nodes.ros.parameters import values_after, with_floats
@@ -46,7 +46,13 @@ class CompensatorNode(Node):
         self._arm = ControlledArm(self, self._lock)
         self._control, values = self._arm.control, self._arm.values
         self._names = values["joint_names"]
-        self._interface = interface_of(self, self._names, values)
+        self._threads: list[HotPath | MultiArrayInterface] = [*self._arm.threads]
+        self._interface: JointStateInterface | MultiArrayInterface
+        if values.get("command_interface") == "multi_array":
+            self._interface = MultiArrayInterface(self, self._names, values)
+            self._threads.append(self._interface)
+        else:
+            self._interface = JointStateInterface(self, self._names)
         self._diagnostics = Diagnostics(self)
         self._answer = Answer(None)
         self._changes: deque[Answer] = deque(maxlen=MAX_CHANGES)
@@ -58,32 +64,30 @@ class CompensatorNode(Node):
         self._source = SolePublisher(self, topic)
         # Which input had a second publisher, as a sentence, and when (monotonic s).
         self._intruder, self._intruded = "", -math.inf
-        self._joint_states = HotPath(self, JointState, topic, self._on_joint_states, NEWEST)
+        self._threads.append(HotPath(self, JointState, topic, self._on_joint_states, NEWEST))
         if values["use_imu"]:
             TiltSubscription(self, self._control, self._lock, self._refused, self._withdraw, self._arm.on_motion)
-        self.add_pre_set_parameters_callback(lambda changes: with_floats(self, self._arm.table, changes))
+        self.add_pre_set_parameters_callback(lambda changes: with_floats(self, changes))
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         # Only the executor's thread reports: diagnostics and budget are not for two threads.
         self._changed = self.create_guard_condition(self._report_changes)
         self.create_timer(REPORT_PERIOD, self._report_current)
         self.get_logger().info(sentence(self._control.settings))
-        self._arm.start()
-        self._interface.start()
-        self._joint_states.start()
+        for thread in self._threads:
+            thread.start()
         for refused in request_real_time(values["thread_priority"], values["thread_priority"] > 0):
             self.get_logger().warning(refused)
 
     @property
     def failure(self) -> Exception | None:
         """The exception that ended the thread of the joint states, of the assistance, or of a fade."""
-        return self._joint_states.failure or self._arm.failure or self._interface.failure
+        return next((thread.failure for thread in self._threads if thread.failure), None)
 
     def close(self) -> None:
         """Stop answering joint states."""
-        self._joint_states.stop()
-        self._interface.stop()
-        self._arm.stop()
+        for thread in reversed(self._threads):
+            thread.stop()
 
     def _on_joint_states(self, message: JointState, info: dict[str, Any]) -> None:
         now = time.monotonic()

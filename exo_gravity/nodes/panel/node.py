@@ -9,6 +9,7 @@ arrive hundreds of times a second: their subscription keeps the newest message o
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
 import math
 import time
 from collections.abc import Collection, Mapping
@@ -28,7 +29,6 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity.core.errors import ExoGravityError
-from exo_gravity.nodes.panel.setup import Setup
 from exo_gravity.nodes.ros.hot_path import HotPath
 from exo_gravity.nodes.ros.messages import OK, Diagnostics
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
@@ -36,7 +36,7 @@ from exo_gravity.nodes.ros.run import run
 from exo_gravity.panel.control import Control
 from exo_gravity.panel.params import PANEL, scripts_folder
 from exo_gravity.panel.recordings import Recordings
-from exo_gravity.panel.view import SILENT, Joints, Status, arm_state
+from exo_gravity.panel.view import Newest, Values, joint_rows, setup_of
 
 STATE_PERIOD = 0.1  # s between two states that the pages get
 DISCOVERY_PERIOD = 0.5  # s between two searches for nodes
@@ -50,19 +50,19 @@ class ArmClient:
     """One arm, in the namespace `/name`."""
 
     def __init__(self, node: Node, name: str) -> None:
-        self.joints, self.bridge, self.compensator = Joints(), Status(), Status()
+        self.joints, self.bridge, self.compensator = Newest(), Newest(), Newest()
         self.enable = node.create_client(SetBool, f"/{name}/{BRIDGE}/enable")
         self.clear_fault = node.create_client(Trigger, f"/{name}/{BRIDGE}/clear_fault")
         self.set = parameter_client(node, f"/{name}/{COMPENSATOR}")
         self._states = HotPath(node, JointState, f"/{name}/joint_states", self._on_states)
 
     def state(self, now: float) -> dict[str, Any]:
-        """Take the newest joint states, and return what the page shows."""
+        """Take the newest joint states, and return what the page shows; None in the place of what is old."""
         self._states.poll()
-        return arm_state(now, self.joints, self.bridge, self.compensator)
+        return {kind: getattr(self, kind).at(now) for kind in ("joints", "bridge", "compensator")}
 
     def _on_states(self, message: JointState, _info: dict[str, Any]) -> None:
-        self.joints = Joints(time.monotonic(), *map(list, (message.name, message.position, message.effort)))
+        self.joints = Newest(joint_rows(message.name, message.position, message.effort), time.monotonic())
 
 
 class Arms:
@@ -107,6 +107,11 @@ class Arms:
         now = time.monotonic()
         return {name: client.state(now) for name, client in sorted(self.clients.items(), reverse=True)}
 
+    def nodes(self) -> dict[str, tuple[Values, Values]]:
+        """Return the newest parameters of bridge and compensator by arm, {} while they are not known."""
+        get = self.known.get
+        return {arm: (get(f"/{arm}/{BRIDGE}", {}), get(f"/{arm}/{COMPENSATOR}", {})) for arm in self.names}
+
     # For a trial (`Device` of exo_gravity.panel.recordings); called on the web server's thread
 
     def parameters(self) -> dict[str, dict[str, Any]]:
@@ -117,8 +122,7 @@ class Arms:
     def states(self) -> dict[str, str | None]:
         """Return the state that each bridge reports; None if it is silent."""
         now = time.monotonic()
-        of_arms = {name: client.bridge for name, client in self.clients.items()}
-        return {name: s.values.get("state") if now - s.time < SILENT else None for name, s in of_arms.items()}
+        return {name: (client.bridge.at(now) or {}).get("state") for name, client in self.clients.items()}
 
     async def perform(self, script: str) -> str:
         """Let the virtual wearers perform the script at this path; return '' or why not."""
@@ -153,7 +157,8 @@ class Arms:
             if arm not in self.clients:
                 continue
             values = {pair.key: pair.value for pair in status.values}
-            newest = Status(int.from_bytes(status.level, "big"), status.message, values, time.monotonic())
+            level = int.from_bytes(status.level, "big")
+            newest = Newest({**values, "level": level, "message": status.message}, time.monotonic())
             if leaf == BRIDGE:
                 self.clients[arm].bridge = newest
             elif leaf == COMPENSATOR:
@@ -177,17 +182,17 @@ def parameter_request(values: Mapping[str, Any]) -> SetParametersAtomically.Requ
 
 async def call(client: Client, request: Any) -> str:
     """Send `request` at once; return '' if it was carried out, else why not."""
-    loop = asyncio.get_running_loop()
-    done: asyncio.Future[Any] = loop.create_future()
+    done: concurrent.futures.Future[Any] = concurrent.futures.Future()
 
     def answer(future: Future) -> None:
-        loop.call_soon_threadsafe(lambda: None if done.done() else done.set_result(future.result()))
+        if done.set_running_or_notify_cancel():  # else it came too late
+            done.set_result(future.result())
 
     sent = client.call_async(request)
     sent.add_done_callback(answer)
     try:
-        is_there = client.service_is_ready()
-        response = await asyncio.wait_for(done, CALL_TIMEOUT if is_there else ABSENT_TIMEOUT)
+        timeout = CALL_TIMEOUT if client.service_is_ready() else ABSENT_TIMEOUT
+        response = await asyncio.wait_for(asyncio.wrap_future(done), timeout)
     except asyncio.TimeoutError:
         client.remove_pending_request(sent)
         return f"{client.srv_name} does not answer"
@@ -209,12 +214,13 @@ class Panel(Node):
         self._diagnostics = Diagnostics(self)
         self._noted = 0
         self._arms = Arms(self)
-        self._tilt: tuple[float, Vector3Stamped] | None = None
+        self._tilt = Newest()
         self._tilts = HotPath(self, Vector3Stamped, TILT, self._on_tilt)
         scripts = scripts_folder(values["trials"])
         self._recordings = Recordings(values["output"], scripts, self._arms, self._note, time.monotonic)
         own = {name: values[name] for name in ("language", "dead_man")}
-        self._setup = Setup({**own, "trials": list(self._recordings.trials)})
+        self._own_setup = {**own, "trials": list(self._recordings.trials)}
+        self._shown: Any = None  # the nodes' parameters that the pages have
         control = Control(self._arms, self._recordings, self._note, time.monotonic, values["dead_man"])
         try:
             from exo_gravity.panel.server import PanelServer
@@ -231,7 +237,6 @@ class Panel(Node):
     def close(self) -> None:
         """End the recording and the server. The arms are left as they are."""
         self._recordings.close()
-        self._setup.close()
         self._server.stop()
 
     def _log_address(self, host: str, port: int) -> None:
@@ -254,20 +259,16 @@ class Panel(Node):
         if not self._server.is_running:
             self.failure = RuntimeError("the web server has ended")
         self._tilts.poll()
-        news = self._setup.news(self._arms.names, self._arms.known)
-        if news is not None:
-            self._server.publish_setup(news)
-        state = {"arms": self._arms.state(), "tilt": self._tilt_state(), **self._recordings.state()}
-        self._server.publish(state)
-
-    def _tilt_state(self) -> dict[str, float] | None:
-        if self._tilt is None or time.monotonic() - self._tilt[0] > SILENT:
-            return None
-        vector = self._tilt[1].vector
-        return {"pitch": vector.y, "roll": vector.x} if math.isfinite(vector.x + vector.y) else None
+        nodes = self._arms.nodes()
+        if nodes != self._shown:
+            self._shown = nodes
+            self._server.setup = {**self._own_setup, **setup_of(nodes)}
+        tilt = self._tilt.at(time.monotonic())
+        self._server.state = {"arms": self._arms.state(), "tilt": tilt, **self._recordings.state()}
 
     def _on_tilt(self, message: Vector3Stamped, _info: dict[str, Any]) -> None:
-        self._tilt = time.monotonic(), message
+        pitch, roll = message.vector.y, message.vector.x
+        self._tilt = Newest({"pitch": pitch, "roll": roll} if math.isfinite(pitch + roll) else None, time.monotonic())
 
 
 def main() -> None:

@@ -29,6 +29,7 @@ from std_msgs.msg import String
 from exo_gravity.bag import content
 from exo_gravity.bag.content import PARAMETERS, STATES, arm_of, leaf
 from exo_gravity.bag.writer import BagWriter, offered_qos
+from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.nodes.ros.hot_path import Drain
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
@@ -45,7 +46,6 @@ DEPTH = 1000  # queued messages per topic: two seconds at 500 Hz
 LOSS_REPORT_PERIOD = 5.0  # s between two warnings of lost messages
 # After the launcher's death a bridge lets its arm down: this is recorded while joint states arrive.
 SILENCE = 0.5  # s without joint states, after which the arms are down
-DESCENT_TIMEOUT = 40.0  # s
 
 
 class Recorder(Node):

@@ -43,7 +43,7 @@ def values_after(node: Node, table: Sequence[Param], changes: Sequence[Parameter
     return values_of(table, {name: plain(value) for name, value in values.items()})
 
 
-def with_floats(node: Node, table: Sequence[Param], changes: Sequence[Parameter]) -> list[Parameter]:
+def with_floats(node: Node, changes: Sequence[Parameter]) -> list[Parameter]:
     """Return `changes` with whole numbers converted to float where needed, as in `ros2 param set ... support 1`.
 
     Raises ParameterNotDeclaredException with the unknown names, which rclpy itself leaves out.
@@ -51,8 +51,7 @@ def with_floats(node: Node, table: Sequence[Param], changes: Sequence[Parameter]
     unknown = [change.name for change in changes if not node.has_parameter(change.name)]
     if unknown:
         raise ParameterNotDeclaredException(unknown)
-    floats = {param.name for param in table if isinstance(_first(param.default), float)}
-    return [_with_float(change) if change.name in floats else change for change in changes]
+    return [_with_floats(change, node.get_parameter(change.name).type_) for change in changes]
 
 
 def bus_of(node: Node, values: dict[str, Any]) -> tuple[str, str, dict[str, Any]]:
@@ -76,16 +75,12 @@ def descriptor_of(param: Param) -> ParameterDescriptor:
     return descriptor
 
 
-def _with_float(change: Parameter) -> Parameter:
-    if change.type_ == Parameter.Type.INTEGER:
+def _with_floats(change: Parameter, declared: Parameter.Type) -> Parameter:
+    if (change.type_, declared) == (Parameter.Type.INTEGER, Parameter.Type.DOUBLE):
         return Parameter(change.name, value=float(change.value))
-    if change.type_ == Parameter.Type.INTEGER_ARRAY:
+    if (change.type_, declared) == (Parameter.Type.INTEGER_ARRAY, Parameter.Type.DOUBLE_ARRAY):
         return Parameter(change.name, value=[float(number) for number in change.value])
     return change
-
-
-def _first(default: Any) -> Any:
-    return next(iter(default), None) if isinstance(default, list) else default
 
 
 def plain(value: Any) -> Any:
@@ -118,13 +113,12 @@ class NodeParameters:
         self._get = node.create_client(GetParameters, f"{name}/get_parameters")
         self._list = None if names else node.create_client(ListParameters, f"{name}/list_parameters")
         self._clients = [self._get] if self._list is None else [self._get, self._list]
-        self._is_due = True
-        self._asked = -math.inf  # s, when the request was sent that has no answer yet
+        self._due = -math.inf  # s, when to ask; infinite while the values are known
         self._is_destroyed = False
 
     def refresh(self) -> None:
         """Read the parameters again, at the next `update`."""
-        self._is_due = True
+        self._due = -math.inf
 
     def update(self) -> None:
         """Read the parameters if they may have changed and the node answers. Call it on the executor's thread."""
@@ -132,11 +126,11 @@ class NodeParameters:
             return
         self.is_present = all(client.service_is_ready() for client in self._clients)
         if not self.is_present:
-            self._is_due = True  # it may return with other values
+            self._due = -math.inf  # it may return with other values
             return
         now = self._clock()
-        if (self._is_due or math.isfinite(self._asked)) and now - self._asked >= ANSWER_TIMEOUT:
-            self._is_due, self._asked = False, now
+        if now >= self._due:
+            self._due = now + ANSWER_TIMEOUT
             if self._list is None:
                 self._request(self._names)
             else:
@@ -157,7 +151,8 @@ class NodeParameters:
     def _on_values(self, names: Sequence[str], future: Future) -> None:
         if self._is_destroyed:
             return
-        self._asked = -math.inf
+        if math.isfinite(self._due):  # else they have changed since
+            self._due = math.inf
         values = map(parameter_value_to_python, future.result().values)
         self.values = {name: plain(value) for name, value in zip(names, values, strict=False) if value is not None}
         self._on_change(self.values)

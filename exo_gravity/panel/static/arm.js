@@ -1,6 +1,6 @@
 // The card of one arm: its state in words, what to do about a fault, its buttons, its support, its joints.
 
-import { degrees, has, number, t, translate, write } from "./texts.js";
+import { degrees, finite, has, number, t, translate, write } from "./texts.js";
 
 const SIGNS = { disabled: "○", checking: "◔", "proving signs": "◑", "ramping in": "◕", active: "●", "letting down": "▼", fault: "✖", silent: "?" };
 const STEP_PERIOD = 200; // ms between two steps of the support
@@ -13,6 +13,7 @@ export class ArmCard {
     this.name = name;
     this.actions = actions;
     this.setup = null;
+    this.limit = null; // the largest support 0..1 within the motors' rated torque
     this.root = document.getElementById("arm").content.cloneNode(true).firstElementChild;
     this.root.dataset.arm = name;
     this.find = (selector) => this.root.querySelector(selector);
@@ -101,9 +102,9 @@ export class ArmCard {
 
   showSupport() {
     const value = Number(this.slider.value);
-    const limit = this.setup?.support_limit;
+    const limit = this.limit;
     const now = this.stepped;
-    const known = limit !== null && limit !== undefined;
+    const known = limit !== null;
     const mark = this.find(".mark");
     mark.hidden = !known;
     if (known) mark.style.left = `${100 * limit}%`;
@@ -128,16 +129,18 @@ export class ArmCard {
     this.showRemedy(bridge);
     write(this.find(".detail"), bridge?.message ? t("detail", bridge.message) : "");
     const other = alive ? state.compensator : null;
-    write(this.find(".compensator"), other ? (other.level ? t("compensator_detail", other.message) : t("carried", other["mass carried"])) : t("compensator_silent"));
+    write(this.find(".compensator"), other ? (other.level ? t("compensator_detail", other.message) : t("carried", other["mass carried (kg)"])) : t("compensator_silent"));
+    this.limit = finite(other?.["largest support"]);
     this.root.classList.toggle("stale", !alive);
     this.find(".enable").disabled = !operates || name !== "disabled";
     this.find(".clear").disabled = !operates || name !== "fault";
     for (const control of [this.slider, ...this.root.querySelectorAll("[data-mode]")]) control.disabled = !operates || !other || !isFinite(this.stepped);
     if (this.setup?.settings) this.follow();
     this.showSupport();
-    this.showJoints(alive ? state.joints : null);
-    const rates = bridge ? `${t("rate")}: ${bridge.rate} Hz. ${t("age")}: ${bridge.answered} ms.` : "";
-    write(this.find(".rates"), bridge?.limits && bridge.limits !== "none" ? `${rates} ${t("limits", bridge.limits)}` : rates);
+    this.showJoints(alive ? state.joints : null, bridge);
+    const rates = bridge ? `${t("rate")}: ${bridge["rate (Hz)"] ?? ""} Hz. ${t("age")}: ${bridge["age of efforts (ms)"] ?? ""} ms.` : "";
+    const limits = bridge?.["limits acting"];
+    write(this.find(".rates"), limits && limits !== "none" ? `${rates} ${t("limits", limits)}` : rates);
   }
 
   showRemedy(bridge) {
@@ -147,14 +150,14 @@ export class ArmCard {
     if (code) write(box.querySelector("p"), t(has(`fault.${code}`) ? `fault.${code}` : "fault.unknown"));
   }
 
-  showJoints(joints) {
+  showJoints(joints, bridge) {
     const body = this.find("tbody");
     const rows = joints ?? [];
     while (body.rows.length > rows.length) body.deleteRow(-1);
     rows.forEach((joint, n) => {
       const row = body.rows[n] ?? newRow(body);
       const limit = this.setup?.max_effort?.[n];
-      const cells = [jointText(this.name, joint.name), `${number(degrees(joint.position), 1)}°`, `${number(joint.effort, 2)} / ${number(limit, 1)} Nm`, `${number(joint.temperature, 0)} °C`];
+      const cells = [jointText(this.name, joint.name), `${number(degrees(joint.position), 1)}°`, `${number(joint.effort, 2)} / ${number(limit, 1)} Nm`, `${number(temperature(joint, bridge), 0)} °C`];
       cells.forEach((text, column) => write(row.cells[column], text));
     });
   }
@@ -172,6 +175,8 @@ function newRow(body) {
   for (let n = 0; n < 3; n++) row.insertCell();
   return row;
 }
+
+export const temperature = (joint, bridge) => finite(bridge?.[`${joint.name} temperature (degC)`]);
 
 export function jointText(arm, name) {
   const leaf = name.replace(`${arm}_`, "");

@@ -90,7 +90,7 @@ function onSetup(message) {
     cards.get(name).configure(arm);
   }
   plots.configure(message.arms ?? {});
-  picture.configure(message.scene);
+  picture.configure(message.urdf);
   sections.configure(message);
 }
 

@@ -23,10 +23,9 @@ export class Picture {
       });
   }
 
-  async configure(scene) {
-    const description = JSON.stringify(scene ?? null);
-    if (!scene || description === this.description) return;
-    this.description = description;
+  async configure(urdf) {
+    if (!urdf || urdf === this.description) return;
+    this.description = urdf;
     if (!this.three) {
       try {
         this.three = await import("./vendor/three.module.min.js");
@@ -39,7 +38,7 @@ export class Picture {
       this.place.textContent = t("picture_none");
       return;
     }
-    this.build(scene);
+    this.build(new DOMParser().parseFromString(urdf, "text/xml").documentElement);
   }
 
   start() {
@@ -66,49 +65,60 @@ export class Picture {
     this.render();
   }
 
-  build(scene) {
+  // robot: the root element of the URDF
+  build(robot) {
     const T = this.three;
     if (this.trunk) dispose(this.trunk);
-    const frames = Object.fromEntries(Object.keys(scene.links).map((name) => [name, new T.Group()]));
-    for (const [name, shapes] of Object.entries(scene.links)) for (const shape of shapes) frames[name].add(this.shape(shape));
+    const named = (tag) => [...robot.children].filter((part) => part.tagName === tag);
+    const frames = Object.fromEntries(named("link").map((link) => [link.getAttribute("name"), new T.Group()]));
+    const colours = Object.fromEntries(named("material").map((material) => [material.getAttribute("name"), numbers(material, "color", "rgba")]));
+    for (const link of named("link"))
+      for (const visual of link.querySelectorAll("visual")) frames[link.getAttribute("name")].add(this.shape(visual, colours));
     this.joints = {};
-    for (const joint of scene.joints) {
-      const child = frames[joint.child];
-      child.position.set(...joint.xyz);
-      child.rotation.set(...joint.rpy, "ZYX");
-      frames[joint.parent].add(child);
-      if (joint.axis) this.joints[joint.name] = this.joint(joint, frames);
+    for (const joint of named("joint")) {
+      const child = frames[joint.querySelector("child").getAttribute("link")];
+      const parent = frames[joint.querySelector("parent").getAttribute("link")];
+      setPose(child, joint);
+      parent.add(child);
+      if (joint.querySelector("axis")) this.joints[joint.getAttribute("name")] = this.joint(joint, parent, child);
     }
-    this.trunk = frames[scene.joints[0]?.parent] ?? new T.Group();
+    this.trunk = frames[robot.querySelector("joint > parent").getAttribute("link")];
     this.scene.add(this.trunk);
     this.render();
   }
 
   // A joint turns its child, and has a bar for its torque and an arc from limit to limit.
-  joint(joint, frames) {
+  joint(joint, parent, child) {
     const T = this.three;
-    const axis = new T.Vector3(...joint.axis);
+    const axis = new T.Vector3(...numbers(joint, "axis", "xyz"));
+    const [lower] = numbers(joint, "limit", "lower");
+    const [upper] = numbers(joint, "limit", "upper");
     const bar = new T.Mesh(new T.CylinderGeometry(0.014, 0.014, 1, 12), new T.MeshLambertMaterial({ color: 0xa61218 }));
     const turn = new T.Quaternion().setFromUnitVectors(new T.Vector3(0, 1, 0), axis);
     bar.quaternion.copy(turn);
-    const arc = new T.Mesh(new T.TorusGeometry(0.07, 0.004, 6, 40, joint.upper - joint.lower), new T.MeshLambertMaterial({ color: 0x7a4b00 }));
+    const arc = new T.Mesh(new T.TorusGeometry(0.07, 0.004, 6, 40, upper - lower), new T.MeshLambertMaterial({ color: 0x7a4b00 }));
     arc.quaternion.copy(new T.Quaternion().setFromUnitVectors(new T.Vector3(0, 0, 1), axis));
-    arc.rotateZ(joint.lower);
+    arc.rotateZ(lower);
     const fixed = new T.Group();
-    fixed.position.set(...joint.xyz);
+    fixed.position.copy(child.position);
     fixed.add(arc, bar);
-    frames[joint.parent].add(fixed);
-    return { child: frames[joint.child], axis, bar, start: new T.Quaternion().copy(frames[joint.child].quaternion) };
+    parent.add(fixed);
+    return { child, axis, bar, start: new T.Quaternion().copy(child.quaternion) };
   }
 
-  shape({ kind, size, keys, xyz, rpy, rgba }) {
+  shape(visual, colours) {
     const T = this.three;
-    const value = (key) => size[keys.indexOf(key)];
-    const geometry = kind === "box" ? new T.BoxGeometry(...size) : kind === "cylinder" ? new T.CylinderGeometry(value("radius"), value("radius"), value("length"), 24).rotateX(Math.PI / 2) : new T.SphereGeometry(value("radius"), 20, 14);
-    const material = new T.MeshLambertMaterial({ color: new T.Color(rgba[0], rgba[1], rgba[2]), transparent: rgba[3] < 1, opacity: rgba[3] });
-    const mesh = new T.Mesh(geometry, material);
-    mesh.position.set(...xyz);
-    mesh.rotation.set(...rpy, "ZYX");
+    const geometry = visual.querySelector("geometry").firstElementChild;
+    const value = (key) => Number(geometry.getAttribute(key));
+    const bodies = {
+      box: () => new T.BoxGeometry(...numbers(visual, "box", "size")),
+      cylinder: () => new T.CylinderGeometry(value("radius"), value("radius"), value("length"), 24).rotateX(Math.PI / 2),
+      sphere: () => new T.SphereGeometry(value("radius"), 20, 14),
+    };
+    const [red, green, blue, opacity] = colours[visual.querySelector("material").getAttribute("name")];
+    const material = new T.MeshLambertMaterial({ color: new T.Color(red, green, blue), transparent: opacity < 1, opacity });
+    const mesh = new T.Mesh(bodies[geometry.tagName](), material);
+    setPose(mesh, visual);
     return mesh;
   }
 
@@ -145,6 +155,20 @@ export class Picture {
     this.renderer.render(this.scene, this.camera);
     this.renderer.getContext().finish(); // else a slow computer queues pictures
   }
+}
+
+// The numbers in attribute `key` of the first `tag` within an element; none if it is absent.
+function numbers(element, tag, key) {
+  const text = element.querySelector(tag)?.getAttribute(key);
+  return text ? text.trim().split(/\s+/).map(Number) : [];
+}
+
+// Sets the pose of `part` to the element's origin.
+function setPose(part, element) {
+  const [x = 0, y = 0, z = 0] = numbers(element, "origin", "xyz");
+  const [roll = 0, pitch = 0, yaw = 0] = numbers(element, "origin", "rpy");
+  part.position.set(x, y, z);
+  part.rotation.set(roll, pitch, yaw, "ZYX");
 }
 
 function dispose(root) {

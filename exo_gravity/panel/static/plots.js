@@ -1,8 +1,8 @@
 // The last 30 seconds of each arm: angles, torques with their limits, temperatures, rate and age. uPlot draws.
 
-import { jointText } from "./arm.js";
+import { jointText, temperature } from "./arm.js";
 import { Painter } from "./painter.js";
-import { degrees, t } from "./texts.js";
+import { degrees, finite, t } from "./texts.js";
 
 const LENGTH = 300; // states, ten a second
 const COLOURS = ["#0a4f9e", "#a61218", "#0b6b2e", "#7a4b00"];
@@ -10,7 +10,7 @@ const DASHES = [[], [8, 4], [2, 3], [10, 3, 2, 3]]; // so that colour is not all
 const KINDS = [
   ["angle", "°", (joint) => degrees(joint.position)],
   ["torque", "Nm", (joint) => joint.effort],
-  ["temperature", "°C", (joint) => joint.temperature],
+  ["temperature", "°C", temperature],
 ];
 
 export class Plots {
@@ -37,10 +37,8 @@ export class Plots {
       if (!this.arms.has(name)) this.create(name, arm.joints);
       const { figures } = this.arms.get(name);
       const now = performance.now() / 1000;
-      const rows = KINDS.map(([, , value]) => arm.joints.map(value));
-      const rate = Number(arm.bridge?.rate);
-      const age = Number(arm.bridge?.answered);
-      rows.push([Number.isFinite(rate) ? rate : null, Number.isFinite(age) ? age : null]);
+      const rows = KINDS.map(([, , value]) => arm.joints.map((joint) => value(joint, arm.bridge)));
+      rows.push([finite(arm.bridge?.["rate (Hz)"]), finite(arm.bridge?.["age of efforts (ms)"])]);
       figures.forEach((figure, n) => push(figure, now, rows[n]));
     }
     this.painter.request();

@@ -50,6 +50,12 @@ export function number(value, digits) {
   return formats[key].format(value);
 }
 
+// The number in a text of /diagnostics, null if there is none.
+export function finite(text) {
+  const value = parseFloat(text);
+  return Number.isFinite(value) ? value : null;
+}
+
 export const degrees = (radians) => (radians * 180) / Math.PI;
 
 // Writes a text only where it differs: screen readers announce each change.

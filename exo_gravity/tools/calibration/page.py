@@ -20,7 +20,7 @@ from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.model.moments import MOMENTS, load_moments, regressor
 from exo_gravity.tools.calibration.result import CalibrationResult, Change, Curve, plain, value_text
 from exo_gravity.tools.reporting import html
-from exo_gravity.tools.reporting.colours import FAINT, HOLD_COLOUR, INK, JOINT_COLOURS, make_plain
+from exo_gravity.tools.reporting.html import FAINT, HOLD_COLOUR, INK, JOINT_COLOURS, make_plain
 
 DPI = 130
 FIGURE_WIDTH = 11.0  # inches

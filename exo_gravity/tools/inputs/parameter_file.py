@@ -22,7 +22,9 @@ from typing import Any, NamedTuple
 
 import yaml
 
+from exo_gravity import packaged
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 
 FORM = "/namespace/executable: {ros__parameters: {...}}"
 MAX_LIST = 100  # entries; the longest list of any parameter has 4, and ROS's reader takes minutes for 200,000
@@ -30,7 +32,6 @@ MAX_LIST = 100  # entries; the longest list of any parameter has 4, and ROS's re
 Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 NODES_PACKAGE = "exo_gravity.nodes."
-DESCENT_TIMEOUT = 40.0  # s for a bridge to let its arm down, after which it is killed
 WATCHDOG_TIMEOUT = 30.0  # s for the watchdog of a dead bridge to let the arm down
 RECOVERY_TIMEOUT = WATCHDOG_TIMEOUT + DESCENT_TIMEOUT
 STOP_TIMEOUT = 5.0  # s for any other node to end
@@ -45,18 +46,10 @@ Nodes = dict[str, dict[str, Any]]  # node name -> dotted parameter name -> value
 
 
 def packaged_config(name: str) -> Path:
-    """Return the path of a file of `config/`, in a checkout, a virtual environment or a ROS workspace.
-
-    Raises ParameterError if it is in none of them.
-    """
-    shares = [
-        Path(prefix, "share/exo_gravity") for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(":") if prefix
-    ]
-    for root in (Path(__file__).parents[3], *shares, Path(sys.prefix, "share/exo_gravity")):
-        path = root / "config" / name
-        if path.is_file():
-            return path
-    raise ParameterError("config", name, "a file that the package installs: reinstall the package")
+    """Return the path of a file of `config/`. Raises ParameterError if it is not installed."""
+    if (path := packaged(name)) is None:
+        raise ParameterError("config", name, "a file that the package installs: reinstall the package")
+    return path
 
 
 def load(path: str | Path) -> Nodes:

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.numbers import JOINT_COUNT
 
@@ -46,10 +45,8 @@ def gravload(arm: ArmModel) -> Reference:
 
 def toolbox_robot(arm: ArmModel) -> Any:
     """Return the arm as the Robotics Toolbox's DHRobot."""
-    try:
-        from roboticstoolbox import DHRobot, RevoluteDH
-    except ImportError as error:
-        raise _not_importable("roboticstoolbox", error) from None
+    from roboticstoolbox import DHRobot, RevoluteDH
+
     return DHRobot(
         [
             # The toolbox measures a centre of gravity from the link's far end.
@@ -77,10 +74,8 @@ def pinocchio(arm: ArmModel) -> Reference:
 
 def pinocchio_model(arm: ArmModel) -> tuple[Any, Any]:
     """Return the module `pinocchio` and the arm as its Model."""
-    try:
-        import pinocchio as pin
-    except ImportError as error:
-        raise _not_importable("pinocchio", error) from None
+    import pinocchio as pin
+
     model = pin.Model()
     parent, placement = 0, pin.SE3.Identity()
     for joint in range(JOINT_COUNT):
@@ -94,7 +89,3 @@ def pinocchio_model(arm: ArmModel) -> tuple[Any, Any]:
 
 
 REFERENCES = {"gravload": gravload, "Pinocchio": pinocchio}
-
-
-def _not_importable(module: str, error: ImportError) -> DataError:
-    return DataError(f"cannot import {module} ({error}): pip install 'exo_gravity[report,validate]'")

@@ -7,6 +7,8 @@ frames, which keeps it small.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import imageio.v3 as iio
@@ -18,40 +20,39 @@ from PIL import Image, ImageDraw, ImageFont
 from exo_gravity.bag.content import Bag
 from exo_gravity.core.compensation.params import COMPENSATOR
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.params import Param
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.params import CAN_BRIDGE
 from exo_gravity.core.trial.recording import Recording
 from exo_gravity.core.view.scene import AMBER, ARROW, GREEN, GREY, LINE, RED, SPHERE, ArmView, Shape, arm_shapes
 from exo_gravity.core.view.urdf import ArmDescription, described, joint_names, urdf
-from exo_gravity.tools.reporting.video import Clip, frame_times
+from exo_gravity.tools.reporting.table import shown
 
-WIDTH, HEIGHT = 640, 480
-GIF_WIDTH, GIF_HEIGHT, COLOURS = 480, 360, 128
+SIZE, GIF_SIZE = (640, 480), (480, 360)  # pixels
+COLOURS = 128  # of a GIF
 LINE_HEIGHT = 0.042  # of the picture's height
 INK = (40, 44, 52)
 SWATCH = 12  # pixels
 NO_TORQUE = 0.05  # Nm, below which a motor counts as off
 STEPS = {"move": "the wearer moves the arm", "hold": "hands off", "push": "a push"}
 
-OnFrame = Callable[[int, int], None]  # (frames done, frames in total)
+OnFrame = Callable[[int], None]  # number of frames drawn
 
 
-def write_clip(bag: Bag, clip: Clip, on_frame: OnFrame = lambda done, count: None) -> None:
-    """Write the clip of a recording. Raises DataError if its arms are not described, or it cannot be drawn."""
+def write_clip(bag: Bag, path: Path, times: Sequence[float], frame_rate: int, on_frame: OnFrame) -> None:
+    """Write a clip with a frame for each of `times` (s) in the recording, `frame_rate` per second.
+
+    Raises DataError if the arms are not described, or the clip cannot be drawn or written.
+    """
     arms = [_description(bag.parameters, recording.name) for recording in bag.recordings]
-    is_gif = clip.path.suffix.lower() == ".gif"
-    size = (GIF_WIDTH, GIF_HEIGHT) if is_gif else (WIDTH, HEIGHT)
+    write, size = (_write_gif, GIF_SIZE) if path.suffix.lower() == ".gif" else (_write_mp4, SIZE)
     try:
         stage = Stage(arms, *size)
     except ParameterError as error:
         raise DataError(f"{bag.path}: {error}") from None
-    times = frame_times(min(float(recording.time[-1]) for recording in bag.recordings), clip)
-    pictures = _pictures(stage, list(zip(arms, bag.recordings, strict=True)), times, on_frame)
     try:
-        _write_gif(pictures, clip) if is_gif else _write_mp4(pictures, clip)
+        write(_pictures(stage, list(zip(arms, bag.recordings, strict=True)), times, on_frame), path, frame_rate)
     except OSError as error:
-        raise DataError(f"{clip.path}: cannot be written ({error.strerror or error})") from None
+        raise DataError(f"{path}: cannot be written ({error.strerror or error})") from None
     finally:
         stage.close()
 
@@ -59,12 +60,13 @@ def write_clip(bag: Bag, clip: Clip, on_frame: OnFrame = lambda done, count: Non
 def _pictures(
     stage: Stage, arms: Sequence[tuple[ArmDescription, Recording]], times: Sequence[float], on_frame: OnFrame
 ) -> Iterator[Image.Image]:
-    for i, time in enumerate(times):
+    for i, time in enumerate(times, 1):
         views = [_view(arm, recording, time) for arm, recording in arms]
         shapes: list[Shape] = [shape for view in views for shape in arm_shapes(view)]
         picture = Image.fromarray(stage.frame([angle for view in views for angle in view.theta], shapes))
-        _write_caption(picture, [f"{time:.1f} s  {_step(arms[0][1], time)}", *map(_torques, views)])
-        on_frame(i + 1, len(times))
+        torques = (f"{view.arm.side} {' '.join(shown(effort, 2) for effort in view.effort)} Nm" for view in views)
+        _write_caption(picture, (f"{time:.1f} s  {_step(arms[0][1], time)}", *torques))
+        on_frame(i)
         yield picture
 
 
@@ -95,10 +97,6 @@ def _step(recording: Recording, time: float) -> str:
     return "let down" if recording.carried and time > recording.carried[0][0] else "start-up checks"
 
 
-def _torques(view: ArmView) -> str:
-    return f"{view.arm.side} " + " ".join(f"{round(effort, 2) + 0.0:.2f}" for effort in view.effort) + " Nm"
-
-
 def _write_caption(picture: Image.Image, lines: Sequence[str]) -> None:
     height = LINE_HEIGHT * picture.height
     font, draw = ImageFont.load_default(height), ImageDraw.Draw(picture)
@@ -106,19 +104,19 @@ def _write_caption(picture: Image.Image, lines: Sequence[str]) -> None:
         draw.text((height / 2, height / 2 + 1.2 * height * i), line, INK, font)
 
 
-def _write_mp4(pictures: Iterator[Image.Image], clip: Clip) -> None:
-    with iio.imopen(clip.path, "w", plugin="pyav") as file:
-        file.init_video_stream("libx264", fps=clip.frame_rate)
+def _write_mp4(pictures: Iterator[Image.Image], path: Path, frame_rate: int) -> None:
+    with iio.imopen(path, "w", plugin="pyav") as file:
+        file.init_video_stream("libx264", fps=frame_rate)
         for picture in pictures:
             file.write_frame(np.asarray(picture))
 
 
-def _write_gif(pictures: Iterator[Image.Image], clip: Clip) -> None:
+def _write_gif(pictures: Iterator[Image.Image], path: Path, frame_rate: int) -> None:
     """Write frames in one palette; Pillow stores of each frame only what has changed."""
     first = next(pictures)
     palette = _palette(first)
     frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in (first, *pictures)]
-    frames[0].save(clip.path, save_all=True, append_images=frames[1:], duration=round(1000 / clip.frame_rate), loop=0)
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=round(1000 / frame_rate), loop=0)
 
 
 def _palette(picture: Image.Image) -> Image.Image:
@@ -134,25 +132,21 @@ def _palette(picture: Image.Image) -> Image.Image:
 
 
 def _description(parameters: Mapping[str, str], name: str) -> ArmDescription:
-    """Return the arm `name` of a recording from the nodes' parameters in it. Raises DataError."""
-    namespace = "" if name == "arm" else f"/{name}"
+    """Return the arm `name` from the nodes' parameters in a recording; the default for one that their version lacked.
+
+    Raises DataError.
+    """
+    values: list[dict[str, Any]] = []
+    for executable, table in (("compensator", COMPENSATOR), ("can_bridge", CAN_BRIDGE)):
+        node = f"/{executable}" if name == "arm" else f"/{name}/{executable}"
+        if node not in parameters:
+            raise DataError(f"{name}: the recording has no parameters of {node}, which describe the arm")
+        given = yaml.safe_load(parameters[node])[node]["ros__parameters"]
+        values.append({param.name: given.get(param.name, param.default) for param in table})
     try:
-        values = [
-            _values(parameters, f"{namespace}/{node}", table)
-            for node, table in (("compensator", COMPENSATOR), ("can_bridge", CAN_BRIDGE))
-        ]
         return described(*values)
     except ParameterError as error:
         raise DataError(f"{name}: the recording's parameters do not describe the arm: {error}") from None
-
-
-def _values(parameters: Mapping[str, str], node: str, table: Sequence[Param]) -> dict[str, Any]:
-    """Return the recorded parameters of `node`; the default for one that its version did not have."""
-    text = parameters.get(node)
-    if text is None:
-        raise ParameterError("parameters", sorted(parameters), f"those of {node} among others")
-    given = yaml.safe_load(text)[node]["ros__parameters"]
-    return {param.name: given.get(param.name, param.default) for param in table}
 
 
 MAX_SHAPES = 4000
@@ -160,6 +154,11 @@ AZIMUTH = {"left": 215.0, "right": 145.0}  # deg, of the camera: in front, on th
 BOTH_SIDES, ELEVATION, DISTANCE = 165.0, -8.0, 1.75  # deg, deg, m
 CENTRE = 0.28  # m below the shoulders, what the camera looks at
 FIELD_OF_VIEW = 38.0  # deg
+GEOMS = {
+    LINE: mujoco.mjtGeom.mjGEOM_CAPSULE,
+    ARROW: mujoco.mjtGeom.mjGEOM_ARROW,
+    SPHERE: mujoco.mjtGeom.mjGEOM_SPHERE,
+}
 SKY = ((0.97, 0.98, 1.0), (0.80, 0.84, 0.89))  # above and below
 
 
@@ -208,9 +207,8 @@ def _model(arms: Sequence[ArmDescription], width: int, height: int) -> Any:
 
 
 def _camera(arms: Sequence[ArmDescription]) -> Any:
-    base = np.mean([arm.base for arm in arms], axis=0)
     camera = mujoco.MjvCamera()
-    camera.lookat[:] = base - (0.0, 0.0, CENTRE)
+    camera.lookat[:] = np.mean([arm.base for arm in arms], axis=0) - (0.0, 0.0, CENTRE)
     camera.azimuth = AZIMUTH[arms[0].side] if len(arms) == 1 else BOTH_SIDES
     camera.elevation, camera.distance = ELEVATION, DISTANCE
     return camera
@@ -218,32 +216,12 @@ def _camera(arms: Sequence[ArmDescription]) -> Any:
 
 def _add(scene: Any, shape: Shape) -> None:
     """Add a shape to MuJoCo's scene; a text is left out, since the caption carries the words."""
-    radius = shape.size / 2
-    if shape.kind == LINE:
-        for start, end in zip(shape.points, shape.points[1:], strict=False):
-            _connect(scene, mujoco.mjtGeom.mjGEOM_CAPSULE, radius, start, end, shape.colour)
-    elif shape.kind == ARROW:
-        start, end = shape.points
-        _connect(scene, mujoco.mjtGeom.mjGEOM_ARROW, radius, start, end, shape.colour)
-    elif shape.kind == SPHERE:
-        size = np.full(3, radius)
-        geom = _next(scene)
-        mujoco.mjv_initGeom(
-            geom,
-            mujoco.mjtGeom.mjGEOM_SPHERE,
-            size,
-            shape.points[0],
-            np.eye(3).ravel(),
-            np.array(shape.colour, np.float32),
-        )
-
-
-def _connect(scene: Any, kind: Any, radius: float, start: np.ndarray, end: np.ndarray, colour: Sequence[float]) -> None:
-    geom = _next(scene)
-    mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), np.array(colour, np.float32))
-    mujoco.mjv_connector(geom, kind, radius, start, end)
-
-
-def _next(scene: Any) -> Any:
-    scene.ngeom += 1
-    return scene.geoms[scene.ngeom - 1]
+    if shape.kind not in GEOMS:
+        return
+    kind, radius, colour = GEOMS[shape.kind], shape.size / 2, np.array(shape.colour, np.float32)
+    for start, end in [(shape.points[0], None)] if shape.kind == SPHERE else pairwise(shape.points):
+        geom = scene.geoms[scene.ngeom]
+        scene.ngeom += 1
+        mujoco.mjv_initGeom(geom, kind, np.full(3, radius), start, np.eye(3).ravel(), colour)
+        if end is not None:
+            mujoco.mjv_connector(geom, kind, radius, start, end)

@@ -8,44 +8,41 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
-from exo_gravity.core.trial.analysis import Hold, HoldCriteria, TrialAnalysis
-from exo_gravity.core.trial.recording import Recording
-from exo_gravity.tools.reporting.colours import (
-    FAINT,
-    HOLD_COLOUR,
-    INK,
-    JOINT_COLOURS,
-    PUSH_COLOUR,
-    make_plain,
-)
+from exo_gravity.core.trial.analysis import HoldCriteria, TrialAnalysis
+from exo_gravity.core.trial.recording import Recording, in_blocks
+from exo_gravity.tools.reporting.html import FAINT, HOLD_COLOUR, INK, JOINT_COLOURS, PUSH_COLOUR, make_plain
 from exo_gravity.tools.reporting.table import degrees, joint_labels, per_minute
 
 INTERVALS = 2_000  # per curve
 WIDTH = 11.0  # inches
+START = 5  # blocks of 0.1 s, from whose mean the drift is drawn
 
 
 def overview(recording: Recording, analysis: TrialAnalysis) -> Figure:
     """Return positions, velocities and torques over time, with holds and pushes shaded and holds numbered."""
     figure = Figure(figsize=(WIDTH, 8.2), layout="constrained")
     axes = figure.subplots(3, 1, sharex=True, height_ratios=(1.25, 1.0, 1.25))
-    panels = ((degrees(1.0), recording.position), (degrees(1.0), recording.velocity), (1.0, recording.effort))
-    for axis, label, (scale, values) in zip(
-        axes, ("Position (deg)", "Velocity (deg/s)", "Torque (Nm)"), panels, strict=True
-    ):
-        _shade(axis, analysis)
-        for joint, colour in enumerate(JOINT_COLOURS):
-            axis.plot(*_envelope(recording.time, scale * values[:, joint]), color=colour, lw=1.1)
+    panels = (
+        ("Position (deg)", degrees(1.0), recording.position),
+        ("Velocity (deg/s)", degrees(1.0), recording.velocity),
+        ("Torque (Nm)", 1.0, recording.effort),
+    )
+    for axis, (label, scale, values) in zip(axes, panels, strict=True):
+        for column, name, colour in zip(values.T, joint_labels(recording), JOINT_COLOURS, strict=True):
+            axis.plot(*_envelope(recording.time, scale * column), color=colour, lw=1.1, label=name)
+        for hold in analysis.holds:
+            axis.axvspan(hold.start, hold.end, color=HOLD_COLOUR, lw=0, zorder=0, label="hold")
+        for motion in analysis.motions:
+            if motion.kind in ("push", "slip"):
+                axis.axvspan(motion.start, motion.end, color=PUSH_COLOUR, lw=0, zorder=0, label="push")
         axis.set_ylabel(label)
-        _plain(axis)
-    commanded = bool(np.isfinite(recording.command).any())
-    for command in recording.command.T if commanded else ():
-        axes[2].plot(*_envelope(recording.time, command), color=INK, lw=0.6, ls=(0, (4, 3)))
+        make_plain(axis)
+    for command in recording.command.T if np.isfinite(recording.command).any() else ():
+        time, torque = _envelope(recording.time, command)
+        axes[2].plot(time, torque, color=INK, lw=0.6, ls=(0, (4, 3)), label="commanded")
     for number, hold in enumerate(analysis.holds, 1):
         middle = (hold.start + hold.end) / 2
         axes[0].annotate(
@@ -54,24 +51,32 @@ def overview(recording: Recording, analysis: TrialAnalysis) -> Figure:
         )  # fmt: skip
     axes[2].set_xlabel("Time (s)")
     axes[2].set_xlim(recording.time[0], recording.time[-1])
-    _legend(figure, recording, analysis, commanded)
+    handles, names = axes[2].get_legend_handles_labels()
+    entries = dict(zip(names, handles, strict=True))  # each once
+    columns = len(entries) if sum(map(len, entries)) < 90 else 4
+    figure.legend(
+        entries.values(), entries.keys(), loc="outside upper center", ncols=columns, frameon=False, fontsize=9
+    )
     return figure
 
 
 def drift(recording: Recording, analysis: TrialAnalysis, criteria: HoldCriteria) -> Figure:
     """Return the deviation of each joint from the start of each hold, and the drift rate of each hold."""
-    figure = Figure(figsize=(WIDTH, 6.6), layout="constrained")
+    figure, blocks = Figure(figsize=(WIDTH, 6.6), layout="constrained"), in_blocks(recording)
     grid = figure.add_gridspec(2, 4, height_ratios=(1.0, 1.1))
     first = figure.add_subplot(grid[0, 0])
     axes = [first, *(figure.add_subplot(grid[0, joint], sharex=first, sharey=first) for joint in (1, 2, 3))]
     for joint, (axis, name) in enumerate(zip(axes, joint_labels(recording), strict=True)):
         for hold in analysis.holds:
-            time, away = _from_start(recording, hold, joint)
-            axis.plot(time, degrees(away), color=JOINT_COLOURS[joint], lw=0.9, alpha=0.75)
+            within = blocks.between(hold.start, hold.end)
+            angle = degrees(blocks.mean[within, joint])
+            time, away = blocks.time[within] - hold.start, angle - angle[:START].mean()
+            axis.plot(time, away, color=JOINT_COLOURS[joint], lw=0.9, alpha=0.75)
         axis.set_title(name, fontsize=10, color=JOINT_COLOURS[joint], loc="left", weight="bold")
         axis.set_xlabel("Time in the hold (s)")
         axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
-        _plain(axis)
+        make_plain(axis)
+        axis.margins(x=0)
         axis.tick_params(labelleft=joint == 0)
     first.set_ylabel("Deviation from the start (deg)")
     reach = max([0.1, *(abs(value) for axis in axes for value in axis.dataLim.intervaly if math.isfinite(value))])
@@ -95,18 +100,7 @@ def _rates(axis: Axes, recording: Recording, analysis: TrialAnalysis, criteria: 
     axis.set_xlim(0.4, len(analysis.holds) + 0.6)
     axis.set_xlabel("Hold")
     axis.set_ylabel("Drift (deg/min)")
-    _plain(axis)
-
-
-def _from_start(recording: Recording, hold: Hold, joint: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return time in the hold, and the joint's mean over each 0.1 s minus its mean over the first 0.5 s."""
-    first, last = np.searchsorted(recording.time, (hold.start, hold.end))
-    time = recording.time[first:last] - hold.start
-    edges = np.unique(np.searchsorted(time, np.arange(0.0, hold.duration, max(0.1, hold.duration / INTERVALS))))
-    edges = edges[edges < len(time)]
-    count = np.diff(np.append(edges, len(time)))
-    mean = np.add.reduceat(recording.position[first:last, joint], edges, dtype=float) / count
-    return time[edges], mean - mean[: max(1, round(0.5 / 0.1))].mean()
+    make_plain(axis)
 
 
 def _envelope(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -116,30 +110,3 @@ def _envelope(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndar
     edges = np.linspace(0, len(time), INTERVALS, endpoint=False).astype(int)
     ends = np.stack([np.minimum.reduceat(values, edges), np.maximum.reduceat(values, edges)], axis=1)
     return np.repeat(time[edges], 2), ends.ravel()
-
-
-def _shade(axis: Axes, analysis: TrialAnalysis) -> None:
-    for hold in analysis.holds:
-        axis.axvspan(hold.start, hold.end, color=HOLD_COLOUR, lw=0, zorder=0)
-    for motion in analysis.motions:
-        if motion.kind in ("push", "slip"):
-            axis.axvspan(motion.start, motion.end, color=PUSH_COLOUR, lw=0, zorder=0)
-
-
-def _legend(figure: Figure, recording: Recording, analysis: TrialAnalysis, commanded: bool) -> None:
-    entries: list[Artist] = [
-        Line2D([], [], color=colour, lw=2.5, label=name)
-        for name, colour in zip(joint_labels(recording), JOINT_COLOURS, strict=True)
-    ]
-    if commanded:
-        entries.append(Line2D([], [], color=INK, lw=0.8, ls=(0, (4, 3)), label="commanded"))
-    entries.append(Patch(color=HOLD_COLOUR, label="hold"))
-    if any(motion.kind in ("push", "slip") for motion in analysis.motions):
-        entries.append(Patch(color=PUSH_COLOUR, label="push"))
-    columns = len(entries) if sum(len(str(entry.get_label())) for entry in entries) < 90 else 4
-    figure.legend(handles=entries, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
-
-
-def _plain(axis: Axes) -> None:
-    make_plain(axis)
-    axis.margins(x=0)

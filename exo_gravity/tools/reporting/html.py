@@ -1,6 +1,7 @@
-"""HTML pages that need nothing outside themselves: one style, headings, tables and embedded figures.
+"""HTML pages that need nothing outside themselves, and the look of their figures.
 
-Every function returns a piece of HTML, and escapes every text that it is given; a line break in a heading is kept.
+A function that returns a piece of HTML escapes every text that it is given; a line break in a heading is kept. The
+palette is that of Okabe and Ito (2008), told apart with any colour vision.
 """
 
 from __future__ import annotations
@@ -11,12 +12,14 @@ from html import escape
 from io import BytesIO
 from typing import TYPE_CHECKING
 
-from exo_gravity.tools.reporting.colours import JOINT_COLOURS
-
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 DPI = 150
+JOINT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
+INK, FAINT, GRID_LINE = "#222222", "#9AA3AB", "#D5DADF"
+HOLD_COLOUR, PUSH_COLOUR = "#E8EEF4", "#F9E3B4"
 Rows = Iterable[Sequence[str]]
 
 STYLE = """
@@ -29,8 +32,6 @@ figcaption { color: #5a646d; font-size: .9rem; }
 .verdict { border-left: .4rem solid #009E73; background: #eef7f3; padding: .7rem 1rem; margin: 1.2rem 0; }
 .verdict.not { border-color: #D55E00; background: #fdf1ea; }
 .verdict ul { margin: .3rem 0 0; padding-left: 1.2rem; }
-.key { display: flex; flex-wrap: wrap; gap: 1rem 2.5rem; margin: 1rem 0; }
-.key b { display: block; font-size: 1.5rem; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabular-nums; }
 th, td { padding: .15rem .6rem; text-align: right; white-space: nowrap; }
@@ -82,15 +83,18 @@ def explained(terms: Mapping[str, str]) -> str:
     )
 
 
-def key_numbers(numbers: Iterable[tuple[str, str]]) -> str:
-    """Return large numbers, each with what it is below it."""
-    cells = "".join(f"<div><b>{escape(number)}</b>{escape(label)}</div>" for number, label in numbers)
-    return f'<div class="key">{cells}</div>'
-
-
 def folded(summary: str, text: str) -> str:
     """Return preformatted text that a click unfolds, or '' for no text."""
     return f"<details><summary>{escape(summary)}</summary><pre>{escape(text)}</pre></details>" if text else ""
+
+
+def make_plain(axis: Axes) -> None:
+    """Leave two spines of a figure's axes, and faint horizontal lines."""
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.spines[["left", "bottom"]].set_color(FAINT)
+    axis.tick_params(color=FAINT, labelcolor=INK, labelsize=9)
+    axis.grid(axis="y", color=GRID_LINE, lw=0.5)
+    axis.set_axisbelow(True)
 
 
 def png_of(figure: Figure, dpi: int = DPI) -> bytes:

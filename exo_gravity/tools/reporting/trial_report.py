@@ -146,10 +146,8 @@ def _figures(report: Report, recording: Recording, analysis: TrialAnalysis) -> d
         return {}
     from exo_gravity.tools.reporting import figures
 
-    drawn = {"overview": figures.overview(recording, analysis)}
-    if analysis.holds:
-        drawn["drift"] = figures.drift(recording, analysis, report.criteria)
-    return drawn
+    drift = {"drift": figures.drift(recording, analysis, report.criteria)} if analysis.holds else {}
+    return {"overview": figures.overview(recording, analysis), **drift}
 
 
 def _page(report: Report, sections: Sequence[str]) -> str:

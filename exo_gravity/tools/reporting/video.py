@@ -98,7 +98,7 @@ def select_backend() -> None:
 def frame_times(end: float, clip: Clip) -> list[float]:
     """Return the times in s, from 0 to `end`, of the recording that the frames show."""
     step = clip.speed / clip.frame_rate
-    return [step * i for i in range(max(1, math.floor(end / step) + 1))]
+    return [step * i for i in range(math.floor(end / step) + 1)]
 
 
 def write(bag: Bag, clip: Clip, console: Console) -> None:
@@ -108,7 +108,8 @@ def write(bag: Bag, clip: Clip, console: Console) -> None:
 
     from exo_gravity.tools.reporting.clip import write_clip
 
+    times = frame_times(min(float(recording.time[-1]) for recording in bag.recordings), clip)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task(f"drawing {clip.path.name}", total=None)
-        write_clip(bag, clip, lambda done, count: progress.update(task, completed=done, total=count))
+        task = progress.add_task(f"drawing {clip.path.name}", total=len(times))
+        write_clip(bag, clip.path, times, clip.frame_rate, lambda done: progress.update(task, completed=done))
     console.print(f"Clip: {clip.path}", markup=False, soft_wrap=True)

@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import yaml
 from rich.console import Console
@@ -26,7 +25,7 @@ from exo_gravity.sim.offline import ArmSetup, OfflineTrial, TrunkReading
 from exo_gravity.sim.params import SIMULATOR, device_of, imu_of, set_faults
 from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.tools.inputs.arms import named, node_values, read_arm
-from exo_gravity.tools.inputs.parameter_file import Nodes, load
+from exo_gravity.tools.inputs.parameter_file import load
 
 
 def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
@@ -38,9 +37,25 @@ def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
     namespaces = [node.removesuffix("/simulator") for node in nodes if node.endswith("/simulator")]
     if not namespaces:
         raise ParameterError("params", str(params), "a file with a simulator: --offline runs the simulated device only")
+    simulators = {namespace: node_values(nodes, f"{namespace}/simulator", SIMULATOR) for namespace in namespaces}
+    with_imu = next((values for values in simulators.values() if values["imu.topic"] and "/imu" in nodes), None)
+    rotation = nodes.get("/imu", {}).get("rotation_trunk_from_imu", [])
     moves = any(step.action in TRUNK_ACTIONS for step in script.steps)
-    tilt = None if moves else _tilt(nodes, namespaces)
-    return [_trial(nodes, namespaces, namespace, script, tilt) for namespace in namespaces]
+    tilt, trials = None, []
+    if with_imu and not moves:
+        with named("/imu"):
+            trunk = with_imu["trunk.pitch"], with_imu["trunk.roll"]
+            tilt = measured_tilt(*trunk, SimulatedImu(imu_of(with_imu)), rotation)
+    for namespace, simulator in simulators.items():
+        arm = read_arm(nodes, namespace)
+        with named(f"{namespace}/simulator"):
+            device = device_of(simulator)
+            set_faults(device, simulator)
+        rate = arm.can_bridge["rate"]
+        imu = TrunkImu(imu_of(with_imu), rotation, rate) if with_imu and moves else None
+        setup = ArmSetup(arm.name, device, arm.motors, arm.limits, arm.settings(), rate, tilt, imu)
+        trials.append(OfflineTrial(setup, script, simulator["trial_delay"]))
+    return trials
 
 
 def run_offline(
@@ -78,42 +93,6 @@ def _run_one(trial: OfflineTrial, console: Console, should_stop: Callable[[], bo
     length = float(recording.time[-1])
     console.print(f"{name}: {length:.0f} s simulated in {taken:.1f} s, {length / taken:.0f} times real time")
     return recording
-
-
-def _trial(
-    nodes: Nodes, namespaces: list[str], namespace: str, script: TrialScript, tilt: tuple[float, float] | None
-) -> OfflineTrial:
-    """Return the trial of the arm in `namespace`; tilt: of a trunk that does not move, as measured."""
-    arm = read_arm(nodes, namespace)
-    simulator = node_values(nodes, f"{namespace}/simulator", SIMULATOR)
-    with named(f"{namespace}/simulator"):
-        device = device_of(simulator)
-        set_faults(device, simulator)
-    rate = arm.can_bridge["rate"]
-    trunk = None
-    if tilt is None and (mounted := _imu(nodes, namespaces)):
-        trunk = TrunkImu(imu_of(mounted[0]), mounted[1], rate)
-    setup = ArmSetup(arm.name, device, arm.motors, arm.limits, arm.settings(), rate, tilt, trunk)
-    return OfflineTrial(setup, script, simulator["trial_delay"])
-
-
-def _tilt(nodes: Nodes, namespaces: list[str]) -> tuple[float, float] | None:
-    """Return the trunk's pitch and roll (rad) as its IMU measures them at rest, None without an IMU."""
-    if (mounted := _imu(nodes, namespaces)) is None:
-        return None
-    simulator, rotation = mounted
-    with named("/imu"):
-        trunk = simulator["trunk.pitch"], simulator["trunk.roll"]
-        return measured_tilt(*trunk, SimulatedImu(imu_of(simulator)), rotation)
-
-
-def _imu(nodes: Nodes, namespaces: list[str]) -> tuple[dict[str, Any], Sequence[float]] | None:
-    """Return the parameters of the simulator with the trunk's IMU and the mounting that /imu assumes, or None."""
-    for namespace in namespaces:
-        simulator = node_values(nodes, f"{namespace}/simulator", SIMULATOR)
-        if simulator["imu.topic"] and "/imu" in nodes:
-            return simulator, nodes["/imu"].get("rotation_trunk_from_imu", [])
-    return None
 
 
 class TrunkImu:

@@ -111,7 +111,7 @@ def run_attempts(
 def run_nodes(params: Path, script: TrialScript, folder: Path, screen: TrialScreen, stopped: Stopping) -> TrialEnd:
     """Run the nodes of `params` until the script is done, a fault latches or `stopped` is set."""
     last_errors: dict[str, str] = {}
-    with (folder / "log.txt").open("w", 1, encoding="utf-8") as log, screen:
+    with (folder / "log.txt").open("w", 1, encoding="utf-8") as log, screen.live:
 
         def on_line(node: str, line: str) -> None:
             if node == RECORDER and line.startswith("{"):
@@ -126,8 +126,8 @@ def run_nodes(params: Path, script: TrialScript, folder: Path, screen: TrialScre
         dead: list[tuple[str, int] | None] = []
         nodes = threading.Thread(target=lambda: dead.append(launcher.run(ending)))
         nodes.start()
-        trouble = follow(screen, script, stopped, lambda: _exit_code(launcher, RECORDER), nodes)
-        recorder_failed = _exit_code(launcher, RECORDER) is not None and launcher.dead() is None
+        trouble = follow(screen, script, stopped, lambda: launcher.exit_code(RECORDER), nodes)
+        recorder_failed = launcher.exit_code(RECORDER) is not None and launcher.dead() is None
         if nodes.is_alive():
             screen.end("letting the arm down and closing the recording")
         ending.set()
@@ -143,14 +143,6 @@ def run_nodes(params: Path, script: TrialScript, folder: Path, screen: TrialScre
     if RECORDER in last_errors and trouble:
         trouble += f": {last_errors[RECORDER]}"
     return TrialEnd(trouble, int(bool(trouble)), busy)
-
-
-def _exit_code(launcher: Launcher, node: str) -> int | None:
-    """Return the exit code of a node that was started and has ended, else None."""
-    try:
-        return launcher.process(node).poll()
-    except KeyError:
-        return None
 
 
 def follow(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection
 from typing import Any
 
 from rich.console import Console, Group
@@ -17,7 +17,7 @@ from rich.live import Live
 from rich.text import Text
 
 from exo_gravity.core.safety.drive import State
-from exo_gravity.core.trial.script import TRUNK_ACTIONS, Step, TrialScript
+from exo_gravity.core.trial.script import Step, TrialScript
 
 SETTLING = 0.5  # s between letting go and the position from which drift is measured
 LEAD = 5.0  # s for a person to get ready when the arm is carried
@@ -58,16 +58,11 @@ class TrialScreen:
         self._start = math.inf  # of a script that the clock leads
         self._origin: dict[str, list[float]] = {}  # position of each arm from which drift is measured
         self._ending = ""
-        self._live = Live(console=console, refresh_per_second=10, get_renderable=self.screen, transient=True)
-
-    def __enter__(self) -> TrialScreen:
-        if self._console.is_terminal:
-            self._live.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        if self._console.is_terminal:
-            self._live.stop()
+        #: shows `screen` on a terminal, and nothing elsewhere
+        self.live = Live(
+            console=console, auto_refresh=console.is_terminal, refresh_per_second=10, get_renderable=self.screen,
+            transient=True,
+        )  # fmt: skip
 
     def end(self, text: str) -> None:
         """Print `text`, and stop following the script."""
@@ -151,7 +146,8 @@ class TrialScreen:
         """Return the changing part of the screen: time left, drift, next step, each arm, warnings and errors."""
         lines = [Text(self._headline(), style="bold")]
         for name, arm in self._arms.items():
-            angles, torques = columns(map(math.degrees, arm["position"]), 1), columns(arm["effort"], 2)
+            angles = " ".join(f"{math.degrees(angle):6.1f}" for angle in arm["position"])
+            torques = " ".join(f"{torque:7.2f}" for torque in arm["effort"])
             lines.append(Text(f"     {name:<6} deg {angles}    Nm {torques}", no_wrap=True))
         lines += [Text(f"     {fault}", style="yellow") for fault in self.faults]
         return Group(*lines)
@@ -172,27 +168,19 @@ class TrialScreen:
 
 def describe(step: Step, guided: bool) -> str:
     """Return a step as a sentence: an instruction for the person at the arm, or what the virtual wearer does."""
+    if step.action == "hold":
+        return f"hands off for {step.duration:g} s"
     if step.action == "move":
         pose = " ".join(f"{math.degrees(angle):.0f}" for angle in step.value)
         return f"bring the arm to {pose} deg, then let go" if guided else f"the wearer brings the arm to {pose} deg"
     if step.action == "push":
         pushed = "once, briefly" if step.duration < 1.0 else f"for {step.duration:g} s, then let go"
         return f"push the arm {pushed}" if guided else "the wearer pushes the arm"
-    if step.action in TRUNK_ACTIONS:
-        return _of_trunk(step) if guided else f"the wearer: {_of_trunk(step)}"
-    return f"hands off for {step.duration:g} s"
-
-
-def _of_trunk(step: Step) -> str:
     if step.action == "walk":
-        return f"walk for {step.duration:g} s, and leave the arm alone"
-    if step.action == "sit":
-        return "sit down hard, and leave the arm alone"
-    angle = math.degrees(step.value[0])
-    way = "forward" if step.action == "bow" else "to the right"
-    return f"{step.action} to {angle:.0f} deg {way} in {step.duration:g} s, and leave the arm alone"
-
-
-def columns(values: Iterable[float], digits: int) -> str:
-    """Return `values` in columns, with `digits` decimal places."""
-    return " ".join(f"{value:{digits + 5}.{digits}f}" for value in values)
+        what = f"walk for {step.duration:g} s"
+    elif step.action == "sit":
+        what = "sit down hard"
+    else:
+        way = "forward" if step.action == "bow" else "to the right"
+        what = f"{step.action} to {math.degrees(step.value[0]):.0f} deg {way} in {step.duration:g} s"
+    return f"{'' if guided else 'the wearer: '}{what}, and leave the arm alone"

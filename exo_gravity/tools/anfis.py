@@ -1,4 +1,9 @@
-"""Hybrid learning of an ANFIS that converges: variable projection with SciPy's least squares.
+"""An ANFIS of joints 2 to 4 of an upright arm: the samples it is trained on, and a hybrid learning that converges.
+
+Samples are torques in Nm at gain 1, not scaled. Computed: `gravload` torques at the paper's 1,053 positions, 13 x 9 x 9
+over joints 2, 3, 4, checked half-way between them. Recorded: the mean measured torque of each hold of a rosbag2, of
+which every fifth is held out. A measured torque lacks the part that stiction carries, so approach each pose from both
+sides.
 
 In each epoch, Jang's hybrid learning solves the consequents by least squares and moves the premises down the gradient.
 Variable projection completes this split: the consequents are a function of the premises (the least-squares solution),
@@ -10,29 +15,142 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_typestore
 from scipy.linalg import qr, solve_triangular
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
+from exo_gravity.bag.reader import read_bag
+from exo_gravity.bag.storage import Storage
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.anfis import JOINTS, Anfis, AnfisLaw, grades, scaled
+from exo_gravity.core.model.anfis import INPUTS, JOINTS, UPRIGHT, Anfis, AnfisLaw, grades, scaled
 from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.tools.anfis.samples import Samples
+from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.trial.analysis import analyse
+from exo_gravity.core.trial.recording import Recording
+from exo_gravity.tools.inputs.arms import ConfiguredArm
+from exo_gravity.tools.inputs.references import gravload
 
+GRID = (13, 9, 9)  # positions of joints 2, 3, 4: 1,053 as in the paper
+HELD_OUT = 5  # every fifth hold
+TILT_TOPIC, TILT_TYPE = "/imu/pitch_yaw", "geometry_msgs/msg/Vector3Stamped"
 RIDGE = 1e-6  # keeps consequents that the data do not determine near 0; noisy data need more
 # In units of half the training box. Narrow functions overfit the sampled positions: at a width of 0.4 the held-out
 # error is up to ten times that at 0.8.
 NARROWEST, WIDEST = 0.8, 4.0
 FARTHEST = 2.0  # largest distance of a centre from the middle of the box, in the same units
-
 MAX_EVALUATIONS = 100
 
 OnEvaluation = Callable[[int, float], None]  # (number of the evaluation, RMSE)
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Training and held-out samples of joints 2 to 4."""
+
+    angle: np.ndarray  #: (n, 3) rad in the box low..high
+    torque: np.ndarray  #: (n, 3) Nm
+    held_out_angle: np.ndarray
+    held_out_torque: np.ndarray
+    low: np.ndarray  #: (3,) rad
+    high: np.ndarray
+    source: str  #: what the samples are from, in words
+
+
+def from_gravload(configured: ConfiguredArm) -> Samples:
+    """Return the upright arm's torques by the Robotics Toolbox, on the grid and half-way between its positions."""
+    low, high = configured.low[1:], configured.high[1:]
+    axes = [np.linspace(a, b, count) for a, b, count in zip(low, high, GRID, strict=True)]
+    reference = gravload(replace(configured.robot, gain=np.ones(4)))
+
+    def torques(angle: np.ndarray) -> np.ndarray:
+        theta = np.column_stack((np.zeros(len(angle)), angle))
+        return reference(theta, np.tile((0.0, 0.0, 1.0), (len(theta), 1)))[:, 1:]
+
+    angle = np.array(list(product(*axes)))
+    between = np.array(list(product(*((axis[1:] + axis[:-1]) / 2 for axis in axes))))
+    source = f"gravload of the Robotics Toolbox, {len(angle)} positions"
+    return Samples(angle, torques(angle), between, torques(between), low, high, source)
+
+
+def from_bag(path: str | Path, configured: ConfiguredArm, functions: int) -> Samples:
+    """Return the mean measured torque of each hold of a rosbag2 during which the trunk was upright.
+
+    The box spans the held poses within the joint limits. Raises DataError, one sentence, if they are too few for
+    `functions` membership functions per input.
+    """
+    bag = read_bag(path)
+    names = {recording.name: recording for recording in bag.recordings}
+    recording = names.get(configured.side) or (next(iter(names.values())) if len(names) == 1 else None)
+    if recording is None:
+        raise DataError(f"{path}: the arms are {', '.join(names)}: must include {configured.side}")
+    if sorted(recording.joint_names) != sorted(configured.joint_names):
+        expected = ", ".join(configured.joint_names)
+        raise DataError(f"{path}: the joints are {', '.join(recording.joint_names)}: must be {expected}")
+    order = [recording.joint_names.index(name) for name in configured.joint_names]
+    angle, torque = (part[:, order] for part in held(recording, _tilted(path, configured.side, bag.start)))
+    kept = np.all((angle >= configured.low) & (angle <= configured.high), axis=1)
+    angle, torque = angle[kept, 1:], torque[kept, 1:]
+    checked = np.arange(len(angle)) % HELD_OUT == HELD_OUT - 1
+    if len(angle) < HELD_OUT:
+        raise DataError(f"{path}: {len(angle)} holds with an upright trunk: must be at least {HELD_OUT}")
+    low, high = angle.min(axis=0), angle.max(axis=0)
+    _check_coverage(scaled(angle[~checked], low, high), functions)
+    source = f"recording {Path(path).name}, {len(angle)} holds"
+    return Samples(angle[~checked], torque[~checked], angle[checked], torque[checked], low, high, source)
+
+
+def held(recording: Recording, tilted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean angle (m, 4) rad and measured torque (m, 4) Nm of each hold.
+
+    tilted: times in s at which the trunk was not upright; their holds are left out.
+    """
+    angle, torque = [], []
+    for hold in analyse(recording).holds:
+        within = (recording.time >= hold.start) & (recording.time <= hold.end)
+        if not np.any((tilted >= hold.start) & (tilted <= hold.end)):
+            angle.append(hold.pose)
+            torque.append(recording.effort[within].mean(axis=0))
+    angles, means = (np.array(values, dtype=float).reshape(-1, JOINT_COUNT) for values in (angle, torque))
+    known = np.all(np.isfinite(means), axis=1)
+    return angles[known], means[known]
+
+
+def _tilted(path: str | Path, side: str, start: int) -> np.ndarray:
+    """Return the times in s at which the trunk was not upright; without an IMU it is taken as upright."""
+    types = get_typestore(Stores.ROS2_JAZZY)
+    times = []
+    for batch in Storage(path).batches(lambda topic, msgtype: (topic, msgtype) == (TILT_TOPIC, TILT_TYPE)):
+        for stamp, data in zip(batch.stamps, batch.data, strict=True):
+            try:
+                message: Any = types.deserialize_cdr(data, TILT_TYPE)
+            except (SerdeError, ValueError) as error:
+                raise DataError(f"{path}: cannot read {TILT_TOPIC} ({error})") from None
+            if not Tilt.of(side, pitch=message.vector.y, roll=message.vector.x).axis_angle <= UPRIGHT:
+                times.append((stamp - start) / 1e9)
+    return np.array(times)
+
+
+def _check_coverage(inputs: np.ndarray, functions: int) -> None:
+    """Raise DataError if a cell of the grid partition has no sample to determine its rule."""
+    cell = np.minimum(((inputs + 1) / 2 * functions).astype(int), functions - 1)
+    empty = sorted(set(product(range(functions), repeat=len(INPUTS))) - set(map(tuple, cell.tolist())))
+    if empty:
+        where = ", ".join(f"{name} {part + 1}/{functions}" for name, part in zip(INPUTS, empty[0], strict=True))
+        raise DataError(
+            f"{len(empty)} of the {functions ** len(INPUTS)} cells of the box that the poses span have no hold "
+            f"(the first: {where}): record holds there"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,12 +158,9 @@ class Trained:
     """A model of one output, trained."""
 
     model: Anfis
-    #: On the training data, in the output's unit.
-    rmse: float
-    #: Of the premises.
-    evaluations: int
-    #: Training time in s.
-    seconds: float
+    rmse: float  #: on the training data, in the output's unit
+    evaluations: int  #: of the premises
+    seconds: float  #: training time
 
 
 class Projection:
@@ -166,14 +281,13 @@ def train_law(
     """Return the law for `arm` trained on `samples`, and the training results of joints 2, 3 and 4."""
     inputs = scaled(samples.angle, samples.low, samples.high)
     results = []
-    for joint, torque in zip(JOINTS, samples.torque.T, strict=True):
-        with Progress(console=Console(stderr=True), transient=True) as progress:
+    # Threads gain nothing on matrices this small, and wait for each other on busy cores: 73 s instead of 2 s.
+    with threadpool_limits(1), Progress(console=Console(stderr=True), transient=True) as progress:
+        for joint, torque in zip(JOINTS, samples.torque.T, strict=True):
             show = _progress_line(progress, joint)
-            # Threads gain nothing on matrices this small, and wait for each other on busy cores: 73 s instead of 2 s.
-            with threadpool_limits(1):
-                results.append(
-                    train(inputs, torque, functions, ridge=ridge, max_evaluations=MAX_EVALUATIONS, on_evaluation=show)
-                )
+            results.append(
+                train(inputs, torque, functions, ridge=ridge, max_evaluations=MAX_EVALUATIONS, on_evaluation=show)
+            )
     parts = (np.concatenate([getattr(r.model, part) for r in results]) for part in ("centre", "sigma", "consequent"))
     model = Anfis(*parts)
     held_out = model.output(scaled(samples.held_out_angle, samples.low, samples.high)) - samples.held_out_torque

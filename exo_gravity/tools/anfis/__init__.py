@@ -1,1 +1,0 @@
-"""Training an ANFIS: its samples, computed or recorded, and the learning itself."""

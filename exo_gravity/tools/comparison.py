@@ -1,0 +1,298 @@
+"""The paper's comparison: every law against every reference, the checks of the result, its tables, CSV and figures.
+
+Each arm is compared over the 1,053 positions with an upright trunk, and over random poses whose pitch and sideways tilt
+are uniform within a limit. The paper's laws take the angle between joint 1's axis and gravity as theta_1, as in the
+compensator.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import groupby, product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.progress import Progress
+
+from exo_gravity.core.model.anfis import AnfisLaw
+from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.model.gravity import gravity_torque, paper_mobile_torque, paper_static_torque
+from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.tools.anfis import GRID, Trained, from_gravload, train_law
+from exo_gravity.tools.inputs.arms import ConfiguredArm, with_cog_at_link_ends
+from exo_gravity.tools.inputs.references import PAPER_ANALYTICAL, PAPER_ANFIS, PAPER_SECONDS, REFERENCES, gravload
+
+TILTS = (0, 5, 10, 20, 30)  # degrees
+CHUNK = 2_000  # poses between two updates of the progress bar
+ROUNDING = 1e-12  # Nm; the exact law may differ this much from a reference
+LINK_ENDS, CONFIGURED = "at the link ends", "as configured"
+FLOOR, CEILING = 1e-7, 1.0  # Nm, ends of the colour scale
+FIGURE_GRID = (56, 56, 7)  # positions of joints 2, 3, 4 in the workspace figure
+# Overlapping lines stay visible, because the wider ones are drawn first.
+STYLES: dict[str, dict[str, Any]] = {
+    "EQ2-EQ5": {"color": "tab:orange", "marker": "s", "linewidth": 4, "markersize": 7},
+    "EQ1m-EQ4m": {"color": "tab:red", "marker": "D", "linewidth": 2},
+    "ANFIS": {"color": "tab:blue", "marker": "^", "linestyle": "--"},
+    "exact": {"color": "tab:green", "marker": "o"},
+}
+
+
+class Case(NamedTuple):
+    """Poses of an arm, each with a trunk tilt."""
+
+    cog: str  #: which centres of gravity
+    positions: str  #: 'workspace' or 'random'
+    limit: int  #: of the tilt, degrees
+    arm: ArmModel
+    theta: np.ndarray  #: (n, 4) rad
+    direction: np.ndarray  #: (n, 3); this and the following (n,) rad as in `core.model.tilt.Tilt`
+    axis_angle: np.ndarray
+    beta: np.ndarray
+    phi: np.ndarray
+
+    def torques(self, anfis: AnfisLaw) -> dict[str, np.ndarray]:
+        """Return the torques (n, 4) in Nm by each law; the ANFIS also outside its training box."""
+        axis_first = np.column_stack((self.axis_angle, self.theta[:, 1:]))  # with the paper's theta_1
+        return {
+            "exact": gravity_torque(self.arm, self.theta, self.direction),
+            "EQ2-EQ5": paper_static_torque(self.arm, axis_first),
+            "EQ1m-EQ4m": paper_mobile_torque(self.arm, axis_first, self.beta, self.phi),
+            "ANFIS": self.arm.gain * np.pad(anfis.torques(self.theta[:, 1:]), ((0, 0), (1, 0))),
+        }
+
+
+@dataclass(frozen=True)
+class Row:
+    """The error in Nm of `law` against `reference` on one joint (1..4) over the `count` poses of a case."""
+
+    cog: str
+    positions: str
+    limit: int
+    count: int
+    law: str
+    reference: str
+    joint: int
+    rmse: float
+    largest: float
+    rms_torque: float
+
+    @property
+    def share(self) -> float:
+        """RMSE / RMS torque; NaN for a joint without gravity torque."""
+        return self.rmse / self.rms_torque if self.rms_torque > 1e-12 else math.nan
+
+
+def cases(cog: str, configured: ConfiguredArm, count: int) -> Iterator[Case]:
+    """Yield the 1,053 positions, then `count` random poses for each of `TILTS`."""
+    yield _upright(cog, configured, GRID)[0]
+    for limit in TILTS:
+        rng, bound = np.random.default_rng(limit), math.radians(limit)
+        theta = rng.uniform(configured.low, configured.high, (count, 4))
+        yield _case(cog, "random", limit, configured, theta, rng.uniform(-bound, bound, (count, 2)))
+
+
+def _upright(cog: str, configured: ConfiguredArm, counts: Sequence[int]) -> tuple[Case, list[np.ndarray]]:
+    """Return a grid of positions of joints 2 to 4 with the trunk upright, and the angles of each joint."""
+    box = zip(configured.low[1:], configured.high[1:], counts, strict=True)
+    angles = [np.linspace(low, high, n) for low, high, n in box]
+    theta = np.array(list(product((0.0,), *angles)))
+    return _case(cog, "workspace", 0, configured, theta, np.zeros((len(theta), 2))), angles
+
+
+def _case(cog: str, positions: str, limit: int, configured: ConfiguredArm, theta: np.ndarray, tilt: np.ndarray) -> Case:
+    tilts = [Tilt.of(configured.side, pitch, roll) for pitch, roll in tilt.tolist()]
+    felt = (np.array([getattr(t, name) for t in tilts]) for name in ("direction", "axis_angle", "beta", "phi"))
+    return Case(cog, positions, limit, configured.robot, theta, *felt)
+
+
+def compare(case: Case, torque: dict[str, np.ndarray], reference: str, expected: np.ndarray) -> list[Row]:
+    """Return a row per law and joint; torque: of each law (n, 4) Nm; expected: of the reference (n, 4) Nm."""
+    rows = []
+    for law, given in torque.items():
+        error = given - expected
+        figures = zip(rms(error), np.abs(error).max(axis=0), rms(expected), strict=True)
+        for joint, numbers in enumerate(figures, start=1):
+            head = case.cog, case.positions, case.limit, len(case.theta), law, reference, joint
+            rows.append(Row(*head, *map(float, numbers)))
+    return rows
+
+
+def rms(values: np.ndarray) -> np.ndarray:
+    """Return the root mean square of each column."""
+    result: np.ndarray = np.sqrt(np.mean(np.square(values), axis=0))
+    return result
+
+
+@dataclass(frozen=True)
+class Part:
+    """The results of one arm: its rows, its ANFIS and how that was trained."""
+
+    configured: ConfiguredArm
+    rows: list[Row]
+    law: AnfisLaw
+    trained: list[Trained]
+
+
+def evaluate(cog: str, configured: ConfiguredArm, count: int) -> Part:
+    """Compare all laws with all references over the workspace and `count` random poses per tilt limit."""
+    references = {name: build(configured.robot) for name, build in REFERENCES.items()}
+    law, trained = train_law(from_gravload(configured), configured.robot)
+    rows: list[Row] = []
+    total = (math.prod(GRID) + len(TILTS) * count) * len(references)
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(f"comparing, CoGs {cog}", total=total)
+        for case in cases(cog, configured, count):
+            torque = case.torques(law)
+            for name, reference in references.items():
+                expected = []
+                for start in range(0, len(case.theta), CHUNK):
+                    chunk = slice(start, start + CHUNK)
+                    expected.append(reference(case.theta[chunk], case.direction[chunk]))
+                    progress.update(task, advance=len(expected[-1]))
+                rows += compare(case, torque, name, np.concatenate(expected))
+    return Part(configured, rows, law, trained)
+
+
+@dataclass(frozen=True)
+class Validation:
+    """The comparison as a whole."""
+
+    link_ends: Part  #: with the paper's assumptions, d_n = l_n
+    as_configured: Part  #: with the configured centres of gravity
+
+    @classmethod
+    def of(cls, configured: ConfiguredArm, count: int) -> Validation:
+        """Return the comparison of an arm over `count` random poses per tilt limit."""
+        ends = replace(configured, robot=with_cog_at_link_ends(configured.robot))
+        return cls(evaluate(LINK_ENDS, ends, count), evaluate(CONFIGURED, configured, count))
+
+    @property
+    def rows(self) -> list[Row]:
+        """The rows of both parts."""
+        return self.link_ends.rows + self.as_configured.rows
+
+    def checks(self) -> Iterator[tuple[bool, str]]:
+        """Yield (held, sentence) for each check."""
+        exact = [row for row in self.rows if row.law == "exact"]
+        largest = max(row.largest for row in exact)
+        compared = sum(row.count for row in exact if row.joint == 1)
+        names = " and ".join(dict.fromkeys(row.reference for row in exact))
+        yield (
+            largest <= ROUNDING,
+            f"exact law within {ROUNDING:g} Nm of {names} in {compared:,} comparisons: largest {largest:.1e} Nm",
+        )
+        upright = [row for row in self.link_ends.rows if row.law.startswith("EQ") and not row.limit]
+        largest = max(row.largest for row in upright)
+        yield largest <= ROUNDING, f"EQ2-EQ5 and EQ1m-EQ4m too, with d_n = l_n, trunk upright: largest {largest:.1e} Nm"
+        for kind, where in (("training", "at the training positions"), ("held_out", "between them")):
+            ratios = [paper / ours for ours, paper in zip(self.link_ends.law.error[kind], PAPER_ANFIS, strict=True)]
+            shares = ", ".join(f"1/{ratio:.0f}" for ratio in ratios)
+            yield min(ratios) >= 1.0, f"ANFIS {where}: RMSE {shares} of the paper's, joints 2, 3, 4"
+
+
+def tables(validation: Validation) -> Iterator[str]:
+    """Yield the lines of all tables."""
+    yield from _law_table(validation.rows)
+    yield "\nThe paper's comparison (d_n = l_n, g = 9.8 m/s^2, torques in Nm, not scaled)"
+    yield from _paper_table(validation.link_ends)
+
+
+def _paper_table(part: Part) -> Iterator[str]:
+    """Yield the lines of the paper's comparison, its figures next to ours; part: with its assumption d_n = l_n."""
+    ours = {
+        name: [r.rmse for r in part.rows if (r.positions, r.law, r.reference) == ("workspace", name, "gravload")]
+        for name in ("exact", "EQ2-EQ5")
+    }
+    seconds = f"{sum(result.seconds for result in part.trained):.1f} s for all three"
+    yield f"{'RMSE against gravload in Nm':<34}{'joint 2':>10}{'joint 3':>10}{'joint 4':>10}   training"
+    for name, values, training in (
+        ("EQ3-EQ5, the paper", PAPER_ANALYTICAL, ""),
+        ("EQ3-EQ5, here", ours["EQ2-EQ5"][1:], ""),
+        ("exact law, here", ours["exact"][1:], ""),
+        ("ANFIS, the paper", PAPER_ANFIS, f"{PAPER_SECONDS:.0f} s per joint"),
+        ("ANFIS, here", part.law.error["training"], seconds),
+        ("ANFIS, here, between the positions", part.law.error["held_out"], ""),
+    ):
+        yield f"{name:<34}{''.join(f'{value:>10.2e}' for value in values)}   {training}".rstrip()
+
+
+def _law_table(rows: Iterable[Row]) -> Iterator[str]:
+    """Yield the lines of RMSE, largest error and RMSE / RMS torque for each case, law and joint."""
+    yield f"{'law - reference; Nm':<22}" + "".join(f"{f'joint {joint}':^24}" for joint in range(1, 5))
+    yield f"{'':<22}" + "".join(f"{'RMSE':>9}{'largest':>9}{'share':>6}" for _ in range(4))
+    for (cog, positions, limit, count), case in groupby(rows, lambda r: (r.cog, r.positions, r.limit, r.count)):
+        tilt = f"trunk tilted by up to {limit} degrees" if limit else "trunk upright"
+        yield f"CoGs {cog}; {count:,} {positions} positions; {tilt}"
+        for (law, reference), line in groupby(case, lambda r: (r.law, r.reference)):
+            if reference == "gravload" or law == "exact":
+                yield f"{f'  {law} - {reference}':<22}" + "".join(map(_cell, line))
+
+
+def _cell(row: Row) -> str:
+    share = "-" if math.isnan(row.share) else f"{100 * row.share:.0f}%"
+    return f"{row.rmse:>9.1e}{row.largest:>9.1e}{share:>6}"
+
+
+def write(validation: Validation, output: Path) -> list[str]:
+    """Write the rows as CSV, one column per field in Nm (`limit` in degrees), and the figures; return the names."""
+    rows = validation.rows
+    with (output / "laws.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, fieldnames=list(asdict(rows[0])))
+        writer.writeheader()
+        writer.writerows(asdict(row) for row in rows)
+    _workspace_figure(validation.as_configured).savefig(output / "workspace.png", dpi=130)
+    _tilt_figure(rows).savefig(output / "tilt.png", dpi=130)
+    return ["laws.csv", "workspace.png", "tilt.png"]
+
+
+def _workspace_figure(part: Part) -> Figure:
+    """Draw the RMSE over the elbow of joints 2 to 4 (rows) and each law (columns) over abduction and flexion."""
+    case, (abduction, flexion, _) = _upright(CONFIGURED, part.configured, FIGURE_GRID)
+    expected, torques = gravload(case.arm)(case.theta, case.direction), case.torques(part.law)
+    figure = Figure(figsize=(3.2 * len(torques) + 1.6, 8.4), layout="constrained")
+    grid = figure.subplots(3, len(torques), sharex=True, sharey=True)
+    for column, (name, torque) in zip(grid.T, torques.items(), strict=True):
+        error = rms(np.moveaxis((torque - expected).reshape(*FIGURE_GRID, 4), 2, 0))
+        for joint, axis in enumerate(column, start=2):
+            image = axis.pcolormesh(
+                np.degrees(abduction), np.degrees(flexion), np.clip(error[..., joint - 1].T, FLOOR, CEILING),
+                norm=LogNorm(FLOOR, CEILING), cmap="viridis", rasterized=True,
+            )  # fmt: skip
+            axis.set_title(f"{name}: joint {joint}", fontsize=10)
+    for axis in grid[-1]:
+        axis.set_xlabel("joint 2, abduction (degrees)")
+    for axis in grid[:, 0]:
+        axis.set_ylabel("joint 3, flexion (degrees)")
+    figure.colorbar(image, ax=grid, label="RMSE over the elbow's range (Nm)", extend="min")
+    figure.suptitle("Error against gravload over the workspace, trunk upright, configured centres of gravity")
+    return figure
+
+
+def _tilt_figure(rows: Sequence[Row]) -> Figure:
+    """Draw the RMSE of each law over the tilt limit: one column per joint, one row per set of centres of gravity."""
+    rows = [row for row in rows if row.positions == "random" and row.reference == "gravload"]
+    cogs = list(dict.fromkeys(row.cog for row in rows))
+    figure = Figure(figsize=(13, 6.4), layout="constrained")
+    grid = figure.subplots(len(cogs), 4, sharex=True, sharey="col", squeeze=False)
+    for (cog, line), joint in product(zip(cogs, grid, strict=True), range(1, 5)):
+        axis = line[joint - 1]
+        for law, style in STYLES.items():
+            chosen = [row for row in rows if (row.cog, row.joint, row.law) == (cog, joint, law)]
+            label = f"{law} (at most {max(row.rmse for row in rows if row.law == law):.2g} Nm)"
+            axis.plot([row.limit for row in chosen], [row.rmse for row in chosen], label=label, **style)
+        axis.set_title(f"joint {joint}, CoGs {cog}", fontsize=10)
+        axis.grid(alpha=0.3)
+    for axis in grid[-1]:
+        axis.set_xlabel("tilt up to (degrees)")
+    for axis in grid[:, 0]:
+        axis.set_ylabel("RMSE (Nm)")
+    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(STYLES))
+    figure.suptitle("Error against gravload over trunk tilt, random poses; the ANFIS was trained upright")
+    return figure

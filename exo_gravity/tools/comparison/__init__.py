@@ -1,1 +1,0 @@
-"""The paper's comparison of all laws with independent references."""
