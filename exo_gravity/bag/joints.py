@@ -28,10 +28,9 @@ class Layout:
     """Where the numbers of a message are."""
 
     names: tuple[str, ...]
-    order: str  #: '<' or '>', the byte order
     fixed: np.ndarray  #: (n,) offsets of the bytes that identify this layout
     content: np.ndarray  #: (n,) those bytes
-    offset: tuple[int | None, ...]  #: of the first number of each of `FIELDS`, None for an empty field
+    numbers: np.dtype[np.void]  #: of a message: sec, nanosec, and those of `FIELDS` that are not empty, (joints,) each
 
     @classmethod
     def of(cls, message: bytes) -> Layout:
@@ -42,55 +41,47 @@ class Layout:
             raise DataError("a message is damaged, or is not a sensor_msgs/msg/JointState in CDR") from None
         is_fixed = np.zeros(len(message), bool)  # the header, lengths and texts; not the stamp, numbers and padding
         is_fixed[:4] = True
-        at = 12
-
-        def take(size: int) -> None:
-            nonlocal at
+        at, order, count = 12, "<" if message[1] == 1 else ">", len(decoded.name)
+        texts = [len(text.encode()) + 1 for text in (decoded.header.frame_id, *decoded.name)]
+        for size in (4 + texts[0], 4, *(4 + length for length in texts[1:])):
             at += -at % 4
             is_fixed[at : at + size] = True
             at += size
-
-        take(4 + len(decoded.header.frame_id.encode()) + 1)
-        take(4)
-        for name in decoded.name:
-            take(4 + len(name.encode()) + 1)
-        offset: list[int | None] = []
+        offsets = {"sec": 4, "nanosec": 8}
+        formats: dict[str, Any] = {"sec": f"{order}i4", "nanosec": f"{order}u4"}
         for field in FIELDS:
-            count = len(getattr(decoded, field))
-            if count not in (0, len(decoded.name)):
-                raise DataError(f"a joint state has {count} values of {field} for {len(decoded.name)} names")
-            take(4)
-            at += -(at - 4) % 8 if count else 0  # alignment counts from the end of the header
-            offset.append(at if count else None)
-            at += 8 * count
-        fixed = np.flatnonzero(is_fixed)
-        order = "<" if message[1] == 1 else ">"
-        return cls(tuple(decoded.name), order, fixed, np.frombuffer(message, np.uint8)[fixed], tuple(offset))
+            given = len(getattr(decoded, field))
+            if given not in (0, count):
+                raise DataError(f"a joint state has {given} values of {field} for {count} names")
+            at += -at % 4
+            is_fixed[at : at + 4] = True
+            at += 4
+            if given:
+                at += -(at - 4) % 8  # alignment counts from the end of the header
+                offsets[field], formats[field] = at, (f"{order}f8", (count,))
+                at += 8 * count
+        fixed, places = np.flatnonzero(is_fixed), list(offsets.values())
+        kinds = list(formats.values())
+        form: Any = {"names": list(offsets), "formats": kinds, "offsets": places, "itemsize": len(message)}
+        return cls(tuple(decoded.name), fixed, np.frombuffer(message, np.uint8)[fixed], np.dtype(form))
 
     def matches(self, rows: np.ndarray) -> np.ndarray:
         """Return which messages have this layout, (n,) bool; rows: their bytes (n, length)."""
-        matching: np.ndarray = np.all(rows[:, self.fixed] == self.content, axis=1)
-        return matching
+        return np.asarray(np.all(rows[:, self.fixed] == self.content, axis=1))
 
     def stamps(self, rows: np.ndarray) -> np.ndarray:
         """Return the stamps in ns since 1970, (n,) int64."""
-        seconds, nanoseconds = (self._extract(rows, place, kind) for place, kind in ((4, "i4"), (8, "u4")))
-        stamps: np.ndarray = seconds[:, 0].astype(np.int64) * 1_000_000_000 + nanoseconds[:, 0]
-        return stamps
+        numbers = rows.view(self.numbers)[:, 0]
+        return np.asarray(numbers["sec"].astype(np.int64) * 1_000_000_000 + numbers["nanosec"])
 
     def values(self, rows: np.ndarray, names: Sequence[str], fields: Sequence[str]) -> np.ndarray:
         """Return (n, fields, joints) in the order of `names`; float32 is 1000 times finer than a position code."""
         result = np.full((len(rows), len(fields), len(names)), np.nan, np.float32)
-        chosen = [self.names.index(name) for name in names]
+        chosen, numbers = [self.names.index(name) for name in names], rows.view(self.numbers)[:, 0]
         for field, name in enumerate(fields):
-            if (offset := self.offset[FIELDS.index(name)]) is not None:
-                result[:, field] = self._extract(rows, offset, "f8", len(self.names))[:, chosen]
+            if name in (self.numbers.names or ()):
+                result[:, field] = numbers[name][:, chosen]
         return result
-
-    def _extract(self, rows: np.ndarray, offset: int, kind: str, count: int = 1) -> np.ndarray:
-        """Return `count` numbers of type `kind` at `offset` of each message, (n, count)."""
-        part = np.ascontiguousarray(rows[:, offset : offset + int(kind[1]) * count])
-        return part.view(np.dtype(self.order + kind))
 
 
 class JointArrays:
@@ -111,9 +102,8 @@ class JointArrays:
         values = np.empty((0, 0, 0), np.float32)
         for length in lengths[np.sort(np.unique(lengths, return_index=True)[1])]:  # in order of appearance
             chosen = np.flatnonzero(lengths == length)
-            rows = np.frombuffer(b"".join([messages[i] for i in chosen.tolist()]), np.uint8).reshape(
-                len(chosen), length
-            )
+            joined = b"".join([messages[i] for i in chosen.tolist()])
+            rows = np.frombuffer(joined, np.uint8).reshape(len(chosen), length)
             while len(chosen):
                 layout = self._layout(rows[0].tobytes())
                 same = layout.matches(rows)
@@ -137,14 +127,13 @@ class JointArrays:
         layout = Layout.of(message)
         self.names = self.names or layout.names
         if sorted(layout.names) != sorted(self.names):
-            raise DataError(
-                f"{self.topic}: joint names differ: {', '.join(layout.names)}; must be {', '.join(self.names)}"
-            )
+            differing, expected = ", ".join(layout.names), ", ".join(self.names)
+            raise DataError(f"{self.topic}: joint names differ: {differing}; must be {expected}")
         self._layouts.append(layout)
         return layout
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return times of arrival (n,) and stamps (n,) in ns, values (n, fields, joints); forget them."""
-        parts, self._parts = self._parts, []
-        arrival, stamp, values = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        arrival, stamp, values = (np.concatenate(columns) for columns in zip(*self._parts, strict=True))
+        self._parts.clear()
         return arrival, stamp, values

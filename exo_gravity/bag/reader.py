@@ -16,23 +16,10 @@ from typing import Any
 
 import numpy as np
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_typestore
 
-from exo_gravity.bag.content import (
-    COMMANDS,
-    DIAGNOSTICS,
-    JOINT_STATE,
-    LOSSES,
-    PARAMETER_EVENTS,
-    STATES,
-    STEPS,
-    Bag,
-    Event,
-    arm_of,
-    is_wanted,
-    leaf,
-)
-from exo_gravity.bag.joints import FIELDS, JointArrays
+from exo_gravity.bag import content
+from exo_gravity.bag.content import COMMANDS, JOINT_STATE, STATES, STEPS, Bag, Event, arm_of, leaf
+from exo_gravity.bag.joints import FIELDS, TYPES, JointArrays
 from exo_gravity.bag.storage import Batch, Storage
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.safety.drive import State
@@ -50,7 +37,7 @@ def read_bag(path: str | Path, on_read: OnRead = lambda done, size: None) -> Bag
     Raises DataError, one sentence, if there is nothing to report: no recording, an empty one, or no arm in it.
     """
     storage, contents = Storage(path), _Contents()
-    for batch in storage.batches(is_wanted):
+    for batch in storage.batches(content.is_wanted):
         contents.add(batch)
         on_read(storage.done, storage.size)
     if storage.cut_short:
@@ -58,7 +45,12 @@ def read_bag(path: str | Path, on_read: OnRead = lambda done, size: None) -> Bag
         contents.notes.append(f"the recording was cut short ({storage.cut_short}): what was written before is reported")
     states = sorted(name for name in contents.joints if leaf(name) == STATES)
     if not states and not contents.problems:
-        raise DataError(f"{path}: {'; '.join((_nothing(storage.topics), *contents.notes))}")
+        problem = (
+            f"the recording has no topic {STATES} of type {JOINT_STATE}; it has {', '.join(sorted(storage.topics))}"
+        )
+        if not storage.topics or any(leaf(topic) == STATES for topic in storage.topics):
+            problem = "the recording is empty: it has no messages"
+        raise DataError(f"{path}: {'; '.join((problem, *contents.notes))}")
     start = min((contents.joints[name].first_arrival for name in states), default=0)
     recordings = tuple(r for name in states if (r := contents.recording(name, start)))
     if not recordings:
@@ -66,23 +58,8 @@ def read_bag(path: str | Path, on_read: OnRead = lambda done, size: None) -> Bag
     log = contents.log
     if log.losses:
         contents.notes.append(f"the recorder lost messages: {log.losses}")
-    return Bag(
-        Path(path),
-        start,
-        recordings,
-        log.events(start),
-        log.parameters,
-        tuple(contents.notes),
-        tuple(contents.problems),
-        contents.is_cut or contents.is_open,
-    )
-
-
-def _nothing(topics: dict[str, str]) -> str:
-    """Return why a recording with these topics, and no joint states, can't be reported."""
-    if not topics or any(leaf(topic) == STATES for topic in topics):
-        return "the recording is empty: it has no messages"
-    return f"the recording has no topic {STATES} of type {JOINT_STATE}; it has {', '.join(sorted(topics))}"
+    notes, problems, is_partial = tuple(contents.notes), tuple(contents.problems), contents.is_cut or contents.is_open
+    return Bag(Path(path), start, recordings, log.events(start), log.parameters, notes, problems, is_partial)
 
 
 class _Contents:
@@ -96,7 +73,6 @@ class _Contents:
         self.is_cut = False  # the file was cut short
         self.is_open = False  # an arm was not down at the end
         self._unreadable: set[str] = set()
-        self._types = get_typestore(Stores.ROS2_JAZZY)
 
     def add(self, batch: Batch) -> None:
         """Add a batch. An unreadable topic becomes a problem, and its later messages are ignored."""
@@ -110,7 +86,7 @@ class _Contents:
                 self.joints[batch.topic].add(batch.stamps, batch.data)
                 return
             for stamp, data in zip(batch.stamps, batch.data, strict=True):
-                self.log.add(batch.topic, stamp, self._types.deserialize_cdr(data, batch.msgtype))
+                self.log.add(batch.topic, stamp, TYPES.deserialize_cdr(data, batch.msgtype))
         except (DataError, SerdeError, ValueError, KeyError) as error:
             self._unreadable.add(batch.topic)
             self.joints.pop(batch.topic, None)
@@ -120,22 +96,20 @@ class _Contents:
     def recording(self, states: str, start: int) -> Recording | None:
         """Return the arm whose joint states are on the topic `states`; None if it is unreadable, which is a problem."""
         name = arm_of(states)
+        names = self.joints[states].names
         try:
-            names = self.joints[states].names
             arrival, stamp, values = self.joints[states].arrays()
             stamped = bool(np.all(np.diff(stamp) >= 0) and abs(np.median(arrival - stamp)) < MAX_CLOCK_OFFSET)
             clock, values = _in_order(stamp if stamped else arrival, values)
             command = self._commands(states, names, clock, stamped)
-            position, velocity, effort = (values[:, FIELDS.index(field)] for field in FIELDS)
+            position, velocity, effort = np.moveaxis(values, 1, 0)
             time = (clock - start) / 1e9
             end = float(time[-1])
             if open_end := self.log.open_end(name, start, end, self.is_cut):
                 self.notes.append(open_end)
                 self.is_open = True
-            carried = self.log.carried(name, start, end)
-            return Recording(
-                name, names, time, position, velocity, effort, command, self.log.steps(name, start), carried
-            )
+            steps, carried = self.log.steps(name, start), self.log.carried(name, start, end)
+            return Recording(name, names, time, position, velocity, effort, command, steps, carried)
         except DataError as error:
             self.problems.append(str(error))
             return None
@@ -187,26 +161,23 @@ class EventLog:
     def add(self, topic: str, stamp: int, message: Any) -> None:
         """Add one decoded message that arrived at `stamp` ns. Raises DataError for an invalid step."""
         if leaf(topic) == STEPS:
-            self._add_step(topic, stamp, message.data)
-        elif topic == DIAGNOSTICS:
+            try:
+                step = json.loads(message.data)
+                entry = stamp, str(step["action"]), float(step["duration"])
+            except (ValueError, KeyError, TypeError):
+                raise DataError(f"{topic}: invalid {STEPS} message") from None
+            self._steps.setdefault(arm_of(topic), []).append(entry)
+        elif topic == content.DIAGNOSTICS:
             for status in message.status:
                 self._add_status(stamp, status)
-        elif topic == PARAMETER_EVENTS:
+        elif topic == content.PARAMETER_EVENTS:
             for parameter in message.changed_parameters:
                 self._events.append((stamp, f"{message.node}: {parameter.name} = {_value(parameter.value)}"))
-        elif topic == LOSSES:
+        elif topic == content.LOSSES:
             self.losses = message.data
         else:
             node, _, text = message.data.partition(":")
             self.parameters[node.strip()] = f"{node}:{text}"
-
-    def _add_step(self, topic: str, stamp: int, text: str) -> None:
-        try:
-            step = json.loads(text)
-            entry = stamp, str(step["action"]), float(step["duration"])
-        except (ValueError, KeyError, TypeError):
-            raise DataError(f"{topic}: invalid {STEPS} message") from None
-        self._steps.setdefault(arm_of(topic), []).append(entry)
 
     def _add_status(self, stamp: int, status: Any) -> None:
         level = int(status.level)
@@ -228,10 +199,7 @@ class EventLog:
         """Return the script steps of an arm; each ends when the next one begins, at the latest."""
         steps = [((stamp - start) / 1e9, action, duration) for stamp, action, duration in self._steps.get(arm, [])]
         ends = [*(begin for begin, _, _ in steps[1:]), float("inf")]
-        return tuple(
-            ScriptedStep(action, begin, min(begin + duration, end))
-            for (begin, action, duration), end in zip(steps, ends, strict=False)
-        )
+        return tuple(ScriptedStep(name, at, min(at + s, end)) for (at, name, s), end in zip(steps, ends, strict=False))
 
     def carried(self, arm: str, start: int, end: float) -> tuple[Span, ...] | None:
         """Return when the arm was carried, by its reported states; None if no state of it was recorded.

@@ -51,18 +51,11 @@ class Batch(NamedTuple):
     data: list[bytes]
 
 
-class Announced(NamedTuple):
-    """What a file states about a topic: its type, the type's definition, and the publishers' quality of service."""
-
-    msgtype: str
-    definition: str
-    offered_qos: str
-
-
 class McapMessages:
     """The messages of one MCAP file, collected by channel.
 
-    After reading, `cut_short` describes where the file ends too early; None for a complete file. announced: by topic.
+    After reading, `cut_short` describes where the file ends too early; None for a complete file. announced: by topic,
+    the definition of its type and the publishers' quality of service.
     """
 
     def __init__(self, stream: BinaryIO, topics: dict[str, str], wanted: Wanted) -> None:
@@ -70,7 +63,7 @@ class McapMessages:
         if stream.read(len(MAGIC)) != MAGIC:
             raise DataError(f"{stream.name}: not an MCAP file, or empty")
         self.cut_short: str | None = None
-        self.announced: dict[str, Announced] = {}
+        self.announced: dict[str, tuple[str, str]] = {}
         self._stream = stream
         self._topics = topics
         self._wanted = wanted
@@ -112,7 +105,7 @@ class McapMessages:
     def _collected(self) -> Iterator[Batch]:
         for channel, batch in self._batches.items():
             if batch.stamps:
-                self._batches[channel] = Batch(batch.topic, batch.msgtype, [], [])
+                self._batches[channel] = batch._replace(stamps=[], data=[])
                 yield batch
 
     def _describe(self, opcode: int, body: bytes) -> None:
@@ -125,8 +118,7 @@ class McapMessages:
             msgtype = schema.name if schema else ""
             self._topics[channel.topic] = msgtype
             definition = schema.data.decode(errors="replace") if schema else ""
-            qos = channel.metadata.get("offered_qos_profiles", "")
-            self.announced[channel.topic] = Announced(msgtype, definition, qos)
+            self.announced[channel.topic] = definition, channel.metadata.get("offered_qos_profiles", "")
             if self._wanted(channel.topic, msgtype) and channel.id not in self._batches:
                 self._batches[channel.id] = Batch(channel.topic, msgtype, [], [])
 

@@ -9,10 +9,11 @@ delays this thread only: messages that find the queue full are lost and counted.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import queue
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import cast
 
@@ -22,7 +23,7 @@ from rosbags.rosbag2.metadata import parse_qos
 from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from exo_gravity.bag.storage import Announced, Batch, McapMessages, Storage
+from exo_gravity.bag.storage import Batch, McapMessages, Storage
 from exo_gravity.core.errors import DataError
 
 FLUSH_PERIOD = 0.5  # s
@@ -34,17 +35,17 @@ Message = tuple[str, int, bytes]  # topic, time of arrival in ns since 1970, ser
 
 def offered_qos(reliable: bool, transient_local: bool, depth: int) -> Qos:
     """Return the quality of service of a publisher in the form that rosbag2 stores with each topic."""
-    return Qos(
-        QosHistory.KEEP_LAST,
-        depth,
-        QosReliability.RELIABLE if reliable else QosReliability.BEST_EFFORT,
-        QosDurability.TRANSIENT_LOCAL if transient_local else QosDurability.VOLATILE,
-        FOREVER,
-        FOREVER,
-        QosLiveliness.AUTOMATIC,
-        FOREVER,
-        False,
-    )
+    reliability = QosReliability.RELIABLE if reliable else QosReliability.BEST_EFFORT
+    durability = QosDurability.TRANSIENT_LOCAL if transient_local else QosDurability.VOLATILE
+    automatic = QosLiveliness.AUTOMATIC
+    return Qos(QosHistory.KEEP_LAST, depth, reliability, durability, FOREVER, FOREVER, automatic, FOREVER, False)
+
+
+def _opened(folder: Path) -> Writer:
+    """Return a writer of a recording in the new `folder`. Raises WriterError or OSError."""
+    writer = Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
+    writer.open()
+    return writer
 
 
 class BagWriter:
@@ -61,10 +62,10 @@ class BagWriter:
         self.count = self.lost = 0
         self._types = get_typestore(Stores.ROS2_JAZZY)
         try:
-            self._writer = Writer(self.path, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
-            self._writer.open()
+            self._writer = _opened(self.path)
         except (WriterError, OSError) as error:
             raise DataError(f"{self.path}: cannot record there ({error})") from None
+        self._storage = cast(McapWriter, self._writer.storage)
         self._topics: dict[str, tuple[str, Qos]] = {}
         self._connections: dict[str, Connection] = {}
         self._waiting: queue.Queue[list[Message]] = queue.Queue(MAX_WAITING)
@@ -103,27 +104,23 @@ class BagWriter:
         self.close()
 
     def _run(self) -> None:
+        flush_at = time.monotonic() + FLUSH_PERIOD
         try:
-            self._write_until_end()
+            while not (self._ending.is_set() and self._waiting.empty()):
+                with contextlib.suppress(queue.Empty):
+                    self._take(self._waiting.get(timeout=0.05))
+                if time.monotonic() >= flush_at:
+                    flush_at = time.monotonic() + FLUSH_PERIOD
+                    if self._storage.chunk.bio.tell():
+                        self._storage.close_chunk()
+                        self._storage.bio.flush()
+            self._announce()
             self._writer.close()
         except Exception as error:  # of any kind: this thread must not end without a reason
             reason = getattr(error, "strerror", None) or str(error)
             self.error = DataError(f"{self.path}: recording ended after {self.count} messages: {reason}")
-            # Closing the file retries the failed write, whose error is already known.
-            if isinstance(self._writer.storage, McapWriter):
-                with contextlib.suppress(OSError):
-                    self._writer.storage.bio.close()
-
-    def _write_until_end(self) -> None:
-        flush_at = time.monotonic() + FLUSH_PERIOD
-        while not (self._ending.is_set() and self._waiting.empty()):
-            self._announce()
-            with contextlib.suppress(queue.Empty):
-                self._take(self._waiting.get(timeout=0.05))
-            if time.monotonic() >= flush_at:
-                self._flush()
-                flush_at = time.monotonic() + FLUSH_PERIOD
-        self._announce()
+            with contextlib.suppress(OSError):  # closing the file tries the failed write again
+                self._storage.bio.close()
 
     def _announce(self) -> None:
         """Add the topics that are new."""
@@ -143,15 +140,6 @@ class BagWriter:
             self._writer.write(connection, stamp, data)
             self.count += 1
 
-    def _flush(self) -> None:
-        storage = cast(McapWriter, self._writer.storage)
-        if storage.chunk.bio.tell():
-            storage.close_chunk()
-            storage.bio.flush()
-
-
-SUFFIX = "_repaired"
-
 
 def is_complete(path: str | Path) -> bool:
     """Return whether rosbags' own reader opens the recording. Raises DataError if there is none."""
@@ -169,56 +157,38 @@ def repair(path: str | Path) -> tuple[Path, int]:
     Raises DataError if the recording is not MCAP, has no message, or has been repaired before.
     """
     source = Storage(path)
-    other = next((file for file in source.files if file.suffix != ".mcap"), None)
-    if other:
+    if other := next((file for file in source.files if file.suffix != ".mcap"), None):
         raise DataError(f"{other}: must be an .mcap file; try `ros2 bag reindex`")
-    folder = source.path.resolve().with_name(f"{source.path.resolve().stem}{SUFFIX}")
-    copy = _Copy(folder)
+    folder = source.path.resolve().with_name(f"{source.path.resolve().stem}_repaired")
+    types, connections, count = get_typestore(Stores.ROS2_JAZZY), dict[str, Connection](), 0
+    batches = itertools.chain.from_iterable(map(_described, source.files))
+    if (first := next(batches, None)) is None:
+        raise DataError(f"{folder}: not written: the recording has no message")
     try:
-        for file in source.files:
-            with file.open("rb") as stream:
-                messages = McapMessages(stream, {}, lambda topic, msgtype: bool(msgtype))
-                for batch in messages.batches():
-                    copy.add(batch, messages.announced[batch.topic])
-        return folder, copy.close()
+        writer = _opened(folder)
+        for batch, definition, qos in itertools.chain([first], batches):
+            if batch.topic not in connections:
+                if batch.msgtype not in types.fielddefs:
+                    types.register(get_types_from_msg(definition, batch.msgtype))
+                connections[batch.topic] = writer.add_connection(
+                    batch.topic, batch.msgtype, typestore=types, offered_qos_profiles=parse_qos(qos)
+                )
+            for stamp, data in zip(batch.stamps, batch.data, strict=True):
+                writer.write(connections[batch.topic], stamp, data)
+            count += len(batch.stamps)
+        writer.close()
+        with Reader(folder) as reader:
+            found = sum(1 for _ in reader.messages())
     except (WriterError, OSError) as error:
         raise DataError(f"{folder}: cannot write the repaired recording ({error})") from None
+    if found != count:
+        raise DataError(f"{folder}: {found} messages can be read: must be {count}")
+    return folder, count
 
 
-class _Copy:
-    """The copy, which is created with its first message."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._types = get_typestore(Stores.ROS2_JAZZY)
-        self._writer: Writer | None = None
-        self._connections: dict[str, Connection] = {}
-        self._count = 0
-
-    def add(self, batch: Batch, announced: Announced) -> None:
-        """Write the messages of one topic."""
-        if self._writer is None:
-            self._writer = Writer(self._folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
-            self._writer.open()
-        if batch.topic not in self._connections:
-            self._connections[batch.topic] = self._announce(self._writer, batch.topic, announced)
-        for stamp, data in zip(batch.stamps, batch.data, strict=True):
-            self._writer.write(self._connections[batch.topic], stamp, data)
-        self._count += len(batch.stamps)
-
-    def _announce(self, writer: Writer, topic: str, announced: Announced) -> Connection:
-        msgtype, definition, qos = announced
-        if msgtype not in self._types.fielddefs:
-            self._types.register(get_types_from_msg(definition, msgtype))
-        return writer.add_connection(topic, msgtype, typestore=self._types, offered_qos_profiles=parse_qos(qos))
-
-    def close(self) -> int:
-        """Complete the copy, check that it can be read, and return the number of its messages."""
-        if self._writer is None:
-            raise DataError(f"{self._folder}: not written: the recording has no message")
-        self._writer.close()
-        with Reader(self._folder) as reader:
-            found = sum(1 for _ in reader.messages())
-        if found != self._count:
-            raise DataError(f"{self._folder}: {found} messages can be read: must be {self._count}")
-        return found
+def _described(file: Path) -> Iterator[tuple[Batch, str, str]]:
+    """Yield each batch of an MCAP file with the definition of its type and its quality of service."""
+    with file.open("rb") as stream:
+        messages = McapMessages(stream, {}, lambda topic, msgtype: bool(msgtype))
+        for batch in messages.batches():
+            yield batch, *messages.announced[batch.topic]

@@ -22,7 +22,7 @@ from std_msgs.msg import String
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS
-from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.core.trial.script import Step, TrialScript
 from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.nodes.ros.hot_path import LATCHED
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
@@ -119,17 +119,14 @@ class Simulator(Node):
             rates = pitch_step / self._trunk_period, roll_step / self._trunk_period
             state = TrunkState(device.pitch, device.roll, *rates)
         if self._imu_publisher:
-            self._imu_publisher.publish(self._imu_message(state))
-
-    def _imu_message(self, state: TrunkState) -> Imu:
-        sample = self._imu.sample_of(state)
-        message = Imu()
-        message.header.stamp = self.get_clock().now().to_msg()
-        message.header.frame_id = "imu"
-        message.orientation_covariance[0] = -1.0  # REP-145: no orientation
-        for vector, value in zip((message.angular_velocity, message.linear_acceleration), sample, strict=True):
-            vector.x, vector.y, vector.z = value.tolist()
-        return message
+            message = Imu()
+            message.header.stamp = self.get_clock().now().to_msg()
+            message.header.frame_id = "imu"
+            message.orientation_covariance[0] = -1.0  # REP-145: no orientation
+            readings = self._imu.sample_of(state)
+            for vector, value in zip((message.angular_velocity, message.linear_acceleration), readings, strict=True):
+                vector.x, vector.y, vector.z = value.tolist()
+            self._imu_publisher.publish(message)
 
     def _follow_wearer(self) -> None:
         """Start the wearer when the motors are on, and publish each new step."""
@@ -140,13 +137,12 @@ class Simulator(Node):
             self._start_wearer(self._script, self._delay)
         if self._wearer is None or self._wearer.step is None or self._wearer.step == self._published_step:
             return
-        step, steps = self._wearer.step, self._wearer.script.steps
-        self._published_step = step
-        content = {"step": step, "of": len(steps), "action": "done", "duration": 0.0}
-        if step < len(steps):
-            content.update(action=steps[step].action, duration=steps[step].duration)
+        number, steps = self._wearer.step, self._wearer.script.steps
+        self._published_step = number
+        step = steps[number] if number < len(steps) else Step("done", 0.0)
+        content = {"step": number, "of": len(steps), "action": step.action, "duration": step.duration}
         self._step_publisher.publish(String(data=json.dumps(content)))
-        self.get_logger().info(f"wearer: {content['action']} ({step} of {len(steps)})")
+        self.get_logger().info(f"wearer: {step.action} ({number} of {len(steps)})")
 
     def _start_wearer(self, script: TrialScript, delay: float) -> None:
         self._script, self._published_step = script, None
@@ -162,21 +158,19 @@ class Simulator(Node):
             "time lost (ms)": f"{1000.0 * device.slip:.0f}",
             "disconnected": "yes" if device.disconnected else "no",
         }
+        level, message = OK, "running"
         if gaps.longest_stall > MAX_CATCH_UP:
-            message = f"stalled for {1000.0 * gaps.longest_stall:.0f} ms: this computer is too busy"
-            self._diagnostics.report(WARN, message, values)
+            level, message = WARN, f"stalled for {1000.0 * gaps.longest_stall:.0f} ms: this computer is too busy"
         elif device.disconnected:
-            self._diagnostics.report(WARN, "a simulated fault disconnects a motor", values)
-        else:
-            self._diagnostics.report(OK, "running", values)
+            level, message = WARN, "a simulated fault disconnects a motor"
+        self._diagnostics.report(level, message, values)
 
     # ROS callbacks
 
     def _check_parameters(self, changes: Sequence[Parameter]) -> SetParametersResult:
         try:
-            values = values_after(self, SIMULATOR, changes)
-            if values["trial"]:
-                script_of(values["trial"])
+            if path := values_after(self, SIMULATOR, changes)["trial"]:
+                script_of(path)
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

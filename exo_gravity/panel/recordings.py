@@ -131,11 +131,9 @@ class Recordings:
 
     async def save(self) -> str:
         """Write the parameters in force as YAML, from which `launcher` starts."""
-        content = {
-            node: {"ros__parameters": nested(values)}
-            for node, values in self._device.parameters().items()
-            if values and not node.endswith(("/recorder", "/panel"))
-        }
+        nodes = self._device.parameters().items()
+        given = {node: values for node, values in nodes if values and not node.endswith(("/recorder", "/panel"))}
+        content = {node: {"ros__parameters": nested(values)} for node, values in given.items()}
         if not content:
             return "no node has been found yet"
         text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
@@ -198,10 +196,10 @@ class Recordings:
         failed = await trial.wait() not in (0, 1)
         name, problem = self._progress["name"], refused or self._progress.get("problem", "")
         problem = problem or (lines[-1] if failed and lines else "")
-        report = self._folder / "report.html" if self._folder else None
-        key = report.parent.name if report and report.is_file() else ""
-        if report and key:
-            self._reports[key] = report
+        key = ""
+        if self._folder and (self._folder / "report.html").is_file():
+            key = self._folder.name
+            self._reports[key] = self._folder / "report.html"
         self._progress = {"phase": "done", "name": name, "problem": problem, "report": key}
         self._note(f"trial {name} has ended: {problem or 'done'}")
 

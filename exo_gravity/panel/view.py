@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from exo_gravity.core.errors import ExoGravityError
-from exo_gravity.core.view.arm_description import described
-from exo_gravity.core.view.urdf import urdf
+from exo_gravity.core.view.urdf import described, urdf
 from exo_gravity.panel.params import SETTABLE
 
 Values = Mapping[str, Any]

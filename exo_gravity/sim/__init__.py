@@ -4,18 +4,9 @@ It knows nothing of the compensator: CAN frames and IMU samples are the only con
 
     motors = [SimulatedMotor(JointMotor(MOTORS["AK60-6"], can_id=1)), ...]     four, shoulder to elbow
     device = SimulatedDevice(SimulatedArm(ArmConfig()), motors, side="right")
-    device.start(VirtualWearer(script), delay=2.0)     progress: wearer.step
+    device.start(VirtualWearer(script), delay=2.0)
     device.run(bus, stop.is_set)                                               real time, on any python-can bus
-
-or without a bus, as fast as possible:
-
-    reply = device.exchange(can_id, data)                                      (ID, data) of the reply, or None
-    device.advance(0.005)
-
-Faults and tilt may be set from any thread: `device.pitch`, `device.roll`, `device.bus_silent`,
-`device.motors[n].unplugged`, `.temperature`, `.error`. The true state: `device.time`, `device.arm.positions`,
-`.velocities`. A script moves the trunk, too: `device.trunk` is its motion, and `SimulatedImu(ImuConfig(...)).sample_of`
-what its IMU measures.
+    device.exchange(can_id, data); device.advance(0.005)                       or without a bus, as fast as possible
 """
 
 from exo_gravity.sim.arm import STEP, ArmConfig, SimulatedArm

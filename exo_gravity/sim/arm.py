@@ -28,7 +28,7 @@ import numpy as np
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import MAX_LENGTH, MAX_MASS, ArmModel
 from exo_gravity.core.model.moments import MAX_OFFSET
-from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.model.tilt import gravity_in_trunk
 from exo_gravity.core.numbers import JOINT_COUNT, four_floats
 from exo_gravity.core.params import check_owned, owned
 from exo_gravity.sim.trunk_motion import TrunkState, Vector
@@ -114,13 +114,9 @@ def felt_in_base(side: str, state: TrunkState, gravity: float) -> tuple[Vector, 
 
     Gravity less acceleration in m/s^2, angular velocity in rad/s, angular acceleration in rad/s^2. gravity: m/s^2.
     """
-    down, acceleration = Tilt.of(side, state.pitch, state.roll).direction, in_base(side, state.acceleration)
-    x, y, z = (gravity * component - a for component, a in zip(down, acceleration, strict=True))
-    return (
-        (x, y, z),
-        rotation_in_base(side, state.angular_velocity),
-        rotation_in_base(side, state.angular_acceleration),
-    )
+    felt = gravity * gravity_in_trunk(state.pitch, state.roll) - state.acceleration
+    turning, spin_up = state.angular_velocity, state.angular_acceleration
+    return in_base(side, felt.tolist()), rotation_in_base(side, turning), rotation_in_base(side, spin_up)
 
 
 class SimulatedArm:
@@ -144,14 +140,12 @@ class SimulatedArm:
     @property
     def positions(self) -> list[float]:
         """Joint angles (4,) in rad."""
-        positions: list[float] = self._theta.tolist()
-        return positions
+        return list(self._theta.tolist())
 
     @property
     def velocities(self) -> list[float]:
         """Joint velocities (4,) in rad/s."""
-        velocities: list[float] = self._velocity.tolist()
-        return velocities
+        return list(self._velocity.tolist())
 
     def reset(self, theta: Sequence[float]) -> None:
         """Put the arm at rest at `theta`, (4,) rad."""

@@ -89,7 +89,9 @@ class CanLink:
         if message is None or message.is_error_frame or message.is_fd:
             return None, 0.0
         frame = message.arbitration_id | (EXTENDED if message.is_extended_id else 0), bytes(message.data)
-        if self._is_echo(frame):
+        if frame in self._pending:
+            self._pending.remove(frame)
+            self._echo_seen = True
             return None, 0.0
         return frame, max(0.0, time.time() - message.timestamp)
 
@@ -101,25 +103,17 @@ class CanLink:
                 self._no_echo = not self._echo_seen
                 self._pending.clear()
         frame_id, data = frame
+        message = can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED)
         try:
-            self._bus.send(
-                can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED)
-            )
+            self._bus.send(message)
         except can.CanError as error:
             raise BusError(f"sending on {self._bus.channel_info} failed: {error}") from error
-
-    def _is_echo(self, frame: Frame) -> bool:
-        if frame not in self._pending:
-            return False
-        self._pending.remove(frame)
-        self._echo_seen = True
-        return True
 
 
 class SimulatedDevice:
     """An arm with four motors, on a trunk that moves, and optionally a wearer who moves both.
 
-    motors: shoulder to elbow, with different CAN IDs. side: 'left' or 'right'. seed: of the reply delays.
+    motors: shoulder to elbow, with different CAN IDs. side: 'left' or 'right'.
 
     May be set from any thread: `pitch` and `roll` of the trunk in rad; `bus_silent` (frames pass in neither direction,
     and the motors keep their last commands); `cut_off`, the same for each motor (4,); `encoder_error` (4,) rad, added
@@ -128,7 +122,7 @@ class SimulatedDevice:
     of `run`.
     """
 
-    def __init__(self, arm: SimulatedArm, motors: Sequence[SimulatedMotor], side: str = "right", seed: int = 0) -> None:
+    def __init__(self, arm: SimulatedArm, motors: Sequence[SimulatedMotor], side: str = "right") -> None:
         ids = [motor.joint.can_id for motor in motors]
         if len(ids) != JOINT_COUNT or len(set(ids)) != JOINT_COUNT:
             raise ParameterError("can_id", ids, f"{JOINT_COUNT} different IDs, one per joint")
@@ -144,7 +138,7 @@ class SimulatedDevice:
         self.slip = 0.0
         self.gaps = GapMeter()
         self._joint_of_id = {can_id: joint for joint, motor in enumerate(motors) for can_id in motor.received_ids}
-        self._random = random.Random(seed)
+        self._random = random.Random(0)  # of the delays of replies
         self._steps = 0
         self._clock = 0.0  # s elapsed, of which `time` is the part in whole steps
         self._trial: tuple[VirtualWearer, float] | None = None  # the wearer, and the time at which the script starts
@@ -278,11 +272,10 @@ class SimulatedDevice:
                 motor.unplugged = False
         torque = list(map(SimulatedMotor.torque, self.motors, theta, velocity))
         given: Torque = NO_TORQUE
-        step = -1
+        step = None
         if self._trial is not None:
             wearer, start = self._trial
-            given = wearer.torque(self.time - start, theta, velocity)
-            step = -1 if wearer.step is None else wearer.step
+            given, step = wearer.torque(self.time - start, theta, velocity), wearer.step
             self._follow_trunk(wearer.script, self.time - start)
         if self.truth:
             self.truth.note(self.time, theta, velocity, torque, self.motors, self._frames, (given, step))

@@ -46,10 +46,8 @@ class ImuConfig:
     accelerometer_range: float = 16.0 * STANDARD_GRAVITY
     #: Of the sensor's filters: MPU-6050 register map, low-pass of 94 Hz.
     delay: float = owned(0.003, "delay of the IMU's readings behind their stamps", (0.0, 0.1), "s")
-    #: (3,) m from the shoulder, in the trunk's axes.
-    position: Sequence[float] = (0.0, 0.0, 0.0)
-    #: m/s^2.
-    gravity: float = STANDARD_GRAVITY
+    position: Sequence[float] = (0.0, 0.0, 0.0)  #: (3,) m from the shoulder, in the trunk's axes
+    gravity: float = STANDARD_GRAVITY  #: m/s^2
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -14,7 +14,6 @@ What a V3 board does (CubeMars driver manual V3.0.0; frames in core/motors/wire_
 
 from __future__ import annotations
 
-import heapq
 import math
 import random
 from collections.abc import Iterator, Sequence
@@ -25,7 +24,6 @@ from exo_gravity.core.motors.bus_load import MAX_STATUS_RATE
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, SET_ZERO, MotorCommand, MotorReply, pack_reply, unpack_command
 from exo_gravity.core.motors.wire_formats import EXTENDED, MASTER_ID, MIT_V3, MODE_CURRENT, Frame
-from exo_gravity.core.numbers import one_float
 from exo_gravity.core.params import owned
 
 _NO_COMMAND = MotorCommand(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -38,19 +36,14 @@ class Firmware:
     reply_to_master: bool = owned(False, "replies carry ID 0 instead of the motor's own")
     #: 6 without temperature and error.
     reply_length: int = owned(8, "bytes of a reply, 6 or 8", (6, 8))
-    #: s for which the motor ignores frames after SET_ZERO; users report 0.5 to 1.5.
-    zero_silence: float = 1.0
+    zero_silence: float = 1.0  #: s for which the motor ignores frames after SET_ZERO; users report 0.5 to 1.5
     #: Standard deviation of one reply.
     current_noise: float = owned(0.0, "noise of the torque in replies, as a share of it", (0.0, 0.5))
-    #: Status frames per s of a V3 board.
-    status_rate: float = MAX_STATUS_RATE
+    status_rate: float = MAX_STATUS_RATE  #: status frames per s of a V3 board
 
     def __post_init__(self) -> None:
         if self.reply_length not in (6, 8):
             raise ParameterError("reply_length", self.reply_length, "6 or 8 bytes")
-        one_float("zero_silence", self.zero_silence, 0.0, 10.0, "s")
-        one_float("current_noise", self.current_noise, 0.0, 0.5)
-        one_float("status_rate", self.status_rate, 1.0, MAX_STATUS_RATE, "Hz")
 
 
 class SimulatedMotor:
@@ -121,7 +114,7 @@ class SimulatedMotor:
         The motor's kp (p_des - p) + kd (v_des - v) + t_ff, times `torque_scale`, clamped to the peak torque.
         """
         if self.unplugged:
-            self._forget()
+            self.entered, self._command, self._data, self._silent_until = False, _NO_COMMAND, b"", -math.inf
         if not self.entered:
             return 0.0
         joint, command = self.joint, self._command
@@ -144,17 +137,8 @@ class SimulatedMotor:
         )
 
     def _reply(self, position: float, velocity: float) -> bytes:
-        values = self._readings(position, velocity)
-        spec, can_id = self.joint.spec, self.joint.can_id
-        if self.firmware.reply_length == 6:
-            return pack_reply(spec, can_id, *values)
-        temperature = round(max(-40.0, min(215.0, self.temperature)))
-        return pack_reply(spec, can_id, *values, temperature, self.error)
-
-    def _forget(self) -> None:
-        self.entered = False
-        self._command, self._data = _NO_COMMAND, b""
-        self._silent_until = -math.inf
+        extra = (round(max(-40.0, min(215.0, self.temperature))), self.error) if self.firmware.reply_length == 8 else ()
+        return pack_reply(self.joint.spec, self.joint.can_id, *self._readings(position, velocity), *extra)
 
 
 def clamp(value: float, limit: float) -> float:
@@ -204,26 +188,22 @@ class StatusTimer:
     """When each V3 board among `motors` sends its next status frame, from `now` (s) on."""
 
     def __init__(self, motors: Sequence[SimulatedMotor], now: float, rng: random.Random) -> None:
-        self._periods = {
-            joint: 1.0 / motor.firmware.status_rate
-            for joint, motor in enumerate(motors)
-            if isinstance(motor, SimulatedV3Motor)
-        }
-        self._due = [(now + rng.uniform(0.0, period), joint) for joint, period in self._periods.items()]
-        heapq.heapify(self._due)
+        boards = {joint: motor for joint, motor in enumerate(motors) if isinstance(motor, SimulatedV3Motor)}
+        self._periods = {joint: 1.0 / motor.firmware.status_rate for joint, motor in boards.items()}
+        self._next = {joint: now + rng.uniform(0.0, period) for joint, period in self._periods.items()}
 
     @property
     def next(self) -> float:
         """The time in s of the next status frame; infinity for none."""
-        return self._due[0][0] if self._due else math.inf
+        return min(self._next.values(), default=math.inf)
 
     def due(self, now: float) -> Iterator[int]:
         """Yield each joint whose status frame is due at `now` (s), once; frames that were missed are not made up."""
-        while self.next <= now:
-            due, joint = self._due[0]
-            period = self._periods[joint]
-            heapq.heapreplace(self._due, (max(due, now - period) + period, joint))
-            yield joint
+        for joint, period in self._periods.items():
+            if self._next[joint] <= now:
+                following = self._next[joint] + period
+                self._next[joint] = following if following > now else now + period
+                yield joint
 
 
 def simulated_motor(joint: JointMotor, firmware: Firmware | None = None) -> SimulatedMotor:

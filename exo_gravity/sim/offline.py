@@ -26,7 +26,7 @@ from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import Drive, State
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.core.trial.recording import Recording, ScriptedStep
+from exo_gravity.core.trial.recording import Recording, ScriptedStep, Span
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.trunk_motion import TrunkState
@@ -45,11 +45,9 @@ CARRIED = (State.RAMPING_IN, State.ACTIVE)
 class TrunkReading(NamedTuple):
     """What the `imu` node publishes, vectors (3,) in the trunk's axes."""
 
-    #: Unit vector.
-    gravity: Sequence[float]
-    #: m/s^2 and rad/s, as measured.
-    specific_force: Sequence[float]
-    angular_velocity: Sequence[float]
+    gravity: Sequence[float]  #: unit vector
+    specific_force: Sequence[float]  #: m/s^2, as measured
+    angular_velocity: Sequence[float]  #: rad/s, as measured
 
 
 class TrunkSensor(Protocol):
@@ -71,12 +69,9 @@ class ArmSetup:
     motors: Sequence[JointMotor]
     limits: Limits
     settings: Settings
-    #: Control cycles per s.
-    rate: float
-    #: Pitch and roll of the trunk in rad as measured, None without an IMU.
-    tilt: tuple[float, float] | None
-    #: The IMU of a trunk that moves, in place of `tilt`.
-    trunk: TrunkSensor | None = None
+    rate: float  #: control cycles per s
+    tilt: tuple[float, float] | None  #: pitch and roll of the trunk in rad as measured, None without an IMU
+    trunk: TrunkSensor | None = None  #: the IMU of a trunk that moves, in place of `tilt`
 
 
 class OfflineTrial:
@@ -93,7 +88,7 @@ class OfflineTrial:
         self._wearer = VirtualWearer(script)
         self._delay = delay
         self._start = math.inf  # s, of the script
-        self._carried: list[float] = []  # s, the first and the last time at which the motors carried the arm
+        self._carried: tuple[Span, ...] = ()  # from the first to the last time at which the motors carried the arm
         self._safety = SafetyMachine(arm.limits, 1.0 / arm.rate, peaks_of(arm.motors))
         self._compensator = Compensator(arm.settings)
         # The newest efforts, and when the readings that they answer were taken.
@@ -143,11 +138,13 @@ class OfflineTrial:
         arm, (effort, _) = self.arm, self._efforts
         self._exchange(self._safety.step(now, tuple(self._samples), *self._efforts), now)
         if self._safety.state in CARRIED:
-            self._carried[:] = (*self._carried[:1], now)
+            self._carried = ((self._carried[0][0] if self._carried else now, now),)
         position = [joint.position for joint in self._samples]
         if not any(arm.limits.is_silent(now, joint) for joint in self._samples):
-            self._record(now, position, effort)
-            answer = self._compensator.step(now, position, [joint.velocity for joint in self._samples])
+            velocity = [joint.velocity for joint in self._samples]
+            for values in ((now,), position, velocity, [joint.effort for joint in self._samples], effort or NO_COMMAND):
+                self._rows.extend(values)
+            answer = self._compensator.step(now, position, velocity)
             self._efforts = answer.effort, min(joint.time for joint in self._samples)
             if answer.reason and answer.reason != self._reason:
                 self._note(now, f"withdrawn: {answer.reason}")
@@ -209,13 +206,6 @@ class OfflineTrial:
     def _note(self, now: float, text: str) -> None:
         self.events.append((now, f"{self.arm.name}: {text}"))
 
-    def _record(self, now: float, position: Sequence[float], effort: Sequence[float] | None) -> None:
-        self._rows.append(now)
-        self._rows.extend(position)
-        self._rows.extend([joint.velocity for joint in self._samples])
-        self._rows.extend([joint.effort for joint in self._samples])
-        self._rows.extend(effort or NO_COMMAND)
-
     def _recording(self) -> Recording:
         if not self._rows:
             raise DataError(self.trouble or f"{self.arm.name}: nothing was recorded")
@@ -229,6 +219,5 @@ class OfflineTrial:
             for step, start in zip(steps, starts, strict=False)
             if start < end
         )
-        carried = ((self._carried[0], self._carried[1]),) if len(self._carried) == 2 else ()
         name, joint_names = self.arm.name, self.arm.limits.joint_names
-        return Recording(name, joint_names, table[:, 0], position, velocity, effort, command, script, carried)
+        return Recording(name, joint_names, table[:, 0], position, velocity, effort, command, script, self._carried)

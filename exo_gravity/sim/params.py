@@ -66,11 +66,7 @@ def device_of(values: Mapping[str, Any]) -> SimulatedDevice:
     """Return the device that parameter values describe, with its trunk tilted. Raises ParameterError."""
     links = ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"], gravity=values["gravity"])
     arm = ArmConfig(links, **{field: values[name] for field, name in ARM_FIELDS.items()})
-    firmware = Firmware(
-        values["reply_to_master"],
-        values["reply_length"],
-        current_noise=values["current_noise"],
-    )
+    firmware = Firmware(values["reply_to_master"], values["reply_length"], current_noise=values["current_noise"])
     motors = [simulated_motor(motor, firmware) for motor in motors_of(values)]
     device = SimulatedDevice(SimulatedArm(arm), motors, values["side"])
     device.pitch, device.roll = values["trunk.pitch"], values["trunk.roll"]

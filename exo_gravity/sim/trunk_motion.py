@@ -28,17 +28,15 @@ DESCENT, IMPACT = 0.5, 0.1
 
 
 class TrunkState(NamedTuple):
-    """The trunk at one moment."""
+    """The trunk at one moment, in rad, rad/s and rad/s^2."""
 
-    #: rad, rad/s and rad/s^2.
     pitch: float = 0.0
     roll: float = 0.0
     pitch_rate: float = 0.0
     roll_rate: float = 0.0
     pitch_acceleration: float = 0.0
     roll_acceleration: float = 0.0
-    #: Of the shoulder without gravity, (3,) m/s^2 in the trunk's axes.
-    acceleration: Vector = NONE
+    acceleration: Vector = NONE  #: of the shoulder without gravity, (3,) m/s^2 in the trunk's axes
 
     @property
     def angular_velocity(self) -> Vector:
@@ -83,17 +81,14 @@ class Walk:
 
     start: tuple[float, float]
     duration: float
-    #: Per s.
-    stride: float = 0.95
+    stride: float = 0.95  #: per s
     #: Amplitudes in m/s^2 at the frequency of the steps, for the heel strike (vertical) at twice that.
     vertical: float = 0.23 * STANDARD_GRAVITY
     heel_strike: float = 0.06 * STANDARD_GRAVITY
     forward: float = 0.14 * STANDARD_GRAVITY
-    #: Amplitude in m/s^2 at the frequency of the strides.
-    lateral: float = 0.14 * STANDARD_GRAVITY
-    #: Amplitudes in rad at the frequency of the steps and of the strides.
-    pitch_sway: float = math.radians(1.0)
-    roll_sway: float = math.radians(2.0)
+    lateral: float = 0.14 * STANDARD_GRAVITY  #: m/s^2, at the frequency of the strides
+    pitch_sway: float = math.radians(1.0)  #: rad, at the frequency of the steps
+    roll_sway: float = math.radians(2.0)  #: rad, at the frequency of the strides
 
     def at(self, elapsed: float) -> TrunkState:
         """Return the trunk's state `elapsed` s after the motion began."""

@@ -62,15 +62,13 @@ class TruthLog:
         torque: Sequence[float],
         motors: Sequence[SimulatedMotor],
         frames: Sequence[int],
-        wearer: tuple[Sequence[float], int],
+        wearer: tuple[Sequence[float], int | None],
     ) -> None:
-        """Append the state of the arm at the simulated time `now` (s); sequences are (4,); wearer: torque and step."""
-        stamp = now + self._offset
-        damping = [motor.damping for motor in motors]
-        entered = [motor.entered for motor in motors]
-        self._rows += _ROW.pack(
-            stamp, *position, *velocity, *torque, *damping, *wearer[0], *frames, wearer[1], *entered
-        )
+        """Append the state of the arm at the simulated time `now` (s); sequences are (4,); wearer: torque, step."""
+        stamp, (given, step) = now + self._offset, wearer
+        damping, entered = [motor.damping for motor in motors], [motor.entered for motor in motors]
+        number = -1 if step is None else step
+        self._rows += _ROW.pack(stamp, *position, *velocity, *torque, *damping, *given, *frames, number, *entered)
         if abs(stamp - self._flushed) >= FLUSH_PERIOD:
             self._flushed = stamp
             self._file.write(self._rows)

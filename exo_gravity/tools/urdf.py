@@ -15,8 +15,7 @@ from pathlib import Path
 
 from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.core.model.tilt import SIDES
-from exo_gravity.core.view.arm_description import described
-from exo_gravity.core.view.urdf import urdf
+from exo_gravity.core.view.urdf import described, urdf
 from exo_gravity.tools.inputs.arms import configured_arm, configured_arms, named
 
 

@@ -53,7 +53,7 @@ def test_a_database_cut_short_gives_the_rows_before(recording, content, tmp_path
 
 def test_an_empty_recording_is_reported_as_empty(tmp_path):
     topics = [("/right/joint_states", made.JOINT_STATE)]
-    with pytest.raises(DataError, match="empty"):
+    with pytest.raises(DataError, match="is empty: it has no messages"):
         read_bag(made.write_bag(tmp_path / "bag", [], topics=topics))
 
 

@@ -8,7 +8,6 @@ import pytest
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.view.arm_description import ArmDescription
 from exo_gravity.core.view.scene import (
     AMBER,
     GREEN,
@@ -24,7 +23,7 @@ from exo_gravity.core.view.scene import (
     gravity_shapes,
     state_of,
 )
-from exo_gravity.core.view.urdf import urdf
+from exo_gravity.core.view.urdf import ArmDescription, urdf
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")
 ROBOT = ArmModel((0.05, 0.13, 0.3, 0.3), (0.04, 0.1, 0.2, 0.15), (0.6, 0.5, 0.6, 0.2))

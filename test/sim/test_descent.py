@@ -87,7 +87,7 @@ class Lowered:
         return fastest
 
 
-@pytest.mark.parametrize("friction", [0.0, 0.05, 0.5])
+@pytest.mark.parametrize("friction", [0.0, 0.01, 0.05, 0.2, 0.5])
 @pytest.mark.parametrize("body_mass", [0.0, 75.0])
 def test_a_horizontal_arm_comes_down_slowly_in_15_s_and_does_not_drop_when_its_motors_are_switched_off(
     friction, body_mass

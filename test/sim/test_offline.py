@@ -132,6 +132,14 @@ def test_a_stop_lets_the_arm_down_and_keeps_the_recording():
     assert not any(motor.entered for motor in trial.arm.device.motors)
 
 
+def test_a_stop_before_the_arm_is_carried_ends_the_trial_with_the_motors_off_and_keeps_the_recording():
+    trial = make()
+    recording = trial.run(lambda now: now >= 4.0)
+    assert trial.trouble == "right: stopped by the operator"
+    assert 6.0 < recording.time[-1] < 30.0  # of letting down
+    assert not any(motor.entered for motor in trial.arm.device.motors)
+
+
 def test_without_a_tilt_the_arm_is_never_carried_and_the_reason_is_given():
     trial = make(tilt=None)
     assert trial.run().carried == ()

@@ -21,15 +21,7 @@ from itertools import pairwise
 import numpy as np
 
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.trial.recording import (
-    MARGIN,
-    Blocks,
-    Recording,
-    Span,
-    in_blocks,
-    position_resolution,
-    still_spans,
-)
+from exo_gravity.core.trial.recording import MARGIN, Blocks, Recording, Span, in_blocks, still_spans
 from exo_gravity.core.trial.script import TRUNK_ACTIONS
 
 MIN_HOLD = 2.0  # s
@@ -103,7 +95,9 @@ class TrialAnalysis:
 def analyse(recording: Recording, min_hold: float = MIN_HOLD) -> TrialAnalysis:
     """Return the holds of at least `min_hold` s, the motions between them and, with a script, the releases."""
     blocks = in_blocks(recording)
-    resolution = np.array([position_resolution(column) for column in recording.position.T])
+    steps = np.abs(np.diff(recording.position, axis=0))
+    smallest = steps.min(axis=0, initial=math.inf, where=steps > 1e-6)
+    resolution = np.where(np.isfinite(smallest), smallest, 0.0)  # rad, one position code; 0 if no step occurred
     shortest = max(min_hold, 4 * blocks.length) - 1e-6  # a slope requires three whole blocks
     spans = [(start, end) for start, end in still_spans(recording, blocks) if end - start >= shortest]
     motions = tuple(_motion(recording, blocks, *ends) for ends in pairwise(spans))
@@ -175,10 +169,8 @@ def _motion(recording: Recording, blocks: Blocks, left: Span, right: Span) -> Mo
     after = blocks.mean[blocks.between(right[0], min(right[1], right[0] + POSE_TIME))].mean(axis=0)
     within = blocks.between(left[1], right[0])
     samples = slice(*blocks.sample[[within.start, within.stop]])
-    away = recording.position[samples] - before
-    away = away if len(away) else np.zeros((1, JOINT_COUNT))
-    settled = right[1] > right[0]
-    residual = after - before
+    away = np.vstack((np.zeros(JOINT_COUNT), recording.position[samples] - before))
+    settled, residual = right[1] > right[0], after - before
     return Motion(
         kind=_kind(recording, left[1], right[0], bool(blocks.empty[within].any()), residual),
         start=left[1],
@@ -242,15 +234,14 @@ def failures(recording: Recording, trial: TrialAnalysis, criteria: HoldCriteria)
         never = "carried" if recording.carried == () else "still for long enough to count as a hold"
         found.append(f"the arm was never {never}")
     for hold in trial.holds:
-        stray = criteria.max_stray_after_push if hold.after == "push" else criteria.max_stray
-        for joint, name in enumerate(recording.joint_names):
+        most = criteria.max_stray_after_push if hold.after == "push" else criteria.max_stray
+        for name, stray, rate in zip(recording.joint_names, hold.stray, hold.drift_rate, strict=True):
             where = f"{hold.start:.1f}-{hold.end:.1f} s: {name}"
-            if hold.stray[joint] > stray:
-                found.append(f"{where} strayed {_degrees(hold.stray[joint])} within 10 s, more than {_degrees(stray)}")
-            rate = 60.0 * hold.drift_rate[joint]
-            if abs(rate) > 60.0 * criteria.max_rate and hold.duration >= criteria.rated_from:
-                allowed = _degrees(60.0 * criteria.max_rate)
-                found.append(f"{where} drifted {_degrees(rate)} per minute, more than {allowed}")
+            if stray > most:
+                found.append(f"{where} strayed {_degrees(stray)} within 10 s, more than {_degrees(most)}")
+            if abs(rate) > criteria.max_rate and hold.duration >= criteria.rated_from:
+                per_minute, allowed = _degrees(60.0 * rate), _degrees(60.0 * criteria.max_rate)
+                found.append(f"{where} drifted {per_minute} per minute, more than {allowed}")
     for motion in trial.motions:
         peak = np.max(np.abs(motion.peak))
         if motion.kind == "slip" and peak > criteria.max_stray:

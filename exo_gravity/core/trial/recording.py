@@ -6,7 +6,6 @@ motor at rest reports half a step. Position has steps of 0.38 mrad, and `STILL_S
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -115,9 +114,3 @@ def still_spans(recording: Recording, blocks: Blocks) -> Iterator[Span]:
         start, end = blocks.time[max(first - 1, 0)] + MARGIN, blocks.time[beyond] - MARGIN
         for low, high in windows if recording.steps else ((start, end),):
             yield from recording.while_carried(float(max(start, low)), float(min(end, high)))
-
-
-def position_resolution(values: np.ndarray) -> float:
-    """Return the smallest step in rad between two samples, which is one position code; 0 if no step occurred."""
-    steps = np.abs(np.diff(values))
-    return float(steps.min(initial=math.inf, where=steps > 1e-6)) if steps.max() > 1e-6 else 0.0

@@ -28,6 +28,7 @@ from exo_gravity.core.numbers import four_floats, one_float
 MAX_DURATION = 3600.0  # s
 TIMED = {"hold": 0.1, "walk": 2.0, "sit": 1.0}  # steps that have only a duration, and the shortest of each in s
 TURNS = {"bow": 1.6, "lean": 0.8}  # steps that turn the trunk, and the largest angle of each in rad
+TOUCHES = {"move": (3.5, "rad"), "push": (20.0, "Nm")}  # steps that touch the arm, the largest value and its unit
 TRUNK_ACTIONS = ("bow", "lean", "walk", "sit")
 
 
@@ -47,26 +48,22 @@ class Step:
     def parse(cls, entry: Any, where: str) -> Step:
         """Return the step described by a mapping from YAML; `where` is its name in a ParameterError."""
         keys = set(entry) if isinstance(entry, Mapping) else set()
-        for action, shortest in TIMED.items():
-            if keys == {action}:
-                return cls(action, one_float(f"{where}.{action}", entry[action], shortest, MAX_DURATION, "s"))
-        for action, bound in TURNS.items():
-            if keys == {action, "over"}:
-                angle = one_float(f"{where}.{action}", entry[action], -bound, bound, "rad")
-                return cls(action, _over(entry, where), (angle,))
-        for action, bound, unit in (("move", 3.5, "rad"), ("push", 20.0, "Nm")):
-            if keys == {action, "over"}:
-                value = four_floats(f"{where}.{action}", entry[action], -bound, bound, unit)
-                return cls(action, _over(entry, where), tuple(value.tolist()))
+        action = next(iter(keys - {"over"}), "")
+        name = f"{where}.{action}"
+        if action in TIMED and keys == {action}:
+            return cls(action, one_float(name, entry[action], TIMED[action], MAX_DURATION, "s"))
+        if keys == {action, "over"} and action in (*TURNS, *TOUCHES):
+            if action in TURNS:
+                value: tuple[float, ...] = (one_float(name, entry[action], -TURNS[action], TURNS[action], "rad"),)
+            else:
+                bound, unit = TOUCHES[action]
+                value = tuple(four_floats(name, entry[action], -bound, bound, unit).tolist())
+            return cls(action, one_float(f"{where}.over", entry["over"], 0.1, 60.0, "s"), value)
         expected = (
             "{move: [4 rad], over: s}, {hold: s}, {push: [4 Nm], over: s}, {bow: rad, over: s}, {lean: rad, over: s}, "
             "{walk: s} or {sit: s}"
         )
         raise ParameterError(where, entry, expected)
-
-
-def _over(entry: Mapping[str, Any], where: str) -> float:
-    return one_float(f"{where}.over", entry["over"], 0.1, 60.0, "s")
 
 
 @dataclass(frozen=True)

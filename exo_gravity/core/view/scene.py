@@ -16,18 +16,13 @@ from exo_gravity.core.model.kinematics import frames
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 from exo_gravity.core.safety.drive import CARRYING, State
 from exo_gravity.core.safety.limits import WALL_WIDTH
-from exo_gravity.core.view.arm_description import ArmDescription
+from exo_gravity.core.view.urdf import ArmDescription
 
 Colour = tuple[float, float, float, float]
 
 ARROW, LINE, TEXT, SPHERE = "arrow", "line", "text", "sphere"
-GREEN, AMBER, RED, GREY, BLUE = (
-    (0.20, 0.70, 0.30, 1.0),
-    (0.95, 0.65, 0.10, 1.0),
-    (0.85, 0.15, 0.15, 1.0),
-    (0.60, 0.60, 0.60, 1.0),
-    (0.20, 0.45, 0.85, 1.0),
-)
+GREEN, AMBER, RED = (0.20, 0.70, 0.30, 1.0), (0.95, 0.65, 0.10, 1.0), (0.85, 0.15, 0.15, 1.0)
+GREY, BLUE = (0.60, 0.60, 0.60, 1.0), (0.20, 0.45, 0.85, 1.0)
 RANGE_RADIUS, TORQUE_RADIUS = 0.11, 0.075  # m
 TORQUE_SPAN = math.radians(270.0)
 ARC_STEP = math.radians(6.0)
@@ -65,17 +60,14 @@ class ArmPose(NamedTuple):
 
 
 class ArmView(NamedTuple):
-    """What is known of one arm now: theta (4,) rad, velocity (4,) rad/s, effort (4,) Nm as the motors report it.
-
-    state: of its bridge, '' if not known. message: of its bridge.
-    """
+    """What is known of one arm now."""
 
     arm: ArmDescription
-    theta: Sequence[float]
-    velocity: Sequence[float]
-    effort: Sequence[float]
-    state: str
-    message: str = ""
+    theta: Sequence[float]  #: (4,) rad
+    velocity: Sequence[float]  #: (4,) rad/s
+    effort: Sequence[float]  #: (4,) Nm, as the motors report it
+    state: str  #: of its bridge, '' if not known
+    message: str = ""  #: of its bridge
 
 
 def arm_pose(arm: ArmDescription, theta: Sequence[float]) -> ArmPose:
@@ -105,7 +97,7 @@ def gravity_shapes(gravity: Vector | None) -> list[Shape]:
 
 
 def arm_shapes(view: ArmView) -> list[Shape]:
-    """Return what is drawn around one arm."""
+    """Return what is drawn around one arm: range and torque of each joint, and what the arm's bridge does."""
     pose, limits = arm_pose(view.arm, view.theta), view.arm.limits
     shapes = []
     for n in range(JOINT_COUNT):
@@ -122,17 +114,11 @@ def arm_shapes(view: ArmView) -> list[Shape]:
         strength = RED if abs(share) >= 1.0 else AMBER if abs(share) > 0.5 else GREEN
         shapes.append(Shape("torques", LINE, arc, TORQUE_WIDTH, strength))
         shapes.append(Shape("torques", TEXT, tip, TEXT_HEIGHT, strength, f"{effort + 0.0:.2f} Nm"))
-    return shapes + state_shapes(view)
-
-
-def state_shapes(view: ArmView) -> list[Shape]:
-    """Return the sphere and the text that show what the arm's bridge does."""
-    above = np.array([np.add(view.arm.base, (0.0, 0.0, STATE_HEIGHT))])
     colour, state = state_of(view)
-    text = Shape(
-        "states", TEXT, above + np.array((0.0, 0.0, SPHERE_SIZE)), TEXT_HEIGHT, colour, f"{view.arm.side}: {state}"
-    )
-    return [Shape("states", SPHERE, above, SPHERE_SIZE, colour), text]
+    above = np.add([view.arm.base], (0.0, 0.0, STATE_HEIGHT))
+    shapes.append(Shape("states", SPHERE, above, SPHERE_SIZE, colour))
+    over = np.add(above, (0.0, 0.0, SPHERE_SIZE))
+    return [*shapes, Shape("states", TEXT, over, TEXT_HEIGHT, colour, f"{view.arm.side}: {state}")]
 
 
 def state_of(view: ArmView) -> tuple[Colour, str]:
@@ -148,7 +134,7 @@ def state_of(view: ArmView) -> tuple[Colour, str]:
 def _arc(
     origin: np.ndarray, axis: np.ndarray, zero: np.ndarray, start: float, end: float, radius: float = RANGE_RADIUS
 ) -> np.ndarray:
-    """Return points (n, 3) on the arc around `axis` from angle `start` to `end` rad, counted from `zero`."""
+    """Return points (n, 3) on the arc around `axis` from angle `start` to `end` rad; at angle 0 it is along `zero`."""
     count = 2 + int(abs(end - start) / ARC_STEP)
     angles = np.linspace(start, end, count)[:, None]
     return np.asarray(origin + radius * (np.cos(angles) * zero + np.sin(angles) * np.cross(axis, zero)))

@@ -16,36 +16,96 @@ are abduction and flexion on both sides. The gain c_n is no part of a descriptio
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
+from exo_gravity.core.compensation.params import robot_of
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.view.arm_description import ArmDescription, Point
+from exo_gravity.core.model.arm import ZEROS, ArmModel
+from exo_gravity.core.model.tilt import SIDES
+from exo_gravity.core.numbers import JOINT_COUNT, Vector
+from exo_gravity.core.params import Param
+from exo_gravity.core.safety.limits import Limits
+from exo_gravity.core.safety.params import LIMIT_PARAMETERS, limits_of
+
+Point = tuple[float, float, float]
 
 ROOT = "trunk"
-TUBE_RADIUS = 0.03  # m; each link has the inertia of a thin tube
-
-
+HALF_BREADTH = 0.15  # m from the middle of the trunk to the axis of joint 1, if `shoulder` is not given
+# The parameters that `described` reads.
+OF_COMPENSATOR = (
+    "side", "link_length", "gain", "gravity", "robot.mass", "robot.cog", "robot.first_moment", "robot.off_axis",
+    "shoulder_from_imu", "friction.viscous", "friction.coulomb",
+)  # fmt: skip
+OF_BRIDGE = ("joint_names", *(param.name for param in LIMIT_PARAMETERS))
+# The parameters of `robot_model`.
+# fmt: off
+ROBOT_MODEL = (
+    Param("rate", 30.0, "joint states of all arms per second", (1.0, 100.0), "Hz", fixed=True),
+    Param("meshes", "", "address of a folder with LINK.stl for each link, as package://NAME/FOLDER; empty: tubes",
+          fixed=True),
+)
+# fmt: on
 COLOURS = {
     "person": (0.80, 0.76, 0.70, 0.6),
     "tube": (0.16, 0.17, 0.19, 1.0),
     "motor": (0.55, 0.58, 0.62, 1.0),
     "centre_of_gravity": (0.85, 0.25, 0.15, 1.0),
 }
-TUBE = 0.0125  # m, radius of the carbon tubes (the paper, appendix A)
-MOTOR_RADIUS, MOTOR_LENGTH = 0.042, 0.04  # m, between AK60-6 and AK80-9
+TUBE_RADIUS = 0.03  # m; each link has the inertia of a thin tube
+DRAWN_RADIUS = 0.0125  # m, of the carbon tubes (the paper, appendix A)
+MOTOR: dict[str, Any] = {"radius": 0.042, "length": 0.04}  # m, between AK60-6 and AK80-9
 COG_RADIUS = 0.018  # m
 CHEST, HEAD_RADIUS, HEAD_HEIGHT = (0.14, 0.26, 0.48), 0.10, 0.20  # m
 
 
-class Body(NamedTuple):
-    """Mass in kg and centre of gravity (3,) in m of one link, in the frame of its joint."""
+@dataclass(frozen=True, eq=False)
+class ArmDescription:
+    """What a description, and a picture, states about one arm."""
 
-    mass: float
-    centre: Point
+    side: str  #: 'left' or 'right'
+    robot: ArmModel  #: without a wearer
+    mass: Vector  #: (4,) kg, used if `robot` is given by its moments
+    limits: Limits  #: names, position, speed and torque limits of the joints
+    damping: Vector = ZEROS  #: (4,) Nm s/rad, 0 for unknown
+    friction: Vector = ZEROS  #: (4,) Nm, 0 for unknown
+    shoulder: Vector = (0.0, 0.0, 0.0)  #: (3,) m, the arm's base in the trunk's axes; zeros for unknown
+
+    def __post_init__(self) -> None:
+        if self.side not in SIDES:
+            raise ParameterError("side", self.side, f"one of {', '.join(SIDES)}")
+
+    @property
+    def outward(self) -> float:
+        """1 if the arm is on the trunk's +y side (left), -1 otherwise."""
+        return 1.0 if self.side == "left" else -1.0
+
+    @property
+    def base(self) -> Point:
+        """Origin of joint 1 in the trunk's axes, m."""
+        x, y, z = map(float, self.shoulder)
+        return (x, y, z) if any((x, y, z)) else (0.0, self.outward * HALF_BREADTH, 0.0)
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Names of the links (4,), and of the frame at the far end of link 4."""
+        return (*(f"{self.side}_link_{n}" for n in range(1, JOINT_COUNT + 1)), f"{self.side}_end")
+
+
+def described(compensator: Mapping[str, Any], can_bridge: Mapping[str, Any]) -> ArmDescription:
+    """Return the arm that the parameters of its two nodes describe, or raise ParameterError."""
+    return ArmDescription(
+        compensator["side"],
+        robot_of(compensator),
+        compensator["robot.mass"],
+        limits_of(can_bridge),
+        compensator["friction.viscous"],
+        compensator["friction.coulomb"],
+        compensator["shoulder_from_imu"],
+    )
 
 
 def urdf(arms: Sequence[ArmDescription], meshes: str = "") -> str:
@@ -58,12 +118,17 @@ def urdf(arms: Sequence[ArmDescription], meshes: str = "") -> str:
     if not arms or len(set(sides)) != len(sides):
         raise ParameterError("side", sides, "one arm for each side that is described")
     robot = Element("robot", name="exo_gravity")
-    _add_material(robot)
-    trunk = SubElement(robot, "link", name=ROOT)
+    for name, colour in COLOURS.items():
+        _add(_add(robot, "material", name=name), "color", rgba=colour)
+    trunk = _add(robot, "link", name=ROOT)
     if meshes:
         _add_mesh(trunk, meshes)
     else:
-        _add_trunk_shapes(trunk, [arm.base for arm in arms])
+        x, _, z = (sum(column) / len(arms) for column in zip(*(arm.base for arm in arms), strict=True))
+        _draw(trunk, "person", "box", (x, 0.0, z - CHEST[2] / 2), size=CHEST)
+        _draw(trunk, "person", "sphere", (x, 0.0, z + HEAD_HEIGHT), radius=HEAD_RADIUS)
+        for arm in arms:
+            _draw(trunk, "motor", "cylinder", arm.base, **MOTOR)
     for arm, names in zip(arms, joint_names(arms), strict=True):
         _add_arm(robot, arm, names, meshes)
     ElementTree.indent(robot)
@@ -78,8 +143,8 @@ def joint_names(arms: Sequence[ArmDescription]) -> list[tuple[str, ...]]:
     return [tuple(f"{arm.side}_{name}" for name in four) for arm, four in zip(arms, names, strict=True)]
 
 
-def bodies(arm: ArmDescription) -> tuple[Body, ...]:
-    """Return mass and centre of gravity of the four links.
+def _bodies(arm: ArmDescription) -> list[tuple[float, Point]]:
+    """Return mass in kg and centre of gravity (3,) in m of each link, in the frame of its joint.
 
     Moments across the links (moments.py) become offsets of the centres of gravity: W of link 1, Z of link 2, Y3 and
     Y4 of links 3 and 4. An arm given by its moments has the masses `arm.mass`, and its centres of gravity, also beyond
@@ -89,135 +154,86 @@ def bodies(arm: ArmDescription) -> tuple[Body, ...]:
     mass = [float(m) for m in (arm.mass if robot.by_moments else robot.mass)]
     if not all(m > 0.0 for m in mass):
         raise ParameterError("robot.mass", mass, "above 0 kg for each link of a robot description")
-    along = [
-        (robot.first_moment[n] - float(robot.length[n]) * sum(mass[n + 1 :])) / mass[n]
-        if robot.by_moments
-        else float(robot.cog[n])
-        for n in range(JOINT_COUNT)
-    ]
-    w, z, y3, y4 = robot.off_axis
+    along = robot.cog
+    if robot.by_moments:
+        carried = [sum(mass[n + 1 :]) for n in range(JOINT_COUNT)]
+        along = (robot.first_moment - robot.length * carried) / mass
+    a1, a2, a3, a4 = along.tolist()
+    w, z, y3, y4 = (moment / m for moment, m in zip(robot.off_axis, mass, strict=True))
     out = arm.outward
-    centres = (
-        (w / mass[0], out * along[0], 0.0),
-        (0.0, -out * z / mass[1], -along[1]),
-        (y3 / mass[2], 0.0, -along[2]),
-        (y4 / mass[3], 0.0, -along[3]),
-    )
-    return tuple(Body(m, centre) for m, centre in zip(mass, centres, strict=True))
-
-
-def axes(arm: ArmDescription) -> tuple[Point, ...]:
-    """Return the axes of the four joints in the trunk's axes."""
-    return (0.0, 0.0, -arm.outward), (arm.outward, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, -1.0, 0.0)
-
-
-def ends(arm: ArmDescription) -> tuple[Point, ...]:
-    """Return the far end of each of the four links in the frame of its joint, m."""
-    first, *others = arm.robot.length.tolist()
-    return ((0.0, arm.outward * first, 0.0), *((0.0, 0.0, -length) for length in others))
+    centres = (w, out * a1, 0.0), (0.0, -out * z, -a2), (y3, 0.0, -a3), (y4, 0.0, -a4)
+    return list(zip(mass, centres, strict=True))
 
 
 def _add_arm(robot: Element, arm: ArmDescription, names: Sequence[str], meshes: str) -> None:
-    lengths, end = arm.robot.length.tolist(), ends(arm)
-    axis, parent, origin = axes(arm), ROOT, arm.base
-    for n, (name, body) in enumerate(zip(names, bodies(arm), strict=True)):
-        _add_joint(robot, name, "revolute", parent, arm.links[n], origin)
-        _add_motion(robot[-1], arm, n, axis[n])
-        link = SubElement(robot, "link", name=arm.links[n])
-        _add_inertia(link, body, lengths[n], sideways=n == 0)
+    out, limits, lengths = arm.outward, arm.limits, arm.robot.length.tolist()
+    axes: list[Point] = [(0.0, 0.0, -out), (out, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, -1.0, 0.0)]
+    ends: list[Point] = [(0.0, out * lengths[0], 0.0), *((0.0, 0.0, -length) for length in lengths[1:])]
+    parent, origin = ROOT, arm.base
+    for n, (mass, centre) in enumerate(_bodies(arm)):
+        joint = _add_joint(robot, names[n], "revolute", parent, arm.links[n], origin)
+        _add(joint, "axis", xyz=axes[n])
+        lower, upper = limits.position_min[n], limits.position_max[n]
+        _add(joint, "limit", lower=lower, upper=upper, effort=limits.max_effort[n], velocity=limits.max_velocity[n])
+        if arm.damping[n] or arm.friction[n]:
+            _add(joint, "dynamics", damping=arm.damping[n], friction=arm.friction[n])
+        link = _add(robot, "link", name=arm.links[n])
+        along = axes[3] if n == 0 else axes[0]  # of the link, but for its sign
+        _add_inertia(link, mass, centre, lengths[n], sideways=n == 0)
         if meshes:
             _add_mesh(link, meshes)
         else:
-            next_axis = axis[n + 1] if n + 1 < JOINT_COUNT else None
-            _add_link_shapes(link, end[n], next_axis, body.centre, sideways=n == 0)
-        parent, origin = arm.links[n], end[n]
+            if lengths[n]:
+                middle = ends[n][0] / 2, ends[n][1] / 2, ends[n][2] / 2
+                _draw(link, "tube", "cylinder", middle, along, radius=DRAWN_RADIUS, length=lengths[n])
+            if n + 1 < JOINT_COUNT:
+                _draw(link, "motor", "cylinder", ends[n], axes[n + 1], **MOTOR)
+            _draw(link, "centre_of_gravity", "sphere", centre, radius=COG_RADIUS)
+        parent, origin = arm.links[n], ends[n]
     _add_joint(robot, f"{arm.links[-1]}_joint", "fixed", parent, arm.links[-1], origin)
-    SubElement(robot, "link", name=arm.links[-1])
+    _add(robot, "link", name=arm.links[-1])
 
 
-def _add_joint(robot: Element, name: str, kind: str, parent: str, child: str, origin: Point) -> None:
-    joint = SubElement(robot, "joint", name=name, type=kind)
-    SubElement(joint, "origin", xyz=_numbers(*origin), rpy=_numbers(0.0, 0.0, 0.0))
-    SubElement(joint, "parent", link=parent)
-    SubElement(joint, "child", link=child)
+def _add_joint(robot: Element, name: str, kind: str, parent: str, child: str, origin: Point) -> Element:
+    joint = _add(robot, "joint", name=name, type=kind)
+    _add(joint, "origin", xyz=origin, rpy=(0.0, 0.0, 0.0))
+    _add(joint, "parent", link=parent)
+    _add(joint, "child", link=child)
+    return joint
 
 
-def _add_motion(joint: Element, arm: ArmDescription, n: int, axis: Point) -> None:
-    limits = arm.limits
-    SubElement(joint, "axis", xyz=_numbers(*axis))
-    values = {
-        "lower": limits.position_min[n],
-        "upper": limits.position_max[n],
-        "effort": limits.max_effort[n],
-        "velocity": limits.max_velocity[n],
-    }
-    SubElement(joint, "limit", {name: _numbers(value) for name, value in values.items()})
-    damping, friction = float(arm.damping[n]), float(arm.friction[n])
-    if damping or friction:
-        SubElement(joint, "dynamics", damping=_numbers(damping), friction=_numbers(friction))
-
-
-def _add_inertia(link: Element, body: Body, length: float, sideways: bool) -> None:
+def _add_inertia(link: Element, mass: float, centre: Point, length: float, sideways: bool) -> None:
     """Add the inertial element of a thin tube along the link, which points along y if `sideways` and along z if not."""
-    along = body.mass * TUBE_RADIUS**2
-    across = along / 2 + body.mass * length**2 / 12
-    principal = (across, along, across) if sideways else (across, across, along)
-    inertial = SubElement(link, "inertial")
-    SubElement(inertial, "origin", xyz=_numbers(*body.centre), rpy=_numbers(0.0, 0.0, 0.0))
-    SubElement(inertial, "mass", value=_numbers(body.mass))
-    moments = dict(zip(("ixx", "iyy", "izz"), map(_numbers, principal), strict=True))
-    SubElement(inertial, "inertia", {**moments, "ixy": "0.0", "ixz": "0.0", "iyz": "0.0"})
-
-
-def _numbers(*values: float) -> str:
-    """Return numbers as URDF writes them, with every digit, so that nothing is rounded."""
-    return " ".join(repr(float(value) + 0.0) for value in values)  # + 0.0: no negative zero
-
-
-def _add_material(robot: Element) -> None:
-    """Add the colours."""
-    for name, colour in COLOURS.items():
-        SubElement(SubElement(robot, "material", name=name), "color", rgba=_numbers(*colour))
+    along = mass * TUBE_RADIUS**2
+    across = along / 2 + mass * length**2 / 12
+    iyy, izz = (along, across) if sideways else (across, along)
+    inertial = _add(link, "inertial")
+    _add(inertial, "origin", xyz=centre, rpy=(0.0, 0.0, 0.0))
+    _add(inertial, "mass", value=mass)
+    _add(inertial, "inertia", ixx=across, iyy=iyy, izz=izz, ixy=0.0, ixz=0.0, iyz=0.0)
 
 
 def _add_mesh(link: Element, folder: str) -> None:
     """Add the mesh LINK.stl in `folder`, an address, as the visual of `link`."""
-    visual = SubElement(link, "visual")
-    geometry = SubElement(visual, "geometry")
-    SubElement(geometry, "mesh", filename=f"{folder.rstrip('/')}/{link.get('name')}.stl")
+    geometry = _add(_add(link, "visual"), "geometry")
+    _add(geometry, "mesh", filename=f"{folder.rstrip('/')}/{link.get('name')}.stl")
 
 
-def _add_trunk_shapes(trunk: Element, shoulders: Sequence[Point]) -> None:
-    """Add chest, head, and the motor of each joint 1, at `shoulders` (n, 3) m."""
-    x, _, z = (sum(column) / len(shoulders) for column in zip(*shoulders, strict=True))
-    _add(trunk, "person", "box", (x, 0.0, z - CHEST[2] / 2), size=_numbers(*CHEST))
-    _add(trunk, "person", "sphere", (x, 0.0, z + HEAD_HEIGHT), radius=_numbers(HEAD_RADIUS))
-    for shoulder in shoulders:
-        _add_cylinder(trunk, "motor", shoulder, (0.0, 0.0, 1.0), MOTOR_RADIUS, MOTOR_LENGTH)
-
-
-def _add_link_shapes(link: Element, end: Point, next_axis: Point | None, centre: Point, sideways: bool) -> None:
-    """Add the tube to `end`, the motor of the next joint there if there is one, and the centre of gravity, m."""
-    middle = (end[0] / 2, end[1] / 2, end[2] / 2)
-    along = (0.0, 1.0, 0.0) if sideways else (0.0, 0.0, 1.0)
-    if any(end):
-        _add_cylinder(link, "tube", middle, along, TUBE, math.hypot(*end))
-    if next_axis:
-        _add_cylinder(link, "motor", end, next_axis, MOTOR_RADIUS, MOTOR_LENGTH)
-    _add(link, "centre_of_gravity", "sphere", centre, radius=_numbers(COG_RADIUS))
-
-
-def _add_cylinder(link: Element, material: str, centre: Point, axis: Point, radius: float, length: float) -> None:
-    """Add a cylinder along `axis`, one of the frame's axes."""
-    x, y, _ = map(abs, axis)
-    turned = (y * math.pi / 2, x * math.pi / 2, 0.0)  # a cylinder of URDF lies along z
-    _add(link, material, "cylinder", centre, turned, radius=_numbers(radius), length=_numbers(length))
-
-
-def _add(
-    link: Element, material: str, shape: str, centre: Point, turned: Point = (0.0, 0.0, 0.0), **dimensions: str
+def _draw(
+    link: Element, material: str, shape: str, centre: Point, axis: Point = (0.0, 0.0, 1.0), **size: float | Point
 ) -> None:
-    visual = SubElement(link, "visual")
-    SubElement(visual, "origin", xyz=_numbers(*centre), rpy=_numbers(*turned))
-    SubElement(SubElement(visual, "geometry"), shape, dimensions)
-    SubElement(visual, "material", name=material)
+    """Add a shape; axis: one of the frame's axes, of a cylinder, which in URDF lies along z."""
+    visual = _add(link, "visual")
+    _add(visual, "origin", xyz=centre, rpy=(abs(axis[1]) * math.pi / 2, abs(axis[0]) * math.pi / 2, 0.0))
+    _add(_add(visual, "geometry"), shape, **size)
+    _add(visual, "material", name=material)
+
+
+def _add(parent: Element, tag: str, **attributes: str | float | Sequence[float]) -> Element:
+    """Add an element. Numbers are written with every digit, so that nothing is rounded."""
+    texts = {}
+    for name, value in attributes.items():
+        numbers = (value,) if isinstance(value, float | int) else value
+        # + 0.0: no negative zero
+        texts[name] = value if isinstance(value, str) else " ".join(repr(float(number) + 0.0) for number in numbers)
+    return SubElement(parent, tag, texts)

@@ -8,9 +8,9 @@ how many messages were lost, if any were. A topic that fails is reported, and th
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
-import sys
 import time
 from collections.abc import Callable
 from functools import partial
@@ -26,22 +26,18 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
-from exo_gravity.bag.content import ASSIST, COMMANDS, LOSSES, PARAMETERS, RECORDER, STATES, STEPS, arm_of, leaf
+from exo_gravity.bag import content
+from exo_gravity.bag.content import PARAMETERS, STATES, arm_of, leaf
 from exo_gravity.bag.writer import BagWriter, offered_qos
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.nodes.ros.hot_path import Drain
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
 
-SHARED_TOPICS = {
-    "/imu/pitch_yaw": Vector3Stamped,
-    "/imu/data": Imu,
-    "/imu/data_raw": Imu,
-    "/diagnostics": DiagnosticArray,
-    "/parameter_events": ParameterEvent,
-}
-ARM_TOPICS = {STATES: JointState, COMMANDS: JointState, STEPS: String}  # in the live line
-OF_ARMS = {**ARM_TOPICS, ASSIST: JointState}
+SHARED_TOPICS = {"/imu/pitch_yaw": Vector3Stamped, "/imu/data": Imu, "/imu/data_raw": Imu}
+SHARED_TOPICS |= {content.DIAGNOSTICS: DiagnosticArray, content.PARAMETER_EVENTS: ParameterEvent}
+ARM_TOPICS = {STATES: JointState, content.COMMANDS: JointState, content.STEPS: String}  # in the live line
+OF_ARMS = {**ARM_TOPICS, content.ASSIST: JointState}
 REPEATER = "robot_model"  # its joint states are those of the arms once more
 DRAIN_PERIOD = 0.05  # s between two writes of what has arrived
 DISCOVERY_PERIOD = 0.5  # s between two searches for new topics and nodes
@@ -57,7 +53,7 @@ class Recorder(Node):
 
     def __init__(self) -> None:
         super().__init__("recorder", automatically_declare_parameters_from_overrides=True)
-        values = declare(self, RECORDER)
+        values = declare(self, content.RECORDER)
         self.failure: Exception | None = None  # ends the node, see run()
         self._writer = BagWriter(values["output"])
         self._writer.add_topic(PARAMETERS, "std_msgs/msg/String", offered_qos(True, True, 1))
@@ -70,9 +66,7 @@ class Recorder(Node):
         self._live = LiveLine() if values["live"] else None
         self.create_timer(DRAIN_PERIOD, self._drain)
         self.create_timer(DISCOVERY_PERIOD, self._discover)
-        self.create_timer(LIVE_PERIOD, self._request_parameters)
-        if self._live:
-            self.create_timer(LIVE_PERIOD, self._print_live_line)
+        self.create_timer(LIVE_PERIOD, self._look)
         self.create_timer(LOSS_REPORT_PERIOD, self._report_losses)
         self._discover()
         self.get_logger().info(f"recording to {self._writer.path}")
@@ -88,11 +82,10 @@ class Recorder(Node):
         """Write what has arrived, and close the recording."""
         try:
             self._drain()
-            self._report_losses()
-            if any(self._losses()):
-                missed, unwritten = self._losses()
-                self._writer.add_topic(LOSSES, "std_msgs/msg/String", offered_qos(True, True, 1))
-                self._write_text(LOSSES, f"{missed} did not arrive, {unwritten} were not written")
+            if any(self._report_losses()):
+                missed, unwritten = self._reported
+                self._writer.add_topic(content.LOSSES, "std_msgs/msg/String", offered_qos(True, True, 1))
+                self._write_text(content.LOSSES, f"{missed} did not arrive, {unwritten} were not written")
         finally:
             self._writer.close()
         if self._writer.error:
@@ -132,9 +125,13 @@ class Recorder(Node):
         write = partial(self._guarded, node, self._write_parameters, node)
         self._unwritten[node] = NodeParameters(self, node, write)
 
-    def _request_parameters(self) -> None:
+    def _look(self) -> None:
+        """Ask the nodes whose parameters are not known, and print the live line."""
         for node, parameters in list(self._unwritten.items()):
             self._guarded(node, parameters.update)
+        if self._live:
+            counts = {"messages": self._writer.count, "lost": sum(self._losses())}
+            self._guarded("live state", self._live.write, counts)
 
     def _guarded(self, name: str, function: Callable[..., Any], *args: Any) -> Any:
         """Return the function's result; None after an exception, which is logged once for each `name`."""
@@ -150,16 +147,12 @@ class Recorder(Node):
         """Return how many messages of joints and IMU did not arrive, and how many were not written."""
         return sum(drain.lost for drain in self._drains), self._writer.lost
 
-    def _report_losses(self) -> None:
+    def _report_losses(self) -> tuple[int, int]:
         lost = self._losses()
         if lost != self._reported:
             self._reported = lost
             self.get_logger().warning(f"messages lost so far: {lost[0]} did not arrive, {lost[1]} were not written")
-
-    def _print_live_line(self) -> None:
-        counts = {"messages": self._writer.count, "lost": sum(self._losses())}
-        if self._live:
-            self._guarded("live state", self._live.write, counts)
+        return lost
 
     def _subscribe(self, topic: str, msgtype: type) -> None:
         publishers = self.get_publishers_info_by_topic(topic)
@@ -204,8 +197,7 @@ class LiveLine:
     "step": {...}}, "status": {"right/can_bridge": {"level": 2, "message": "...", "state": "fault", ...}},
     "faults": ["right/can_bridge: ..."], "recorder": {"messages": 1000, "lost": 0}}
 
-    status: the newest of each node on /diagnostics, its values included. faults: those whose level is not OK, as text.
-    recorder: the number of messages that it wrote and lost.
+    status: the newest of each node on /diagnostics, its values included. faults: those whose level is not OK.
     """
 
     def __init__(self) -> None:
@@ -214,7 +206,7 @@ class LiveLine:
 
     def note(self, topic: str, messages: list[bytes]) -> None:
         """Keep the newest message of a topic, and the newest status of each node."""
-        if topic != "/diagnostics":
+        if topic != content.DIAGNOSTICS:
             self._latest[topic] = messages[-1]
             return
         for data in messages:
@@ -227,27 +219,21 @@ class LiveLine:
         """Write the line to standard output."""
         line: dict[str, Any] = {}
         for topic, data in self._latest.items():
-            name = leaf(topic)
-            if name in ARM_TOPICS:
-                arm = line.setdefault(arm_of(topic), {})
-                arm.update(_summary(name, deserialize_message(data, ARM_TOPICS[name])))
+            if (name := leaf(topic)) not in ARM_TOPICS:
+                continue
+            arm, message = line.setdefault(arm_of(topic), {}), deserialize_message(data, ARM_TOPICS[name])
+            if name == content.STEPS:
+                with contextlib.suppress(ValueError):  # the report states it
+                    arm["step"] = json.loads(message.data)
+            elif name == content.COMMANDS:
+                arm["command"] = list(message.effort)
+            else:
+                arm["names"] = list(message.name)
+                arm |= {field: list(getattr(message, field)) for field in ("position", "velocity", "effort")}
         line["recorder"] = recorder
         line["status"] = self._status
         line["faults"] = [f"{name}: {status['message']}" for name, status in self._status.items() if status["level"]]
-        sys.stdout.write(json.dumps(line) + "\n")
-        sys.stdout.flush()
-
-
-def _summary(name: str, message: JointState | String) -> dict[str, Any]:
-    if name == STEPS:
-        try:
-            return {"step": json.loads(message.data)}
-        except ValueError:  # the report states it
-            return {}
-    if name == COMMANDS:
-        return {"command": list(message.effort)}
-    fields = {field: list(getattr(message, field)) for field in ("position", "velocity", "effort")}
-    return {"names": list(message.name), **fields}
+        print(json.dumps(line), flush=True)
 
 
 def main() -> None:

@@ -11,9 +11,11 @@ It only reads: nothing depends on it, and the arms run on if it ends.
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
-from collections.abc import Iterable
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from builtin_interfaces.msg import Duration, Time
@@ -26,11 +28,19 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.tilt import gravity_in_trunk
-from exo_gravity.core.view.arm_description import OF_BRIDGE, OF_COMPENSATOR, ROBOT_MODEL, ArmDescription, described
 from exo_gravity.core.view.scene import ARROW, LINE, SPHERE, TEXT, ArmView, Shape, arm_shapes, gravity_shapes
-from exo_gravity.core.view.urdf import ROOT, joint_names, urdf
+from exo_gravity.core.view.urdf import (
+    OF_BRIDGE,
+    OF_COMPENSATOR,
+    ROBOT_MODEL,
+    ROOT,
+    ArmDescription,
+    described,
+    joint_names,
+    urdf,
+)
 from exo_gravity.nodes.ros.hot_path import LATCHED, NEWEST, HotPath
-from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics, by_name
+from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics, by_name, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
 
@@ -69,8 +79,8 @@ class RobotModel(Node):
         for name, namespace in self.get_node_names_and_namespaces():
             if name == "compensator" and namespace not in self._arms:
                 self._arms[namespace] = ViewedArm(self, namespace.rstrip("/"))
-        for arm in self._arms.values():
-            arm.update()
+        for parameters in [parameters for arm in self._arms.values() for parameters in arm.parameters]:
+            parameters.update()
         self._describe()
         problem = self._problem or next((arm.problem for arm in self._arms.values() if arm.problem), "")
         if not self._arms:
@@ -83,14 +93,12 @@ class RobotModel(Node):
         known = tuple(arm for _, arm in sorted(self._arms.items()) if arm.description)
         if known == self._described:
             return
-        self._described = known
+        self._described, self._problem = known, ""
         try:
             text = urdf([arm.description for arm in known if arm.description], self._meshes)
+            self._description.publish(String(data=text))
         except ParameterError as error:
             self._problem = str(error)
-            return
-        self._problem = ""
-        self._description.publish(String(data=text))
 
     def _publish_states(self) -> None:
         self._views = [(arm, view) for arm in self._described if (view := arm.view())]
@@ -100,7 +108,8 @@ class RobotModel(Node):
         names = joint_names([arm.description for arm in self._described if arm.description])
         by_arm = dict(zip(self._described, names, strict=True))
         states = JointState()
-        states.header.stamp = max((arm.states.header.stamp for arm, _ in self._views if arm.states), key=_seconds)
+        stamps = (arm.states.header.stamp for arm, _ in self._views if arm.states)
+        states.header.stamp = max(stamps, key=to_nanoseconds)
         for arm, view in self._views:
             states.name = [*states.name, *by_arm[arm]]
             states.position = [*states.position, *view.theta]
@@ -127,10 +136,6 @@ class RobotModel(Node):
         self._tilt, self._tilt_time = (message.vector.y, message.vector.x), time.monotonic()
 
 
-def _seconds(stamp: Any) -> tuple[int, int]:
-    return stamp.sec, stamp.nanosec
-
-
 class ViewedArm:
     """The arm in `namespace` ('/right', '' for the root): its parameters and its newest joint states."""
 
@@ -144,22 +149,17 @@ class ViewedArm:
         self._bridge = f"{namespace}/can_bridge".lstrip("/")
         self._status, self._status_time = ("", ""), -math.inf
         self._time = -math.inf
-        self._parameters = [
+        self.parameters = [
             NodeParameters(node, f"{namespace}/{leaf}", self._on_values, names)
             for leaf, names in (("compensator", OF_COMPENSATOR), ("can_bridge", OF_BRIDGE))
         ]
         self._subscription = HotPath(node, JointState, self.states_topic, self._on_states, NEWEST)
 
-    def update(self) -> None:
-        """Read the parameters of both nodes, if they are not known."""
-        for parameters in self._parameters:
-            parameters.update()
-
     def note(self, status: DiagnosticStatus) -> None:
         """Keep the status of this arm's bridge; ignore any other."""
         if status.name == self._bridge:
-            values = {pair.key: pair.value for pair in status.values}
-            self._status, self._status_time = (values.get("state", ""), status.message), time.monotonic()
+            state = next((pair.value for pair in status.values if pair.key == "state"), "")
+            self._status, self._status_time = (state, status.message), time.monotonic()
 
     def view(self) -> ArmView | None:
         """Return what is known of the arm now; None without a description or a fresh reading."""
@@ -184,10 +184,10 @@ class ViewedArm:
         self.states, self._time = message, time.monotonic()
 
     def _on_values(self, _values: object) -> None:
-        if not all(parameters.values for parameters in self._parameters):
+        if not all(parameters.values for parameters in self.parameters):
             return
         try:
-            self.description = described(*(parameters.values for parameters in self._parameters))
+            self.description = described(*(parameters.values for parameters in self.parameters))
         except ParameterError as error:
             self.problem = f"{self._bridge.rpartition('/')[0] or 'arm'}: {error}"
             self._node.get_logger().error(self.problem)
@@ -195,11 +195,10 @@ class ViewedArm:
 
 def marker_array(shapes: Iterable[tuple[str, Shape]], stamp: Time) -> MarkerArray:
     """Return the markers of (owner, shape): an owner is a side, or '' for what both arms share."""
-    markers, counts = [], dict[str, int]()
+    markers, numbers = [], defaultdict[str, Iterator[int]](itertools.count)
     for owner, shape in shapes:
         group = f"{owner}/{shape.group}" if owner else shape.group
-        counts[group] = counts.get(group, -1) + 1
-        markers.append(_marker(group, counts[group], shape, stamp))
+        markers.append(_marker(group, next(numbers[group]), shape, stamp))
     return MarkerArray(markers=markers)
 
 

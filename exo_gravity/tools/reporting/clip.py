@@ -23,9 +23,8 @@ from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.params import CAN_BRIDGE
 from exo_gravity.core.trial.recording import Recording
-from exo_gravity.core.view.arm_description import ArmDescription, described
 from exo_gravity.core.view.scene import AMBER, ARROW, GREEN, GREY, LINE, RED, SPHERE, ArmView, Shape, arm_shapes
-from exo_gravity.core.view.urdf import joint_names, urdf
+from exo_gravity.core.view.urdf import ArmDescription, described, joint_names, urdf
 from exo_gravity.tools.reporting.table import shown
 
 SIZE, GIF_SIZE = (640, 480), (480, 360)  # pixels
