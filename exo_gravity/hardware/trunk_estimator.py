@@ -71,6 +71,13 @@ class TrunkOrientation:
 class TrunkEstimator:
     """Follows one IMU; where VQF is installed, it need not report its orientation."""
 
+    _why: str  # there is no orientation yet
+    _age: float  # s of a reported orientation
+    _speed: float  # rad/s, the highest in the last second
+    _up: Floats3 | None  # the world's z axis in the IMU's axes, by the last sample
+    _last_rate: Floats3 | None
+    _last_acceleration: Floats3 | None
+
     def __init__(
         self,
         rotation_trunk_from_imu: Sequence[float],
@@ -202,11 +209,8 @@ class TrunkEstimator:
         self._uncertainty.restart()
         self._agreement.restart()
         self._why = why
-        self._age = 0.0  # s of a reported orientation
-        self._speed = 0.0  # rad/s, the highest in the last second
-        self._up: Floats3 | None = None  # the world's z axis in the IMU's axes, by the last sample
-        self._last_rate: Floats3 | None = None
-        self._last_acceleration: Floats3 | None = None
+        self._age = self._speed = 0.0
+        self._up = self._last_rate = self._last_acceleration = None
 
 
 class VqfFusion:

@@ -20,15 +20,9 @@ import struct
 from collections.abc import Callable
 
 from exo_gravity.core.errors import DeviceError, ParameterError
-from exo_gravity.core.model.rotation import Quaternion
-from exo_gravity.hardware.imu_sources.source import (
-    RADIANS_PER_DEGREE,
-    Axes,
-    Clock,
-    ImuSource,
-    Measurement,
-    acceleration_scale,
-)
+from exo_gravity.core.model.arm import STANDARD_GRAVITY
+from exo_gravity.core.model.rotation import Quaternion, product
+from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Axes, Clock, ImuSource, Measurement
 
 ACCELERATION, ANGULAR_VELOCITY, ANGLES, QUATERNION = 0x51, 0x52, 0x53, 0x59
 WITMOTION_LENGTH = 11
@@ -38,49 +32,13 @@ PACKETS_A_SAMPLE = 4
 RATES = {20.0: 0x07, 50.0: 0x08, 100.0: 0x09, 200.0: 0x0B}  # Hz: RRATE
 BITS_A_BYTE = 10  # on the wire
 RATE_PER_LSB = RADIANS_PER_DEGREE * 2000.0 / 32768
-WITMOTION_ACCELERATION = acceleration_scale(32768 / 16.0)
+WITMOTION_ACCELERATION = STANDARD_GRAVITY * 16.0 / 32768
 WITMOTION_ANGLE = RADIANS_PER_DEGREE * 180.0 / 32768
 
 Numbers = tuple[int, int, int, int]  # of a packet
 
 RVC_RATE, RVC_LENGTH = 100.0, 19  # Hz, fixed; bytes
-RVC_ANGLE, RVC_ACCELERATION = 0.01 * RADIANS_PER_DEGREE, acceleration_scale(1000.0)
-
-
-class SerialPort:
-    """An open port that is read without waiting."""
-
-    def __init__(self, device: str, port: str, baud: int) -> None:
-        """Open `port`. Raises DeviceError, and ParameterError without pyserial."""
-        self.name = f"{device} on {port}"
-        try:
-            import serial
-        except ImportError:
-            expected = "topic, or install the extra imu (pyserial)"
-            raise ParameterError("source", "an IMU on a serial port", expected) from None
-        try:
-            self._port = serial.Serial(port, baud, timeout=0, write_timeout=0.2)
-        except (OSError, ValueError) as error:  # pyserial's own errors are OSErrors
-            raise DeviceError(self.name, f"cannot be opened: {error}") from None
-
-    def read(self) -> bytes:
-        """Return the bytes that have arrived."""
-        try:
-            return bytes(self._port.read(self._port.in_waiting))
-        except OSError as error:
-            raise DeviceError(self.name, f"cannot be read: {error}") from None
-
-    def write(self, data: bytes) -> None:
-        """Send `data`."""
-        try:
-            self._port.write(data)
-        except OSError as error:
-            raise DeviceError(self.name, f"cannot be written: {error}") from None
-
-    def close(self) -> None:
-        """Close the port."""
-        with contextlib.suppress(OSError):
-            self._port.close()
+RVC_ANGLE, RVC_ACCELERATION = 0.01 * RADIANS_PER_DEGREE, 1e-3 * STANDARD_GRAVITY
 
 
 class Packets:
@@ -113,22 +71,34 @@ class Packets:
 
 
 class SerialSource(ImuSource):
-    """Base of the sensors on serial ports; a sensor's class decodes its packets."""
+    """Base of the sensors on serial ports, which are read without waiting; a sensor's class decodes its packets."""
 
-    def __init__(self, port: SerialPort, packets: Packets, rate: float, clock: Clock) -> None:
-        """Read from an open port."""
-        super().__init__(port.name, rate, clock)
-        self._port = port
+    def __init__(self, device: str, port: str, baud: int, packets: Packets, rate: float, clock: Clock) -> None:
+        """Open `port`. Raises DeviceError, and ParameterError without pyserial."""
+        super().__init__(f"{device} on {port}", rate, clock)
+        try:
+            import serial
+        except ImportError:
+            expected = "topic, or install the extra imu (pyserial)"
+            raise ParameterError("source", "an IMU on a serial port", expected) from None
+        try:
+            self._port = serial.Serial(port, baud, timeout=0, write_timeout=0.2)
+        except (OSError, ValueError) as error:  # pyserial's own errors are OSErrors
+            raise DeviceError(self.name, f"cannot be opened: {error}") from None
         self._packets = packets
         self._damaged = 0  # packets, as last seen
         self.silence = "not one byte"
 
     def close(self) -> None:
         """Close the port; never raises."""
-        self._port.close()
+        with contextlib.suppress(OSError):
+            self._port.close()
 
     def _measure(self, now: float) -> list[Measurement]:
-        data = self._port.read()
+        try:
+            data = bytes(self._port.read(self._port.in_waiting))
+        except OSError as error:
+            raise DeviceError(self.name, f"cannot be read: {error}") from None
         packets = self._packets.feed(data)
         if data:
             self.silence = "not one byte" if packets else "bytes, but no whole packet: is serial.baud the sensor's?"
@@ -151,17 +121,16 @@ class WitMotion(SerialSource):
         needed = int(rate * PACKETS_A_SAMPLE * WITMOTION_LENGTH * BITS_A_BYTE)
         if baud < needed:
             raise ParameterError("serial.baud", baud, f"{needed} or more for {rate:g} samples a second")
-        opened = SerialPort("WitMotion", port, baud)
-        super().__init__(opened, Packets(b"\x55", WITMOTION_LENGTH, _is_whole), rate, clock)
+        super().__init__("WitMotion", port, baud, Packets(b"\x55", WITMOTION_LENGTH, _is_whole), rate, clock)
         self._parts: dict[int, Numbers] = {}  # of the present sample, by type
         self._last_type = 0  # that completes a sample
         self._begun = False
         self._skipped = 0  # samples since the last whole one
         try:
-            opened.write(UNLOCK + CONTENT + bytes((0xFF, 0xAA, 0x03, RATES[rate], 0x00)))
-        except DeviceError:
-            opened.close()
-            raise
+            self._port.write(UNLOCK + CONTENT + bytes((0xFF, 0xAA, 0x03, RATES[rate], 0x00)))
+        except OSError as error:
+            self.close()
+            raise DeviceError(self.name, f"cannot be written: {error}") from None
 
     def _decode(self, packet: bytes) -> Measurement | None:
         kind, numbers = packet[1], struct.unpack_from("<4h", packet, 2)
@@ -214,7 +183,7 @@ class Bno085(SerialSource):
     def __init__(self, port: str, baud: int, clock: Clock) -> None:
         """Open the port. Raises DeviceError, ParameterError."""
         packets = Packets(b"\xaa\xaa", RVC_LENGTH, lambda packet: sum(packet[2:18]) & 0xFF == packet[18])
-        super().__init__(SerialPort("BNO085", port, baud), packets, RVC_RATE, clock)
+        super().__init__("BNO085", port, baud, packets, RVC_RATE, clock)
         self._counter: int | None = None
 
     def _decode(self, packet: bytes) -> Measurement:
@@ -228,13 +197,8 @@ class Bno085(SerialSource):
 
 def from_angles(*turns: tuple[str, float]) -> Quaternion:
     """Return the orientation after turns by (axis, rad) in order, each about an axis of the body as turned so far."""
-    x, y, z, w = 0.0, 0.0, 0.0, 1.0
+    q: Quaternion = (0.0, 0.0, 0.0, 1.0)
     for axis, angle in turns:
-        s, c = math.sin(angle / 2), math.cos(angle / 2)
-        if axis == "x":
-            x, y, z, w = x * c + w * s, y * c + z * s, z * c - y * s, w * c - x * s
-        elif axis == "y":
-            x, y, z, w = x * c - z * s, y * c + w * s, z * c + x * s, w * c - y * s
-        else:
-            x, y, z, w = x * c + y * s, y * c - x * s, z * c + w * s, w * c - z * s
-    return x, y, z, w
+        x, y, z = (math.sin(angle / 2) * (axis == other) for other in "xyz")
+        q = product(q, (x, y, z, math.cos(angle / 2)))
+    return q
