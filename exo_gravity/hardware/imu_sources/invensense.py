@@ -107,10 +107,8 @@ class InvenSense(FifoSource):
             ("gyroscope", response[:3], gyroscope_codes, (0.5, math.inf), (60.0 * 131.0, math.inf)),
             ("accelerometer", response[3:], accelerometer_codes, (0.5, 1.5), (225.0 * 16.384, 675.0 * 16.384)),
         ):
-            factory = [2620.0 * 1.01 ** (code - 1) for code in codes]
-            limits = [
-                (shares[0] * f, shares[1] * f) if code else without for f, code in zip(factory, codes, strict=True)
-            ]
+            low, high = (2620.0 * share for share in shares)
+            limits = [(low * 1.01 ** (code - 1), high * 1.01 ** (code - 1)) if code else without for code in codes]
             judged = [value if code else abs(value) for value, code in zip(values, codes, strict=True)]
             self._judge(sensor, judged, limits, "LSB")
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 import contextlib
 import math
 import struct
-from collections.abc import Callable
+from typing import ClassVar
 
 from exo_gravity.core.errors import DeviceError, ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
@@ -25,7 +25,6 @@ from exo_gravity.core.model.rotation import Quaternion, product
 from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Axes, Clock, ImuSource, Measurement
 
 ACCELERATION, ANGULAR_VELOCITY, ANGLES, QUATERNION = 0x51, 0x52, 0x53, 0x59
-WITMOTION_LENGTH = 11
 UNLOCK = b"\xff\xaa\x69\x88\xb5"
 CONTENT = b"\xff\xaa\x02\x0e\x02"  # RSW: quaternion, angles, angular velocity, acceleration
 PACKETS_A_SAMPLE = 4
@@ -37,43 +36,21 @@ WITMOTION_ANGLE = RADIANS_PER_DEGREE * 180.0 / 32768
 
 Numbers = tuple[int, int, int, int]  # of a packet
 
-RVC_RATE, RVC_LENGTH = 100.0, 19  # Hz, fixed; bytes
+RVC_RATE = 100.0  # Hz, fixed
 RVC_ANGLE, RVC_ACCELERATION = 0.01 * RADIANS_PER_DEGREE, 1e-3 * STANDARD_GRAVITY
 
 
-class Packets:
-    """Cuts packets of one length out of a stream of bytes, and finds their start again after lost or extra bytes."""
-
-    def __init__(self, header: bytes, length: int, is_whole: Callable[[bytes], bool]) -> None:
-        self.damaged = 0  #: times that packets that had arrived well were followed by one that had not
-        self._header = header
-        self._length = length
-        self._is_whole = is_whole
-        self._pending = bytearray()
-        self._in_step = False
-
-    def feed(self, data: bytes) -> list[bytes]:
-        """Return the whole packets that `data` completes."""
-        self._pending += data
-        packets, at = [], 0
-        while len(self._pending) - at >= self._length:
-            packet = bytes(self._pending[at : at + self._length])
-            if packet.startswith(self._header) and self._is_whole(packet):
-                packets.append(packet)
-                at += self._length
-                self._in_step = True
-                continue
-            self.damaged += self._in_step
-            self._in_step = False
-            at += 1
-        del self._pending[:at]
-        return packets
-
-
 class SerialSource(ImuSource):
-    """Base of the sensors on serial ports, which are read without waiting; a sensor's class decodes its packets."""
+    """Base of the sensors on serial ports, which are read without waiting.
 
-    def __init__(self, device: str, port: str, baud: int, packets: Packets, rate: float, clock: Clock) -> None:
+    Their packets have one length. They are cut out of the stream of bytes; after lost or extra bytes their start is
+    found again.
+    """
+
+    HEADER: ClassVar[bytes]
+    LENGTH: ClassVar[int]  # bytes of a packet
+
+    def __init__(self, device: str, port: str, baud: int, rate: float, clock: Clock) -> None:
         """Open `port`. Raises DeviceError, and ParameterError without pyserial."""
         super().__init__(f"{device} on {port}", rate, clock)
         try:
@@ -85,8 +62,8 @@ class SerialSource(ImuSource):
             self._port = serial.Serial(port, baud, timeout=0, write_timeout=0.2)
         except (OSError, ValueError) as error:  # pyserial's own errors are OSErrors
             raise DeviceError(self.name, f"cannot be opened: {error}") from None
-        self._packets = packets
-        self._damaged = 0  # packets, as last seen
+        self._pending = bytearray()
+        self._in_step = False  # whether the last packet has arrived well
         self.silence = "not one byte"
 
     def close(self) -> None:
@@ -99,13 +76,30 @@ class SerialSource(ImuSource):
             data = bytes(self._port.read(self._port.in_waiting))
         except OSError as error:
             raise DeviceError(self.name, f"cannot be read: {error}") from None
-        packets = self._packets.feed(data)
+        packets = self._packets(data)
         if data:
             self.silence = "not one byte" if packets else "bytes, but no whole packet: is serial.baud the sensor's?"
-        if self._packets.damaged > self._damaged:
-            self._damaged = self._packets.damaged
-            self._why_lost = "damaged packets"
         return [measurement for packet in packets if (measurement := self._decode(packet))]
+
+    def _packets(self, data: bytes) -> list[bytes]:
+        """Return the whole packets that `data` completes."""
+        self._pending += data
+        packets, at = [], 0
+        while len(self._pending) - at >= self.LENGTH:
+            packet = bytes(self._pending[at : at + self.LENGTH])
+            is_whole = packet.startswith(self.HEADER) and self._is_whole(packet)
+            if is_whole:
+                packets.append(packet)
+            elif self._in_step:
+                self._why_lost = "damaged packets"
+            self._in_step = is_whole
+            at += self.LENGTH if is_whole else 1
+        del self._pending[:at]
+        return packets
+
+    def _is_whole(self, packet: bytes) -> bool:
+        """Return whether the packet's sum is right."""
+        raise NotImplementedError
 
     def _decode(self, packet: bytes) -> Measurement | None:
         """Return the measurement that a packet completes."""
@@ -115,13 +109,15 @@ class SerialSource(ImuSource):
 class WitMotion(SerialSource):
     """A WitMotion sensor. A sample is complete with its orientation: a quaternion, or angles if it sends none."""
 
+    HEADER, LENGTH = b"\x55", 11
+
     def __init__(self, port: str, baud: int, rate: float, clock: Clock) -> None:
         """Open the port and set the sensor's rate. Raises DeviceError, ParameterError."""
         rate = min(RATES, key=lambda candidate: abs(candidate - rate))
-        needed = int(rate * PACKETS_A_SAMPLE * WITMOTION_LENGTH * BITS_A_BYTE)
+        needed = int(rate * PACKETS_A_SAMPLE * self.LENGTH * BITS_A_BYTE)
         if baud < needed:
             raise ParameterError("serial.baud", baud, f"{needed} or more for {rate:g} samples a second")
-        super().__init__("WitMotion", port, baud, Packets(b"\x55", WITMOTION_LENGTH, _is_whole), rate, clock)
+        super().__init__("WitMotion", port, baud, rate, clock)
         self._parts: dict[int, Numbers] = {}  # of the present sample, by type
         self._last_type = 0  # that completes a sample
         self._begun = False
@@ -131,6 +127,9 @@ class WitMotion(SerialSource):
         except OSError as error:
             self.close()
             raise DeviceError(self.name, f"cannot be written: {error}") from None
+
+    def _is_whole(self, packet: bytes) -> bool:
+        return 0x50 <= packet[1] <= 0x5F and sum(packet[:10]) & 0xFF == packet[10]
 
     def _decode(self, packet: bytes) -> Measurement | None:
         kind, numbers = packet[1], struct.unpack_from("<4h", packet, 2)
@@ -168,10 +167,6 @@ def _orientation(parts: dict[int, Numbers]) -> Quaternion | None:
     return None
 
 
-def _is_whole(packet: bytes) -> bool:
-    return 0x50 <= packet[1] <= 0x5F and sum(packet[:10]) & 0xFF == packet[10]
-
-
 def _axes(numbers: Numbers, scale: float) -> Axes:
     x, y, z, _ = numbers
     return x * scale, y * scale, z * scale
@@ -180,11 +175,15 @@ def _axes(numbers: Numbers, scale: float) -> Axes:
 class Bno085(SerialSource):
     """A BNO085 with PS0 high and PS1 low, which selects UART-RVC."""
 
+    HEADER, LENGTH = b"\xaa\xaa", 19
+
     def __init__(self, port: str, baud: int, clock: Clock) -> None:
         """Open the port. Raises DeviceError, ParameterError."""
-        packets = Packets(b"\xaa\xaa", RVC_LENGTH, lambda packet: sum(packet[2:18]) & 0xFF == packet[18])
-        super().__init__("BNO085", port, baud, packets, RVC_RATE, clock)
+        super().__init__("BNO085", port, baud, RVC_RATE, clock)
         self._counter: int | None = None
+
+    def _is_whole(self, packet: bytes) -> bool:
+        return sum(packet[2:18]) & 0xFF == packet[18]
 
     def _decode(self, packet: bytes) -> Measurement:
         counter, yaw, pitch, roll, x, y, z = struct.unpack_from("<B6h", packet, 2)
