@@ -1,20 +1,27 @@
-"""The trunk's orientation with VQF as the fusion, fed with samples that are not evenly spaced.
+"""Samples of an inertial measurement unit (IMU) on the trunk -> gravity in the trunk's axes, and how sure that is.
 
-VQF (D. Laidig, T. Seel, Information Fusion 91, 2023) averages the accelerometer in the frame that the gyroscope carries
-along, and learns the gyroscope's bias at rest and in motion. Its sampling period is fixed, but samples come with jitter
-and with gaps. So the rates are scaled such that VQF turns in its period as far as the IMU did between two samples, and
-the accelerometer is passed on once for each period that has passed. On evenly spaced samples this is VQF alone.
+An orientation that the IMU reports is used as it is. Without one, VQF (D. Laidig, T. Seel, Information Fusion 91, 2023)
+fuses gyroscope and accelerometer. Without a magnetometer the heading drifts, on which gravity does not depend.
+
+Only a sample that no working IMU gives is refused, with the reason; the estimate goes on over it. What was not
+measured, in a gap or in saturation, makes the estimate less certain (`core.trunk.uncertainty`). While it may be off by
+more than 3 degrees there is no output: the output never jumps.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
-from exo_gravity.core.model.rotation import Floats3, Quaternion
-from exo_gravity.core.trunk.estimator import TiltEstimator, TrunkOrientation
-from exo_gravity.core.trunk.imu_sample import ACCELEROMETER_RANGE, GYROSCOPE_RANGE, ImuSample
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.rotation import ZERO, Floats3, Quaternion, product, unit_quaternion, up_in_body
+from exo_gravity.core.model.tilt import angle_between, pitch_roll, rotation_matrix
+from exo_gravity.core.numbers import one_float
+from exo_gravity.core.trunk.imu_checks import Agreement, ClockCheck, Contradiction, EqualValues
+from exo_gravity.core.trunk.imu_sample import ACCELEROMETER_RANGE, GYROSCOPE_RANGE, ImuSample, Ranges, three_floats
+from exo_gravity.core.trunk.uncertainty import OVERSHOOT, SETTLE_TIME, TiltUncertainty
 
 try:
     from vqf import VQF
@@ -23,11 +30,53 @@ except ImportError:  # needed only for an IMU that reports no orientation
 
 __all__ = ["ImuSample", "TrunkEstimator", "TrunkOrientation"]
 
+MAX_GAP = 0.1  # s between two samples, after which the estimate begins anew
+REPORTED_SIGMA = math.radians(1.0)  # rad; data sheets of fused sensors state 1 to 2 degrees
+MAX_REPORTED_RATE = 15.0  # rad/s; a reported orientation that turns faster has jumped: no trunk turns so fast
+MAX_JUMP = 0.01  # rad by which rounding may turn a reported orientation
 BIAS_INTERVAL = 10  # samples; the bias changes slowly
 
 
-class TrunkEstimator(TiltEstimator):
+class TrunkOrientation:
+    """The trunk's orientation by one sample."""
+
+    __slots__ = ("_down", "_imu_from_trunk", "_world_from_imu", "uncertainty")
+
+    def __init__(self, down: Floats3, world_from_imu: Quaternion, imu_from_trunk: Quaternion, sigma: float) -> None:
+        #: one standard deviation of the tilt, rad
+        self.uncertainty = sigma
+        self._down, self._world_from_imu, self._imu_from_trunk = down, world_from_imu, imu_from_trunk
+
+    @property
+    def gravity(self) -> np.ndarray:
+        """Its unit vector (3,) in the trunk's axes (x forward, y left, z up)."""
+        return np.array(self._down)
+
+    @property
+    def pitch(self) -> float:
+        """In rad (REP-103: > 0 bows forward)."""
+        return pitch_roll(self._down)[0]
+
+    @property
+    def roll(self) -> float:
+        """In rad (> 0 leans right)."""
+        return pitch_roll(self._down)[1]
+
+    @property
+    def orientation(self) -> np.ndarray:
+        """(x, y, z, w), world from trunk; its heading is arbitrary."""
+        return np.array(product(self._world_from_imu, self._imu_from_trunk))
+
+
+class TrunkEstimator:
     """Follows one IMU; where VQF is installed, it need not report its orientation."""
+
+    _why: str  # there is no orientation yet
+    _age: float  # s of a reported orientation
+    _speed: float  # rad/s, the highest in the last second
+    _up: Floats3 | None  # the world's z axis in the IMU's axes, by the last sample
+    _last_rate: Floats3 | None
+    _last_acceleration: Floats3 | None
 
     def __init__(
         self,
@@ -36,20 +85,149 @@ class TrunkEstimator(TiltEstimator):
         gyroscope_range: float = GYROSCOPE_RANGE,
         accelerometer_range: float = ACCELEROMETER_RANGE,
     ) -> None:
-        """Create an estimator; see `core.trunk.estimator.TiltEstimator`."""
-        fusion = VqfFusion(rate) if VQF else None
-        super().__init__(rotation_trunk_from_imu, fusion, rate, gyroscope_range, accelerometer_range)
+        """Create an estimator for an IMU mounted at `rotation_trunk_from_imu`, (x, y, z, w), known from a calibration.
+
+        rate: nominal sample rate in Hz. gyroscope_range rad/s, accelerometer_range m/s^2: of the sensor, at which it
+        saturates. Raises ParameterError.
+        """
+        #: (3, 3), trunk from IMU
+        self.rotation = rotation_matrix(rotation_trunk_from_imu, "rotation_trunk_from_imu")
+        self._rows = (-self.rotation).tolist()  # of gravity, which points down
+        x, y, z, w = map(float, rotation_trunk_from_imu)
+        self._imu_from_trunk = (-x, -y, -z, w)
+        self._period = 1.0 / one_float("rate", rate, 2.0 / MAX_GAP, 10_000.0, "Hz")
+        self._ranges = Ranges(gyroscope_range, accelerometer_range)
+        self._fusion = VqfFusion(self._period) if VQF else None
+        self._uncertainty = TiltUncertainty(self._period)
+        self._equal = EqualValues()
+        self._agreement = Agreement()
+        self._clock = ClockCheck()
+        self._is_fused: bool | None = None  # None before the first sample
+        self._time = -math.inf
+        self._restart("no sample yet")
+
+    @property
+    def gyroscope_bias(self) -> np.ndarray:
+        """The gyroscope bias that the fusion estimates and subtracts, (3,) rad/s in the IMU's axes."""
+        return np.array(self._fusion.bias if self._fusion else ZERO)
+
+    @property
+    def settling(self) -> str:
+        """Why there is no orientation yet; empty once there is."""
+        if self._is_fused and self._agreement.is_suspect:
+            return f"until gyroscope and accelerometer agree on a turn of the trunk; {self._why}"
+        return "" if self._is_settled else self._why
+
+    @property
+    def _is_settled(self) -> bool:
+        if not self._is_fused:
+            return self._age >= SETTLE_TIME
+        return self._uncertainty.is_settled and not self._agreement.is_suspect
+
+    def update(self, sample: ImuSample, arrival: float | None = None) -> TrunkOrientation | None:
+        """Process a sample; return the trunk's orientation, or None while it is not sure enough.
+
+        arrival: s, when the sample arrived, by a clock that need not agree with that of the stamps; None: not known.
+        Raises ParameterError if the sample is impossible, frozen or not later than the last one (it is then ignored),
+        or if what it measures contradicts itself or the samples before it.
+        """
+        try:
+            quaternion = self._follow(sample)
+            if arrival is not None:
+                self._clock.check(self._time, arrival)
+        except Contradiction as error:
+            self._agreement.suspect()
+            self._restart(f"{error.name} must be {error.expected}")
+            raise
+        if not self._is_settled:
+            return None
+        assert self._up
+        (x, y, z), (p, q, r) = self._up, self._rows
+        down = p[0] * x + p[1] * y + p[2] * z, q[0] * x + q[1] * y + q[2] * z, r[0] * x + r[1] * y + r[2] * z
+        sigma = math.sqrt(self._uncertainty.variance) if self._is_fused else REPORTED_SIGMA
+        return TrunkOrientation(down, quaternion, self._imu_from_trunk, sigma)
+
+    def _follow(self, sample: ImuSample) -> Quaternion:
+        """Return the IMU's orientation, world from IMU."""
+        is_fused, is_saturated = sample.orientation is None, False
+        acceleration: Floats3 | None
+        if is_fused:
+            if self._fusion is None:
+                raise ParameterError("orientation", None, "reported by the IMU, or install vqf to fuse it")
+            rate, is_saturated = self._ranges.angular_velocity(sample.angular_velocity)
+            acceleration = self._ranges.acceleration(sample.acceleration, self._last_acceleration)
+        else:
+            quaternion = unit_quaternion("orientation", sample.orientation)
+            given, force = sample.angular_velocity, sample.acceleration
+            rate = ZERO if given is None else three_floats("angular_velocity", given)
+            acceleration = None if force is None else three_floats("linear_acceleration", force)
+        time = float(sample.time)
+        dt = time - self._time
+        if not math.isfinite(time) or -MAX_GAP <= dt <= 0.0:  # far in the past: another clock, like a gap
+            raise ParameterError("stamp", time, "a finite number, later than the last stamp")
+        self._equal.check(time, rate, acceleration, self._up if is_fused and not is_saturated else None)
+        if not 0.0 < dt <= MAX_GAP or is_fused is not self._is_fused:
+            self._restart(f"gap of {dt:.2f} s" if is_fused is self._is_fused else "started")
+            self._is_fused, dt, self._clock = is_fused, 0.0, ClockCheck()
+        self._time = time
+        if is_fused:
+            return self._fuse(dt, rate, acceleration, is_saturated)
+        self._age += dt
+        up = up_in_body(quaternion)
+        if self._up and angle_between(up, self._up) > MAX_REPORTED_RATE * max(dt, self._period) + MAX_JUMP:
+            self._restart("orientation jumped")
+        self._up = up
+        if acceleration:
+            self._agreement.check_reported(dt, up, acceleration)
+        return quaternion
+
+    def _fuse(self, dt: float, rate: Floats3, acceleration: Floats3 | None, is_saturated: bool) -> Quaternion:
+        """Return the IMU's orientation `dt` s after the last sample; 0 for the first one."""
+        fusion, uncertainty = self._fusion, self._uncertainty
+        assert fusion
+        uncertainty.advance(dt, rate, self._last_rate or rate)
+        if self._equal.duration:
+            uncertainty.repeat(dt, self._equal.duration)
+        elif is_saturated:
+            uncertainty.lose(OVERSHOOT * self._ranges.gyroscope * dt)
+        if uncertainty.is_lost:
+            self._restart("too much rotation was not measured")
+        quaternion = fusion.advance(dt, rate, self._last_rate or rate, acceleration)
+        self._last_rate, self._last_acceleration = rate, acceleration
+        self._up = up_in_body(quaternion)
+        if acceleration:
+            self._agreement.check(dt, quaternion, self._up, acceleration)
+        self._speed = max(abs(rate[0]) + abs(rate[1]) + abs(rate[2]), self._speed * (1.0 - dt))
+        contradiction = self._agreement.contradiction + self._speed * self._clock.offset
+        uncertainty.combine(fusion.bias_sigma, self._agreement.square, contradiction)
+        return quaternion
+
+    def _restart(self, why: str) -> None:
+        """Begin anew with the next sample, or the present one."""
+        if self._fusion:
+            self._fusion.restart()
+        self._uncertainty.restart()
+        self._agreement.restart()
+        self._why = why
+        self._age = self._speed = 0.0
+        self._up = self._last_rate = self._last_acceleration = None
 
 
 class VqfFusion:
-    """The `core.trunk.estimator.Fusion` by VQF."""
+    """Orientation by VQF from samples that are not evenly spaced; the heading is arbitrary.
 
-    def __init__(self, rate: float) -> None:
-        """Create a fusion for samples at about `rate` Hz."""
-        self._period = 1.0 / rate
-        self._vqf = VQF(self._period)
+    VQF averages the accelerometer in the frame that the gyroscope carries along, and learns the gyroscope's bias at
+    rest and in motion. Its sampling period is fixed, but samples come with jitter and with gaps. So the rates are
+    scaled such that VQF turns in its period as far as the IMU did between two samples, and the accelerometer is passed
+    on once for each period that has passed. On evenly spaced samples this is VQF alone.
+    """
+
+    def __init__(self, period: float) -> None:
+        """Create a fusion for samples that are usually `period` s apart."""
+        self._period = period
+        self._vqf = VQF(period)
         self._rate, self._acceleration = np.zeros(3), np.zeros(3)  # reused
-        self._due = self._period  # s for which the accelerometer has not been passed on
+        self._due = period  # s for which the accelerometer has not been passed on
         self._count = 0
         self._read_bias()
 
@@ -60,10 +238,10 @@ class VqfFusion:
         self._due = self._period
 
     def advance(self, dt: float, rate: Floats3, last_rate: Floats3, acceleration: Floats3 | None) -> Quaternion:
-        """Return the orientation `dt` s after the last sample; see `Fusion`.
+        """Return the orientation `dt` s after the last sample, world from IMU.
 
-        A rate is that of the period that it ends. Over several periods the rates between the two known ones are
-        interpolated.
+        rate, last_rate: of this sample and the last one, each of the period that it ends; over several periods those
+        between the two are interpolated. acceleration: None if it is not known.
         """
         vqf, period, scaled = self._vqf, self._period, self._rate
         periods = dt / period
@@ -75,17 +253,15 @@ class VqfFusion:
         self._due += dt
         count = round(self._due / period)
         self._due -= count * period
-        if acceleration is None:
-            count = 0
-        else:
-            measured = self._acceleration
+        measured = self._acceleration
+        if acceleration:
             measured[0], measured[1], measured[2] = acceleration
-        if count:
+        if acceleration and count:
             vqf.update(scaled, measured)
+            for _ in range(1, count):
+                vqf.updateAcc(measured)
         else:
             vqf.updateGyr(scaled)
-        for _ in range(1, count):
-            vqf.updateAcc(measured)
         self._count += 1
         if self._count % BIAS_INTERVAL == 0:
             self._read_bias()
@@ -93,5 +269,6 @@ class VqfFusion:
         return x, y, z, w
 
     def _read_bias(self) -> None:
+        """Read the gyroscope's bias, (3,) rad/s, and its standard deviation."""
         bias, self.bias_sigma = self._vqf.getBiasEstimate()
         self.bias: Floats3 = tuple(bias.tolist())

@@ -93,7 +93,7 @@ def test_a_start_in_motion_takes_longer_and_an_unknown_bias_and_a_contradiction_
 
 def turned(samples):
     """The angle in rad about z after (dt, rate about z) for each sample."""
-    orientation, last = VqfFusion(100.0), STILL
+    orientation, last = VqfFusion(0.01), STILL
     for dt, rate in samples:
         now = (0.0, 0.0, rate)
         _, _, z, w = orientation.advance(dt, now, last, (0.0, 0.0, G))
@@ -109,7 +109,7 @@ def test_over_a_gap_the_rates_between_are_interpolated():
 
 
 def test_a_restart_keeps_the_bias():
-    orientation = VqfFusion(100.0)
+    orientation = VqfFusion(0.01)
     random = np.random.default_rng(4)
     for _ in range(1000):
         x, y, z = random.normal(0.0, 1e-3, 3)

@@ -9,23 +9,16 @@ from bench.imu_report import report
 from bench.imu_trials import by_estimator, by_vqf, lost_samples, read_trials, score
 
 TRIALS = list(read_trials())
-each_trial = pytest.mark.parametrize("trial", TRIALS, ids=[trial.name for trial in TRIALS])
 
 
-@each_trial
-def test_on_real_motion_the_tilt_is_as_good_as_vqfs_and_never_off_by_5_degrees(trial):
-    here, vqf = score(trial, "here"), score(trial, "VQF, its defaults")
+@pytest.mark.parametrize("lost", [0.0, 0.03])
+@pytest.mark.parametrize("trial", TRIALS, ids=[trial.name for trial in TRIALS])
+def test_on_real_motion_the_tilt_is_as_good_as_vqfs_and_never_off_by_5_degrees(trial, lost):
+    here = score(trial.without(lost_samples(len(trial.times), lost)), "here")
+    vqf = score(trial, "VQF, its defaults")
     assert here.rms <= max(1.1 * vqf.rms, vqf.rms + 0.1)
     assert here.largest < 5.0
     assert here.published >= 0.99
-
-
-@each_trial
-def test_with_3_percent_of_the_samples_lost_too(trial):
-    lossy, vqf = score(trial.without(lost_samples(len(trial.times), 0.03)), "here"), score(trial, "VQF, its defaults")
-    assert lossy.rms <= max(1.1 * vqf.rms, vqf.rms + 0.1)
-    assert lossy.largest < 5.0
-    assert lossy.published >= 0.99
 
 
 def test_evenly_spaced_samples_give_vqf_alone():

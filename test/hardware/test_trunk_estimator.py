@@ -10,8 +10,8 @@ from vqf import VQF
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.tilt import gravity_in_trunk
-from exo_gravity.core.trunk.estimator import MAX_GAP
 from exo_gravity.hardware import ImuSample, TrunkEstimator
+from exo_gravity.hardware.trunk_estimator import MAX_GAP
 
 from ..support.handheld_imu import read_recording
 
@@ -196,13 +196,6 @@ def test_a_driver_that_always_reports_the_identity_is_detected():
         last(estimator, constant)
 
 
-def test_a_gyroscope_with_a_reversed_axis_is_detected():
-    estimator = settled()
-    bow = samples_of(lambda t: Rotation.from_euler("y", 0.5 * t), duration=3.0, start=5.0)
-    with pytest.raises(ParameterError, match="check the gyroscope's unit, axes and signs"):
-        last(estimator, (s._replace(angular_velocity=-np.asarray(s.angular_velocity)) for s in bow))
-
-
 def frozen(count, rate=100.0, **values):
     """Samples that repeat one measurement with new stamps, after those of `settled`."""
     return (GOOD._replace(time=5.0 + (k + 1) / rate, **values) for k in range(count))
@@ -230,12 +223,6 @@ def test_a_slow_or_fast_imu_counts_as_frozen_by_samples_and_by_time():
     for estimator, rate, count in ((slow, 20.0, 10), (fast, 1000.0, 103)):
         with pytest.raises(ParameterError, match="the IMU or its driver is frozen"):
             estimator.update(list(frozen(count, rate))[-1])
-
-
-def test_an_imu_frozen_from_the_start_is_refused_too():
-    estimator = TrunkEstimator(ALIGNED)
-    with pytest.raises(ParameterError, match="frozen"):
-        last(estimator, frozen(20))
 
 
 def test_a_driver_that_reports_its_orientation_alone_is_not_frozen():

@@ -186,12 +186,7 @@ def test_a_turned_imu_gives_tilt_rate_and_acceleration_in_the_trunks_axes(imu):
     ("arguments", "sentence"),
     [
         ([], "rotation_trunk_from_imu = [0.0, 0.0, 0.0, 0.0]: must be a unit quaternion"),
-        (["-p", "rotation_trunk_from_imu:=[0.0, 0.0, 1.0]"], "rotation_trunk_from_imu = [0.0, 0.0, 1.0]: must be 4"),
-        (
-            ["-p", "input_topic:=/imu/data"],
-            "input_topic = '/imu/data': must be a topic that this node does",
-        ),
-        (["-p", "timeot:=0.2"], "timeot = 0.2: must be one of"),
+        (["-p", "input_topic:=/imu/data"], "input_topic = '/imu/data': must be a topic that this node does"),
     ],
 )
 def test_an_invalid_parameter_ends_the_node_with_one_sentence(arguments, sentence):

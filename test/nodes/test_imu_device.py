@@ -1,7 +1,6 @@
-"""An IMU on a serial port that the node reads itself, over real DDS in this process."""
+"""An IMU on a serial port that the node reads itself: the device in virtual time, and the node over real DDS."""
 
 import math
-import threading
 import time
 
 import pytest
@@ -9,7 +8,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.executors import SingleThreadedExecutor
-from sensor_msgs.msg import Imu
+from rclpy.time import Time
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.nodes.imu.device import ImuDevice
@@ -17,55 +16,49 @@ from exo_gravity.nodes.imu.node import ImuNode
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.run import keep_to_this_machine
 
+from ..hardware.virtual_time import VirtualClock
 from ..support.fake_imu.chip import G
 from ..support.fake_imu.serial import FakeSerialSensor, rvc_packet
 
 keep_to_this_machine()
-TOPIC = "/imu/data_raw"
+PERIOD = 0.01  # s
 
 
 class Rig:
-    """A BNO085 that sends on a pseudo-terminal, the device that reads it, and a listener on the topic."""
+    """A BNO085 on a pseudo-terminal, the device that reads it, and the node of which it is a part."""
 
-    def __init__(self, port, **values):
+    def __init__(self, port):
         self.sensor = FakeSerialSensor(port)
-        self.values = {"source": "bno085", "rate": 100.0, "serial.port": str(port), "serial.baud": 115200} | values
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context)
-        self.node = rclpy.create_node("imu_device_test", context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+        self.values = {"source": "bno085", "rate": 100.0, "serial.port": str(port), "serial.baud": 115200}
+        self.time = VirtualClock()
         self.received, self.published = [], []
-        self.node.create_subscription(Imu, TOPIC, self.published.append, 50)
-        self.counter = 0
-        self.device = None
 
-    def start(self):
-        self.device = ImuDevice(self.node, self.values, TOPIC, self._on_imu)
-        self.device.start()
-        self.wait_until(lambda: self.device._publisher.get_subscription_count() == 1)
+    def open(self, **values):
+        self.device = ImuDevice(self, self.values | values, "/imu/data_raw", self._on_imu, self.time)
+
+    def poll(self, count, sends=True):
+        """Poll `count` times; before each, the sensor sends a sample."""
+        for _ in range(count):
+            self.time.sleep(PERIOD)
+            if sends:
+                self.sensor.deliver(rvc_packet(len(self.received) + 1, (90, 0, 0), (0, 0, 1000)))
+            self.device.poll()
 
     def _on_imu(self, message, info):
-        self.received.append((message, info["publication_sequence_number"], threading.current_thread().name))
+        self.received.append((message, info["publication_sequence_number"]))
 
-    def send(self):
-        self.counter += 1
-        self.sensor.send(rvc_packet(self.counter, (90, 0, 0), (0, 0, 1000)))
+    # of the node
+    def create_publisher(self, msgtype, topic, depth):
+        return self
 
-    def wait_until(self, condition, action=lambda: None):
-        end = time.monotonic() + 20.0
-        while not condition():
-            action()
-            assert time.monotonic() < end, self.device.problem
-            self.executor.spin_once(timeout_sec=0.01)
+    def publish(self, message):
+        self.published.append(message)
 
-    def close(self):
-        if self.device:
-            self.device.stop()
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self.context)
-        self.sensor.unplug()
+    def get_clock(self):
+        return self
+
+    def now(self):
+        return Time(nanoseconds=round(self.time.monotonic() * 1e9))
 
 
 @pytest.fixture
@@ -73,115 +66,88 @@ def rig(tmp_path):
     """A BNO085 that is plugged in."""
     rig = Rig(tmp_path / "imu")
     yield rig
-    rig.close()
+    rig.sensor.unplug()
 
 
 def test_each_sample_goes_to_the_callback_and_to_the_topic_once_and_in_order(rig):
-    rig.start()
-    rig.wait_until(lambda: len(rig.received) >= 20, rig.send)
-    rig.wait_until(lambda: len(rig.published) == len(rig.received))
-    assert [number for _, number, _ in rig.received] == list(range(1, len(rig.received) + 1))
-    assert {thread for _, _, thread in rig.received[1:]} == {"bno085"}
-    assert [message.header.stamp for message in rig.published] == [
-        message.header.stamp for message, _, _ in rig.received
-    ]
+    rig.open()
+    rig.poll(20)
+    messages, numbers = zip(*rig.received, strict=True)
+    assert numbers == tuple(range(1, 21)) and rig.published == list(messages)
 
 
-def test_a_message_is_stamped_when_it_was_taken_and_says_what_is_not_measured(rig):
-    rig.start()
-    rig.wait_until(lambda: rig.received, rig.send)
-    message = rig.received[-1][0]
-    age = rig.node.get_clock().now().nanoseconds - to_nanoseconds(message.header.stamp)
-    assert 0 <= age < 1e9
+def test_a_message_is_stamped_when_it_was_taken_and_states_what_is_not_measured(rig):
+    rig.open()
+    rig.poll(1)
+    message, _ = rig.received[-1]
+    age = rig.now().nanoseconds - to_nanoseconds(message.header.stamp)
+    assert age == pytest.approx(0.5e9 * PERIOD, rel=0.01)
     assert message.angular_velocity_covariance[0] == -1.0 and message.orientation_covariance[0] == 0.0
     assert message.linear_acceleration.z == pytest.approx(G) and message.orientation.z == pytest.approx(0.5**0.5)
 
 
 def test_a_sensor_that_is_unplugged_is_named_and_comes_back_by_itself(rig):
-    rig.start()
-    rig.wait_until(lambda: rig.received, rig.send)
-    rig.wait_until(lambda: rig.device.problem == "")
-    assert rig.device.values["device"] == f"BNO085 on {rig.sensor.port}"
+    rig.open()
+    rig.poll(1)
+    assert rig.device.problem == "" and rig.device.values["device"] == f"BNO085 on {rig.sensor.port}"
     rig.sensor.unplug()
-    rig.wait_until(lambda: f"BNO085 on {rig.sensor.port}: cannot be" in rig.device.problem)
+    rig.poll(1, sends=False)
+    assert f"BNO085 on {rig.sensor.port}: cannot be" in rig.device.problem
     rig.sensor.plug()
-    before = len(rig.received)
-    rig.wait_until(lambda: len(rig.received) > before, rig.send)
-    assert rig.device.problem == "" and rig.device.failure is None and rig.device.values["opened"] >= 2
+    rig.poll(52, sends=False)
+    rig.poll(1)
+    assert len(rig.received) == 2 and rig.device.problem == "" and rig.device.values["opened"] == 2
 
 
 def test_a_sensor_that_is_missing_at_the_start_is_waited_for(rig):
     rig.sensor.unplug()
-    rig.start()
+    rig.open()
     assert "cannot be opened" in rig.device.problem
     rig.sensor.plug()
-    rig.wait_until(lambda: rig.received, rig.send)
+    rig.poll(52, sends=False)
+    rig.poll(1)
+    assert len(rig.received) == 1
 
 
 def test_a_parameter_that_does_not_suit_the_device_is_an_error_at_the_start(rig):
-    rig.values["source"], rig.values["serial.baud"] = "witmotion", 9600
     with pytest.raises(ParameterError, match=r"serial\.baud = 9600"):
-        rig.start()
+        rig.open(**{"source": "witmotion", "serial.baud": 9600})
 
 
-class NodeRig:
-    """The node `imu` in this process, which reads a BNO085 itself, and a listener."""
+def test_the_node_publishes_the_tilt_of_a_sensor_that_it_reads_itself_and_reports_its_absence(rig):
+    arguments = ("source:=bno085", f"serial.port:={rig.sensor.port}", "rotation_trunk_from_imu:=[0.0, 0.0, 0.0, 1.0]")
+    rclpy.init(args=["--ros-args", *(part for argument in arguments for part in ("-p", argument))])
+    node, listener = ImuNode(), rclpy.create_node("imu_listener")
+    executor = SingleThreadedExecutor()
+    tilts, reports = [], [DiagnosticStatus()]
+    executor.add_node(node)
+    executor.add_node(listener)
+    listener.create_subscription(Vector3Stamped, "/imu/pitch_yaw", tilts.append, 50)
+    listener.create_subscription(DiagnosticArray, "/diagnostics", lambda message: reports.extend(message.status), 50)
 
-    def __init__(self, port):
-        self.sensor = FakeSerialSensor(port)
-        arguments = ("source:=bno085", f"serial.port:={port}", "rotation_trunk_from_imu:=[0.0, 0.0, 0.0, 1.0]")
-        rclpy.init(args=["--ros-args", *(part for argument in arguments for part in ("-p", argument))])
-        self.node, self.listener = ImuNode(), rclpy.create_node("imu_listener")
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.node)
-        self.executor.add_node(self.listener)
-        self.tilts, self.status = [], DiagnosticStatus()
-        self.listener.create_subscription(Vector3Stamped, "/imu/pitch_yaw", self.tilts.append, 50)
-        self.listener.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
-        self.counter = 0
-
-    def _on_diagnostics(self, message):
-        (self.status,) = message.status
-
-    def send(self):
-        """Send a level sensor's packet with noise, as every real one has."""
-        self.counter += 1
-        self.sensor.send(rvc_packet(self.counter, (0, 20, 0), (0, 342, 940 + self.counter % 3)))
-
-    def wait_until(self, condition, action=lambda: None):
-        end, due = time.monotonic() + 20.0, time.monotonic()
+    def wait_until(condition, sends=True):
+        end, due, counter = time.monotonic() + 20.0, time.monotonic(), 0
         while not condition():
-            assert time.monotonic() < end, self.status
-            if time.monotonic() >= due:
-                due += 0.01
-                action()
-            self.executor.spin_once(timeout_sec=0.002)
+            assert time.monotonic() < end, reports[-1]
+            if sends and time.monotonic() >= due:
+                due, counter = due + 0.01, counter + 1
+                # with noise, as every real one has
+                rig.sensor.send(rvc_packet(counter, (0, 20, 0), (0, 342, 940 + counter % 3)))
+            executor.spin_once(timeout_sec=0.002)
 
-    def close(self):
-        self.node.close()
-        self.executor.shutdown()
-        self.node.destroy_node()
-        self.listener.destroy_node()
+    try:
+        wait_until(lambda: tilts)
+        assert (tilts[-1].vector.x, tilts[-1].vector.y) == pytest.approx((math.radians(20), 0.0), abs=1e-3)
+        wait_until(lambda: reports[-1].message == "publishing")
+        rig.sensor.unplug()
+        wait_until(lambda: f"BNO085 on {rig.sensor.port}: cannot be" in reports[-1].message, sends=False)
+        assert reports[-1].level == DiagnosticStatus.ERROR
+        rig.sensor.plug()
+        wait_until(lambda: reports[-1].message == "publishing")
+        assert int({pair.key: pair.value for pair in reports[-1].values}["opened"]) >= 2
+    finally:
+        node.close()
+        executor.shutdown()
+        node.destroy_node()
+        listener.destroy_node()
         rclpy.try_shutdown()
-        self.sensor.unplug()
-
-
-@pytest.fixture
-def node_rig(tmp_path):
-    """The node `imu` with a BNO085."""
-    rig = NodeRig(tmp_path / "imu")
-    yield rig
-    rig.close()
-
-
-def test_the_node_publishes_the_tilt_of_a_sensor_that_it_reads_itself_and_reports_its_absence(node_rig):
-    node_rig.wait_until(lambda: node_rig.tilts, node_rig.send)
-    tilt = node_rig.tilts[-1].vector
-    assert (tilt.x, tilt.y) == pytest.approx((math.radians(20), 0.0), abs=1e-3)
-    node_rig.wait_until(lambda: node_rig.status.message == "publishing", node_rig.send)
-    node_rig.sensor.unplug()
-    node_rig.wait_until(lambda: f"BNO085 on {node_rig.sensor.port}: cannot be" in node_rig.status.message)
-    assert node_rig.status.level == DiagnosticStatus.ERROR
-    node_rig.sensor.plug()
-    node_rig.wait_until(lambda: node_rig.status.message == "publishing", node_rig.send)
-    assert int({pair.key: pair.value for pair in node_rig.status.values}["opened"]) >= 2

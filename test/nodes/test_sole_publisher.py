@@ -2,57 +2,51 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-
-from rclpy.node import Node
-from std_msgs.msg import String
-
-from exo_gravity.nodes.ros import sole_publisher
 from exo_gravity.nodes.ros.sole_publisher import SolePublisher
 
-UNNUMBERED = {"publication_sequence_number": None}
+from ..hardware.virtual_time import VirtualClock
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 10.0
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+class StubNode:
+    """A node that lists the publishers of a topic, and keeps its warnings."""
+
+    def __init__(self):
+        self.publishers, self.counted, self.warnings = 1, 0, []
+
+    def resolve_topic_name(self, topic):
+        return f"/right/{topic}"
+
+    def count_publishers(self, topic):
+        assert topic == "/right/commands"
+        self.counted += 1
+        return self.publishers
+
+    def get_logger(self):
+        return self
+
+    def warning(self, text):
+        self.warnings.append(text)
 
 
-def numbers(sole: SolePublisher, *values: int) -> list[bool]:
+def numbers(*values: int) -> list[bool]:
+    sole = SolePublisher(StubNode(), "commands")
     return [sole.is_another({"publication_sequence_number": value}) for value in values]
 
 
-def test_rising_numbers_come_from_one_publisher_even_if_messages_are_lost(node: Node):
-    assert not any(numbers(SolePublisher(node, "commands"), 7, 8, 9, 40, 41))
+def test_rising_numbers_come_from_one_publisher_even_if_messages_are_lost():
+    assert not any(numbers(7, 8, 9, 40, 41))
 
 
-def test_a_number_that_does_not_rise_comes_from_another_publisher(node: Node):
-    assert numbers(SolePublisher(node, "commands"), 7, 8, 1, 9, 2) == [False, False, True, False, True]
+def test_a_number_that_does_not_rise_comes_from_another_publisher():
+    assert numbers(7, 8, 1, 9, 2) == [False, False, True, False, True]
 
 
-def test_without_numbers_the_publishers_are_counted_and_the_log_states_it_once(node: Node, monkeypatch):
-    monkeypatch.setattr(sole_publisher, "COUNT_PERIOD", 0.05)
-    warnings: list[str] = []
-    monkeypatch.setattr(type(node.get_logger()), "warning", lambda _, text: warnings.append(text))
-    sole = SolePublisher(node, "commands")
-    first = node.create_publisher(String, "commands", 1)
-    wait_until(lambda: node.count_publishers("commands") == 1)
-    assert not sole.is_another(UNNUMBERED)
-    second = node.create_publisher(String, "/right/commands", 1)
-    wait_until(lambda: sole.is_another(UNNUMBERED))
-    node.destroy_publisher(first)
-    wait_until(lambda: not sole.is_another(UNNUMBERED))
-    node.destroy_publisher(second)
-    assert len(warnings) == 1 and "/right/commands: the middleware does not number messages" in warnings[0]
-
-
-def test_the_count_is_taken_at_most_twice_a_second(node: Node, monkeypatch):
-    counted: list[str] = []
-    monkeypatch.setattr(node, "count_publishers", lambda topic: counted.append(topic) or 1)
-    sole = SolePublisher(node, "commands")
-    for _ in range(100):
-        sole.is_another(UNNUMBERED)
-    assert counted == ["/right/commands"]
+def test_without_numbers_the_publishers_are_counted_twice_a_second_and_the_log_states_it_once():
+    node, clock, answers = StubNode(), VirtualClock(), []
+    sole = SolePublisher(node, "commands", clock)
+    for k in range(300):
+        node.publishers = 2 if 100 <= k < 200 else 1
+        answers.append(sole.is_another({"publication_sequence_number": None}))
+        clock.sleep(0.01)
+    assert node.counted == 6 and not any(answers[:100]) and all(answers[151:200]) and not any(answers[251:])
+    assert len(node.warnings) == 1 and "/right/commands: the middleware does not number messages" in node.warnings[0]

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.rotation import unit_quaternion
 from exo_gravity.core.numbers import Vector, one_float
 
 SIDES = ("left", "right")
@@ -43,14 +44,9 @@ class Tilt(NamedTuple):
     @classmethod
     def of(cls, side: str, pitch: float = 0.0, roll: float = 0.0) -> Tilt:
         """Return the tilt of the `side` ('left' or 'right') arm for a trunk at `pitch` and `roll` in rad."""
-        if side not in SIDES:
-            raise ParameterError("side", side, f"one of {', '.join(SIDES)}")
         pitch = one_float("pitch", pitch, -math.pi, math.pi, "rad")
         roll = one_float("roll", roll, -math.pi, math.pi, "rad")
-        outward = roll if side == "left" else -roll
-        forward, right, down = _gravity(pitch, outward)
-        direction = (-right, forward, down)
-        return cls(pitch, roll, direction, math.acos(max(-1.0, min(1.0, down))), -pitch, outward)
+        return cls._of(side, pitch, roll, *gravity_in_trunk(pitch, roll).tolist())
 
     @classmethod
     def of_gravity(cls, side: str, gravity_in_trunk: Vector) -> Tilt:
@@ -59,26 +55,22 @@ class Tilt(NamedTuple):
         It has no singularity: a trunk that bows past 90 degrees, or lies, has a direction like any other. Raises
         ParameterError.
         """
-        if side not in SIDES:
-            raise ParameterError("side", side, f"one of {', '.join(SIDES)}")
         x, y, z = map(float, gravity_in_trunk)
         pitch, roll = pitch_roll((x, y, z))
         norm = math.hypot(x, y, z)
-        x, y, z = x / norm, (y if side == "left" else -y) / norm, z / norm
-        return cls(
-            pitch, roll, (y, x, -z), math.acos(max(-1.0, min(1.0, -z))), -pitch, roll if side == "left" else -roll
-        )
+        return cls._of(side, pitch, roll, x / norm, y / norm, z / norm)
 
-
-def _gravity(pitch: float, roll: float) -> tuple[float, float, float]:
-    """Return the components of gravity's unit vector along forward, right and down."""
-    return math.sin(pitch), math.sin(roll) * math.cos(pitch), math.cos(roll) * math.cos(pitch)
+    @classmethod
+    def _of(cls, side: str, pitch: float, roll: float, x: float, y: float, z: float) -> Tilt:
+        if side not in SIDES:
+            raise ParameterError("side", side, f"one of {', '.join(SIDES)}")
+        y, outward = (y, roll) if side == "left" else (-y, -roll)
+        return cls(pitch, roll, (y, x, -z), math.acos(max(-1.0, min(1.0, -z))), -pitch, outward)
 
 
 def gravity_in_trunk(pitch: float, roll: float) -> np.ndarray:
     """Return the unit vector of gravity, (3,), in the trunk's axes (x forward, y left, z up)."""
-    forward, right, down = _gravity(pitch, roll)
-    return np.array((forward, -right, -down))
+    return np.array((math.sin(pitch), -math.sin(roll) * math.cos(pitch), -math.cos(roll) * math.cos(pitch)))
 
 
 def pitch_roll(gravity_in_trunk: Vector) -> tuple[float, float]:
@@ -100,11 +92,7 @@ def rotation_matrix(quaternion: Vector | None, name: str = "quaternion") -> np.n
 
     Raises ParameterError that names `name` unless its norm is within 1 % of 1, which allows for rounding in drivers.
     """
-    q = np.asarray(quaternion, dtype=float)
-    norm = float(np.linalg.norm(q)) if q.shape == (4,) else math.nan
-    if not abs(norm - 1.0) < 0.01:
-        raise ParameterError(name, quaternion, "a unit quaternion (x, y, z, w)")
-    x, y, z, w = q / norm
+    x, y, z, w = unit_quaternion(name, quaternion)
     return np.array(
         (
             (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),

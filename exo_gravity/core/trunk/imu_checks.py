@@ -10,7 +10,7 @@ import math
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.rotation import ZERO, Floats3
+from exo_gravity.core.model.rotation import ZERO, Floats3, Quaternion, rotated
 
 FROZEN_TIME, FROZEN_SAMPLES = 0.1, 10  # s of equal samples, and at least this many
 STUCK_SAMPLES = 5
@@ -18,6 +18,7 @@ NEAR_GRAVITY = 0.15  # share of 1 g
 TURN = math.radians(3.0)
 STUCK_TURN = 0.1  # of gravity's unit vector along an axis
 
+CHECK_PERIOD = 0.0095  # s between two comparisons of gyroscope and accelerometer
 QUIET_TIME, QUIET = 0.15, 0.1  # s over which the acceleration must be near 1 g, by a share of 1 g
 MAX_CONTRADICTION = math.radians(20.0)
 CONTRADICTION_TIME = 0.5  # s; less than the time to settle, so that a wrong orientation is never used
@@ -40,6 +41,10 @@ WINDOW, DRIFTING_WINDOWS = 0.25, 2  # s; in a row
 MAX_DRIFT, MAX_OFFSET = 0.03, 0.06  # s a second, in each of these windows; s, in all of them
 
 
+class Contradiction(ParameterError):
+    """The samples contradict each other: the estimate begins anew once gyroscope and accelerometer agree on a turn."""
+
+
 class EqualValues:
     """Values that an IMU repeats with new stamps: all from a frozen one, one axis from a broken one.
 
@@ -53,13 +58,12 @@ class EqualValues:
         self.duration = 0.0  #: s for which whole samples have been equal
         self._since, self._count = math.inf, 0  # of equal samples
         self._values: tuple[float, ...] = (math.nan,) * 6  # gyroscope and accelerometer
-        self._counts = [0] * 6  # of equal values
+        self._counts = [0.0] * 6  # of equal values; infinite for a stuck axis
         self._ups = [0.0] * 6  # the estimate's vertical when the accelerometer's axis began to repeat its value
         self._any_equal = False  # axes, by the last sample
-        self._stuck: set[int] = set()
 
     def check(self, time: float, rate: Floats3, acceleration: Floats3 | None, up: Floats3 | None) -> None:
-        """Check the sample of `time` (s). Raises ParameterError once the IMU is frozen, or one of its axes is stuck.
+        """Raise ParameterError once the IMU is frozen, Contradiction once an axis is stuck, at the sample of `time` s.
 
         up: the vertical in the IMU's axes by an estimate from the samples before; None if there is none.
         """
@@ -81,15 +85,12 @@ class EqualValues:
             return
         for axis in range(6):
             if values[axis] != last[axis]:
-                if self._counts[axis]:
-                    self._counts[axis] = 0
-                    self._stuck.discard(axis)
+                self._counts[axis] = 0
             elif self._is_stuck(axis, acceleration, up):
-                self._stuck.add(axis)
+                self._counts[axis] = math.inf
                 name, shown = ("angular_velocity", rate) if axis < 3 else ("linear_acceleration", acceleration)
                 expected = f"different from sample to sample while the trunk turns: the {'xyz'[axis % 3]} axis is stuck"
-                raise ParameterError(name, shown, expected)
-
+                raise Contradiction(name, shown, expected)
         self._any_equal = any(self._counts)
 
     def _is_stuck(self, axis: int, acceleration: Floats3, up: Floats3) -> bool:
@@ -97,8 +98,8 @@ class EqualValues:
         if not self._counts[axis]:
             self._ups[axis] = up[axis % 3]
         self._counts[axis] += 1
-        if self._counts[axis] < STUCK_SAMPLES or axis in self._stuck:
-            return axis in self._stuck
+        if not STUCK_SAMPLES <= self._counts[axis] < math.inf:
+            return self._counts[axis] == math.inf
         if axis >= 3:
             return abs(up[axis - 3] - self._ups[axis]) > STUCK_TURN
         norm = math.hypot(*acceleration)
@@ -107,32 +108,11 @@ class EqualValues:
         return is_near and math.dist(up, (x / norm, y / norm, z / norm)) > TURN
 
 
-class GravityCheck:
-    """A reported orientation against the accelerometer: one that the driver does not have, or upside down."""
-
-    def __init__(self) -> None:
-        self._deviation = self._contradicted = 0.0  # share of 1 g, mean over QUIET_TIME; s
-
-    def update(self, dt: float, up: Floats3, acceleration: Floats3) -> None:
-        """Raise ParameterError once `up`, the world's z axis in the IMU's axes, has been contradicted for too long."""
-        x, y, z = acceleration
-        norm = math.hypot(x, y, z)
-        now = abs(norm / STANDARD_GRAVITY - 1.0)
-        self._deviation += (now - self._deviation) * min(1.0, dt / QUIET_TIME)
-        if self._deviation < QUIET and now < QUIET:
-            contradicts = up[0] * x + up[1] * y + up[2] * z < norm * math.cos(MAX_CONTRADICTION)
-            self._contradicted = self._contradicted + dt if contradicts else 0.0
-        if self._contradicted > CONTRADICTION_TIME:
-            limit = math.degrees(MAX_CONTRADICTION)
-            expected = f"within {limit:g} degrees of the accelerometer at rest: check the IMU's axes, units and signs"
-            raise ParameterError("gravity_in_imu", [round(-component, 2) for component in up], expected)
-
-
 class Agreement:
-    """Gyroscope against accelerometer, for an IMU that reports no orientation.
+    """The orientation against the accelerometer. Every method raises Contradiction where no movement explains it.
 
-    Turns: gravity must have turned by both alike over the last second. The more the acceleration's length deviates from
-    1 g, the larger a turn must be to be compared.
+    Turns: gravity must have turned by gyroscope and accelerometer alike over the last second. The more the
+    acceleration's length deviates from 1 g, the larger a turn must be to be compared.
 
     Mean: the mean acceleration in the world must be gravity, because a velocity is bounded. Over a time T a change of
     velocity by v shifts the mean by v / T. For a person who starts to walk v is known; for any other movement it is the
@@ -147,33 +127,60 @@ class Agreement:
     def restart(self) -> None:
         """Begin anew with the next sample. Whether the two have agreed before is kept."""
         self.contradiction = 0.0  #: rad by which the two turns differ, while they clearly do
+        self.square = 0.0  #: of the acceleration's deviation from its mean, in shares of 1 g
         self._deviation = 0.0  # of the acceleration's length from 1 g, mean over QUIET_TIME, as a share
         self._up: Floats3 | None = None  # mean over TURN_TIME, like the next one
         self._measured: Floats3 = ZERO
-        self._unlike = self._rest = 0.0  # s
+        self._unlike = self._rest = self._contradicted = 0.0  # s
         self._age = 0.0  # s
         self._mean: Floats3 = ZERO  # in 1 g
-        self.square = 0.0  #: of the deviation from the mean
-
-    @property
-    def is_begun(self) -> bool:
-        """Whether there was a sample since the restart."""
-        return self._up is not None
+        self._sum, self._span, self._count = ZERO, 0.0, 0  # of accelerations since the last comparison; s; samples
 
     def suspect(self) -> None:
         """Require that the two agree on a turn."""
         self.is_suspect, self._agreed = True, 0.0
 
-    def check_turns(self, dt: float, up: Floats3, acceleration: Floats3) -> None:
-        """Compare the estimate, whose world z axis is `up` in the IMU's axes, with `acceleration`.
+    def check_reported(self, dt: float, up: Floats3, acceleration: Floats3) -> None:
+        """Check a reported orientation: one that the driver does not have, or upside down.
 
-        Raises ParameterError once the two have contradicted each other for longer than a movement can make them.
+        up: the world's z axis in the IMU's axes. Raises ParameterError.
         """
+        x, y, z = acceleration
+        norm = math.hypot(x, y, z)
+        now = abs(norm / STANDARD_GRAVITY - 1.0)
+        self._deviation += (now - self._deviation) * min(1.0, dt / QUIET_TIME)
+        if self._deviation < QUIET and now < QUIET:
+            contradicts = up[0] * x + up[1] * y + up[2] * z < norm * math.cos(MAX_CONTRADICTION)
+            self._contradicted = self._contradicted + dt if contradicts else 0.0
+        if self._contradicted > CONTRADICTION_TIME:
+            limit = math.degrees(MAX_CONTRADICTION)
+            expected = f"within {limit:g} degrees of the accelerometer at rest: check the IMU's axes, units and signs"
+            raise ParameterError("gravity_in_imu", [round(-component, 2) for component in up], expected)
+
+    def check(self, dt: float, quaternion: Quaternion, up: Floats3, acceleration: Floats3) -> None:
+        """Compare a fused orientation, and its world z axis `up` in the IMU's axes, with the mean of the accelerations.
+
+        The mean is that since the last comparison, CHECK_PERIOD before.
+        """
+        (x, y, z), (a, b, c) = self._sum, acceleration
+        total = x + a, y + b, z + c
+        span, count = self._span + dt, self._count + 1
+        if span < CHECK_PERIOD and self._up:
+            self._sum, self._span, self._count = total, span, count
+            return
+        self._sum, self._span, self._count = ZERO, 0.0, 0
+        share = 1.0 / (count * STANDARD_GRAVITY)
+        mean = total[0] * share, total[1] * share, total[2] * share
+        self._check_turns(span, up, mean)
+        self._check_mean(span, rotated(quaternion, mean))
+
+    def _check_turns(self, dt: float, up: Floats3, acceleration: Floats3) -> None:
+        """Compare the turns. acceleration: in 1 g."""
         (a, b, c), (x, y, z) = up, acceleration
         norm = math.sqrt(x * x + y * y + z * z)
         x, y, z = x / norm, y / norm, z / norm
-        self._deviation += (abs(norm / STANDARD_GRAVITY - 1.0) - self._deviation) * min(1.0, dt / QUIET_TIME)
-        share, deviation = dt / TURN_TIME, self._deviation
+        self._deviation += (abs(norm - 1.0) - self._deviation) * min(1.0, dt / QUIET_TIME)
+        share = dt / TURN_TIME
         (d, e, f), (u, v, w) = (self._up, self._measured) if self._up else (up, (x, y, z))
         d, e, f = d + share * (a - d), e + share * (b - e), f + share * (c - f)
         u, v, w = u + share * (x - u), v + share * (y - v), w + share * (z - w)
@@ -184,13 +191,13 @@ class Agreement:
         size = math.sqrt(a * a + b * b + c * c)
         if size <= CLEAR_TURN:
             if self.is_suspect:
-                self._rest = self._rest + dt if deviation < AT_REST else 0.0
+                self._rest = self._rest + dt if self._deviation < AT_REST else 0.0
                 self.is_suspect = self._rest < REST_TIME
             return
         self._rest = 0.0
-        difference = math.dist((x - u, y - v, z - w), (a, b, c))
-        if size <= CLEAR * deviation:
+        if size <= CLEAR * self._deviation:
             return
+        difference = math.dist((x - u, y - v, z - w), (a, b, c))
         if difference < ALIKE * size:
             self._agreed += dt
             self._unlike = max(0.0, self._unlike - 2.0 * dt)
@@ -200,15 +207,15 @@ class Agreement:
             self.contradiction = difference * self._unlike / PATIENCE  # a movement can look like one for 12 ms
             if self._unlike > PATIENCE:
                 expected = "the turn that the accelerometer shows: check the gyroscope's unit, axes and signs"
-                raise ParameterError("turn by angular_velocity", [round(v, 3) for v in (a, b, c)], expected)
+                raise Contradiction("turn by angular_velocity", [round(v, 3) for v in (a, b, c)], expected)
 
-    def check_mean(self, dt: float, acceleration_in_world: Floats3) -> None:
-        """Raise ParameterError if the mean of `acceleration_in_world` (3,) m/s^2 cannot be gravity."""
+    def _check_mean(self, dt: float, acceleration: Floats3) -> None:
+        """Compare the mean acceleration in the world, in 1 g, with gravity."""
         self._age += dt
         span = self._age if self._age < AVERAGE_TIME else AVERAGE_TIME
         share = dt / span if dt else 1.0
-        (u, v, w), (x, y, z) = self._mean, acceleration_in_world
-        x, y, z = x / STANDARD_GRAVITY - u, y / STANDARD_GRAVITY - v, z / STANDARD_GRAVITY - w
+        (u, v, w), (x, y, z) = self._mean, acceleration
+        x, y, z = x - u, y - v, z - w
         self._mean = u, v, w = u + share * x, v + share * y, w + share * z
         self.square += share * ((1.0 - share) * (x * x + y * y + z * z) - self.square)
         shift = math.sqrt(u * u + v * v + (w - 1.0) ** 2)
@@ -218,7 +225,7 @@ class Agreement:
         if shift > limit:
             mean = [round(STANDARD_GRAVITY * component, 2) for component in (u, v, w)]
             expected = f"within {STANDARD_GRAVITY * limit:.2f} m/s^2 of gravity upwards: check units, axes and signs"
-            raise ParameterError("mean linear_acceleration in the world", mean, expected)
+            raise Contradiction("mean linear_acceleration in the world", mean, expected)
 
 
 class ClockCheck:
@@ -236,7 +243,7 @@ class ClockCheck:
         self._drifts = 0  # windows in a row with a drift, < 0 for a fast clock
 
     def check(self, time: float, arrival: float) -> None:
-        """Check the stamp `time` of a sample that arrived at `arrival`, both s. Raises ParameterError."""
+        """Check the stamp `time` of a sample that arrived at `arrival`, both s. Raises Contradiction."""
         lag = arrival - time
         if lag < self._shortest:
             self._shortest = lag
@@ -249,17 +256,14 @@ class ClockCheck:
         if abs(self._drifts) >= DRIFTING_WINDOWS and abs(self._last - self._before) > MAX_OFFSET:
             drifted = f"{1e3 * (self._before - self._last):+.0f} ms in {WINDOW * abs(self._drifts):.1f} s"
             expected = f"by a clock as fast as this computer's, not one that gains {drifted}"
-            raise ParameterError("stamp", round(time, 4), expected)
+            raise Contradiction("stamp", round(time, 4), expected)
 
     def _close(self, limit: float) -> None:
         """End the window, in which a drift by more than `limit` s is one."""
         step, least = self._shortest - self._last, min(self._least, self._last)
         is_slow, is_fast = step > limit, step < -limit and self._last <= least
-        if is_slow or is_fast:
-            direction = 1 if is_slow else -1
-            if self._drifts * direction <= 0:
-                self._drifts, self._before = 0, self._last
-            self._drifts += direction
-        else:
-            self._drifts, self._before = 0, self._shortest
+        direction = is_slow - is_fast
+        if self._drifts * direction <= 0:
+            self._drifts, self._before = 0, self._last if direction else self._shortest
+        self._drifts += direction
         self._last, self._least, self._shortest = self._shortest, least, math.inf

@@ -48,11 +48,12 @@ class Ranges:
         """Take the ranges in rad/s and m/s^2. Raises ParameterError for one that no IMU has."""
         self.gyroscope = one_float("gyroscope_range", gyroscope, *GYROSCOPE_RANGES, "rad/s")
         self.accelerometer = one_float("accelerometer_range", accelerometer, *ACCELEROMETER_RANGES, "m/s^2")
+        self._usual = SATURATED * self.gyroscope, SATURATED * self.accelerometer
 
     def angular_velocity(self, values: Sequence[float] | None) -> tuple[Floats3, bool]:
         """Return the rates, and whether one is saturated; raises ParameterError if one is impossible."""
         rate = x, y, z = three_floats("angular_velocity", values)
-        usual = SATURATED * self.gyroscope
+        usual = self._usual[0]
         if -usual < x < usual and -usual < y < usual and -usual < z < usual:
             return rate, False
         if max(map(abs, rate)) > BEYOND * self.gyroscope:
@@ -66,28 +67,29 @@ class Ranges:
         last: the acceleration before it, None at first.
         """
         acceleration = x, y, z = three_floats("linear_acceleration", values)
-        usual, square = SATURATED * self.accelerometer, x * x + y * y + z * z
+        usual, square = self._usual[1], x * x + y * y + z * z
         if square > ALMOST_NOTHING**2 and -usual < x < usual and -usual < y < usual and -usual < z < usual:
             return acceleration
         largest = max(map(abs, acceleration))
+        expected = ""
         if largest > BEYOND * self.accelerometer:
             expected = f"at most accelerometer_range = {self.accelerometer:.4g} m/s^2 along each axis"
+        elif largest < DEAD:
+            expected = "not zero, as a dead accelerometer reports"
+        elif last and square < ALMOST_NOTHING**2:
+            in_g = tuple(STANDARD_GRAVITY * component for component in acceleration)
+            expected = "in m/s^2, not in g" if math.dist(in_g, last) < SAME * STANDARD_GRAVITY else ""
+        if expected:
             raise ParameterError("linear_acceleration", acceleration, expected)
-        if largest < DEAD:
-            raise ParameterError("linear_acceleration", acceleration, "not zero, as a dead accelerometer reports")
-        in_g = tuple(STANDARD_GRAVITY * component for component in acceleration)
-        if last and square < ALMOST_NOTHING**2 and math.dist(in_g, last) < SAME * STANDARD_GRAVITY:
-            raise ParameterError("linear_acceleration", acceleration, "in m/s^2, not in g")
         return acceleration if largest < usual else None
 
 
 def three_floats(name: str, values: Sequence[float] | None) -> Floats3:
     """Return `values` as 3 finite floats, or raise ParameterError that names them."""
     try:
-        x, y, z = values  # type: ignore[misc]  # None is one of the wrong values
-        x, y, z = float(x), float(y), float(z)
+        x, y, z = map(float, values)  # type: ignore[arg-type]  # None is one of the wrong values
+        if -math.inf < x + y + z < math.inf:
+            return x, y, z
     except (TypeError, ValueError):
-        raise ParameterError(name, values, "3 finite numbers") from None
-    if not -math.inf < x + y + z < math.inf:
-        raise ParameterError(name, values, "3 finite numbers")
-    return x, y, z
+        pass
+    raise ParameterError(name, values, "3 finite numbers")

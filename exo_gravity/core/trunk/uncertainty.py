@@ -1,17 +1,7 @@
 """How far the estimated tilt may be off: a small model, in which each thing that was not measured has its term.
 
-One standard deviation of the tilt is the root of the sum of the squares of
-    BASE                      VQF's error on real motion: 0.3 to 1.2 degrees RMS (docs/imu.md)
-    BIAS_TIME * s_b           gyroscope bias not yet learnt: its standard deviation s_b, over VQF's 3 s window
-    v / (g T)                 start: T s after it, the mean acceleration is wrong by a change of speed v over T, which
-                              is the deviation of the acceleration times CORRELATION_TIME
-    d / SIGMAS                gyroscope and accelerometer contradict each other by an angle d
-    a t^2 n / 30              a gap of t s or n usual intervals, 5 at most: rates interpolated, while the rotation
-                              accelerated by a, as lately; measured on the same trials
-    OVERSHOOT * range * t     t s of saturation: the true rate exceeded the range by this share
-    a t^2 / 2                 t s of repeated samples: the rate may have changed since
-    w t                       a rate that changes by w in one sample of t s, unusually and by more than JUMP
-The last four add up, and decay with VQF's time constant.
+One standard deviation of the tilt is the root of the sum of the squares of the terms that docs/imu.md lists. Those of a
+gap, of saturation, of repeated samples and of a jump of the rate add up, and decay with VQF's time constant.
 """
 
 from __future__ import annotations
@@ -22,15 +12,15 @@ from exo_gravity.core.model.rotation import Floats3
 
 MAX_ERROR = math.radians(3.0)  # of a tilt that is used
 SIGMAS = 2.0  # standard deviations by which a tilt may be off
-BASE = math.radians(0.6)
-BIAS_TIME = 2.0  # s
+BASE = math.radians(0.6)  # VQF's error on real motion: 0.3 to 1.2 degrees RMS (docs/imu.md)
+BIAS_TIME = 2.0  # s; VQF averages over 3 s
 CORRELATION_TIME = 0.25  # s, a quarter of a stride
 SETTLE_TIME = 1.0  # s, the shortest time from a start to the first tilt
 START_TIME = 10.0  # s, after which the error of the start has gone
 DECAY_TIME = 3.0  # s, VQF's tauAcc
 LEAST_ACCELERATION = 20.0  # rad/s^2, assumed in a gap even after rest
 ACCELERATION_TIME = 0.3  # s
-OVERSHOOT = 0.25
+OVERSHOOT = 0.25  # share of the range by which the true rate exceeds it
 JUMP = math.radians(2.0)  # a sample; in good data a knock made 1.4 degrees
 UNUSUAL = 8.0  # times the angular acceleration of the last ACCELERATION_TIME
 GAP = 1.5  # usual intervals

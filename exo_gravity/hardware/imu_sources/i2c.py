@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 from exo_gravity.core.errors import DeviceError, ParameterError
@@ -18,7 +18,6 @@ from exo_gravity.hardware.imu_sources.source import Axes, Clock, ImuSource, Meas
 MAX_BLOCK = 32  # bytes
 TEMPERATURE_PERIOD = 1.0  # s
 THREE_NUMBERS = {order: struct.Struct(f"{order}3h") for order in "<>"}
-
 
 Bus = Any  # a `smbus2.SMBus`
 Wait = Callable[[float], Any]  # s, e.g. time.sleep
@@ -47,28 +46,18 @@ class Registers:
 
     def read(self, register: int) -> int:
         """Return the value of one register."""
-        try:
-            return self._bus.read_byte_data(self._address, register)
-        except OSError as error:
-            raise self._failed(register, error) from None
+        return int(self._transfer(self._bus.read_byte_data, register))
 
     def read_block(self, register: int, length: int, unit: int = 1) -> bytes:
         """Return `length` bytes that start at `register`, read in parts that are multiples of `unit` bytes."""
         data, part = bytearray(), MAX_BLOCK // unit * unit
-        try:
-            while len(data) < length:
-                count = min(part, length - len(data))
-                data += bytes(self._bus.read_i2c_block_data(self._address, register, count))
-        except OSError as error:
-            raise self._failed(register, error) from None
+        while len(data) < length:
+            data += bytes(self._transfer(self._bus.read_i2c_block_data, register, min(part, length - len(data))))
         return bytes(data)
 
     def write(self, register: int, value: int) -> None:
         """Write one register."""
-        try:
-            self._bus.write_byte_data(self._address, register, value)
-        except OSError as error:
-            raise self._failed(register, error) from None
+        self._transfer(self._bus.write_byte_data, register, value)
 
     def set(self, register: int, value: int) -> None:
         """Write one register and read it back."""
@@ -89,9 +78,11 @@ class Registers:
         with contextlib.suppress(OSError):
             self._bus.close()
 
-    def _failed(self, register: int, error: OSError) -> DeviceError:
-        # 121, EREMOTEIO: the address was not acknowledged
-        return DeviceError(self.name, f"does not answer: {error.strerror or error}", register)
+    def _transfer(self, function: Callable[..., Any], register: int, *arguments: int) -> Any:
+        try:
+            return function(self._address, register, *arguments)
+        except OSError as error:  # 121, EREMOTEIO: the address was not acknowledged
+            raise DeviceError(self.name, f"does not answer: {error.strerror or error}", register) from None
 
 
 class FifoSource(ImuSource):
@@ -103,6 +94,7 @@ class FifoSource(ImuSource):
 
     IDENTITY: ClassVar[int]  # the register WHO_AM_I
     KNOWN: ClassVar[dict[int, str]]  # its values
+    SETTLING: ClassVar[float]  # s after the self-test's actuators were switched
 
     def __init__(self, registers: Registers, rate: float, clock: Clock, wait: Wait, self_test: bool = True) -> None:
         """Set up the chip for about `rate` samples a second; with `self_test` it must be still for a second.
@@ -141,6 +133,35 @@ class FifoSource(ImuSource):
         self._sample_clock.interrupt()
         self._empty_fifo()
         return []
+
+    def _responses(
+        self, switch: Callable[[bool], None], registers: Sequence[int], count: int, period: float, order: str = ">"
+    ) -> list[float]:
+        """Return how the self-test's actuators change the mean of `count` readings, `period` s apart, in LSB.
+
+        switch: switches the actuators on and off. registers: of three axes each, whose means follow one another.
+        """
+        means = []
+        for on in (False, True):
+            switch(on)
+            self._wait(self.SETTLING)
+            readings = []
+            for _ in range(count):
+                self._wait(period)
+                blocks = (self._registers.read_block(register, 6) for register in registers)
+                readings.append([value for block in blocks for value in axes(block, 1.0, order)])
+            means.append([sum(axis) / count for axis in zip(*readings, strict=True)])
+        return [on - off for off, on in zip(*means, strict=True)]
+
+    def _judge(self, sensor: str, response: Sequence[float], limits: Sequence[tuple[float, float]], unit: str) -> None:
+        """Raise DeviceError unless the response of each axis lies within its limits."""
+        for axis, value, (low, high) in zip("xyz", response, limits, strict=True):
+            if not low <= value <= high:
+                raise DeviceError(
+                    self._registers.name,
+                    f"self-test failed: {sensor} {axis} responds by {value:.0f} {unit}, must be {low:.0f} to "
+                    f"{high:.0f}: keep it still and try again, or replace it",
+                )
 
     def _reset(self) -> None:
         """Return the chip to its reset values, and wake it."""

@@ -10,19 +10,19 @@ against PX4, InvenSense_ICM20948_registers.hpp.
 
 from __future__ import annotations
 
+import math
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
-from exo_gravity.core.errors import DeviceError
+from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.hardware.imu_sources.i2c import FifoSource, Registers, axes
-from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Measurement, acceleration_scale
+from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Measurement
 
 SAMPLE = 12  # bytes in the FIFO
 RADIANS_PER_LSB = RADIANS_PER_DEGREE / 16.4  # at 2000 deg/s
-ACCELERATION_PER_LSB = acceleration_scale(2048.0)  # at 16 g
+ACCELERATION_PER_LSB = STANDARD_GRAVITY / 2048.0  # at 16 g
 READINGS = 200  # of each mean of the self-test
-SETTLING = 0.02  # s after the actuators were switched
 START_UP = 0.1  # s after a reset, and after waking
 RESET, BEST_CLOCK = 0x80, 0x01  # PWR_MGMT_1
 ENABLE_FIFO = 0x40  # USER_CTRL
@@ -52,11 +52,7 @@ ACCEL_SMPLRT_DIV_1, ACCEL_SMPLRT_DIV_2, ICM_ACCEL_CONFIG, ICM_ACCEL_CONFIG_2 = 0
 
 BOTH_TO_FIFO = 0x1E  # FIFO_EN_2: accelerometer, gyroscope z, y, x
 ICM_RESET_FIFO = 0x1F  # FIFO_RST
-USE_FILTER, ICM_SELECT_2000_DPS, ICM_SELECT_16_G = (
-    0x01,
-    0x06,
-    0x06,
-)  # GYRO_CONFIG_1, ACCEL_CONFIG
+USE_FILTER, ICM_SELECT_2000_DPS, ICM_SELECT_16_G = 0x01, 0x06, 0x06  # GYRO_CONFIG_1, ACCEL_CONFIG
 GYROSCOPE_ACTUATORS, ACCELEROMETER_ACTUATORS = 0x38, 0x1C  # GYRO_CONFIG_2, ACCEL_CONFIG_2
 
 
@@ -68,6 +64,7 @@ class InvenSense(FifoSource):
     POWER: ClassVar[tuple[int, int]]  # PWR_MGMT_1, PWR_MGMT_2
     BANDWIDTHS: ClassVar[dict[int, float]]  # Hz of the low-pass filters by their code
     FILTER_RATE: ClassVar[float]  # Hz, divided by 1 + SMPLRT_DIV
+    SETTLING = 0.02
     capacity = 512  # bytes of the FIFO
     thermometer = 333.87, 21.0  # LSB/degC, degC
 
@@ -100,47 +97,20 @@ class InvenSense(FifoSource):
         (raw,) = struct.unpack(">h", self._registers.read_block(self.DATA[2], 2))
         return float(raw / self.thermometer[0] + self.thermometer[1])
 
-    def _responses(self, switch_actuators: Callable[[bool], None]) -> tuple[list[float], list[float]]:
-        """Return how the actuators change angular velocity and acceleration, in LSB."""
-        means = []
-        for on in (False, True):
-            switch_actuators(on)
-            means.append(self._mean())
-        (rate_off, acceleration_off), (rate_on, acceleration_on) = means
-        return (
-            [on - off for on, off in zip(rate_on, rate_off, strict=True)],
-            [on - off for on, off in zip(acceleration_on, acceleration_off, strict=True)],
-        )
+    def _judge_6500(self, response: Sequence[float], gyroscope_codes: bytes, accelerometer_codes: bytes) -> None:
+        """Judge a chip since the MPU-6500, angular velocity first, by its SELF_TEST registers.
 
-    def _mean(self) -> tuple[list[float], list[float]]:
-        """Return the means of angular velocity and acceleration, in LSB."""
-        self._wait(SETTLING)
-        totals = [[0.0] * 3, [0.0] * 3]
-        for _ in range(READINGS):
-            self._wait(1e-3)
-            for total, register in zip(totals, self.DATA[:2], strict=True):
-                for axis, value in enumerate(axes(self._registers.read_block(register, 6), 1.0 / READINGS)):
-                    total[axis] += value
-        return totals[1], totals[0]
-
-    def _judge(
-        self, sensor: str, response: Sequence[float], factory: Sequence[float], passes: Callable[[float, float], bool]
-    ) -> None:
-        """Raise DeviceError unless `passes(response, factory)` for each axis; both are in LSB."""
-        for axis, measured, expected in zip("xyz", response, factory, strict=True):
-            if not passes(measured, expected):
-                raise DeviceError(
-                    self._registers.name,
-                    f"self-test failed: {sensor} {axis} responds by {measured:.0f} LSB, the factory measured "
-                    f"{expected:.0f}: keep it still and try again, or replace it",
-                )
-
-    def _judge_6500(
-        self, responses: tuple[list[float], list[float]], gyroscope_codes: bytes, accelerometer_codes: bytes
-    ) -> None:
-        """Judge the responses of a chip since the MPU-6500 by its SELF_TEST registers."""
-        self._judge("gyroscope", responses[0], _factory_6500(gyroscope_codes), _gyroscope_6500_passes)
-        self._judge("accelerometer", responses[1], _factory_6500(accelerometer_codes), _accelerometer_6500_passes)
+        A response, at 250 deg/s (131 LSB each) and 2 g, must be over half the factory's, an accelerometer's at most 1.5
+        times. Without one it must be at least 60 deg/s, and 225 to 675 mg (16.384 LSB each), of either sign.
+        """
+        for sensor, values, codes, shares, without in (
+            ("gyroscope", response[:3], gyroscope_codes, (0.5, math.inf), (60.0 * 131.0, math.inf)),
+            ("accelerometer", response[3:], accelerometer_codes, (0.5, 1.5), (225.0 * 16.384, 675.0 * 16.384)),
+        ):
+            low, high = (2620.0 * share for share in shares)
+            limits = [(low * 1.01 ** (code - 1), high * 1.01 ** (code - 1)) if code else without for code in codes]
+            judged = [value if code else abs(value) for value, code in zip(values, codes, strict=True)]
+            self._judge(sensor, judged, limits, "LSB")
 
 
 class Mpu6050(InvenSense):
@@ -186,14 +156,14 @@ class Mpu6050(InvenSense):
     def _test(self) -> None:
         self._set_filter(2)
         self._registers.set(SMPLRT_DIV, 0)
-        responses = self._responses(self._switch_actuators)
+        response = self._responses(self._switch_actuators, self.DATA[1::-1], READINGS, 1e-3)
         if self._is_6050:
-            factory = _factory_6050(self._registers.read_block(SELF_TEST_6050, 4))
-            self._judge("gyroscope", responses[0], factory[0], _passes_6050)
-            self._judge("accelerometer", responses[1], factory[1], _passes_6050)
+            limits = _limits_6050(self._registers.read_block(SELF_TEST_6050, 4))
+            self._judge("gyroscope", response[:3], limits[:3], "LSB")
+            self._judge("accelerometer", response[3:], limits[3:], "LSB")
         else:
             codes = (self._registers.read_block(start, 3) for start in (SELF_TEST_GYRO_6500, SELF_TEST_ACCEL_6500))
-            self._judge_6500(responses, *codes)
+            self._judge_6500(response, *codes)
 
     def _switch_actuators(self, on: bool) -> None:
         actuators = ALL_AXES if on else 0
@@ -258,43 +228,29 @@ class Icm20948(InvenSense):
                 ICM_ACCEL_CONFIG: USE_FILTER | low_pass,  # 2 g
             }
         )
-        responses = self._responses(self._switch_actuators)
+        response = self._responses(self._switch_actuators, self.DATA[1::-1], READINGS, 1e-3)
         self._registers.write(REG_BANK_SEL, 0x10)
         gyroscope_codes = self._registers.read_block(ICM_SELF_TEST_GYRO, 3)
         accelerometer_codes = self._registers.read_block(ICM_SELF_TEST_ACCEL, 3)
         self._registers.write(REG_BANK_SEL, 0x00)
-        self._judge_6500(responses, gyroscope_codes, accelerometer_codes)
+        self._judge_6500(response, gyroscope_codes, accelerometer_codes)
 
     def _switch_actuators(self, on: bool) -> None:
         self._set_bank_2({GYRO_CONFIG_2: on * GYROSCOPE_ACTUATORS, ICM_ACCEL_CONFIG_2: on * ACCELEROMETER_ACTUATORS})
 
 
-def _factory_6050(codes: bytes) -> tuple[list[float], list[float]]:
-    """Return the factory's responses, gyroscope and accelerometer, in LSB at 250 deg/s and 8 g (RM-MPU-6000A 4.1)."""
+def _limits_6050(codes: bytes) -> list[tuple[float, float]]:
+    """Return the limits of the responses, gyroscope first, in LSB at 250 deg/s and 8 g.
+
+    They lie 14 % (PS-MPU-6000A 6.1) about the factory's response (RM-MPU-6000A 4.1); without one there are none.
+    """
     gyroscope, accelerometer = [], []
     for axis, sign in enumerate((1.0, -1.0, 1.0)):
         code = codes[axis] & 0x1F
-        gyroscope.append(sign * 25.0 * 131.0 * 1.046 ** (code - 1) if code else 0.0)
+        gyroscope.append(sign * 25.0 * 131.0 * 1.046 ** (code - 1) if code else math.inf)
         code = codes[axis] >> 5 << 2 | codes[3] >> (4 - 2 * axis) & 3
-        accelerometer.append(4096.0 * 0.34 * (0.92 / 0.34) ** ((code - 1) / 30.0) if code else 0.0)
-    return gyroscope, accelerometer
-
-
-def _passes_6050(response: float, factory: float) -> bool:
-    """Return whether the response is within 14 % of the factory's (PS-MPU-6000A 6.1); without one it is not judged."""
-    return not factory or abs(response / factory - 1.0) <= 0.14
-
-
-def _factory_6500(codes: Sequence[int]) -> list[float]:
-    """Return the factory's responses in LSB at 250 deg/s and 2 g from SELF_TEST registers; 0 if none was stored."""
-    return [2620.0 * 1.01 ** (code - 1) if code else 0.0 for code in codes]
-
-
-def _gyroscope_6500_passes(response: float, factory: float) -> bool:
-    """Return whether the response is over half the factory's, or at least 60 deg/s (131 LSB each) without one."""
-    return response > 0.5 * factory if factory else abs(response) >= 60.0 * 131.0
-
-
-def _accelerometer_6500_passes(response: float, factory: float) -> bool:
-    """Return whether the response is 0.5 to 1.5 times the factory's, or 225 to 675 mg (16.384 LSB each) without one."""
-    return 0.5 < response / factory < 1.5 if factory else 225.0 <= abs(response) / 16.384 <= 675.0
+        accelerometer.append(4096.0 * 0.34 * (0.92 / 0.34) ** ((code - 1) / 30.0) if code else math.inf)
+    return [
+        (factory - 0.14 * abs(factory), factory + 0.14 * abs(factory)) if factory < math.inf else (-math.inf, math.inf)
+        for factory in gyroscope + accelerometer
+    ]

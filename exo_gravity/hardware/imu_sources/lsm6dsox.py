@@ -7,12 +7,12 @@ DS12814 (LSM6DSOX), DS12140 (LSM6DSO).
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
 from typing import ClassVar
 
 from exo_gravity.core.errors import DeviceError
+from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.hardware.imu_sources.i2c import FifoSource, axes
-from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Axes, Measurement, acceleration_scale
+from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Axes, Measurement
 
 FIFO_CTRL3, FIFO_CTRL4, WHO_AM_I, CTRL1_XL, CTRL2_G, CTRL3_C, CTRL5_C, CTRL9_XL = (
     0x09, 0x0A, 0x0F, 0x10, 0x11, 0x12, 0x14, 0x18,
@@ -29,9 +29,10 @@ WORD = 7  # bytes
 GYROSCOPE, ACCELEROMETER = 1, 2  # tags
 
 RADIANS_PER_LSB = 0.070 * RADIANS_PER_DEGREE  # at 2000 deg/s
-ACCELERATION_PER_LSB = acceleration_scale(1000.0 / 0.488)  # at 16 g
+ACCELERATION_PER_LSB = 0.488e-3 * STANDARD_GRAVITY  # at 16 g
 MILLI_G_PER_LSB = 0.122  # at 4 g, in the self-test
 DEGREES_PER_LSB = 0.070  # per second, in the self-test
+Limits = tuple[float, float]
 ACCELEROMETER_RESPONSE, GYROSCOPE_RESPONSE = (50.0, 1700.0), (150.0, 700.0)  # mg; deg/s
 
 
@@ -40,6 +41,7 @@ class Lsm6dsox(FifoSource):
 
     IDENTITY = WHO_AM_I
     KNOWN: ClassVar = {0x6C: "LSM6DSOX"}
+    SETTLING = 0.1
 
     def _reset(self) -> None:
         self._half: tuple[int, int, Axes] | None = None  # tag, time slot and axes that wait for the other sensor's
@@ -56,35 +58,21 @@ class Lsm6dsox(FifoSource):
     def _test(self) -> None:
         """Compare means of 5 samples with the actuators off and on, as the manufacturer's example does."""
         self._registers.set(CTRL1_XL, RATES[52.0] << 4 | SELECT_4_G)
-        response = self._response(OUTX_L_A, actuators=0x01, period=1 / 52, scale=MILLI_G_PER_LSB)
-        self._judge("accelerometer", response, ACCELEROMETER_RESPONSE, "mg")
+        self._test_sensor("accelerometer", OUTX_L_A, 0x01, 52.0, MILLI_G_PER_LSB, ACCELEROMETER_RESPONSE, "mg")
         self._registers.set(CTRL1_XL, OFF)
         self._registers.set(CTRL2_G, RATES[208.0] << 4 | SELECT_2000_DPS)
-        response = self._response(OUTX_L_G, actuators=0x04, period=1 / 208, scale=DEGREES_PER_LSB)
-        self._judge("gyroscope", response, GYROSCOPE_RESPONSE, "deg/s")
+        self._test_sensor("gyroscope", OUTX_L_G, 0x04, 208.0, DEGREES_PER_LSB, GYROSCOPE_RESPONSE, "deg/s")
         self._registers.set(CTRL2_G, OFF)
 
-    def _response(self, register: int, actuators: int, period: float, scale: float) -> list[float]:
-        means = []
-        for setting in (0, actuators):
-            self._registers.set(CTRL5_C, setting)
-            self._wait(0.1)
-            readings = []
-            for _ in range(5):
-                self._wait(1.1 * period)  # the chip's clock may be slow
-                readings.append(axes(self._registers.read_block(register, 6), scale, "<"))
-            means.append([sum(axis) / len(readings) for axis in zip(*readings, strict=True)])
-        self._registers.set(CTRL5_C, 0)
-        return [abs(on - off) for off, on in zip(*means, strict=True)]
+    def _test_sensor(
+        self, sensor: str, register: int, actuators: int, rate: float, scale: float, limits: Limits, unit: str
+    ) -> None:
+        def switch(on: bool) -> None:
+            self._registers.set(CTRL5_C, on * actuators)
 
-    def _judge(self, sensor: str, response: Sequence[float], limits: tuple[float, float], unit: str) -> None:
-        for axis, value in zip("xyz", response, strict=True):
-            if not limits[0] <= value <= limits[1]:
-                raise DeviceError(
-                    self._registers.name,
-                    f"self-test failed: {sensor} {axis} responds by {value:.0f} {unit}, must be {limits[0]:.0f} to "
-                    f"{limits[1]:.0f}: keep it still and try again, or replace it",
-                )
+        response = self._responses(switch, [register], 5, 1.1 / rate, "<")  # the chip's clock may be slow
+        switch(False)
+        self._judge(sensor, [abs(scale * value) for value in response], [limits] * 3, unit)
 
     def _start(self, rate: float) -> float:
         rate = min(RATES, key=lambda candidate: abs(candidate - rate))

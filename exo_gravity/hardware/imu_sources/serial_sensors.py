@@ -17,42 +17,42 @@ from __future__ import annotations
 import contextlib
 import math
 import struct
-from collections.abc import Callable
+from typing import ClassVar
 
 from exo_gravity.core.errors import DeviceError, ParameterError
-from exo_gravity.core.model.rotation import Quaternion
-from exo_gravity.hardware.imu_sources.source import (
-    RADIANS_PER_DEGREE,
-    Axes,
-    Clock,
-    ImuSource,
-    Measurement,
-    acceleration_scale,
-)
+from exo_gravity.core.model.arm import STANDARD_GRAVITY
+from exo_gravity.core.model.rotation import Quaternion, product
+from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Axes, Clock, ImuSource, Measurement
 
 ACCELERATION, ANGULAR_VELOCITY, ANGLES, QUATERNION = 0x51, 0x52, 0x53, 0x59
-WITMOTION_LENGTH = 11
 UNLOCK = b"\xff\xaa\x69\x88\xb5"
 CONTENT = b"\xff\xaa\x02\x0e\x02"  # RSW: quaternion, angles, angular velocity, acceleration
 PACKETS_A_SAMPLE = 4
 RATES = {20.0: 0x07, 50.0: 0x08, 100.0: 0x09, 200.0: 0x0B}  # Hz: RRATE
 BITS_A_BYTE = 10  # on the wire
 RATE_PER_LSB = RADIANS_PER_DEGREE * 2000.0 / 32768
-WITMOTION_ACCELERATION = acceleration_scale(32768 / 16.0)
+WITMOTION_ACCELERATION = STANDARD_GRAVITY * 16.0 / 32768
 WITMOTION_ANGLE = RADIANS_PER_DEGREE * 180.0 / 32768
 
 Numbers = tuple[int, int, int, int]  # of a packet
 
-RVC_RATE, RVC_LENGTH = 100.0, 19  # Hz, fixed; bytes
-RVC_ANGLE, RVC_ACCELERATION = 0.01 * RADIANS_PER_DEGREE, acceleration_scale(1000.0)
+RVC_RATE = 100.0  # Hz, fixed
+RVC_ANGLE, RVC_ACCELERATION = 0.01 * RADIANS_PER_DEGREE, 1e-3 * STANDARD_GRAVITY
 
 
-class SerialPort:
-    """An open port that is read without waiting."""
+class SerialSource(ImuSource):
+    """Base of the sensors on serial ports, which are read without waiting.
 
-    def __init__(self, device: str, port: str, baud: int) -> None:
+    Their packets have one length. They are cut out of the stream of bytes; after lost or extra bytes their start is
+    found again.
+    """
+
+    HEADER: ClassVar[bytes]
+    LENGTH: ClassVar[int]  # bytes of a packet
+
+    def __init__(self, device: str, port: str, baud: int, rate: float, clock: Clock) -> None:
         """Open `port`. Raises DeviceError, and ParameterError without pyserial."""
-        self.name = f"{device} on {port}"
+        super().__init__(f"{device} on {port}", rate, clock)
         try:
             import serial
         except ImportError:
@@ -62,80 +62,44 @@ class SerialPort:
             self._port = serial.Serial(port, baud, timeout=0, write_timeout=0.2)
         except (OSError, ValueError) as error:  # pyserial's own errors are OSErrors
             raise DeviceError(self.name, f"cannot be opened: {error}") from None
-
-    def read(self) -> bytes:
-        """Return the bytes that have arrived."""
-        try:
-            return bytes(self._port.read(self._port.in_waiting))
-        except OSError as error:
-            raise DeviceError(self.name, f"cannot be read: {error}") from None
-
-    def write(self, data: bytes) -> None:
-        """Send `data`."""
-        try:
-            self._port.write(data)
-        except OSError as error:
-            raise DeviceError(self.name, f"cannot be written: {error}") from None
-
-    def close(self) -> None:
-        """Close the port."""
-        with contextlib.suppress(OSError):
-            self._port.close()
-
-
-class Packets:
-    """Cuts packets of one length out of a stream of bytes, and finds their start again after lost or extra bytes."""
-
-    def __init__(self, header: bytes, length: int, is_whole: Callable[[bytes], bool]) -> None:
-        self.damaged = 0  #: times that packets that had arrived well were followed by one that had not
-        self._header = header
-        self._length = length
-        self._is_whole = is_whole
         self._pending = bytearray()
-        self._in_step = False
-
-    def feed(self, data: bytes) -> list[bytes]:
-        """Return the whole packets that `data` completes."""
-        self._pending += data
-        packets, at = [], 0
-        while len(self._pending) - at >= self._length:
-            packet = bytes(self._pending[at : at + self._length])
-            if packet.startswith(self._header) and self._is_whole(packet):
-                packets.append(packet)
-                at += self._length
-                self._in_step = True
-                continue
-            self.damaged += self._in_step
-            self._in_step = False
-            at += 1
-        del self._pending[:at]
-        return packets
-
-
-class SerialSource(ImuSource):
-    """Base of the sensors on serial ports; a sensor's class decodes its packets."""
-
-    def __init__(self, port: SerialPort, packets: Packets, rate: float, clock: Clock) -> None:
-        """Read from an open port."""
-        super().__init__(port.name, rate, clock)
-        self._port = port
-        self._packets = packets
-        self._damaged = 0  # packets, as last seen
+        self._in_step = False  # whether the last packet has arrived well
         self.silence = "not one byte"
 
     def close(self) -> None:
         """Close the port; never raises."""
-        self._port.close()
+        with contextlib.suppress(OSError):
+            self._port.close()
 
     def _measure(self, now: float) -> list[Measurement]:
-        data = self._port.read()
-        packets = self._packets.feed(data)
+        try:
+            data = bytes(self._port.read(self._port.in_waiting))
+        except OSError as error:
+            raise DeviceError(self.name, f"cannot be read: {error}") from None
+        packets = self._packets(data)
         if data:
             self.silence = "not one byte" if packets else "bytes, but no whole packet: is serial.baud the sensor's?"
-        if self._packets.damaged > self._damaged:
-            self._damaged = self._packets.damaged
-            self._why_lost = "damaged packets"
         return [measurement for packet in packets if (measurement := self._decode(packet))]
+
+    def _packets(self, data: bytes) -> list[bytes]:
+        """Return the whole packets that `data` completes."""
+        self._pending += data
+        packets, at = [], 0
+        while len(self._pending) - at >= self.LENGTH:
+            packet = bytes(self._pending[at : at + self.LENGTH])
+            is_whole = packet.startswith(self.HEADER) and self._is_whole(packet)
+            if is_whole:
+                packets.append(packet)
+            elif self._in_step:
+                self._why_lost = "damaged packets"
+            self._in_step = is_whole
+            at += self.LENGTH if is_whole else 1
+        del self._pending[:at]
+        return packets
+
+    def _is_whole(self, packet: bytes) -> bool:
+        """Return whether the packet's sum is right."""
+        raise NotImplementedError
 
     def _decode(self, packet: bytes) -> Measurement | None:
         """Return the measurement that a packet completes."""
@@ -145,23 +109,27 @@ class SerialSource(ImuSource):
 class WitMotion(SerialSource):
     """A WitMotion sensor. A sample is complete with its orientation: a quaternion, or angles if it sends none."""
 
+    HEADER, LENGTH = b"\x55", 11
+
     def __init__(self, port: str, baud: int, rate: float, clock: Clock) -> None:
         """Open the port and set the sensor's rate. Raises DeviceError, ParameterError."""
         rate = min(RATES, key=lambda candidate: abs(candidate - rate))
-        needed = int(rate * PACKETS_A_SAMPLE * WITMOTION_LENGTH * BITS_A_BYTE)
+        needed = int(rate * PACKETS_A_SAMPLE * self.LENGTH * BITS_A_BYTE)
         if baud < needed:
             raise ParameterError("serial.baud", baud, f"{needed} or more for {rate:g} samples a second")
-        opened = SerialPort("WitMotion", port, baud)
-        super().__init__(opened, Packets(b"\x55", WITMOTION_LENGTH, _is_whole), rate, clock)
+        super().__init__("WitMotion", port, baud, rate, clock)
         self._parts: dict[int, Numbers] = {}  # of the present sample, by type
         self._last_type = 0  # that completes a sample
         self._begun = False
         self._skipped = 0  # samples since the last whole one
         try:
-            opened.write(UNLOCK + CONTENT + bytes((0xFF, 0xAA, 0x03, RATES[rate], 0x00)))
-        except DeviceError:
-            opened.close()
-            raise
+            self._port.write(UNLOCK + CONTENT + bytes((0xFF, 0xAA, 0x03, RATES[rate], 0x00)))
+        except OSError as error:
+            self.close()
+            raise DeviceError(self.name, f"cannot be written: {error}") from None
+
+    def _is_whole(self, packet: bytes) -> bool:
+        return 0x50 <= packet[1] <= 0x5F and sum(packet[:10]) & 0xFF == packet[10]
 
     def _decode(self, packet: bytes) -> Measurement | None:
         kind, numbers = packet[1], struct.unpack_from("<4h", packet, 2)
@@ -199,10 +167,6 @@ def _orientation(parts: dict[int, Numbers]) -> Quaternion | None:
     return None
 
 
-def _is_whole(packet: bytes) -> bool:
-    return 0x50 <= packet[1] <= 0x5F and sum(packet[:10]) & 0xFF == packet[10]
-
-
 def _axes(numbers: Numbers, scale: float) -> Axes:
     x, y, z, _ = numbers
     return x * scale, y * scale, z * scale
@@ -211,11 +175,15 @@ def _axes(numbers: Numbers, scale: float) -> Axes:
 class Bno085(SerialSource):
     """A BNO085 with PS0 high and PS1 low, which selects UART-RVC."""
 
+    HEADER, LENGTH = b"\xaa\xaa", 19
+
     def __init__(self, port: str, baud: int, clock: Clock) -> None:
         """Open the port. Raises DeviceError, ParameterError."""
-        packets = Packets(b"\xaa\xaa", RVC_LENGTH, lambda packet: sum(packet[2:18]) & 0xFF == packet[18])
-        super().__init__(SerialPort("BNO085", port, baud), packets, RVC_RATE, clock)
+        super().__init__("BNO085", port, baud, RVC_RATE, clock)
         self._counter: int | None = None
+
+    def _is_whole(self, packet: bytes) -> bool:
+        return sum(packet[2:18]) & 0xFF == packet[18]
 
     def _decode(self, packet: bytes) -> Measurement:
         counter, yaw, pitch, roll, x, y, z = struct.unpack_from("<B6h", packet, 2)
@@ -228,13 +196,8 @@ class Bno085(SerialSource):
 
 def from_angles(*turns: tuple[str, float]) -> Quaternion:
     """Return the orientation after turns by (axis, rad) in order, each about an axis of the body as turned so far."""
-    x, y, z, w = 0.0, 0.0, 0.0, 1.0
+    q: Quaternion = (0.0, 0.0, 0.0, 1.0)
     for axis, angle in turns:
-        s, c = math.sin(angle / 2), math.cos(angle / 2)
-        if axis == "x":
-            x, y, z, w = x * c + w * s, y * c + z * s, z * c - y * s, w * c - x * s
-        elif axis == "y":
-            x, y, z, w = x * c - z * s, y * c + w * s, z * c + x * s, w * c - y * s
-        else:
-            x, y, z, w = x * c + y * s, y * c - x * s, z * c + w * s, w * c - z * s
-    return x, y, z, w
+        x, y, z = (math.sin(angle / 2) * (axis == other) for other in "xyz")
+        q = product(q, (x, y, z, math.cos(angle / 2)))
+    return q

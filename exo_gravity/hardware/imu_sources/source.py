@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from exo_gravity.core.errors import DeviceError
-from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.trunk.imu_sample import ImuSample
 
 RADIANS_PER_DEGREE = math.pi / 180.0
@@ -22,11 +21,6 @@ MAX_SILENCE = 0.5  # s without a sample. A chip whose supply broke down for a mo
 
 Clock = Callable[[], float]  # s; the clock of the stamps
 Axes = tuple[float, float, float]
-
-
-def acceleration_scale(lsb_per_g: float) -> float:
-    """Return m/s^2 per LSB."""
-    return STANDARD_GRAVITY / lsb_per_g
 
 
 class Measurement(NamedTuple):

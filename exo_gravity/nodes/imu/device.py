@@ -6,7 +6,6 @@ The messages also go out on the topic that a driver would use, so that recording
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,6 +14,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Imu
 
 from exo_gravity.core.trunk.imu_sample import ImuSample
+from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.imu_sources import Reopening, open_source
 from exo_gravity.nodes.ros.hot_path import Callback
 from exo_gravity.nodes.ros.messages import to_time
@@ -25,27 +25,30 @@ DEPTH = 50
 
 
 class ImuDevice:
-    """Calls `callback(message, info)` for each sample on a thread after `start`, as `HotPath` does for a topic."""
+    """Calls `callback(message, info)` for each sample: on a thread after `start`, or in each `poll`, as `HotPath`."""
 
-    def __init__(self, node: Node, values: Mapping[str, Any], topic: str, callback: Callback) -> None:
+    def __init__(
+        self, node: Node, values: Mapping[str, Any], topic: str, callback: Callback, clock: Clock = COMPUTER_CLOCK
+    ) -> None:
         """Open the device that the parameter values name; if it is missing, it is looked for again and again.
 
-        topic: gets the messages too. Raises ParameterError if a parameter does not suit the device.
+        topic: gets the messages too. clock: of the pauses between attempts; the stamps are by the node's. Raises
+        ParameterError if a parameter does not suit the device.
         """
         self.failure: Exception | None = None  # ends the thread
         self._node = node
         self._callback = callback
         self._publisher = node.create_publisher(Imu, topic, DEPTH)
         self._period = max(MIN_PERIOD, 1.0 / (POLLS_A_SAMPLE * values["rate"]))
-        clock = node.get_clock()
+        self._clock, stamps = clock, node.get_clock()
         self._reopening = Reopening(
-            lambda self_test: open_source(values, lambda: clock.now().nanoseconds * 1e-9, self_test)
+            lambda self_test: open_source(values, lambda: stamps.now().nanoseconds * 1e-9, self_test, wait=clock.sleep)
         )
         self._number = 0  # of the last message
         self._lost = 0  # samples, as last logged
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=values["source"], daemon=True)
-        self._poll()
+        self.poll()
 
     @property
     def problem(self) -> str:
@@ -79,12 +82,13 @@ class ImuDevice:
     def _run(self) -> None:
         try:
             while not self._stopping.wait(self._period):
-                self._poll()
+                self.poll()
         except Exception as error:
             self.failure = error
 
-    def _poll(self) -> None:
-        for sample in self._reopening.read(time.monotonic()):
+    def poll(self) -> None:
+        """Pass on the samples since the last call; raises ParameterError as the constructor does."""
+        for sample in self._reopening.read(self._clock.monotonic()):
             message = message_of(sample)
             self._publisher.publish(message)
             self._number += 1

@@ -8,26 +8,24 @@ publishers that discovery lists are counted instead.
 from __future__ import annotations
 
 import math
-import time
 from typing import Any
 
 from rclpy.node import Node
+
+from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
 DISTRUST = 0.2  # s for which a topic is not trusted after a second publisher was seen
 COUNT_PERIOD = 0.5  # s between two counts of the publishers
 
 
 class SolePublisher:
-    """Checks the `info` of each message of one topic, which rclpy passes to callbacks of two arguments.
+    """Checks the `info` of each message of one topic, which rclpy passes to callbacks of two arguments."""
 
-    missed: count of messages that were published and not received, where the middleware numbers them.
-    """
-
-    def __init__(self, node: Node, topic: str) -> None:
-        self._node = node
+    def __init__(self, node: Node, topic: str, clock: Clock = COMPUTER_CLOCK) -> None:
+        self._node, self._clock = node, clock
         self._topic = node.resolve_topic_name(topic)
         self._number = 0
-        self.missed = 0
+        self.missed = 0  #: messages that were published and not received, where the middleware numbers them
         self._count = 1
         self._counted = -math.inf  # monotonic s
 
@@ -44,7 +42,7 @@ class SolePublisher:
 
     def _count_publishers(self) -> int:
         """Return the number of publishers that discovery lists, at most COUNT_PERIOD old."""
-        now = time.monotonic()
+        now = self._clock.monotonic()
         if self._counted == -math.inf:
             self._node.get_logger().warning(
                 f"{self._topic}: the middleware does not number messages: a second publisher is detected up to "

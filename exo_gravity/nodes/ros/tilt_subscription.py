@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Vector3Stamped
@@ -14,25 +14,13 @@ from sensor_msgs.msg import Imu
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.rotation import unit_quaternion, up_in_body
-from exo_gravity.core.trunk.tilt_input import STILL
+from exo_gravity.core.trunk.tilt_input import STILL, Tilted, TiltInput
 from exo_gravity.nodes.ros.hot_path import NEWEST
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.sole_publisher import SolePublisher
 
 DATA, PITCH_YAW = "/imu/data", "/imu/pitch_yaw"
 NOT_REPORTED = -1.0  # first entry of a covariance (REP-145)
-
-
-class TiltTarget(Protocol):
-    """What receives the tilt: a `core.trunk.tilt_input.TiltInput`, or a compensator."""
-
-    def set_tilt(self, now: float, pitch: float, roll: float, age: float = 0.0) -> None:
-        """Set pitch and roll."""
-
-    def set_gravity(
-        self, now: float, gravity: Sequence[float], angular_velocity: Sequence[float] = STILL, age: float = 0.0
-    ) -> None:
-        """Set gravity's direction."""
 
 
 class TiltSubscription:
@@ -46,7 +34,7 @@ class TiltSubscription:
     def __init__(
         self,
         node: Node,
-        target: TiltTarget,
+        target: TiltInput | Tilted,
         lock: threading.Lock,
         on_refusal: Callable[[str, ParameterError], object],
         on_intruder: Callable[[str], object],
