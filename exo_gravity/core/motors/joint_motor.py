@@ -173,7 +173,7 @@ def _motor_of(given: Mapping[str, Any]) -> JointMotor:
     ranges = (given[name] or getattr(usual, name) for name in ("velocity_range", "torque_range"))
     per_ampere = given["torque_per_ampere"] or usual.torque_per_ampere
     spec = replace(usual.with_ranges(*ranges), torque_per_ampere=per_ampere)
-    return JointMotor(spec, *(given[name] for name in ("can_id", "direction", "zero", "torque_scale")), board)
+    return JointMotor(spec, given["can_id"], given["direction"], given["zero"], given["torque_scale"], board)
 
 
 def traffic_of(values: Mapping[str, Any], options: Mapping[str, Any]) -> Traffic:
