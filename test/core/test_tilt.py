@@ -110,5 +110,5 @@ def test_the_laws_multiply_their_torque_by_the_magnitude_of_gravity():
     arm, theta = ArmModel((0.05, 0.13, 0.3, 0.3), (0.05, 0.1, 0.2, 0.1), (0.6, 0.5, 0.6, 0.2)), (0.2, 0.7, 0.6, 0.5)
     tilt = Tilt.of("left", 0.2, -0.1)
     for law in LAWS.values():
-        felt = law.torque(arm, theta, tilt._replace(magnitude=1.5))
-        np.testing.assert_allclose(felt, 1.5 * np.array(law.torque(arm, theta, tilt)))
+        felt = law(arm, theta, tilt._replace(magnitude=1.5))
+        np.testing.assert_allclose(felt, 1.5 * np.array(law(arm, theta, tilt)))

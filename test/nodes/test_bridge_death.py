@@ -38,6 +38,7 @@ def test_an_arm_whose_bridge_and_watchdog_were_killed_is_let_down_by_the_launche
     assert listener.motors_are_off()
 
 
+@pytest.mark.thorough
 def test_the_launcher_states_that_motors_may_still_be_powered(nodes, probe, monkeypatch):
     monkeypatch.setattr(launcher, "DESCENT_TIMEOUT", 10.0)
     monkeypatch.setattr(launcher, "RECOVERY", {"EXO_GRAVITY_RECOVER": "2"})

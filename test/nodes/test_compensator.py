@@ -68,6 +68,7 @@ def set_at_once(probe: RosProbe, values: Mapping[str, Any], atomically: bool) ->
     return probe.call(SetParameters, "/right/compensator/set_parameters", request).results
 
 
+@pytest.mark.thorough
 def test_a_thousand_valid_and_invalid_changes_neither_step_the_torque_nor_stop_the_node(launch, probe, feed):
     nodes = launch(without=OTHER_NODES, compensator={**NO_IMU, "max_effort": [3.0, 18.0, 9.0, 9.0]})
     feed()

@@ -24,6 +24,7 @@ def pool(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RigPool]:
 
 
 @pytest.mark.real_time
+@pytest.mark.thorough
 @pytest.mark.parametrize("case", CHOSEN, ids=[case.name for case in CHOSEN])
 def test_after_a_fault_the_arm_is_let_down_gently_and_stays_off(pool: RigPool, case: FaultCase) -> None:
     result = pool.run(case)

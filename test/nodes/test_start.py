@@ -7,6 +7,7 @@ import signal
 import subprocess
 from pathlib import Path
 
+import pytest
 import yaml
 
 from exo_gravity.core.motors.specs import ENTER
@@ -41,6 +42,7 @@ def test_a_compensator_without_a_parameter_file_starts_and_waits_for_joint_state
         assert process.wait(10) == 0
 
 
+@pytest.mark.thorough
 def test_a_parameter_dump_starts_the_same_nodes_without_changes(tmp_path, prepare, launch, probe):
     first = launch(compensator={"wearer": {"body_mass": 70.0}})
     nodes = list(yaml.safe_load(first.path.read_text()))

@@ -46,6 +46,7 @@ def tours():
     return [(run, run.run(BestPoses(run.limits, 8, 160.0))) for run in runs]
 
 
+@pytest.mark.thorough
 def test_two_tours_with_and_without_a_weight_give_kilograms_and_true_scales(tours):
     assert [tour.trouble for _, tour in tours] == ["", ""]
     result = moments_from(ARM, [one for _, tour in tours for one in tour.measured])
@@ -82,6 +83,7 @@ def vector(tilt):
     return bytes(STORE.serialize_cdr(message, TILT_TYPE))
 
 
+@pytest.mark.thorough
 def test_the_recording_of_a_tour_gives_the_same_torques(tours, tmp_path):
     run, tour = tours[0]
     found = recorded.observations_of(recorded_by(run, tmp_path / "bag"), ARM, with_held=False)
@@ -106,6 +108,7 @@ def test_held_poses_are_as_uncertain_as_friction(tmp_path):
     assert np.min([o.spread for o in found]) > 0.2
 
 
+@pytest.mark.thorough
 def test_recordings_without_and_with_the_weight_give_kilograms_and_true_scales(tours, tmp_path):
     files = [str(packaged_config("sim.yaml")), str(tmp_path / "1.yaml"), str(tmp_path / "2.yaml")]
     bare = str(recorded_by(tours[0][0], tmp_path / "bare"))

@@ -103,6 +103,7 @@ def thirteen(hold: float) -> dict[str, Any]:
     return {"name": "thirteen", "steps": steps}
 
 
+@pytest.mark.thorough
 def test_the_packaged_arm_drifts_less_than_a_fifth_of_a_degree_per_minute_in_all_thirteen_poses(run):
     code, folder = run("--offline", script=thirteen(2.5))
     rates = [abs(float(row["drift_deg_per_min"])) for row in holds(folder)]
@@ -181,6 +182,7 @@ class Listening(launcher.Launcher):
         raise NotImplementedError
 
 
+@pytest.mark.thorough
 @pytest.mark.real_time
 def test_a_killed_recorder_ends_the_trial_with_a_report_of_what_it_wrote(run, capsys, monkeypatch):
     class KillRecorder(Listening):
@@ -195,6 +197,7 @@ def test_a_killed_recorder_ends_the_trial_with_a_report_of_what_it_wrote(run, ca
     assert "the recorder ended with exit code -9 before the trial was done" in capsys.readouterr().out
 
 
+@pytest.mark.thorough
 @pytest.mark.real_time
 def test_a_node_that_the_computer_does_not_run_ends_a_simulated_trial_with_exit_code_3(run, capsys, monkeypatch):
     class FreezeNode(Listening):

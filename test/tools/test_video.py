@@ -85,6 +85,7 @@ def colourful(frame):
     return int(np.count_nonzero(pixels.max(axis=-1) - pixels.min(axis=-1) > COLOURFUL))
 
 
+@pytest.mark.thorough
 @pytest.mark.timeout(300)  # software rendering on a busy machine
 @pytest.mark.parametrize(("kind", "speed"), [("gif", "20"), ("mp4", "50")])  # a frame every 2 s
 def test_a_clip_of_an_offline_trial_shows_the_arm_move_and_its_torques(tmp_path, kind, speed):

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import sys
 import time
 from collections.abc import Callable
 from functools import partial
@@ -233,7 +234,8 @@ class LiveLine:
         line["recorder"] = recorder
         line["status"] = self._status
         line["faults"] = [f"{name}: {status['message']}" for name, status in self._status.items() if status["level"]]
-        print(json.dumps(line), flush=True)
+        sys.stdout.write(json.dumps(line) + "\n")
+        sys.stdout.flush()
 
 
 def main() -> None:
