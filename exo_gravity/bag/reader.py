@@ -204,7 +204,7 @@ class EventLog:
     def carried(self, arm: str, start: int, end: float) -> tuple[Span, ...] | None:
         """Return when the arm was carried, by its reported states; None if no state of it was recorded.
 
-        end: s, of the arm's recording. An arm that is carried in the last state before it counts as carried until then.
+        end: s, of the arm's recording. An arm that is carried in the last state before it is carried until then.
         """
         if arm not in self._states:
             return None

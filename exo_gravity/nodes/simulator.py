@@ -48,7 +48,7 @@ class Simulator(Node):
     """The ROS shell around `sim.SimulatedDevice`, which runs in its own thread.
 
     That thread also publishes, while no motor has a reply to send. Publishing from another thread would hold the
-    interpreter's lock when a command arrives, and a late reply counts as a silent motor.
+    interpreter's lock when a command arrives, and a late reply looks like a silent motor.
     """
 
     def __init__(self) -> None:

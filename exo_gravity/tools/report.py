@@ -35,7 +35,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     limit("--max-drift", 0.5, "DEG", "drift allowed within any 10 s of a hold (%(default)s)")
     limit("--max-drift-after-push", 2.0, "DEG", "the same for a hold after a push (%(default)s)")
     limit("--max-rate", math.inf, "DEG/MIN", "drift rate allowed over a whole hold (no limit)")
-    limit("--min-hold", MIN_HOLD, "S", "shortest still phase that counts as a hold (%(default)s)")
+    limit("--min-hold", MIN_HOLD, "S", "shortest still phase that is a hold (%(default)s)")
     video.add_arguments(parser)
     return parser.parse_args(args)
 

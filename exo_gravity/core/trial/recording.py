@@ -110,7 +110,7 @@ def still_spans(recording: Recording, blocks: Blocks) -> Iterator[Span]:
     edges = np.flatnonzero(np.diff(np.concatenate(([False], blocks.still, [False])).astype(np.int8)))
     windows = [(step.start, step.end) for step in recording.steps if step.action == "hold"]
     for first, beyond in zip(edges[::2], edges[1::2], strict=True):
-        # A block counts as still if it is still together with the block before it.
+        # A block is still if it is still together with the block before it.
         start, end = blocks.time[max(first - 1, 0)] + MARGIN, blocks.time[beyond] - MARGIN
         for low, high in windows if recording.steps else ((start, end),):
             yield from recording.while_carried(float(max(start, low)), float(min(end, high)))

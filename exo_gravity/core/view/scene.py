@@ -28,7 +28,7 @@ TORQUE_SPAN = math.radians(270.0)
 ARC_STEP = math.radians(6.0)
 GRAVITY_FROM, GRAVITY_LENGTH = (0.30, 0.0, 0.10), 0.25  # m, in front of the chest
 STATE_HEIGHT = 0.20  # m above the shoulder
-RESTING = 0.05  # rad/s, below which a carried arm counts as held; twice the step of the motors' speed
+RESTING = 0.05  # rad/s, below which a carried arm is held; twice the step of the motors' speed
 LIMIT_WIDTH, TORQUE_WIDTH, ARROW_WIDTH, TEXT_HEIGHT, SPHERE_SIZE = 0.004, 0.016, 0.012, 0.035, 0.05  # m
 
 

@@ -32,7 +32,7 @@ COLOURS = 128  # of a GIF
 LINE_HEIGHT = 0.042  # of the picture's height
 INK = (40, 44, 52)
 SWATCH = 12  # pixels
-NO_TORQUE = 0.05  # Nm, below which a motor counts as off
+NO_TORQUE = 0.05  # Nm, below which a motor is off
 STEPS = {"move": "the wearer moves the arm", "hold": "hands off", "push": "a push"}
 
 OnFrame = Callable[[int], None]  # number of frames drawn
