@@ -2,7 +2,7 @@
 
 Upright, the accelerometer shows the trunk's z axis (up). Between upright and bowed the trunk turns about its y axis, so
 gravity moves in the plane across it: y is along bowed x upright. The gyroscope's axis and angle must agree. Posture
-limits the result: no person stands upright, or bows straight ahead, to better than a degree or so. Several bows average.
+limits the result: no person stands upright, or bows straight ahead, to better than a degree. Several bows average.
 
 Six rests of the IMU on different sides show the accelerometer's scale and bias: in each it must show one g.
 """
