@@ -44,7 +44,7 @@ def bits_of(value: int, width: int) -> list[int]:
 
 
 def crc(bits: list[int]) -> int:
-    """CAN's CRC-15: polynomial 0x4599, initial value 0."""
+    """Return CAN's CRC-15: polynomial 0x4599, initial value 0."""
     register = 0
     for bit in bits:
         turn = bit ^ register >> 14

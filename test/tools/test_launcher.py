@@ -1,6 +1,7 @@
 """launcher: which keys of a parameter file it accepts, which nodes start, and in which order they stop.
 
-test/nodes starts real nodes."""
+test/nodes starts real nodes.
+"""
 
 import sys
 import time

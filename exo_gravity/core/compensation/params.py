@@ -99,7 +99,11 @@ def urdf_table(count: int, given: Collection[str]) -> tuple[Param, ...]:
         "tilt_timeout": {},
         "thread_priority": {},
     }  # fmt: skip
-    shared = [replace(param, **other[param.name]) for param in COMPENSATOR if param.name in other]  # type: ignore[arg-type]
+    shared = [
+        replace(param, **other[param.name])  # type: ignore[arg-type]
+        for param in COMPENSATOR
+        if param.name in other
+    ]
     return compensator_table(given, (*shared, *URDF))
 
 

@@ -119,6 +119,7 @@ class V3Format(WireFormat):
         return replace(spec, position_range=V3_POSITION_RANGE, velocity_range=velocity_range, torque_range=torque_range)
 
     def command_id(self, motor_id: int) -> int:
+        """Return the 29-bit ID of a command to a motor."""
         return EXTENDED | MODE_MIT << 8 | motor_id
 
     def status_id(self, motor_id: int) -> int:
@@ -128,10 +129,12 @@ class V3Format(WireFormat):
     def pack_command(
         self, spec: MotorSpec, position: float, velocity: float, kp: float, kd: float, torque: float
     ) -> bytes:
+        """Return the 8 bytes of a command: kp, kd, position, velocity, torque."""
         p, v, stiffness, damping, t = specs.command_codes(spec, position, velocity, kp, kd, torque)
         return (stiffness << 52 | damping << 40 | p << 24 | v << 12 | t).to_bytes(8, "big")
 
     def unpack_command(self, spec: MotorSpec, data: bytes | bytearray) -> MotorCommand:
+        """Return the content of a command. Raises FrameError."""
         if len(data) != 8:
             raise FrameError(data, "8 bytes")
         word = int.from_bytes(data, "big")
@@ -139,6 +142,7 @@ class V3Format(WireFormat):
         return specs.command_of_codes(spec, *codes)
 
     def pack_reply(self, spec: MotorSpec, reply: MotorReply) -> bytes:
+        """Return the 8 bytes of a status frame. Raises ParameterError for a value beyond its range."""
         numbers = []
         steps = POSITION_STEP, _speed_step(spec), CURRENT_STEP * spec.torque_per_ampere
         for name, value, step in zip(("position", "velocity", "torque"), reply[1:4], steps, strict=True):
@@ -149,6 +153,7 @@ class V3Format(WireFormat):
         return _STATUS.pack(*numbers, max(-128, min(127, reply.temperature or 0)), reply.error or 0)
 
     def unpack_reply(self, spec: MotorSpec, motor_id: int, data: bytes | bytearray) -> MotorReply:
+        """Return the content of a status frame. Raises FrameError."""
         if len(data) != 8:
             raise FrameError(data, "a status frame of 8 bytes")
         position, speed, current, temperature, error = _STATUS.unpack(data)
@@ -156,12 +161,15 @@ class V3Format(WireFormat):
         return MotorReply(motor_id, position * POSITION_STEP, speed * _speed_step(spec), torque, temperature, error)
 
     def enter(self, motor_id: int) -> tuple[Frame, ...]:
-        return ()  # a command does it
+        """Return no frames: a command switches the motor on."""
+        return ()
 
     def exit(self, motor_id: int) -> tuple[Frame, ...]:
+        """Return the frame that ends MIT mode: a current of 0 A."""
         return ((EXTENDED | MODE_CURRENT << 8 | motor_id, NO_CURRENT),)
 
     def set_zero(self, motor_id: int) -> tuple[Frame, ...]:
+        """Return no frames: the board has none for it."""
         return ()
 
     def classify(self, frame_id: int, data: bytes | bytearray, motor_ids: frozenset[int]) -> tuple[str, int]:

@@ -44,6 +44,8 @@ class BridgeServices:
         node.create_service(Trigger, "~/set_zero", self.set_zero)
 
     def enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        """Enable the arm, or let it down and disable it."""
+
         def switch(loop: ControlLoop) -> str:
             safety = loop.safety
             if not request.data:
@@ -56,6 +58,8 @@ class BridgeServices:
         return self._on_control_thread(switch, response)
 
     def clear_fault(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Clear a latched fault."""
+
         def clear(loop: ControlLoop) -> str:
             safety = loop.safety
             return "" if safety.clear(time.monotonic()) else f"no fault to clear: the arm is {safety.state.value}"
@@ -63,6 +67,7 @@ class BridgeServices:
         return self._on_control_thread(clear, response)
 
     def set_zero(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Make the present pose the motors' zero, while they are off."""
         since = time.monotonic()
         self._on_control_thread(self._set_zero, response)
         loop = self._get_loop()
