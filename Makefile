@@ -1,8 +1,8 @@
 # make demo         four nodes as processes on the simulated device, about 75 s; a table and figures in trials/
 # make calibrate-demo  a simulated arm with a wrong parameter file, calibrated, 5 minutes; a picture before and after
 # make calibrate-study  20 random simulated devices, calibrated from motors to an arm that holds, offline, 20 minutes
-# make test         the tests, under 5 minutes on two cores
-# make test-all     the same, then the longer ones (make test-long): browser, 13 poses, video, SROS2, two computers
+# make test         the tests, about 6 minutes on two cores
+# make test-all     the same, then the longer ones (make test-long): studies, browser, 13 poses, video, SROS2
 # make lint         ruff, mypy, ament's flake8 and pep257, shellcheck
 # make docs         these documents as a site, in build/site; a warning is an error
 # make faults       the whole fault matrix on the simulated device, 20 minutes; a table and build/faults.json
@@ -48,8 +48,8 @@ calibrate-study:
 # Tests of running nodes need a machine that keeps up with them: they run alone.
 test:
 	@$(SETUP) $(TEST)
-	$(BIN)/python -m pytest -n auto -m "not (real_time or browser or thorough)"
-	$(BIN)/python -m pytest -m "real_time and not (browser or thorough)"
+	$(BIN)/python -m pytest test -n auto -m "not (real_time or browser or thorough)"
+	$(BIN)/python -m pytest test -m "real_time and not (browser or thorough)"
 
 test-all: test test-long
 
@@ -58,8 +58,9 @@ test-long:
 	@mkdir -p build
 	@command -v chromium chromium-browser >/dev/null || ! test -w /var/lib/dpkg || \
 		(apt-get update && apt-get install --yes chromium) >build/chromium.log 2>&1 || true
-	$(BIN)/python -m pytest -n auto -m "(browser or thorough) and not real_time"
-	$(BIN)/python -m pytest -m "(browser or thorough) and real_time"
+	$(BIN)/python -m pytest bench -n auto
+	$(BIN)/python -m pytest test -n auto -m "(browser or thorough) and not real_time"
+	$(BIN)/python -m pytest test -m "(browser or thorough) and real_time"
 
 lint:
 	@$(SETUP) $(TEST) dev

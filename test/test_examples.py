@@ -155,6 +155,7 @@ def emg():
     rig.close()
 
 
+@pytest.mark.thorough
 def test_the_elbow_is_assisted_in_proportion_to_the_biceps_and_against_the_triceps(emg):
     emg.contract(0.01, 0.01, 2.0)  # the offset of the electrodes is removed
     assert emg.contract(0.01, 0.01) == 0.0

@@ -205,6 +205,7 @@ def test_a_full_disk_ends_the_recorder_with_the_reason_and_keeps_what_fits(arm, 
     assert len(read_bag(tmp_path / "bag").recordings[0].time) > 50
 
 
+@pytest.mark.thorough
 def test_messages_that_a_stopped_recorder_misses_are_counted_and_noted_in_the_recording(arm, tmp_path):
     process = start(tmp_path / "bag")
     arm.wait_until(arm.is_recorded)

@@ -122,6 +122,7 @@ def test_recordings_without_and_with_the_weight_give_kilograms_and_true_scales(t
     np.testing.assert_allclose(found.robot.first_moment[1:], TRUTH.first_moment[1:], rtol=0.04)
 
 
+@pytest.mark.thorough
 def test_sweeps_at_five_speeds_give_the_friction_of_each_joint_live_and_recorded(tmp_path):
     truth = ArmConfig(TRUTH, coulomb_friction=(0.25, 0.35, 0.18, 0.22), viscous_friction=(0.1, 0.2, 0.1, 0.1))
     run = TourRun(truth=truth)

@@ -215,6 +215,7 @@ def test_a_node_that_the_computer_does_not_run_ends_a_simulated_trial_with_exit_
     assert code == 3 and last.startswith("trial: this computer was too busy: right/simulator was not run for ")
 
 
+@pytest.mark.thorough
 @pytest.mark.real_time
 def test_over_ros_the_arm_holds_in_the_pose_that_it_has_offline(run):
     code, folder = run()
