@@ -78,7 +78,7 @@ URDF = (
 
 
 def compensator_table(given: Collection[str], table: Sequence[Param] = COMPENSATOR) -> tuple[Param, ...]:
-    """Return `table` and what is declared beside it where a file gives the names `given`."""
+    """Return `table` and what is added to it where a file gives the names `given`."""
     is_command = any(param.name in given for param in COMMAND_PARAMETERS)
     return (*table, *(COMMAND_PARAMETERS if is_command else ()))
 

@@ -242,7 +242,7 @@ class Icm20948(InvenSense):
 def _limits_6050(codes: bytes) -> list[tuple[float, float]]:
     """Return the limits of the responses, gyroscope first, in LSB at 250 deg/s and 8 g.
 
-    They lie 14 % (PS-MPU-6000A 6.1) about the factory's response (RM-MPU-6000A 4.1); without one there are none.
+    They lie 14 % (PS-MPU-6000A 6.1) about the factory's response (RM-MPU-6000A 4.1); a chip without one has no limits.
     """
     gyroscope, accelerometer = [], []
     for axis, sign in enumerate((1.0, -1.0, 1.0)):

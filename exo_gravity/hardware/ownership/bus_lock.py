@@ -1,4 +1,4 @@
-"""One owner per CAN bus on this host, and a page of notes for whoever outlives it.
+"""One owner per CAN bus on this host, and a page of notes for the process that comes after it.
 
 The lock is a file named after the bus, locked with flock(2). The watchdog inherits its descriptor, so the kernel
 releases the lock when bridge and watchdog have both ended. The file itself stays, and with it the notes: if both
@@ -34,8 +34,8 @@ Address = tuple[str, str, Mapping[str, Any]]  # interface, channel and options o
 class DriveNotes:
     """One page of shared memory: what the motors of a bus receive, who owns the bus, and the watchdog's heartbeat.
 
-    `MotorBus` notes each drive before its frames are sent. So whoever outlives the writer knows the torque that the
-    motors still apply. An empty page means that the motors are off.
+    `MotorBus` notes each drive before its frames are sent. A process that outlives the writer thus knows the torque
+    that the motors still apply. An empty page means that the motors are off.
     """
 
     def __init__(self, page: mmap.mmap, clock: Clock) -> None:

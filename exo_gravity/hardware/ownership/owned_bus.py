@@ -23,7 +23,7 @@ class OwnedBus:
         self._arm = arm
         self._clock = clock
         self._lock = BusLock(arm.address, owner, clock=clock)
-        #: What the motors receive, for whoever outlives this process.
+        #: What the motors receive, for a process that outlives this one.
         self.notes = self._lock.notes
         try:
             _let_down(arm, self.notes, log, clock)
