@@ -270,7 +270,7 @@ class SimulatedDevice:
             self._power_returns = math.inf
             for motor in self.motors:
                 motor.unplugged = False
-        torque = list(map(SimulatedMotor.torque, self.motors, theta, velocity))
+        torque = list(map(SimulatedMotor.advance, self.motors, theta, velocity, (count * STEP,) * JOINT_COUNT))
         given: Torque = NO_TORQUE
         step = None
         if self._trial is not None:

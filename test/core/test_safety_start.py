@@ -164,7 +164,7 @@ def test_a_joint_that_moves_backwards_or_not_at_all_under_the_test_torque_is_ref
 def assert_a_wrong_angle_is_refused(arm):
     """The encoder of an arm that is off is wrong by a turn of the motor: the arm is not carried."""
     arm.changes[1].update(position=math.radians(40.0))  # one turn of an AK80-9's motor
-    arm.cycle()
+    arm.cycle(2 * PERIOD)
     arm.enable().cycle(1.0)
     assert arm.fault_code == "implausible_zero"
 
@@ -203,10 +203,19 @@ def test_a_motor_that_does_not_switch_on_is_refused_at_every_start():
     arm = SafetyRun().until_active()
     arm.machine.disable(arm.now)
     arm.cycle(8.0)
-    arm.off.add(3)
+    arm.changes[3].update(effort=0.02)
     arm.enable().cycle(1.6)
     assert arm.fault_code == "torque_not_delivered"
-    assert "d: the motor did not switch on" in arm.machine.fault.reason
+    assert "d: the motor did not switch on: 0 % of the commanded torque replied" in arm.machine.fault.reason
+
+
+def test_a_motor_that_missed_its_enter_gets_another_one():
+    arm = SafetyRun()
+    arm.off.update((0, 3))
+    arm.enable().cycle(1.2)
+    assert not arm.off
+    arm.cycle(2.0)
+    assert arm.machine.state is State.ACTIVE
 
 
 def test_noise_of_the_current_sensors_is_no_fault():

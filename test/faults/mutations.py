@@ -118,7 +118,7 @@ MUTATIONS = (
     Mutation(
         "zeros once checked are trusted for ever",
         ("joint 2 jumps by a motor turn, then clear and enable",),
-        (Edit(SAFETY, "if any(silent) or any(map(self.limits.is_jump, range(JOINT_COUNT), joints, self._before)):",
+        (Edit(SAFETY, "if any(readings.silent) or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):",
               "if False:"),
          Edit(SAFETY, "        if code in DOUBTFUL:\n", "        if False:\n")),
     ),

@@ -140,7 +140,5 @@ def test_a_forged_reply_with_random_values_is_nearly_always_a_fault(length, most
     for _ in range(count):
         joint = rng.randrange(4)
         _, *reading = JOINTS[joint].joint_reply(bytes((joint + 1,)) + rng.randbytes(length - 1))
-        now = [JointSample(*sample[:5], 1.004) for sample in before]
-        now[joint] = JointSample(*reading, 1.004)
-        unseen += LIMITS.find_fault(1.004, now, before) is None
+        unseen += LIMITS.find_fault(joint, JointSample(*reading, 1.004), before[joint], 1.0) is None
     assert unseen / count <= most

@@ -86,7 +86,11 @@ class VirtualBus(can.BusABC):
         self._is_shutdown = False
 
     def deliver(self, message: can.Message) -> None:
-        self._received.append(message)
+        clock, batch = self._wire.clock, self._wire.batch
+        if batch:
+            clock.later(-clock.monotonic() % batch, partial(self._received.append, message))
+        else:
+            self._received.append(message)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         self._check()
@@ -162,7 +166,8 @@ class Played:
 class Wire:
     """A CAN bus in virtual time. echoes: whether it returns each frame to its sender too, unmarked, as udp_multicast.
 
-    refusal: what opening it raises, None if it can be opened. opened: how many ends were opened.
+    refusal: what opening it raises, None if it can be opened. opened: how many ends were opened. loss: share of the
+    frames that are lost. batch: s between two deliveries of the CAN adapters, 0 if they deliver at once.
     """
 
     def __init__(self, clock: VirtualClock | None = None, echoes: bool = False) -> None:
@@ -170,6 +175,8 @@ class Wire:
         self.ends: list[VirtualBus | Responder | Played] = []
         self.refusal: Exception | None = None
         self.opened = 0
+        self.loss = self.batch = 0.0
+        self._random = random.Random(1)
         self.broken: set[VirtualBus] = set()
         self.error: Exception = OSError()
         self._echoes = echoes
@@ -197,6 +204,8 @@ class Wire:
         return self.clock.every(period, partial(self.carry, None, message))
 
     def carry(self, sender: object, message: can.Message) -> None:
+        if self.loss and self._random.random() < self.loss:
+            return
         for end in tuple(self.ends):
             if end is not sender or (self._echoes and isinstance(end, VirtualBus)):
                 end.deliver(message)

@@ -1,8 +1,8 @@
 """The limits of a worn arm: which motor readings are a fault, and how an effort is limited before it reaches a motor.
 
-`find_fault` checks the motors' readings. `shape` limits the requested efforts, in this order: soft wall before a joint
-limit, clamp to the permitted torque (derated when hot), rate limit. docs/safety.md compares the defaults with those of
-other systems.
+`find_fault` checks a motor's reading; readings.py confirms what it finds. `shape` limits the requested efforts, in this
+order: soft wall before a joint limit, clamp to the permitted torque (derated when hot), rate limit. docs/safety.md
+compares the defaults with those of other systems.
 """
 
 from __future__ import annotations
@@ -94,38 +94,28 @@ class Limits:
         """Return whether the motor is silent: its reading `joint` is older than `reply_timeout` at `now` (s)."""
         return not now - joint.time <= self.reply_timeout
 
-    def find_fault(
-        self, now: float, joints: Sequence[JointSample], before: Sequence[JointSample], overshoot: float = OVERSHOOT
-    ) -> Fault | None:
-        """Return the first fault in the readings `joints` at `now` (s), or None.
+    def find_fault(self, i: int, joint: JointSample, last: JointSample, since: float) -> Fault | None:
+        """Return the first fault that the reading `joint` of joint `i` shows, or None.
 
-        before: the previous readings. overshoot: rad past a joint limit that is not yet a fault.
+        last: an earlier reading, UNKNOWN for none, taken after `since` (s).
         """
-        for i, (joint, last) in enumerate(zip(joints, before, strict=True)):
-            name, fastest = self.joint_names[i], self.max_velocity[i]
-            low, high = self.position_min[i], self.position_max[i]
-            if self.is_silent(now, joint):
-                reason = f"{name}: no reply for more than {self.reply_timeout * 1000:.0f} ms"
-                return Fault(FaultCode.MOTOR_SILENT, reason)
-            if joint.error:
-                text = MOTOR_ERRORS.get(joint.error, "unknown")
-                return Fault(FaultCode.MOTOR_ERROR, f"{name}: the motor reports error {joint.error} ({text})")
-            if joint.temperature is not None and joint.temperature >= MAX_TEMPERATURE:
-                reason = f"{name}: {joint.temperature} degC, the limit is {MAX_TEMPERATURE:g}"
-                return Fault(FaultCode.OVER_TEMPERATURE, reason)
-            if not abs(joint.velocity) <= fastest:
-                return Fault(FaultCode.OVER_SPEED, f"{name}: {joint.velocity:.2f} rad/s, the limit is {fastest:g}")
-            if not low - overshoot <= joint.position <= high + overshoot:
-                reason = f"{name}: {joint.position:.3f} rad, the limits are {low:g} to {high:g}"
-                return Fault(FaultCode.OUTSIDE_LIMITS, reason)
-            if self.is_jump(i, joint, last):
-                reason = f"{name}: from {last.position:.3f} to {joint.position:.3f} rad in one step"
-                return Fault(FaultCode.POSITION_JUMP, reason)
+        name, fastest = self.joint_names[i], self.max_velocity[i]
+        low, high = self.position_min[i], self.position_max[i]
+        if joint.error:
+            text = MOTOR_ERRORS.get(joint.error, "unknown")
+            return Fault(FaultCode.MOTOR_ERROR, f"{name}: the motor reports error {joint.error} ({text})")
+        if joint.temperature is not None and joint.temperature >= MAX_TEMPERATURE:
+            reason = f"{name}: {joint.temperature} degC, the limit is {MAX_TEMPERATURE:g}"
+            return Fault(FaultCode.OVER_TEMPERATURE, reason)
+        if not abs(joint.velocity) <= fastest:
+            return Fault(FaultCode.OVER_SPEED, f"{name}: {joint.velocity:.2f} rad/s, the limit is {fastest:g}")
+        if abs(joint.position - last.position) > JUMP + fastest * (joint.time - since):
+            reason = f"{name}: from {last.position:.3f} to {joint.position:.3f} rad in one step"
+            return Fault(FaultCode.POSITION_JUMP, reason)
+        if not low - OVERSHOOT <= joint.position <= high + OVERSHOOT:
+            reason = f"{name}: {joint.position:.3f} rad, the limits are {low:g} to {high:g}"
+            return Fault(FaultCode.OUTSIDE_LIMITS, reason)
         return None
-
-    def is_jump(self, i: int, joint: JointSample, last: JointSample) -> bool:
-        """Return whether joint `i` moved farther than it can since its `last` reading; False if that is UNKNOWN."""
-        return abs(joint.position - last.position) > JUMP + self.max_velocity[i] * (joint.time - last.time)
 
     def find_wrong_zero(self, joints: Sequence[JointSample]) -> Fault | None:
         """Return the fault of the first joint that is not near `home`, or None."""

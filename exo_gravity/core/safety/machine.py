@@ -27,12 +27,12 @@ from collections.abc import Sequence
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import Peaks
-from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DAMPING, DAMPING_RISE, ArmDescent, RestTracker
 from exo_gravity.core.safety.drive import CARRYING, DOUBTFUL, NOTHING, OFF, Drive, Fault, FaultCode, State
 from exo_gravity.core.safety.gate import SignCheck, StartGate, SwitchOnCheck
-from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
+from exo_gravity.core.safety.limits import JointSample, Limits
+from exo_gravity.core.safety.readings import Readings
 
 RAMP_TIME = 1.0  # s from no torque to full torque: the arm becomes light without a jolt
 
@@ -61,8 +61,7 @@ class SafetyMachine:
         self._sent = OFF  # last sent to the motors
         self._descent = ArmDescent(0.0, NOTHING, NOTHING, self._peaks.effort)
         self._rest = RestTracker()
-        self._before: Sequence[JointSample] = (UNKNOWN,) * 4
-        self._silent: Sequence[bool] = (True,) * 4
+        self._readings = Readings(limits)
         self._is_trusted = False  # zeros and signs
         self._delivery = DeliveryMonitor(limits, self._peaks.effort)
         self._gate = StartGate(limits, 0.0)
@@ -125,7 +124,7 @@ class SafetyMachine:
         now = max(now, self._now)  # a call may carry a slightly later time than the cycle that follows it
         dt = min(now - self._now, self._period)
         self._now = now
-        self._track(now, joints)
+        joints = self._track(now, dt, joints)
         if self.state is State.CHECKING:
             self._check(now, joints, effort, effort_time)
         if self._sent.powered:
@@ -133,7 +132,6 @@ class SafetyMachine:
         if self.state in CARRYING:
             self._watch(now, joints, effort, effort_time)
         drive = self._drive(now, joints, effort, dt).within(self._peaks.damping)
-        self._before = joints
         self._sent = drive
         return drive
 
@@ -147,8 +145,9 @@ class SafetyMachine:
                 self.trip(FaultCode.COMMAND_IMPOSSIBLE, str(error), now)
         if self.state is State.PROVING:
             damping = DAMPING * min(1.0, (now - self._since) / DAMPING_RISE)
-            check = self._signs if self._switch_on.done else self._switch_on
-            return Drive(tuple(check.effort), (damping,) * 4, True)
+            if self._switch_on.done:
+                return Drive(tuple(self._signs.effort), (damping,) * 4, True)
+            return Drive(tuple(self._switch_on.effort), (damping,) * 4, True, tuple(self._switch_on.enter))
         if self.state is State.LETTING_DOWN:
             return self._descend(now, joints, dt)
         return self._stand(now, joints, dt)
@@ -158,7 +157,7 @@ class SafetyMachine:
     ) -> None:
         """Continue to PROVING once the start gate has passed, or trip on a fault that refuses the start."""
         are_fresh = effort is not None and now - effort_time <= self.limits.command_timeout
-        fault = self._gate.step(now, joints, self._before, are_fresh, self._is_trusted)
+        fault = self._gate.step(now, joints, self._readings.fault, are_fresh, self._is_trusted)
         self.waiting_for = self._gate.waiting_for
         if fault:
             self.trip(*fault, now)
@@ -179,7 +178,7 @@ class SafetyMachine:
     def _watch(
         self, now: float, joints: Sequence[JointSample], effort: Sequence[float] | None, effort_time: float
     ) -> None:
-        fault = self.limits.find_fault(now, joints, self._before)
+        fault = self._readings.fault
         if fault is None and effort is None:
             fault = Fault(FaultCode.COMMAND_WITHDRAWN, "the compensator withdrew its efforts; see its diagnostics")
         elif fault is None and not now - effort_time <= self.limits.command_timeout:
@@ -193,6 +192,7 @@ class SafetyMachine:
             fault = self._signs.step(dt, joints)
         else:
             fault = self._switch_on.step(dt, joints, self._sent.damping)
+            self._delivery.reset()
         self.waiting_for = self._signs.hint
         if fault:
             self.trip(*fault, now)
@@ -216,16 +216,15 @@ class SafetyMachine:
 
     def _descend(self, now: float, joints: Sequence[JointSample], dt: float) -> Drive:
         descent = self._descent
-        descent.step(now, dt, joints, self._silent)
+        descent.step(now, dt, joints, self._readings.silent)
         if self.state is not State.LETTING_DOWN:  # a motor that could not be reached replies again
             self._enter(State.LETTING_DOWN, now)
         if descent.is_down(now, self._rest.since):
-            self.is_unreached = any(self._silent)
+            self.is_unreached = any(self._readings.silent)
             self._enter(State.FAULT if self.fault else State.DISABLED, now)
             return self._stand(now, joints, dt)
-        enter = tuple(
-            missing and not is_silent for missing, is_silent in zip(self._delivery.missing, self._silent, strict=True)
-        )
+        known = zip(self._delivery.missing, self._readings.silent, strict=True)
+        enter = tuple(missing and not is_silent for missing, is_silent in known)
         if any(enter):
             self._delivery.reset()
         return Drive(descent.effort, descent.damping, True, enter)
@@ -234,21 +233,22 @@ class SafetyMachine:
         """Return what the motors receive while the arm is off: nothing, unless one of them could not be reached."""
         if not self.is_unreached:
             return OFF
-        if any(self._silent):
+        if any(self._readings.silent):
             return Drive(self._descent.effort, self._descent.damping, True)
         self.is_unreached = False
         return self._descend(now, joints, dt)
 
-    def _track(self, now: float, joints: Sequence[JointSample]) -> None:
-        """Note which motors are silent, which returned, and whether the arm is at rest as far as its motors reply."""
-        silent = [self.limits.is_silent(now, joint) for joint in joints]
-        if any(silent) or any(map(self.limits.is_jump, range(JOINT_COUNT), joints, self._before)):
+    def _track(self, now: float, dt: float, joints: Sequence[JointSample]) -> Sequence[JointSample]:
+        """Follow the readings, and note whether the arm is at rest as far as its motors reply; return what counts."""
+        readings = self._readings
+        readings.step(now, dt, joints)
+        if any(readings.silent) or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):
             self._is_trusted = False  # a motor may have lost power, and with it the turn count of its encoder
-        self._rest.step(now, joints, silent)
-        self._silent = silent
+        self._rest.step(now, readings.joints, readings.silent)
+        return tuple(readings.joints)
 
     def _let_down(self, now: float) -> None:
-        applied = self._delivery.applied(self._sent, self._silent)
+        applied = self._delivery.applied(self._sent, self._readings.silent)
         self._descent = ArmDescent(now, *applied, self._peaks.effort)
         self._enter(State.LETTING_DOWN, now)
 

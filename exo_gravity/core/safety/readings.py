@@ -1,0 +1,70 @@
+"""What the motors' readings show: which motors are silent, and faults that two readings in a row confirm.
+
+Chosen against ordinary equipment: 3 % of the frames lost each way, a computer that is late by 20 ms in one cycle of
+ten, adapters that deliver in batches of 1 ms, and a motor that reports one wrong reading now and then.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.safety.drive import Fault, FaultCode
+from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
+
+# Cycles in a row without a reply. At 3 % lost each way one arm loses so many in a row once in 270 hours at 100 Hz.
+MISSED = 7
+
+
+class Readings:
+    """Follows the readings of an arm's motors, cycle by cycle.
+
+    joints: (4,) the newest ones, less those in doubt: a reading that shows a fault counts once the next one shows one
+    too. silent: (4,) whether a motor is silent: no reply for `reply_timeout` and in MISSED cycles. Only the loop's own
+    cycles count: a loop that stood still has not asked. fault: what the newest readings show, or None.
+    """
+
+    def __init__(self, limits: Limits) -> None:
+        self.joints: list[JointSample] = [UNKNOWN] * JOINT_COUNT
+        self.silent: Sequence[bool] = (True,) * JOINT_COUNT
+        self.fault: Fault | None = None
+        self._limits = limits
+        self._newest = [-math.inf] * JOINT_COUNT  # s
+        self._silence = [math.inf] * JOINT_COUNT  # s
+        self._missed = [MISSED] * JOINT_COUNT
+        self._asked = [-math.inf] * JOINT_COUNT  # s; each of `joints` was taken later
+        self._is_doubted = [False] * JOINT_COUNT
+        self._now = -math.inf  # s, of the last cycle
+
+    def step(self, now: float, dt: float, joints: Sequence[JointSample]) -> None:
+        """Take the newest readings `joints` (4,) in the cycle at `now` s; dt: s that the loop ran since the last."""
+        limits = self._limits
+        faults: list[Fault | None] = []
+        for i, joint in enumerate(joints):
+            if joint.time > self._newest[i]:
+                self._newest[i], self._silence[i], self._missed[i] = joint.time, 0.0, 0
+                faults.append(self._take(i, joint))
+            else:
+                self._silence[i] += dt
+                self._missed[i] += 1
+        self.silent = [
+            silence > limits.reply_timeout and missed >= MISSED
+            for silence, missed in zip(self._silence, self._missed, strict=True)
+        ]
+        if any(self.silent):
+            name = limits.joint_names[self.silent.index(True)]
+            reason = f"{name}: no reply for more than {limits.reply_timeout * 1000:.0f} ms"
+            faults.insert(0, Fault(FaultCode.MOTOR_SILENT, reason))
+        self.fault = next(filter(None, faults), None)
+        self._now = now
+
+    def _take(self, i: int, joint: JointSample) -> Fault | None:
+        """Take a reading; return its fault if the reading before showed one, too."""
+        fault = self._limits.find_fault(i, joint, self.joints[i], self._asked[i])
+        is_confirmed = self._is_doubted[i]
+        self._is_doubted[i] = fault is not None
+        if fault and not is_confirmed and self.joints[i] is not UNKNOWN:
+            return None
+        self.joints[i], self._asked[i] = joint, self._now
+        return fault if is_confirmed else None
