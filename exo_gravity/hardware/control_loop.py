@@ -43,6 +43,7 @@ class EffortCommand(NamedTuple):
 
     effort: Sequence[float] | None  #: (4,) Nm, or None to withdraw.
     answered: float  #: s, when the joint states that it answers were taken.
+    held: bool = False  #: Whether it is computed from a tilt that is late.
 
 
 NO_COMMAND = EffortCommand(None, -math.inf)

@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exo_gravity.core.safety.descent import DAMPING
-from exo_gravity.core.safety.drive import CARRYING, OFF, Fault, FaultCode, State
+from exo_gravity.core.safety.descent import DAMPING, DAMPING_RISE
+from exo_gravity.core.safety.drive import CARRYING, NO_ONES, OFF, Fault, FaultCode, State
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
+from exo_gravity.core.safety.ride import LONGEST_AGE, LONGEST_RIDE
 
 from ..support.safety_run import EFFORT, LIMITS, PERIOD, SafetyRun
 
@@ -34,7 +35,7 @@ def test_after_a_fault_the_arm_is_let_down_gently_and_the_fault_stays_latched(sp
     arm = SafetyRun().until_active()
     arm.steps.clear()
     spoil(arm)
-    arm.cycle(0.1)
+    arm.cycle(0.15)
     assert arm.machine.state is State.LETTING_DOWN
     assert arm.fault_code == code
     assert arm.drive.powered
@@ -171,10 +172,117 @@ def check(arm: SafetyRun, had_fault: Fault | None) -> None:
     assert all(abs(e) <= limit for e, limit in zip(drive.effort, LIMITS.max_effort, strict=True))
     if machine.state in CARRYING:
         assert arm.effort is not None
-        assert arm.effort_age <= LIMITS.command_timeout + 1e-9
+        assert arm.effort_age <= LONGEST_AGE + 1e-9
+        assert arm.effort_age <= LIMITS.command_timeout + 1e-9 or min(drive.damping) > 0.0
         assert all(arm.now - joint.time <= LIMITS.reply_timeout + 1e-9 for joint in arm.joints)
         assert machine.fault is None
     elif machine.state is not State.LETTING_DOWN and not machine.is_unreached:
         assert drive == OFF
     if had_fault:
         assert machine.fault == had_fault
+
+
+def test_late_efforts_are_ridden_through_under_rising_damping_which_falls_again():
+    arm = SafetyRun().until_active()
+    arm.steps.clear()
+    arm.effort_age = LIMITS.command_timeout + PERIOD
+    arm.cycle()
+    assert 0.0 < min(arm.drive.damping) < 0.2
+    arm.cycle(0.1)
+    assert arm.machine.state is State.ACTIVE and arm.machine.ride.rides == 1
+    assert min(arm.drive.damping) == pytest.approx(DAMPING * 0.104 / DAMPING_RISE)
+    assert arm.drive.effort == pytest.approx(EFFORT)
+    arm.effort_age = 0.002
+    arm.cycle(0.12)
+    assert arm.machine.state is State.ACTIVE and max(arm.drive.damping) == 0.0
+    assert max(arm.steps) <= 1e-6
+
+
+@pytest.mark.parametrize("age", [0.002, LIMITS.command_timeout + PERIOD], ids=["a late tilt", "late efforts"])
+def test_a_ride_ends_and_who_is_late_more_often_than_once_in_ten_is_let_down(age):
+    arm = SafetyRun().until_active()
+    arm.effort_age, arm.held = age, True
+    arm.cycle(LONGEST_RIDE - PERIOD)
+    assert arm.machine.state is State.ACTIVE
+    arm.cycle(2 * PERIOD)
+    assert (arm.machine.state, arm.fault_code) == (State.LETTING_DOWN, "command_stale")
+
+    arm = SafetyRun().until_active()
+    for late, fresh in [(0.06, 0.6)] * 20:
+        arm.effort_age, arm.held = age, True
+        arm.cycle(late)
+        arm.effort_age, arm.held = 0.002, False
+        arm.cycle(fresh)
+    assert arm.machine.state is State.ACTIVE and arm.machine.ride.rides == 20
+    for late, fresh in [(0.06, 0.2)] * 4:
+        arm.effort_age, arm.held = age, True
+        arm.cycle(late)
+        arm.effort_age, arm.held = 0.002, False
+        arm.cycle(fresh)
+    assert arm.fault_code == "command_stale"
+
+
+def test_after_a_pause_of_the_loop_itself_only_the_age_of_the_efforts_counts():
+    arm = SafetyRun().until_active()
+    arm.now += 0.1  # the computer stood still: no motor was asked, and the ride has only begun
+    arm.effort_age = 0.1
+    arm.cycle()
+    assert arm.machine.state is State.ACTIVE
+    arm.effort_age = LONGEST_AGE + PERIOD
+    arm.cycle()
+    assert arm.fault_code == "command_stale"
+
+
+def let_down_by(code: FaultCode) -> SafetyRun:
+    arm = SafetyRun().until_active()
+    arm.machine.trip(code, "test", arm.now)
+    for step in range(46):  # as a One-G descent leaves a shoulder that no gravity turns back
+        arm.changes[0].update(position=0.02 * step)
+        arm.cycle(0.02)
+    arm.cycle(10.0)
+    assert arm.machine.state is State.FAULT
+    return arm
+
+
+@pytest.mark.parametrize("code", sorted(NO_ONES))
+def test_after_a_let_down_that_was_no_ones_fault_resume_carries_the_arm_on_from_where_it_is(code):
+    arm = let_down_by(code)
+    assert arm.machine.resume(arm.now)
+    start = arm.now
+    while arm.machine.state is not State.ACTIVE:
+        arm.cycle()
+        assert arm.now - start < 2.3, arm.machine.waiting_for or arm.machine.fault
+    assert arm.machine.fault is None
+
+
+def test_resume_is_refused_after_any_other_fault_and_in_any_other_state():
+    for code in set(FaultCode) - NO_ONES:
+        arm = let_down_by(code)
+        assert not arm.machine.resume(arm.now)
+        assert (arm.machine.state, arm.fault_code) == (State.FAULT, code)
+        assert code in arm.machine.why_not_resumed
+    arm = SafetyRun()
+    assert not arm.machine.resume(arm.now)
+    arm.until_active()
+    assert not arm.machine.resume(arm.now)
+    arm.machine.trip(FaultCode.COMMAND_STALE, "test", arm.now)
+    arm.cycle()
+    assert not arm.machine.resume(arm.now)
+    arm.cycle(10.0)
+    arm.silent.add(1)
+    arm.cycle(0.5)
+    arm.silent.clear()
+    arm.cycle(0.1)
+    assert not arm.machine.resume(arm.now) and "zeros" in arm.machine.why_not_resumed
+
+
+@pytest.mark.parametrize(("silence", "turned", "is_trusted"), [(0.08, 0.0, True), (0.08, 0.698, False), (0.2, 0.0, True),
+                                                               (0.2, -0.698, False), (0.4, 0.0, False)])  # fmt: skip
+def test_a_short_silence_keeps_zeros_trusted_unless_the_angle_has_lost_a_turn(silence, turned, is_trusted):
+    arm = let_down_by(FaultCode.COMMAND_STALE)
+    arm.silent.add(1)
+    arm.cycle(silence)
+    arm.silent.clear()
+    arm.changes[1].update(position=turned)
+    arm.cycle(0.1)
+    assert (arm.machine.why_not_resumed == "") == is_trusted

@@ -101,7 +101,7 @@ def test_an_arm_away_from_home_is_refused_until_it_has_been_carried_once():
     arm.machine.disable(arm.now)
     arm.cycle(8.0)
     arm.silent.add(2)  # its supply was interrupted, and its zero may have changed
-    arm.cycle(0.1)
+    arm.cycle(0.4)
     arm.silent.clear()
     arm.enable()
     arm.cycle(1.0)

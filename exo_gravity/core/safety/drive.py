@@ -96,15 +96,16 @@ class FaultCode(str, Enum):
 # After these faults zeros and signs are checked again: an encoder may have lost its turn count, or a motor its power.
 DOUBTFUL = frozenset(
     {
-        FaultCode.MOTOR_SILENT,
         FaultCode.MOTOR_ERROR,
         FaultCode.TORQUE_NOT_DELIVERED,
-        FaultCode.OUTSIDE_LIMITS,
         FaultCode.POSITION_JUMP,
         FaultCode.IMPLAUSIBLE_ZERO,
         FaultCode.FOREIGN_COMMAND,
     }
 )
+
+# After these the operator may carry on at once (`resume`): a computer or a bus was late, and nothing needs mending.
+NO_ONES = frozenset({FaultCode.COMMAND_STALE, FaultCode.COMMAND_WITHDRAWN, FaultCode.MOTOR_SILENT, FaultCode.BUS_ERROR})
 
 
 class Fault(NamedTuple):

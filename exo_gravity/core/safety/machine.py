@@ -17,7 +17,11 @@
 - FAULT latches the code and reason of the first fault. Only `clear` leaves it, and only to DISABLED: clearing a fault
   never enables the arm.
 
-Zeros and signs are trusted once they were checked, until a motor is silent or a fault casts doubt on them (`DOUBTFUL`).
+A compensator that is late for a moment is waited for (ride.py): the last torque stays, and damping rises.
+
+Zeros and signs are trusted once they were checked, until a motor may have lost its turn count (readings.py), or a fault
+casts doubt on them (`DOUBTFUL`). Until then `resume` carries an arm on from any pose after a fault that was no one's
+(`NO_ONES`).
 """
 
 from __future__ import annotations
@@ -29,10 +33,11 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import Peaks
 from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DAMPING, DAMPING_RISE, ArmDescent, RestTracker
-from exo_gravity.core.safety.drive import CARRYING, DOUBTFUL, NOTHING, OFF, Drive, Fault, FaultCode, State
+from exo_gravity.core.safety.drive import CARRYING, DOUBTFUL, NO_ONES, NOTHING, OFF, Drive, Fault, FaultCode, State
 from exo_gravity.core.safety.gate import SignCheck, StartGate, SwitchOnCheck
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.core.safety.readings import Readings
+from exo_gravity.core.safety.ride import RideThrough
 
 RAMP_TIME = 1.0  # s from no torque to full torque: the arm becomes light without a jolt
 
@@ -44,7 +49,8 @@ class SafetyMachine:
     peaks: the most that the motors apply; by default `max_effort`, and any damping.
 
     state: the State. fault: the latched Fault or None. waiting_for: what CHECKING or PROVING waits for. acted: for each
-    limit that has acted, by name, the last time. is_unreached: whether a motor that may be on cannot be reached.
+    limit that has acted, by name, the last time. is_unreached: whether a motor that may be on cannot be reached. ride:
+    through late efforts.
     """
 
     def __init__(self, limits: Limits, period: float, peaks: Peaks | None = None) -> None:
@@ -54,6 +60,7 @@ class SafetyMachine:
         self.waiting_for = ""
         self.acted: dict[str, float] = {}
         self.is_unreached = False
+        self.ride = RideThrough(limits.command_timeout)
         self._period = period
         self._peaks = peaks or Peaks(tuple(limits.max_effort))
         self._since = 0.0
@@ -92,6 +99,19 @@ class SafetyMachine:
         self._enter(State.DISABLED, now)
         return True
 
+    @property
+    def why_not_resumed(self) -> str:
+        """Why `resume` would be refused; '' if it would not."""
+        if self.state is not State.FAULT or self.fault is None:
+            return f"the arm is {self.state.value}, must be in fault"
+        if self.fault.code not in NO_ONES:
+            return f"{self.fault.code} has a cause to look for: then clear the fault and enable the arm"
+        return "" if self._is_trusted else "zeros are no longer sure: let the arm hang, clear the fault, enable the arm"
+
+    def resume(self, now: float) -> bool:
+        """Clear the fault and enable, on the operator's request only. Return False, and do nothing, if refused."""
+        return not self.why_not_resumed and self.clear(now) and self.enable(now)
+
     def trip(self, code: FaultCode, reason: str, now: float) -> None:
         """Latch a fault detected elsewhere (a broken bus, an impossible command). The first fault stays."""
         if code in DOUBTFUL:
@@ -114,12 +134,18 @@ class SafetyMachine:
         return self._rest.is_settled(now)
 
     def step(
-        self, now: float, joints: Sequence[JointSample], effort: Sequence[float] | None, effort_time: float
+        self,
+        now: float,
+        joints: Sequence[JointSample],
+        effort: Sequence[float] | None,
+        effort_time: float,
+        held: bool = False,
     ) -> Drive:
         """Return what the motors receive in the cycle at `now` s.
 
         joints: the 4 newest readings. effort: (4,) Nm requested, None if withdrawn or never requested; effort_time:
-        when the joint readings that it answers were taken. All times are on one monotonic clock.
+        when the joint readings that it answers were taken; held: whether it is computed from a tilt that is late. All
+        times are on one monotonic clock.
         """
         now = max(now, self._now)  # a call may carry a slightly later time than the cycle that follows it
         dt = min(now - self._now, self._period)
@@ -130,7 +156,7 @@ class SafetyMachine:
         if self._sent.powered:
             self._check_delivery(now, joints, dt)
         if self.state in CARRYING:
-            self._watch(now, joints, effort, effort_time)
+            self._watch(now, dt, effort, now - effort_time, held)
         drive = self._drive(now, joints, effort, dt).within(self._peaks.damping)
         self._sent = drive
         return drive
@@ -175,15 +201,12 @@ class SafetyMachine:
         if fault and self.state in CARRYING and is_proven:
             self.trip(*fault, now)
 
-    def _watch(
-        self, now: float, joints: Sequence[JointSample], effort: Sequence[float] | None, effort_time: float
-    ) -> None:
+    def _watch(self, now: float, dt: float, effort: Sequence[float] | None, age: float, held: bool) -> None:
         fault = self._readings.fault
         if fault is None and effort is None:
             fault = Fault(FaultCode.COMMAND_WITHDRAWN, "the compensator withdrew its efforts; see its diagnostics")
-        elif fault is None and not now - effort_time <= self.limits.command_timeout:
-            limit = self.limits.command_timeout * 1000
-            fault = Fault(FaultCode.COMMAND_STALE, f"no effort command younger than {limit:.0f} ms")
+        elif fault is None:
+            fault = self.ride.step(now, dt, age, held)
         if fault:
             self.trip(*fault, now)
 
@@ -209,10 +232,13 @@ class SafetyMachine:
                 self._enter(State.ACTIVE, now)
         shaped, acted = self.limits.shape(effort, ramp, joints, self._sent.effort, dt)
         self.acted.update(dict.fromkeys(acted, now))
-        # Damping rises at once, since the soft wall already rises with the position, and falls over DAMPING_RISE.
-        fall = DAMPING / DAMPING_RISE * dt
+        # The damping of a soft wall rises at once, since it already rises with the position. Any other rises, and all
+        # falls, over DAMPING_RISE.
+        change = DAMPING / DAMPING_RISE * dt
+        wanted = DAMPING if self.ride.is_riding else 0.0
         walls = zip(self.limits.wall_damping(joints), self._sent.damping, strict=True)
-        return Drive(shaped, tuple(max(wall, last - fall) for wall, last in walls), True)
+        damping = tuple(max(wall, last - change, min(last + change, wanted)) for wall, last in walls)
+        return Drive(shaped, damping, True)
 
     def _descend(self, now: float, joints: Sequence[JointSample], dt: float) -> Drive:
         descent = self._descent
@@ -226,6 +252,7 @@ class SafetyMachine:
         known = zip(self._delivery.missing, self._readings.silent, strict=True)
         enter = tuple(missing and not is_silent for missing, is_silent in known)
         if any(enter):
+            self._is_trusted = False
             self._delivery.reset()
         return Drive(descent.effort, descent.damping, True, enter)
 
@@ -241,9 +268,9 @@ class SafetyMachine:
     def _track(self, now: float, dt: float, joints: Sequence[JointSample]) -> Sequence[JointSample]:
         """Follow the readings, and note whether the arm is at rest as far as its motors reply; return what counts."""
         readings = self._readings
-        readings.step(now, dt, joints)
-        if any(readings.silent) or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):
-            self._is_trusted = False  # a motor may have lost power, and with it the turn count of its encoder
+        readings.step(now, dt, joints, self._sent.powered)
+        if readings.lost or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):
+            self._is_trusted = False
         self._rest.step(now, readings.joints, readings.silent)
         return tuple(readings.joints)
 

@@ -15,6 +15,10 @@ from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
 
 # Cycles in a row without a reply. At 3 % lost each way one arm loses so many in a row once in 270 hours at 100 Hz.
 MISSED = 7
+# s without a reply, while the motors hold the arm and while they are off, for which a motor's turn count stays trusted
+# if its angle is then within `home_tolerance` of the one before: a lost turn is twice as large, less what the joint has
+# moved. A forearm whose motor has lost its power falls by 0.3 rad in 0.1 s; an arm that is down, only a person moves.
+TRUSTED_SILENCE, TRUSTED_SILENCE_OFF = 0.1, 0.3
 
 
 class Readings:
@@ -22,13 +26,15 @@ class Readings:
 
     joints: (4,) the newest ones, less those in doubt: a reading that shows a fault counts once the next one shows one
     too. silent: (4,) whether a motor is silent: no reply for `reply_timeout` and in MISSED cycles. Only the loop's own
-    cycles count: a loop that stood still has not asked. fault: what the newest readings show, or None.
+    cycles count: a loop that stood still has not asked. fault: what the newest readings show, or None. lost: whether a
+    motor may have lost its power now, and with it the turn count of its encoder.
     """
 
     def __init__(self, limits: Limits) -> None:
         self.joints: list[JointSample] = [UNKNOWN] * JOINT_COUNT
         self.silent: Sequence[bool] = (True,) * JOINT_COUNT
         self.fault: Fault | None = None
+        self.lost = True
         self._limits = limits
         self._newest = [-math.inf] * JOINT_COUNT  # s
         self._silence = [math.inf] * JOINT_COUNT  # s
@@ -37,17 +43,26 @@ class Readings:
         self._is_doubted = [False] * JOINT_COUNT
         self._now = -math.inf  # s, of the last cycle
 
-    def step(self, now: float, dt: float, joints: Sequence[JointSample]) -> None:
-        """Take the newest readings `joints` (4,) in the cycle at `now` s; dt: s that the loop ran since the last."""
+    def step(self, now: float, dt: float, joints: Sequence[JointSample], powered: bool) -> None:
+        """Take the newest readings `joints` (4,) in the cycle at `now` s; dt: s that the loop ran since the last.
+
+        powered: whether the motors are on.
+        """
         limits = self._limits
+        longest = TRUSTED_SILENCE if powered else TRUSTED_SILENCE_OFF
         faults: list[Fault | None] = []
+        self.lost = False
         for i, joint in enumerate(joints):
             if joint.time > self._newest[i]:
+                gap = joint.time - self._newest[i]
+                moved = abs(joint.position - self.joints[i].position)
+                self.lost |= gap > limits.reply_timeout and moved > limits.home_tolerance[i]
                 self._newest[i], self._silence[i], self._missed[i] = joint.time, 0.0, 0
                 faults.append(self._take(i, joint))
             else:
                 self._silence[i] += dt
                 self._missed[i] += 1
+                self.lost |= self._silence[i] > longest
         self.silent = [
             silence > limits.reply_timeout and missed >= MISSED
             for silence, missed in zip(self._silence, self._missed, strict=True)
