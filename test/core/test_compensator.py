@@ -13,7 +13,7 @@ from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.compensation.limiter import LONGEST_STEP
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.tilt import Tilt, pitch_roll
-from exo_gravity.core.trunk.tilt_input import MAX_LEAD
+from exo_gravity.core.trunk.tilt_input import HOLD, MAX_LEAD
 
 from ..support.compensator_run import PERIOD, ROBOT, THETA, CompensatorRun, settings_with
 
@@ -80,15 +80,48 @@ def test_a_tilt_is_as_old_as_its_stamp():
     for _ in range(100):
         run.compensator.set_tilt(run.now, 0.1, 0.0, age=0.07)
         assert run.cycle().effort is not None
-    run.compensator.set_tilt(run.now, 0.1, 0.0, age=0.0799)
-    assert run.cycle().reason == "trunk tilt older than 80 ms by its stamp: the IMU driver lags, or its clock differs"
+    for _ in range(20):
+        run.compensator.set_tilt(run.now, 0.1, 0.0, age=0.09)
+        answer = run.cycle()
+    assert answer.reason == "trunk tilt older than 80 ms by its stamp: the IMU driver lags, or its clock differs"
 
 
 def test_a_stamp_ahead_of_the_clock_makes_a_tilt_no_younger_than_its_arrival():
     run = CompensatorRun(use_imu=True)
     run.compensator.set_tilt(run.now, 0.0, 0.0, age=-MAX_LEAD)
-    assert run.cycle(0.078).effort is not None
-    assert run.cycle(0.004).reason == "trunk tilt older than 80 ms"
+    assert run.cycle(0.078).held == ""
+    assert run.cycle(0.004).held.startswith("trunk tilt older than 80 ms: held on")
+    assert run.cycle(0.02).reason == "trunk tilt older than 80 ms"
+
+
+@pytest.mark.parametrize("acceleration", [-4.0, 0.0, 4.0])
+def test_a_late_tilt_is_turned_on_within_the_bound_that_it_states_and_then_withdrawn(acceleration):
+    run = CompensatorRun(use_imu=True)
+    for _ in range(600):  # past the ramp
+        run.compensator.set_gravity(run.now, (0.0, 0.0, -1.0), (0.0, 0.3, 0.0))
+        run.cycle()
+    start, held = run.now, 0
+    while (answer := run.cycle()).effort is not None:
+        late = run.now - start
+        tilt = Tilt.of("left", 0.3 * late + acceleration * late**2 / 2, 0.0)
+        error = np.abs(np.subtract(answer.effort, gravity_torque(ROBOT, THETA, tilt.direction))).max()
+        if answer.held:
+            held += 1
+            assert error <= float(answer.held.split()[-2])
+    assert held * PERIOD == pytest.approx(HOLD - 0.08, abs=2 * PERIOD)
+    assert answer.reason == "trunk tilt older than 80 ms"
+    before = [effort for effort in run.efforts if effort is not None][-1]
+    run.compensator.set_gravity(run.now, (math.sin(0.1), 0.0, -math.cos(0.1)), (0.0, 0.3, 0.0))
+    after = run.cycle()
+    assert after.held == "" and np.abs(np.subtract(after.effort, before)).max() < 50.0 * 2 * PERIOD + 1e-9
+
+
+def test_a_tilt_whose_successor_was_refused_is_not_held_on():
+    run = CompensatorRun(use_imu=True)
+    run.compensator.set_tilt(run.now, 0.0, 0.0)
+    with pytest.raises(ParameterError):
+        run.compensator.set_tilt(run.now + 0.01, math.nan, 0.0)
+    assert run.cycle(0.082).effort is None
 
 
 @pytest.mark.parametrize("age", [-3600.0, -0.06, 1.01, 3600.0, math.nan, math.inf])

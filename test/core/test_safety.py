@@ -276,8 +276,10 @@ def test_resume_is_refused_after_any_other_fault_and_in_any_other_state():
     assert not arm.machine.resume(arm.now) and "zeros" in arm.machine.why_not_resumed
 
 
-@pytest.mark.parametrize(("silence", "turned", "is_trusted"), [(0.08, 0.0, True), (0.08, 0.698, False), (0.2, 0.0, True),
-                                                               (0.2, -0.698, False), (0.4, 0.0, False)])  # fmt: skip
+SILENCES = [(0.08, 0.0, True), (0.08, 0.698, False), (0.2, 0.0, True), (0.2, -0.698, False), (0.4, 0.0, False)]
+
+
+@pytest.mark.parametrize(("silence", "turned", "is_trusted"), SILENCES)
 def test_a_short_silence_keeps_zeros_trusted_unless_the_angle_has_lost_a_turn(silence, turned, is_trusted):
     arm = let_down_by(FaultCode.COMMAND_STALE)
     arm.silent.add(1)

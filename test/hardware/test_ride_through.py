@@ -1,4 +1,4 @@
-"""Late efforts, in virtual time: the arm is carried on under rising damping, judged by the simulated arm's true motion."""
+"""Late efforts, in virtual time: the arm is carried on under rising damping, judged by the arm's true motion."""
 
 from __future__ import annotations
 

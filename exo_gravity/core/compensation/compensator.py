@@ -25,7 +25,7 @@ from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.model.kinematics import turning_torque
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.trunk.felt_motion import FeltMotion
-from exo_gravity.core.trunk.tilt_input import Tilted
+from exo_gravity.core.trunk.tilt_input import MAX_TURN, Tilted
 
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
 JOINTS = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
@@ -39,6 +39,7 @@ class Answer(NamedTuple):
     reason: str = ""
     clamped: tuple[int, ...] = ()  #: indices of the joints whose torque exceeded `max_effort`
     fallback: str = ""  #: why the exact law replaced the chosen one, or ''
+    held: str = ""  #: why the last tilt is held on, and the bound of the error in Nm; or ''
 
 
 class Compensator(Tilted):
@@ -86,15 +87,29 @@ class Compensator(Tilted):
         count = len(self._nothing)
         if len(theta) != count or not all(-MAX_ANGLE <= angle <= MAX_ANGLE for angle in theta):
             return Answer(None, f"joint angles {list(theta)} are not {count} numbers within {MAX_ANGLE:g} rad")
-        if self.settings.use_imu and (problem := self._tilt.problem(now)):
-            return Answer(None, problem)
+        held = self._tilt.problem(now) if self.settings.use_imu else ""
+        if held:
+            turn = self._tilt.unknown_turn(now)
+            if not turn <= MAX_TURN:
+                return Answer(None, held)
+            held = f"{held}: held on, torque off by at most {turn * self._largest_torque(theta):.2f} Nm"
         torque = self._without_step(now, theta)
         if not all(map(math.isfinite, torque)):
             return Answer(None, f"torque {list(torque)} Nm from the law is not finite")
         added = self.terms.torque(now, theta, velocity, torque) if velocity and self.terms else self._nothing
         s = self.settings
         effort, clamped = self._limiter.limit(now, torque, added, s.max_effort, s.max_effort_rate)
-        return Answer(effort, clamped=clamped, fallback=self._fallback)
+        return Answer(effort, clamped=clamped, fallback=self._fallback, held=held)
+
+    def _largest_torque(self, theta: Sequence[float]) -> float:
+        """Return the most in Nm that gravity takes of any joint at `theta` (n,) rad, whatever its direction."""
+        settings = self.settings
+        tilts = [Tilt.of_gravity(settings.side, axis) for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
+        if isinstance(settings, Settings):
+            torques = [settings.torque(theta, tilt, exact=True) for tilt in tilts]
+        else:
+            torques = [settings.torque(theta, tilt) for tilt in tilts]
+        return max(math.hypot(*components) for components in zip(*torques, strict=True))
 
     def _law(self, now: float, theta: Sequence[float]) -> Torque:
         """Return the torque of the chosen law, or of the exact law while the chosen one does not apply."""

@@ -1,10 +1,10 @@
 """Riding through: for a moment the last efforts, and damping that rises, hold the arm as well as new efforts would.
 
 A compensator that is late for a moment on a busy computer, or whose tilt is late, needs no descent. While efforts are
-older than `command_timeout`, or computed from a late tilt, the motors keep their torque, and their damping rises as in a
-descent; once the efforts are sound again it falls, and the arm is carried on. The ride ends in a fault once it is too
-long, efforts are too old, or they have been late too often: ordinary computers are late for less than RECOVERY of the
-time. Until LONGEST_AGE an arm that moves on at 1 rad/s makes the torque wrong by 18 % of what gravity takes at most.
+older than `command_timeout`, or computed from a late tilt, the motors apply the newest ones, and their damping rises as
+in a descent; once the efforts are sound again it falls, and the arm is carried on. The ride ends in a fault once it is
+too long, efforts are too old, or they have been late too often: ordinary computers are late for less than RECOVERY of
+the time. Up to LONGEST_AGE an arm that moves on at 1 rad/s makes the torque wrong by 18 % of gravity's largest.
 """
 
 from __future__ import annotations

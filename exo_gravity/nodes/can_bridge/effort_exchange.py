@@ -96,4 +96,4 @@ class EffortExchange:
             except ParameterError as error:
                 effort, self.refusal = None, str(error)
                 loop.trip(FaultCode.COMMAND_IMPOSSIBLE, f"effort_commands: {error.name} must be {error.expected}")
-            self._command = EffortCommand(effort, answered)
+            self._command = EffortCommand(effort, answered, held=bool(message.position))

@@ -41,6 +41,7 @@ class BridgeServices:
         self._zero = [motor.zero for motor in motors]
         node.create_service(SetBool, "~/enable", self.enable)
         node.create_service(Trigger, "~/clear_fault", self.clear_fault)
+        node.create_service(Trigger, "~/resume", self.resume)
         node.create_service(Trigger, "~/set_zero", self.set_zero)
 
     def enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
@@ -65,6 +66,15 @@ class BridgeServices:
             return "" if safety.clear(time.monotonic()) else f"no fault to clear: the arm is {safety.state.value}"
 
         return self._on_control_thread(clear, response)
+
+    def resume(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Clear a fault that was no one's and enable the arm, where it is."""
+
+        def resume(loop: ControlLoop) -> str:
+            why_not = loop.safety.why_not_resumed
+            return "" if loop.safety.resume(time.monotonic()) else f"refused: {why_not}"
+
+        return self._on_control_thread(resume, response)
 
     def set_zero(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Make the present pose the motors' zero, while they are off."""
@@ -170,6 +180,8 @@ class BridgeReport:
             "rate (Hz)": f"{rate:.1f}",
             "bus load (%)": f"{100.0 * self._traffic.load(rate).share:.0f}" if rate else "0",
             "age of efforts (ms)": milliseconds(now - answered),
+            "rides": safety.ride.rides,
+            "resume": safety.why_not_resumed or "possible",
             "cycles": loop.cycles,
             "late cycles": loop.late,
             "incomplete cycles": loop.incomplete,
@@ -185,6 +197,8 @@ class BridgeReport:
             values[f"{name} RMS torque (Nm)"] = row([rms], 2)
             values[f"{name} RMS of rated torque (%)"] = row([100.0 * share], 0)
         warnings = [f"limited by {acting}"] if acting else []
+        if now - safety.ride.ended < RECENT:
+            warnings.append(f"riding through: {safety.ride.why}")
         hot = [name for name, share in zip(self._names, self._motors.share, strict=True) if share > 1.0]
         if hot:
             warnings.append(f"above rated torque for too long: {', '.join(hot)}")

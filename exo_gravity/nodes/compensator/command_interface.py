@@ -28,7 +28,10 @@ JointReading = tuple[Sequence[float], Sequence[float] | None]  # positions (n,) 
 
 
 class JointStateInterface:
-    """Answers each joint state with `effort_commands` of the same stamp; without efforts: withdrawn."""
+    """Answers each joint state with `effort_commands` of the same stamp; without efforts: withdrawn.
+
+    Positions in it say that the efforts are those of a late tilt: the bridge damps the motion meanwhile.
+    """
 
     topic = "joint_states"
     problem = ""
@@ -47,6 +50,7 @@ class JointStateInterface:
         """Send the answer to a joint state."""
         self._command.header.stamp = message.header.stamp
         self._command.effort = answer.effort or ()
+        self._command.position = message.position if answer.held else ()
         self._publisher.publish(self._command)
 
 

@@ -57,7 +57,7 @@ class CompensatorNode(Node):
         self._answer = Answer(None)
         self._changes: deque[Answer] = deque(maxlen=MAX_CHANGES)
         self._last_answer = -math.inf
-        self._answers = 0
+        self._answers = self._rides = 0
         self._rate = Rate()
         self._refusal = "none"
         topic = self._interface.topic
@@ -106,7 +106,8 @@ class CompensatorNode(Node):
             answer = Answer(None, self._intruder)
         self._interface.send(now, message, answer)
         self._answers += answer.effort is not None
-        changed = answer.reason != self._answer.reason
+        self._rides += bool(answer.held and not self._answer.held)
+        changed = answer.reason != self._answer.reason or bool(answer.held) != bool(self._answer.held)
         self._answer, self._last_answer = answer, now
         if changed:
             self._changes.append(answer)
@@ -147,6 +148,7 @@ class CompensatorNode(Node):
             "age of joint states (ms)": milliseconds(now - self._last_answer),
             "age of tilt (ms)": milliseconds(self._control.tilt_age(now)),
             "answers": self._answers,
+            "rides": self._rides,
             "joint states missed": self._source.missed,
             "effort (Nm)": row(answer.effort) if answer.effort else "none",
             **self._arm.report(answer),
@@ -173,7 +175,7 @@ class CompensatorNode(Node):
             return STALE if self._answers else WARN, f"waiting for {self._interface.topic}"
         if answer.effort is None:
             return ERROR, f"withdrawn: {answer.reason}"
-        warnings = [warning for warning in (self._arm.concern(answer),) if warning]
+        warnings = [warning for warning in (answer.held, self._arm.concern(answer)) if warning]
         if answer.clamped:
             warnings.append(f"gravity exceeds max_effort: {', '.join(self._names[joint] for joint in answer.clamped)}")
         return (WARN, "; ".join(warnings)) if warnings else (OK, "compensating")
