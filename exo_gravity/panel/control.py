@@ -9,6 +9,7 @@ holds control, the others watch. Every page may let the arms down, at any time a
 {"do": "take"}                                       control; every page may
 {"do": "enable", "arm": "right"}                     the rest: only the page that holds control
 {"do": "clear_fault", "arm": "right"}
+{"do": "resume", "arm": "right"}                     clear and enable, after a fault that was no one's
 {"do": "set", "arm": "right", "values": {"support": 0.3}}
 {"do": "release"}                                    control
 {"do": "record"}, {"do": "stop_recording"}, {"do": "save"}
@@ -31,7 +32,7 @@ from exo_gravity.panel.params import SETTABLE
 # The kinds of requests, and the keys that each has besides "do".
 KEYS: Mapping[str, frozenset[str]] = {
     **dict.fromkeys(("take", "release", "record", "stop_recording", "save", "stop_trial"), frozenset()),
-    **dict.fromkeys(("let_down", "enable", "clear_fault"), frozenset({"arm"})),
+    **dict.fromkeys(("let_down", "enable", "clear_fault", "resume"), frozenset({"arm"})),
     "set": frozenset({"arm", "values"}),
     "trial": frozenset({"name"}),
 }

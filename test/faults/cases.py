@@ -52,6 +52,7 @@ from .device_faults import (
 from .fault_case import ALL_JOINTS, PROCESS_REACTION, FaultCase
 from .frames import MOTOR_2, foreign_frames, random_frames
 from .outer_loop_cases import OUTER_LOOP
+from .ride_cases import RIDES
 from .rig import Rig
 from .rigs import (
     BothArmsRig,
@@ -238,4 +239,4 @@ ARMS = (
         PROCESS_REACTION),
 )
 # fmt: on
-CASES = (*HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *OUTER_LOOP, *CLOCK, *ARMS, *V3_BOARDS)
+CASES = (*HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *OUTER_LOOP, *CLOCK, *ARMS, *V3_BOARDS, *RIDES)

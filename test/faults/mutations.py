@@ -113,12 +113,12 @@ MUTATIONS = (
     Mutation(
         "stale efforts are accepted",
         ("compensator frozen, the rest runs on",),
-        (Edit(SAFETY, "elif fault is None and not now - effort_time <= self.limits.command_timeout:", "elif False:"),),
+        (Edit(SAFETY, "elif fault is None:", "elif False:"),),
     ),
     Mutation(
         "zeros once checked are trusted for ever",
         ("joint 2 jumps by a motor turn, then clear and enable",),
-        (Edit(SAFETY, "if any(readings.silent) or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):",
+        (Edit(SAFETY, "if readings.lost or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):",
               "if False:"),
          Edit(SAFETY, "        if code in DOUBTFUL:\n", "        if False:\n")),
     ),
@@ -138,6 +138,16 @@ MUTATIONS = (
         "the last effort of an outer loop that ended stays",
         ("outer loop killed",),
         (Edit(ASSIST, "elif now - self._stamp > self.valid:", "elif self._stamp == -math.inf:"),),
+    ),
+    Mutation(
+        "a ride that never ends",
+        ("compensator frozen, the rest runs on",),
+        (Edit("exo_gravity/core/safety/ride.py", "if self._left >= 0.0 and age <= LONGEST_AGE:", "if True:"),),
+    ),
+    Mutation(
+        "a ride without damping",
+        ("compensator stopped for 0.1 s",),
+        (Edit(SAFETY, "wanted = DAMPING if self.ride.is_riding else 0.0", "wanted = 0.0"),),
     ),
 )  # fmt: skip
 

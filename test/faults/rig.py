@@ -146,7 +146,7 @@ class Rig:
         probe.wait_until(lambda: self.truth.motors_are_off() and probe.state in ("disabled", "fault"))
         for silent in (True, False):
             probe.set_parameters("simulator", fault__bus_silent=silent)
-            time.sleep(0.2)
+            time.sleep(0.5)
         if probe.state == "fault":
             assert probe.trigger("clear_fault").success
         probe.enable(True)  # without effect if autostart came first

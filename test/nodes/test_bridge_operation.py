@@ -63,6 +63,18 @@ def test_a_loop_below_its_rate_is_reported(sent):
     assert reports[-1][:2] == (WARN, "active, slower than 225 Hz")
 
 
+def test_a_ride_through_late_efforts_is_reported_and_counted(sent):
+    def riding(n):
+        loop = carrying(1.0, 25 * n)
+        loop.safety.ride.step(1000.0, 0.004, 0.07, False)
+        return loop
+
+    reports = sent(riding, 30)
+    assert reports[15][:2] == (WARN, "active, riding through: efforts 70 ms old")
+    assert reports[15][2]["rides"] == 1
+    assert reports[-1][:2] == (OK, "active")
+
+
 @pytest.fixture
 def ask(node):
     """A function that asks for a service of a bridge whose control thread is `loop`; it returns the message."""
@@ -106,6 +118,21 @@ def test_an_operator_enables_disables_and_clears_or_reads_why_not(ask):
     assert ask("clear_fault", loop) == ""
     assert ask("clear_fault", loop) == "no fault to clear: the arm is disabled"
     assert ask("enable", None, True) == "the node is not active"
+
+
+def test_one_request_carries_an_arm_on_after_a_fault_that_was_no_ones_or_is_refused_with_the_reason(ask, monkeypatch):
+    loop = standing()
+    assert ask("resume", loop) == "refused: the arm is disabled, must be in fault"
+    loop.safety.enable(0.0)
+    loop.safety.trip(FaultCode.WATCHDOG_DEAD, "dead", 1.0)
+    assert ask("resume", loop).startswith("refused: watchdog_dead has a cause to look for")
+    loop.safety.clear(1.0)
+    loop.safety.enable(1.0)
+    loop.safety.trip(FaultCode.COMMAND_STALE, "late", 1.0)
+    assert ask("resume", loop).startswith("refused: zeros are no longer sure")
+    monkeypatch.setattr(SafetyMachine, "why_not_resumed", "")
+    assert ask("resume", loop) == ""
+    assert (loop.safety.state, loop.safety.fault) == (State.CHECKING, None)
 
 
 def test_the_zero_is_set_only_for_an_arm_that_is_off_at_rest_and_replies(ask, monkeypatch):

@@ -87,6 +87,16 @@ def test_a_fault_shows_its_remedy_and_is_cleared(visit, stage):
     assert not page.is_visible('[data-arm="right"] .remedy')
 
 
+def test_after_a_fault_that_was_no_ones_one_press_carries_the_arm_again(visit, stage):
+    page = visit()
+    assert not page.is_visible('[data-arm="right"] .resume')
+    stage.arms.fail("right", "command_stale")
+    page.click('[data-arm="right"] .resume')
+    wait_for_state(page, "active")
+    assert stage.arms.calls[-1] == ("resume", "right")
+    assert not page.is_visible('[data-arm="right"] .resume')
+
+
 def test_the_support_slides_and_shows_the_motors_limit(visit, stage):
     page = visit()
     page.wait_for_selector("[data-arm=right] .mark:not([hidden])", state="attached")

@@ -147,7 +147,7 @@ def test_the_operator_enables_an_arm_and_it_is_noted_with_the_client(panel):
     assert panel.notes == ["10.0.0.1 page 1: enable right: done"]
 
 
-@pytest.mark.parametrize("kind", ["enable", "clear_fault"])
+@pytest.mark.parametrize("kind", ["enable", "clear_fault", "resume"])
 def test_a_page_that_watches_moves_nothing(panel, kind):
     for page in (panel.second, "", "guessed"):
         assert panel.ask(page, do=kind, arm="right").status == 403

@@ -53,6 +53,11 @@ class PlayedArms:
             self.faults.pop(arm, None)
         return self._change("clear_fault", arm, "disabled")
 
+    async def resume(self, arm: str) -> str:
+        if not self.problem:
+            self.faults.pop(arm, None)
+        return self._change("resume", arm, "active")
+
     async def set(self, arm: str, values: Mapping[str, Any]) -> str:
         self.calls.append(("set", arm, str(dict(values))))
         if not self.problem:
@@ -79,6 +84,7 @@ class PlayedArms:
         state, fault = self.states[name], self.faults.get(name, "none")
         values = {"state": state, "fault": fault, "rate (Hz)": "250.0", "age of efforts (ms)": "4.1"}
         values |= {"limits acting": "none", **{f"{joint} temperature (degC)": "31" for joint in names}}
+        values["resume"] = "possible" if fault == "command_stale" else "refused"
         message = f"fault: {fault}: {name} elbow" if fault != "none" else state
         bridge = {**values, "level": 2 if fault != "none" else 0, "message": message}
         carried = {"mass carried (kg)": "1.854", "largest support": "0.068", "level": 0, "message": "compensating"}

@@ -1,4 +1,4 @@
-"""How `can_bridge` is operated: the services enable, clear_fault and set_zero; its limits in the log; /diagnostics.
+"""How `can_bridge` is operated: its services enable, clear_fault, resume and set_zero; its limits; /diagnostics.
 
 Each service runs on the control thread between two cycles.
 """

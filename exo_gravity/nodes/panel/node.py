@@ -53,6 +53,7 @@ class ArmClient:
         self.joints, self.bridge, self.compensator = Newest(), Newest(), Newest()
         self.enable = node.create_client(SetBool, f"/{name}/{BRIDGE}/enable")
         self.clear_fault = node.create_client(Trigger, f"/{name}/{BRIDGE}/clear_fault")
+        self.resume = node.create_client(Trigger, f"/{name}/{BRIDGE}/resume")
         self.set = parameter_client(node, f"/{name}/{COMPENSATOR}")
         self._states = HotPath(node, JointState, f"/{name}/joint_states", self._on_states)
 
@@ -146,6 +147,10 @@ class Arms:
     async def clear_fault(self, arm: str) -> str:
         """Clear the latched fault of one arm."""
         return await call(self.clients[arm].clear_fault, Trigger.Request())
+
+    async def resume(self, arm: str) -> str:
+        """Clear the fault of one arm and enable it, where it is."""
+        return await call(self.clients[arm].resume, Trigger.Request())
 
     async def set(self, arm: str, values: Mapping[str, Any]) -> str:
         """Set parameters of the arm's compensator together."""

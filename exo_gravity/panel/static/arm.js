@@ -27,6 +27,7 @@ export class ArmCard {
     this.moved = -Infinity; // ms, when its user moved the slider or the last step was sent
     this.find(".enable").addEventListener("click", () => actions.enable(this));
     this.find(".clear").addEventListener("click", () => actions.send({ do: "clear_fault", arm: name }));
+    this.find(".resume").addEventListener("click", () => actions.send({ do: "resume", arm: name }));
     this.find(".down").addEventListener("click", () => actions.down(name));
     for (const button of this.root.querySelectorAll("[data-mode]"))
       button.addEventListener("click", () => actions.mode(this, button.dataset.mode));
@@ -40,6 +41,7 @@ export class ArmCard {
     write(this.find("h2"), has(`head.${this.name}`) ? t(`head.${this.name}`) : this.name);
     this.find(".enable").setAttribute("aria-label", t("enable_arm", arm));
     this.find(".clear").setAttribute("aria-label", t("clear_fault_arm", arm));
+    this.find(".resume").setAttribute("aria-label", t("resume_arm", arm));
     this.find(".down").setAttribute("aria-label", t("let_down_arm", arm));
     write(this.find(".down"), t("let_down_arm", arm));
   }
@@ -134,6 +136,8 @@ export class ArmCard {
     this.root.classList.toggle("stale", !alive);
     this.find(".enable").disabled = !operates || name !== "disabled";
     this.find(".clear").disabled = !operates || name !== "fault";
+    this.find(".resume").hidden = bridge?.resume !== "possible";
+    this.find(".resume").disabled = !operates;
     for (const control of [this.slider, ...this.root.querySelectorAll("[data-mode]")]) control.disabled = !operates || !other || !isFinite(this.stepped);
     if (this.setup?.settings) this.follow();
     this.showSupport();
