@@ -1,4 +1,4 @@
-"""Rows of the fault matrix in which something is late for a moment: the arm stays carried, or one press carries it on."""
+"""Rows of the fault matrix in which something is late for a moment: the arm stays carried, or one press carries on."""
 
 from __future__ import annotations
 
