@@ -32,7 +32,7 @@ class Run:
 
         lost: the second motor's reply does not come. changes: of the second motor's reading.
         """
-        self.readings.step(self.now, PERIOD, tuple(self._joints))
+        self.readings.step(self.now, tuple(self._joints))
         if self.readings.fault:
             self.faults.append(str(self.readings.fault.code))
         angle = self.speed * (self.now - 10.0)  # when the motors reply

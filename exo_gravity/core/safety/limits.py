@@ -91,7 +91,7 @@ class Limits:
             raise ParameterError("position_max", list(self.position_max), expected)
 
     def is_silent(self, now: float, joint: JointSample) -> bool:
-        """Return whether the motor is silent: its reading `joint` is older than `reply_timeout` at `now` (s)."""
+        """Return whether the reading `joint` of a motor is older than `reply_timeout` at `now` (s)."""
         return not now - joint.time <= self.reply_timeout
 
     def find_fault(self, i: int, joint: JointSample, last: JointSample, since: float) -> Fault | None:

@@ -21,8 +21,8 @@ class Readings:
     """Follows the readings of an arm's motors, cycle by cycle.
 
     joints: (4,) the newest ones, less those in doubt: a reading that shows a fault counts once the next one shows one
-    too. silent: (4,) whether a motor is silent: no reply for `reply_timeout` and in MISSED cycles. Only the loop's own
-    cycles count: a loop that stood still has not asked. fault: what the newest readings show, or None.
+    too. silent: (4,) whether a motor is silent: no reply for `reply_timeout`, nor in MISSED cycles: a loop that stood
+    still has not asked. fault: what the newest readings show, or None.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -31,27 +31,23 @@ class Readings:
         self.fault: Fault | None = None
         self._limits = limits
         self._newest = [-math.inf] * JOINT_COUNT  # s
-        self._silence = [math.inf] * JOINT_COUNT  # s
         self._missed = [MISSED] * JOINT_COUNT
         self._asked = [-math.inf] * JOINT_COUNT  # s; each of `joints` was taken later
         self._is_doubted = [False] * JOINT_COUNT
         self._now = -math.inf  # s, of the last cycle
 
-    def step(self, now: float, dt: float, joints: Sequence[JointSample]) -> None:
-        """Take the newest readings `joints` (4,) in the cycle at `now` s; dt: s that the loop ran since the last."""
+    def step(self, now: float, joints: Sequence[JointSample]) -> None:
+        """Take the newest readings `joints` (4,) in the cycle at `now` s."""
         limits = self._limits
         faults: list[Fault | None] = []
         for i, joint in enumerate(joints):
             if joint.time > self._newest[i]:
-                self._newest[i], self._silence[i], self._missed[i] = joint.time, 0.0, 0
+                self._newest[i], self._missed[i] = joint.time, 0
                 faults.append(self._take(i, joint))
             else:
-                self._silence[i] += dt
                 self._missed[i] += 1
-        self.silent = [
-            silence > limits.reply_timeout and missed >= MISSED
-            for silence, missed in zip(self._silence, self._missed, strict=True)
-        ]
+        asked = zip(joints, self._missed, strict=True)
+        self.silent = [missed >= MISSED and limits.is_silent(now, joint) for joint, missed in asked]
         if any(self.silent):
             name = limits.joint_names[self.silent.index(True)]
             reason = f"{name}: no reply for more than {limits.reply_timeout * 1000:.0f} ms"
