@@ -139,6 +139,12 @@ MUTATIONS = (
         ("outer loop killed",),
         (Edit(ASSIST, "elif now - self._stamp > self.valid:", "elif self._stamp == -math.inf:"),),
     ),
+    Mutation(
+        "a motor that replies no torque is taken for sound",
+        ("motor 2 restarts in 30 ms",),
+        (Edit("exo_gravity/core/safety/delivery.py", "excess = abs(joint.effort - nearest) -",
+              "excess = (abs(joint.effort) > 0.1) * abs(joint.effort - nearest) -"),),
+    ),
 )  # fmt: skip
 
 
