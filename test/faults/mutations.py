@@ -149,6 +149,12 @@ MUTATIONS = (
         ("compensator stopped for 0.1 s",),
         (Edit(SAFETY, "wanted = DAMPING if self.ride.is_riding else 0.0", "wanted = 0.0"),),
     ),
+    Mutation(
+        "a motor that replies no torque is taken for sound",
+        ("motor 2 restarts in 30 ms",),
+        (Edit("exo_gravity/core/safety/delivery.py", "excess = abs(joint.effort - nearest) -",
+              "excess = (abs(joint.effort) > 0.1) * abs(joint.effort - nearest) -"),),
+    ),
 )  # fmt: skip
 
 

@@ -135,7 +135,7 @@ class Played:
         self._last = wire.clock.monotonic()
         self._random = random.Random(0)
         wire.ends.append(self)
-        wire.clock.every(TICK, self._catch_up)
+        wire.clock.every(TICK, self.catch_up)
         for joint, motor in enumerate(device.motors):
             if not motor.joint.wire_format.replies:
                 wire.clock.every(1.0 / motor.firmware.status_rate, partial(self._report, joint))
@@ -143,20 +143,21 @@ class Played:
     def deliver(self, message: can.Message) -> None:
         if message.is_error_frame or message.is_fd:
             return
-        self._catch_up()
+        self.catch_up()
         frame_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
         if reply := self._device.exchange(frame_id, bytes(message.data)):
             self._wire.clock.later(self._random.uniform(*REPLY_DELAY), partial(self._send, reply))
 
     def _report(self, joint: int) -> None:
-        self._catch_up()
+        self.catch_up()
         if status := self._device.status(joint):
             self._send(status)
 
     def _send(self, frame: Frame) -> None:
         self._wire.carry(self, message_of(frame))
 
-    def _catch_up(self) -> None:
+    def catch_up(self) -> None:
+        """Let the device's time pass until now."""
         now = self._wire.clock.monotonic()
         self._device.advance(now - self._last)
         self._last = now
@@ -190,9 +191,9 @@ class Wire:
         self.ends.append(bus)
         return bus
 
-    def play(self, device: SimulatedDevice, look: Callable[[], None] = lambda: None) -> None:
+    def play(self, device: SimulatedDevice, look: Callable[[], None] = lambda: None) -> Played:
         """Connect a simulated device; call `look` after every step of it."""
-        Played(self, device, look)
+        return Played(self, device, look)
 
     def break_down(self, error: Exception) -> None:
         """Let every end that is open now raise `error` from now on."""

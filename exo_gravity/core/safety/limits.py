@@ -73,7 +73,9 @@ class Limits:
         (3.0, 9.0, 3.0, 3.0), "torque limit, by default the motors' rated torque", (0.0, PEAK_TORQUE), "Nm"
     )
     command_timeout: float = owned(0.05, "age of effort commands that trips a fault", (0.01, 0.1), "s")
-    reply_timeout: float = owned(0.05, "time without a reply from a motor that trips a fault", (0.01, 0.1), "s")
+    reply_timeout: float = owned(
+        0.05, "time without a reply from a motor, 7 cycles at least, that trips a fault", (0.01, 0.1), "s"
+    )
     sign_check_torque: float = owned(
         1.5, "largest test torque of the sign check; 0 skips the check", (0.0, 3.0), "Nm", expert=True
     )
@@ -91,7 +93,7 @@ class Limits:
             raise ParameterError("position_max", list(self.position_max), expected)
 
     def is_silent(self, now: float, joint: JointSample) -> bool:
-        """Return whether the motor is silent: its reading `joint` is older than `reply_timeout` at `now` (s)."""
+        """Return whether the reading `joint` of a motor is older than `reply_timeout` at `now` (s)."""
         return not now - joint.time <= self.reply_timeout
 
     def find_fault(self, i: int, joint: JointSample, last: JointSample, since: float) -> Fault | None:

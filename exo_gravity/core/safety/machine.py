@@ -150,7 +150,7 @@ class SafetyMachine:
         now = max(now, self._now)  # a call may carry a slightly later time than the cycle that follows it
         dt = min(now - self._now, self._period)
         self._now = now
-        joints = self._track(now, dt, joints)
+        joints = self._track(now, joints)
         if self.state is State.CHECKING:
             self._check(now, joints, effort, effort_time)
         if self._sent.powered:
@@ -265,10 +265,10 @@ class SafetyMachine:
         self.is_unreached = False
         return self._descend(now, joints, dt)
 
-    def _track(self, now: float, dt: float, joints: Sequence[JointSample]) -> Sequence[JointSample]:
+    def _track(self, now: float, joints: Sequence[JointSample]) -> Sequence[JointSample]:
         """Follow the readings, and note whether the arm is at rest as far as its motors reply; return what counts."""
         readings = self._readings
-        readings.step(now, dt, joints, self._sent.powered)
+        readings.step(now, joints, self._sent.powered)
         if readings.lost or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):
             self._is_trusted = False
         self._rest.step(now, readings.joints, readings.silent)

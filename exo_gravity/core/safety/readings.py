@@ -25,9 +25,9 @@ class Readings:
     """Follows the readings of an arm's motors, cycle by cycle.
 
     joints: (4,) the newest ones, less those in doubt: a reading that shows a fault counts once the next one shows one
-    too. silent: (4,) whether a motor is silent: no reply for `reply_timeout` and in MISSED cycles. Only the loop's own
-    cycles count: a loop that stood still has not asked. fault: what the newest readings show, or None. lost: whether a
-    motor may have lost its power now, and with it the turn count of its encoder.
+    too. silent: (4,) whether a motor is silent: no reply for `reply_timeout`, nor in MISSED cycles: a loop that stood
+    still has not asked. fault: what the newest readings show, or None. lost: whether a motor may have lost its power
+    now, and with it the turn count of its encoder.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -37,17 +37,13 @@ class Readings:
         self.lost = True
         self._limits = limits
         self._newest = [-math.inf] * JOINT_COUNT  # s
-        self._silence = [math.inf] * JOINT_COUNT  # s
         self._missed = [MISSED] * JOINT_COUNT
         self._asked = [-math.inf] * JOINT_COUNT  # s; each of `joints` was taken later
         self._is_doubted = [False] * JOINT_COUNT
         self._now = -math.inf  # s, of the last cycle
 
-    def step(self, now: float, dt: float, joints: Sequence[JointSample], powered: bool) -> None:
-        """Take the newest readings `joints` (4,) in the cycle at `now` s; dt: s that the loop ran since the last.
-
-        powered: whether the motors are on.
-        """
+    def step(self, now: float, joints: Sequence[JointSample], powered: bool = True) -> None:
+        """Take the newest readings `joints` (4,) in the cycle at `now` s; powered: whether the motors are on."""
         limits = self._limits
         longest = TRUSTED_SILENCE if powered else TRUSTED_SILENCE_OFF
         faults: list[Fault | None] = []
@@ -57,16 +53,13 @@ class Readings:
                 gap = joint.time - self._newest[i]
                 moved = abs(joint.position - self.joints[i].position)
                 self.lost |= gap > limits.reply_timeout and moved > limits.home_tolerance[i]
-                self._newest[i], self._silence[i], self._missed[i] = joint.time, 0.0, 0
+                self._newest[i], self._missed[i] = joint.time, 0
                 faults.append(self._take(i, joint))
             else:
-                self._silence[i] += dt
                 self._missed[i] += 1
-                self.lost |= self._silence[i] > longest
-        self.silent = [
-            silence > limits.reply_timeout and missed >= MISSED
-            for silence, missed in zip(self._silence, self._missed, strict=True)
-        ]
+                self.lost |= self._missed[i] >= MISSED and now - joint.time > longest
+        asked = zip(joints, self._missed, strict=True)
+        self.silent = [missed >= MISSED and limits.is_silent(now, joint) for joint, missed in asked]
         if any(self.silent):
             name = limits.joint_names[self.silent.index(True)]
             reason = f"{name}: no reply for more than {limits.reply_timeout * 1000:.0f} ms"

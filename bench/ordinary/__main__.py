@@ -1,0 +1,66 @@
+"""python -m bench.ordinary [--minutes 60] [--only TEXT]: ordinary motors, sensors and computers raise no alarm.
+
+Plays an arm in virtual time: many starts, a wearer who reaches, walks and rests, no fault. Prints a table, and writes
+build/ordinary.json. Exit code 1 if a start was refused, an arm was let down, or was without tilt for a second.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from .arm import Result
+from .rows import Row, all_rows
+
+LONGEST = 1.0  # s without tilt
+
+
+def is_quiet(result: Result) -> bool:
+    """Return whether nothing was raised without cause."""
+    return not result.refused_starts and not result.let_downs and result.without_tilt < LONGEST
+
+
+def main() -> int:
+    """Play the rows; return the exit code."""
+    parser = argparse.ArgumentParser(prog="bench.ordinary", description="Watch for false alarms in virtual time.")
+    parser.add_argument("--minutes", type=float, default=60.0, help="simulated, all rows together (%(default)g)")
+    parser.add_argument("--only", default="", metavar="TEXT", help="only rows whose name contains TEXT")
+    parser.add_argument("--workers", type=int, default=None, help="processes (default: one per core)")
+    options = parser.parse_args()
+    console = Console(width=None if Console().is_terminal else 180, highlight=False)
+    rows = [row for row in all_rows() if options.only in row.name]
+    results: dict[Row, Result] = {}
+    with ProcessPoolExecutor(options.workers) as pool:
+        share = 60.0 * options.minutes / len(rows)
+        played = {pool.submit(row.play, share): row for row in rows}
+        for future in as_completed(played):
+            row, result = played[future], future.result()
+            results[row] = result
+            causes = "; ".join(result.refused_starts + result.let_downs) or "quiet"
+            console.print(f"{len(results)} of {len(rows)}: {row.name}: {causes}", markup=False)
+    table = Table("", "minutes", "starts", "refused", "let down", "samples %", "no tilt s", "error Nm", box=None)
+    for row in rows:
+        one = results[row]
+        refused = 100.0 * one.refused_samples / max(1, one.samples)
+        figures = (f"{one.time / 60.0:.1f}", one.starts, len(one.refused_starts), len(one.let_downs))
+        others = (f"{refused:.1f}", f"{one.without_tilt:.2f}", f"{one.largest_error:.2f}")
+        table.add_row(row.name, *map(str, figures), *others)
+    console.print(table)
+    loud = [row.name for row in rows if not is_quiet(results[row])]
+    total = sum(result.time for result in results.values()) / 60.0
+    console.print(f"{total:.0f} minutes, {sum(result.starts for result in results.values())} starts; not quiet: {loud}")
+    output = Path("build/ordinary.json")
+    output.parent.mkdir(exist_ok=True)
+    output.write_text(json.dumps({row.name: asdict(results[row]) for row in rows}, indent=1) + "\n", encoding="utf-8")
+    return int(bool(loud))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,227 @@
+"""One arm with ordinary motors, sensors and computers, in virtual time: is it carried, and how well.
+
+Everything between frames and samples is what the nodes use: MotorBus, ControlLoop, SafetyMachine, TrunkEstimator and
+Compensator. The simulated device gives the truth.
+"""
+
+from __future__ import annotations
+
+import random
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from exo_gravity.core.compensation.compensator import Compensator
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.gravity import gravity_torque
+from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.motors.joint_motor import peaks_of
+from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
+from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.limits import JointSample, Limits
+from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.hardware import ImuSample, TrunkEstimator
+from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.control_loop import ControlLoop, EffortCommand
+from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedImu, VirtualWearer
+from exo_gravity.sim.motor import simulated_motor
+from exo_gravity.tools.inputs.arms import read_arm
+from exo_gravity.tools.inputs.parameter_file import load, packaged_config
+from test.hardware.virtual_time import VirtualClock, Wire
+from test.support.imu_drivers import Timing
+from test.support.simulated_device import joints_of
+
+LATE = 0.02  # s by which a busy computer is late
+LOOK_PERIOD = 0.01  # s between two comparisons with the truth
+SETTLED = 1.5  # s until a tilt must be there
+DAY = TrialScript.parse(  # what the wearer does while the arm is carried
+    {
+        "name": "a wearer reaches, walks, bows and rests",
+        "steps": [
+            {"move": [0.1, 0.5, 0.5, 0.6], "over": 1.6},
+            {"hold": 2.0},
+            {"move": [-0.2, 0.8, 0.2, 1.2], "over": 1.3},
+            {"push": [0.2, 1.0, 0.6, 0.2], "over": 0.4},
+            {"hold": 1.0},
+            {"walk": 5.0},
+            {"move": [0.2, 0.4, 0.9, 0.4], "over": 1.3},
+            {"bow": 0.5, "over": 1.5},
+            {"hold": 1.0},
+            {"bow": 0.0, "over": 1.5},
+            {"move": [0.0, 0.2, 0.2, 0.3], "over": 1.4},
+            {"hold": 3.0},
+        ],
+    }
+)
+
+
+@dataclass(frozen=True)
+class Equipment:
+    """Ordinary equipment: the motors' firmware, the arm's friction, the CAN adapter, and a busy computer.
+
+    loss: share of the frames lost each way. batch: s between two deliveries of the adapter. late: how often in 10 ms
+    the bridge is late by LATE, and the compensator.
+    """
+
+    name: str
+    firmware: Firmware
+    friction: tuple[float, float] = (0.2, 0.0)  #: Nm, Coulomb's and Stribeck's
+    loss: float = 0.0
+    batch: float = 0.0
+    late: float = 0.0
+
+
+@dataclass
+class Result:
+    """What happened. Times in s, errors in Nm."""
+
+    time: float = 0.0
+    starts: int = 0
+    refused_starts: list[str] = field(default_factory=list)
+    let_downs: list[str] = field(default_factory=list)
+    samples: int = 0
+    refused_samples: int = 0
+    without_tilt: float = 0.0
+    largest_error: float = 0.0
+
+
+class OrdinaryArm:
+    """An arm of `equipment` and its wearer, whose trunk carries an IMU behind the driver `timing`."""
+
+    def __init__(self, equipment: Equipment, is_v3: bool, rate: float, timing: Timing, seed: int = 0) -> None:
+        self.result = Result()
+        self._random = random.Random(seed)
+        self._late = equipment.late / (0.01 * rate)  # of each cycle
+        settings = replace(read_arm(load(packaged_config("sim.yaml")), "/right").settings(), tilt_timeout=0.08)
+        robot = settings.robot_by_mass
+        assert robot
+        motors = joints_of((MIT_V3 if is_v3 else MIT,) * 4)
+        coulomb, stribeck = equipment.friction
+        config = ArmConfig(robot, coulomb_friction=(coulomb,) * 4, stribeck_friction=(stribeck,) * 4)
+        boards = [simulated_motor(joint, equipment.firmware) for joint in motors]
+        self.device = SimulatedDevice(SimulatedArm(config), boards)
+        self.clock = VirtualClock()
+        self._robot = robot
+        wire = Wire(self.clock)
+        wire.loss, wire.batch = equipment.loss, equipment.batch
+        self._played = wire.play(self.device)
+        self._compensator = Compensator(settings)
+        self._estimator = TrunkEstimator((0.0, 0.0, 0.0, 1.0))
+        self._imu = SimulatedImu()
+        self._answers: deque[tuple[float, EffortCommand]] = deque()  # on their way, by the time of their arrival
+        self._efforts = EffortCommand(None, -np.inf)
+        limits = Limits(("rotation", "abduction", "flexion", "elbow"))
+        self.safety = SafetyMachine(limits, 1.0 / rate, peaks_of(motors))
+        bus = MotorBus(wire.open(), motors, reopen=wire.open, clock=self.clock)
+        self.loop = ControlLoop(bus, self.safety, 1.0 / rate, self._on_cycle, self._get_efforts)
+        self._begin = self._tilted = self.clock.monotonic()
+        self.clock.every(LOOK_PERIOD, self._look)
+        self._send_samples(timing)
+
+    def play(self, duration: float, carried: float) -> Result:
+        """Start the arm again and again for `duration` s, and let it down after it was carried for `carried` s."""
+        end = self._begin + duration
+        while self.clock.monotonic() < end:
+            self._start(carried)
+        self.result.time = self.clock.monotonic() - self._begin
+        self.loop.abandon()
+        return self.result
+
+    def _start(self, carried: float) -> None:
+        safety, result = self.safety, self.result
+        safety.clear(self.clock.monotonic())
+        safety.enable(self.clock.monotonic())
+        result.starts += 1
+        if not self._run_until((State.ACTIVE,), 60.0):
+            cause = f"{safety.fault.code}: {safety.fault.reason}" if safety.fault else safety.waiting_for
+            result.refused_starts.append(cause)
+        elif self._carry(carried):
+            safety.disable(self.clock.monotonic())
+        else:
+            assert safety.fault
+            result.let_downs.append(f"{safety.fault.code}: {safety.fault.reason}")
+        self._run_until((State.DISABLED, State.FAULT), 60.0)
+
+    def _carry(self, duration: float) -> bool:
+        """Carry the arm for `duration` s; return whether it still is."""
+        end = script_end = self.clock.monotonic()
+        end += duration
+        while self.clock.monotonic() < end and self.safety.state is State.ACTIVE:
+            if self.clock.monotonic() >= script_end:
+                self.device.start(VirtualWearer(DAY))
+                script_end += DAY.duration
+            self.loop.cycle()
+        self.device.start(VirtualWearer(DAY), delay=1e9)
+        return self.safety.state is State.ACTIVE
+
+    def _run_until(self, states: Sequence[State], timeout: float) -> bool:
+        end = self.clock.monotonic() + timeout
+        while self.safety.state not in states:
+            is_over = self.safety.fault and State.ACTIVE in states
+            if self.clock.monotonic() > end or is_over or not self.loop.cycle():
+                return False
+        return True
+
+    def _get_efforts(self, latest: float) -> EffortCommand:
+        if self._random.random() < self._late:
+            self.clock.stall(LATE)
+        while self._answers and self._answers[0][0] <= self.clock.monotonic():
+            self._efforts = self._answers.popleft()[1]
+        return self._efforts
+
+    def _on_cycle(self, now: float, joints: Sequence[JointSample]) -> None:
+        """Answer the readings as the compensator does."""
+        if any(self.safety.limits.is_silent(now, joint) for joint in joints):
+            return
+        answer = self._compensator.step(now, [joint.position for joint in joints], [joint.velocity for joint in joints])
+        due = now + (LATE if self._random.random() < self._late else 0.0)
+        due = max(due, self._answers[-1][0]) if self._answers else due
+        self._answers.append((due, EffortCommand(answer.effort, min(joint.time for joint in joints))))
+
+    def _send_samples(self, timing: Timing) -> None:
+        """Let the driver take its samples, and deliver them."""
+        begin = self.clock.monotonic()
+        columns = zip(timing.taken.tolist(), timing.stamps.tolist(), timing.arrivals.tolist(), strict=True)
+
+        def take_next() -> None:
+            if (row := next(columns, None)) is not None:
+                taken, stamp, arrival = row
+                self.clock.later(begin + taken - self.clock.monotonic(), lambda: take(stamp, arrival))
+
+        def take(stamp: float, arrival: float) -> None:
+            self._played.catch_up()
+            rate, force = self._imu.sample_of(self.device.trunk)
+            sample = ImuSample(begin + stamp, rate.tolist(), force.tolist())
+            self.clock.later(begin + arrival - self.clock.monotonic(), lambda: self._arrive(sample))
+            take_next()
+
+        take_next()
+
+    def _arrive(self, sample: ImuSample) -> None:
+        result, now = self.result, self.clock.monotonic()
+        result.samples += 1
+        try:
+            if answer := self._estimator.update(sample, now):
+                assert sample.angular_velocity
+                self._compensator.set_gravity(now, answer.gravity, sample.angular_velocity, now - sample.time)
+                self._note_tilt(now)
+        except ParameterError:
+            result.refused_samples += 1
+
+    def _note_tilt(self, now: float) -> None:
+        if self._tilted > self._begin + SETTLED:
+            self.result.without_tilt = max(self.result.without_tilt, now - self._tilted)
+        self._tilted = now
+
+    def _look(self) -> None:
+        """Compare the torque of the motors with gravity's, by the truth."""
+        if self.safety.state is not State.ACTIVE:
+            return
+        arm, trunk = self.device.arm, self.device.trunk
+        theta, velocity = arm.positions, arm.velocities
+        applied = [motor.torque(*at) for motor, *at in zip(self.device.motors, theta, velocity, strict=True)]
+        wanted = gravity_torque(self._robot, theta, Tilt.of("right", trunk.pitch, trunk.roll).direction)
+        self.result.largest_error = max(self.result.largest_error, float(np.max(np.abs(np.subtract(applied, wanted)))))

@@ -1,0 +1,115 @@
+"""Readings of ordinary motors: one wrong reading, lost frames and a late computer are no fault; two readings are."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import pytest
+
+from exo_gravity.core.safety.limits import UNKNOWN
+from exo_gravity.core.safety.readings import Readings
+
+from ..support.safety_run import LIMITS, reading
+
+PERIOD = 0.01  # s
+
+
+class Run:
+    """Four motors that turn at `speed` rad/s; faults: the codes found so far."""
+
+    def __init__(self, speed: float = 0.0) -> None:
+        self.readings = Readings(LIMITS)
+        self.speed = speed
+        self.now = 10.0
+        self.faults: list[str] = []
+        self._joints = [UNKNOWN] * 4
+        self.run(2)
+        self.faults.clear()  # silent before the first replies
+
+    def cycle(self, late: float = 0.0, lost: bool = False, **changes: Any) -> None:
+        """One cycle, in which the loop stands still for `late` s before it takes the replies.
+
+        lost: the second motor's reply does not come. changes: of the second motor's reading.
+        """
+        self.readings.step(self.now, tuple(self._joints))
+        if self.readings.fault:
+            self.faults.append(str(self.readings.fault.code))
+        angle = self.speed * (self.now - 10.0)  # when the motors reply
+        self.now += PERIOD + late
+        for i in range(4):
+            if not (lost and i == 1):
+                given = changes if i == 1 else {}
+                self._joints[i] = reading(
+                    **{"position": angle, "velocity": self.speed, "time": self.now - 0.009, **given}
+                )
+
+    def run(self, count: int, **options: Any) -> None:
+        for _ in range(count):
+            self.cycle(**options)
+
+
+WRONG = {
+    "over_temperature": {"temperature": 120},
+    "over_speed": {"velocity": 40.0},
+    "motor_error": {"error": 4},
+    "position_jump": {"position": 0.7},
+    "outside_limits": {"position": 3.3},
+}
+
+
+@pytest.mark.parametrize("code", WRONG)
+def test_one_wrong_reading_is_no_fault_and_is_not_passed_on_and_two_are_a_fault(code):
+    run = Run()
+    run.run(5)
+    run.cycle(**WRONG[code])
+    run.cycle()
+    assert run.readings.joints[1] == reading(time=run.readings.joints[1].time)
+    run.run(5)
+    assert not run.faults
+    run.run(4, **WRONG[code])
+    assert run.faults[0] == ("position_jump" if "position" in WRONG[code] else code)
+
+
+def test_a_joint_outside_its_limits_is_a_fault():
+    run = Run(speed=2.0)
+    run.run(80)  # to 1.6 rad; the upper limit of joint 1 is 1.6
+    assert not run.faults
+    run.run(10)
+    assert run.faults[0] == "outside_limits"
+
+
+@pytest.mark.parametrize("speed", [-4.9, 4.9])
+def test_a_fast_joint_does_not_jump_when_the_loop_is_late_or_frames_are_lost(speed):
+    random.seed(1)
+    run = Run(speed)
+    for _ in range(25):
+        run.cycle(late=0.02 if random.random() < 0.2 else 0.0, lost=random.random() < 0.1)
+        if abs(run.speed * (run.now - 10.0)) > 0.7:
+            break
+    assert "position_jump" not in run.faults
+
+
+def test_a_loop_that_stood_still_has_not_asked():
+    run = Run()
+    run.run(5)
+    run.cycle(late=1.0, lost=True)
+    run.run(3)
+    assert not run.faults
+
+
+@pytest.mark.parametrize(("misses", "is_silent"), [(6, False), (8, True)])
+def test_a_motor_is_silent_after_seven_cycles_without_a_reply(misses, is_silent):
+    run = Run()
+    run.run(5)
+    run.run(misses, lost=True)
+    assert run.readings.silent == [False, is_silent, False, False]
+    assert run.faults[:1] == ["motor_silent"] * is_silent
+
+
+def test_three_percent_of_lost_frames_each_way_are_no_silence_in_200_s():
+    random.seed(2)
+    run = Run()
+    for _ in range(20_000):
+        run.cycle(lost=random.random() > 0.97**2)
+    assert not run.faults
