@@ -32,7 +32,7 @@ from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DAMPING, DAMPING_RISE, ArmDescent, RestTracker
 from exo_gravity.core.safety.drive import CARRYING, DOUBTFUL, NOTHING, OFF, Drive, Fault, FaultCode, State
 from exo_gravity.core.safety.gate import SignCheck, StartGate, SwitchOnCheck
-from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
+from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits, guide_damping
 
 RAMP_TIME = 1.0  # s from no torque to full torque: the arm becomes light without a jolt
 
@@ -115,12 +115,18 @@ class SafetyMachine:
         return self._rest.is_settled(now)
 
     def step(
-        self, now: float, joints: Sequence[JointSample], effort: Sequence[float] | None, effort_time: float
+        self,
+        now: float,
+        joints: Sequence[JointSample],
+        effort: Sequence[float] | None,
+        effort_time: float,
+        damped: bool = False,
     ) -> Drive:
         """Return what the motors receive in the cycle at `now` s.
 
         joints: the 4 newest readings. effort: (4,) Nm requested, None if withdrawn or never requested; effort_time:
-        when the joint readings that it answers were taken. All times are on one monotonic clock.
+        when the joint readings that it answers were taken. damped: whether the joints are to be damped too, because the
+        load changes. All times are on one monotonic clock.
         """
         now = max(now, self._now)  # a call may carry a slightly later time than the cycle that follows it
         dt = min(now - self._now, self._period)
@@ -132,17 +138,19 @@ class SafetyMachine:
             self._check_delivery(now, joints, dt)
         if self.state in CARRYING:
             self._watch(now, joints, effort, effort_time)
-        drive = self._drive(now, joints, effort, dt).within(self._peaks.damping)
+        drive = self._drive(now, joints, effort, damped, dt).within(self._peaks.damping)
         self._before = joints
         self._sent = drive
         return drive
 
-    def _drive(self, now: float, joints: Sequence[JointSample], effort: Sequence[float] | None, dt: float) -> Drive:
+    def _drive(
+        self, now: float, joints: Sequence[JointSample], effort: Sequence[float] | None, damped: bool, dt: float
+    ) -> Drive:
         if self.state is State.PROVING:
             self._prove(now, joints, dt)
         if self.state in (State.RAMPING_IN, State.ACTIVE):
             try:
-                return self._carry(now, joints, effort or NOTHING, dt)
+                return self._carry(now, joints, effort or NOTHING, damped, dt)
             except ParameterError as error:
                 self.trip(FaultCode.COMMAND_IMPOSSIBLE, str(error), now)
         if self.state is State.PROVING:
@@ -200,7 +208,9 @@ class SafetyMachine:
             self._is_trusted = True
             self._enter(State.RAMPING_IN, now)
 
-    def _carry(self, now: float, joints: Sequence[JointSample], effort: Sequence[float], dt: float) -> Drive:
+    def _carry(
+        self, now: float, joints: Sequence[JointSample], effort: Sequence[float], damped: bool, dt: float
+    ) -> Drive:
         ramp = 1.0
         if self.state is State.RAMPING_IN:
             ramp = (now - self._since) / RAMP_TIME
@@ -209,10 +219,13 @@ class SafetyMachine:
                 self._enter(State.ACTIVE, now)
         shaped, acted = self.limits.shape(effort, ramp, joints, self._sent.effort, dt)
         self.acted.update(dict.fromkeys(acted, now))
-        # Damping rises at once, since the soft wall already rises with the position, and falls over DAMPING_RISE.
-        fall = DAMPING / DAMPING_RISE * dt
-        walls = zip(self.limits.wall_damping(joints), self._sent.damping, strict=True)
-        return Drive(shaped, tuple(max(wall, last - fall) for wall, last in walls), True)
+        # A wall's damping rises at once, since it already rises with the position. That of a changing load rises over
+        # DAMPING_RISE, and any damping falls so.
+        step = DAMPING / DAMPING_RISE * dt
+        guided = [guide_damping(joint.velocity) if damped else 0.0 for joint in joints]
+        columns = zip(self.limits.wall_damping(joints), guided, self._sent.damping, strict=True)
+        damping = tuple(max(wall, last - step, min(last + step, guide)) for wall, guide, last in columns)
+        return Drive(shaped, damping, True)
 
     def _descend(self, now: float, joints: Sequence[JointSample], dt: float) -> Drive:
         descent = self._descent

@@ -85,6 +85,9 @@ class ControlledArm:
 
     def concern(self, answer: Answer) -> str:
         """Return why the arm is not carried as set; '' if it is."""
+        if answer.remainder:
+            joint = max(range(len(answer.remainder)), key=lambda n: abs(answer.remainder[n]))
+            return f"changing load: {self.values['joint_names'][joint]}, {abs(answer.remainder[joint]):.1f} Nm to go"
         if answer.fallback:
             return f"the exact law replaces {self.control.settings.law}: {answer.fallback}"
         problem = self.control.terms.problem if self.control.terms else ""
