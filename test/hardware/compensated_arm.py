@@ -51,7 +51,7 @@ class CompensatedArm:
     """The arm of a 75 kg wearer, carried in `pose`; settings: what differs from exact Zero-G.
 
     top_speed: rad/s, the largest true speed of a joint since the arm was raised. efforts: (n, 4) Nm, what the motors
-    applied since then. hand: what the wearer does.
+    applied since then. is_damped: whether the bridge damps while the load changes.
     """
 
     def __init__(
@@ -85,7 +85,8 @@ class CompensatedArm:
         self.clock = self.wire.clock
         motors = joints_of(formats)
         self.device = make_device(config=ArmConfig(coulomb_friction=(friction,) * 4, **worn), formats=formats)
-        self.top_speed, self.torques = 0.0, []
+        self.top_speed = 0.0
+        self.torques: list[list[float]] = []
         self.wire.play(self.device, self._look)
         low, high = (-1.65, -0.17, -0.78, -0.17), (1.65, 3.14, 2.53, 3.14)
         limits = Limits(JOINTS, low, high, (5.0, 5.0, 5.0, 6.0), limit, sign_check_torque=0.0)
@@ -96,10 +97,9 @@ class CompensatedArm:
         self.device.start(self.person, 3.0)
         self.safety.enable(self.clock.monotonic())
         self.run(3.0 + MOVE + 0.5)
-        self.person.hand = lambda *_: (0.0,) * 4
         assert self.safety.state is State.ACTIVE, (self.safety.fault, self.safety.waiting_for)
-        self.top_speed, self.torques = 0.0, []
-        self.trace = []
+        self.top_speed = 0.0
+        self.torques.clear()
 
     def _look(self) -> None:
         self.top_speed = max(self.top_speed, *map(abs, self.device.arm.velocities))

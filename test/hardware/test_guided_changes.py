@@ -47,17 +47,19 @@ CHANGES = {
     "law": (NO_WEARER, {"law": "paper_static"}, False),
     "gain": ({"limit": PEAK, "pose": RAISED}, HALVED, True),
 }
-DURATION = 14.0  # s, from above the shoulder until the arm hangs
+# Of those, in which an arm whose motors do not damp comes near to SAFE_SPEED.
+FASTEST = [name for name, (rig, *_) in CHANGES.items() if rig.get("limit") and "support" not in name]
 
 
-@pytest.mark.parametrize("is_damped", [True, False], ids=["bridge", "effort controller"])
-@pytest.mark.parametrize("name", CHANGES)
+@pytest.mark.parametrize(
+    ("name", "is_damped"), [*((name, True) for name in CHANGES), *((name, False) for name in FASTEST)]
+)
 def test_no_change_of_load_drops_or_throws_a_passive_arm(name, is_damped):
     rig, change, hangs = CHANGES[name]
     arm = CompensatedArm(**rig)
     arm.is_damped = is_damped
     arm.change(**change)
-    arm.run(DURATION if hangs else 6.0)
+    arm.run(14.0 if hangs and "pose" in rig else 8.0)
     assert arm.top_speed < SAFE_SPEED
     assert arm.safety.state is State.ACTIVE, arm.safety.fault
     if hangs:

@@ -7,9 +7,9 @@ it would give in this pose to what the new ones give:
 
 The share falls from 1 to 0 within FADE_TIME or longer, more slowly the faster the joint moves where the change drives
 it. Beyond GUIDE_SPEED it rises again, at SPEED_GAIN: so an arm that becomes heavy sinks at about that speed until it
-hangs, and a spring that is switched on pulls no faster. The torque always lies between the old load's and the new one's in this
-pose, wherever the arm has moved meanwhile: it cannot wind up, and never works on the arm more than those two would.
-A wearer who holds still gets the new load within FADE_TIME; one who moves gets it when he pauses.
+hangs, and a spring that is switched on pulls no faster. The torque always lies between the old load's and the new
+one's in this pose, wherever the arm has moved meanwhile: it cannot wind up, and never works on the arm more than those
+two would. A wearer who holds still gets the new load within FADE_TIME; one who moves gets it when he pauses.
 
 What the two settings do not explain, because a change follows another or a law does not apply in this pose, is the
 constant offset of the start.
