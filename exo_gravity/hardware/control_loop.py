@@ -43,6 +43,7 @@ class EffortCommand(NamedTuple):
 
     effort: Sequence[float] | None  #: (4,) Nm, or None to withdraw.
     answered: float  #: s, when the joint states that it answers were taken.
+    damped: bool = False  #: whether the load is changing, so that the motors are to damp the joints.
     held: bool = False  #: Whether it is computed from a tilt that is late.
 
 

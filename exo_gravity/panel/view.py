@@ -27,14 +27,17 @@ class Newest:
         return self.content if now - self.time < SILENT else None
 
 
-def joint_rows(names: Sequence[str], position: Sequence[float], effort: Sequence[float]) -> list[dict[str, Any]]:
-    """Return name, angle in rad and torque in Nm of each joint; None for a number that is missing or not finite."""
+def joint_rows(
+    names: Sequence[str], position: Sequence[float], velocity: Sequence[float], effort: Sequence[float]
+) -> list[dict[str, Any]]:
+    """Return name, angle in rad, speed in rad/s and torque in Nm of each joint; None for a number that is not known."""
 
     def rounded(values: Sequence[float], index: int) -> float | None:
         return round(values[index], 4) if index < len(values) and math.isfinite(values[index]) else None
 
+    columns = {"position": position, "velocity": velocity, "effort": effort}
     return [
-        {"name": name, "position": rounded(position, n), "effort": rounded(effort, n)} for n, name in enumerate(names)
+        {"name": name, **{key: rounded(values, n) for key, values in columns.items()}} for n, name in enumerate(names)
     ]
 
 

@@ -91,8 +91,8 @@ class OfflineTrial:
         self._carried: tuple[Span, ...] = ()  # from the first to the last time at which the motors carried the arm
         self._safety = SafetyMachine(arm.limits, 1.0 / arm.rate, peaks_of(arm.motors))
         self._compensator = Compensator(arm.settings)
-        # The newest efforts, and when the readings that they answer were taken.
-        self._efforts: tuple[Sequence[float] | None, float] = (None, -math.inf)
+        # The newest efforts, when the readings that they answer were taken, and whether the joints are to be damped.
+        self._efforts: tuple[Sequence[float] | None, float, bool] = (None, -math.inf, False)
         self._reason = ""  # why the compensator has withdrawn
         self._tilt_time = -math.inf  # of the compensator's newest tilt
         self._reading: tuple[TrunkReading | None, float] = (None, 0.0)  # on its way, and when it was taken
@@ -135,7 +135,7 @@ class OfflineTrial:
         return self._recording()
 
     def _cycle(self, now: float) -> None:
-        arm, (effort, _) = self.arm, self._efforts
+        arm, effort = self.arm, self._efforts[0]
         self._exchange(self._safety.step(now, tuple(self._samples), *self._efforts), now)
         if self._safety.state in CARRIED:
             self._carried = ((self._carried[0][0] if self._carried else now, now),)
@@ -145,7 +145,7 @@ class OfflineTrial:
             for values in ((now,), position, velocity, [joint.effort for joint in self._samples], effort or NO_COMMAND):
                 self._rows.extend(values)
             answer = self._compensator.step(now, position, velocity)
-            self._efforts = answer.effort, min(joint.time for joint in self._samples)
+            self._efforts = answer.effort, min(joint.time for joint in self._samples), answer.damped
             if answer.reason and answer.reason != self._reason:
                 self._note(now, f"withdrawn: {answer.reason}")
             self._reason = answer.reason

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.compensation.compensator import FALLBACK_TIME
+from exo_gravity.core.compensation.guidance import FADE_TIME
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.anfis import Anfis, AnfisLaw
 from exo_gravity.core.model.tilt import Tilt
@@ -71,8 +72,8 @@ def test_along_a_path_across_the_edge_of_the_box_the_torque_neither_steps_nor_ch
     run.cycle(2.0)
     run.efforts.clear()
     replaced = wobble(run, 4.0, width, hertz)
-    # The laws differ by up to 2 Nm, which fades over 1 s; the exact law changes by up to 3 Nm/rad along the path.
-    remainders = 2.0 * PERIOD / 1.0
+    # The laws differ by up to 2 Nm, which fades over 2 s; the exact law changes by up to 3 Nm/rad along the path.
+    remainders = 2.0 * PERIOD / FADE_TIME
     path = 3.0 * width * 2 * math.pi * hertz * PERIOD
     assert run.largest_step <= 2 * remainders + path
     switches = np.flatnonzero(np.diff(replaced))
@@ -85,7 +86,7 @@ def test_the_anfis_returns_half_a_second_after_it_applies_again():
     assert run.cycle(theta=(0.2, 1.01, 0.6, 0.5)).fallback
     assert "theta_2" in run.cycle(FALLBACK_TIME - 2 * PERIOD).fallback
     assert run.cycle(2 * PERIOD).fallback == ""
-    run.cycle(1.1)
+    run.cycle(2.1)
     np.testing.assert_allclose(run.efforts[-1], (0.0, 0.5, 1.0, 0.25), rtol=1e-9)
 
 

@@ -57,7 +57,7 @@ def test_switching_it_on_does_not_step_the_torque():
     settings = settings_with(use_imu=True, inertial=True)
     run.compensator.apply(settings)
     before = len(run.efforts)
-    for _ in range(700):
+    for _ in range(1200):
         run.compensator.set_tilt(run.now, 0.0, 0.0)
         run.compensator.set_motion(run.now, FORCE, STILL)
         run.cycle()

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.compensation.limiter import LONGEST_STEP, RAMP_TIME, TRANSITION_TIME
+from exo_gravity.core.compensation.guidance import FADE_TIME
+from exo_gravity.core.compensation.limiter import LONGEST_STEP, RAMP_TIME
 from exo_gravity.core.compensation.params import urdf_settings_of, urdf_table
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import values_of
@@ -34,7 +35,7 @@ def settings(**changes):
 
 
 def steps(arm, start, seconds):
-    return [arm.step(start + n * PERIOD, POSE).effort for n in range(round(seconds / PERIOD))]
+    return [arm.step(start + n * PERIOD, POSE, (0.0, 0.0)).effort for n in range(round(seconds / PERIOD))]
 
 
 def test_it_ramps_in_and_then_gives_the_models_torque_times_the_gain():
@@ -68,9 +69,9 @@ def test_a_change_of_settings_fades_in_without_a_step():
     arm = Compensator(settings(max_effort_rate=1000.0))
     before = steps(arm, 1.0, 1.5)[-1]
     arm.apply(settings(gain=[2.0, 2.0], max_effort_rate=1000.0))
-    efforts = [before, *steps(arm, 2.5, TRANSITION_TIME + 0.1)]
+    efforts = [before, *steps(arm, 2.5, FADE_TIME + 0.1)]
     assert np.allclose(efforts[-1], np.multiply(2.0, before), rtol=0.0, atol=1e-12)
-    assert np.abs(np.diff(efforts, axis=0)).max() <= np.abs(before).max() * PERIOD / TRANSITION_TIME + 1e-9
+    assert np.abs(np.diff(efforts, axis=0)).max() <= np.abs(before).max() * PERIOD / FADE_TIME + 1e-9
 
 
 def test_random_changes_of_settings_never_exceed_the_rate_limit():

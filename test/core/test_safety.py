@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from exo_gravity.core.safety.descent import DAMPING, DAMPING_RISE
-from exo_gravity.core.safety.drive import CARRYING, NO_ONES, OFF, Fault, FaultCode, State
-from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
+from exo_gravity.core.safety.drive import CARRYING, NO_ONES, NOTHING, OFF, Fault, FaultCode, State
+from exo_gravity.core.safety.limits import GUIDE_BRAKE, GUIDE_SPEED, MAX_EFFORT_RATE
 from exo_gravity.core.safety.ride import LONGEST_AGE, LONGEST_RIDE
 
 from ..support.safety_run import EFFORT, LIMITS, PERIOD, SafetyRun
@@ -288,3 +289,24 @@ def test_a_short_silence_keeps_zeros_trusted_unless_the_angle_has_lost_a_turn(si
     arm.changes[1].update(position=turned)
     arm.cycle(0.1)
     assert (arm.machine.why_not_resumed == "") == is_trusted
+
+
+def test_while_the_load_changes_only_a_joint_that_moves_is_damped_and_damping_neither_steps_nor_stays():
+    run = SafetyRun().until_active()
+    run.damped = True
+    run.changes[1] = {"velocity": GUIDE_SPEED}
+    run.changes[2] = {"velocity": -1.0}
+    run.changes[3] = {"velocity": 0.4}
+    steps = [run.drive.damping]
+    for _ in range(100):
+        steps.append(run.cycle().drive.damping)
+    assert run.drive.damping[:2] == (0.0, 0.0)
+    assert run.drive.damping[2] == pytest.approx(GUIDE_BRAKE)
+    assert 0.5 < 0.4 * run.drive.damping[3] < GUIDE_BRAKE
+    run.damped = False
+    for _ in range(100):
+        steps.append(run.cycle().drive.damping)
+    assert run.drive.damping == NOTHING
+    largest = np.abs(np.diff(steps, axis=0)).max()
+    assert largest <= DAMPING / DAMPING_RISE * PERIOD * 1.001
+    assert run.machine.state is State.ACTIVE

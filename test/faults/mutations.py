@@ -23,6 +23,7 @@ from ..support import ROOT
 COPIED = ("exo_gravity", "test", "config")
 ROW_LIMIT = 240.0  # s for each row, with the start of its nodes
 SAFETY, DESCENT, LIMITS = (f"exo_gravity/core/safety/{name}.py" for name in ("machine", "descent", "limits"))
+GUIDANCE = "exo_gravity/core/compensation/guidance.py"
 ASSIST = "exo_gravity/core/compensation/terms/assist.py"
 BUS_LOCK, WATCHDOG = "exo_gravity/hardware/ownership/bus_lock.py", "exo_gravity/hardware/ownership/watchdog.py"
 
@@ -147,13 +148,24 @@ MUTATIONS = (
     Mutation(
         "a ride without damping",
         ("compensator stopped for 0.1 s",),
-        (Edit(SAFETY, "wanted = DAMPING if self.ride.is_riding else 0.0", "wanted = 0.0"),),
+        (Edit(SAFETY, "(DAMPING,) * len(guided) if self.ride.is_riding else guided", "guided"),),
     ),
     Mutation(
         "a motor that replies no torque is taken for sound",
         ("motor 2 restarts in 30 ms",),
         (Edit("exo_gravity/core/safety/delivery.py", "excess = abs(joint.effort - nearest) -",
               "excess = (abs(joint.effort) > 0.1) * abs(joint.effort - nearest) -"),),
+    ),
+    Mutation(
+        "a change of load that ignores the joint's speed",
+        ("Zero-G to One-G, 75 kg", "body mass 75 to 100"),
+        (Edit(GUIDANCE, "driven = -math.copysign(speed, way * speed)", "driven = 0.0"),),
+    ),
+    Mutation(
+        "a clamp outside the guided change",
+        ("max_effort 9 to 0.5 Nm, Zero-G, 75 kg",),
+        (Edit("exo_gravity/core/compensation/compensator.py", "self._limiter.limit(now, torque, s.max_effort_rate)",
+              "self._limiter.limit(now, clamped(torque, s.max_effort), s.max_effort_rate)"),),
     ),
 )  # fmt: skip
 

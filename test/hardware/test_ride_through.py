@@ -79,7 +79,7 @@ class RidingArm:
         samples = self.loop.samples
         if not self.is_late and min(joint.time for joint in samples) > 0.0:
             effort = tuple(gravity_torque(self.links, [joint.position for joint in samples]))
-            self._command = EffortCommand(effort, min(joint.time for joint in samples), self.is_held)
+            self._command = EffortCommand(effort, min(joint.time for joint in samples), held=self.is_held)
         return self._command._replace(effort=None) if self.is_withdrawn else self._command
 
     def _look(self) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import pairwise
 
 import pytest
 
@@ -106,32 +105,74 @@ def test_the_support_slides_and_shows_the_motors_limit(visit, stage):
     page.focus('[data-arm="right"] input')
     for _ in range(20):
         page.keyboard.press("ArrowRight")
+    page.click("#ask-yes")  # more than the motors' rated torque
     wait_until(page, lambda: stage.arms.settings["right"]["support"] == pytest.approx(0.15))
     assert "More than rated torque" in page.inner_text('[data-arm="right"] .limit')
 
 
-def test_the_slider_shows_the_support_in_force_from_the_start_and_a_slip_does_not_jump(visit, stage):
+def test_the_slider_shows_the_support_in_force_and_a_slip_on_it_asks_first(visit, stage):
+    stage.arms.states["right"] = "active"
+    stage.arms.settings["right"]["mode"] = "zero_g"
     page = visit()
-    page.wait_for_selector('[data-arm="right"] .support input:enabled')
-    assert page.input_value('[data-arm="right"] .support input') == "5"
-    page.focus('[data-arm="right"] .support input')
+    slider = '[data-arm="right"] .support input'
+    page.wait_for_selector(f"{slider}:enabled")
+    assert page.input_value(slider) == "5"
+    page.focus(slider)
     page.keyboard.press("ArrowRight")
     wait_until(page, lambda: ("set", "right", "{'support': 0.055}") in stage.arms.calls)
     page.keyboard.press("End")
-    wait_until(page, lambda: stage.arms.settings["right"]["support"] > 0.2)
-    page.keyboard.press("Home")
-    supports = [float(call[2].split(": ")[1].rstrip("}")) for call in stage.arms.calls if call[0] == "set"]
-    assert supports[0] == 0.055
-    assert max(abs(b - a) for a, b in pairwise(supports)) <= 0.0201
+    page.wait_for_selector("#ask:visible")
+    assert "More than rated torque" in page.inner_text("#ask-text")
+    page.click("#ask-no")
+    wait_until(page, lambda: page.input_value(slider) == "5.5")
+    page.focus(slider)
+    page.keyboard.press("End")
+    page.click("#ask-yes")
+    wait_until(page, lambda: stage.arms.settings["right"]["support"] == 1.0)
+    assert len(stage.arms.calls) == 2
 
 
-def test_zero_g_asks_first(visit, stage):
+def test_zero_g_and_one_g_of_an_arm_that_is_carried_ask_first_and_the_support_starts_at_0(visit, stage):
     page = visit()
     page.click('[data-arm="right"] [data-mode="zero_g"]')
     assert stage.arms.calls == []
     page.click("#ask-yes")
     page.wait_for_selector('[data-arm="right"] [data-mode="zero_g"][aria-pressed="true"]')
-    assert stage.arms.settings["right"]["mode"] == "zero_g"
+    settings = stage.arms.settings["right"]
+    assert (settings["mode"], settings["support"]) == ("zero_g", 0.0)
+    stage.arms.states["right"] = "active"
+    wait_for_state(page, "active")
+    page.click('[data-arm="right"] [data-mode="one_g"]')
+    assert "it sinks slowly" in page.inner_text("#ask-text")
+    page.click("#ask-yes")
+    page.wait_for_selector('[data-arm="right"] [data-mode="one_g"][aria-pressed="true"]')
+
+
+def test_the_wearers_data_of_a_carried_arm_ask_first_and_the_first_ones_set_the_support_to_0(visit, stage):
+    stage.arms.states["right"] = "active"
+    stage.arms.settings["right"].update({"mode": "zero_g", "support": 1.0, "wearer.body_mass": 0.0})
+    page = visit()
+    wait_for_state(page, "active")
+    page.fill("input[name=body_mass]", "62")
+    page.click("#wearer button")
+    assert "may move slowly" in page.inner_text("#ask-text")
+    assert stage.arms.calls == []
+    page.click("#ask-yes")
+    wait_until(page, lambda: len(stage.arms.calls) == 2)
+    right, left = (stage.arms.settings[arm] for arm in ("right", "left"))
+    assert (right["wearer.body_mass"], right["support"], left["support"]) == (62.0, 0.0, 0.05)
+
+
+def test_an_arm_that_sinks_while_its_load_changes_is_not_called_carried(visit, stage):
+    stage.arms.states["right"] = "active"
+    stage.arms.changing, stage.arms.sinking = "right_elbow_flexion, 2.1 Nm to go", 0.2
+    page = visit()
+    state = '[data-arm="right"] .state'
+    page.wait_for_selector(f"{state}:has-text('Sinking')")
+    stage.arms.sinking = -0.2
+    page.wait_for_selector(f"{state}:has-text('Moving')")
+    stage.arms.changing = "none"
+    page.wait_for_selector(f"{state}:has-text('Carrying')")
 
 
 def test_a_reload_in_the_middle_keeps_control_and_shows_the_state(visit, stage):

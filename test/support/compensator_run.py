@@ -37,11 +37,17 @@ class CompensatorRun:
         self.now = 50.0
         self.efforts: list[Sequence[float] | None] = []
 
-    def cycle(self, seconds: float = PERIOD, theta: Sequence[float] = THETA, period: float = PERIOD) -> Answer:
+    def cycle(
+        self,
+        seconds: float = PERIOD,
+        theta: Sequence[float] = THETA,
+        period: float = PERIOD,
+        velocity: Sequence[float] | None = (0.0,) * 4,
+    ) -> Answer:
         """Run the compensator for `seconds`, at least one cycle, and return its last answer."""
         for _ in range(max(1, round(seconds / period))):
             self.now += period
-            answer = self.compensator.step(self.now, theta)
+            answer = self.compensator.step(self.now, theta, velocity)
             self.efforts.append(answer.effort)
         return answer
 

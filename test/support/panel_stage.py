@@ -35,6 +35,8 @@ class PlayedArms:
     calls: list[tuple[str, ...]] = field(default_factory=list)
     problem: str = ""
     errors: dict[str, Exception] = field(default_factory=dict)
+    changing: str = "none"  #: what a compensator reports of a change of load
+    sinking: float = 0.0  #: rad/s at which the joints give way to gravity
 
     def __post_init__(self) -> None:
         self.states = dict.fromkeys(self.names, "disabled")
@@ -88,7 +90,9 @@ class PlayedArms:
         message = f"fault: {fault}: {name} elbow" if fault != "none" else state
         bridge = {**values, "level": 2 if fault != "none" else 0, "message": message}
         carried = {"mass carried (kg)": "1.854", "largest support": "0.068", "level": 0, "message": "compensating"}
-        return {"bridge": bridge, "compensator": carried, "joints": joint_rows(names, position, effort)}
+        carried |= {"changing load": self.changing}
+        velocity = [-self.sinking * math.copysign(1.0, tau) for tau in effort]
+        return {"bridge": bridge, "compensator": carried, "joints": joint_rows(names, position, velocity, effort)}
 
 
 @dataclass

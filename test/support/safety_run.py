@@ -31,9 +31,9 @@ class SafetyRun:
     """A machine, its inputs, and the motors that it drives.
 
     changes: of each joint's reading. silent: the joints whose motors do not reply. off: those whose motors have been
-    switched off behind the machine's back. effort: Nm, with `effort_age` in s; held: of a late tilt. drive: the
-    machine's last output.
-    applied: (4,) Nm, what the motors truly apply; a silent motor keeps its torque. steps: its largest step per cycle.
+    switched off behind the machine's back. effort: Nm, with `effort_age` in s; damped: as while the load changes; held:
+    as of a late tilt. drive: the machine's last output. applied: (4,) Nm, what the motors truly apply; a silent motor
+    keeps its torque. steps: its largest step per cycle.
     """
 
     def __init__(self, **limits: Any) -> None:
@@ -42,7 +42,8 @@ class SafetyRun:
         self.changes: list[dict[str, Any]] = [{} for _ in range(4)]
         self.silent: set[int] = set()
         self.effort: Sequence[float] | None = EFFORT
-        self.effort_age, self.held = 0.002, False
+        self.effort_age = 0.002
+        self.damped = self.held = False
         self.joints = [UNKNOWN] * 4
         self.off: set[int] = set()
         self.drive = OFF
@@ -59,7 +60,7 @@ class SafetyRun:
                     torque = 0.0 if i in self.off else damped
                     self.joints[i] = reading(**{"time": self.now - 0.001, "effort": torque, **change})
             before = list(self.applied)
-            efforts = self.effort, self.now - self.effort_age, self.held
+            efforts = self.effort, self.now - self.effort_age, self.damped, self.held
             self.drive = self.machine.step(self.now, tuple(self.joints), *efforts)
             for i in range(4):
                 if i not in self.silent:

@@ -1,9 +1,9 @@
 """Joint angles and trunk tilt -> step-free torques that hold an arm of n joints, or the reason why there are none.
 
-Each call checks that the input is fresh and finite, evaluates the law, blends in the last change of settings, ramps in,
-clamps and limits the rate. A change of law, mode, mass or gain never steps the torque: the difference between the
-torques before and after the change is kept as a remainder that fades. Where the chosen law does not apply, the exact
-law replaces it, with the same transition, for at least `FALLBACK_TIME`.
+Each call checks that the input is fresh and finite, evaluates law and terms, clamps their sum, ramps in and limits the
+rate. A change of any setting is a guided motion (`guidance`): the torque moves from the old load's to the new one's
+only as fast as the arm stays calm. Where the chosen law does not apply, the exact law replaces it in the same way, for
+at least `FALLBACK_TIME`.
 
 The exoskeleton's own arm (`Settings`) has a wearer and terms on top of gravity compensation; any other arm
 (`UrdfSettings`) has the torque of its URDF alone.
@@ -13,18 +13,19 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from exo_gravity.core.compensation.limiter import BREAK, EffortLimiter, Transition
+from exo_gravity.core.compensation.guidance import GuidedChange
+from exo_gravity.core.compensation.limiter import BREAK, EffortLimiter
 from exo_gravity.core.compensation.settings import Settings, UrdfSettings
-from exo_gravity.core.compensation.terms.terms import Terms
+from exo_gravity.core.compensation.terms.terms import Active, Terms
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.model.kinematics import turning_torque
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.trunk.felt_motion import FeltMotion
+from exo_gravity.core.trunk.felt_motion import Felt, FeltMotion
 from exo_gravity.core.trunk.tilt_input import MAX_TURN, Tilted
 
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
@@ -37,13 +38,22 @@ class Answer(NamedTuple):
 
     effort: Torque | None  #: (n,) Nm; None for the given `reason`
     reason: str = ""
-    clamped: tuple[int, ...] = ()  #: indices of the joints whose torque exceeded `max_effort`
+    clamped: tuple[int, ...] = ()  #: indices of the joints whose gravity torque exceeds `max_effort`
     fallback: str = ""  #: why the exact law replaced the chosen one, or ''
+    remainder: Torque = ()  #: (n,) Nm by which a change of load is not done yet; () if none is under way
+    damped: bool = False  #: whether the motors are to damp the joints meanwhile
     held: str = ""  #: why the last tilt is held on, and the bound of the error in Nm; or ''
 
 
+class CarriedLoad(NamedTuple):
+    """What the compensator carries."""
+
+    settings: Settings | UrdfSettings
+    active: Active = Active()  #: the terms on top of it
+
+
 class Compensator(Tilted):
-    """The control law and its state: ramp, rate limit, and the remainder of the last change of settings.
+    """The control law and its state: ramp, rate limit, and the change of load that is under way.
 
     names: of the joints (4,), for the outer loop's input.
     """
@@ -56,19 +66,18 @@ class Compensator(Tilted):
         self._motion = FeltMotion()
         self._nothing = (0.0,) * len(settings.max_effort)
         self._limiter = EffortLimiter(len(settings.max_effort))
-        self._transition = Transition()  # of the last change of law or settings
-        self._torque: Torque = self._nothing  # before ramp and limits
+        self._change = GuidedChange(len(settings.max_effort))
+        self._origin: CarriedLoad | None = None  # where the change began; None where no settings say
+        self._torque: Torque = self._nothing  # the last, before ramp and rate limit
         self._pending: Settings | UrdfSettings | None = None
         self._fallback = ""  # why the exact law replaces the chosen one
         self._fallback_until = -math.inf
 
     def apply(self, settings: Settings | UrdfSettings) -> None:
-        """Use new settings from the next `step` on; the torque moves to them without a step."""
+        """Use new settings from the next `step` on; the torque moves to them as a guided motion."""
         if settings.side != self.settings.side:
             raise ParameterError("side", settings.side, f"{self.settings.side}, because the side cannot change")
         self._pending = settings
-        if self.terms is not None and isinstance(settings, Settings):
-            self.terms.apply(settings.terms, settings.moving)
 
     def set_motion(
         self, now: float, specific_force: Sequence[float], angular_velocity: Sequence[float], age: float = 0.0
@@ -82,7 +91,7 @@ class Compensator(Tilted):
     def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Answer:
         """Return the torque for joint angles `theta` (n,) rad at `now` s on a monotonic clock.
 
-        velocity: (n,) rad/s, None if not known: then the terms add nothing.
+        velocity: (n,) rad/s, None if not known: then the terms add nothing, and changes take longer.
         """
         count = len(self._nothing)
         if len(theta) != count or not all(-MAX_ANGLE <= angle <= MAX_ANGLE for angle in theta):
@@ -93,13 +102,34 @@ class Compensator(Tilted):
             if not turn <= MAX_TURN:
                 return Answer(None, held)
             held = f"{held}: held on, torque off by at most {turn * self._largest_torque(theta):.2f} Nm"
-        torque = self._without_step(now, theta)
-        if not all(map(math.isfinite, torque)):
-            return Answer(None, f"torque {list(torque)} Nm from the law is not finite")
-        added = self.terms.torque(now, theta, velocity, torque) if velocity and self.terms else self._nothing
+        before = self._carried
+        if self._pending is not None:
+            self._use(self._pending)
+        replaced = bool(self._fallback)
+        gravity = self._law(now, theta)
+        if not all(map(math.isfinite, gravity)):
+            return Answer(None, f"torque {list(gravity)} Nm from the law is not finite")
+        added = self.terms.torque(now, theta, velocity, gravity) if velocity and self.terms else self._nothing
         s = self.settings
-        effort, clamped = self._limiter.limit(now, torque, added, s.max_effort, s.max_effort_rate)
-        return Answer(effort, clamped=clamped, fallback=self._fallback, held=held)
+        torque = clamped(map(operator.add, gravity, added), s.max_effort)
+        dt = now - self._limiter.last_answer
+        if not 0.0 <= dt <= BREAK:
+            self._change.stop()  # the torque ramps in from zero
+        elif before.settings is not s:
+            self._begin(now, theta, velocity, torque, before)
+        elif bool(self._fallback) != replaced:
+            self._begin(now, theta, velocity, torque, None)  # the replaced law may not apply at `theta`
+        if not self._change.is_over:
+            start = torque
+            if self._origin is not None:
+                start = self._torque_of(self._origin, now, theta, velocity)
+            torque = self._change.step(dt, velocity, start, torque)
+        self._torque = torque
+        effort = self._limiter.limit(now, torque, s.max_effort_rate)
+        over = [joint for joint, most in enumerate(s.max_effort) if not -most <= gravity[joint] <= most]
+        change = self._change
+        remainder = () if change.is_over else change.remainder
+        return Answer(effort, "", tuple(over), self._fallback, remainder, change.is_large, held)
 
     def _largest_torque(self, theta: Sequence[float]) -> float:
         """Return the most in Nm that gravity takes of any joint at `theta` (n,) rad, whatever its direction."""
@@ -111,40 +141,85 @@ class Compensator(Tilted):
             torques = [settings.torque(theta, tilt) for tilt in tilts]
         return max(math.hypot(*components) for components in zip(*torques, strict=True))
 
+    @property
+    def _carried(self) -> CarriedLoad:
+        return CarriedLoad(self.settings, self.terms.now) if self.terms else CarriedLoad(self.settings)
+
+    def _use(self, settings: Settings | UrdfSettings) -> None:
+        if settings.law != self.settings.law:
+            self._fallback, self._fallback_until = "", -math.inf
+        self.settings, self._pending = settings, None
+        self._tilt.timeout = settings.tilt_timeout
+        if self.terms is not None and isinstance(settings, Settings):
+            self.terms.apply(settings.terms, settings.moving)
+
+    def _begin(
+        self,
+        now: float,
+        theta: Sequence[float],
+        velocity: Sequence[float] | None,
+        torque: Torque,
+        before: CarriedLoad | None,
+    ) -> None:
+        """Begin a change to `torque` (n,) Nm, from `before` or from where an unfinished change began.
+
+        Of the two, the one is chosen that explains the present torque better.
+        """
+        origins = [before] if self._change.is_over else [self._origin, before]
+        ways = []
+        for origin in origins:
+            start = torque if origin is None else self._torque_of(origin, now, theta, velocity)
+            change = GuidedChange(len(torque))
+            change.begin(self._torque, start, torque)
+            ways.append((change.unexplained, origin, change))
+        _, self._origin, self._change = min(ways, key=operator.itemgetter(0))
+
+    def _torque_of(
+        self, load: CarriedLoad, now: float, theta: Sequence[float], velocity: Sequence[float] | None
+    ) -> Torque:
+        """Return the torque (n,) in Nm that `load` would need here, clamped as it was."""
+        gravity = self._gravity(load.settings, now, theta)
+        if not velocity or self.terms is None:
+            return clamped(gravity, load.settings.max_effort)
+        added = self.terms.torque_of(load.active, gravity)
+        return clamped(map(operator.add, gravity, added), load.settings.max_effort)
+
     def _law(self, now: float, theta: Sequence[float]) -> Torque:
         """Return the torque of the chosen law, or of the exact law while the chosen one does not apply."""
-        settings, tilt = self.settings, self._tilt.at(now)
-        if not isinstance(settings, Settings):
-            return settings.torque(theta, tilt)
+        settings = self.settings
+        if isinstance(settings, Settings):
+            reason = settings.outside(theta, self._felt(settings, now)[0])
+            if reason:
+                self._fallback, self._fallback_until = reason, now + FALLBACK_TIME
+            elif now >= self._fallback_until:
+                self._fallback = ""
+        return self._gravity(settings, now, theta, bool(self._fallback))
+
+    def _felt(self, settings: Settings, now: float) -> tuple[Tilt, Felt | None]:
+        """Return the tilt of what the trunk feels as gravity, and its motion if that is compensated, too."""
+        tilt = self._tilt.at(now)
         felt = self._motion.at(now, settings.shoulder_from_imu) if settings.inertial and settings.use_imu else None
         if felt:
             magnitude = math.hypot(*felt.gravity) / STANDARD_GRAVITY
             tilt = Tilt.of_gravity(settings.side, felt.gravity)._replace(magnitude=magnitude)
-        reason = settings.outside(theta, tilt)
-        if reason:
-            self._fallback, self._fallback_until = reason, now + FALLBACK_TIME
-        elif now >= self._fallback_until:
-            self._fallback = ""
-        torque = settings.torque(theta, tilt, exact=bool(self._fallback))
+        return tilt, felt
+
+    def _gravity(
+        self, settings: Settings | UrdfSettings, now: float, theta: Sequence[float], exact: bool | None = None
+    ) -> Torque:
+        """Return the torque (n,) in Nm of the law of `settings`; exact: None for where that law does not apply."""
+        if not isinstance(settings, Settings):
+            return settings.torque(theta, self._tilt.at(now))
+        tilt, felt = self._felt(settings, now)
+        if exact is None:
+            exact = bool(settings.outside(theta, tilt))
+        torque = settings.torque(theta, tilt, exact)
         if felt is None:
             return torque
         turning = turning_torque(settings.arm, settings.side, theta, felt.angular_acceleration)
         return tuple(map(operator.add, torque, turning))
 
-    def _without_step(self, now: float, theta: Sequence[float]) -> Torque:
-        """Return the law's torque plus the remainder of the last change of settings or law."""
-        replaced = bool(self._fallback)
-        torque = self._law(now, theta)
-        if bool(self._fallback) != replaced and 0.0 <= now - self._limiter.last_answer <= BREAK:
-            # Continue from the last torque: the replaced law may not apply at `theta`.
-            torque = self._transition.begin(now, self._torque, torque)
-        else:
-            torque = self._transition.blended(now, torque)
-        if self._pending is not None:
-            if self._pending.law != self.settings.law:
-                self._fallback, self._fallback_until = "", -math.inf
-            self.settings, self._pending = self._pending, None
-            self._tilt.timeout = self.settings.tilt_timeout
-            torque = self._transition.begin(now, torque, self._law(now, theta))
-        self._torque = torque
-        return torque
+
+def clamped(torque: Iterable[float], limit: Sequence[float]) -> Torque:
+    """Return `torque` (n,) within -`limit`..`limit`, both in Nm."""
+    return tuple([max(-most, min(most, tau)) for tau, most in zip(torque, limit, strict=True)])

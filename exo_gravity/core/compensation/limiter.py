@@ -1,4 +1,4 @@
-"""What keeps torques from stepping, for any number of joints: ramp, clamp, rate limit, transitions, and a last fade."""
+"""What keeps torques from stepping, for any number of joints: ramp, rate limit, and a last fade."""
 
 from __future__ import annotations
 
@@ -6,14 +6,11 @@ import math
 from collections.abc import Sequence
 from enum import Enum
 
-from exo_gravity.core.model.gravity import Torque
-
 RAMP_TIME = 1.0  # s from zero to full torque, at the start and after a break
 # s without an answer, after which the torque ramps in from zero. This is longer than any command_timeout: the arm is
 # already being let down, so the restart from zero cannot drop it.
 BREAK = 0.2
 LONGEST_STEP = 0.01  # s that the rate limit allows for after a pause, so that the torque does not catch up in one step
-TRANSITION_TIME = 1.0  # s over which a change of law or settings takes effect
 FADE_TIME = 2.0  # s of the last fade; a launcher kills a node 5 s after it asked it to end
 
 
@@ -31,62 +28,21 @@ class EffortLimiter:
         self._zero = self._effort = (0.0,) * count
         self._ramp_start = -math.inf
 
-    def limit(
-        self,
-        now: float,
-        torque: Sequence[float],
-        added: Sequence[float],
-        max_effort: Sequence[float],
-        max_effort_rate: float,
-    ) -> tuple[tuple[float, ...], tuple[int, ...]]:
-        """Return the effort (n,) in Nm at `now` s, and the indices of the joints whose `torque` exceeds `max_effort`.
-
-        torque, added: (n,) Nm, of gravity and on top of it. max_effort: (n,) Nm. max_effort_rate: Nm/s.
-        """
+    def limit(self, now: float, torque: Sequence[float], max_effort_rate: float) -> tuple[float, ...]:
+        """Return the effort (n,) in Nm at `now` s for the `torque` (n,) in Nm. max_effort_rate: Nm/s."""
         dt = now - self.last_answer
         if not 0.0 <= dt <= BREAK:
             self._ramp_start, self._effort, dt = now, self._zero, 0.0
         self.last_answer = now
         ramp = min(1.0, (now - self._ramp_start) / RAMP_TIME)
         step = max_effort_rate * min(dt, LONGEST_STEP)
-        effort, clamped = [], []
-        for joint, (gravity, more, last, limit) in enumerate(zip(torque, added, self._effort, max_effort, strict=True)):
-            if not -limit <= gravity <= limit:
-                clamped.append(joint)
-            wanted = gravity + more
-            target = ramp * (limit if wanted > limit else -limit if wanted < -limit else wanted)
-            effort.append(limited(target, last, limit, step))
-        self._effort = tuple(effort)
-        return self._effort, tuple(clamped)
-
-
-class Transition:
-    """A change of law or settings without a step: what the torque would jump by is kept, and fades linearly."""
-
-    def __init__(self) -> None:
-        self._remainder: Torque = ()
-        self._start: float | None = None  # s; None after the transition
-
-    @property
-    def is_over(self) -> bool:
-        """Whether nothing is left of the last change."""
-        return self._start is None
-
-    def begin(self, now: float, before: Torque, after: Sequence[float]) -> Torque:
-        """Begin the way from `before` to `after`, (n,) Nm each, at `now` s; return its start, `before`."""
-        self._remainder = tuple(b - a for b, a in zip(before, after, strict=True))
-        self._start = now
-        return before
-
-    def blended(self, now: float, torque: Torque) -> Torque:
-        """Return `torque` (n,) plus what is left at `now` s of the remainder."""
-        if self._start is None:
-            return torque
-        left = 1.0 - (now - self._start) / TRANSITION_TIME
-        if left <= 0.0:
-            self._start = None
-            return torque
-        return tuple([t + left * r for t, r in zip(torque, self._remainder, strict=True)])
+        self._effort = tuple(
+            [
+                last + max(-step, min(step, ramp * wanted - last))
+                for wanted, last in zip(torque, self._effort, strict=True)
+            ]
+        )
+        return self._effort
 
 
 class Output(Enum):

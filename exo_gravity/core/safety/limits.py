@@ -30,6 +30,11 @@ WALL_EDGE = 0.02  # rad into the wall over which the damping rises
 WALL_RELEASE = 0.03  # rad/s out of the wall, from which on the spring no longer pushes
 OVERSHOOT = 0.1  # rad past a joint limit that is not yet a fault, because mechanical stops are not infinitely stiff
 MAX_EFFORT_RATE = 50.0  # Nm/s; the full torque of an AK60-6 in 60 ms, slow enough not to jolt the arm
+# While the load changes (core/compensation/guidance.py), joints are braked beyond GUIDE_SPEED, by GUIDE_BRAKE at most:
+# a wearer who holds or moves slowly feels nothing, one who moves on feels 0.5 kg in his hand.
+GUIDE_SPEED = 0.25  # rad/s; above the noise of a motor's velocity
+GUIDE_BRAKE = 1.5  # Nm
+GUIDE_DAMPING = 5.0  # Nm s/rad, the range of kd on the wire
 MAX_TEMPERATURE = 80.0  # degC, an assumption: a motor whose own protection switches it off would drop the arm
 DERATING = 10.0  # degC below MAX_TEMPERATURE over which the permitted torque falls to half
 JUMP = 0.05  # rad that two readings may differ by in addition to what max_velocity allows
@@ -172,6 +177,14 @@ class Limits:
         above = position - self.position_max[i] + WALL_WIDTH
         below = self.position_min[i] + WALL_WIDTH - position
         return above if above > 0.0 else -max(0.0, below)
+
+
+def guide_damping(velocity: float) -> float:
+    """Return the damping in Nm s/rad of a joint at `velocity` rad/s while its load changes."""
+    speed = abs(velocity)
+    if not speed > GUIDE_SPEED:
+        return 0.0
+    return min(GUIDE_DAMPING * (speed - GUIDE_SPEED), GUIDE_BRAKE) / speed
 
 
 def _derating(temperature: int | None) -> float:

@@ -35,7 +35,7 @@ from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DAMPING, DAMPING_RISE, ArmDescent, RestTracker
 from exo_gravity.core.safety.drive import CARRYING, DOUBTFUL, NO_ONES, NOTHING, OFF, Drive, Fault, FaultCode, State
 from exo_gravity.core.safety.gate import SignCheck, StartGate, SwitchOnCheck
-from exo_gravity.core.safety.limits import JointSample, Limits
+from exo_gravity.core.safety.limits import JointSample, Limits, guide_damping
 from exo_gravity.core.safety.readings import Readings
 from exo_gravity.core.safety.ride import RideThrough
 
@@ -139,13 +139,14 @@ class SafetyMachine:
         joints: Sequence[JointSample],
         effort: Sequence[float] | None,
         effort_time: float,
+        damped: bool = False,
         held: bool = False,
     ) -> Drive:
         """Return what the motors receive in the cycle at `now` s.
 
         joints: the 4 newest readings. effort: (4,) Nm requested, None if withdrawn or never requested; effort_time:
-        when the joint readings that it answers were taken; held: whether it is computed from a tilt that is late. All
-        times are on one monotonic clock.
+        when the joint readings that it answers were taken. damped: whether the joints are to be damped too, because the
+        load changes; held: whether the efforts are computed from a tilt that is late. All times are on one clock.
         """
         now = max(now, self._now)  # a call may carry a slightly later time than the cycle that follows it
         dt = min(now - self._now, self._period)
@@ -157,16 +158,18 @@ class SafetyMachine:
             self._check_delivery(now, joints, dt)
         if self.state in CARRYING:
             self._watch(now, dt, effort, now - effort_time, held)
-        drive = self._drive(now, joints, effort, dt).within(self._peaks.damping)
+        drive = self._drive(now, joints, effort, damped, dt).within(self._peaks.damping)
         self._sent = drive
         return drive
 
-    def _drive(self, now: float, joints: Sequence[JointSample], effort: Sequence[float] | None, dt: float) -> Drive:
+    def _drive(
+        self, now: float, joints: Sequence[JointSample], effort: Sequence[float] | None, damped: bool, dt: float
+    ) -> Drive:
         if self.state is State.PROVING:
             self._prove(now, joints, dt)
         if self.state in (State.RAMPING_IN, State.ACTIVE):
             try:
-                return self._carry(now, joints, effort or NOTHING, dt)
+                return self._carry(now, joints, effort or NOTHING, damped, dt)
             except ParameterError as error:
                 self.trip(FaultCode.COMMAND_IMPOSSIBLE, str(error), now)
         if self.state is State.PROVING:
@@ -223,7 +226,9 @@ class SafetyMachine:
             self._is_trusted = True
             self._enter(State.RAMPING_IN, now)
 
-    def _carry(self, now: float, joints: Sequence[JointSample], effort: Sequence[float], dt: float) -> Drive:
+    def _carry(
+        self, now: float, joints: Sequence[JointSample], effort: Sequence[float], damped: bool, dt: float
+    ) -> Drive:
         ramp = 1.0
         if self.state is State.RAMPING_IN:
             ramp = (now - self._since) / RAMP_TIME
@@ -232,12 +237,13 @@ class SafetyMachine:
                 self._enter(State.ACTIVE, now)
         shaped, acted = self.limits.shape(effort, ramp, joints, self._sent.effort, dt)
         self.acted.update(dict.fromkeys(acted, now))
-        # The damping of a soft wall rises at once, since it already rises with the position. Any other rises, and all
-        # falls, over DAMPING_RISE.
-        change = DAMPING / DAMPING_RISE * dt
-        wanted = DAMPING if self.ride.is_riding else 0.0
-        walls = zip(self.limits.wall_damping(joints), self._sent.damping, strict=True)
-        damping = tuple(max(wall, last - change, min(last + change, wanted)) for wall, last in walls)
+        # A wall's damping rises at once, since it already rises with the position. That of a ride or a changing load
+        # rises over DAMPING_RISE, and any damping falls so.
+        step = DAMPING / DAMPING_RISE * dt
+        guided = [guide_damping(joint.velocity) if damped else 0.0 for joint in joints]
+        wanted = (DAMPING,) * len(guided) if self.ride.is_riding else guided
+        columns = zip(self.limits.wall_damping(joints), wanted, self._sent.damping, strict=True)
+        damping = tuple(max(wall, last - step, min(last + step, most)) for wall, most, last in columns)
         return Drive(shaped, damping, True)
 
     def _descend(self, now: float, joints: Sequence[JointSample], dt: float) -> Drive:

@@ -2,6 +2,7 @@
 
 Efforts carry the stamp of the joint state that they answer. The exchange remembers when, on the monotonic clock, each
 stamped state was measured: so the age of an answer does not depend on the wall clock, and an unknown stamp is refused.
+Velocities of zero beside the efforts ask for the motors' damping, while the load changes; others are refused.
 """
 
 from __future__ import annotations
@@ -93,7 +94,9 @@ class EffortExchange:
         else:
             try:
                 effort = by_name(message, "effort", self._limits.joint_names) if message.effort else None
+                if any(message.velocity):
+                    raise ParameterError("velocity", list(message.velocity), "empty, or zeros to ask for damping")
             except ParameterError as error:
                 effort, self.refusal = None, str(error)
                 loop.trip(FaultCode.COMMAND_IMPOSSIBLE, f"effort_commands: {error.name} must be {error.expected}")
-            self._command = EffortCommand(effort, answered, held=bool(message.position))
+            self._command = EffortCommand(effort, answered, bool(message.velocity), bool(message.position))

@@ -88,16 +88,26 @@ class ControlledArm:
         if answer.fallback:
             return f"the exact law replaces {self.control.settings.law}: {answer.fallback}"
         problem = self.control.terms.problem if self.control.terms else ""
-        return f"gravity compensation alone: {problem}" if problem else ""
+        if problem:
+            return f"gravity compensation alone: {problem}"
+        changing = self._changing(answer)
+        return "" if changing == "none" else f"changing load: {changing}"
+
+    def _changing(self, answer: Answer) -> str:
+        """Return which joint has most to go until a change of load is done; 'none' if none is under way."""
+        if not answer.remainder:
+            return "none"
+        most, name = max(zip(map(abs, answer.remainder), self.values["joint_names"], strict=True))
+        return f"{name}, {most:.1f} Nm to go"
 
     def report(self, answer: Answer) -> dict[str, object]:
         """Return the current values for /diagnostics."""
         s, terms = self.control.settings, self.control.terms
+        values: dict[str, object] = {"law": s.law, "changing load": self._changing(answer)}
         if isinstance(s, UrdfSettings):
             carried, limits = f"{s.arm.mass:.3f}", row(s.max_effort)
-            return {"law": s.law, "mass carried (kg)": carried, "gain": row(s.gain), "max effort (Nm)": limits}
-        values: dict[str, object] = {
-            "law": s.law,
+            return {**values, "mass carried (kg)": carried, "gain": row(s.gain), "max effort (Nm)": limits}
+        values |= {
             "law in use": "exact" if answer.fallback else s.law,
             "mode": s.mode,
             "support": s.support,

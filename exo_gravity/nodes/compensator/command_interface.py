@@ -40,6 +40,7 @@ class JointStateInterface:
         self._names = names
         self._publisher = node.create_publisher(JointState, "effort_commands", 1)
         self._command = JointState(name=names)  # one message, reused
+        self._still = (0.0,) * len(names)
         self.values: dict[str, object] = {}  # for /diagnostics
 
     def read(self, message: JointState) -> JointReading:
@@ -51,6 +52,7 @@ class JointStateInterface:
         self._command.header.stamp = message.header.stamp
         self._command.effort = answer.effort or ()
         self._command.position = message.position if answer.held else ()
+        self._command.velocity = self._still if answer.damped else ()  # asks for damping about standstill
         self._publisher.publish(self._command)
 
 

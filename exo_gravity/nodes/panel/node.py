@@ -63,7 +63,8 @@ class ArmClient:
         return {kind: getattr(self, kind).at(now) for kind in ("joints", "bridge", "compensator")}
 
     def _on_states(self, message: JointState, _info: dict[str, Any]) -> None:
-        self.joints = Newest(joint_rows(message.name, message.position, message.effort), time.monotonic())
+        rows = joint_rows(message.name, message.position, message.velocity, message.effort)
+        self.joints = Newest(rows, time.monotonic())
 
 
 class Arms:

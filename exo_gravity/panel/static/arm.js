@@ -3,10 +3,10 @@
 import { degrees, finite, has, number, t, translate, write } from "./texts.js";
 
 const SIGNS = { disabled: "○", checking: "◔", "proving signs": "◑", "ramping in": "◕", active: "●", "letting down": "▼", fault: "✖", silent: "?" };
-const STEP_PERIOD = 200; // ms between two steps of the support
-const LARGEST_STEP = 2; // % of support at once: a slip on the slider must not throw the arm
-const SETTLING = 2000; // ms after the last step until the parameters in force are known again
+const PAUSE = 300; // ms without a move of the slider after which its support is asked for
+const SETTLING = 2000; // ms after that until the parameters in force are known again
 const CARRIED = ["proving signs", "ramping in", "active"];
+const STILL = 0.08; // rad/s; slower joints rest
 
 export class ArmCard {
   constructor(name, actions) {
@@ -23,8 +23,7 @@ export class ArmCard {
     this.slider = this.find("input");
     this.slider.disabled = true; // until the support in force is known
     this.timer = null;
-    this.stepped = NaN; // %, the last step that was taken
-    this.moved = -Infinity; // ms, when its user moved the slider or the last step was sent
+    this.moved = -Infinity; // ms, when its user moved the slider or the support was sent
     this.find(".enable").addEventListener("click", () => actions.enable(this));
     this.find(".clear").addEventListener("click", () => actions.send({ do: "clear_fault", arm: name }));
     this.find(".resume").addEventListener("click", () => actions.send({ do: "resume", arm: name }));
@@ -70,42 +69,29 @@ export class ArmCard {
   // Shows the support in force, unless its user is about to change it.
   follow() {
     if (this.timer || performance.now() - this.moved < SETTLING) return;
-    this.stepped = 100 * this.support;
-    if (isFinite(this.stepped)) this.slider.value = this.stepped;
+    if (isFinite(this.support)) this.slider.value = 100 * this.support;
     this.showSupport();
   }
 
   slide() {
     this.moved = performance.now();
     this.showSupport();
-    this.timer ??= setInterval(() => this.step(), STEP_PERIOD);
+    clearTimeout(this.timer);
+    this.timer = setTimeout(() => this.request(), PAUSE);
   }
 
-  // Sends the next step towards the slider's value.
-  async step() {
-    const left = Number(this.slider.value) - this.stepped;
-    if (!(Math.abs(left) > 0.05) || this.slider.disabled || this.isSending) {
-      if (!this.isSending) this.stop();
-      return;
-    }
-    this.isSending = true;
-    const next = this.stepped + Math.max(-LARGEST_STEP, Math.min(LARGEST_STEP, left));
-    const done = await this.actions.send({ do: "set", arm: this.name, values: { support: Math.round(10 * next) / 1000 } });
-    this.isSending = false;
-    this.moved = performance.now();
-    if (done) this.stepped = next;
-    else this.stop();
-  }
-
-  stop() {
-    clearInterval(this.timer);
+  // Asks for the slider's support; the compensator moves the torque to it only as fast as the arm stays calm.
+  async request() {
+    const taken = await this.actions.support(this, Math.round(10 * Number(this.slider.value)) / 1000);
     this.timer = null;
+    this.moved = taken ? performance.now() : -Infinity;
+    this.follow();
   }
 
   showSupport() {
     const value = Number(this.slider.value);
     const limit = this.limit;
-    const now = this.stepped;
+    const now = 100 * this.support;
     const known = limit !== null;
     const mark = this.find(".mark");
     mark.hidden = !known;
@@ -125,9 +111,10 @@ export class ArmCard {
     const badge = this.find(".badge");
     badge.dataset.state = name;
     write(this.find(".sign"), SIGNS[name] ?? "?");
-    write(this.find(".state"), has(`state.${name}`) ? t(`state.${name}`) : name);
+    const moving = name === "active" && alive ? motion(state) : "";
+    write(this.find(".state"), moving ? t(moving) : has(`state.${name}`) ? t(`state.${name}`) : name);
     const unreached = bridge?.message.includes("may still be powered");
-    write(this.find(".sentence"), unreached ? t("unreached") : has(`sentence.${name}`) ? t(`sentence.${name}`) : "");
+    write(this.find(".sentence"), unreached ? t("unreached") : moving ? t("sentence.changing") : has(`sentence.${name}`) ? t(`sentence.${name}`) : "");
     this.showRemedy(bridge);
     write(this.find(".detail"), bridge?.message ? t("detail", bridge.message) : "");
     const other = alive ? state.compensator : null;
@@ -138,7 +125,7 @@ export class ArmCard {
     this.find(".clear").disabled = !operates || name !== "fault";
     this.find(".resume").hidden = bridge?.resume !== "possible";
     this.find(".resume").disabled = !operates;
-    for (const control of [this.slider, ...this.root.querySelectorAll("[data-mode]")]) control.disabled = !operates || !other || !isFinite(this.stepped);
+    for (const control of [this.slider, ...this.root.querySelectorAll("[data-mode]")]) control.disabled = !operates || !other || !isFinite(this.support);
     if (this.setup?.settings) this.follow();
     this.showSupport();
     this.showJoints(alive ? state.joints : null, bridge);
@@ -169,6 +156,14 @@ export class ArmCard {
   get isCarried() {
     return CARRIED.includes(this.find(".badge").dataset.state);
   }
+}
+
+// What the arm does while its load changes; '' while it does not. Gravity moves it where the motors' torque opposes that.
+function motion(state) {
+  if ((state.compensator?.["changing load"] ?? "none") === "none") return "";
+  const joints = state.joints ?? [];
+  if (!joints.some((joint) => Math.abs(joint.velocity) > STILL)) return "changing";
+  return joints.reduce((sum, joint) => sum + joint.effort * joint.velocity, 0) < 0 ? "sinking" : "moving";
 }
 
 function newRow(body) {

@@ -59,6 +59,7 @@ async function send(body) {
   return problem === "";
 }
 
+const ASKED = 0.1; // a larger change of the support of an arm that is carried is asked about: it may be a slip
 const percent = (card) => number(100 * card.support, 1);
 const actions = {
   send,
@@ -68,9 +69,18 @@ const actions = {
     if (await ask(t("enable_arm", card.armText()), text, t("enable"))) send({ do: "enable", arm: card.name });
   },
   async mode(card, mode) {
-    const risky = mode === "zero_g" && card.mode !== "zero_g";
-    if (risky && !(await ask(t("mode.zero_g"), t("zero_g_ask", percent(card)), t("mode.zero_g")))) return;
-    send({ do: "set", arm: card.name, values: { mode } });
+    if (mode === card.mode) return;
+    const text = mode === "zero_g" ? t("zero_g_ask") : t("one_g_ask", percent(card));
+    if ((mode === "zero_g" || card.isCarried) && !(await ask(t(`mode.${mode}`), text, t(`mode.${mode}`)))) return;
+    send({ do: "set", arm: card.name, values: mode === "zero_g" ? { mode, support: 0 } : { mode } });
+  },
+  // Returns whether the support was taken.
+  async support(card, support) {
+    const over = card.limit !== null && support > card.limit && support > card.support;
+    const far = card.isCarried && card.mode === "zero_g" && Math.abs(support - card.support) > ASKED;
+    const text = `${t("support_ask", percent(card), number(100 * support, 1))} ${over ? t("support_over") : ""}`;
+    if ((over || far) && !(await ask(t("support_title"), text, t("change")))) return false;
+    return send({ do: "set", arm: card.name, values: { support } });
   },
 };
 

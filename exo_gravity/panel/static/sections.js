@@ -1,5 +1,6 @@
 // Wearer, trial, recording and parameters.
 
+import { ask } from "./ask.js";
 import { degrees, number, t, write } from "./texts.js";
 
 const byId = (id) => document.getElementById(id);
@@ -41,7 +42,12 @@ export class Sections {
       "wearer.sex": fields.sex.value,
       "wearer.segment_length": LENGTHS.map((name) => Number(fields[name].value) / 100),
     };
-    for (const arm of this.cards.keys()) if (!(await this.send({ do: "set", arm, values }))) return;
+    const acts = [...this.cards.values()].some((card) => card.isCarried && card.mode === "zero_g");
+    if (acts && !(await ask(t("wearer"), t("wearer_ask"), t("change")))) return;
+    for (const [arm, card] of this.cards) {
+      const isFirst = !card.setup?.settings?.["wearer.body_mass"]; // the support starts at 0
+      if (!(await this.send({ do: "set", arm, values: isFirst ? { ...values, support: 0 } : values }))) return;
+    }
     this.edited = false;
     write(byId("message"), t("applied"));
   }

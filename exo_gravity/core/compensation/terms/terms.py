@@ -1,8 +1,7 @@
 """The terms at work: their parameters, their bounded sum, plus the outer loop's input.
 
-The sum is bounded, rate-limited, and never steps: the difference that a change of parameters makes fades. Whatever is
-wrong with the sum, gravity compensation goes on beneath it. A new term is a field of `TermSettings` and an item in
-`Terms._build`.
+The sum is bounded and rate-limited. The compensator guides a change of parameters. Whatever is wrong with the sum,
+gravity compensation goes on beneath it. A new term is a field of `TermSettings` and an item in `Terms._built`.
 """
 
 from __future__ import annotations
@@ -10,9 +9,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
-from exo_gravity.core.compensation.limiter import LONGEST_STEP, Transition, limited
+from exo_gravity.core.compensation.limiter import LONGEST_STEP, limited
 from exo_gravity.core.compensation.terms.assist import Assist, AssistInput
 from exo_gravity.core.compensation.terms.friction_inertia import (
     MAX_FRICTION_SHARE,
@@ -83,25 +82,31 @@ def term_settings_of(values: Mapping[str, Any]) -> TermSettings:
     return TermSettings(**groups)
 
 
+class Active(NamedTuple):
+    """The terms of some settings."""
+
+    terms: Sequence[Term] = ()
+    since: float = -math.inf  #: s, when the spring's settings came into force
+
+
 class Terms:
     """What one compensator adds to gravity compensation.
 
     names: of the joints (4,). arm: what moves, with known masses, for `inertia`. `assist` is the outer loop's input.
+    now: the terms in force.
     """
 
     def __init__(self, names: Sequence[str], settings: TermSettings, arm: ArmModel) -> None:
         self.settings = settings
         self.assist = AssistInput(names, settings.assist)
-        self._arm = arm
         self._refusal = ""  # why the sum is not used
-        self._output = NO_TORQUE
-        self._transition = Transition()
+        self._output = self._assisted = NO_TORQUE
         self._tank = EnergyTank()
         self._acceleration = AccelerationFilter()
-        self._time = self._spring_start = -math.inf
-        self._pending: tuple[TermSettings, ArmModel] | None = None
-        self._active = self._build()
-        self._idle = False
+        self._time = -math.inf
+        self._state = TermState(self._time, 0.0, NO_TORQUE, NO_TORQUE, NO_TORQUE, NO_TORQUE, 0.0)
+        self._has_inertia = self._has_changed = False
+        self.now = Active(self._built(settings, arm))
 
     @property
     def active(self) -> list[str]:
@@ -121,9 +126,10 @@ class Terms:
         return self._refusal or refused
 
     def apply(self, settings: TermSettings, arm: ArmModel) -> None:
-        """Use new settings and a new arm from the next `torque` on; the torque moves to them without a step."""
-        if settings != self.settings or arm is not self._arm:
-            self._pending, self._idle = (settings, arm), False
+        """Use new settings and a new arm at once: it is for the caller to guide the change (`guidance`)."""
+        since = self.now.since if settings.spring == self.settings.spring else self._time
+        self.settings, self.assist.assist, self._has_changed = settings, settings.assist, True
+        self.now = Active(self._built(settings, arm), since)
 
     def torque(self, now: float, theta: Sequence[float], velocity: Sequence[float], gravity: Sequence[float]) -> Torque:
         """Return the torque (4,) in Nm on top of gravity compensation at `now` (s, monotonic).
@@ -131,49 +137,46 @@ class Terms:
         theta, velocity: (4,) rad and rad/s. gravity: (4,) Nm of gravity compensation.
         """
         dt, self._time = now - self._time, now
-        if self._idle:
-            return NO_TORQUE
         if not 0.0 <= dt <= MAX_GAP:
-            self._output, self._transition, dt = NO_TORQUE, Transition(), 0.0
-        acceleration = self._acceleration.update(velocity, dt) if self.settings.inertia.on else NO_TORQUE
-        state = TermState(now, dt, theta, velocity, acceleration, gravity, now - self._spring_start)
-        total = self._transition.blended(now, self._sum(state))
-        if self._pending is not None:
-            self._change(*self._pending, now)
-            after = self._sum(state._replace(dt=0.0, elapsed=now - self._spring_start))
-            total = self._transition.begin(now, total, after)
+            self._output, self._has_changed, dt = NO_TORQUE, False, 0.0
+        acceleration = self._acceleration.update(velocity, dt) if self._has_inertia else NO_TORQUE
+        self._state = TermState(now, dt, theta, velocity, acceleration, gravity, now - self.now.since)
+        total = _sum(self.now.terms, self._state) if self.now.terms else NO_TORQUE
         self._refusal = "" if math.isfinite(sum(total)) else "torque of the terms is not finite"
         if self._refusal:
-            total, self._transition = NO_TORQUE, Transition()
-            self._acceleration = AccelerationFilter()  # it may have kept what is not finite
-        step = MAX_EFFORT_RATE * min(dt, LONGEST_STEP)
+            total, self._acceleration = NO_TORQUE, AccelerationFilter()  # it may have kept what is not finite
+        step = math.inf if self._has_changed else MAX_EFFORT_RATE * min(dt, LONGEST_STEP)
+        self._has_changed = False
         columns = zip(total, self._output, MAX_EFFORT, strict=True)
-        self._output = shaped = tuple([limited(wanted, last, limit, step) for wanted, last, limit in columns])
-        if self.assist.idle:
-            self._idle = not self._active and self._transition.is_over and shaped == NO_TORQUE
-            return shaped
-        a, b, c, d = self.assist.torque(now)
-        return a + shaped[0], b + shaped[1], c + shaped[2], d + shaped[3]
+        self._output = tuple([limited(wanted, last, limit, step) for wanted, last, limit in columns])
+        self._assisted = NO_TORQUE if self.assist.idle else self.assist.torque(now)
+        return self._with_assistance(self._output)
 
-    def _sum(self, state: TermState) -> Torque:
-        a = b = c = d = 0.0
-        for term in self._active:
-            e, f, g, h = term.torque(state)
-            a, b, c, d = a + e, b + f, c + g, d + h
-        return a, b, c, d
+    def torque_of(self, active: Active, gravity: Sequence[float]) -> Torque:
+        """Return the torque (4,) in Nm that other terms would give in the state of the last `torque`."""
+        state = self._state._replace(dt=0.0, gravity=gravity, elapsed=self._time - active.since)
+        total = _sum(active.terms, state)
+        if not math.isfinite(sum(total)):
+            total = NO_TORQUE
+        return self._with_assistance([max(-most, min(most, tau)) for tau, most in zip(total, MAX_EFFORT, strict=True)])
 
-    def _change(self, settings: TermSettings, arm: ArmModel, now: float) -> None:
-        if settings.spring != self.settings.spring:
-            self._spring_start = now
-        self.settings, self._arm, self._pending = settings, arm, None
-        self.assist.assist = settings.assist
-        self._active = self._build()
+    def _with_assistance(self, torque: Sequence[float]) -> Torque:
+        a, b, c, d = self._assisted
+        return a + torque[0], b + torque[1], c + torque[2], d + torque[3]
 
-    def _build(self) -> list[Term]:
+    def _built(self, s: TermSettings, arm: ArmModel) -> Sequence[Term]:
         """Return the terms that are on."""
-        s = self.settings
         terms: list[Term] = [term for term in (s.friction, s.damping, s.spring, s.coupling, s.limits) if term.on]
         if s.inertia.on:
+            self._has_inertia = True
             left = [(MAX_FRICTION_SHARE - s.friction.share) * coulomb for coulomb in s.friction.coulomb]
-            terms.append(InertiaTerm(s.inertia.share, LinkInertia.of(self._arm), left, self._tank))
+            terms.append(InertiaTerm(s.inertia.share, LinkInertia.of(arm), left, self._tank))
         return terms
+
+
+def _sum(terms: Sequence[Term], state: TermState) -> Torque:
+    a = b = c = d = 0.0
+    for term in terms:
+        e, f, g, h = term.torque(state)
+        a, b, c, d = a + e, b + f, c + g, d + h
+    return a, b, c, d

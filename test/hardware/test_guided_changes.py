@@ -1,0 +1,136 @@
+"""Live changes of load, with a person's arm in the device: judged by the true motion of the joints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from exo_gravity.core import ArmModel
+from exo_gravity.core.compensation.guidance import MAX_FADE_RATE
+from exo_gravity.core.compensation.terms.springs import Spring
+from exo_gravity.core.compensation.terms.terms import TermSettings
+from exo_gravity.core.model.wearer import Wearer
+from exo_gravity.core.motors.wire_formats import MIT_V3
+from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.limits import GUIDE_BRAKE
+from exo_gravity.sim.arm import DEFAULT_LINKS
+
+from .compensated_arm import CYCLE, PEAK, CompensatedArm
+
+SAFE_SPEED = 0.6  # rad/s
+CODE = 0.009  # Nm, of a torque of the AK80-9 on the wire
+RAISED, UPRIGHT = (0.0, 1.2, 0.3, 0.3), (0.0, 2.4, 0.3, 0.3)
+ONE_G, NO_WEARER = {"mode": "one_g"}, {"mode": "one_g", "has_wearer": False}
+HEAVIER = dict(zip(("wearer_mass", "wearer_cog"), Wearer(100.0).on_links(DEFAULT_LINKS.length), strict=True))
+SPRING = {"terms": TermSettings(spring=Spring((4.0, 14.0, 7.0, 3.9), (0.0, 0.0, -0.3, 1.3)))}
+CLAMPED = {"max_effort": (0.5,) * 4}
+HALVED = {"robot": ArmModel(DEFAULT_LINKS.length, DEFAULT_LINKS.cog, DEFAULT_LINKS.mass, (0.5,) * 4)}
+V3 = {"formats": (MIT_V3,) * 4}
+
+# An arm, what changes, and whether its end is the hanging arm.
+CHANGES = {
+    "Zero-G to One-G": ({}, ONE_G, True),
+    "Zero-G to One-G, raised, peak torque": ({"limit": PEAK, "pose": RAISED}, ONE_G, True),
+    "Zero-G to One-G, above the shoulder": ({"limit": PEAK, "pose": UPRIGHT}, ONE_G, True),
+    "Zero-G to One-G, almost no friction": ({"friction": 0.01}, ONE_G, True),
+    "Zero-G to One-G, V3 boards": (V3, ONE_G, True),
+    "support 1 to 0": ({"limit": PEAK}, {"support": 0.0}, True),
+    "body mass 75 to 100": ({}, HEAVIER, False),
+    "body mass 75 to 100, peak torque": ({"limit": PEAK}, HEAVIER, False),
+    "max_effort 9 to 0.5": ({}, CLAMPED, True),
+    "max_effort 18 to 0.5, raised": ({"limit": PEAK, "pose": RAISED}, CLAMPED, True),
+    "a spring": ({}, SPRING, False),
+    "a spring without a wearer": (NO_WEARER, SPRING, False),
+    "Zero-G without a wearer": ({**NO_WEARER, "limit": PEAK}, {"mode": "zero_g"}, False),
+    "law": (NO_WEARER, {"law": "paper_static"}, False),
+    "gain": ({"limit": PEAK, "pose": RAISED}, HALVED, True),
+}
+# Of those, in which an arm whose motors do not damp comes near to SAFE_SPEED.
+FASTEST = [name for name, (rig, *_) in CHANGES.items() if rig.get("limit") and "support" not in name]
+
+
+@pytest.mark.parametrize(
+    ("name", "is_damped"), [*((name, True) for name in CHANGES), *((name, False) for name in FASTEST)]
+)
+def test_no_change_of_load_drops_or_throws_a_passive_arm(name, is_damped):
+    rig, change, hangs = CHANGES[name]
+    arm = CompensatedArm(**rig)
+    arm.is_damped = is_damped
+    arm.change(**change)
+    arm.run(14.0 if hangs and "pose" in rig else 8.0)
+    assert arm.top_speed < SAFE_SPEED
+    assert arm.safety.state is State.ACTIVE, arm.safety.fault
+    if hangs:
+        assert max(map(abs, arm.device.arm.velocities)) < 0.2
+        assert abs(arm.device.arm.positions[1]) < 0.1
+        assert arm.answer.remainder == ()
+
+
+def test_changes_during_changes_are_as_calm_as_one():
+    arm = CompensatedArm(pose=RAISED, limit=PEAK)
+    back = {"mode": "zero_g", "max_effort": PEAK}
+    for change in (ONE_G, back, ONE_G, CLAMPED, {"support": 0.3}, back, SPRING, ONE_G):
+        arm.change(**change)
+        arm.run(0.7)
+    for support in np.linspace(1.0, 0.0, 20):
+        arm.change(mode="zero_g", support=float(support))
+        arm.run(0.1)
+    arm.run(9.0)
+    assert arm.top_speed < SAFE_SPEED
+    assert arm.safety.state is State.ACTIVE
+    assert arm.answer.remainder == ()
+
+
+class Leading:
+    """A hand that leads joints 2 and 4 to and fro at up to `speed` rad/s. torques: what it applied, (n, 4) Nm."""
+
+    def __init__(self, start: Sequence[float], speed: float) -> None:
+        self.torques: list[np.ndarray] = []
+        self._start, self._speed = np.array(start), speed
+        self._weight = np.zeros(4)
+        self._begin: float | None = None
+
+    def __call__(self, now: float, theta: Sequence[float], velocity: Sequence[float]) -> Sequence[float]:
+        self._begin = now if self._begin is None else self._begin
+        pace, moving = 2.5, np.array((0.0, 1.0, 0.0, 1.0))
+        phase = pace * (now - self._begin)
+        error = self._start + moving * self._speed / pace * np.sin(phase) - theta
+        self._weight += np.array((120.0, 160.0, 150.0, 80.0)) * error * 0.001
+        damping = np.array((3.0, 6.0, 5.0, 2.0)) * (moving * self._speed * np.cos(phase) - velocity)
+        self.torques.append(np.array((60.0, 80.0, 60.0, 30.0)) * error + damping + self._weight)
+        return self.torques[-1].tolist()
+
+
+@pytest.mark.parametrize("change", [ONE_G, {"support": 0.0}, SPRING, CLAMPED])
+def test_a_wearer_who_holds_still_feels_the_new_load_come_slowly_and_nothing_else(change):
+    arm = CompensatedArm()
+    arm.person.hand = Leading(arm.device.arm.positions, 0.0)
+    arm.run(1.0)
+    arm.torques.clear()
+    arm.change(**change)
+    arm.run(4.5)
+    assert arm.answer.remainder == ()
+    of_tenth = np.array(arm.torques)[:: round(0.1 / CYCLE)]
+    assert np.abs(np.diff(of_tenth, axis=0)).max() < 0.1 * MAX_FADE_RATE + 2 * CODE
+    assert arm.top_speed < 0.1
+
+
+@pytest.mark.parametrize(("speed", "most"), [(0.2, 0.1), (1.0, GUIDE_BRAKE + 0.5)])
+def test_a_wearer_who_moves_on_is_not_stopped(speed, most):
+    felt = {}
+    for is_damped in (True, False):
+        arm = CompensatedArm()
+        arm.is_damped = is_damped
+        arm.person.hand = hand = Leading(arm.device.arm.positions, speed)
+        arm.run(1.0)
+        hand.torques.clear()
+        arm.top_speed = 0.0
+        arm.change(**ONE_G)
+        arm.run(5.0)
+        assert arm.safety.state is State.ACTIVE
+        assert arm.top_speed < 1.3 * speed + 0.05
+        felt[is_damped] = np.array(hand.torques)
+    length = min(map(len, felt.values()))
+    assert np.abs(felt[True][:length] - felt[False][:length]).max() < most  # Nm that the damping costs him
