@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+import time
 from concurrent.futures import Future
 from types import SimpleNamespace
 
 import pytest
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
 
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.bus_load import Traffic
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS
@@ -15,6 +19,7 @@ from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.nodes.can_bridge import operation
+from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.can_bridge.operation import BridgeReport, BridgeServices
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
 
@@ -123,6 +128,32 @@ def test_the_zero_is_set_only_for_an_arm_that_is_off_at_rest_and_replies(ask, mo
     monkeypatch.setattr(operation, "ZERO_TIMEOUT", 0.0)
     loop.samples = (*loop.samples[:3], JointSample(0.5, 0.0, 0.0, 40, 0, math.inf))
     assert ask("set_zero", loop).endswith("c at 0.000 rad, elbow at 0.500 rad")
+
+
+def test_simulated_time_is_refused_beside_a_real_bus_at_the_start_and_live(node):
+    operation.refuse_simulated_time(node, "udp_multicast")
+    assert node.set_parameters([Parameter("use_sim_time", value=True)])[0].successful
+    with pytest.raises(ParameterError, match="use_sim_time = True: must be false with a real bus"):
+        operation.refuse_simulated_time(node, "socketcan")
+    node.set_parameters([Parameter("use_sim_time", value=False)])
+    operation.refuse_simulated_time(node, "slcan")
+    result = node.set_parameters([Parameter("use_sim_time", value=True)])[0]
+    assert not result.successful and result.reason.startswith("use_sim_time must be false with a real bus")
+
+
+def test_under_a_clock_that_stands_still_efforts_grow_old(node):
+    node.set_parameters([Parameter("use_sim_time", value=True)])  # and no /clock
+    limits, loop = Limits(("a", "b", "c", "elbow")), SimpleNamespace()
+    exchange = EffortExchange(node, limits, lambda: loop)
+    compensator = node.create_publisher(JointState, "effort_commands", 1)
+    for now in (100.0, 100.004, 100.3):
+        exchange.publish(now, [JointSample(0.0, 0.0, 0.0, 40, 0, now)] * 4)
+    end = time.monotonic() + 20.0
+    while exchange.answered == -math.inf:
+        compensator.publish(JointState(name=limits.joint_names, effort=(0.0,) * 4))
+        exchange.get_efforts(time.monotonic() + 0.05)
+        assert time.monotonic() < end, exchange.refusal
+    assert exchange.answered == 100.0
 
 
 def test_an_enable_that_timed_out_never_arms_the_arm_later(ask, monkeypatch):

@@ -10,10 +10,12 @@ from collections.abc import Callable, Sequence
 from concurrent import futures
 from typing import TypeVar
 
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
-from exo_gravity.core.errors import BusError
+from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.bus_load import Traffic
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import Rate
@@ -28,9 +30,33 @@ RECENT = 2.0  # s for which a limit that acted is still shown
 SLOW = 0.9  # share of the set rate below which the loop is slow
 ZERO_TOLERANCE = 0.02  # rad that a motor may report after set_zero
 ZERO_TIMEOUT = 3.0  # s; motors are silent for up to 1.5 s while they write their memory
+SIMULATED = ("udp_multicast", "virtual")  # interfaces of python-can that no motor listens to
 CALL_TIMEOUT = 2.0  # s that a service waits for the control thread
 
 Response = TypeVar("Response", SetBool.Response, Trigger.Response)
+
+
+def refuse_simulated_time(node: Node, interface: str) -> None:
+    """Refuse `use_sim_time`, now and live, unless the python-can `interface` leads to a simulated device.
+
+    Efforts are as old as the joint states whose stamp they carry: a clock that stops would hide a dead compensator.
+    Raises ParameterError.
+    """
+    if interface in SIMULATED:
+        return
+    expected = (
+        f"false with a real bus (can.interface {interface}): it stamps the joint states with a clock that can stop"
+    )
+
+    def check(changes: list[Parameter]) -> SetParametersResult:
+        is_asked = any(change.name == "use_sim_time" and change.value for change in changes)
+        return SetParametersResult(
+            successful=not is_asked, reason=f"use_sim_time must be {expected}" if is_asked else ""
+        )
+
+    if node.get_parameter("use_sim_time").value:
+        raise ParameterError("use_sim_time", True, expected)
+    node.add_on_set_parameters_callback(check)
 
 
 class BridgeServices:
