@@ -8,6 +8,7 @@ from concurrent.futures import Future
 from types import SimpleNamespace
 
 import pytest
+from diagnostic_msgs.msg import KeyValue
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
@@ -16,12 +17,15 @@ from exo_gravity.core.motors.bus_load import Traffic
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.safety.lease import LEASE_TIME
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
-from exo_gravity.nodes.can_bridge.operation import BridgeReport, BridgeServices
+from exo_gravity.nodes.can_bridge.operation import BridgeReport, BridgeServices, Operator
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
+
+from ..hardware.virtual_rig import Carried
 
 
 def carrying(effort, cycles=0):
@@ -154,6 +158,65 @@ def test_under_a_clock_that_stands_still_efforts_grow_old(node):
         exchange.get_efforts(time.monotonic() + 0.05)
         assert time.monotonic() < end, exchange.refusal
     assert exchange.answered == 100.0
+
+
+WATCH_PERIOD = 0.1  # s
+
+
+@pytest.fixture
+def operated(node):
+    """An arm that is carried in virtual time, who operates it, and a function that lets the bridge watch for a time."""
+    arm = Carried()
+    operator = Operator(node, arm.clock)
+
+    def run(seconds, holding=""):
+        for _ in range(round(seconds / WATCH_PERIOD)):
+            if holding:
+                operator.lease.request(arm.clock.monotonic(), holding, "hold")
+            arm.run(WATCH_PERIOD)
+            operator.watch(arm.loop)
+
+    return SimpleNamespace(arm=arm, operator=operator, run=run, safety=arm.safety)
+
+
+def test_an_arm_whose_operator_is_gone_is_let_down_gently(operated):
+    operated.run(5.0, holding="anna")
+    assert operated.safety.state is State.ACTIVE and operated.operator.lease.holder == "anna"
+    operated.run(LEASE_TIME - 0.2)
+    assert operated.safety.state is State.ACTIVE
+    operated.run(0.5)
+    assert operated.safety.state is State.LETTING_DOWN
+    assert operated.safety.fault == (
+        FaultCode.CONTROL_LOST,
+        "anna held control and has not renewed it for 1 s",
+    )
+    operated.arm.assert_let_down()
+
+
+def test_an_arm_stays_carried_after_a_release_and_without_an_operator(operated):
+    operated.run(2.0)
+    operated.run(2.0, holding="anna")
+    operated.operator.lease.request(operated.arm.clock.monotonic(), "anna", "release")
+    operated.run(5.0)
+    assert operated.safety.state is State.ACTIVE and not operated.safety.fault
+
+
+def test_an_operator_who_leaves_during_the_descent_leaves_no_fault(operated):
+    operated.run(1.0, holding="anna")
+    operated.safety.disable(operated.arm.clock.monotonic())
+    operated.run(3.0)
+    operated.arm.assert_let_down()
+    assert operated.safety.state is State.DISABLED and not operated.safety.fault
+
+
+def test_requests_for_control_arrive_by_topic(operated, node):
+    publisher = node.create_publisher(KeyValue, "listener/control", 10)
+    end = time.monotonic() + 20.0
+    for kind, holder in (("hold", "anna"), ("release", "")):
+        while operated.operator.lease.holder != holder:
+            publisher.publish(KeyValue(key="anna", value=kind))
+            operated.operator.watch(None)
+            assert time.monotonic() < end
 
 
 def test_an_enable_that_timed_out_never_arms_the_arm_later(ask, monkeypatch):

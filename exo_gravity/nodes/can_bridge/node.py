@@ -35,6 +35,7 @@ from exo_gravity.nodes.can_bridge.operation import (
     CALL_TIMEOUT,
     BridgeReport,
     BridgeServices,
+    Operator,
     log_limits,
     refuse_simulated_time,
 )
@@ -71,6 +72,7 @@ class CanBridge(LifecycleNode):
         self._exchange = EffortExchange(self, limits, lambda: self.loop)
         self._report = BridgeReport(self, limits.joint_names, traffic, values["rate"], [m.rated_effort for m in motors])
         BridgeServices(self, lambda: self.loop, motors)
+        self._operator = Operator(self)
         self.create_timer(REPORT_PERIOD, self._on_report)
         log_limits(self, limits, traffic, values["rate"])
         if values["autostart"]:
@@ -182,11 +184,15 @@ class CanBridge(LifecycleNode):
     def _on_report(self) -> None:
         if self.loop is not None and self._owned is not None and not self._owned.watchdog.alive:
             self.loop.trip_if_carried(FaultCode.WATCHDOG_DEAD, "the watchdog process has died or is frozen")
-        self._report.send(self.loop, self._exchange.refusal, self._exchange.answered)
+        self._operator.watch(self.loop)
+        self._send_report()
+
+    def _send_report(self) -> None:
+        self._report.send(self.loop, self._exchange.refusal, self._exchange.answered, self._operator.lease.holder)
 
     def _report_descent(self) -> None:
         with contextlib.suppress(Exception):  # whatever the middleware does, the arm comes down
-            self._report.send(self.loop, self._exchange.refusal, self._exchange.answered)
+            self._send_report()
 
 
 def _declared(node: Node) -> tuple[dict[str, Any], ArmOnBus]:

@@ -1,4 +1,4 @@
-"""How `can_bridge` is operated: the services enable, clear_fault and set_zero; its limits in the log; /diagnostics.
+"""How `can_bridge` is operated: enable, clear_fault, set_zero; who holds control; limits in the log; /diagnostics.
 
 Each service runs on the control thread between two cycles.
 """
@@ -8,11 +8,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from concurrent import futures
-from typing import TypeVar
+from typing import Any, TypeVar
 
+from diagnostic_msgs.msg import KeyValue
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity.core.errors import BusError, ParameterError
@@ -20,10 +22,13 @@ from exo_gravity.core.motors.bus_load import Traffic
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import Rate
 from exo_gravity.core.safety.delivery import MotorLoad
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.safety.lease import Lease
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, MAX_TEMPERATURE, Limits
+from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, milliseconds, row
+from exo_gravity.nodes.ros.hot_path import HotPath
+from exo_gravity.nodes.ros.messages import ERROR, HELD_BY, NOBODY, OK, WARN, Diagnostics, milliseconds, row
 from exo_gravity.nodes.ros.run import open_to_others
 
 RECENT = 2.0  # s for which a limit that acted is still shown
@@ -31,6 +36,7 @@ SLOW = 0.9  # share of the set rate below which the loop is slow
 ZERO_TOLERANCE = 0.02  # rad that a motor may report after set_zero
 ZERO_TIMEOUT = 3.0  # s; motors are silent for up to 1.5 s while they write their memory
 SIMULATED = ("udp_multicast", "virtual")  # interfaces of python-can that no motor listens to
+REQUESTS = 32  # of control, that wait for the next look
 CALL_TIMEOUT = 2.0  # s that a service waits for the control thread
 
 Response = TypeVar("Response", SetBool.Response, Trigger.Response)
@@ -143,6 +149,34 @@ class BridgeServices:
         return response
 
 
+class Operator:
+    """Who holds control of the arm, by the topic `~/control`: a KeyValue of a name, and hold, take or release.
+
+    lease: the holder. It is renewed several times a second. Messages wait until `watch`, ten times a second: a flood of
+    them costs nothing, and at most makes the arm sink.
+    """
+
+    def __init__(self, node: Node, clock: Clock = COMPUTER_CLOCK) -> None:
+        self.lease = Lease()
+        self._now = clock.monotonic
+        self._log = node.get_logger()
+        self._requests = HotPath(node, KeyValue, "~/control", self._on_request, QoSProfile(depth=REQUESTS))
+
+    def watch(self, loop: ControlLoop | None) -> None:
+        """Do what was asked for, and let the arm of `loop` down if its operator is gone."""
+        self._requests.poll()
+        reason = self.lease.lost(self._now())
+        if reason:
+            self._log.warning(reason)
+        if reason and loop is not None and loop.safety.state is not State.LETTING_DOWN:
+            loop.trip(FaultCode.CONTROL_LOST, reason)
+
+    def _on_request(self, message: KeyValue, _info: dict[str, Any]) -> None:
+        news = self.lease.request(self._now(), message.key, message.value)
+        if news:
+            self._log.info(news)
+
+
 def log_limits(node: Node, limits: Limits, traffic: Traffic, rate: float) -> None:
     """Log the limits, the bus load at `rate` (Hz), and whether other hosts can command the arm."""
     log = node.get_logger()
@@ -176,14 +210,15 @@ class BridgeReport:
         self._slow = SLOW * rate  # Hz
         self._motors = MotorLoad(rated)
 
-    def send(self, loop: ControlLoop | None, refusal: str, answered: float) -> None:
+    def send(self, loop: ControlLoop | None, refusal: str, answered: float, holder: str = "") -> None:
         """Report on `loop`, None while the node is inactive.
 
         refusal: why the last message was refused. answered: monotonic s, when the joint states were measured that the
-        newest efforts answer.
+        newest efforts answer. holder: of control, '' for nobody.
         """
+        operator = {HELD_BY: holder or NOBODY}
         if loop is None:
-            self._diagnostics.report(WARN, "inactive")
+            self._diagnostics.report(WARN, "inactive", operator)
             return
         now, safety = time.monotonic(), loop.safety
         acting = ", ".join(sorted(limit for limit, acted in tuple(safety.acted.items()) if acted > now - RECENT))
@@ -192,6 +227,7 @@ class BridgeReport:
         values: dict[str, object] = {
             "state": safety.state.value,
             "fault": safety.fault.code if safety.fault else "none",
+            **operator,
             "limits acting": acting or "none",
             "rate (Hz)": f"{rate:.1f}",
             "bus load (%)": f"{100.0 * self._traffic.load(rate).share:.0f}" if rate else "0",
