@@ -51,6 +51,7 @@ from .device_faults import (
 )
 from .fault_case import ALL_JOINTS, PROCESS_REACTION, FaultCase
 from .frames import MOTOR_2, foreign_frames, random_frames
+from .operator_lease_cases import OPERATOR
 from .outer_loop_cases import OUTER_LOOP
 from .rig import Rig
 from .rigs import (
@@ -238,4 +239,16 @@ ARMS = (
         PROCESS_REACTION),
 )
 # fmt: on
-CASES = (*HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *OUTER_LOOP, *CLOCK, *ARMS, *V3_BOARDS)
+CASES = (
+    *HELD_ROWS,
+    *MOTORS,
+    *DESCENT,
+    *START,
+    *PROCESSES,
+    *EFFORT_COMMANDS,
+    *OUTER_LOOP,
+    *CLOCK,
+    *ARMS,
+    *V3_BOARDS,
+    *OPERATOR,
+)

@@ -24,6 +24,7 @@ COPIED = ("exo_gravity", "test", "config")
 ROW_LIMIT = 240.0  # s for each row, with the start of its nodes
 SAFETY, DESCENT, LIMITS = (f"exo_gravity/core/safety/{name}.py" for name in ("machine", "descent", "limits"))
 ASSIST = "exo_gravity/core/compensation/terms/assist.py"
+LEASE = "exo_gravity/core/safety/lease.py"
 BUS_LOCK, WATCHDOG = "exo_gravity/hardware/ownership/bus_lock.py", "exo_gravity/hardware/ownership/watchdog.py"
 
 
@@ -138,6 +139,22 @@ MUTATIONS = (
         "the last effort of an outer loop that ended stays",
         ("outer loop killed",),
         (Edit(ASSIST, "elif now - self._stamp > self.valid:", "elif self._stamp == -math.inf:"),),
+    ),
+    Mutation(
+        "the torque of an outer loop that has ended is remembered",
+        ("outer loop killed, the next one asks for 0 Nm",),
+        (
+            Edit(
+                ASSIST,
+                "self._torque = tuple([left * last for last in self._torque])",
+                "return tuple([left * last for last in self._torque])",
+            ),
+        ),
+    ),
+    Mutation(
+        "control that is not renewed is not lost",
+        ("who holds control killed",),
+        (Edit(LEASE, "if not self.holder or now - self._renewed <= LEASE_TIME:", "if True:"),),
     ),
 )  # fmt: skip
 

@@ -73,10 +73,13 @@ class AssistedRig(Rig):
         super().close()
 
 
-def only_the_assistance_ends(records: np.ndarray) -> str:
-    """Return what is wrong unless every motor keeps its torque without the assistance, and the arm rests."""
+def only_the_assistance_ends(records: np.ndarray, until: float = GONE_FOR) -> str:
+    """Return what is wrong unless every motor keeps its torque without the assistance, and the arm rests.
+
+    until: s after the fault in which the assistance must not return.
+    """
     since = records["time"] - records["time"][0]
-    gone = (since > PROCESS_REACTION) & (since < GONE_FOR)
+    gone = (since > PROCESS_REACTION) & (since < until)
     wrong = np.abs(records["torque"][gone] - (records["torque"][0] - EFFORTS))
     motion = np.abs(records["position"] - records["position"][0]).max()
     if wrong.max(initial=0.0) > TOLERANCE:
