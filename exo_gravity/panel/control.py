@@ -27,7 +27,6 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from exo_gravity.core.errors import ExoGravityError, ParameterError
-from exo_gravity.core.safety.lease import LEASE_TIME
 from exo_gravity.panel.params import SETTABLE
 
 # The kinds of requests, and the keys that each has besides "do".
@@ -37,7 +36,7 @@ KEYS: Mapping[str, frozenset[str]] = {
     "set": frozenset({"arm", "values"}),
     "trial": frozenset({"name"}),
 }
-GONE = LEASE_TIME  # s without a confirmation
+GONE = 2.0  # s without a confirmation; longer than a lease lasts, so that the next page finds the arm let down
 FORGOTTEN = 600.0  # s after which a page that is gone loses its number
 MAX_PAGES = 32
 BURST, REFILL = 20.0, 10.0  # requests that a page may send at once, and per second

@@ -160,11 +160,15 @@ class Operator:
         self.lease = Lease()
         self._now = clock.monotonic
         self._log = node.get_logger()
+        self._news = ""  # for the log, which a flood must not fill
         self._requests = HotPath(node, KeyValue, "~/control", self._on_request, QoSProfile(depth=REQUESTS))
 
     def watch(self, loop: ControlLoop | None) -> None:
         """Do what was asked for, and let the arm of `loop` down if its operator is gone."""
         self._requests.poll()
+        if self._news:
+            self._log.info(self._news)
+            self._news = ""
         reason = self.lease.lost(self._now())
         if reason:
             self._log.warning(reason)
@@ -172,9 +176,7 @@ class Operator:
             loop.trip(FaultCode.CONTROL_LOST, reason)
 
     def _on_request(self, message: KeyValue, _info: dict[str, Any]) -> None:
-        news = self.lease.request(self._now(), message.key, message.value)
-        if news:
-            self._log.info(news)
+        self._news = self.lease.request(self._now(), message.key, message.value) or self._news
 
 
 def log_limits(node: Node, limits: Limits, traffic: Traffic, rate: float) -> None:
