@@ -17,12 +17,12 @@ from exo_gravity.core.motors.bus_load import Traffic
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.safety.drive import FaultCode, State
-from exo_gravity.core.safety.lease import LEASE_TIME
+from exo_gravity.core.safety.lease import LEASE_TIME, Lease
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
-from exo_gravity.nodes.can_bridge.operation import BridgeReport, BridgeServices, Operator
+from exo_gravity.nodes.can_bridge.operation import WATCH_PERIOD, BridgeReport, BridgeServices, Operator
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
 
 from ..hardware.virtual_rig import Carried
@@ -48,7 +48,7 @@ def sent(node, monkeypatch):
     monkeypatch.setattr(operation, "time", SimpleNamespace(monotonic=lambda: clock.now))
 
     def sent(loop, count, answered=None):
-        report = BridgeReport(node, ("a", "b", "c", "elbow"), Traffic(4), 250.0, (3.0, 9.0, 3.0, 3.0))
+        report = BridgeReport(node, ("a", "b", "c", "elbow"), Traffic(4), 250.0, (3.0, 9.0, 3.0, 3.0), Lease())
         for n in range(count):
             report.send(loop(n), "none", clock.now if answered is None else answered)
             clock.now += 0.1
@@ -160,21 +160,18 @@ def test_under_a_clock_that_stands_still_efforts_grow_old(node):
     assert exchange.answered == 100.0
 
 
-WATCH_PERIOD = 0.1  # s
-
-
 @pytest.fixture
 def operated(node):
     """An arm that is carried in virtual time, who operates it, and a function that lets the bridge watch for a time."""
     arm = Carried()
-    operator = Operator(node, arm.clock)
+    operator = Operator(node, lambda: arm.loop, arm.clock)
 
     def run(seconds, holding=""):
         for _ in range(round(seconds / WATCH_PERIOD)):
             if holding:
                 operator.lease.request(arm.clock.monotonic(), holding, "hold")
             arm.run(WATCH_PERIOD)
-            operator.watch(arm.loop)
+            operator.watch()
 
     return SimpleNamespace(arm=arm, operator=operator, run=run, safety=arm.safety)
 
@@ -215,7 +212,7 @@ def test_requests_for_control_arrive_by_topic(operated, node):
     for kind, holder in (("hold", "anna"), ("release", "")):
         while operated.operator.lease.holder != holder:
             publisher.publish(KeyValue(key="anna", value=kind))
-            operated.operator.watch(None)
+            operated.operator.watch()
             assert time.monotonic() < end
 
 

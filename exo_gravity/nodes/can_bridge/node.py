@@ -70,9 +70,10 @@ class CanBridge(LifecycleNode):
         self._bus: MotorBus | None = None  # while inactive
         self._error = ""  # why the last transition failed
         self._exchange = EffortExchange(self, limits, lambda: self.loop)
-        self._report = BridgeReport(self, limits.joint_names, traffic, values["rate"], [m.rated_effort for m in motors])
+        lease = Operator(self, lambda: self.loop).lease
+        rated = [motor.rated_effort for motor in motors]
+        self._report = BridgeReport(self, limits.joint_names, traffic, values["rate"], rated, lease)
         BridgeServices(self, lambda: self.loop, motors)
-        self._operator = Operator(self)
         self.create_timer(REPORT_PERIOD, self._on_report)
         log_limits(self, limits, traffic, values["rate"])
         if values["autostart"]:
@@ -184,15 +185,11 @@ class CanBridge(LifecycleNode):
     def _on_report(self) -> None:
         if self.loop is not None and self._owned is not None and not self._owned.watchdog.alive:
             self.loop.trip_if_carried(FaultCode.WATCHDOG_DEAD, "the watchdog process has died or is frozen")
-        self._operator.watch(self.loop)
-        self._send_report()
-
-    def _send_report(self) -> None:
-        self._report.send(self.loop, self._exchange.refusal, self._exchange.answered, self._operator.lease.holder)
+        self._report.send(self.loop, self._exchange.refusal, self._exchange.answered)
 
     def _report_descent(self) -> None:
         with contextlib.suppress(Exception):  # whatever the middleware does, the arm comes down
-            self._send_report()
+            self._report.send(self.loop, self._exchange.refusal, self._exchange.answered)
 
 
 def _declared(node: Node) -> tuple[dict[str, Any], ArmOnBus]:

@@ -37,6 +37,7 @@ ZERO_TOLERANCE = 0.02  # rad that a motor may report after set_zero
 ZERO_TIMEOUT = 3.0  # s; motors are silent for up to 1.5 s while they write their memory
 SIMULATED = ("udp_multicast", "virtual")  # interfaces of python-can that no motor listens to
 REQUESTS = 32  # of control, that wait for the next look
+WATCH_PERIOD = 0.1  # s between two looks at them
 CALL_TIMEOUT = 2.0  # s that a service waits for the control thread
 
 Response = TypeVar("Response", SetBool.Response, Trigger.Response)
@@ -152,24 +153,27 @@ class BridgeServices:
 class Operator:
     """Who holds control of the arm, by the topic `~/control`: a KeyValue of a name, and hold, take or release.
 
-    lease: the holder. It is renewed several times a second. Messages wait until `watch`, ten times a second: a flood of
-    them costs nothing, and at most makes the arm sink.
+    get_loop returns the present control loop, None while the node is inactive. lease: the holder. It is renewed several
+    times a second. Messages wait until `watch`, ten times a second: a flood of them costs nothing, and at most lets the
+    arm down.
     """
 
-    def __init__(self, node: Node, clock: Clock = COMPUTER_CLOCK) -> None:
+    def __init__(self, node: Node, get_loop: Callable[[], ControlLoop | None], clock: Clock = COMPUTER_CLOCK) -> None:
         self.lease = Lease()
+        self._get_loop = get_loop
         self._now = clock.monotonic
         self._log = node.get_logger()
         self._news = ""  # for the log, which a flood must not fill
         self._requests = HotPath(node, KeyValue, "~/control", self._on_request, QoSProfile(depth=REQUESTS))
+        node.create_timer(WATCH_PERIOD, self.watch)
 
-    def watch(self, loop: ControlLoop | None) -> None:
-        """Do what was asked for, and let the arm of `loop` down if its operator is gone."""
+    def watch(self) -> None:
+        """Do what was asked for, and let the arm down if its operator is gone."""
         self._requests.poll()
         if self._news:
             self._log.info(self._news)
             self._news = ""
-        reason = self.lease.lost(self._now())
+        reason, loop = self.lease.lost(self._now()), self._get_loop()
         if reason:
             self._log.warning(reason)
         if reason and loop is not None and loop.safety.state is not State.LETTING_DOWN:
@@ -201,24 +205,27 @@ def log_limits(node: Node, limits: Limits, traffic: Traffic, rate: float) -> Non
 class BridgeReport:
     """The status of one bridge.
 
-    rate: Hz, as set. rated: (4,) Nm, the motors' rated torque at the joints.
+    rate: Hz, as set. rated: (4,) Nm, the motors' rated torque at the joints. lease: of control.
     """
 
-    def __init__(self, node: Node, names: Sequence[str], traffic: Traffic, rate: float, rated: Sequence[float]) -> None:
+    def __init__(
+        self, node: Node, names: Sequence[str], traffic: Traffic, rate: float, rated: Sequence[float], lease: Lease
+    ) -> None:
         self._diagnostics = Diagnostics(node)
         self._names = names
+        self._lease = lease
         self._traffic = traffic
         self._rate = Rate()
         self._slow = SLOW * rate  # Hz
         self._motors = MotorLoad(rated)
 
-    def send(self, loop: ControlLoop | None, refusal: str, answered: float, holder: str = "") -> None:
+    def send(self, loop: ControlLoop | None, refusal: str, answered: float) -> None:
         """Report on `loop`, None while the node is inactive.
 
         refusal: why the last message was refused. answered: monotonic s, when the joint states were measured that the
-        newest efforts answer. holder: of control, '' for nobody.
+        newest efforts answer.
         """
-        operator = {HELD_BY: holder or NOBODY}
+        operator = {HELD_BY: self._lease.holder or NOBODY}
         if loop is None:
             self._diagnostics.report(WARN, "inactive", operator)
             return
