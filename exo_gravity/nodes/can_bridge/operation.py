@@ -1,6 +1,6 @@
-"""How `can_bridge` is operated: enable, clear_fault, set_zero; who holds control; limits in the log; /diagnostics.
+"""How `can_bridge` is operated: the services enable, clear_fault and set_zero; its limits in the log; /diagnostics.
 
-Each service runs on the control thread between two cycles.
+Each service runs on the control thread between two cycles. Who holds control is a lease (core/safety/lease.py).
 """
 
 from __future__ import annotations
