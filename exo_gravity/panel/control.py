@@ -174,6 +174,8 @@ class Control:
                 return self._refused(page, 403, f"{action}: another page holds control")
             if action.arm and (other := self._arms.other_holder(action.arm, str(page))):
                 return self._refused(page, 403, f"{action}: {other} holds control of this arm")
+        if action.kind == "enable":  # by a page that confirms nothing, the arm is not carried for long
+            self._arms.lease(str(page), "hold")
         problem = await self._carry_out(action, page)
         self._log(f"{page or f'{address} unknown page'}: {action}: {problem or 'done'}")
         return Reply(409 if problem else 200, problem)

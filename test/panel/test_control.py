@@ -260,6 +260,13 @@ def test_each_confirmation_of_the_operators_page_and_nothing_else_renews_its_lea
     assert panel.arms.leases == [("10.0.0.1 page 1", "hold")] * 2
 
 
+def test_an_arm_is_not_enabled_without_a_lease(panel):
+    panel.arms.leases.clear()
+    panel.ask(panel.first, do="enable", arm="right")
+    panel.ask(panel.second, do="enable", arm="right")
+    assert panel.arms.leases == [("10.0.0.1 page 1", "hold")]
+
+
 def test_a_page_is_replaced_only_after_its_lease_has_ended():
     assert GONE > LEASE_TIME + 0.1  # s between two looks of the bridge
 
