@@ -1,8 +1,10 @@
-"""Who operates the arms, what a page may ask for, and what happens when the operator's page is gone.
+"""Who operates the arms, and what a page may ask for.
 
 A page is one browser tab. It keeps its secret while it is reloaded, and confirms each few states that it receives. A
 page that confirms nothing for `GONE` seconds is gone: the laptop is closed, or the network lost. One page at a time
-holds control, the others watch. Every page may let the arms down, at any time and without a rate limit. The requests:
+holds control, the others watch. Every page may let the arms down, at any time and without a rate limit. Each
+confirmation of the page that holds control renews its lease at the arms (core/safety/lease.py), if the panel has one:
+no page, no panel, no lease. The requests:
 
 {"do": "let_down"}                                   all arms
 {"do": "let_down", "arm": "right"}                   one arm
@@ -20,7 +22,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import math
 import secrets
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
@@ -36,11 +37,10 @@ KEYS: Mapping[str, frozenset[str]] = {
     "set": frozenset({"arm", "values"}),
     "trial": frozenset({"name"}),
 }
-GONE = 2.0  # s without a confirmation
+GONE = 2.0  # s without a confirmation; longer than a lease lasts, so that the next page finds the arm let down
 FORGOTTEN = 600.0  # s after which a page that is gone loses its number
 MAX_PAGES = 32
 BURST, REFILL = 20.0, 10.0  # requests that a page may send at once, and per second
-RETRY = 1.0  # s between two attempts to let the arms down
 
 
 @dataclass(frozen=True)
@@ -107,30 +107,26 @@ class Control:
     """The pages, which of them holds control, and what is done for them.
 
     arms: has their `names` and, for each kind of request with the key "arm", a coroutine function that takes the arm,
-    and `set` the values too. files: has the names of the `trials` and such functions for the other requests, of which
-    `trial` takes a name. Each returns '' or why it failed. note: called with a sentence for the log and the recording.
-    clock: monotonic s. dead_man: whether the arms are let down when the page that holds control is gone; until they
-    are, only a page that takes control replaces it.
+    and `set` the values too; `lease(page, kind)`, which sends a page's request for control to all arms, and
+    `other_holder(arm, page)`, the name of who else holds control of an arm. files: has the names of the `trials` and
+    such functions for the other requests, of which `trial` takes a name. Each returns '' or why it failed. note: called
+    with a sentence for the log and the recording. clock: monotonic s.
     """
 
-    def __init__(
-        self, arms: Any, files: Any, note: Callable[[str], object], clock: Callable[[], float], dead_man: bool = False
-    ) -> None:
+    def __init__(self, arms: Any, files: Any, note: Callable[[str], object], clock: Callable[[], float]) -> None:
         self.holder: Page | None = None  #: the page that holds control
         self._arms = arms
         self._files = files
         self._note = note
         self._clock = clock
-        self._dead_man = dead_man
         self._pages: dict[str, Page] = {}  # by secret
         self._numbers = 0
-        self._attempted = -math.inf  # s, when `watch` last let the arms down
 
     def open(self, secret: str, address: str) -> Page | None:
         """Return the page of a new connection; None if there are too many pages.
 
         A known secret is the same page, reloaded. A page holds control from the start if no other does, or if the other
-        is gone and there is no `dead_man`.
+        is gone.
         """
         self._forget()
         page = self._pages.get(secret)
@@ -141,18 +137,27 @@ class Control:
             self._numbers += 1
             page = Page(secrets.token_urlsafe(24), self._numbers, address, now, now)
             self._pages[page.secret] = page
-        if self.holder is None or (self.is_gone() and not self._dead_man):
+        if self.holder is None or self.is_gone():
             self.holder = page
-        page.connected, page.seen = True, now
+        page.connected = True
+        self.confirm(page)
         return page
 
     def confirm(self, page: Page) -> None:
-        """Note that the page shows the present state."""
+        """Note that the page shows the present state, and renew its lease."""
         page.seen = self._clock()
+        if page is self.holder:
+            self._arms.lease(str(page), "hold")
 
     def is_gone(self) -> bool:
         """Return whether a page holds control that is gone."""
         return self.holder is not None and self._clock() - self.holder.seen > GONE
+
+    @property
+    def elsewhere(self) -> str:
+        """The name of who else holds control of an arm, in place of the page that holds it here; '' for nobody."""
+        others = [self._arms.other_holder(arm, str(self.holder)) for arm in self._arms.names]
+        return next(filter(None, others), "")
 
     async def perform(self, body: Any, secret: str, address: str) -> Reply:
         """Do what the JSON value `body` asks for, sent by the page with `secret`, at `address`."""
@@ -168,6 +173,10 @@ class Control:
                 return Reply(429, "too many requests: wait a moment")
             if action.kind != "take" and page is not self.holder:
                 return self._refused(page, 403, f"{action}: another page holds control")
+            if action.arm and (other := self._arms.other_holder(action.arm, str(page))):
+                return self._refused(page, 403, f"{action}: {other} holds control of this arm")
+        if action.kind in ("enable", "resume"):  # by a page that confirms nothing, the arm is not carried for long
+            self._arms.lease(str(page), "hold")
         problem = await self._carry_out(action, page)
         self._log(f"{page or f'{address} unknown page'}: {action}: {problem or 'done'}")
         return Reply(409 if problem else 200, problem)
@@ -183,6 +192,7 @@ class Control:
             problem = await self._let_down([action.arm] if action.arm else self._arms.names)
         elif action.kind in ("take", "release"):
             self.holder = page if action.kind == "take" else None
+            self._arms.lease(str(page), action.kind)
         else:
             function = getattr(self._arms if action.arm else self._files, action.kind)
             problem = await function(*filter(None, (action.arm, action.values, action.name)))
@@ -195,29 +205,6 @@ class Control:
         results = await asyncio.gather(*map(self._arms.let_down, arms), return_exceptions=True)
         problems = [_described(result) if isinstance(result, BaseException) else result for result in results]
         return "; ".join(f"{arm}: {problem}" for arm, problem in zip(arms, problems, strict=True) if problem)
-
-    async def watch(self) -> None:
-        """With `dead_man`, let all arms down if the page that holds control is gone; retry until it worked.
-
-        Call it often. If it fails itself, the reason is noted, the arms are let down as if the page were gone, and the
-        next call watches on.
-        """
-        if not self._dead_man or self._clock() - self._attempted < RETRY:
-            return
-        try:
-            if self.is_gone():
-                holder = self.holder
-                worked = await self._let_down_all(f"{holder} has been gone for {GONE:g} s")
-                if worked and self.holder is holder and self.is_gone():
-                    self.holder = None
-        except Exception as error:
-            await self._let_down_all(f"the watch of the operator's page failed: {_described(error)}")
-
-    async def _let_down_all(self, why: str) -> bool:
-        self._attempted = self._clock()
-        problem = await self._let_down(self._arms.names)
-        self._log(f"{why}: let down: {problem or 'done'}")
-        return not problem
 
     def _log(self, text: str) -> None:
         try:
@@ -239,8 +226,7 @@ class Control:
         """Drop pages that are long gone, and any that is closed if there are too many."""
         now, full = self._clock(), len(self._pages) >= MAX_PAGES
         for page in list(self._pages.values()):
-            awaited = self._dead_man and page is self.holder  # by `watch`
-            if not page.connected and not awaited and (full or now - page.seen > FORGOTTEN):
+            if not page.connected and (full or now - page.seen > FORGOTTEN):
                 del self._pages[page.secret]
                 if page is self.holder:
                     self.holder = None

@@ -15,7 +15,7 @@ PANEL = (
     Param("port", 8080, "TCP port of the page", (1, 65535), fixed=True),
     Param("token", "", "secret that opens the page; empty: none on loopback, elsewhere a random one in the log",
           fixed=True),
-    Param("dead_man", False, "let the arms down when the page that holds control has been gone for 2 s", fixed=True),
+    Param("dead_man", False, "let the arms down when the page that holds control has been gone for 1 s", fixed=True),
     Param("language", "en", "language of the page until its user chooses another", choices=("en", "de"), fixed=True),
     Param("trials", "", "folder with trial scripts; empty: those of the package", fixed=True),
     Param("output", "recordings", "folder for recordings, trials and saved parameters", fixed=True),

@@ -34,7 +34,6 @@ from exo_gravity.panel.access import MAX_BODY, Access, Guard, address_of, body_o
 from exo_gravity.panel.control import Control, Page
 
 FOLDER = Path(__file__).parent
-WATCH_PERIOD = 0.1  # s
 SEND_PERIOD = 0.05  # s between two looks for news
 HELLO_TIMEOUT = 5.0  # s for a page to send its first message
 STOP_TIMEOUT = 3.0  # s
@@ -83,7 +82,9 @@ class PanelServer:
             timeout_graceful_shutdown=1,
         )  # fmt: skip
         self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(target=lambda: asyncio.run(self._serve()), name="panel", daemon=True)
+        self._thread = threading.Thread(
+            target=lambda: asyncio.run(self._server.serve([self._socket])), name="panel", daemon=True
+        )
 
     def start(self) -> None:
         """Start to serve, on a thread."""
@@ -99,16 +100,6 @@ class PanelServer:
     def is_running(self) -> bool:
         """Whether it still serves."""
         return self._thread.is_alive()
-
-    async def _serve(self) -> None:
-        watch = asyncio.create_task(self._watch())
-        await self._server.serve([self._socket])
-        watch.cancel()
-
-    async def _watch(self) -> None:
-        while True:
-            await asyncio.sleep(WATCH_PERIOD)
-            await self._control.watch()
 
     async def _on_live(self, connection: WebSocket) -> None:
         await connection.accept()
@@ -147,7 +138,8 @@ class PanelServer:
             if self.state is not state:
                 state, number = self.state, number + 1
                 holder, gone = self._control.holder, self._control.is_gone()
-                of_holder = {"page": holder.number, "address": holder.address, "gone": gone} if holder else None
+                where = {"gone": gone, "elsewhere": self._control.elsewhere}
+                of_holder = {"page": holder.number, "address": holder.address, **where} if holder else None
                 await connection.send_json({"type": "state", "number": number, "control": of_holder, **state})
             await asyncio.sleep(SEND_PERIOD)
 

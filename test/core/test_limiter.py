@@ -5,11 +5,12 @@ import pytest
 from exo_gravity.core.compensation.limiter import CommandFade, Output
 
 EFFORT = (2.0, -4.0)
+NOTHING = (0.0, 0.0)
 
 
 def active(now: float = 10.0) -> CommandFade:
     fade = CommandFade(0.05)
-    assert fade.take(now, EFFORT)
+    assert fade.take(now, EFFORT, NOTHING) == EFFORT
     return fade
 
 
@@ -17,7 +18,7 @@ def test_nothing_is_sent_before_the_first_effort_nor_while_efforts_arrive():
     fade = CommandFade(0.05)
     fade.withdraw(1.0, "no trunk tilt yet")
     assert fade.tick(1.0) is None and fade.state is Output.WAITING and not fade.problem
-    fade.take(10.0, EFFORT)
+    fade.take(10.0, EFFORT, NOTHING)
     assert fade.tick(10.04) is None
 
 
@@ -40,11 +41,11 @@ def test_withdrawn_efforts_fade_at_once_and_the_first_reason_stays():
 def test_an_arm_that_was_let_down_rises_only_after_an_operator_cleared_the_fault():
     fade = active()
     fade.tick(10.06)
-    assert not fade.take(10.1, EFFORT) and not fade.clear()
+    assert not fade.take(10.1, EFFORT, NOTHING) and not fade.clear()
     assert fade.tick(10.1) < EFFORT
     fade.tick(13.0)
-    assert not fade.take(13.0, EFFORT) and fade.state is Output.ZERO
-    assert fade.clear() and fade.take(13.1, EFFORT)
+    assert not fade.take(13.0, EFFORT, NOTHING) and fade.state is Output.ZERO
+    assert fade.clear() and fade.take(13.1, EFFORT, NOTHING)
 
 
 @pytest.mark.parametrize("period", [0.01, 0.3])
@@ -57,3 +58,20 @@ def test_no_message_of_a_fade_steps_by_more_than_the_fade_itself(period):
         columns = zip(effort, last, EFFORT, strict=True)
         assert all(abs(a - b) <= abs(full) * period / 2.0 + 1e-12 for a, b, full in columns)
         last = effort
+
+
+def test_the_first_efforts_begin_from_what_a_controller_holds_since_its_last_sender_died():
+    fade, held, last = CommandFade(0.05), (3.59, -1.0), (3.59, -1.0)
+    for cycle in range(151):  # 1.5 s at 100 Hz
+        ramp = min(1.0, 0.01 * cycle)  # that of the compensator
+        effort = fade.take(10.0 + 0.01 * cycle, [ramp * tau for tau in EFFORT], held)
+        assert max(abs(a - b) for a, b in zip(effort, last, strict=True)) <= 0.01 * 3.0 + 1e-9
+        last = effort
+    assert last == EFFORT
+
+
+def test_a_fade_in_the_first_second_begins_from_what_was_sent():
+    fade = CommandFade(0.05)
+    assert fade.take(10.0, NOTHING, (3.59, 0.0)) == (3.59, 0.0)
+    fade.withdraw(10.01, "no trunk tilt")
+    assert fade.tick(10.01) == (3.59, 0.0) and fade.tick(12.1) == NOTHING

@@ -52,6 +52,7 @@ from .device_faults import (
 from .fault_case import ALL_JOINTS, PROCESS_REACTION, FaultCase
 from .frames import MOTOR_2, foreign_frames, random_frames
 from .operator_cases import OPERATOR
+from .operator_lease_cases import LEASES
 from .outer_loop_cases import OUTER_LOOP
 from .ride_cases import RIDES
 from .rig import Rig
@@ -252,5 +253,6 @@ CASES = (
     *ARMS,
     *V3_BOARDS,
     *RIDES,
+    *LEASES,
     *OPERATOR,
 )

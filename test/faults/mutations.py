@@ -25,6 +25,7 @@ ROW_LIMIT = 240.0  # s for each row, with the start of its nodes
 SAFETY, DESCENT, LIMITS = (f"exo_gravity/core/safety/{name}.py" for name in ("machine", "descent", "limits"))
 GUIDANCE = "exo_gravity/core/compensation/guidance.py"
 ASSIST = "exo_gravity/core/compensation/terms/assist.py"
+LEASE = "exo_gravity/core/safety/lease.py"
 BUS_LOCK, WATCHDOG = "exo_gravity/hardware/ownership/bus_lock.py", "exo_gravity/hardware/ownership/watchdog.py"
 
 
@@ -166,6 +167,22 @@ MUTATIONS = (
         ("max_effort 9 to 0.5 Nm, Zero-G, 75 kg",),
         (Edit("exo_gravity/core/compensation/compensator.py", "self._limiter.limit(now, torque, s.max_effort_rate)",
               "self._limiter.limit(now, clamped(torque, s.max_effort), s.max_effort_rate)"),),
+    ),
+    Mutation(
+        "the torque of an outer loop that has ended is remembered",
+        ("outer loop killed, the next one asks for 0 Nm",),
+        (
+            Edit(
+                ASSIST,
+                "self._torque = tuple([left * last for last in self._torque])",
+                "return tuple([left * last for last in self._torque])",
+            ),
+        ),
+    ),
+    Mutation(
+        "control that is not renewed is not lost",
+        ("who holds control killed",),
+        (Edit(LEASE, "if not self.holder or now - self._renewed <= LEASE_TIME:", "if True:"),),
     ),
 )  # fmt: skip
 

@@ -1,6 +1,7 @@
 """A user's outer loop as a process, which signals make go wrong: python -m test.faults.outer_loop.
 
-It publishes EFFORTS on /right/assist_efforts. GO_WRONG: NaN from now on. FLOOD: far too often. BE_SOUND: neither.
+It publishes EFFORTS on /right/assist_efforts, or zeros with the argument 0. GO_WRONG: NaN from now on. FLOOD: far too
+often. BE_SOUND: neither.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 import signal
+import sys
 import time
 
 import rclpy
@@ -41,9 +43,10 @@ def main() -> None:
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("outer_loop", namespace="/right")
     publisher = node.create_publisher(JointState, TOPIC, 1)
-    message, parent = JointState(name=NAMES), os.getppid()
+    message, parent, share = JointState(name=NAMES), os.getppid(), float("0" not in sys.argv[1:])
     while os.getppid() == parent:
-        message.effort, period = MODES[signals[-1]]
+        efforts, period = MODES[signals[-1]]
+        message.effort = [share * effort for effort in efforts]
         message.header.stamp = node.get_clock().now().to_msg()
         publisher.publish(message)
         time.sleep(period)

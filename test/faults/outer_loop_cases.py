@@ -18,7 +18,7 @@ from ..support import CONFIG, ROOT
 from ..support.launched_nodes import NO_IMU, LaunchedNodes, Parameters
 from .actions import publish, send_signal
 from .fault_case import PROCESS_REACTION, Action, FaultCase
-from .outer_loop import BE_SOUND, EFFORTS, FLOOD, GO_WRONG, NAMES, TOPIC
+from .outer_loop import BE_SOUND, EFFORTS, GO_WRONG, NAMES, TOPIC
 from .rig import Rig
 from .rigs import UPRIGHT
 
@@ -73,10 +73,13 @@ class AssistedRig(Rig):
         super().close()
 
 
-def only_the_assistance_ends(records: np.ndarray) -> str:
-    """Return what is wrong unless every motor keeps its torque without the assistance, and the arm rests."""
+def only_the_assistance_ends(records: np.ndarray, until: float = GONE_FOR) -> str:
+    """Return what is wrong unless every motor keeps its torque without the assistance, and the arm rests.
+
+    until: s after the fault in which the assistance must not return.
+    """
     since = records["time"] - records["time"][0]
-    gone = (since > PROCESS_REACTION) & (since < GONE_FOR)
+    gone = (since > PROCESS_REACTION) & (since < until)
     wrong = np.abs(records["torque"][gone] - (records["torque"][0] - EFFORTS))
     motion = np.abs(records["position"] - records["position"][0]).max()
     if wrong.max(initial=0.0) > TOLERANCE:
@@ -118,7 +121,6 @@ OUTER_LOOP = (
     outer_loop_case("outer loop killed", send_signal("outer_loop", signal.SIGKILL), "waiting: assist_efforts stopped"),
     outer_loop_case("outer loop frozen", send_signal("outer_loop", signal.SIGSTOP), "waiting: assist_efforts stopped"),
     outer_loop_case("outer loop sends NaN", send_signal("outer_loop", GO_WRONG), "refused: assist_efforts must be num"),
-    outer_loop_case("outer loop floods", send_signal("outer_loop", FLOOD), "refused: assist_efforts come more often"),
     outer_loop_case("second outer loop for half a second", publish(JointState, TOPIC, other_efforts), "assisting"),
 )
 # fmt: on

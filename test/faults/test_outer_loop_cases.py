@@ -5,6 +5,7 @@ import pytest
 
 from exo_gravity.sim.truth import RECORD
 
+from .operator_lease_cases import LEASES
 from .outer_loop import EFFORTS
 from .outer_loop_cases import only_the_assistance_ends
 
@@ -39,3 +40,13 @@ def test_a_change_of_gravity_compensation_is_seen(records):
 def test_an_arm_that_moves_is_seen(records):
     records["position"][300:, 1] = 0.1
     assert only_the_assistance_ends(records) == "the arm moved by 0.10 rad"
+
+
+def test_assistance_that_returns_with_the_next_outer_loop_is_seen(records):
+    records["time"] = records["time"][0] + 0.01 * np.arange(500)  # 5 s
+    records["torque"] = GRAVITY
+    check = next(case.check for case in LEASES if "next one" in case.name)
+    records["torque"][0] = np.add(GRAVITY, EFFORTS)
+    assert check(records) == ""
+    records["torque"][300:303, 1] += 0.2
+    assert "0.20 Nm beside gravity compensation" in check(records)

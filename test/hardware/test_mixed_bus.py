@@ -13,12 +13,16 @@ import pytest
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.specs import ENTER, EXIT, MotorReply
 from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, MIT, MIT_V3, WireFormat
-from exo_gravity.core.safety.drive import NOTHING, OFF, Drive
+from exo_gravity.core.safety.drive import NOTHING, OFF, Drive, State
+from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedDevice
 
 from ..support.simulated_device import joints_of, make_device
+from .simulated_rig import LIMITS
 from .test_motor_bus import WEIGHTLESS, now
+from .virtual_rig import CYCLE
 from .virtual_time import Wire, wire_for_test
 
 MIXED = (MIT, MIT_V3, MIT_V3, MIT)
@@ -168,3 +172,29 @@ def test_an_exit_that_was_not_ours_is_undone_on_both_kinds_of_board(wire, other)
     bus.receive_until(now(bus) + 1.0, lambda: bus.foreign_commands == 2)
     first, second = (1, joints[0].command(0.0, 0.0)), (joints[1].command_id, joints[1].command(0.5, 0.0))
     assert sent(other) == [first, (1, ENTER), first, second, second]
+
+
+@pytest.mark.parametrize("formats", [(MIT,) * 4, V3], ids=["v2", "v3"])
+def test_another_host_that_drives_motors_which_are_off_is_a_fault_until_it_stops(wire, other, start, formats) -> None:
+    device, joint = start(formats), joints_of(formats)[1]
+    bus = motor_bus(wire, formats)
+    loop = ControlLoop(bus, SafetyMachine(LIMITS, CYCLE), CYCLE)
+
+    def run(seconds: float) -> None:
+        end = now(bus) + seconds
+        while now(bus) < end:
+            loop.cycle()
+
+    run(0.5)
+    assert loop.safety.state is State.DISABLED and not device.powered
+    for frame_id, data in (*joint.enter, (joint.command_id, joint.command(2.0, 0.0))):
+        other.send(can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED))
+    run(0.1)
+    assert loop.safety.fault is not None and loop.safety.fault.code == "foreign_command"
+    assert "another sender commands motor 2" in loop.safety.fault.reason
+    assert not loop.safety.enable(now(bus))
+    run(1.0)
+    assert not device.powered
+    assert loop.safety.clear(now(bus))
+    run(1.0)
+    assert loop.safety.fault is None and loop.safety.enable(now(bus))

@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 import math
+import time
 from concurrent.futures import Future
 from types import SimpleNamespace
 
 import pytest
+from diagnostic_msgs.msg import KeyValue
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
 
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.bus_load import Traffic
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.safety.lease import LEASE_TIME, Lease
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.nodes.can_bridge import operation
-from exo_gravity.nodes.can_bridge.operation import BridgeReport, BridgeServices
+from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
+from exo_gravity.nodes.can_bridge.operation import WATCH_PERIOD, BridgeReport, BridgeServices, Operator
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
+
+from ..hardware.virtual_rig import Carried
 
 
 def carrying(effort, cycles=0):
@@ -39,7 +48,7 @@ def sent(node, monkeypatch):
     monkeypatch.setattr(operation, "time", SimpleNamespace(monotonic=lambda: clock.now))
 
     def sent(loop, count, answered=None):
-        report = BridgeReport(node, ("a", "b", "c", "elbow"), Traffic(4), 250.0, (3.0, 9.0, 3.0, 3.0))
+        report = BridgeReport(node, ("a", "b", "c", "elbow"), Traffic(4), 250.0, (3.0, 9.0, 3.0, 3.0), Lease())
         for n in range(count):
             report.send(loop(n), "none", clock.now if answered is None else answered)
             clock.now += 0.1
@@ -150,6 +159,88 @@ def test_the_zero_is_set_only_for_an_arm_that_is_off_at_rest_and_replies(ask, mo
     monkeypatch.setattr(operation, "ZERO_TIMEOUT", 0.0)
     loop.samples = (*loop.samples[:3], JointSample(0.5, 0.0, 0.0, 40, 0, math.inf))
     assert ask("set_zero", loop).endswith("c at 0.000 rad, elbow at 0.500 rad")
+
+
+def test_simulated_time_is_refused_beside_a_real_bus_at_the_start_and_live(node):
+    operation.refuse_simulated_time(node, "udp_multicast")
+    assert node.set_parameters([Parameter("use_sim_time", value=True)])[0].successful
+    with pytest.raises(ParameterError, match="use_sim_time = True: must be false with a real bus"):
+        operation.refuse_simulated_time(node, "socketcan")
+    node.set_parameters([Parameter("use_sim_time", value=False)])
+    operation.refuse_simulated_time(node, "slcan")
+    result = node.set_parameters([Parameter("use_sim_time", value=True)])[0]
+    assert not result.successful and result.reason.startswith("use_sim_time must be false with a real bus")
+
+
+def test_under_a_clock_that_stands_still_efforts_grow_old(node):
+    node.set_parameters([Parameter("use_sim_time", value=True)])  # and no /clock
+    limits, loop = Limits(("a", "b", "c", "elbow")), SimpleNamespace()
+    exchange = EffortExchange(node, limits, lambda: loop)
+    compensator = node.create_publisher(JointState, "effort_commands", 1)
+    for now in (100.0, 100.004, 100.3):
+        exchange.publish(now, [JointSample(0.0, 0.0, 0.0, 40, 0, now)] * 4)
+    end = time.monotonic() + 20.0
+    while exchange.answered == -math.inf:
+        compensator.publish(JointState(name=limits.joint_names, effort=(0.0,) * 4))
+        exchange.get_efforts(time.monotonic() + 0.05)
+        assert time.monotonic() < end, exchange.refusal
+    assert exchange.answered == 100.0
+
+
+@pytest.fixture
+def operated(node):
+    """An arm that is carried in virtual time, who operates it, and a function that lets the bridge watch for a time."""
+    arm = Carried()
+    operator = Operator(node, lambda: arm.loop, arm.clock)
+
+    def run(seconds, holding=""):
+        for _ in range(round(seconds / WATCH_PERIOD)):
+            if holding:
+                operator.lease.request(arm.clock.monotonic(), holding, "hold")
+            arm.run(WATCH_PERIOD)
+            operator.watch()
+
+    return SimpleNamespace(arm=arm, operator=operator, run=run, safety=arm.safety)
+
+
+def test_an_arm_whose_operator_is_gone_is_let_down_gently(operated):
+    operated.run(5.0, holding="anna")
+    assert operated.safety.state is State.ACTIVE and operated.operator.lease.holder == "anna"
+    operated.run(LEASE_TIME - 0.2)
+    assert operated.safety.state is State.ACTIVE
+    operated.run(0.5)
+    assert operated.safety.state is State.LETTING_DOWN
+    assert operated.safety.fault == (
+        FaultCode.CONTROL_LOST,
+        "anna held control and has not renewed it for 1 s",
+    )
+    operated.arm.assert_let_down()
+
+
+def test_an_arm_stays_carried_after_a_release_and_without_an_operator(operated):
+    operated.run(2.0)
+    operated.run(2.0, holding="anna")
+    operated.operator.lease.request(operated.arm.clock.monotonic(), "anna", "release")
+    operated.run(5.0)
+    assert operated.safety.state is State.ACTIVE and not operated.safety.fault
+
+
+def test_an_operator_who_leaves_during_the_descent_leaves_no_fault(operated):
+    operated.run(1.0, holding="anna")
+    operated.safety.disable(operated.arm.clock.monotonic())
+    operated.run(3.0)
+    operated.arm.assert_let_down()
+    assert operated.safety.state is State.DISABLED and not operated.safety.fault
+
+
+def test_requests_for_control_arrive_by_topic(operated, node):
+    publisher = node.create_publisher(KeyValue, "listener/control", 10)
+    end = time.monotonic() + 20.0
+    for kind, holder in (("hold", "anna"), ("release", "")):
+        while operated.operator.lease.holder != holder:
+            publisher.publish(KeyValue(key="anna", value=kind))
+            operated.operator.watch()
+            assert time.monotonic() < end
 
 
 def test_an_enable_that_timed_out_never_arms_the_arm_later(ask, monkeypatch):

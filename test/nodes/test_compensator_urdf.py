@@ -60,6 +60,7 @@ class Rig:
         self.commands: list[tuple[float, ...]] = []
         self.status = DiagnosticStatus()
         self.lag, self.names, self.pose = 0.0, ["gripper", *NAMES[::-1]], (float("nan"), *POSE[::-1])
+        self.applied = (0.0,) * 7  # Nm, in the order of `names`
         self.publisher = self.user.create_publisher(JointState, "joint_states", 1)
         self.user.create_subscription(
             Float64MultiArray,
@@ -89,7 +90,7 @@ class Rig:
 
     def _send(self) -> None:
         if self.is_feeding:
-            states = JointState(name=self.names, position=self.pose)
+            states = JointState(name=self.names, position=self.pose, effort=self.applied)
             states.header.stamp = to_time(time.time_ns() - round(self.lag * 1e9))
             self.publisher.publish(states)
 
@@ -155,7 +156,7 @@ def running() -> Iterator[Rig]:
 def rig(running: Rig) -> Rig:
     """The node of this module, fed with sound joint states, and carrying the arm."""
     running.lag, running.names, running.pose = 0.0, ["gripper", *NAMES[::-1]], (float("nan"), *POSE[::-1])
-    running.is_feeding = True
+    running.is_feeding, running.applied = True, (0.0,) * 7
     running.commands.clear()
     return carried(running)
 
@@ -173,6 +174,18 @@ def test_the_description_may_come_from_a_latched_topic(make_rig):
     rig = make_rig(**{"urdf.file": '""', "urdf.topic": "robot_description"})
     rig.user.create_publisher(String, "robot_description", LATCHED).publish(String(data=URDF.read_text()))
     carried(rig.start())
+
+
+def test_after_a_restart_the_torque_begins_from_what_the_joints_apply(make_rig):
+    rig = make_rig()
+    rig.applied = ()
+    rig.start()
+    rig.wait_until(lambda: "joint_states: effort must be 7 values" in rig.status.message)
+    assert rig.commands == [] and rig.status.level == DiagnosticStatus.ERROR
+    rig.applied = (0.0, *(float(n) for n in range(6, 0, -1)))
+    rig.wait_until(lambda: rig.commands)
+    assert rig.commands[0] == pytest.approx((1.0, 2.0, 3.0, 4.0, 5.0, 6.0))
+    carried(rig)
 
 
 def test_a_missing_description_is_an_error_at_the_start(make_rig, monkeypatch):
@@ -218,7 +231,7 @@ def test_joint_states_that_are_old_by_their_stamps_do_not_count(rig):
 
 
 def test_a_missing_joint_fades_the_torque(rig):
-    rig.names, rig.pose = rig.names[:-1], rig.pose[:-1]
+    rig.names, rig.pose, rig.applied = rig.names[:-1], rig.pose[:-1], ()
     rig.wait_until(rig.is_zero)
     rig.wait_until(lambda: "joint_states: name must be joint_a1" in rig.status.message)
 

@@ -17,7 +17,7 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import String
 
 from exo_gravity.nodes.ros import hot_path
-from exo_gravity.nodes.ros.hot_path import Drain, HotPath, LossCounter
+from exo_gravity.nodes.ros.hot_path import NEWEST, Drain, HotPath, LossCounter
 from exo_gravity.nodes.ros.run import keep_to_this_machine
 
 keep_to_this_machine()
@@ -46,16 +46,18 @@ class Pair:
     received: (text, sequence number, thread) of each message. error: raised by the callback if set.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, qos: QoSProfile = QUEUE, **options: float) -> None:
         self.topic = f"topic_{next(NUMBERS)}"
         self.received: list[tuple[str, int, str]] = []
         self.error: Exception | None = None
-        self.hot = HotPath(node, String, self.topic, self._on_message, QUEUE)
+        self.on_message: Callable[[], object] = lambda: None
+        self.hot = HotPath(node, String, self.topic, self._on_message, qos, **options)
         self.publisher = node.create_publisher(String, self.topic, 8)
         self.wait_until(lambda: self.publisher.get_subscription_count() == 1)
 
     def _on_message(self, message: String, info: dict[str, Any]) -> None:
         self.received.append((message.data, info["publication_sequence_number"], threading.current_thread().name))
+        self.on_message()
         if self.error:
             raise self.error
 
@@ -110,6 +112,24 @@ def test_a_poll_waits_for_a_message_until_its_timeout(pair):
     pair.hot.poll(20.0)
     assert pair.texts() == ["a"]
     sender.join()
+
+
+def test_a_poll_ends_although_messages_arrive_faster_than_it_takes_them(pair):
+    pair.on_message = lambda: [pair.send("more"), time.sleep(0.01)]
+    pair.send("a")
+    pair.wait_until(lambda: pair.received, pair.hot.poll)
+    assert pair.texts()[0] == "a" and len(pair.texts()) <= QUEUE.depth
+
+
+def test_of_a_flood_the_thread_takes_the_newest_message_once_in_each_pause(executor):
+    pair = Pair(executor.get_nodes()[0], NEWEST, pause=0.5)
+    pair.hot.start()
+    pair.send("a")
+    pair.wait_until(lambda: pair.received)
+    pair.send(*(str(number) for number in range(200)))
+    pair.wait_until(lambda: len(pair.received) == 2)
+    assert pair.texts() == ["a", "199"]
+    pair.hot.stop()
 
 
 def test_the_executor_does_not_take_the_messages(pair, executor):

@@ -7,13 +7,13 @@ import asyncio
 import pytest
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.safety.lease import LEASE_TIME
 from exo_gravity.panel.control import (
     BURST,
     FORGOTTEN,
     GONE,
     MAX_PAGES,
     REFILL,
-    RETRY,
     Action,
     Control,
     Page,
@@ -29,11 +29,11 @@ DOWN = [("let_down", "right"), ("let_down", "left")]
 class Panel(Control):
     """Two pages, of which the first holds control, and what the arms were asked for."""
 
-    def __init__(self, dead_man: bool = False) -> None:
+    def __init__(self) -> None:
         self.now = 100.0
         self.arms, self.files, self.notes = PlayedArms(), PlayedFiles(), list[str]()
         self.note_error: Exception | None = None
-        super().__init__(self.arms, self.files, self.write, lambda: self.now, dead_man)
+        super().__init__(self.arms, self.files, self.write, lambda: self.now)
         self.first, self.second = (self.opened(f"10.0.0.{n}") for n in (1, 2))
 
     def write(self, text: str) -> None:
@@ -50,24 +50,11 @@ class Panel(Control):
         secret = page if isinstance(page, str) else page.secret
         return asyncio.run(self.perform(body, secret, "10.0.0.9"))
 
-    def watch_after(self, seconds: float) -> list[tuple[str, ...]]:
-        """Let `watch` be called `seconds` later; return what it asked of the arms."""
-        self.now += seconds
-        self.arms.calls.clear()
-        asyncio.run(self.watch())
-        return list(self.arms.calls)
-
 
 @pytest.fixture
 def panel() -> Panel:
-    """A panel without dead man."""
+    """A panel with two pages."""
     return Panel()
-
-
-@pytest.fixture
-def guarded() -> Panel:
-    """A panel with dead man."""
-    return Panel(dead_man=True)
 
 
 # Requests
@@ -259,76 +246,54 @@ def test_the_number_of_pages_is_limited(panel):
     assert panel.opened(secret=pages[6].secret).secret != pages[6].secret
 
 
-# The operator's page is gone
+# The lease at the arms
 
 
-def test_the_arms_go_on_without_dead_man(panel):
-    assert panel.watch_after(GONE + 0.1) == []
+def test_each_confirmation_of_the_operators_page_and_nothing_else_renews_its_lease(panel):
+    panel.arms.leases.clear()
+    panel.confirm(panel.second)
+    panel.ask(panel.first, do="let_down")
+    panel.open(panel.second.secret, "10.0.0.2")
+    assert panel.arms.leases == []
+    panel.confirm(panel.first)
+    panel.open(panel.first.secret, "10.0.0.1")  # reloaded
+    assert panel.arms.leases == [("10.0.0.1 page 1", "hold")] * 2
 
 
-def test_with_dead_man_the_arms_are_let_down_once(guarded):
-    assert guarded.watch_after(GONE) == []
-    assert guarded.watch_after(0.1) == DOWN
-    assert guarded.notes == ["10.0.0.1 page 1 has been gone for 2 s: let down: done"]
-    assert guarded.watch_after(10.0) == []
+def test_an_arm_is_not_enabled_without_a_lease(panel):
+    panel.arms.leases.clear()
+    panel.ask(panel.first, do="enable", arm="right")
+    panel.ask(panel.second, do="enable", arm="right")
+    assert panel.arms.leases == [("10.0.0.1 page 1", "hold")]
 
 
-def test_with_dead_man_a_page_that_opens_meanwhile_does_not_keep_the_arms_up(guarded):
-    guarded.now += GONE + 0.05
-    guarded.opened()
-    assert guarded.watch_after(0.0) == DOWN
+def test_a_page_is_replaced_only_after_its_lease_has_ended():
+    assert GONE > LEASE_TIME + 0.1  # s between two looks of the bridge
 
 
-def test_with_dead_man_a_page_that_takes_control_replaces_the_one_that_is_gone(guarded):
-    guarded.now += GONE - 0.1
-    guarded.confirm(guarded.second)
-    assert guarded.ask(guarded.second, do="take").status == 200
-    assert guarded.watch_after(0.2) == []
+def test_taking_and_giving_up_control_reaches_the_arms(panel):
+    panel.arms.leases.clear()
+    panel.ask(panel.second, do="take")
+    panel.confirm(panel.first)
+    panel.confirm(panel.second)
+    panel.ask(panel.second, do="release")
+    panel.confirm(panel.second)
+    assert panel.arms.leases == [("10.0.0.2 page 2", kind) for kind in ("take", "hold", "release")]
 
 
-def test_with_dead_man_the_page_that_holds_control_is_not_forgotten(guarded):
-    guarded.first.connected = False
-    for _ in range(MAX_PAGES - 2):
-        guarded.opened()
-    assert guarded.open("", "10.0.0.1") is None
-    guarded.now += FORGOTTEN + 1.0
-    guarded.open("", "10.0.0.1")
-    assert guarded.is_gone()
+def test_an_arm_that_somebody_else_holds_is_only_let_down(panel):
+    panel.arms.others["left"] = "anna"
+    assert panel.elsewhere == "anna"
+    for body in ({"do": "enable"}, {"do": "clear_fault"}, {"do": "set", "values": {"support": 0.1}}):
+        assert panel.ask(panel.first, arm="left", **body).status == 403
+        assert panel.notes[-1].endswith("anna holds control of this arm")
+    assert panel.arms.calls == []
+    assert panel.ask(panel.first, do="enable", arm="right").status == 200
+    assert panel.ask(panel.first, do="let_down", arm="left").status == 200
 
 
-def test_with_dead_man_letting_down_is_repeated_until_it_works(guarded):
-    guarded.arms.problem = "can_bridge does not answer"
-    guarded.now += GONE + 0.1
-    assert [guarded.watch_after(RETRY / 2) for _ in range(4)] == [DOWN, [], DOWN, []]
-    guarded.arms.problem = ""
-    assert [guarded.watch_after(RETRY) for _ in range(2)] == [DOWN, []]
-
-
-def test_with_dead_man_an_arm_that_raises_is_noted_and_asked_again(guarded):
-    guarded.arms.errors["right"] = RuntimeError("the client is gone")
-    assert guarded.watch_after(GONE + 0.1) == DOWN
-    assert guarded.notes[-1].endswith("gone for 2 s: let down: right: RuntimeError: the client is gone")
-    del guarded.arms.errors["right"]
-    assert [guarded.watch_after(RETRY) for _ in range(2)] == [DOWN, []]
-
-
-def test_with_dead_man_a_log_that_raises_keeps_no_arm_up(guarded, caplog):
-    guarded.note_error = OSError("no space left")
-    assert guarded.watch_after(GONE + 0.1) == DOWN
-    assert "no space left" in caplog.text and "page 1 has been gone for 2 s: let down: done" in caplog.text
-    assert guarded.watch_after(10.0) == []
-
-
-def test_with_dead_man_a_watch_that_fails_says_why_lets_the_arms_down_and_goes_on(guarded, monkeypatch):
-    def fail() -> bool:
-        raise KeyError("page 1")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(guarded, "is_gone", fail)
-        assert guarded.watch_after(0.0) == DOWN
-        assert guarded.notes == ["the watch of the operator's page failed: KeyError: 'page 1': let down: done"]
-        assert guarded.watch_after(0.1) == []
-        assert guarded.watch_after(RETRY) == DOWN
-    guarded.confirm(guarded.first)
-    assert guarded.watch_after(RETRY) == []
-    assert guarded.watch_after(GONE) == DOWN
+def test_a_log_that_raises_keeps_no_arm_up(panel, caplog):
+    panel.note_error = OSError("no space left")
+    assert panel.ask(panel.first, do="let_down") == (200, "")
+    assert panel.arms.calls == DOWN
+    assert "no space left" in caplog.text and "page 1: let down: done" in caplog.text

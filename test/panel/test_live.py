@@ -130,10 +130,10 @@ def test_killing_the_panel_changes_nothing_about_the_arm(clinic):
 @pytest.mark.parametrize("clinic", [{"dead_man": True}], indirect=True, ids=["dead_man"])
 def test_with_dead_man_closing_the_page_lets_the_arm_down(clinic):
     wait_for_state(clinic.page, "active")
+    assert "127.0.0.1 page 1" in clinic.probe.diagnostic("can_bridge", "control held by")
     clinic.page.context.close()
-    clinic.probe.wait_until(lambda: clinic.probe.state == "disabled")
-    assert clinic.probe.fault == "none"
-    assert "127.0.0.1 page 1 has been gone for 2 s: let down: done" in clinic.notes()
+    clinic.probe.wait_until(lambda: clinic.probe.state == "fault")
+    assert clinic.probe.fault == "control_lost"
 
 
 def test_a_trial_is_followed_recorded_and_reported(tmp_path: Path):

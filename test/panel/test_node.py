@@ -51,9 +51,14 @@ class PanelProcess:
 
 
 class PlayedArm:
-    """`can_bridge` and `compensator` of the right arm. asked: what their services were asked for."""
+    """`can_bridge` and `compensator` of the right arm.
+
+    asked: what their services were asked for. leases: names and requests for control. holder: of control, as reported.
+    """
 
     def __init__(self) -> None:
+        self.leases: set[tuple[str, str]] = set()
+        self.holder = "nobody"
         self.asked: list[tuple[str, Any]] = []
         self.context = rclpy.Context()
         rclpy.init(context=self.context)
@@ -64,6 +69,7 @@ class PlayedArm:
         self.compensator.declare_parameter("support", 0.1)
         self.bridge.create_service(SetBool, "~/enable", self._on_enable)
         self.bridge.create_service(Trigger, "~/clear_fault", self._on_clear_fault)
+        self.bridge.create_subscription(KeyValue, "~/control", self._on_control, 10)
         self._states = self.bridge.create_publisher(JointState, "joint_states", 1)
         self._statuses = self.bridge.create_publisher(DiagnosticArray, "/diagnostics", 1)
         self.bridge.create_timer(0.05, self._publish)
@@ -89,8 +95,12 @@ class PlayedArm:
     def _publish(self) -> None:
         self._states.publish(JointState(name=NAMES, position=[0.1] * 4, velocity=[0.0] * 4, effort=[1.0] * 4))
         values = [KeyValue(key="state", value="disabled"), KeyValue(key="fault", value="none")]
+        values.append(KeyValue(key="control held by", value=self.holder))
         status = DiagnosticStatus(name="right/can_bridge", message="disabled", values=values)
         self._statuses.publish(DiagnosticArray(status=[status]))
+
+    def _on_control(self, message: KeyValue) -> None:
+        self.leases.add((message.key, message.value))
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self.asked.append(("enable", request.data))
@@ -105,8 +115,8 @@ class PlayedArm:
 
 @pytest.fixture
 def panel(tmp_path: Path) -> Iterator[PanelProcess]:
-    """A panel on loopback."""
-    panel = PanelProcess(tmp_path)
+    """A panel on loopback whose page holds the arms' control."""
+    panel = PanelProcess(tmp_path, dead_man=True)
     assert "on this machine only" in panel.wait_for_address()
     yield panel
     panel.close()
@@ -142,6 +152,17 @@ def test_the_page_shows_and_operates_an_arm_that_comes_and_goes(panel):
             message(connection, "setup", is_known)
             state = message(connection, "state", lambda state: state["arms"]["right"]["joints"])["arms"]["right"]
             assert [joint["position"] for joint in state["joints"]] == [0.1] * 4
+            name = f"panel {panel.process.pid}, 127.0.0.1 page 1"
+            while (name, "hold") not in arm.leases:
+                connection.send(json.dumps({"seen": message(connection, "state", lambda _: True)["number"]}))
+            arm.holder = "anna"
+            message(connection, "state", lambda state: state["control"]["elsewhere"] == "anna")
+            assert ask(do="enable", arm="right") == (403, "enable right: anna holds control of this arm")
+            assert ask(do="take") == (200, "")
+            arm.holder = name
+            message(connection, "state", lambda state: not state["control"]["elsewhere"])
+            while (name, "take") not in arm.leases:
+                message(connection, "state", lambda _: True)
             assert ask(do="enable", arm="right") == (200, "")
             assert ask(do="clear_fault", arm="right") == (409, "refused: there is no fault")
             assert ask(do="set", arm="right", values={"support": 0.2}) == (200, "")

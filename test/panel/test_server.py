@@ -208,19 +208,14 @@ def test_a_report_may_hold_styles_but_no_scripts(stage, tmp_path: Path):
     assert "default-src 'none'" in answer.headers["content-security-policy"]
 
 
-def test_with_dead_man_a_page_that_stops_confirming_lets_the_arms_down(stages):
-    now = [0.0]
-    stage = stages(dead_man=True, clock=lambda: now[0])
+def test_a_page_that_stops_confirming_no_longer_renews_its_lease(stages):
+    stage = stages()
     with live(stage) as connection:
         first(connection, "page")
-        holder = stage.control.holder
-        for _ in range(4):  # 4 s, confirmed in time
-            now[0] += 1.0
-            while holder.seen < now[0]:
-                connection.send(json.dumps({"seen": first(connection, "state")["number"]}))
-        first(connection, "state")
-        assert stage.arms.calls == []
-        now[0] += 2.1  # the connection stays open, but the page is frozen
-        while len(stage.arms.calls) < 2:
+        for _ in range(3):
+            connection.send(json.dumps({"seen": first(connection, "state")["number"]}))
+        while len(stage.arms.leases) < 4:  # as it opened, and three confirmations
             first(connection, "state")
-    assert stage.arms.calls == [("let_down", "right"), ("let_down", "left")]
+        for _ in range(3):
+            first(connection, "state")  # the connection stays open, but the page is frozen
+        assert stage.arms.leases == [("127.0.0.1 page 1", "hold")] * 4

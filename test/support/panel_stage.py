@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,10 @@ PERIOD = 0.1  # s between two states
 
 @dataclass
 class PlayedArms:
-    """`Arms` of the panel. calls: what was asked for, in order. problem: the answer to each call. errors: by arm."""
+    """`Arms` of the panel. calls: what was asked for, in order. problem: the answer to each call. errors: by arm.
+
+    leases: what pages asked for of control, in order. others: who else holds control, by arm.
+    """
 
     names: tuple[str, ...] = ("right", "left")
     states: dict[str, str] = field(default_factory=dict)
@@ -37,12 +40,20 @@ class PlayedArms:
     errors: dict[str, Exception] = field(default_factory=dict)
     changing: str = "none"  #: what a compensator reports of a change of load
     sinking: float = 0.0  #: rad/s at which the joints give way to gravity
+    leases: list[tuple[str, str]] = field(default_factory=list)
+    others: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.states = dict.fromkeys(self.names, "disabled")
         for name in self.names:
             given = {"side": name, "joint_names": [f"{name}_{leaf}" for leaf in LEAVES], "wearer.body_mass": 75.0}
             self.settings[name] = values_of(COMPENSATOR, {**given, "support": 0.05})
+
+    def lease(self, page: str, kind: str) -> None:
+        self.leases.append((page, kind))
+
+    def other_holder(self, arm: str, page: str) -> str:
+        return self.others.get(arm, "")
 
     async def let_down(self, arm: str) -> str:
         return self._change("let_down", arm, "letting down" if self.states[arm] == "active" else self.states[arm])
@@ -132,26 +143,17 @@ class PlayedFiles:
 
 
 class Stage:
-    """A running panel at `url`. notes: what it wrote to the log. reports: trial reports by name.
+    """A running panel at `url`. notes: what it wrote to the log. reports: trial reports by name."""
 
-    clock: of the panel's rules, in s; a test that sets it does not depend on how busy the machine is.
-    """
-
-    def __init__(
-        self,
-        host: str = "127.0.0.1",
-        token: str = "",
-        dead_man: bool = False,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, host: str = "127.0.0.1", token: str = "") -> None:
         self.arms = PlayedArms()
         self.files, self.notes = PlayedFiles(), list[str]()
         self.reports: dict[str, Path] = {}
-        self.control = Control(self.arms, self.files, self.notes.append, clock, dead_man)
+        self.control = Control(self.arms, self.files, self.notes.append, time.monotonic)
         self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}/"
-        self.server = PanelServer(host, self.port, token, self.control, self.reports.get, dict, clock)
-        self._own_setup = {"language": "en", "dead_man": dead_man, "trials": list(self.files.trials)}
+        self.server = PanelServer(host, self.port, token, self.control, self.reports.get, dict, time.monotonic)
+        self._own_setup = {"language": "en", "dead_man": False, "trials": list(self.files.trials)}
         self._bridge = values_of(CAN_BRIDGE, BUS, "can.options")
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._play, daemon=True)

@@ -69,6 +69,8 @@ class CommandFade:
         self._timeout = timeout
         self._effort: tuple[float, ...] = ()
         self._time = -math.inf  # s, of the last effort; then of the begin of the fade
+        self._held: tuple[float, ...] = ()  # what the joints applied before the first effort
+        self._start = -math.inf  # s, of the first effort
 
     @property
     def is_open(self) -> bool:
@@ -80,12 +82,18 @@ class CommandFade:
         """Why efforts are not passed on; '' if they are."""
         return "" if self.is_open else f"{self.reason}: {self.state.value}, call clear_fault"
 
-    def take(self, now: float, effort: Sequence[float]) -> bool:
-        """Return whether `effort` (n,) Nm, computed at `now` s, may be sent."""
+    def take(self, now: float, effort: Sequence[float], applied: Sequence[float]) -> tuple[float, ...] | None:
+        """Return the efforts to send for `effort` (n,) Nm, computed at `now` s; None if none may be sent.
+
+        applied: (n,) Nm that the joints apply; only that before the first effort matters.
+        """
         if not self.is_open:
-            return False
-        self.state, self._effort, self._time = Output.ACTIVE, tuple(effort), now
-        return True
+            return None
+        if self.state is Output.WAITING:
+            self.state, self._held, self._start = Output.ACTIVE, tuple(applied), now
+        left = max(0.0, 1.0 - (now - self._start) / RAMP_TIME)
+        self._effort, self._time = tuple([tau + left * h for tau, h in zip(effort, self._held, strict=True)]), now
+        return self._effort
 
     def withdraw(self, now: float, reason: str) -> None:
         """Begin the fade at `now` s, if efforts were sent."""

@@ -86,6 +86,8 @@ class FaultCode(str, Enum):
     COMMAND_WITHDRAWN = "command_withdrawn", "the compensator withdrew its efforts; its diagnostics give the reason"
     COMMAND_IMPOSSIBLE = "command_impossible", "an effort is NaN, beyond 40 Nm, misnamed or missing"
     SECOND_COMMANDER = "second_commander", "two publishers send effort commands"
+    # The operator
+    CONTROL_LOST = "control_lost", "who held control of the arm has not renewed it for 1 s"
     # The bus and the computer
     FOREIGN_COMMAND = "foreign_command", "another sender commands a motor of this arm"
     BUS_ERROR = "bus_error", "the CAN bus cannot be opened, or sending or receiving failed"
@@ -104,8 +106,16 @@ DOUBTFUL = frozenset(
     }
 )
 
-# After these the operator may carry on at once (`resume`): a computer or a bus was late, and nothing needs mending.
-NO_ONES = frozenset({FaultCode.COMMAND_STALE, FaultCode.COMMAND_WITHDRAWN, FaultCode.MOTOR_SILENT, FaultCode.BUS_ERROR})
+# After these the operator may carry on at once (`resume`): a computer, bus or network was late; nothing needs mending.
+NO_ONES = frozenset(
+    {
+        FaultCode.COMMAND_STALE,
+        FaultCode.COMMAND_WITHDRAWN,
+        FaultCode.MOTOR_SILENT,
+        FaultCode.BUS_ERROR,
+        FaultCode.CONTROL_LOST,
+    }
+)
 
 
 class Fault(NamedTuple):

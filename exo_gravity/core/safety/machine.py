@@ -113,13 +113,16 @@ class SafetyMachine:
         return not self.why_not_resumed and self.clear(now) and self.enable(now)
 
     def trip(self, code: FaultCode, reason: str, now: float) -> None:
-        """Latch a fault detected elsewhere (a broken bus, an impossible command). The first fault stays."""
+        """Latch a fault detected elsewhere (a broken bus, an impossible command). The first fault stays.
+
+        While the arm is off only a foreign command is a fault: it may have switched a motor on.
+        """
         if code in DOUBTFUL:
             self._is_trusted = False
-        if self.state in (State.DISABLED, State.FAULT):
+        if self.state is State.FAULT or (self.state is State.DISABLED and code is not FaultCode.FOREIGN_COMMAND):
             return
         self.fault = self.fault or Fault(code, reason)
-        if self.state is State.CHECKING:
+        if self.state in (State.CHECKING, State.DISABLED):
             self._enter(State.FAULT, now)
         elif self.state is not State.LETTING_DOWN:
             self._let_down(now)

@@ -75,7 +75,8 @@ class EffortExchange:
         message.position, message.velocity, message.effort, *_ = zip(*joints, strict=True)
         message.header.stamp = self._clock.now().to_msg()
         self._measured = min(joint.time for joint in joints)
-        self._published[to_nanoseconds(message.header.stamp)] = self._measured
+        # Of states with one stamp, by a clock that stands still, efforts answer the first: they grow old.
+        self._published.setdefault(to_nanoseconds(message.header.stamp), self._measured)
         if len(self._published) > REMEMBERED:
             self._published.popitem(last=False)
         self._publisher.publish(message)

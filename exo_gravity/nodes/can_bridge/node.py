@@ -31,7 +31,14 @@ from exo_gravity.hardware.ownership.handover import ArmOnBus
 from exo_gravity.hardware.ownership.owned_bus import OwnedBus, recover
 from exo_gravity.hardware.scheduling import request_real_time
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
-from exo_gravity.nodes.can_bridge.operation import CALL_TIMEOUT, BridgeReport, BridgeServices, log_limits
+from exo_gravity.nodes.can_bridge.operation import (
+    CALL_TIMEOUT,
+    BridgeReport,
+    BridgeServices,
+    Operator,
+    log_limits,
+    refuse_simulated_time,
+)
 from exo_gravity.nodes.ros.parameters import bus_of, declare
 from exo_gravity.nodes.ros.run import keep_to_this_machine, run
 
@@ -52,6 +59,7 @@ class CanBridge(LifecycleNode):
     def __init__(self) -> None:
         super().__init__("can_bridge", automatically_declare_parameters_from_overrides=True)
         values, self._arm = _declared(self)
+        refuse_simulated_time(self, self._arm.address[0])
         motors, limits = self._arm.motors, self._arm.limits
         traffic = traffic_of(values, self._arm.address[2])
         check_bridge(values["rate"], motors, limits, traffic.status_rate)
@@ -62,7 +70,9 @@ class CanBridge(LifecycleNode):
         self._bus: MotorBus | None = None  # while inactive
         self._error = ""  # why the last transition failed
         self._exchange = EffortExchange(self, limits, lambda: self.loop)
-        self._report = BridgeReport(self, limits.joint_names, traffic, values["rate"], [m.rated_effort for m in motors])
+        lease = Operator(self, lambda: self.loop).lease
+        rated = [motor.rated_effort for motor in motors]
+        self._report = BridgeReport(self, limits.joint_names, traffic, values["rate"], rated, lease)
         BridgeServices(self, lambda: self.loop, motors)
         self.create_timer(REPORT_PERIOD, self._on_report)
         log_limits(self, limits, traffic, values["rate"])

@@ -1,6 +1,6 @@
 """How `can_bridge` is operated: its services enable, clear_fault, resume and set_zero; its limits; /diagnostics.
 
-Each service runs on the control thread between two cycles.
+Each service runs on the control thread between two cycles. Who holds control is a lease (core/safety/lease.py).
 """
 
 from __future__ import annotations
@@ -8,29 +8,62 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from concurrent import futures
-from typing import TypeVar
+from typing import Any, TypeVar
 
+from diagnostic_msgs.msg import KeyValue
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
-from exo_gravity.core.errors import BusError
+from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.bus_load import Traffic
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import Rate
 from exo_gravity.core.safety.delivery import MotorLoad
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.safety.lease import Lease
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, MAX_TEMPERATURE, Limits
+from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, milliseconds, row
+from exo_gravity.nodes.ros.hot_path import HotPath
+from exo_gravity.nodes.ros.messages import ERROR, HELD_BY, NOBODY, OK, WARN, Diagnostics, milliseconds, row
 from exo_gravity.nodes.ros.run import open_to_others
 
 RECENT = 2.0  # s for which a limit that acted is still shown
 SLOW = 0.9  # share of the set rate below which the loop is slow
 ZERO_TOLERANCE = 0.02  # rad that a motor may report after set_zero
 ZERO_TIMEOUT = 3.0  # s; motors are silent for up to 1.5 s while they write their memory
+SIMULATED = ("udp_multicast", "virtual")  # interfaces of python-can that no motor listens to
+REQUESTS = 32  # of control, that wait for the next look
+WATCH_PERIOD = 0.1  # s between two looks at them
 CALL_TIMEOUT = 2.0  # s that a service waits for the control thread
 
 Response = TypeVar("Response", SetBool.Response, Trigger.Response)
+
+
+def refuse_simulated_time(node: Node, interface: str) -> None:
+    """Refuse `use_sim_time`, now and live, unless the python-can `interface` leads to a simulated device.
+
+    Efforts are as old as the joint states whose stamp they carry: a clock that stops would hide a dead compensator.
+    Raises ParameterError.
+    """
+    if interface in SIMULATED:
+        return
+    expected = (
+        f"false with a real bus (can.interface {interface}): it stamps the joint states with a clock that can stop"
+    )
+
+    def check(changes: list[Parameter]) -> SetParametersResult:
+        is_asked = any(change.name == "use_sim_time" and change.value for change in changes)
+        return SetParametersResult(
+            successful=not is_asked, reason=f"use_sim_time must be {expected}" if is_asked else ""
+        )
+
+    if node.get_parameter("use_sim_time").value:
+        raise ParameterError("use_sim_time", True, expected)
+    node.add_on_set_parameters_callback(check)
 
 
 class BridgeServices:
@@ -127,6 +160,39 @@ class BridgeServices:
         return response
 
 
+class Operator:
+    """Who holds control of the arm, by the topic `~/control`: a KeyValue of a name, and hold, take or release.
+
+    get_loop returns the present control loop, None while the node is inactive. lease: the holder. It is renewed several
+    times a second. Messages wait until `watch`, ten times a second: a flood of them costs nothing, and at most lets the
+    arm down.
+    """
+
+    def __init__(self, node: Node, get_loop: Callable[[], ControlLoop | None], clock: Clock = COMPUTER_CLOCK) -> None:
+        self.lease = Lease()
+        self._get_loop = get_loop
+        self._now = clock.monotonic
+        self._log = node.get_logger()
+        self._news = ""  # for the log, which a flood must not fill
+        self._requests = HotPath(node, KeyValue, "~/control", self._on_request, QoSProfile(depth=REQUESTS))
+        node.create_timer(WATCH_PERIOD, self.watch)
+
+    def watch(self) -> None:
+        """Do what was asked for, and let the arm down if its operator is gone."""
+        self._requests.poll()
+        if self._news:
+            self._log.info(self._news)
+            self._news = ""
+        reason, loop = self.lease.lost(self._now()), self._get_loop()
+        if reason:
+            self._log.warning(reason)
+        if reason and loop is not None and loop.safety.state is not State.LETTING_DOWN:
+            loop.trip(FaultCode.CONTROL_LOST, reason)
+
+    def _on_request(self, message: KeyValue, _info: dict[str, Any]) -> None:
+        self._news = self.lease.request(self._now(), message.key, message.value) or self._news
+
+
 def log_limits(node: Node, limits: Limits, traffic: Traffic, rate: float) -> None:
     """Log the limits, the bus load at `rate` (Hz), and whether other hosts can command the arm."""
     log = node.get_logger()
@@ -149,12 +215,15 @@ def log_limits(node: Node, limits: Limits, traffic: Traffic, rate: float) -> Non
 class BridgeReport:
     """The status of one bridge.
 
-    rate: Hz, as set. rated: (4,) Nm, the motors' rated torque at the joints.
+    rate: Hz, as set. rated: (4,) Nm, the motors' rated torque at the joints. lease: of control.
     """
 
-    def __init__(self, node: Node, names: Sequence[str], traffic: Traffic, rate: float, rated: Sequence[float]) -> None:
+    def __init__(
+        self, node: Node, names: Sequence[str], traffic: Traffic, rate: float, rated: Sequence[float], lease: Lease
+    ) -> None:
         self._diagnostics = Diagnostics(node)
         self._names = names
+        self._lease = lease
         self._traffic = traffic
         self._rate = Rate()
         self._slow = SLOW * rate  # Hz
@@ -166,8 +235,9 @@ class BridgeReport:
         refusal: why the last message was refused. answered: monotonic s, when the joint states were measured that the
         newest efforts answer.
         """
+        operator = {HELD_BY: self._lease.holder or NOBODY}
         if loop is None:
-            self._diagnostics.report(WARN, "inactive")
+            self._diagnostics.report(WARN, "inactive", operator)
             return
         now, safety = time.monotonic(), loop.safety
         acting = ", ".join(sorted(limit for limit, acted in tuple(safety.acted.items()) if acted > now - RECENT))
@@ -176,6 +246,7 @@ class BridgeReport:
         values: dict[str, object] = {
             "state": safety.state.value,
             "fault": safety.fault.code if safety.fault else "none",
+            **operator,
             "limits acting": acting or "none",
             "rate (Hz)": f"{rate:.1f}",
             "bus load (%)": f"{100.0 * self._traffic.load(rate).share:.0f}" if rate else "0",

@@ -37,6 +37,7 @@ from exo_gravity.nodes.ros.messages import row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.sole_publisher import SolePublisher
 
+ASSIST_PAUSE = 0.002  # s
 DESCRIPTION_TIMEOUT = 10.0  # s in which robot_description must arrive
 
 
@@ -147,10 +148,13 @@ def _of_robot(robot: ArmModel) -> str:
 
 
 class AssistEfforts(HotPath):
-    """Passes each message on the topic `assist_efforts` to `assist` on a thread, holding `lock`."""
+    """Passes the newest message on the topic `assist_efforts` to `assist` on a thread, holding `lock`.
+
+    It looks 500 times a second at most, so that an outer loop that floods the topic does not slow the answers down.
+    """
 
     def __init__(self, node: Node, assist: AssistInput, lock: threading.Lock) -> None:
-        super().__init__(node, JointState, "assist_efforts", self._on_efforts)
+        super().__init__(node, JointState, "assist_efforts", self._on_efforts, pause=ASSIST_PAUSE)
         self._clock = node.get_clock()
         self._assist = assist
         self._lock = lock

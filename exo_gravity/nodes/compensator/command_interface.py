@@ -74,6 +74,7 @@ class MultiArrayInterface:
         self._publisher = node.create_publisher(Float64MultiArray, values["multi_array.topic"], 1)
         self._message = Float64MultiArray()
         self._is_late = False  # the last joint state, by its stamp
+        self._applied: Sequence[float] = ()  # Nm, what the joints applied before the first effort
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="fade", daemon=True)
         node.create_service(Trigger, "~/clear_fault", self._clear)
@@ -92,12 +93,15 @@ class MultiArrayInterface:
         """Return positions and velocities of these joints, which may be some of many.
 
         Raises ParameterError if one is missing, and if the message is old by its stamp: a driver that lost its hardware
-        may go on publishing.
+        may go on publishing. Raises it, too, while nothing was sent and the message lacks the joints' efforts: the
+        controller may hold a torque, from which the next one must begin.
         """
         age = (self._clock.now().nanoseconds - to_nanoseconds(message.header.stamp)) * 1e-9
         self._is_late = not -MAX_LEAD <= age <= self._timeout
         if self._is_late:
             raise ParameterError("age by its stamp", round(age, 3), f"from {-MAX_LEAD:g} to {self._timeout:g} s")
+        if self._fade.state is Output.WAITING:
+            self._applied = by_name(message, "effort", self._names, exact=False)
         return by_name(message, "position", self._names, exact=False), velocity_of(message, self._names, exact=False)
 
     def send(self, now: float, message: JointState, answer: Answer) -> None:
@@ -107,8 +111,8 @@ class MultiArrayInterface:
                 return  # one late message is not yet a reason to let the arm down
             if answer.effort is None:
                 self._fade.withdraw(now, answer.reason)
-            elif self._fade.take(now, answer.effort):
-                self._publish(answer.effort)
+            elif effort := self._fade.take(now, answer.effort, self._applied):
+                self._publish(effort)
 
     def start(self) -> None:
         """Start the thread."""

@@ -11,13 +11,14 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import math
+import os
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, KeyValue
 from geometry_msgs.msg import Vector3Stamped
 from rcl_interfaces.msg import ParameterEvent
 from rcl_interfaces.srv import SetParametersAtomically
@@ -30,7 +31,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.nodes.ros.hot_path import HotPath
-from exo_gravity.nodes.ros.messages import OK, Diagnostics
+from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.panel.control import Control
@@ -55,6 +56,7 @@ class ArmClient:
         self.clear_fault = node.create_client(Trigger, f"/{name}/{BRIDGE}/clear_fault")
         self.resume = node.create_client(Trigger, f"/{name}/{BRIDGE}/resume")
         self.set = parameter_client(node, f"/{name}/{COMPENSATOR}")
+        self.control = node.create_publisher(KeyValue, f"/{name}/{BRIDGE}/control", 10)
         self._states = HotPath(node, JointState, f"/{name}/joint_states", self._on_states)
 
     def state(self, now: float) -> dict[str, Any]:
@@ -70,13 +72,15 @@ class ArmClient:
 class Arms:
     """All arms, by name: 'right', 'left', or the namespace that a parameter file gives them; and all other nodes.
 
-    An arm stays in the list when its nodes end: it shows that they do not answer.
+    An arm stays in the list when its nodes end: it shows that they do not answer. has_lease: whether a page that holds
+    control holds it at the arms too.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, has_lease: bool) -> None:
         self.clients: dict[str, ArmClient] = {}
         self.known: dict[str, dict[str, Any]] = {}  #: the newest parameters of each node by full name, also if it ended
         self._node = node
+        self._lessee = f"panel {os.getpid()}, " if has_lease else ""
         self._parameters: dict[str, NodeParameters] = {}
         self._wearers: dict[str, Client] = {}  # the virtual ones, by their simulator's name
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
@@ -135,7 +139,18 @@ class Arms:
             problems += [f"{name}: {problem}"] if problem else []
         return "; ".join(problems)
 
-    # For the pages (`Control`); called on the web server's thread; each returns '' or why it failed
+    # For the pages (`Control`); called on the web server's thread; each coroutine returns '' or why it failed
+
+    def lease(self, page: str, kind: str) -> None:
+        """Hold, take or release control of all arms for a page, if the panel has a lease."""
+        if self._lessee:
+            for client in tuple(self.clients.values()):
+                client.control.publish(KeyValue(key=self._lessee + page, value=kind))
+
+    def other_holder(self, arm: str, page: str) -> str:
+        """Return who holds control of the arm, by its bridge's report, '' if this page or nobody does."""
+        holder = (self.clients[arm].bridge.at(time.monotonic()) or {}).get(HELD_BY, NOBODY)
+        return "" if holder in (NOBODY, self._lessee + page) else str(holder)
 
     async def let_down(self, arm: str) -> str:
         """Let one arm down. The request is sent even where the service seems to be absent."""
@@ -219,7 +234,7 @@ class Panel(Node):
         self.failure: Exception | None = None  # ends the node, see run()
         self._diagnostics = Diagnostics(self)
         self._noted = 0
-        self._arms = Arms(self)
+        self._arms = Arms(self, values["dead_man"])
         self._tilt = Newest()
         self._tilts = HotPath(self, Vector3Stamped, TILT, self._on_tilt)
         scripts = scripts_folder(values["trials"])
@@ -227,7 +242,7 @@ class Panel(Node):
         own = {name: values[name] for name in ("language", "dead_man")}
         self._own_setup = {**own, "trials": list(self._recordings.trials)}
         self._shown: Any = None  # the nodes' parameters that the pages have
-        control = Control(self._arms, self._recordings, self._note, time.monotonic, values["dead_man"])
+        control = Control(self._arms, self._recordings, self._note, time.monotonic)
         try:
             from exo_gravity.panel.server import PanelServer
         except ModuleNotFoundError as error:

@@ -136,16 +136,19 @@ function showConnection() {
 
 function showControl(operates) {
   const holder = state.control;
-  const text = !holder ? t("control_none") : operates ? t("control_yours", holder.page) : holder.gone ? t("control_gone", holder.page, holder.address) : t("control_other", holder.page, holder.address, link.number);
+  const elsewhere = operates && holder.elsewhere;
+  const yours = elsewhere ? t("control_elsewhere", elsewhere, link.number) : t("control_yours", link.number);
+  const text = !holder ? t("control_none") : operates ? yours : holder.gone ? t("control_gone", holder.page, holder.address) : t("control_other", holder.page, holder.address, link.number);
   write(byId("control-text"), text);
-  byId("take").hidden = operates || !link.alive;
+  byId("take").hidden = (operates && !(elsewhere && setup.dead_man)) || !link.alive;
   byId("release").hidden = !operates;
 }
 
 byId("take").addEventListener("click", async () => {
   const holder = state?.control;
   const free = !holder || holder.gone;
-  if (free || (await ask(t("take"), t("take_ask", holder.page, holder.address), t("take")))) send({ do: "take" });
+  const question = holder?.page === link.number ? t("take_elsewhere", holder.elsewhere) : t("take_ask", holder?.page, holder?.address);
+  if (free || (await ask(t("take"), question, t("take")))) send({ do: "take" });
 });
 byId("release").addEventListener("click", () => send({ do: "release" }));
 

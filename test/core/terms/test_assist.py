@@ -153,14 +153,38 @@ def test_a_sender_whose_messages_arrive_late_is_refused():
     assert "late by their stamp" in loop.input.reason
 
 
-def test_a_flood_is_refused():
-    loop = assisting()
-    for _ in range(3000):
-        loop.now += 1e-4
-        loop.send(stamp=loop.now)
-        loop.torques.append(loop.input.torque(loop.now))
-    assert loop.torques[-1] == (0.0,) * 4
-    assert "more often than 1000 times a second" in loop.input.reason
+@pytest.mark.parametrize("goes_on", [True, False], ids=["the arm is carried on", "the arm is let down meanwhile"])
+@pytest.mark.parametrize("pause", [0.06, 0.3, 120.0])
+def test_the_torque_of_an_outer_loop_that_died_never_returns(goes_on, pause):
+    loop = OuterLoop()
+    loop.input.assist, loop.efforts = Assist((10.0,) * 4), (5.0, 0.0, 0.0, 0.0)
+    assert loop.run(2.0) == pytest.approx(loop.efforts)
+    loop.sending = False
+    if goes_on:
+        loop.run(min(pause, 1.0))
+    else:
+        loop.now += pause
+    loop.torques.clear()
+    loop.input.assist = Assist((1.0,) * 4)
+    loop.efforts, loop.sending, loop.publisher = (0.0,) * 4, True, 2
+    loop.run(3.0)
+    torque = np.array(loop.torques)[:, 0]
+    if pause > 0.2:
+        assert not np.any(torque)
+    assert np.all(np.diff(torque) <= 0.0) and torque[-1] == 0.0  # what is left of it fades and nothing else comes
+    assert np.abs(np.diff(torque)).max() <= 5.0 * 1.001 * CYCLE / FADE
+
+
+def test_a_lower_bound_holds_for_the_efforts_that_are_followed_already():
+    loop = OuterLoop()
+    loop.input.assist, loop.efforts = Assist((10.0,) * 4), (5.0, -5.0, 0.0, 0.0)
+    loop.run(2.0)
+    loop.input.assist = Assist((1.0,) * 4)
+    loop.sending = False
+    loop.run(0.04)  # the newest message is still valid
+    assert loop.torques[-1] == pytest.approx((5.0 - 0.04 * MAX_RATE, -5.0 + 0.04 * MAX_RATE, 0.0, 0.0))
+    loop.sending = True
+    assert loop.run(1.0) == (1.0, -1.0, 0.0, 0.0)
 
 
 def test_slower_than_10_hz_the_torque_fades_between_messages():

@@ -9,6 +9,9 @@ Messages may come at 10 to 500 Hz. An effort is valid for 1.5 observed periods a
 least, so that a single late message costs nothing. Then, or at once when a message is wrong, the torque fades in FADE.
 So it is zero 100 ms after the first missing message was due: at 500 Hz 100 ms after the last one, at 10 Hz 200 ms. Only
 the compensator's `max_effort_rate` can make that longer, for an effort above 2.5 Nm at its default.
+
+The only memory is the torque that is applied. It moves to what the newest message asks for, never past it: whoever
+sends next begins from there, from zero once it has faded, and after a pause of the compensator.
 """
 
 from __future__ import annotations
@@ -17,13 +20,14 @@ import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
+from exo_gravity.core.compensation.limiter import BREAK
 from exo_gravity.core.compensation.terms.springs import TermParameters, clamp
 from exo_gravity.core.model.gravity import NO_TORQUE, Torque
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import owned
 from exo_gravity.core.safety.limits import MAX_COMMAND
 
-SLOWEST, FASTEST = 0.1, 0.001  # s between two messages; faster ones are a flood
+SLOWEST = 0.1  # s between two messages
 MIN_VALID = 0.05  # s from its stamp for which an effort is valid at any rate
 PERIODS = 1.5  # observed periods for which it is valid
 PERIOD_SMOOTHING = 0.2  # share of a new interval in the observed period
@@ -53,9 +57,9 @@ class AssistInput:
         self.assist = assist or Assist()
         self.reason = "no assist_efforts yet"
         self._names = list(names)
-        self._target = NO_TORQUE  # the newest efforts, clamped
-        self._held = list(NO_TORQUE)  # follows the target at the permitted rate
-        self._gain = 0.0
+        self._target = NO_TORQUE  # the newest efforts
+        self._torque = NO_TORQUE  # as applied
+        self._ramp = 0.0  # share of the target that may be applied
         self._period = SLOWEST
         self._stamp = self._arrival = -math.inf
         self._refused = -math.inf
@@ -74,7 +78,7 @@ class AssistInput:
     @property
     def idle(self) -> bool:
         """Whether `torque` returns nothing, and will until the next message."""
-        return self._gain <= 0.0 and not self.assist.on
+        return self._ramp <= 0.0 and not self.assist.on
 
     @property
     def report(self) -> str:
@@ -103,8 +107,7 @@ class AssistInput:
             self._refused, self.reason = now, problem
             return
         self._stamp = stamp
-        order = efforts if list(names) == self._names else [efforts[names.index(name)] for name in self._names]
-        self._target = tuple(clamp(float(tau), most) for tau, most in zip(order, self.assist.max_effort, strict=True))
+        self._target = tuple(float(efforts[names.index(name)]) for name in self._names)
 
     def _problem(self, now: float, names: Sequence[str], efforts: Sequence[float], stamp: float, second: bool) -> str:
         """Return what is wrong with a message, without a measured value; '' if nothing is."""
@@ -114,25 +117,26 @@ class AssistInput:
             return f"assist_efforts must be numbers within {MAX_COMMAND:g} Nm"
         if second:
             return "more than one publisher of assist_efforts"
-        if self._period < FASTEST:
-            return f"assist_efforts come more often than {1 / FASTEST:g} times a second"
         if not now - self.valid <= stamp <= now + MAX_LEAD:
             return "assist_efforts are late by their stamp, or their clock differs"
         return ""
 
     def torque(self, now: float) -> Torque:
         """Return the torque (4,) in Nm at `now`; call it in every cycle."""
-        dt = min(max(0.0, now - self._last), FADE)
-        self._last = now
-        sound = self._is_sound(now)
-        self._gain = min(1.0, self._gain + dt / RAMP) if sound else max(0.0, self._gain - dt / FADE)
-        if self._gain <= 0.0:
-            return NO_TORQUE
-        step = MAX_RATE * dt
-        for joint, (last, target) in enumerate(zip(self._held, self._target, strict=True)):
-            self._held[joint] = max(last - step, min(last + step, target))
-        gain = self._gain
-        return tuple([gain * tau for tau in self._held])
+        dt = now - self._last
+        if not 0.0 <= dt <= BREAK:
+            self._ramp, self._torque, dt = 0.0, NO_TORQUE, 0.0
+        self._last, before = now, self._ramp
+        if self._is_sound(now):
+            self._ramp = ramp = min(1.0, before + dt / RAMP)
+            step = MAX_RATE * min(dt, FADE)
+            columns = zip(self._target, self._torque, self.assist.max_effort, strict=True)
+            self._torque = tuple([last + clamp(ramp * clamp(tau, most) - last, step) for tau, last, most in columns])
+        else:
+            self._ramp = max(0.0, before - dt / FADE)
+            left = self._ramp / before if before else 0.0
+            self._torque = tuple([left * last for last in self._torque])
+        return self._torque
 
     def _is_sound(self, now: float) -> bool:
         """Return whether the newest efforts are to be followed at `now`; note why not."""

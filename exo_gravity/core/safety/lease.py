@@ -1,0 +1,54 @@
+"""Who holds control of one arm: a lease with a name, which its holder renews and nobody else can.
+
+    hold     takes the lease if it is free, and renews it
+    take     takes it from its holder
+    release  gives it back: the arm stays as it is
+
+A lease that is not renewed for LEASE_TIME has run out: its holder is gone, and the arm must not be carried without him.
+Without a lease nobody is waited for.
+
+LEASE_TIME is chosen for a holder on Wi-Fi that sends three times a second over TCP. A station that roams or scans is
+silent for 0.1 to 0.5 s. TCP sends again 0.2 and 0.6 s after a loss, so after a gap of up to 0.6 s the next message is
+at most 0.9 s behind the last one. A longer gap lets the arm down.
+"""
+
+from __future__ import annotations
+
+LEASE_TIME = 1.0  # s
+LONGEST_NAME = 64
+
+
+class Lease:
+    """The lease of one arm. Every time is in s on the caller's monotonic clock. holder: a name, '' for nobody."""
+
+    def __init__(self) -> None:
+        self.holder = ""
+        self._renewed = 0.0
+        self._refused = ""  # the last one, which repeats its request
+
+    def request(self, now: float, name: str, kind: str) -> str:
+        """Do what `name` asks for: `kind` is hold, take or release. Return a sentence for the log if it is news."""
+        if not (name.isprintable() and 0 < len(name) <= LONGEST_NAME) or kind not in ("hold", "take", "release"):
+            return self._refusal("?", f"control: needs a name of 1 to {LONGEST_NAME} letters and hold, take or release")
+        if kind == "release":
+            if name != self.holder:
+                return ""
+            self.holder = ""
+            return f"{name} has released control"
+        before = self.holder
+        if before == name or not before or kind == "take":
+            self.holder, self._renewed, self._refused = name, now, ""
+            taken = f"{name} has taken control from {before}" if before else f"{name} holds control"
+            return "" if before == name else taken
+        return self._refusal(name, f"{name} may not hold control: {before} does")
+
+    def lost(self, now: float) -> str:
+        """Return who has lost control and why if the lease has run out, after which it is free; else ''."""
+        if not self.holder or now - self._renewed <= LEASE_TIME:
+            return ""
+        reason, self.holder = f"{self.holder} held control and has not renewed it for {LEASE_TIME:g} s", ""
+        return reason
+
+    def _refusal(self, name: str, sentence: str) -> str:
+        is_news, self._refused = name != self._refused, name
+        return sentence if is_news else ""
