@@ -59,7 +59,7 @@ class SafetyMachine:
         self._since = 0.0
         self._now = -math.inf
         self._sent = OFF  # last sent to the motors
-        self._descent = ArmDescent(0.0, NOTHING, NOTHING, self._peaks.effort)
+        self._descent = ArmDescent(0.0, NOTHING, NOTHING, NOTHING)
         self._rest = RestTracker()
         self._before: Sequence[JointSample] = (UNKNOWN,) * 4
         self._silent: Sequence[bool] = (True,) * 4
@@ -249,7 +249,7 @@ class SafetyMachine:
 
     def _let_down(self, now: float) -> None:
         applied = self._delivery.applied(self._sent, self._silent)
-        self._descent = ArmDescent(now, *applied, self._peaks.effort)
+        self._descent = ArmDescent(now, *applied, self.limits.max_effort)
         self._enter(State.LETTING_DOWN, now)
 
     def _enter(self, state: State, now: float) -> None:
