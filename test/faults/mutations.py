@@ -74,8 +74,8 @@ MUTATIONS = (
         (
             Edit(
                 DESCENT,
-                "self.effort = max(-brake, min(brake, effort))",
-                "self.effort = 0.0",
+                "self.effort = self._carried = effort",
+                "self.effort = self._carried = 0.0",
             ),
         ),
     ),

@@ -3,12 +3,19 @@
 Each joint has a torque s, which starts as the last one applied, and a damping k, which the motor itself applies. With v
 the joint's velocity and V the permitted speed:
 
-    |v| <= V:  s fades to zero within FADE_TIME; once s is zero, k fades to zero, too
-    |v| >  V:  s grows against the motion, s' = -SPEED_GAIN (v - sign(v) V), at most to the motor's peak torque; k grows
+    |v| <= V:             s fades to zero within FADE_TIME; once s is zero, k fades to zero, too
+    s v > 0:              the motor drives the joint, or the wearer lifts it: s goes to zero, and never beyond
+    |v| > V, sinking:     s grows against the motion, and k grows
+    |v| > V, otherwise:   k grows
 
-So s lowers a heavy link, and k a light one, at V and a little more. No model of the arm is needed: masses, tilt and
-friction may be anything. V halves whenever the joint swings back, so that a frictionless arm comes to rest, and
-recovers slowly. A joint is down when s and k are zero: it hangs, or lies on something.
+A joint sinks when it moves against the torque that it carried when the descent began: that torque shows which way
+gravity pulls. So the brake only takes energy out of the arm, and a wearer who lifts it meets damping alone. The brake
+returns at once to what the joint carried, which balanced gravity. Beyond that it grows slowly: gravity changes slowly,
+a wearer who pushes does not. It never exceeds `max_effort`, or what the joint carried if that was more.
+
+No model of the arm is needed: masses, tilt and friction may be anything. Where gravity comes to pull the other way, k
+alone holds: an arm of 3.7 Nm then sinks at 0.74 rad/s. V halves whenever the joint swings back, so that a frictionless
+arm comes to rest, and recovers slowly. A joint is down when s and k are zero: it hangs, or lies on something.
 
 A motor that cannot be reached keeps applying its torque, so s and k of a silent joint are held. When it replies again,
 s continues from the torque that it reports.
@@ -33,13 +40,15 @@ DESCENT_SPEED = 0.35  # rad/s; a horizontal arm is down within 10 s
 MIN_SPEED = 0.04  # rad/s; two codes of the velocity
 SPEED_RECOVERY = 5.0  # s, time constant
 SWING_SPEED = 0.05  # rad/s; slower motion has no direction
-SPEED_GAIN = 20.0  # Nm/rad; with full damping, inertias of 0.005 to 1 kg m^2 do not oscillate
+DRIVEN_SPEED = 0.1  # rad/s; a torque must not drive its joint faster. Four codes of the velocity
+# At 100 Hz and with a velocity filtered over 20 ms, twice these gains make an arm of 75 kg oscillate.
+BRAKE_GAIN = 40.0  # Nm/rad, up to what the joint carried
+RELEASE_GAIN = 60.0  # Nm/rad
+BRAKE_GROWTH = 3.0  # Nm/s beyond it: gravity of an arm of 75 kg changes no faster while it sinks
 MIN_FADE_RATE = 0.5  # Nm/s
 DAMPING = 5.0  # Nm s/rad, the range of kd on the wire: with less the joint swings longer
 FADE_TIME = 2.0  # s from full torque to none: the wearer has time to take over his arm
-DAMPING_RISE = 0.2  # s; damping that starts at once would be a torque step
-DAMPING_GROWTH = 0.05  # s in which damping doubles at twice the permitted speed
-DAMPING_GAIN = 5.0  # Nm/rad; lets zero damping grow
+DAMPING_RISE = 0.2  # s to DAMPING; damping that starts at once would be a torque step
 DAMPING_FADE = 0.4  # s, time constant
 MIN_DAMPING = 0.01  # Nm s/rad; smaller values become zero
 
@@ -48,13 +57,13 @@ class JointDescent:
     """One joint on its way down: `effort` in Nm and `damping` in Nm s/rad are to be applied now.
 
     effort, damping: what the motor applies when the descent starts; the damping first rises to DAMPING, within
-    DAMPING_RISE. brake: Nm, the largest torque against the motion.
+    DAMPING_RISE. max_effort: Nm, which the brake exceeds only where `effort` does.
     """
 
-    def __init__(self, effort: float, damping: float, brake: float) -> None:
-        self.effort = max(-brake, min(brake, effort))
+    def __init__(self, effort: float, damping: float, max_effort: float) -> None:
+        self.effort = self._carried = effort
         self.damping = damping
-        self._brake = brake
+        self._most = max(max_effort, abs(effort))
         self._fade_rate = _rate_to_fade(effort)
         self._is_rising = True  # the damping has not yet reached DAMPING
         self._speed = DESCENT_SPEED
@@ -67,7 +76,7 @@ class JointDescent:
 
     def restart(self, effort: float) -> None:
         """Continue from `effort` (Nm), which the motor is found to apply after a silence, without damping."""
-        self.effort = max(-self._brake, min(self._brake, effort))
+        self.effort = effort
         self.damping = 0.0
         self._fade_rate = _rate_to_fade(effort)
         self._is_rising = True
@@ -77,15 +86,27 @@ class JointDescent:
         if not math.isfinite(velocity):
             velocity = 0.0
         self._limit_swing(dt, velocity)
-        excess = velocity - max(-self._speed, min(self._speed, velocity))
-        if excess:
-            most = MAX_EFFORT_RATE * dt
-            change = max(-most, min(most, -SPEED_GAIN * excess * dt))
-            self.effort = max(-self._brake, min(self._brake, self.effort + change))
+        speed, excess = abs(velocity), max(0.0, abs(velocity) - self._speed)
+        if self.effort * velocity > 0.0 and speed > DRIVEN_SPEED:
+            self._approach(0.0, RELEASE_GAIN * (speed - DRIVEN_SPEED), dt)
+        elif excess and self._carried * velocity < 0.0:
+            self._brake(excess, dt)
         else:
-            fade = self._fade_rate * dt
-            self.effort -= max(-fade, min(fade, self.effort))
-        self._step_damping(dt, abs(excess))
+            self._approach(0.0, self._fade_rate, dt)
+        self._step_damping(dt, excess)
+
+    def _brake(self, excess: float, dt: float) -> None:
+        """Let the torque grow against a joint that sinks by `excess` rad/s too fast."""
+        if abs(self.effort) < abs(self._carried):
+            self._approach(self._carried, BRAKE_GAIN * excess, dt)
+        elif abs(self.effort) < self._most:
+            rate = min(BRAKE_GROWTH, BRAKE_GAIN * excess)
+            self._approach(math.copysign(self._most, self._carried), rate, dt)
+
+    def _approach(self, effort: float, rate: float, dt: float) -> None:
+        """Bring the torque nearer to `effort` (Nm), by at most `rate` (Nm/s)."""
+        most = min(MAX_EFFORT_RATE, rate) * dt
+        self.effort += max(-most, min(most, effort - self.effort))
 
     def _limit_swing(self, dt: float, velocity: float) -> None:
         self._speed += (DESCENT_SPEED - self._speed) * dt / SPEED_RECOVERY
@@ -99,8 +120,8 @@ class JointDescent:
             self.damping = min(DAMPING, self.damping + DAMPING / DAMPING_RISE * dt)
             self._is_rising = self.damping < DAMPING
         elif excess:
-            growth = 1.0 + excess / self._speed * dt / DAMPING_GROWTH
-            self.damping = min(DAMPING, self.damping * growth + DAMPING_GAIN * excess * dt)
+            rise = DAMPING / DAMPING_RISE * min(1.0, excess / self._speed)
+            self.damping = min(DAMPING, self.damping + rise * dt)
         elif self.effort == 0.0:
             self.damping *= math.exp(-dt / DAMPING_FADE)
             if self.damping < MIN_DAMPING:
@@ -114,11 +135,13 @@ def _rate_to_fade(effort: float) -> float:
 class ArmDescent:
     """The four joints of an arm on their way down, from `effort` (4,) Nm and `damping` (4,) Nm s/rad.
 
-    peak: (4,) Nm, the largest torque of each motor against the motion.
+    max_effort: (4,) Nm, which the torque of a joint exceeds only where `effort` does.
     """
 
-    def __init__(self, now: float, effort: Sequence[float], damping: Sequence[float], peak: Sequence[float]) -> None:
-        self._joints = tuple(JointDescent(*joint) for joint in zip(effort, damping, peak, strict=True))
+    def __init__(
+        self, now: float, effort: Sequence[float], damping: Sequence[float], max_effort: Sequence[float]
+    ) -> None:
+        self._joints = tuple(JointDescent(*joint) for joint in zip(effort, damping, max_effort, strict=True))
         self._silent: Sequence[bool] = (False,) * len(self._joints)
         self._start = now
         self._held = now  # when something last held the arm, s

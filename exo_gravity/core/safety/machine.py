@@ -66,7 +66,7 @@ class SafetyMachine:
         self._since = 0.0
         self._now = -math.inf
         self._sent = OFF  # last sent to the motors
-        self._descent = ArmDescent(0.0, NOTHING, NOTHING, self._peaks.effort)
+        self._descent = ArmDescent(0.0, NOTHING, NOTHING, NOTHING)
         self._rest = RestTracker()
         self._readings = Readings(limits)
         self._is_trusted = False  # zeros and signs
@@ -285,7 +285,7 @@ class SafetyMachine:
 
     def _let_down(self, now: float) -> None:
         applied = self._delivery.applied(self._sent, self._readings.silent)
-        self._descent = ArmDescent(now, *applied, self._peaks.effort)
+        self._descent = ArmDescent(now, *applied, self.limits.max_effort)
         self._enter(State.LETTING_DOWN, now)
 
     def _enter(self, state: State, now: float) -> None:
