@@ -50,7 +50,7 @@ calibrate-study:
 test:
 	@$(SETUP) $(TEST)
 	$(BIN)/python -m pytest test -n auto -m "not (real_time or browser or thorough)"
-	$(BIN)/python -m pytest test -m "real_time and not (browser or thorough)"
+	$(BIN)/python -m pytest test/hardware test/nodes -m "real_time and not thorough"
 
 test-all: test test-long
 

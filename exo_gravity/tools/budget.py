@@ -12,7 +12,7 @@ import argparse
 import math
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
@@ -103,6 +103,14 @@ def table_lines(arm: ArmBudget) -> Iterator[str]:
             f"{', '.join(pose)}; {pitch}, {roll}",
             "none" if joint.support is None else f"{rounded_down(joint.support):.3f}",
         )
+
+
+def _mirrored(arms: Sequence[ArmBudget]) -> list[ArmBudget]:
+    """Return the arms whose tables differ; one table names all arms that share it."""
+    tables: dict[tuple[str, ...], list[ArmBudget]] = {}
+    for arm in arms:
+        tables.setdefault(tuple(table_lines(replace(arm, name=""))), []).append(arm)
+    return [replace(alike[0], name=" and ".join(arm.name for arm in alike)) for alike in tables.values()]
 
 
 def _line(*cells: str) -> str:
@@ -227,7 +235,7 @@ def main(args: Sequence[str] | None = None) -> int:
     masses = zip(("upper arm", "forearm", "hand"), wearer.segments, strict=True)
     segments = ", ".join(f"{name} {mass:.2f} kg at {cog:.3f} m" for name, (mass, cog) in masses)
     print(f"Wearer: {wearer.body_mass:g} kg, {wearer.sex}, table {wearer.table}: {segments}")
-    for arm in arms:
-        print("", *table_lines(arm), "", *verdict(arm, wearer), sep="\n")
+    for alike in _mirrored(arms):
+        print("", *table_lines(alike), "", *verdict(alike, wearer), sep="\n")
     print(f"\n{written}")
     return int(any(arm.beyond for arm in arms))

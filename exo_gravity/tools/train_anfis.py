@@ -31,7 +31,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     option("--bag", metavar="BAG", help="learn from the holds of this rosbag2 recording instead of from gravload")
     functions = "membership functions per input (default: 4, for a bag 2)"
     option("--functions", metavar="N", type=int, choices=range(2, 7), help=functions)
-    option("--output", metavar="FILE", default="anfis.json", help="where to save the law (default: anfis.json)")
+    option("--output", required=True, metavar="FILE", help="where to save the law, e.g. anfis.json")
     return parser.parse_args(args)
 
 

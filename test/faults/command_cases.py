@@ -34,7 +34,7 @@ def second_effort(value: float) -> Action:
 
 # fmt: off
 EFFORT_COMMANDS = (
-    FaultCase("effort NaN", second_effort(math.nan), CommandedRig, in_tests=True),
+    FaultCase("effort NaN", second_effort(math.nan), CommandedRig),
     FaultCase("three efforts", change_message(lambda message: message.effort.pop()), CommandedRig),
     FaultCase("a wrong name", change_message(lambda message: message.name.__setitem__(3, "left_knee")), CommandedRig),
     FaultCase("no efforts", change_message(lambda message: setattr(message, "effort", [])), CommandedRig),

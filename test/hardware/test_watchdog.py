@@ -87,7 +87,14 @@ def carry(rig: SimulatedRig, tmp_path: Path) -> Iterator[Callable[..., Carrier]]
         carrier.close()
 
 
-@pytest.mark.parametrize("end", ["killed", "frozen", "hands its arm over"])
+@pytest.mark.parametrize(
+    "end",
+    [
+        "killed",
+        pytest.param("frozen", marks=pytest.mark.thorough),
+        pytest.param("hands its arm over", marks=pytest.mark.thorough),
+    ],
+)
 def test_the_arm_of_a_bridge_that_ends_is_let_down_by_the_watchdog_which_holds_its_bus_meanwhile(rig, carry, end):
     carrier = carry()
     if end == "hands its arm over":
@@ -101,6 +108,7 @@ def test_the_arm_of_a_bridge_that_ends_is_let_down_by_the_watchdog_which_holds_i
     rig.assert_let_down()
 
 
+@pytest.mark.thorough
 def test_a_full_pipe_of_the_log_does_not_delay_the_watchdog(rig, carry):
     reader, writer = os.pipe()
     carrier = carry(stderr=writer)

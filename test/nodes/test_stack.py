@@ -119,6 +119,7 @@ def seated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosProbe]:
     print("\n".join(nodes.log))
 
 
+@pytest.mark.thorough
 def test_set_zero_makes_the_present_pose_zero_and_is_refused_while_the_arm_is_carried(seated):
     seated.wait_until_carried()
     assert not seated.trigger("set_zero").success
@@ -129,6 +130,7 @@ def test_set_zero_makes_the_present_pose_zero_and_is_refused_while_the_arm_is_ca
     seated.wait_until(lambda: np.abs(seated.joint_angles()).max() < 0.02)
 
 
+@pytest.mark.thorough
 def test_the_anfis_law_runs_from_its_file_and_the_exact_law_replaces_it_outside_its_training(seated, tmp_path):
     path = str(tmp_path / "anfis.json")
     assert train_anfis.main(["--params", str(CONFIG / "sim.yaml"), "--output", path]) is None

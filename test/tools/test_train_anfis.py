@@ -190,7 +190,7 @@ def test_a_missing_package_is_named_with_the_extra_that_installs_it(capsys, monk
     monkeypatch.delitem(sys.modules, "exo_gravity.tools.anfis")
     monkeypatch.setitem(sys.modules, "threadpoolctl", None)
     with pytest.raises(SystemExit) as ended:
-        main([])
+        main(["--output", "law.json"])
     assert ended.value.code == 2
     expected = "threadpoolctl is not installed: apt install python3-threadpoolctl, or pip install 'exo_gravity[report"
     assert expected in capsys.readouterr().err

@@ -15,17 +15,21 @@ BOW = {"bow": math.radians(30.0), "over": 3.0}
 WALK, SHORT_WALK = {"walk": 10.0}, {"walk": 4.0}
 
 
-@pytest.mark.parametrize(("step", "limit"), [(BOW, 2.0), (WALK, 3.0)], ids=["bow", "walk"])
+@pytest.mark.parametrize(
+    ("step", "limit"), [(BOW, 2.0), pytest.param(WALK, 3.0, marks=pytest.mark.thorough)], ids=["bow", "walk"]
+)
 def test_the_arm_stays_where_it_is_if_the_trunks_acceleration_is_compensated(step, limit):
     trial = trunk_trial(step, {"hold": 1.0}, inertial=True)
     assert moved(trial.run(), ("bow", "walk")) < limit
     assert trial.trouble == ""
 
 
+@pytest.mark.thorough
 def test_the_arm_stays_where_it_is_in_a_bow_even_if_only_its_tilt_is_compensated():
     assert moved(trunk_trial(BOW, {"hold": 1.0}).run(), ("bow",)) < 2.0
 
 
+@pytest.mark.thorough
 def test_walking_shakes_an_arm_of_which_only_the_tilt_is_compensated():
     assert moved(trunk_trial(SHORT_WALK).run(), ("walk",)) > 5.0
 
@@ -34,7 +38,7 @@ def test_an_arm_that_knows_nothing_of_the_trunk_falls_in_a_bow():
     assert moved(trunk_trial(BOW, use_imu=False).run(), ("bow",)) > 10.0
 
 
-@pytest.mark.parametrize("error", [-1.0, 0.0], ids=["wrong sign", "ignored"])
+@pytest.mark.parametrize("error", [-1.0, pytest.param(0.0, marks=pytest.mark.thorough)], ids=["wrong sign", "ignored"])
 def test_an_acceleration_of_the_wrong_sign_or_none_does_not_hold_the_arm(monkeypatch, error):
     """What the IMU measures is what holds it: the same trial with a wrong acceleration fails."""
     sample_of = SimulatedImu.sample_of
