@@ -52,6 +52,7 @@ from .device_faults import (
 from .fault_case import ALL_JOINTS, PROCESS_REACTION, FaultCase
 from .frames import MOTOR_2, foreign_frames, random_frames
 from .outer_loop_cases import OUTER_LOOP
+from .ownership_cases import OWNERSHIP
 from .rig import Rig
 from .rigs import (
     BothArmsRig,
@@ -239,3 +240,4 @@ ARMS = (
 )
 # fmt: on
 CASES = (*HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *OUTER_LOOP, *CLOCK, *ARMS, *V3_BOARDS)
+CASES += OWNERSHIP

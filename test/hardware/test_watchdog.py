@@ -66,7 +66,7 @@ def is_running(pid: int) -> bool:
 
 
 @pytest.fixture
-def rig(lock_folder: Path) -> Iterator[SimulatedRig]:
+def rig() -> Iterator[SimulatedRig]:
     rig = SimulatedRig(interface="udp_multicast", carried=True)
     yield rig
     rig.close()

@@ -50,8 +50,12 @@ class StartGate:
         before: Sequence[JointSample],
         efforts_are_fresh: bool,
         zeros_are_trusted: bool,
+        hindrance: str = "",
     ) -> Fault | None:
-        """Check the newest readings and those `before` them at `now` (s); return a fault that refuses the start."""
+        """Check the newest readings and those `before` them at `now` (s); return a fault that refuses the start.
+
+        hindrance: what must end first, outside the arm; '' for nothing.
+        """
         limits = self._limits
         outside = self._outside(joints)
         fault = limits.find_fault(now, joints, before, overshoot=math.inf)
@@ -65,6 +69,8 @@ class StartGate:
             self.waiting_for = outside
         elif any(abs(joint.velocity) > AT_REST for joint in joints):
             self.waiting_for = "the arm to be at rest"
+        elif hindrance:
+            self.waiting_for = hindrance
         elif not efforts_are_fresh:
             self.waiting_for = "effort commands"
         else:

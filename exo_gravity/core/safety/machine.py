@@ -43,8 +43,9 @@ class SafetyMachine:
     period: s of a cycle. After a pause the torque continues as if only one period had passed: it never catches up.
     peaks: the most that the motors apply; by default `max_effort`, and any damping.
 
-    state: the State. fault: the latched Fault or None. waiting_for: what CHECKING or PROVING waits for. acted: for each
-    limit that has acted, by name, the last time. is_unreached: whether a motor that may be on cannot be reached.
+    state: the State. fault: the latched Fault or None. waiting_for: what CHECKING or PROVING waits for. hindrance: what
+    the caller lets CHECKING wait for, '' for nothing. acted: for each limit that has acted, by name, the last time.
+    is_unreached: whether a motor that may be on cannot be reached.
     """
 
     def __init__(self, limits: Limits, period: float, peaks: Peaks | None = None) -> None:
@@ -52,6 +53,7 @@ class SafetyMachine:
         self.state = State.DISABLED
         self.fault: Fault | None = None
         self.waiting_for = ""
+        self.hindrance = ""
         self.acted: dict[str, float] = {}
         self.is_unreached = False
         self._period = period
@@ -158,7 +160,7 @@ class SafetyMachine:
     ) -> None:
         """Continue to PROVING once the start gate has passed, or trip on a fault that refuses the start."""
         are_fresh = effort is not None and now - effort_time <= self.limits.command_timeout
-        fault = self._gate.step(now, joints, self._before, are_fresh, self._is_trusted)
+        fault = self._gate.step(now, joints, self._before, are_fresh, self._is_trusted, self.hindrance)
         self.waiting_for = self._gate.waiting_for
         if fault:
             self.trip(*fault, now)
