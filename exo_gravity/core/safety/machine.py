@@ -43,9 +43,8 @@ class SafetyMachine:
     period: s of a cycle. After a pause the torque continues as if only one period had passed: it never catches up.
     peaks: the most that the motors apply; by default `max_effort`, and any damping.
 
-    state: the State. fault: the latched Fault or None. waiting_for: what CHECKING or PROVING waits for. hindrance: what
-    the caller lets CHECKING wait for, '' for nothing. acted: for each limit that has acted, by name, the last time.
-    is_unreached: whether a motor that may be on cannot be reached.
+    state: the State. fault: the latched Fault or None. waiting_for: what CHECKING or PROVING waits for. acted: for each
+    limit that has acted, by name, the last time. is_unreached: whether a motor that may be on cannot be reached.
     """
 
     def __init__(self, limits: Limits, period: float, peaks: Peaks | None = None) -> None:
@@ -53,7 +52,6 @@ class SafetyMachine:
         self.state = State.DISABLED
         self.fault: Fault | None = None
         self.waiting_for = ""
-        self.hindrance = ""
         self.acted: dict[str, float] = {}
         self.is_unreached = False
         self._period = period
@@ -70,6 +68,8 @@ class SafetyMachine:
         self._gate = StartGate(limits, 0.0)
         self._switch_on = SwitchOnCheck(limits)
         self._signs = SignCheck(limits.joint_names, NOTHING)
+        #: What else CHECKING waits for, set from outside; '' for nothing.
+        self.hindrance = ""
 
     def enable(self, now: float) -> bool:
         """Start the checks, after which torque ramps in. Return False, and do nothing, unless DISABLED."""
