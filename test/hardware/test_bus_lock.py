@@ -26,19 +26,20 @@ from .simulated_rig import MOTORS_OF_ARM, NoWatchdog
 from .virtual_rig import VirtualRig
 from .virtual_time import Responder, VirtualClock
 
-CAN0 = ("socketcan", "can0", {})
+CHANNEL = f"can{os.getpid()}"  # other test runs share the network namespace
+CAN0 = ("socketcan", CHANNEL, {})
 DRIVE = Drive((0.0, 3.0, 1.0, 0.5), (0.0, 5.0, 0.0, 0.0), True)
 ENDED = "the last can_bridge on this bus and its watchdog ended with the motors on: letting the arm down"
 FIRST = f"/right/can_bridge (PID {os.getpid()})"
-# Prints why a process of another session, with other folders, may not have can0.
+# Prints why a process of another session, with other folders, may not have the bus.
 OTHER_SESSION = """
 import sys
 from pathlib import Path
 from exo_gravity.core.errors import BusError
 from exo_gravity.hardware.ownership import bus_lock
-bus_lock.NAME, bus_lock.FOLDERS = "\\0" + sys.argv[1], (Path(sys.argv[2]),)
+bus_lock.FOLDERS = (Path(sys.argv[2]),)
 try:
-    bus_lock.BusLock(("socketcan", "can0", {}), "another", 0.0)
+    bus_lock.BusLock(("socketcan", sys.argv[1], {}), "another", 0.0)
 except BusError as error:
     print(error, end="")
 """
@@ -52,9 +53,9 @@ def lock_of(owner: str, **options: bool) -> BusLock:
 
 def test_a_held_bus_is_refused_with_its_owner_and_free_again_after_its_release():
     lock = lock_of(FIRST)
-    with pytest.raises(BusError, match=f"^CAN bus can0 is held by {re.escape(FIRST)}$"):
+    with pytest.raises(BusError, match=f"^CAN bus {CHANNEL} is held by {re.escape(FIRST)}$"):
         lock_of("/left/can_bridge (PID 124)")
-    BusLock(("socketcan", "can1", {}), "another").release()
+    BusLock(("socketcan", f"{CHANNEL}x", {}), "another").release()
     lock.release()
     lock_of("another").release()
 
@@ -62,9 +63,9 @@ def test_a_held_bus_is_refused_with_its_owner_and_free_again_after_its_release()
 def test_a_process_of_another_user_and_container_is_refused_although_it_shares_no_folder(tmp_path):
     lock = lock_of(FIRST)
     environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "HOME": str(tmp_path), "TMPDIR": str(tmp_path)}
-    command = [sys.executable, "-c", OTHER_SESSION, bus_lock.NAME[1:], str(tmp_path / "none")]
+    command = [sys.executable, "-c", OTHER_SESSION, CHANNEL, str(tmp_path / "none")]
     refused = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
-    assert refused == f"CAN bus can0 is held by PID {os.getpid()} of user {os.getuid()}"
+    assert refused == f"CAN bus {CHANNEL} is held by PID {os.getpid()} of user {os.getuid()}"
     lock.release()
 
 
@@ -147,7 +148,7 @@ def test_the_notes_are_in_the_first_folder_that_every_user_may_write_to(monkeypa
         folder.mkdir()
         folder.chmod(mode)
     monkeypatch.setattr(bus_lock, "FOLDERS", folders)
-    assert notes_file(CAN0) == folders[2] / "exo_gravity_socketcan_can0.bus"
+    assert notes_file(CAN0) == folders[2] / f"exo_gravity_socketcan_{CHANNEL}.bus"
 
 
 def test_a_second_owner_sends_no_frame_and_the_first_keeps_carrying():
