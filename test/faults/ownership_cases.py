@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
 import time
 from pathlib import Path
 
+from ..support.ros_probe import Timeout
 from .actions import has_refused, run_bridge, second_bridge, send_signal
 from .device_faults import END_SILENCE, SILENCE
 from .fault_case import ALL_JOINTS, PROCESS_REACTION, FaultCase
@@ -15,7 +17,7 @@ from .rig import Rig
 from .rigs import LauncherRig
 
 GIVEN_UP = 8.0  # s after which a watchdog says that its motors do not reply
-TAKEN_OVER = 3.0  # s for the next bridge to start and to ask for the bus
+START_LIMIT = 20.0  # s for the next bridge to start and to take the bus over, or to be refused
 
 
 def start_in_another_session(rig: Rig) -> None:
@@ -52,7 +54,8 @@ def start_beside_silent_motors(rig: HandedOverRig) -> None:
     time.sleep(GIVEN_UP)
     with rig.log_of_next.open("w") as log:
         rig.next_bridge = second_bridge(rig, "/right", stdout=log, stderr=subprocess.STDOUT)
-    time.sleep(TAKEN_OVER)
+    with contextlib.suppress(Timeout):  # then it was refused
+        rig.probe.wait_until(lambda: "letting the arm down" in rig.log_of_next.read_text(), START_LIMIT)
     END_SILENCE(rig)
 
 
