@@ -220,16 +220,14 @@ def _lock(address: Address, patience: float, clock: Clock, asks: bool) -> socket
 
 
 def _holder(address: Address, asking: socket.socket | None) -> str:
-    """Return who holds the bus, as noted, with its process as the kernel knows it, if it is not the noted one."""
-    noted = ""
+    """Return who holds the bus, as noted, or as the kernel tells who is connected to him by `asking`."""
     with contextlib.suppress(OSError):
         descriptor = os.open(notes_file(address), os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
         with os.fdopen(descriptor, "rb"):
-            noted = os.pread(descriptor, OWNER_LENGTH, OWNER_AT).rstrip(b"\0").decode(errors="replace")
-    pid, user = 0, -1
+            if noted := os.pread(descriptor, OWNER_LENGTH, OWNER_AT).rstrip(b"\0"):
+                return noted.decode(errors="replace")
     if asking:
         pid, user, _ = CREDENTIALS.unpack(asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size))
-    if f"PID {pid})" in noted or (noted and not asking):
-        return noted
-    process = f"PID {pid} of user {user}" if pid else "a process of another container"
-    return f"{noted}, {process}" if noted else process
+        if pid:
+            return f"PID {pid} of user {user}"
+    return "a process of another container"
