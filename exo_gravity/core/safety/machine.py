@@ -159,8 +159,9 @@ class SafetyMachine:
         self, now: float, joints: Sequence[JointSample], effort: Sequence[float] | None, effort_time: float
     ) -> None:
         """Continue to PROVING once the start gate has passed, or trip on a fault that refuses the start."""
+        self._gate.hindrance = self.hindrance
         are_fresh = effort is not None and now - effort_time <= self.limits.command_timeout
-        fault = self._gate.step(now, joints, self._before, are_fresh, self._is_trusted, self.hindrance)
+        fault = self._gate.step(now, joints, self._before, are_fresh, self._is_trusted)
         self.waiting_for = self._gate.waiting_for
         if fault:
             self.trip(*fault, now)
