@@ -117,7 +117,6 @@ class BusLock:
         except OSError as error:
             self.problem = f"{path}: {error.strerror}"
             self.descriptor = os.memfd_create("exo_gravity")
-        if os.fstat(self.descriptor).st_size < mmap.PAGESIZE:
             os.ftruncate(self.descriptor, mmap.PAGESIZE)
         self._page = mmap.mmap(self.descriptor, mmap.PAGESIZE)
         #: The shared page.
@@ -189,11 +188,15 @@ def _open_notes(path: Path) -> int:
     except FileNotFoundError:
         descriptor = os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o666)
         os.fchmod(descriptor, 0o666)  # whatever the umask
-    status = os.fstat(descriptor)
-    if not stat.S_ISREG(status.st_mode) or status.st_nlink != 1:  # another file's link would be overwritten
+    try:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode) or status.st_nlink != 1:  # another file's link would be overwritten
+            raise OSError(errno.EINVAL, "not a file of its own")
+        os.posix_fallocate(descriptor, 0, mmap.PAGESIZE)  # without it, a full disk would end the process later
+        return descriptor
+    except OSError:
         os.close(descriptor)
-        raise OSError(errno.EINVAL, "not a file of its own")
-    return descriptor
+        raise
 
 
 def _lock(address: Address, patience: float, clock: Clock, asks: bool) -> socket.socket:
