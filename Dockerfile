@@ -2,12 +2,14 @@
 #
 #   docker build --tag exo_gravity .
 #   docker run --rm exo_gravity ros2 run exo_gravity trial demo --output /tmp/trials
-#   docker run --rm --network host --stop-timeout 60 --cap-add SYS_NICE --ulimit rtprio=98 --ulimit memlock=-1 \
-#       --volume "$PWD/my.yaml:/exo.yaml:ro" exo_gravity ros2 run exo_gravity launcher --params /exo.yaml
+#   docker run --rm --network host --stop-timeout 120 --cap-add SYS_NICE --ulimit rtprio=98 --ulimit memlock=-1 \
+#       --volume /run/lock:/run/lock --volume "$PWD/my.yaml:/exo.yaml:ro" exo_gravity launcher --params /exo.yaml
 #
-# `docker stop` kills a container 10 s after it asked it to end, but letting an arm down takes up to 22 s:
-# --stop-timeout (stop_grace_period in a compose file) gives it 60 s. A CAN interface of the host needs
-# --network host; the interface itself is set up on the host.
+# `docker stop` asks the container's first process alone to end, and kills all of them 10 s later. So the launcher must
+# be that process: `ros2 run` (Jazzy) does not pass the request on. Letting an arm down takes up to 22 s, and 110 s if
+# a process must be given up: --stop-timeout (stop_grace_period in a compose file) gives it 120 s. A CAN interface of
+# the host needs --network host; the interface itself is set up on the host. Through /run/lock the next can_bridge, in
+# whichever container, learns what the motors still apply.
 FROM ros:jazzy-ros-base
 
 SHELL ["/bin/bash", "-o", "pipefail", "-c"]
@@ -34,4 +36,4 @@ RUN source /opt/ros/jazzy/setup.bash && colcon build --packages-select exo_gravi
 # For a terminal of its own: source /workspace/install/setup.bash
 COPY --chmod=755 docker/entrypoint.sh /entrypoint.sh
 ENTRYPOINT ["/entrypoint.sh"]
-CMD ["ros2", "run", "exo_gravity", "launcher"]
+CMD ["launcher"]

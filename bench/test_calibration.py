@@ -81,7 +81,6 @@ def test_trouble_is_reported_by_name_and_nothing_is_fitted(
 def test_a_random_device_is_calibrated_from_motors_to_an_arm_that_holds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setitem(os.environ, "OMP_NUM_THREADS", "1")
     result = go(draw(0, tmp_path), tmp_path, fewer_poses=4)
     missed = [row for row in verdict([result], []) if not row.held and "within 2 standard errors" not in row.what]

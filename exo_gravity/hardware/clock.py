@@ -8,10 +8,15 @@ from collections.abc import Callable
 
 
 class Clock:
-    """The computer's monotonic clock, in s. Another clock has the same three methods."""
+    """The computer's monotonic clock, in s. Another clock has the same four methods."""
 
     monotonic = staticmethod(time.monotonic)
     sleep = staticmethod(time.sleep)
+
+    def suspended(self) -> float:
+        """Return the time in s for which the computer has been suspended so far, which `monotonic` does not count."""
+        now = time.clock_gettime(time.CLOCK_MONOTONIC)
+        return time.clock_gettime(time.CLOCK_BOOTTIME) - now
 
     def later(self, delay: float, function: Callable[[], None]) -> None:
         """Call `function` in `delay` s, on another thread, which does not keep the process alive."""

@@ -29,6 +29,7 @@ from exo_gravity.hardware.can.motor_bus import MotorBus
 EFFORT_WAIT = 0.5  # share of a cycle's idle time for which the loop may wait for late efforts
 SMOOTHING = 0.02  # per cycle, of the measured work time
 MAX_ERRORS = 3  # unexpected exceptions in a row after which the state machine is no longer trusted
+SUSPENDED = 1.0  # s; less may be a thread that waited between two looks at a clock
 HAND_OVER_TIME = 0.5  # s in which a watchdog that takes over has ended this process
 
 # Lowering an arm without the state machine.
@@ -90,6 +91,7 @@ class ControlLoop:
         self._errors = 0  # in a row
         self._drive = OFF  # last decided
         self._foreign_commands = 0  # so far
+        self._suspended = bus.clock.suspended()  # s, so far
         self._work = period  # s per cycle, without waiting for efforts; smoothed
         self._calls: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
         self._is_stopping = self._is_abandoned = self._has_ended = False
@@ -208,6 +210,9 @@ class ControlLoop:
         efforts = self._efforts(due)
         self._run_calls()
         now = self._now()
+        if (suspended := self._clock.suspended() - self._suspended) > SUSPENDED:
+            self._suspended += suspended
+            self.safety.trip(FaultCode.MOTOR_SILENT, f"the computer was suspended for {suspended:.0f} s", now)
         if self._is_stopping:
             self.safety.disable(now)
         drive = self._drive = self.safety.step(now, tuple(self._bus.samples), *efforts)

@@ -10,12 +10,14 @@ let the arm down and nothing else.
 
 `--only PATTERN` starts a part of the nodes, for an arm whose nodes run on two computers.
 
-Exit code 0: stopped by Ctrl-C or SIGTERM. 1: a node ended, or motors may still be powered. 2: wrong use or wrong file.
+Exit code 0: stopped by Ctrl-C, SIGTERM or a closed terminal. 1: a node ended, or motors may still be powered. 2: wrong
+use or wrong file.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import signal
 import subprocess
@@ -175,7 +177,8 @@ class Launcher:
 
     def _read(self, node: str, process: subprocess.Popen[str]) -> None:
         for line in process.stdout or ():
-            self._on_line(node, line.rstrip())
+            with contextlib.suppress(OSError):  # of a closed terminal: a node whose log is not read would block
+                self._on_line(node, line.rstrip())
 
 
 class StopFlag:
@@ -203,10 +206,11 @@ Stopping = StopFlag | threading.Event
 
 
 def stop_on_signals() -> StopFlag:
-    """Return a flag that Ctrl-C or SIGTERM sets."""
+    """Return a flag that Ctrl-C, SIGTERM or a closed terminal sets; nohup keeps the last one away."""
     stopping = StopFlag()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, stopping.set)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, stopping.set)
     return stopping
 
 

@@ -8,7 +8,7 @@ import resource
 import signal
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -165,7 +165,7 @@ def set_contradicting_parameters(rig: Rig) -> None:
     live = rig.probe.set_parameters("compensator", atomically=True, gain=[2.0] * 4, gravity=25.0)
     assert not live.successful, "gain 2 with gravity 25 was accepted"
     for values in ({"max_effort": [18.0] * 4}, {"rate": 20.0}):
-        code, log = run_bridge(rig, "/another", port_offset=1, **values)
+        code, log = run_bridge(rig, "/another", port_offset=1, changes=values)
         assert code == 2, f"can_bridge started with {values}: {log[-1:]}"
 
 
@@ -184,17 +184,29 @@ def has_refused(rig: Rig) -> None:
     assert code not in (0, None), f"a second can_bridge ran on the same bus: {log[-1:]}"
 
 
-def run_bridge(rig: Rig, namespace: str, port_offset: int = 0, **changes: object) -> tuple[int | None, list[str]]:
-    """Run a second bridge on the rig's bus; return its exit code, None if it had to be ended, and its log."""
+def second_bridge(
+    rig: Rig,
+    namespace: str,
+    port_offset: int = 0,
+    environment: Mapping[str, str] | None = None,
+    changes: Mapping[str, object] | None = None,
+    **streams: Any,
+) -> subprocess.Popen[str]:
+    """Start a second bridge on the rig's bus. environment, changes: of its variables and parameters."""
     content = yaml.safe_load(rig.nodes[0].path.read_text())["/right/can_bridge"]
-    content["ros__parameters"].update(changes)
+    content["ros__parameters"].update(changes or {})
     content["ros__parameters"]["can"]["options"]["port"] += port_offset
     path = rig.folder / f"second_bridge_{time.monotonic_ns()}.yaml"
     path.write_text(yaml.safe_dump({f"{namespace}/can_bridge": content}))
     command = [executable("can_bridge"), "--ros-args", "-r", f"__ns:={namespace}", "--params-file", str(path)]
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    return subprocess.Popen(
+        command, env={**os.environ, **(environment or {})}, text=True, start_new_session=True, **streams
     )
+
+
+def run_bridge(rig: Rig, namespace: str, **options: Any) -> tuple[int | None, list[str]]:
+    """Run a `second_bridge`; return its exit code, None if it had to be ended, and its log."""
+    process = second_bridge(rig, namespace, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **options)
     try:
         output, code = process.communicate(timeout=START_LIMIT)[0], process.returncode
     except subprocess.TimeoutExpired:

@@ -55,6 +55,7 @@ from .operator_cases import OPERATOR
 from .operator_lease_cases import LEASES
 from .outer_loop_cases import OUTER_LOOP
 from .ride_cases import RIDES
+from .ownership_cases import OWNERSHIP
 from .rig import Rig
 from .rigs import (
     BothArmsRig,
@@ -242,17 +243,6 @@ ARMS = (
 )
 # fmt: on
 CASES = (
-    *HELD_ROWS,
-    *MOTORS,
-    *DESCENT,
-    *START,
-    *PROCESSES,
-    *EFFORT_COMMANDS,
-    *OUTER_LOOP,
-    *CLOCK,
-    *ARMS,
-    *V3_BOARDS,
-    *RIDES,
-    *LEASES,
-    *OPERATOR,
+    *(*HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *OUTER_LOOP, *CLOCK, *ARMS, *V3_BOARDS),
+    *(*RIDES, *OWNERSHIP, *LEASES, *OPERATOR),
 )

@@ -93,7 +93,7 @@ MUTATIONS = (
         "a second bridge takes the bus",
         ("second can_bridge on the bus",),
         (
-            Edit(BUS_LOCK, "if not self._is_acquired(patience):", "if False:"),
+            Edit(BUS_LOCK, "lock.bind(name)", 'lock.bind("")'),  # to a name that nobody has
             Edit("exo_gravity/hardware/ownership/owned_bus.py", "bus.listen()", "pass"),
         ),
     ),
@@ -183,6 +183,19 @@ MUTATIONS = (
         "control that is not renewed is not lost",
         ("who holds control killed",),
         (Edit(LEASE, "if not self.holder or now - self._renewed <= LEASE_TIME:", "if True:"),),
+    ),
+    Mutation(
+        "the lock of a bus depends on the user's folder",
+        ("can_bridge of another session on the bus",),
+        (
+            Edit(BUS_LOCK, 'NAME = "\\0exo_gravity/"', 'NAME = "\\0" + os.environ.get("XDG_RUNTIME_DIR", "")[-20:]'),
+            Edit("exo_gravity/hardware/ownership/owned_bus.py", "bus.listen()", "pass"),
+        ),
+    ),
+    Mutation(
+        "the watchdog of silent motors never hands the bus over",
+        ("motors silent for long, then the next can_bridge",),
+        (Edit(WATCHDOG, "is_wanted=is_wanted)", "is_wanted=lambda: False)"),),
     ),
 )  # fmt: skip
 

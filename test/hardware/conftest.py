@@ -1,4 +1,4 @@
-"""A folder for the locks of buses."""
+"""A folder for the notes of buses."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from exo_gravity.hardware.ownership import owned_bus
+from exo_gravity.hardware.ownership import bus_lock, owned_bus
 
 from .simulated_rig import NoWatchdog
 
 
 @pytest.fixture
 def lock_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of the lock files of buses, for this test and the processes that it starts."""
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    """The folder of the notes of this test's buses. Their names must differ from those of another test run."""
+    monkeypatch.setattr(bus_lock, "FOLDERS", (tmp_path,))
     monkeypatch.setattr(owned_bus, "Watchdog", NoWatchdog)
     return tmp_path

@@ -96,7 +96,7 @@ class SimulatedRig(Rig):
 class NoWatchdog:
     """In place of the watchdog of a bridge in this process, which a real one would kill on a busy machine."""
 
-    alive = True
+    alive, is_starting = True, False
 
     def __init__(self, *_: object) -> None:
         pass

@@ -1,44 +1,90 @@
 """One owner per bus and host."""
 
 import os
-import tempfile
+import re
+import stat
+import subprocess
+import sys
 
 import pytest
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.drive import OFF, Drive
 from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.ownership.bus_lock import ATTEMPT_TIME, BusLock, lock_file
+from exo_gravity.hardware.ownership import bus_lock, owned_bus
+from exo_gravity.hardware.ownership.bus_lock import (
+    ATTEMPT_TIME,
+    UNKNOWN_DRIVE,
+    BusLock,
+    bus_name,
+    is_asked_for,
+    notes_file,
+)
 from exo_gravity.hardware.ownership.owned_bus import OwnedBus, recover
 
-from .simulated_rig import MOTORS_OF_ARM
+from .simulated_rig import MOTORS_OF_ARM, NoWatchdog
 from .virtual_rig import VirtualRig
 from .virtual_time import Responder, VirtualClock
 
-CAN0 = ("socketcan", "can0", {})
+CHANNEL = f"can{os.getpid()}"  # other test runs share the network namespace
+CAN0 = ("socketcan", CHANNEL, {})
 DRIVE = Drive((0.0, 3.0, 1.0, 0.5), (0.0, 5.0, 0.0, 0.0), True)
-DIED = "the last can_bridge on this bus and its watchdog died while the motors were on: letting the arm down"
+ENDED = "the last can_bridge on this bus and its watchdog ended with the motors on: letting the arm down"
+FIRST = f"/right/can_bridge (PID {os.getpid()})"
+# Prints why a process of another session, with other folders, may not have the bus.
+OTHER_SESSION = """
+import sys
+from pathlib import Path
+from exo_gravity.core.errors import BusError
+from exo_gravity.hardware.ownership import bus_lock
+bus_lock.FOLDERS = (Path(sys.argv[2]),)
+try:
+    bus_lock.BusLock(("socketcan", sys.argv[1], {}), "another", 0.0)
+except BusError as error:
+    print(error, end="")
+"""
 
 pytestmark = pytest.mark.usefixtures("lock_folder")
 
 
-def lock_of(owner: str) -> BusLock:
-    return BusLock(CAN0, owner, clock=VirtualClock())
+def lock_of(owner: str, **options: bool) -> BusLock:
+    return BusLock(CAN0, owner, clock=VirtualClock(), **options)
 
 
 def test_a_held_bus_is_refused_with_its_owner_and_free_again_after_its_release():
-    lock = lock_of("/right/can_bridge (PID 123)")
-    with pytest.raises(BusError, match=r"^CAN bus can0 is held by /right/can_bridge \(PID 123\)$"):
+    lock = lock_of(FIRST)
+    with pytest.raises(BusError, match=f"^CAN bus {CHANNEL} is held by {re.escape(FIRST)}$"):
         lock_of("/left/can_bridge (PID 124)")
-    BusLock(("socketcan", "can1", {}), "another").release()
+    BusLock(("socketcan", f"{CHANNEL}x", {}), "another").release()
     lock.release()
     lock_of("another").release()
+
+
+def test_a_process_of_another_user_and_container_is_refused_although_it_shares_no_folder(tmp_path):
+    lock = lock_of(FIRST)
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "HOME": str(tmp_path), "TMPDIR": str(tmp_path)}
+    command = [sys.executable, "-c", OTHER_SESSION, CHANNEL, str(tmp_path / "none")]
+    refused = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+    assert refused == f"CAN bus {CHANNEL} is held by PID {os.getpid()} of user {os.getuid()}"
+    lock.release()
 
 
 def test_a_bus_that_its_owner_releases_a_little_later_is_waited_for():
     lock, clock = lock_of("first"), VirtualClock()
     clock.later(0.9 * ATTEMPT_TIME, lock.release)
     BusLock(CAN0, "second", clock=clock).release()
+
+
+@pytest.mark.parametrize("asks", [False, True])
+def test_a_bus_is_asked_for_only_while_someone_waits_for_it(asks):
+    lock, clock, seen = lock_of("first"), VirtualClock(), []
+    for delay in (0.5 * ATTEMPT_TIME, 1.5 * ATTEMPT_TIME):
+        clock.later(delay, lambda: seen.append(is_asked_for(lock.socket)))
+    with pytest.raises(BusError):
+        BusLock(CAN0, "second", clock=clock, asks=asks)
+    clock.sleep(ATTEMPT_TIME)
+    assert seen == [asks, False]
+    lock.release()
 
 
 def test_a_refused_owner_leaves_the_notes_unchanged():
@@ -50,34 +96,64 @@ def test_a_refused_owner_leaves_the_notes_unchanged():
     lock.release()
 
 
-def test_the_notes_outlive_their_owner():
+def test_the_notes_outlive_their_owner_unless_the_motors_are_off(lock_folder):
     lock = lock_of("first")
-    assert lock.notes.drive == OFF
+    assert lock.notes.drive == OFF and not lock.problem
+    assert stat.S_IMODE(notes_file(CAN0).stat().st_mode) == 0o666  # the next owner may be another user
     lock.notes.note(DRIVE)
     lock.release()
     lock = lock_of("second")
     assert lock.notes.drive == DRIVE
+    lock.notes.note(OFF)
     lock.release()
+    assert not list(lock_folder.iterdir())
 
 
-def test_buses_on_two_ports_or_channels_have_two_locks():
+@pytest.mark.parametrize("obstacle", ["link", "second link", "folder", "pipe", "damage", "no folder"])
+def test_motors_whose_notes_cannot_be_trusted_may_be_on(obstacle, lock_folder, monkeypatch):
+    path, other = notes_file(CAN0), lock_folder / "another file"
+    other.write_bytes(b"precious")
+    if obstacle == "link":
+        path.symlink_to(other)
+    elif obstacle == "second link":
+        path.hardlink_to(other)
+    elif obstacle == "folder":
+        path.mkdir()
+    elif obstacle == "pipe":
+        os.mkfifo(path)
+    elif obstacle == "damage":
+        path.write_bytes(b"\xff" * 4096)
+    else:
+        monkeypatch.setattr(bus_lock, "FOLDERS", (lock_folder / "none",))
+    lock = lock_of("first")
+    assert str(notes_file(CAN0)) in lock.problem
+    assert lock.notes.drive == UNKNOWN_DRIVE and lock.notes.drive.powered
+    lock.release()
+    assert other.read_bytes() == b"precious"
+
+
+def test_each_bus_has_one_name_and_no_other_bus_has_it(tmp_path):
     addresses = [("udp_multicast", "239.74.163.2", {"port": port}) for port in (1, 2)]
     addresses += [CAN0, ("slcan", "/dev/ttyACM0", {}), ("slcan", "/dev/ttyACM1", {})]
-    assert len({lock_file(address) for address in addresses}) == len(addresses)
-    assert lock_file(addresses[-1]).name == "slcan__dev_ttyACM1.bus"
+    assert len(set(map(bus_name, addresses))) == len(addresses)
+    link = tmp_path / "adapter"
+    link.symlink_to("/dev/null")  # as udev's names of an adapter
+    names = {bus_name(("slcan", channel, {})) for channel in ("/dev/null", f"{link}", f"{link}@115200")}
+    assert names == {"device_1_3"}
 
 
-def test_without_a_runtime_folder_the_lock_is_in_a_folder_of_this_user(monkeypatch, tmp_path):
-    monkeypatch.delenv("XDG_RUNTIME_DIR")
-    monkeypatch.setattr(os, "access", lambda folder, mode: False)
-    monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
-    assert lock_file(CAN0).parent == tmp_path / f"exo_gravity-{os.getuid()}"
-    BusLock(CAN0, "a test").release()
+def test_the_notes_are_in_the_first_folder_that_every_user_may_write_to(monkeypatch, tmp_path):
+    folders = tuple(tmp_path / name for name in ("missing", "private", "shared"))
+    for folder, mode in zip(folders[1:], (0o755, 0o1777), strict=True):
+        folder.mkdir()
+        folder.chmod(mode)
+    monkeypatch.setattr(bus_lock, "FOLDERS", folders)
+    assert notes_file(CAN0) == folders[2] / f"exo_gravity_socketcan_{CHANNEL}.bus"
 
 
 def test_a_second_owner_sends_no_frame_and_the_first_keeps_carrying():
     rig = VirtualRig()
-    owned = OwnedBus(rig.arm, "/right/can_bridge (PID 1)", print, rig.clock)
+    owned = OwnedBus(rig.arm, FIRST, print, rig.clock)
     bus = owned.open()
     bus.exchange(rig.drive, rig.clock.monotonic() + 1.0)
     rig.clock.sleep(0.01)  # until the last replies
@@ -107,22 +183,37 @@ def test_the_arm_that_a_dead_owner_left_with_its_motors_on_is_let_down_first(is_
     rig, log = VirtualRig(), []
     leave_on(rig)
     if is_recovery:
-        assert recover(rig.arm, "a recovery", log.append, 1.0, rig.clock)
+        recover(rig.arm, "a recovery", log.append, 1.0, rig.clock)
     else:
         OwnedBus(rig.arm, "the next owner", log.append, rig.clock).close()
-    assert log == [DIED, "the arm is down, its motors are off"]
+    assert log == [ENDED, "the arm is down, its motors are off"]
     rig.assert_let_down()
     lock = BusLock(rig.arm.address, "a test")
     assert not lock.notes.drive.powered
     lock.release()
 
 
-def test_an_owner_is_refused_while_an_arm_left_with_its_motors_on_cannot_be_reached():
-    rig = VirtualRig()
+def test_an_arm_whose_notes_cannot_be_read_is_let_down_gently_from_what_its_motors_reply():
+    rig, log = VirtualRig(), []
+    notes_file(rig.arm.address).mkdir()
+    OwnedBus(rig.arm, "the next owner", log.append, rig.clock).close()
+    assert log[0].startswith("it is not known what the motors apply, they may be on")
+    rig.assert_let_down()
+
+
+def test_a_watchdog_stays_with_an_arm_that_the_next_owner_cannot_reach(monkeypatch):
+    rig, stayed = VirtualRig(), []
+
+    class Stays(NoWatchdog):
+        def __init__(self, lock: BusLock, *_: object) -> None:
+            stayed.append(lock.notes.drive.powered)
+
+    monkeypatch.setattr(owned_bus, "Watchdog", Stays)
     leave_on(rig)
     rig.device.bus_silent = True
     with pytest.raises(BusError, match="a motor that may be powered does not reply"):
         OwnedBus(rig.arm, "the next owner", lambda text: None, rig.clock)
+    assert stayed == [True]
     lock = BusLock(rig.arm.address, "a test")
     assert lock.notes.drive.powered
     lock.release()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import can
 import pytest
 
@@ -15,7 +17,7 @@ from exo_gravity.sim import Firmware
 from ..support.simulated_device import SPECS, frame, make_device
 from .virtual_time import Responder, Wire
 
-ADDRESS = ("wire", "in virtual time", {})
+ADDRESS = ("wire", f"of process {os.getpid()}", {})
 
 pytestmark = pytest.mark.usefixtures("lock_folder")
 

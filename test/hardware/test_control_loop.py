@@ -47,6 +47,17 @@ def test_an_abandoned_arm_receives_no_further_frame():
     assert arm.drives[-1].powered
 
 
+def test_an_arm_is_let_down_after_its_computer_was_suspended():
+    arm = Carried()
+    arm.clock.slept += 0.9  # less may be a thread that was not run
+    arm.run(0.1)
+    assert arm.safety.state is State.ACTIVE
+    arm.clock.slept += 3600.0
+    arm.run(2 * CYCLE)
+    assert arm.safety.fault == ("motor_silent", "the computer was suspended for 3601 s")
+    arm.assert_let_down()
+
+
 @pytest.mark.parametrize("error", [ValueError("garbled line"), can.CanOperationError("down"), OSError("no device")])
 def test_an_exception_of_the_bus_lets_the_arm_down_on_a_bus_that_was_opened_again(error):
     arm = Carried()

@@ -18,6 +18,7 @@ from pathlib import Path
 import pytest
 
 from exo_gravity.core.errors import BusError
+from exo_gravity.core.safety.drive import OFF
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.hardware.ownership.watchdog import Watchdog
@@ -66,7 +67,7 @@ def is_running(pid: int) -> bool:
 
 
 @pytest.fixture
-def rig(lock_folder: Path) -> Iterator[SimulatedRig]:
+def rig() -> Iterator[SimulatedRig]:
     rig = SimulatedRig(interface="udp_multicast", carried=True)
     yield rig
     rig.close()
@@ -106,6 +107,21 @@ def test_the_arm_of_a_bridge_that_ends_is_let_down_by_the_watchdog_which_holds_i
         BusLock(rig.arm.address, "another")
     assert carrier.log().endswith("letting the arm down\nERROR the arm is down, its motors are off\n")
     rig.assert_let_down()
+
+
+@pytest.mark.thorough
+def test_a_watchdog_whose_motors_are_silent_ends_with_the_notes_once_the_next_bridge_asks(rig, carry):
+    carrier = carry()
+    rig.device.bus_silent = True
+    carrier.kill()
+    assert "a motor does not reply" in [carrier.process.stderr.readline() for _ in range(2)][1]
+    with pytest.raises(BusError, match="held by the watchdog"):
+        BusLock(rig.arm.address, "one who does not ask")
+    lock = BusLock(rig.arm.address, "the next bridge", patience=20.0, asks=True)
+    assert lock.notes.drive.powered
+    assert "the next can_bridge takes the bus over" in carrier.log()
+    lock.notes.note(OFF)
+    lock.release()
 
 
 @pytest.mark.thorough

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import mmap
+import os
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
+from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.drive import OFF
 from exo_gravity.core.safety.params import FROZEN
-from exo_gravity.hardware.ownership.bus_lock import DriveNotes
-from exo_gravity.hardware.ownership.watchdog import HEARTBEAT_TIMEOUT, LONGEST_LOOK, Silence, guard
+from exo_gravity.hardware.ownership.bus_lock import BusLock, DriveNotes
+from exo_gravity.hardware.ownership.owned_bus import OwnedBus
+from exo_gravity.hardware.ownership.watchdog import HEARTBEAT_TIMEOUT, LONGEST_LOOK, Silence, SleepInhibitor, guard
 
+from ..support.launched_nodes import children
 from .virtual_rig import CYCLE, VirtualRig
 from .virtual_time import Responder, VirtualClock
 
@@ -51,6 +56,7 @@ class Bridge:
         self.pipe.messages.append(self.rig.arm)
         self.killed: list[float] = []
         self.log: list[str] = []
+        self.inhibited: list[bool] = []
         self.drive = self.rig.drive
         self.freeze = self.clock.every(CYCLE, lambda: self.notes.note(self.drive))
         self.listener = Responder(self.rig.wire)
@@ -69,9 +75,10 @@ class Bridge:
         self.clock.later(delay, happens)
         return self.clock.monotonic() + delay
 
-    def guard(self) -> int:
+    def guard(self, is_wanted: Callable[[], bool] = lambda: False) -> int:
         """Run the watchdog to its end; return its exit code."""
-        return guard(self.kill, self.notes, self.pipe, self.log.append, self.clock)
+        inhibit = self.inhibited.append
+        return guard(self.kill, self.notes, self.pipe, self.log.append, self.clock, is_wanted, inhibit)
 
 
 @pytest.fixture
@@ -87,6 +94,61 @@ def test_the_arm_of_a_bridge_that_has_died_is_let_down_under_the_watchdogs_name(
     assert "of /right/can_bridge (PID 1); it is letting the arm down" in bridge.notes.owner
     assert not bridge.notes.drive.powered
     bridge.rig.assert_let_down()
+
+
+def test_a_watchdog_whose_motors_are_silent_hands_the_bus_over_and_the_next_bridge_lets_the_arm_down(
+    bridge: Bridge, lock_folder: Path
+) -> None:
+    """The lock is free once the watchdog's process has ended: test_bus_lock.py."""
+    bridge.at(1.0, lambda: setattr(bridge.rig.device, "bus_silent", True))
+    bridge.at(1.0, bridge.die)
+    asked = bridge.clock.monotonic() + 20.0
+    assert bridge.guard(lambda: bridge.clock.monotonic() > asked) == 1
+    assert asked < bridge.clock.monotonic() < asked + 0.5
+    assert bridge.notes.drive.powered
+    lock = BusLock(bridge.rig.arm.address, "left behind")
+    lock.notes.note(bridge.notes.drive)
+    lock.release()
+    bridge.clock.later(2.0, lambda: setattr(bridge.rig.device, "bus_silent", False))
+    OwnedBus(bridge.rig.arm, "the next bridge", bridge.log.append, bridge.clock).close()
+    assert bridge.log[-1] == LET_DOWN[1]
+    bridge.rig.assert_let_down()
+
+
+def test_a_watchdog_that_cannot_open_its_bus_hands_it_over(bridge: Bridge) -> None:
+    bridge.rig.wire.refusal = BusError("no such device")
+    bridge.at(1.0, bridge.die)
+    asked = bridge.clock.monotonic() + 20.0
+    assert bridge.guard(lambda: bridge.clock.monotonic() > asked) == 1
+    assert bridge.notes.drive == bridge.drive
+
+
+def test_a_descent_is_not_handed_over_while_the_motors_reply(bridge: Bridge) -> None:
+    bridge.at(1.0, bridge.die)
+    assert bridge.guard(lambda: True) == 0
+    bridge.rig.assert_let_down()
+
+
+def test_the_computer_is_not_suspended_while_the_motors_are_on(bridge: Bridge) -> None:
+    bridge.drive = OFF
+    bridge.at(1.0, lambda: setattr(bridge, "drive", bridge.rig.drive))
+    seen: list[tuple[bool, bool]] = []
+    bridge.clock.every(0.1, lambda: seen.append((bridge.drive.powered, bridge.inhibited[-1])))
+    bridge.at(2.05, bridge.die)
+    assert bridge.guard() == 0
+    assert seen[0] == (False, False) and seen[15] == (True, True)
+
+
+def test_the_inhibiting_program_runs_until_it_is_released() -> None:
+    inhibitor = SleepInhibitor(("sh", "-c", "cat"))
+    inhibitor.hold(True)
+    (program,) = children(os.getpid())
+    inhibitor.hold(True)
+    assert children(os.getpid()) == [program]
+    inhibitor.hold(False)
+    assert os.waitpid(program, 0) == (program, 0)
+    for command in ((), ("no_such_program",)):
+        SleepInhibitor(command).hold(True)  # no error: the arm matters more
 
 
 def test_a_frozen_bridge_is_killed_before_the_first_frame_and_its_arm_let_down(bridge: Bridge) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -42,7 +43,7 @@ class VirtualRig(Rig):
         self.wire = Wire(echoes=echoes)
         super().__init__(friction, pose, carried, self.wire.clock)
         self.wire.play(self.device, self.note_speed)
-        self.arm = VirtualArm(("wire", "in virtual time", {}), MOTORS_OF_ARM, LIMITS, CYCLE, self.wire)
+        self.arm = VirtualArm(("wire", f"of process {os.getpid()}", {}), MOTORS_OF_ARM, LIMITS, CYCLE, self.wire)
 
     @property
     def drive(self) -> Drive:

@@ -33,6 +33,7 @@ class VirtualClock:
 
     def __init__(self) -> None:
         self._nanoseconds = 100 * 10**9
+        self.slept = 0.0  # s, with the whole computer
         self._events: list[tuple[int, int, Callable[[], None]]] = []  # a heap: when, in which order, what
         self._order = itertools.count()
 
@@ -41,6 +42,9 @@ class VirtualClock:
 
     def sleep(self, duration: float) -> None:
         self.run(duration)
+
+    def suspended(self) -> float:
+        return self.slept
 
     def later(self, delay: float, function: Callable[[], None]) -> None:
         heapq.heappush(self._events, (self._after(delay), next(self._order), function))

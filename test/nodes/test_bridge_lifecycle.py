@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 import rclpy
@@ -28,8 +27,7 @@ SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FA
 
 
 @pytest.fixture
-def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedRig]:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedRig]:
     monkeypatch.setattr(bus_lock, "ATTEMPT_TIME", 0.1)
     monkeypatch.setattr(owned_bus, "Watchdog", NoWatchdog)
     rig = SimulatedRig(friction=0.5, pose=NOTHING)  # more friction than the pushes of the switch-on check
@@ -104,6 +102,19 @@ def test_carried_deactivated_once_all_motors_reply_activated_again_and_cleaned_u
     assert bridge.trigger_cleanup() is SUCCESS
     assert_nothing_runs(bridge, rig)
     assert_bus_is_free(rig)
+
+
+def test_no_motor_is_switched_on_before_the_watchdog_watches_nor_stays_on_without_it(rig, make_bridge, monkeypatch):
+    monkeypatch.setattr(NoWatchdog, "is_starting", True)
+    bridge = make_bridge()
+    assert bridge.trigger_configure() is SUCCESS
+    assert bridge.trigger_activate() is SUCCESS
+    safety = bridge.loop.safety
+    wait_until(lambda: safety.waiting_for == "the watchdog to start")
+    monkeypatch.setattr(NoWatchdog, "alive", False)  # it never started
+    wait_until(lambda: rclpy.spin_once(bridge, timeout_sec=0.2) or safety.fault)
+    assert (safety.state, safety.fault.code) == (State.FAULT, "watchdog_dead")
+    assert rig.motors_on == [False] * 4
 
 
 def test_a_shutdown_lets_the_arm_down_reports_it_and_releases_the_bus(rig, make_bridge, monkeypatch):

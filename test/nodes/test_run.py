@@ -1,12 +1,13 @@
-"""Which hosts a node communicates with, as set before it starts."""
+"""Which hosts a node communicates with, as set before it starts, and which signals end it."""
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
 
 from exo_gravity.nodes.ros import run
-from exo_gravity.nodes.ros.run import keep_to_this_machine, open_to_others
+from exo_gravity.nodes.ros.run import handle_signals, keep_to_this_machine, open_to_others
 
 NAMES = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS", "ROS_DISCOVERY_SERVER")
 LOOPBACK = str(Path(run.__file__).with_name("fastdds.xml"))
@@ -70,3 +71,25 @@ def test_the_setting_that_admits_other_hosts_is_named(environment, settings, nam
     for name, value in settings.items():
         environment(name, value)
     assert open_to_others() == named
+
+
+@pytest.mark.parametrize(
+    ("ignores_interrupts", "has_nohup", "ends"),
+    [(False, False, ["SIGTERM", "SIGINT", "SIGHUP"]), (False, True, ["SIGTERM", "SIGINT"]), (True, False, ["SIGTERM"])],
+    ids=["a bridge", "a bridge under nohup", "a node that a bridge needs"],
+)
+def test_which_signals_end_a_node(environment, ignores_interrupts, has_nohup, ends):
+    if ignores_interrupts:
+        environment("EXO_GRAVITY_IGNORE_SIGINT", "1")
+    sent = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+    handlers = [signal.getsignal(number) for number in sent]
+    ending = []
+    try:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN if has_nohup else signal.SIG_DFL)
+        handle_signals(ending)
+        for number in sent:
+            signal.raise_signal(number)
+    finally:
+        for number, handler in zip(sent, handlers, strict=True):
+            signal.signal(number, handler)
+    assert ending == [signal.Signals[name] for name in ends]

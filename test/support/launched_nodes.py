@@ -15,6 +15,7 @@ from typing import Any
 
 import yaml
 
+from exo_gravity.hardware.ownership.bus_lock import notes_file
 from exo_gravity.tools.launcher import Launcher
 
 from . import CONFIG
@@ -131,7 +132,7 @@ class LaunchedNodes:
         self._end_watchdogs()
 
     def _end_watchdogs(self) -> None:
-        """End watchdogs that retry without end, because their simulated motors are gone: they hold the lock file."""
+        """End watchdogs that retry without end, because their simulated motors are gone, and remove their notes."""
         bus = f"{self.bus['channel']}_{self.bus['port']}.bus"
         for process in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
@@ -139,6 +140,8 @@ class LaunchedNodes:
                     bus in os.readlink(descriptor) for descriptor in (process / "fd").iterdir()
                 ):
                     os.kill(int(process.name), signal.SIGKILL)
+        for port in (self.bus["port"], self.bus["port"] + 1):
+            notes_file((self.bus["interface"], self.bus["channel"], {"port": port})).unlink(missing_ok=True)
 
 
 class LauncherProcess(LaunchedNodes):

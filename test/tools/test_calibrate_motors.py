@@ -211,7 +211,6 @@ def device_on(channel: str, arm: Arm) -> Iterator[SimulatedDevice]:
 def test_the_command_line_describes_the_device_in_the_new_file_or_says_why_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setattr(BusScan.scan, "__defaults__", (range(1, IDS),))  # test_bus_scan.py scans all
     monkeypatch.setattr(motors, "MAX_SILENCE", 10.0)  # of a thread on a busy computer
     arm, channel = Arm(15), "calibrate-motors"

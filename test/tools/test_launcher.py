@@ -3,6 +3,7 @@
 test/nodes starts real nodes.
 """
 
+import signal
 import sys
 import time
 from pathlib import Path
@@ -12,7 +13,7 @@ import yaml
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.tools.inputs.parameter_file import Stages, chosen, in_namespace, load, node_names
-from exo_gravity.tools.launcher import Launcher, main
+from exo_gravity.tools.launcher import Launcher, main, stop_on_signals
 
 NODES = Path(__file__).parents[2] / "exo_gravity" / "nodes"
 SIM = Path(__file__).parents[2] / "config" / "sim.yaml"
@@ -34,6 +35,19 @@ def refused(tmp_path, capsys):
         return capsys.readouterr().err
 
     return refused
+
+
+def test_a_closed_terminal_stops_the_launcher_as_ctrl_c_does():
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    handlers = [signal.getsignal(number) for number in numbers]
+    try:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        stopping = stop_on_signals()
+        signal.raise_signal(signal.SIGHUP)
+    finally:
+        for number, handler in zip(numbers, handlers, strict=True):
+            signal.signal(number, handler)
+    assert stopping.is_set()
 
 
 def test_the_node_names_are_the_modules_with_an_entry_point():

@@ -35,7 +35,7 @@ class RunTrial(Protocol):
 @pytest.fixture
 def run(tmp_path: Path) -> Iterator[RunTrial]:
     """Run `trial`; return its exit code and the folder that it wrote, `tmp_path` if it wrote none."""
-    handlers = [(number, signal.getsignal(number)) for number in (signal.SIGINT, signal.SIGTERM)]
+    handlers = [(number, signal.getsignal(number)) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
 
     def run(*arguments: str, script: Any = SHORT, changes: Changes | None = None) -> tuple[int, Path]:
         (tmp_path / "script.yaml").write_text(yaml.safe_dump(script))

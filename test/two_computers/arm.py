@@ -101,7 +101,6 @@ class TwoComputers:
         environment = {
             "PYTHONPATH": str(ROOT),
             "ROS_STATIC_PEERS": self._peers[computer],
-            "XDG_RUNTIME_DIR": str(self._params.parent),
         }
         command = [executable("launcher"), "--params", str(self._params), "--only", *PARTS[computer]]
         launcher = self._network.start(computer, command, environment)

@@ -36,10 +36,14 @@ MAX_DISTURBED = 5  # times that a joint may move without a push
 
 
 class StartGate:
-    """Waits for the conditions of a start. waiting_for: the condition that is not met; passed: whether all were."""
+    """Waits for the conditions of a start. waiting_for: the condition that is not met; passed: whether all were.
+
+    hindrance: what else must end first, set by the caller; '' for nothing.
+    """
 
     def __init__(self, limits: Limits, now: float) -> None:
         self.waiting_for = "the first replies of the motors"
+        self.hindrance = ""
         self.passed = False
         self._limits = limits
         self._calm_since = now
@@ -64,6 +68,8 @@ class StartGate:
             self.waiting_for = outside
         elif any(abs(joint.velocity) > AT_REST for joint in joints):
             self.waiting_for = "the arm to be at rest"
+        elif self.hindrance:
+            self.waiting_for = self.hindrance
         elif not efforts_are_fresh:
             self.waiting_for = "effort commands"
         else:

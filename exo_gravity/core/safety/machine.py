@@ -74,6 +74,8 @@ class SafetyMachine:
         self._gate = StartGate(limits, 0.0)
         self._switch_on = SwitchOnCheck(limits)
         self._signs = SignCheck(limits.joint_names, NOTHING)
+        #: What else CHECKING waits for, set from outside; '' for nothing.
+        self.hindrance = ""
 
     def enable(self, now: float) -> bool:
         """Start the checks, after which torque ramps in. Return False, and do nothing, unless DISABLED."""
@@ -188,6 +190,7 @@ class SafetyMachine:
         self, now: float, joints: Sequence[JointSample], effort: Sequence[float] | None, effort_time: float
     ) -> None:
         """Continue to PROVING once the start gate has passed, or trip on a fault that refuses the start."""
+        self._gate.hindrance = self.hindrance
         are_fresh = effort is not None and now - effort_time <= self.limits.command_timeout
         fault = self._gate.step(now, joints, self._readings.fault, are_fresh, self._is_trusted)
         self.waiting_for = self._gate.waiting_for

@@ -1,32 +1,47 @@
-"""One owner per CAN bus on this host, and a page of notes for the process that comes after it.
+"""One owner per CAN bus and host, and a page of notes for the process that comes after it.
 
-The lock is a file named after the bus, locked with flock(2). The watchdog inherits its descriptor, so the kernel
-releases the lock when bridge and watchdog have both ended. The file itself stays, and with it the notes: if both
-processes were killed, the next owner knows what the motors still apply.
+The lock is an abstract UNIX socket named after the bus. Such a name belongs to the network namespace, as a CAN
+interface does: it is one for every user, folder and container that reaches the interface. The watchdog inherits the
+socket, so the kernel frees the name when bridge and watchdog have both ended. Who wants the bus holds a connection to
+the socket while it waits (`is_asked_for`).
+
+The notes are a file in a folder that all users share. It is removed once the motors are off. If both processes were
+killed, it tells the next owner what the motors still apply.
 """
 
 from __future__ import annotations
 
-import fcntl
+import contextlib
+import errno
+import math
 import mmap
 import os
 import re
+import socket
+import stat
 import struct
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.safety.drive import Drive
+from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.safety.descent import DAMPING
+from exo_gravity.core.safety.drive import NOTHING, Drive
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
 ATTEMPT_TIME = 1.0  # s; a watchdog with nothing to do may take that long to end after its bridge
 ATTEMPT_PERIOD = 0.02  # s
 
-NOTE = struct.Struct("=10d")  # monotonic time, powered, effort (4,), damping (4,)
-HEARTBEAT = struct.Struct("=d")  # monotonic time
+NAME = "\0exo_gravity/"  # the first character makes a socket's name abstract
+# The first that every user may write to; /dev/shm only after it, because logind empties it when a user logs out.
+FOLDERS = ("/run/lock", "/dev/shm", "/tmp")
+SHARED = stat.S_ISVTX | stat.S_IWOTH | stat.S_IXOTH
+NOTE = struct.Struct("=10d")  # time, powered, effort (4,), damping (4,)
+HEARTBEAT = struct.Struct("=d")  # time
 HEARTBEAT_AT, OWNER_AT, OWNER_LENGTH = 128, 256, 512  # bytes
+CREDENTIALS = struct.Struct("3i")  # PID, user and group of a socket's other end
+UNKNOWN_DRIVE = Drive(NOTHING, (DAMPING,) * JOINT_COUNT, True)  # of motors that may be on: the first frames hold
 
 Address = tuple[str, str, Mapping[str, Any]]  # interface, channel and options of a python-can bus
 
@@ -79,58 +94,143 @@ class DriveNotes:
 class BusLock:
     """Exclusive ownership of the bus at `address` until `release`. owner: shown to others who want the bus.
 
-    Raises BusError with the present owner if the bus is still held after `patience` s.
+    asks: whether to ask for the bus, so that the watchdog of motors that do not reply hands it over. Raises BusError
+    with the present owner if the bus is still held after `patience` s.
     """
 
     def __init__(
-        self, address: Address, owner: str, patience: float = ATTEMPT_TIME, clock: Clock = COMPUTER_CLOCK
+        self,
+        address: Address,
+        owner: str,
+        patience: float = ATTEMPT_TIME,
+        clock: Clock = COMPUTER_CLOCK,
+        asks: bool = False,
     ) -> None:
-        path = lock_file(address)
+        #: The lock, for the watchdog to inherit.
+        self.socket = _lock(address, patience, clock, asks)
+        #: Why the notes of the last owner are not known, '' if they are. The motors count as powered then.
+        self.problem = ""
+        path = notes_file(address)
         try:
-            path.parent.mkdir(mode=0o700, exist_ok=True)
-            #: Of the lock file, for the watchdog to inherit.
-            self.descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-            if os.fstat(self.descriptor).st_size < mmap.PAGESIZE:
-                os.ftruncate(self.descriptor, mmap.PAGESIZE)
+            #: Of the notes, for the watchdog to inherit.
+            self.descriptor = _open_notes(path)
         except OSError as error:
-            raise BusError(f"lock file {path}: {error.strerror}") from error
+            self.problem = f"{path}: {error.strerror}"
+            self.descriptor = os.memfd_create("exo_gravity")
+            os.ftruncate(self.descriptor, mmap.PAGESIZE)
         self._page = mmap.mmap(self.descriptor, mmap.PAGESIZE)
-        self._clock = clock
         #: The shared page.
         self.notes = DriveNotes(self._page, clock)
-        if not self._is_acquired(patience):
-            holder = self.notes.owner
-            self.release()
-            raise BusError(f"CAN bus {address[1]} is held by {holder}")
+        if not math.isfinite(sum(self.notes.drive.effort + self.notes.drive.damping)):
+            self.problem = f"{path}: damaged"
+        if self.problem:
+            self.notes.note(UNKNOWN_DRIVE)
         self.notes.owner = owner
         self.notes.beat(0.0)
 
     def release(self) -> None:
-        """Close the lock file: the bus is free once the watchdog has ended, too."""
+        """Give up the bus: it is free once the watchdog has ended, too."""
+        if not self.notes.drive.powered:
+            remove_notes(self.descriptor)
         self._page.close()
         os.close(self.descriptor)
+        self.socket.close()
 
-    def _is_acquired(self, patience: float) -> bool:
-        end = self._clock.monotonic() + patience
-        while True:
+
+def is_asked_for(lock: socket.socket) -> bool:
+    """Return whether someone waits for the bus of `lock`, with a connection that is still open."""
+    lock.setblocking(False)
+    while True:
+        try:
+            asking, _ = lock.accept()
+        except OSError:
+            return False
+        with asking, contextlib.suppress(ConnectionError):
+            asking.setblocking(False)
             try:
-                fcntl.flock(self.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                return True
+                asking.recv(1)  # returns at once if the other end was closed
             except BlockingIOError:
-                if self._clock.monotonic() > end:
-                    return False
-                self._clock.sleep(ATTEMPT_PERIOD)
+                return True
 
 
-def lock_file(address: Address) -> Path:
-    """Return the path of the bus's lock file, in this user's runtime folder."""
+def notes_file(address: Address) -> Path:
+    """Return the path of the bus's notes, the same for every user."""
+    usable = (folder for folder in map(Path, FOLDERS) if folder.is_dir() and folder.stat().st_mode & SHARED == SHARED)
+    return next(usable, Path(FOLDERS[0])) / f"exo_gravity_{bus_name(address)}.bus"
+
+
+def bus_name(address: Address) -> str:
+    """Return a name of the bus; a serial adapter has the same under each of its names, and so has an interface."""
     interface, channel, options = address
     parts = [interface, channel, *([str(options["port"])] if "port" in options else [])]
-    return _runtime_folder() / (re.sub(r"[^\w.:-]", "_", "_".join(parts)) + ".bus")
+    path = Path(channel.partition("@")[0])  # slcan: DEVICE@BITRATE
+    with contextlib.suppress(OSError, ValueError):
+        if path.is_absolute() and path.is_char_device():
+            device = path.stat()
+            parts = ["device", str(os.major(device.st_rdev)), str(os.minor(device.st_rdev))]
+    if interface == "socketcan":
+        with contextlib.suppress(OSError):  # it may have alternative names
+            parts[1] = socket.if_indextoname(socket.if_nametoindex(channel))
+    return re.sub(r"[^\w.:-]", "_", "_".join(parts))[-80:]
 
 
-def _runtime_folder() -> Path:
-    for folder in (os.environ.get("XDG_RUNTIME_DIR"), f"/run/user/{os.getuid()}"):
-        if folder and os.access(folder, os.W_OK):
-            return Path(folder, "exo_gravity")
-    return Path(tempfile.gettempdir(), f"exo_gravity-{os.getuid()}")
+def remove_notes(descriptor: int) -> None:
+    """Remove the file of the notes, whose motors are off. Another user's file stays, and says the same."""
+    with contextlib.suppress(OSError):
+        os.unlink(os.readlink(f"/proc/self/fd/{descriptor}"))
+
+
+def _open_notes(path: Path) -> int:
+    """Return a descriptor of the notes, which any user may write. Raises OSError."""
+    flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    try:
+        descriptor = os.open(path, flags)
+    except FileNotFoundError:
+        descriptor = os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o666)
+        os.fchmod(descriptor, 0o666)  # whatever the umask
+    try:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode) or status.st_nlink != 1:  # another file's link would be overwritten
+            raise OSError(errno.EINVAL, "not a file of its own")
+        os.posix_fallocate(descriptor, 0, mmap.PAGESIZE)  # without it, a full disk would end the process later
+        return descriptor
+    except OSError:
+        os.close(descriptor)
+        raise
+
+
+def _lock(address: Address, patience: float, clock: Clock, asks: bool) -> socket.socket:
+    name, end = NAME + bus_name(address), clock.monotonic() + patience
+    with socket.socket(socket.AF_UNIX) as asking:
+        asking.setblocking(False)
+        is_asking = False
+        while True:
+            lock = socket.socket(socket.AF_UNIX)
+            try:
+                lock.bind(name)
+                lock.listen()
+                return lock
+            except OSError as error:
+                lock.close()
+                if error.errno != errno.EADDRINUSE:
+                    raise BusError(f"CAN bus {address[1]} cannot be locked: {error.strerror}") from error
+            is_late = clock.monotonic() > end
+            if (asks or is_late) and not is_asking:
+                is_asking = not asking.connect_ex(name)
+            if is_late:
+                raise BusError(f"CAN bus {address[1]} is held by {_holder(address, asking if is_asking else None)}")
+            clock.sleep(ATTEMPT_PERIOD)
+
+
+def _holder(address: Address, asking: socket.socket | None) -> str:
+    """Return who holds the bus, as noted, or as the kernel tells who is connected to him by `asking`."""
+    with contextlib.suppress(OSError):
+        descriptor = os.open(notes_file(address), os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+        with os.fdopen(descriptor, "rb"):
+            if noted := os.pread(descriptor, OWNER_LENGTH, OWNER_AT).rstrip(b"\0"):
+                return noted.decode(errors="replace")
+    if asking:
+        pid, user, _ = CREDENTIALS.unpack(asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size))
+        if pid:
+            return f"PID {pid} of user {user}"
+    return "a process of another container"

@@ -48,14 +48,15 @@ def let_down(
     log: Callable[[str], None] = lambda text: None,
     is_endless: bool = True,
     clock: Clock = COMPUTER_CLOCK,
+    is_wanted: Callable[[], bool] = lambda: False,
 ) -> bool:
     """Let down an arm whose motors apply `drive`; return whether its motors have confirmed that they are off.
 
     note: called with each drive. log: called with each change worth knowing. is_endless: whether to keep trying while
-    the bus or a motor cannot be reached.
+    the bus or a motor cannot be reached. is_wanted: whether someone else waits for the bus, who then gets his chance.
     """
     try:
-        bus = _open(arm, log, is_endless, clock)
+        bus = _open(arm, log, is_endless, clock, is_wanted)
     except BusError as error:
         log(str(error))
         return False
@@ -68,7 +69,7 @@ def let_down(
         if machine.is_unreached and not was_unreached:
             log("a motor does not reply; it may still be powered; trying again")
         was_unreached = machine.is_unreached
-        if was_unreached and not is_endless:
+        if was_unreached and (not is_endless or is_wanted()):
             loop.abandon()
             return False
         # Once every motor has replied, the next cycle must come before their replies are too old.
@@ -78,13 +79,15 @@ def let_down(
     return not motors.may_be_powered
 
 
-def _open(arm: ArmOnBus, log: Callable[[str], None], is_endless: bool, clock: Clock) -> can.BusABC:
+def _open(
+    arm: ArmOnBus, log: Callable[[str], None], is_endless: bool, clock: Clock, is_wanted: Callable[[], bool]
+) -> can.BusABC:
     is_first = True
     while True:
         try:
             return arm.open()
         except BusError as error:
-            if not is_endless:
+            if not is_endless or is_wanted():
                 raise
             if is_first:
                 log(f"{error}; the motors may still be powered; trying again")

@@ -22,13 +22,14 @@ from rclpy.signals import SignalHandlerOptions
 
 from exo_gravity.core.errors import BusError, ExoGravityError
 from exo_gravity.core.motors.joint_motor import OPTIONS, motors_of, peaks_of, traffic_of
-from exo_gravity.core.safety.drive import FaultCode
+from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.params import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.ownership.handover import ArmOnBus
 from exo_gravity.hardware.ownership.owned_bus import OwnedBus, recover
+from exo_gravity.hardware.ownership.watchdog import Watchdog
 from exo_gravity.hardware.scheduling import request_real_time
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.can_bridge.operation import (
@@ -166,6 +167,7 @@ class CanBridge(LifecycleNode):
             loop.stop()
             raise
         self.loop = loop
+        self._look_at(self._owned.watchdog, loop)
         loop.call(lambda: safety.enable(time.monotonic()))
 
     def _deactivate(self) -> None:
@@ -183,9 +185,15 @@ class CanBridge(LifecycleNode):
         self._stop(loop)
 
     def _on_report(self) -> None:
-        if self.loop is not None and self._owned is not None and not self._owned.watchdog.alive:
-            self.loop.trip_if_carried(FaultCode.WATCHDOG_DEAD, "the watchdog process has died or is frozen")
+        if self.loop is not None and self._owned is not None:
+            self._look_at(self._owned.watchdog, self.loop)
         self._report.send(self.loop, self._exchange.refusal, self._exchange.answered)
+
+    def _look_at(self, watchdog: Watchdog, loop: ControlLoop) -> None:
+        """Let no motor be switched on before the watchdog watches, and none stay on without it."""
+        loop.safety.hindrance = "the watchdog to start" if watchdog.is_starting else ""
+        if not watchdog.alive and loop.safety.state is not State.LETTING_DOWN:
+            loop.trip(FaultCode.WATCHDOG_DEAD, "the watchdog process has died, is frozen, or did not start")
 
     def _report_descent(self) -> None:
         with contextlib.suppress(Exception):  # whatever the middleware does, the arm comes down
@@ -211,7 +219,8 @@ def run_recovery(patience: float) -> int:
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("can_bridge", automatically_declare_parameters_from_overrides=True)
     try:
-        return 0 if recover(_declared(node)[1], _owner(node), node.get_logger().error, patience) else 1
+        recover(_declared(node)[1], _owner(node), node.get_logger().error, patience)
+        return 0
     except ExoGravityError as error:
         node.get_logger().error(str(error))
         return 1
