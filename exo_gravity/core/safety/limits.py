@@ -74,6 +74,7 @@ class Limits:
     )
     command_timeout: float = owned(0.05, "age of effort commands that trips a fault", (0.01, 0.1), "s")
     reply_timeout: float = owned(0.05, "time without a reply from a motor that trips a fault", (0.01, 0.1), "s")
+    enable_timeout: float = owned(10.0, "time for the checks of a start to pass, else it is refused", (2.0, 60.0), "s")
     sign_check_torque: float = owned(
         1.5, "largest test torque of the sign check; 0 skips the check", (0.0, 3.0), "Nm", expert=True
     )
