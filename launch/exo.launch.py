@@ -5,7 +5,7 @@ others while they let the arms down, then the others, the recorders last. A term
 so all but the bridges ignore SIGINT. If `ros2 launch` itself is killed, each node stops with its standard input.
 
 The nodes are no `LifecycleNode` actions: with those, `ros2 launch` would be one more DDS participant while an arm
-is worn. `can_bridge` activates itself (`autostart`); `ros2 lifecycle` works as with any lifecycle node.
+is worn. `can_bridge` activates itself if `autostart` is set; `ros2 lifecycle` works as with any lifecycle node.
 """
 
 import asyncio

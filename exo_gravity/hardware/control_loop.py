@@ -24,6 +24,7 @@ from exo_gravity.core.safety.descent import DAMPING
 from exo_gravity.core.safety.drive import CARRYING, OFF, Drive, FaultCode, State
 from exo_gravity.core.safety.limits import JointSample
 from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.core.safety.supply import SupplyMonitor
 from exo_gravity.hardware.can.motor_bus import MotorBus
 
 EFFORT_WAIT = 0.5  # share of a cycle's idle time for which the loop may wait for late efforts
@@ -53,6 +54,8 @@ NO_COMMAND = EffortCommand(None, -math.inf)
 
 class ControlLoop:
     """Owns `bus` and `safety` until it has ended. Its clock is that of the bus.
+
+    It begins by finding out whether a motor is on (`SafetyMachine.meet`), unless `safety` already lets an arm down.
 
     `start` repeats `cycle` on a thread. A loop that was not started is run by its owner, one `cycle` after another.
 
@@ -87,6 +90,8 @@ class ControlLoop:
         self._on_cycle = on_cycle
         self._get_efforts = get_efforts
         self._hand_over = hand_over
+        if safety.state is State.DISABLED:
+            safety.meet(self._now())
         self._due = self._now()  # of the next cycle
         self._errors = 0  # in a row
         self._drive = OFF  # last decided
@@ -277,15 +282,25 @@ def lower(bus: MotorBus, drive: Drive, period: float) -> None:
     """Lower an arm whose motors receive `drive`, without the state machine; return once each has replied to EXIT.
 
     The torque fades slowly under full damping. The damping stays until the joints have been at rest for a while: a
-    joint under damping creeps, and would fall if it were switched off before it hangs. No exception ends this.
+    joint under damping creeps, and would fall if it were switched off before it hangs. While no motor replies the
+    torque is held, and one that then returns without torque stays off. No exception ends this.
     """
     now = bus.clock.monotonic
-    start = rest_since = now()
+    rest_since, faded = now(), 0.0
     rest: Sequence[JointSample] = tuple(bus.samples)
-    while (time := now()) - rest_since < REST_TIME or time - start < LOWERING_FADE:
-        share = max(0.0, 1.0 - (time - start) / LOWERING_FADE)
+    supply = SupplyMonitor()
+    if any(drive.unsure):
+        supply.doubt(drive.effort)
+    while (time := now()) - rest_since < REST_TIME or faded < LOWERING_FADE:
+        share = max(0.0, 1.0 - faded / LOWERING_FADE)
         effort = tuple(share * effort for effort in drive.effort)
-        _exchange(bus, Drive(effort, (DAMPING,) * len(effort), True), time + period)
+        silent = [time - joint.time > REPLY_TIMEOUT for joint in bus.samples]
+        if all(silent):
+            supply.doubt(effort)
+        else:
+            faded += period
+        supply.step(period, bus.samples, silent)
+        _exchange(bus, Drive(effort, (DAMPING,) * len(effort), True, unsure=supply.unsure), time + period)
         if not all(_is_at_rest(time, joint, last) for joint, last in zip(bus.samples, rest, strict=True)):
             rest_since, rest = time, tuple(bus.samples)
     while bus.may_be_powered:

@@ -54,8 +54,8 @@ from .frames import MOTOR_2, foreign_frames, random_frames
 from .operator_cases import OPERATOR
 from .operator_lease_cases import LEASES
 from .outer_loop_cases import OUTER_LOOP
-from .ride_cases import RIDES
 from .ownership_cases import OWNERSHIP
+from .ride_cases import RIDES
 from .rig import Rig
 from .rigs import (
     BothArmsRig,

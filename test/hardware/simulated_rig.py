@@ -9,8 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from exo_gravity.core.model.gravity import gravity_torque
-from exo_gravity.core.motors.specs import ENTER
-from exo_gravity.core.motors.wire_formats import MIT
+from exo_gravity.core.motors.wire_formats import MIT, WireFormat
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.ownership.handover import ArmOnBus
@@ -35,18 +34,22 @@ class Rig:
     carrying: (4,) Nm, what holds it in `POSE`. top_speed: rad/s, the largest true speed of a joint so far.
     """
 
-    def __init__(self, friction: float, pose: Sequence[float], carried: bool, clock: Clock) -> None:
+    def __init__(
+        self, friction: float, pose: Sequence[float], carried: bool, clock: Clock, wire_format: WireFormat = MIT
+    ) -> None:
         config = ArmConfig(coulomb_friction=(friction,) * 4)
         self.clock = clock
-        self.device = make_device(config=config)
+        self.motors = joints_of((wire_format,) * 4)
+        self.device = make_device(config=config, formats=(wire_format,) * 4)
         self.device.arm.reset(pose)
         self.links = config.links
         self.carrying = tuple(gravity_torque(self.links, POSE))
         self.top_speed = 0.0
         if carried:
-            for joint, torque in zip(MOTORS_OF_ARM, self.carrying, strict=True):
-                self.device.exchange(joint.can_id, joint.command(torque, 0.0))
-                self.device.exchange(joint.can_id, ENTER)
+            for joint, torque in zip(self.motors, self.carrying, strict=True):
+                self.device.exchange(joint.command_id, joint.command(torque, 0.0))
+                for frame in joint.enter:
+                    self.device.exchange(*frame)
 
     @property
     def motors_on(self) -> list[bool]:

@@ -11,13 +11,14 @@ import can
 
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.motors.joint_motor import peaks_of
+from exo_gravity.core.motors.wire_formats import MIT, WireFormat
 from exo_gravity.core.safety.drive import NOTHING, Drive, State
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop, EffortCommand
 from exo_gravity.hardware.ownership.handover import ArmOnBus
 
-from .simulated_rig import LIMITS, MOTORS_OF_ARM, POSE, Rig
+from .simulated_rig import LIMITS, POSE, Rig
 from .virtual_time import Wire
 
 CYCLE = 0.008  # s
@@ -38,12 +39,17 @@ class VirtualRig(Rig):
     """A simulated arm on a wire in virtual time."""
 
     def __init__(
-        self, friction: float = 0.1, pose: Sequence[float] = POSE, carried: bool = True, echoes: bool = False
+        self,
+        friction: float = 0.1,
+        pose: Sequence[float] = POSE,
+        carried: bool = True,
+        echoes: bool = False,
+        wire_format: WireFormat = MIT,
     ) -> None:
         self.wire = Wire(echoes=echoes)
-        super().__init__(friction, pose, carried, self.wire.clock)
+        super().__init__(friction, pose, carried, self.wire.clock, wire_format)
         self.wire.play(self.device, self.note_speed)
-        self.arm = VirtualArm(("wire", f"of process {os.getpid()}", {}), MOTORS_OF_ARM, LIMITS, CYCLE, self.wire)
+        self.arm = VirtualArm(("wire", f"of process {os.getpid()}", {}), self.motors, LIMITS, CYCLE, self.wire)
 
     @property
     def drive(self) -> Drive:
@@ -56,6 +62,11 @@ class VirtualRig(Rig):
         arm = self.device.arm
         return math.dist(arm.positions, POSE) < 0.1 and max(map(abs, arm.velocities)) < 0.1
 
+    def switch_supply(self, on: bool) -> None:
+        """Switch the supply of all motors; they come back switched off."""
+        for motor in self.device.motors:
+            motor.unplugged = not on
+
     def raising(self) -> tuple[float, ...]:
         """Return the torque (4,) in Nm that carries the arm where it is, and moves it to `POSE`."""
         arm = self.device.arm
@@ -67,14 +78,14 @@ class VirtualRig(Rig):
 class Carried:
     """An arm that a control loop carries in `POSE`, ACTIVE; options: those of the loop. drives: all that were noted."""
 
-    def __init__(self, echoes: bool = False, **options: Callable[..., object]) -> None:
-        self.rig = VirtualRig(pose=NOTHING, carried=False, echoes=echoes)
+    def __init__(self, echoes: bool = False, wire_format: WireFormat = MIT, **options: Callable[..., object]) -> None:
+        self.rig = VirtualRig(pose=NOTHING, carried=False, echoes=echoes, wire_format=wire_format)
         self.clock, self.wire = self.rig.clock, self.rig.wire
         self.drives: list[Drive] = []
         self.motors = MotorBus(
-            self.wire.open(), MOTORS_OF_ARM, note=self.drives.append, reopen=self.wire.open, clock=self.clock
+            self.wire.open(), self.rig.motors, note=self.drives.append, reopen=self.wire.open, clock=self.clock
         )
-        self.safety = SafetyMachine(QUICK, CYCLE, peaks_of(MOTORS_OF_ARM))
+        self.safety = SafetyMachine(QUICK, CYCLE, peaks_of(self.rig.motors))
         self.failure_of_efforts: Exception | None = None
         self._is_raised = False
         self.loop = ControlLoop(self.motors, self.safety, CYCLE, get_efforts=self._get_efforts, **options)

@@ -179,7 +179,8 @@ class RosProbe:
                 assert self.trigger("clear_fault").success
                 self.wait_until(lambda: self.state == "disabled")
             self.enable(True)  # refused while the bridge enables by itself
-            self.wait_until(lambda: self.state in ("active", "fault"))
+            self.wait_for_report()
+            self.wait_until(lambda: self.state in ("active", "fault", "disabled"))  # disabled: the enable has expired
 
     def bring_to(self, script: object) -> None:
         """Let the virtual wearer move the carried arm by the trial script at the path `script`, and release it."""

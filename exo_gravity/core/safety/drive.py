@@ -39,6 +39,8 @@ class Drive(NamedTuple):
     powered: bool
     #: (4,) which motors must be switched on again, because they are found off
     enter: tuple[bool, ...] = (False, False, False, False)
+    #: (4,) which motors may be on or off: they are sent nothing that could switch them on
+    unsure: tuple[bool, ...] = (False, False, False, False)
 
     def within(self, peak_damping: tuple[float, ...]) -> Drive:
         """Return the drive with no more damping than `peak_damping` (4,) Nm s/rad."""

@@ -81,6 +81,7 @@ class Limits:
     reply_timeout: float = owned(
         0.05, "time without a reply from a motor, 7 cycles at least, that trips a fault", (0.01, 0.1), "s"
     )
+    enable_timeout: float = owned(10.0, "time for the checks of a start to pass, else it is refused", (2.0, 60.0), "s")
     sign_check_torque: float = owned(
         1.5, "largest test torque of the sign check; 0 skips the check", (0.0, 3.0), "Nm", expert=True
     )

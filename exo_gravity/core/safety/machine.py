@@ -8,12 +8,13 @@
         +-------------------------------------------+ down: FAULT after a fault, else DISABLED
 
 - DISABLED, CHECKING, FAULT: the motors are off. Zero commands poll their positions.
-- CHECKING waits for the start gate (gate.py). If zeros are not trusted, the arm must hang.
+- CHECKING waits for the start gate (gate.py), at most `enable_timeout`. If zeros are not trusted, the arm must hang.
 - PROVING: each motor must show in its replies that it is on. If signs are not trusted, each joint is pushed gently, and
   must move the right way (gate.py).
 - LETTING_DOWN lowers each joint at a bounded speed (descent.py). The motors are switched off once nothing holds
   the arm and nothing moves it. A motor that cannot be reached stays in this state's care: if it replies again, however
-  late, its joint is lowered from the torque that it then applies.
+  late, its joint is lowered from the torque that it then applies. If all were silent at once, their supply may have
+  been cut: a motor that returns without torque stays off (supply.py).
 - FAULT latches the code and reason of the first fault. Only `clear` leaves it, and only to DISABLED: clearing a fault
   never enables the arm.
 
@@ -27,10 +28,12 @@ casts doubt on them (`DOUBTFUL`). Until then `resume` carries an arm on from any
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Sequence
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import Peaks
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DAMPING, DAMPING_RISE, ArmDescent, RestTracker
 from exo_gravity.core.safety.drive import CARRYING, DOUBTFUL, NO_ONES, NOTHING, OFF, Drive, Fault, FaultCode, State
@@ -38,6 +41,7 @@ from exo_gravity.core.safety.gate import SignCheck, StartGate, SwitchOnCheck
 from exo_gravity.core.safety.limits import JointSample, Limits, guide_damping
 from exo_gravity.core.safety.readings import Readings
 from exo_gravity.core.safety.ride import RideThrough
+from exo_gravity.core.safety.supply import SupplyMonitor
 
 RAMP_TIME = 1.0  # s from no torque to full torque: the arm becomes light without a jolt
 
@@ -48,16 +52,16 @@ class SafetyMachine:
     period: s of a cycle. After a pause the torque continues as if only one period had passed: it never catches up.
     peaks: the most that the motors apply; by default `max_effort`, and any damping.
 
-    state: the State. fault: the latched Fault or None. waiting_for: what CHECKING or PROVING waits for. acted: for each
-    limit that has acted, by name, the last time. is_unreached: whether a motor that may be on cannot be reached. ride:
-    through late efforts.
+    state: the State. fault: the latched Fault or None. waiting_for: what CHECKING or PROVING waits for. refusal: why
+    the last enable was refused without a fault, or "". acted: for each limit that has acted, by name, the last time.
+    is_unreached: whether a motor that may be on cannot be reached. ride: through late efforts.
     """
 
     def __init__(self, limits: Limits, period: float, peaks: Peaks | None = None) -> None:
         self.limits = limits
         self.state = State.DISABLED
         self.fault: Fault | None = None
-        self.waiting_for = ""
+        self.waiting_for = self.refusal = ""
         self.acted: dict[str, float] = {}
         self.is_unreached = False
         self.ride = RideThrough(limits.command_timeout)
@@ -69,8 +73,10 @@ class SafetyMachine:
         self._descent = ArmDescent(0.0, NOTHING, NOTHING, NOTHING)
         self._rest = RestTracker()
         self._readings = Readings(limits)
+        self._is_found_on = False  # by this cycle's replies
         self._is_trusted = False  # zeros and signs
         self._delivery = DeliveryMonitor(limits, self._peaks.effort)
+        self._supply = SupplyMonitor()
         self._gate = StartGate(limits, 0.0)
         self._switch_on = SwitchOnCheck(limits)
         self._signs = SignCheck(limits.joint_names, NOTHING)
@@ -82,7 +88,7 @@ class SafetyMachine:
         if self.state is not State.DISABLED:
             return False
         self._gate = StartGate(self.limits, now)
-        self.waiting_for = self._gate.waiting_for
+        self.waiting_for, self.refusal = self._gate.waiting_for, ""
         self._enter(State.CHECKING, now)
         return True
 
@@ -132,7 +138,13 @@ class SafetyMachine:
     def take_over(self, effort: Sequence[float], damping: Sequence[float], now: float) -> None:
         """Let down an arm whose controller has died while its motors applied `effort` (4,) Nm and `damping` (4,)."""
         self._sent = Drive(tuple(effort), tuple(damping), True)
+        self._supply.doubt(effort)
         self._let_down(now)
+
+    def meet(self, now: float) -> None:
+        """Find out, under damping, whether motors are on that a dead controller may have left; let them down if so."""
+        self._descent = ArmDescent(now, NOTHING, (DAMPING,) * JOINT_COUNT, self._peaks.effort)
+        self._supply.doubt(NOTHING)
 
     def settled(self, now: float) -> bool:
         """Return whether no replying joint has moved for a while."""
@@ -156,7 +168,7 @@ class SafetyMachine:
         now = max(now, self._now)  # a call may carry a slightly later time than the cycle that follows it
         dt = min(now - self._now, self._period)
         self._now = now
-        joints = self._track(now, joints)
+        joints = self._track(now, joints, dt)
         if self.state is State.CHECKING:
             self._check(now, joints, effort, effort_time)
         if self._sent.powered:
@@ -203,6 +215,8 @@ class SafetyMachine:
             self._signs = SignCheck(self.limits.joint_names, [min(largest, most) for most in self.limits.max_effort])
             self._delivery.reset()
             self._enter(State.PROVING, now)
+        elif now - self._since >= self.limits.enable_timeout:
+            self._refuse(f"not enabled within {self.limits.enable_timeout:g} s: waited for {self.waiting_for}", now)
 
     def _check_delivery(self, now: float, joints: Sequence[JointSample], dt: float) -> None:
         fault = self._delivery.step(dt, joints, self._sent.effort, self._sent.damping)
@@ -253,37 +267,55 @@ class SafetyMachine:
         return Drive(shaped, damping, True)
 
     def _descend(self, now: float, joints: Sequence[JointSample], dt: float) -> Drive:
-        descent = self._descent
-        descent.step(now, dt, joints, self._readings.silent)
+        descent, supply, silent = self._descent, self._supply, self._readings.silent
+        descent.step(now, dt, joints, tuple(map(operator.or_, silent, supply.returning)))
         if self.state is not State.LETTING_DOWN:  # a motor that could not be reached replies again
             self._enter(State.LETTING_DOWN, now)
-        if descent.is_down(now, self._rest.since):
-            self.is_unreached = any(self._readings.silent)
+        are_off = supply.all_unsure and supply.are_off
+        if are_off or descent.is_down(now, self._rest.since):
+            self.is_unreached = any(silent)
+            supply.settle(silent)
             self._enter(State.FAULT if self.fault else State.DISABLED, now)
             return self._stand(now, joints, dt)
-        known = zip(self._delivery.missing, self._readings.silent, strict=True)
-        enter = tuple(missing and not is_silent for missing, is_silent in known)
+        columns = zip(self._delivery.missing, silent, supply.unsure, strict=True)
+        enter = tuple(missing and not is_silent and not is_unsure for missing, is_silent, is_unsure in columns)
         if any(enter):
             self._is_trusted = False
             self._delivery.reset()
-        return Drive(descent.effort, descent.damping, True, enter)
+        return Drive(descent.effort, descent.damping, True, enter, supply.unsure)
 
     def _stand(self, now: float, joints: Sequence[JointSample], dt: float) -> Drive:
-        """Return what the motors receive while the arm is off: nothing, unless one of them could not be reached."""
-        if not self.is_unreached:
+        """Return what the motors receive while the arm is off: nothing, unless one of them may be on."""
+        supply = self._supply
+        if supply.are_off:
+            supply.settle()
+            if self.is_unreached and self.state is State.CHECKING:
+                self._refuse("the motors have just returned, switched off: enable them again", now)
+            self.is_unreached = False
+        is_doubtful = any(supply.unsure)
+        if not self.is_unreached and not is_doubtful:
             return OFF
-        if any(self._readings.silent):
-            return Drive(self._descent.effort, self._descent.damping, True)
+        if not self._is_found_on and (is_doubtful or any(self._readings.silent)):
+            return Drive(self._descent.effort, self._descent.damping, True, unsure=supply.unsure)
+        if self.state is State.CHECKING:
+            self._refuse("a motor was still on: it is let down", now)
         self.is_unreached = False
         return self._descend(now, joints, dt)
 
-    def _track(self, now: float, joints: Sequence[JointSample]) -> Sequence[JointSample]:
-        """Follow the readings, and note whether the arm is at rest as far as its motors reply; return what counts."""
+    def _refuse(self, reason: str, now: float) -> None:
+        self.refusal = reason
+        self._enter(State.DISABLED, now)
+
+    def _track(self, now: float, joints: Sequence[JointSample], dt: float) -> Sequence[JointSample]:
+        """Follow the readings: who is silent, who applies torque, whether the arm rests; return those that count."""
         readings = self._readings
         readings.step(now, joints, self._sent.powered)
         if readings.lost or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):
             self._is_trusted = False
         self._rest.step(now, readings.joints, readings.silent)
+        if all(readings.silent) and self._sent.powered:
+            self._supply.doubt(self._sent.effort)
+        self._is_found_on = self._supply.step(dt, readings.joints, readings.silent)
         return tuple(readings.joints)
 
     def _let_down(self, now: float) -> None:

@@ -18,7 +18,7 @@ PERIODS = 2  # control periods that must fit into each time-out, so that one lat
 LIMIT_PARAMETERS = params_of(Limits, fixed=True)
 CAN_BRIDGE = (
     JOINT_NAMES,
-    Param("autostart", True, "configure and activate at start without an operator", fixed=True),
+    Param("autostart", True, "configure and activate once at the start, without an operator", fixed=True),
     Param("rate", 250.0, "control cycles per second, as far as the CAN bus allows", (20.0, 2000.0), "Hz",
           fixed=True),
     *MOTOR_PARAMETERS,

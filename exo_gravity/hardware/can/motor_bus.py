@@ -12,6 +12,9 @@ Linux, MSG_DONTROUTE): there it does not show an echo.
 
 A zero command precedes the frames that switch a V1 or V2 board on or off: the motor remembers its last command, and
 ENTER would carry it out. A command switches a V3 board on, so it gets none while the arm is off.
+
+A motor that is `unsure` in a drive may have restarted or kept its power. A V1 or V2 board gets its command, which holds
+it if it is on, and is ignored if it is off, but no ENTER. A V3 board gets nothing: its status frames come unasked.
 """
 
 from __future__ import annotations
@@ -81,6 +84,7 @@ class MotorBus:
         self._asked = frozenset(joint for joint, motor in enumerate(motors) if motor.wire_format.replies)
         self._joint_of = {motor.can_id: joint for joint, motor in enumerate(motors)}
         self._powered = powered
+        self._unsure: Sequence[bool] = (False,) * JOINT_COUNT  # of the last powered drive
         self._unconfirmed = set(range(JOINT_COUNT)) if powered else set()  # not known to be off
         self._ids = tuple(motor.command_id for motor in motors)
         self._commands: list[Frame | None] = [None] * JOINT_COUNT  # last sent
@@ -93,8 +97,8 @@ class MotorBus:
 
     @property
     def may_be_powered(self) -> bool:
-        """Whether a motor may be on: it was switched on, and has not replied since it was sent EXIT."""
-        return self._powered or bool(self._unconfirmed)
+        """Whether a motor may be on: it was switched on or found on, and has not replied since it was sent EXIT."""
+        return bool(self._unconfirmed)
 
     @property
     def is_contested(self) -> bool:
@@ -119,11 +123,14 @@ class MotorBus:
         Switches the motors on or off when `drive.powered` changes. Returns whether all motors replied in time. Raises
         BusError if the bus fails.
         """
-        self._note(drive._replace(powered=drive.powered or self.may_be_powered))
+        if drive.powered:
+            self._unsure = drive.unsure
+            self._unconfirmed.update(joint for joint, is_unsure in enumerate(drive.unsure) if not is_unsure)
+        self._note(drive._replace(powered=self.may_be_powered))
         self._is_confirming = not self._powered and self._exit_sent > -math.inf
         self._drain()
         if drive.powered:
-            self._switch_on()
+            self._switch_on(drive)
         self._send_commands(drive)
         if not drive.powered:
             self._switch_off()
@@ -158,9 +165,10 @@ class MotorBus:
     def stop(self) -> bool:
         """Send the last frames, a zero command and EXIT, twice; then close the bus. Never raises.
 
-        Returns whether the motors are off, as far as their replies show. If not, they stay noted as powered.
+        Returns whether the motors are off, as far as their replies show. If not, they stay noted as powered. Nothing is
+        sent to motors that were never switched on or off: another owner may have left them on.
         """
-        for _ in range(2):
+        for _ in range(2 if self.may_be_powered or self._exit_sent > -math.inf else 0):
             self._is_confirming = True
             for joint, motor in enumerate(self._motors):
                 for frame in (*self._zero_command(joint), *motor.exit):
@@ -181,10 +189,11 @@ class MotorBus:
         """Close the bus without any frame. Never raises."""
         self._port.close()
 
-    def _switch_on(self) -> None:
-        if not self._powered:
-            self._powered, self._exit_sent = True, -math.inf
-            self._unconfirmed = set(range(JOINT_COUNT))
+    def _switch_on(self, drive: Drive) -> None:
+        if self._powered:
+            return
+        self._powered, self._exit_sent = True, -math.inf
+        if not any(drive.unsure):
             self._send_commands(OFF)
             self._send_each([motor.enter for motor in self._motors])
 
@@ -198,16 +207,18 @@ class MotorBus:
         self._powered = False
 
     def _zero_command(self, joint: int) -> tuple[Frame, ...]:
-        """Return a command without torque and gains; none for a V3 board that is off, which it would switch on."""
-        if joint not in self._asked and joint not in self._unconfirmed and self._exit_sent > -math.inf:
+        """Return a command without torque and gains; none for a V3 board that may be off: it would switch it on."""
+        if joint not in self._asked and (joint not in self._unconfirmed or self._unsure[joint]):
             return ()
         return ((self._ids[joint], self._motors[joint].command(0.0, 0.0)),)
 
     def _send_commands(self, drive: Drive) -> None:
         for joint, motor in enumerate(self._motors):
-            if not drive.powered and joint not in self._asked:
+            if joint not in self._asked and (drive.unsure[joint] or not drive.powered):
+                self._commands[joint] = None
                 continue
-            command = self._commands[joint] = self._ids[joint], motor.command(drive.effort[joint], drive.damping[joint])
+            command = self._ids[joint], motor.command(drive.effort[joint], drive.damping[joint])
+            self._commands[joint] = None if drive.unsure[joint] else command  # what a foreign command is answered with
             if drive.enter[joint]:
                 self._send_each([(command, *motor.enter)])
             self._send(command)

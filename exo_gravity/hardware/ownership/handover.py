@@ -102,10 +102,11 @@ def _applied(motors: MotorBus, drive: Drive, period: float) -> tuple[tuple[float
     """
     clock = motors.clock
     end = clock.monotonic() + FIRST_REPLIES
+    first = drive._replace(powered=True, unsure=(True,) * len(drive.effort))
     is_complete = False
     while not is_complete and clock.monotonic() < end:
         try:
-            is_complete = motors.exchange(drive._replace(powered=True), clock.monotonic() + period)
+            is_complete = motors.exchange(first, clock.monotonic() + period)
         except BusError:
             clock.sleep(period)
     effort, damping = list(drive.effort), list(drive.damping)

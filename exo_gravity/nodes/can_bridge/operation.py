@@ -40,6 +40,8 @@ REQUESTS = 32  # of control, that wait for the next look
 WATCH_PERIOD = 0.1  # s between two looks at them
 CALL_TIMEOUT = 2.0  # s that a service waits for the control thread
 
+UNREACHED = "a motor that was on does not reply and may still be powered, unless its supply is cut: cut it"
+
 Response = TypeVar("Response", SetBool.Response, Trigger.Response)
 
 
@@ -247,6 +249,7 @@ class BridgeReport:
             "state": safety.state.value,
             "fault": safety.fault.code if safety.fault else "none",
             **operator,
+            "refusal": safety.refusal or "none",
             "limits acting": acting or "none",
             "rate (Hz)": f"{rate:.1f}",
             "bus load (%)": f"{100.0 * self._traffic.load(rate).share:.0f}" if rate else "0",
@@ -283,9 +286,11 @@ def _headline(loop: ControlLoop, warnings: str) -> tuple[bytes, str]:
     if loop.failure:
         return ERROR, f"the control thread has ended: {loop.failure}"
     if safety.is_unreached:
-        return ERROR, f"{safety.state.value}: a motor does not reply and may still be powered: cut the motors' supply"
+        return ERROR, f"{safety.state.value}: {UNREACHED}"
     if safety.fault:
         return ERROR, f"{safety.state.value}: {safety.fault.code}: {safety.fault.reason}"
     if safety.state is State.CHECKING:
         return WARN, f"checking: waiting for {safety.waiting_for}"
+    if safety.refusal:
+        return WARN, f"{safety.state.value}: {safety.refusal}"
     return (WARN, f"{safety.state.value}, {warnings}") if warnings else (OK, safety.state.value)

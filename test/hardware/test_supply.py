@@ -1,0 +1,191 @@
+"""The supply of a carried arm is switched off and on, or its bus: what the motors truly do, in virtual time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+
+from exo_gravity.core.motors.wire_formats import MIT, MIT_V3, WireFormat
+from exo_gravity.core.safety.drive import NOTHING, Drive, State
+from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.control_loop import ControlLoop
+from exo_gravity.hardware.ownership.handover import let_down
+
+from .simulated_rig import LIMITS
+from .virtual_rig import CYCLE, QUICK, Carried, VirtualRig
+
+FORMATS = pytest.mark.parametrize("wire_format", [MIT, MIT_V3], ids=["mit", "mit_v3"])
+CAUSED_SPEED = 0.6  # rad/s that motors may cause
+
+
+class OnWatch:
+    """Notes on the clock of `rig` whether a motor was on since."""
+
+    def __init__(self, rig: VirtualRig) -> None:
+        self.was_on = False
+        self._rig = rig
+        self.end = rig.clock.every(0.002, self._look)
+
+    def _look(self) -> None:
+        self.was_on |= any(self._rig.motors_on)
+
+
+def carried_again(arm: Carried) -> None:
+    """Clear the fault, enable the hanging arm, and expect that it is carried."""
+    assert arm.safety.clear(arm.clock.monotonic()) or arm.safety.state is State.DISABLED
+    assert arm.safety.enable(arm.clock.monotonic())
+    arm.run_until(lambda: arm.safety.state is State.ACTIVE, 8.0)
+    assert arm.rig.motors_on == [True] * 4
+
+
+@FORMATS
+@pytest.mark.parametrize(("duration", "clears"), [(2.0, False), (2.0, True), (30.0, False), (30.0, True)])
+def test_motors_whose_supply_returns_stay_off_until_they_are_enabled(
+    wire_format: WireFormat, duration: float, clears: bool
+) -> None:
+    arm = Carried(wire_format=wire_format)
+    arm.rig.switch_supply(False)
+    arm.run(duration)
+    assert arm.safety.fault.code == "motor_silent"
+    if clears and arm.safety.clear(arm.clock.monotonic()):
+        arm.safety.enable(arm.clock.monotonic())
+    watch = OnWatch(arm.rig)
+    arm.run(0.1)
+    arm.rig.top_speed = 0.0
+    arm.rig.switch_supply(True)
+    arm.run(3.0)
+    assert not watch.was_on
+    assert arm.rig.top_speed < 0.05
+    assert arm.loop.is_off
+    watch.end()
+    arm.rig.device.arm.reset(NOTHING)
+    arm.run(0.6)
+    carried_again(arm)
+
+
+@FORMATS
+def test_an_arm_whose_bus_was_cut_is_let_down_by_its_motors_that_kept_their_power(wire_format: WireFormat) -> None:
+    arm = Carried(wire_format=wire_format)
+    arm.rig.device.bus_silent = True
+    arm.run(8.0)
+    assert arm.safety.state is State.FAULT and arm.safety.is_unreached
+    assert arm.rig.motors_on == [True] * 4
+    arm.rig.device.bus_silent = False
+    arm.run(0.1)
+    assert arm.safety.state is State.LETTING_DOWN
+    arm.assert_let_down()
+    assert arm.rig.top_speed < CAUSED_SPEED
+
+
+@FORMATS
+def test_a_single_motor_that_restarts_is_switched_on_again_and_let_down_with_the_others(
+    wire_format: WireFormat,
+) -> None:
+    arm = Carried(wire_format=wire_format)
+    motor = arm.rig.device.motors[2]
+    motor.unplugged = True
+    arm.run(0.1)
+    motor.unplugged = False
+    arm.run(0.3)
+    assert arm.rig.motors_on == [True] * 4
+    arm.run_until(lambda: arm.loop.is_off)
+    assert arm.rig.motors_on == [False] * 4
+
+
+@FORMATS
+@pytest.mark.parametrize("duration", [2.0, 30.0])
+def test_the_watchdog_leaves_motors_off_whose_supply_returns(wire_format: WireFormat, duration: float) -> None:
+    rig = VirtualRig(wire_format=wire_format)
+    watches: list[OnWatch] = []
+
+    def release() -> None:
+        watches.append(OnWatch(rig))
+        rig.switch_supply(True)
+
+    rig.clock.later(0.5, lambda: rig.switch_supply(False))
+    rig.clock.later(0.5 + duration, release)
+    assert let_down(rig.arm, rig.drive, clock=rig.clock)
+    assert watches and not watches[0].was_on
+
+
+@FORMATS
+def test_the_last_resort_leaves_motors_off_whose_supply_returns(wire_format: WireFormat) -> None:
+    arm = Carried(wire_format=wire_format)
+
+    def fail(*_: object) -> Drive:
+        raise ZeroDivisionError
+
+    arm.safety.step = fail  # type: ignore[method-assign]
+    watches: list[OnWatch] = []
+
+    def release() -> None:
+        watches.append(OnWatch(arm.rig))
+        arm.rig.switch_supply(True)
+
+    arm.clock.later(1.0, lambda: arm.rig.switch_supply(False))
+    arm.clock.later(3.0, release)
+    while arm.loop.cycle():
+        pass
+    assert watches and not watches[0].was_on
+
+
+@FORMATS
+@pytest.mark.parametrize("silent_for", [0.0, 3.0], ids=["at once", "reached late"])
+def test_motors_that_an_owner_without_notes_left_on_are_met_with_damping_and_let_down(
+    wire_format: WireFormat, silent_for: float
+) -> None:
+    rig = VirtualRig(wire_format=wire_format)
+    rig.device.bus_silent = silent_for > 0.0
+    rig.clock.later(silent_for, lambda: setattr(rig.device, "bus_silent", False))
+    bus = MotorBus(rig.wire.open(), rig.motors, clock=rig.clock)
+    bus.listen()
+    loop = ControlLoop(bus, SafetyMachine(LIMITS, CYCLE), CYCLE)
+    loop.safety.enable(rig.clock.monotonic())  # refused: the arm does not hang
+    end = rig.clock.monotonic() + silent_for + 30.0
+    while rig.clock.monotonic() < end and (rig.clock.monotonic() < end - 29.0 or not loop.is_off):
+        loop.cycle()
+    assert loop.is_off
+    assert rig.motors_on == [False] * 4
+    rig.clock.sleep(0.5)
+    assert rig.top_speed < 0.9  # 5.3 rad/s without damping; damping alone lets this arm sink at 3.6 Nm / 5 Nm s/rad
+
+
+@FORMATS
+@pytest.mark.parametrize("is_on", [False, True])
+def test_a_loop_can_end_at_once_while_no_motor_was_ever_heard(wire_format: WireFormat, is_on: bool) -> None:
+    rig = VirtualRig(pose=NOTHING, carried=is_on, wire_format=wire_format)
+    rig.device.bus_silent = True
+    bus = MotorBus(rig.wire.open(), rig.motors, clock=rig.clock)
+    loop = ControlLoop(bus, SafetyMachine(LIMITS, CYCLE), CYCLE)
+    loop.cycle()
+    rig.device.bus_silent = False
+    loop.stop()
+    assert rig.motors_on == [is_on] * 4  # nobody knows, so nothing was sent
+
+
+@pytest.mark.parametrize("spoil", [lambda rig: rig.switch_supply(False), lambda rig: None], ids=["supply", "efforts"])
+def test_an_enable_expires_and_says_what_was_missing(spoil: Callable[[VirtualRig], None]) -> None:
+    rig = VirtualRig(pose=NOTHING, carried=False)
+    spoil(rig)
+    bus = MotorBus(rig.wire.open(), rig.motors, clock=rig.clock)
+    loop = ControlLoop(bus, SafetyMachine(QUICK, CYCLE), CYCLE)
+    loop.safety.enable(rig.clock.monotonic())
+    end = rig.clock.monotonic() + QUICK.enable_timeout
+    while rig.clock.monotonic() < end - 0.1:
+        loop.cycle()
+    assert loop.safety.state is State.CHECKING
+    while rig.clock.monotonic() < end + 0.1:
+        loop.cycle()
+    assert loop.safety.state is State.DISABLED and not loop.safety.fault
+    missing = "no reply for more than 50 ms" if math.isnan(loop.samples[0].position) else "effort commands"
+    assert loop.safety.refusal.startswith("not enabled within 10 s: waited for") and missing in loop.safety.refusal
+    rig.switch_supply(True)
+    watch = OnWatch(rig)
+    end = rig.clock.monotonic() + 3.0
+    while rig.clock.monotonic() < end:
+        loop.cycle()
+    assert not watch.was_on
+    assert loop.safety.enable(rig.clock.monotonic()) and not loop.safety.refusal
