@@ -238,6 +238,8 @@ ARMS = (
     FaultCase("can_bridge of the right of two arms killed", send_signal("can_bridge", KILL), BothArmsRig,
         PROCESS_REACTION),
 )
+CASES = (
+    *HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *OUTER_LOOP, *CLOCK, *ARMS, *V3_BOARDS,
+    *OPERATOR,
+)
 # fmt: on
-CASES = (*HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *OUTER_LOOP, *CLOCK, *ARMS, *V3_BOARDS)
-CASES += OPERATOR
