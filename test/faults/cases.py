@@ -66,6 +66,7 @@ from .rigs import (
     WearerRig,
 )
 from .v3_cases import V3_BOARDS
+from .wearer_cases import ACTIVE_WEARER
 
 STATES, EFFORTS, TILT, RAW_IMU = "/right/joint_states", "/right/effort_commands", "/imu/pitch_yaw", "/imu/data_raw"
 TRUNK_IMU = "/imu/data"
@@ -238,4 +239,16 @@ ARMS = (
         PROCESS_REACTION),
 )
 # fmt: on
-CASES = (*HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *OUTER_LOOP, *CLOCK, *ARMS, *V3_BOARDS)
+CASES = (
+    *HELD_ROWS,
+    *MOTORS,
+    *DESCENT,
+    *START,
+    *PROCESSES,
+    *EFFORT_COMMANDS,
+    *OUTER_LOOP,
+    *CLOCK,
+    *ARMS,
+    *V3_BOARDS,
+    *ACTIVE_WEARER,
+)
