@@ -70,6 +70,7 @@ from .rigs import (
     WearerRig,
 )
 from .v3_cases import V3_BOARDS
+from .wearer_cases import ACTIVE_WEARER
 
 STATES, EFFORTS, TILT, RAW_IMU = "/right/joint_states", "/right/effort_commands", "/imu/pitch_yaw", "/imu/data_raw"
 TRUNK_IMU = "/imu/data"
@@ -244,5 +245,5 @@ ARMS = (
 # fmt: on
 CASES = (
     *(*HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *OUTER_LOOP, *CLOCK, *ARMS, *V3_BOARDS),
-    *(*RIDES, *OWNERSHIP, *LEASES, *OPERATOR),
+    *(*RIDES, *OWNERSHIP, *LEASES, *OPERATOR, *ACTIVE_WEARER),
 )

@@ -1,4 +1,9 @@
-"""Judges how an arm came down after a fault, by the simulated arm's true motion, not by the frames on its bus."""
+"""Judges how an arm came down after a fault, by the simulated arm's true motion, not by the frames on its bus.
+
+A wearer may move the arm as fast as he likes. While he touches it, and HAND_OFF s longer, its speed is his. Then only
+the speed that a joint gains counts: what it exceeds the least that it has had since. `driven` is the part of it that a
+motor causes: the largest such speed of a joint in the direction of its motor's torque. A motor that brakes causes none.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +16,7 @@ from exo_gravity.core.motors.specs import MOTORS
 
 MAX_SPEED = 1.0  # rad/s, of every joint
 MAX_EFFORT_RATE = 50.0  # Nm/s
+HAND_OFF = 0.1  # s after the wearer lets go in which the arm still yields to his hand
 MAX_WORK = 0.3  # J that one motor may put into the arm after a fault
 RESOLUTION = 2 * MOTORS["AK80-9"].torque_range * 2 / 0xFFF  # Nm, two codes of a command
 PEAK_TORQUE = np.array([MOTORS[name].peak_torque for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6")])
@@ -22,15 +28,16 @@ class Response:
     """What the arm did since the fault.
 
     reaction: s until every motor that can be reached is off or applies damping, None if one never does. top_speed:
-    rad/s of `fastest` (joint 1..4). largest_step: Nm of a motor's torque within 1 ms, apart from damping times speed;
-    switching off counts. excess: Nm by which the worst step exceeds what `MAX_EFFORT_RATE` allows for the frames that
-    the motor received in that time. work: J that the busiest motor put into the arm. off: s until the last motor was
-    off, None if one is on at the end. re_enabled: whether a motor was switched on after all had been off. gap: s, the
-    longest time without a record.
+    rad/s of `fastest` (joint 1..4), and driven: rad/s, both without the wearer's part. largest_step: Nm of a motor's
+    torque within 1 ms, apart from damping times speed; switching off counts. excess: Nm by which the worst step exceeds
+    what `MAX_EFFORT_RATE` allows for the frames that the motor received in that time. work: J that the busiest motor
+    put into the arm while no hand was on it. off: s until the last motor was off, None if one is on at the end.
+    re_enabled: whether a motor was switched on after all had been off. gap: s, the longest time without a record.
     """
 
     reaction: float | None = None
     top_speed: float = 0.0
+    driven: float = 0.0
     fastest: int = 0
     largest_step: float = 0.0
     excess: float = 0.0
@@ -57,7 +64,8 @@ def measure(
     since = records["time"] - fault_time
     after = since >= 0.0
     on = records["on"] & after[:, None]
-    speed = np.abs(records["velocity"]) * after[:, None]
+    is_free, speed = _gained(records)
+    speed[~after] = 0.0
     speed[:, list(unpowered)] = 0.0
     step, excess = _steps(records, period)
     step, excess = step[since[1:] >= steps_from], excess[since[1:] >= steps_from]
@@ -67,14 +75,27 @@ def measure(
     return Response(
         reaction=_reaction(records, since, unreached),
         top_speed=float(speed.max(initial=0.0)),
+        driven=float(speed[records["torque"] * records["velocity"] > 0.0].max(initial=0.0)),
         fastest=int(np.argmax(speed.max(axis=0, initial=0.0))) + 1,
         largest_step=float(step.max(initial=0.0)),
         excess=float(excess.max(initial=0.0)),
-        work=float(_work(records, after).max(initial=0.0)),
+        work=float(_work(records, after & is_free).max(initial=0.0)),
         off=None if off_at >= len(records) else max(0.0, float(since[off_at])),
         re_enabled=bool(len(dark) and len(powered) and powered[-1] > dark[0]),
         gap=float(np.diff(records["time"]).max(initial=0.0)),
     )
+
+
+def _gained(records: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return when the arm was free of the wearer's hand (n,), and the speed (n, 4) in rad/s that it gained since."""
+    time, speed = records["time"], np.abs(records["velocity"])
+    touched = np.maximum.accumulate(np.where(records["wearer"].any(axis=1), time, -np.inf))
+    is_free = time - touched > HAND_OFF
+    speed[~is_free] = 0.0
+    released = 1 + np.flatnonzero(is_free[1:] & ~is_free[:-1])
+    for part in np.split(speed, released)[1:]:
+        part -= np.minimum.accumulate(part)
+    return is_free, speed
 
 
 def _reaction(records: np.ndarray, since: np.ndarray, unreached: Collection[int]) -> float | None:

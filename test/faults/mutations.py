@@ -197,6 +197,17 @@ MUTATIONS = (
         ("motors silent for long, then the next can_bridge",),
         (Edit(WATCHDOG, "is_wanted=is_wanted)", "is_wanted=lambda: False)"),),
     ),
+    Mutation(
+        "the brake of the descent grows without a bound",
+        ("compensator frozen while the wearer pushes down",),
+        (Edit(DESCENT, "self._most = max(max_effort, abs(effort))", "self._most = 18.0"),
+         Edit(DESCENT, "rate = min(BRAKE_GROWTH, BRAKE_GAIN * excess)", "rate = BRAKE_GAIN * excess")),
+    ),
+    Mutation(
+        "the descent drives a joint that the wearer pushed down",
+        ("compensator frozen while the wearer pushes down",),
+        (Edit(DESCENT, "if self.effort * velocity > 0.0 and speed > DRIVEN_SPEED:", "if False:"),),
+    ),
 )  # fmt: skip
 
 

@@ -103,6 +103,7 @@ def _failures(case: FaultCase, rig: Rig, outcome: str, records: np.ndarray, faul
         f"{outcome} instead of {' or '.join(case.outcomes)}": bool(case.outcomes) and outcome not in case.outcomes,
         "too late": rig.shipped_timeouts and must_react and late,
         "too fast": response.top_speed > case.speed_limit,
+        "moved by a motor": not carried and response.driven > case.driven_limit,
         "torque step": response.excess > 0.0,
         "driven by a motor": not carried and response.work > case.work_limit,
         "switched on again": response.re_enabled,
@@ -129,6 +130,7 @@ def _result(case: FaultCase, outcome: str, response: Response, failures: list[st
         "reaction_ms": None if carried or response.reaction is None else round(response.reaction * 1000),
         "limit_ms": case.limit and round(case.limit * 1000),
         "top_speed_rad_s": round(response.top_speed, 2),
+        "driven_rad_s": round(response.driven, 2),
         "fastest_joint": response.fastest,
         "torque_step_nm": round(response.largest_step, 3),
         "work_j": round(response.work, 3),
@@ -139,7 +141,16 @@ def _result(case: FaultCase, outcome: str, response: Response, failures: list[st
 
 def not_run(case: FaultCase, error: BaseException) -> Result:
     """Return the result of a case that could not be run to its end."""
-    figures = ("reaction_ms", "limit_ms", "top_speed_rad_s", "fastest_joint", "torque_step_nm", "work_j", "off_s")
+    figures = (
+        "reaction_ms",
+        "limit_ms",
+        "top_speed_rad_s",
+        "driven_rad_s",
+        "fastest_joint",
+        "torque_step_nm",
+        "work_j",
+        "off_s",
+    )
     reason = (str(error) or type(error).__name__).splitlines()[0]
     unsafe = f"not run: {reason}"
     return {"fault": case.name, "stage": case.stage, "result": "not run", **dict.fromkeys(figures), "unsafe": unsafe}

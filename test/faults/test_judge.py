@@ -104,6 +104,37 @@ def test_a_motor_that_drives_the_arm_does_work_and_one_that_brakes_does_not(reco
     assert measure(records, FAULT, PERIOD).work < 0.001
 
 
+@pytest.fixture
+def lifted(records):
+    """The wearer moves joint 4 at 2 rad/s until 1 s after the fault, and lets go."""
+    since = records["time"] - FAULT
+    records["wearer"][since < 1.0, 3] = 1.0
+    records["velocity"][:, 3] = np.clip(np.where(since < 1.0, 2.0, 2.0 - 4.0 * (since - 1.0)), 0.0, 2.0)
+    return records
+
+
+def test_speed_that_the_wearer_gives_the_arm_does_not_count(lifted):
+    response = measure(lifted, FAULT, PERIOD)
+    assert response.top_speed <= 0.31
+    assert response.driven == 0.0
+
+
+@pytest.mark.parametrize("torque", [2.0, -2.0])
+def test_speed_that_an_arm_gains_after_the_wearer_let_go_counts_and_is_driven_if_its_motor_pulls(lifted, torque):
+    since = lifted["time"] - FAULT
+    thrown = (since > 1.6) & (since < 1.9)
+    lifted["velocity"][thrown, 3] = 0.9
+    lifted["torque"][thrown, 3] = torque
+    response = measure(lifted, FAULT, PERIOD)
+    assert response.top_speed == pytest.approx(0.9)
+    assert response.driven == pytest.approx(0.9 if torque > 0.0 else 0.0)
+
+
+def test_a_motor_does_no_work_on_an_arm_that_the_wearer_lifts(lifted):
+    lifted["torque"][:, 3] = np.where(lifted["wearer"][:, 3] > 0.0, 3.0, 0.0)
+    assert measure(lifted, FAULT, PERIOD).work < 0.001
+
+
 def test_a_motor_that_is_on_at_the_end_or_on_again_is_seen(records):
     records["on"][-1, 2] = True
     response = measure(records, FAULT, PERIOD)
