@@ -22,7 +22,7 @@ from exo_gravity.core.safety.drive import FaultCode
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.hardware.control_loop import NO_COMMAND, ControlLoop, EffortCommand
 from exo_gravity.nodes.ros.hot_path import HotPath
-from exo_gravity.nodes.ros.messages import by_name, to_nanoseconds
+from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, to_nanoseconds
 from exo_gravity.nodes.ros.sole_publisher import SolePublisher
 
 # The control thread reads them once a cycle; the depth lets it notice a second commander. Not reliable: an old effort
@@ -100,4 +100,4 @@ class EffortExchange:
             except ParameterError as error:
                 effort, self.refusal = None, str(error)
                 loop.trip(FaultCode.COMMAND_IMPOSSIBLE, f"effort_commands: {error.name} must be {error.expected}")
-            self._command = EffortCommand(effort, answered, bool(message.velocity), bool(message.position))
+            self._command = EffortCommand(effort, answered, bool(message.velocity), message.header.frame_id == LATE_TILT)

@@ -21,7 +21,7 @@ from exo_gravity.core.compensation.compensator import Answer
 from exo_gravity.core.compensation.limiter import CommandFade, Output
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.trunk.tilt_input import MAX_LEAD
-from exo_gravity.nodes.ros.messages import by_name, to_nanoseconds, velocity_of
+from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, to_nanoseconds, velocity_of
 
 TICK = 0.01  # s between two messages of a fade
 JointReading = tuple[Sequence[float], Sequence[float] | None]  # positions (n,) rad, velocities (n,) rad/s if known
@@ -30,7 +30,7 @@ JointReading = tuple[Sequence[float], Sequence[float] | None]  # positions (n,) 
 class JointStateInterface:
     """Answers each joint state with `effort_commands` of the same stamp; without efforts: withdrawn.
 
-    Positions in it say that the efforts are those of a late tilt: the bridge damps the motion meanwhile.
+    The frame LATE_TILT says that they are computed from a late tilt: the bridge damps the motion meanwhile.
     """
 
     topic = "joint_states"
@@ -51,7 +51,7 @@ class JointStateInterface:
         """Send the answer to a joint state."""
         self._command.header.stamp = message.header.stamp
         self._command.effort = answer.effort or ()
-        self._command.position = message.position if answer.held else ()
+        self._command.header.frame_id = LATE_TILT if answer.held else ""
         self._command.velocity = self._still if answer.damped else ()  # asks for damping about standstill
         self._publisher.publish(self._command)
 
