@@ -12,6 +12,7 @@ from diagnostic_msgs.msg import KeyValue
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
+from exo_gravity.core.compensation.compensator import Answer
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.bus_load import Traffic
 from exo_gravity.core.motors.joint_motor import JointMotor
@@ -23,6 +24,7 @@ from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.can_bridge.operation import WATCH_PERIOD, BridgeReport, BridgeServices, Operator
+from exo_gravity.nodes.compensator.command_interface import JointStateInterface
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
 
 from ..hardware.virtual_rig import Carried
@@ -185,6 +187,19 @@ def test_under_a_clock_that_stands_still_efforts_grow_old(node):
         exchange.get_efforts(time.monotonic() + 0.05)
         assert time.monotonic() < end, exchange.refusal
     assert exchange.answered == 100.0
+
+
+@pytest.mark.parametrize("held", ["", "trunk tilt older than 80 ms: held on"])
+def test_the_bridge_knows_efforts_of_a_late_tilt(node, held):
+    node.set_parameters([Parameter("use_sim_time", value=True)])  # every stamp is 0
+    limits, loop = Limits(("a", "b", "c", "elbow")), SimpleNamespace()
+    exchange, compensator = EffortExchange(node, limits, lambda: loop), JointStateInterface(node, limits.joint_names)
+    exchange.publish(100.0, [JointSample(0.0, 0.0, 0.0, 40, 0, 100.0)] * 4)
+    end = time.monotonic() + 20.0
+    while (command := exchange.get_efforts(time.monotonic() + 0.05)).effort is None:
+        compensator.send(0.0, JointState(), Answer((0.0, 1.0, 2.0, 3.0), held=held))
+        assert time.monotonic() < end, exchange.refusal
+    assert (tuple(command.effort), command.damped, command.held) == ((0.0, 1.0, 2.0, 3.0), False, bool(held))
 
 
 @pytest.fixture

@@ -100,4 +100,5 @@ class EffortExchange:
             except ParameterError as error:
                 effort, self.refusal = None, str(error)
                 loop.trip(FaultCode.COMMAND_IMPOSSIBLE, f"effort_commands: {error.name} must be {error.expected}")
-            self._command = EffortCommand(effort, answered, bool(message.velocity), message.header.frame_id == LATE_TILT)
+            is_late = message.header.frame_id == LATE_TILT
+            self._command = EffortCommand(effort, answered, bool(message.velocity), is_late)
