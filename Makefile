@@ -8,7 +8,7 @@
 # make faults       the whole fault matrix on the simulated device, 20 minutes; a table and build/faults.json
 # make mutations    deliberate defects, each of which must turn a row of the fault matrix unsafe; 7 minutes
 # make bench        the laws, the loop and the tools against peers, 12 minutes on a quiet machine; QUICK=1: part of it
-# make ordinary     ordinary motors, sensors and computers for an hour of virtual time: no alarm; a table, 15 minutes
+# make ordinary     ordinary motors, sensors and computers for an hour of virtual time: no alarm; a table, 10 minutes
 # make effort-study  how hard the simulated arm is to move, under every setting, 5 minutes; QUICK=1: part of it
 # make baselines    in place of a model: PID, cube map, learned laws, a growing ANFIS, 6 minutes; build/baselines
 # make imu-report   the trunk's inclination error on recorded motion, here and by VQF and imufusion; TRIALS=FOLDER

@@ -10,6 +10,7 @@ import random
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import cast
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.hardware import ImuSample, TrunkEstimator
 from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.clock import Clock
 from exo_gravity.hardware.control_loop import ControlLoop, EffortCommand
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedImu, VirtualWearer
 from exo_gravity.sim.motor import simulated_motor
@@ -115,7 +117,7 @@ class OrdinaryArm:
         self._efforts = EffortCommand(None, -np.inf)
         limits = Limits(("rotation", "abduction", "flexion", "elbow"))
         self.safety = SafetyMachine(limits, 1.0 / rate, peaks_of(motors))
-        bus = MotorBus(wire.open(), motors, reopen=wire.open, clock=self.clock)
+        bus = MotorBus(wire.open(), motors, reopen=wire.open, clock=cast(Clock, self.clock))
         self.loop = ControlLoop(bus, self.safety, 1.0 / rate, self._on_cycle, self._get_efforts)
         self._begin = self._tilted = self.clock.monotonic()
         self.clock.every(LOOK_PERIOD, self._look)
@@ -206,7 +208,7 @@ class OrdinaryArm:
         try:
             if answer := self._estimator.update(sample, now):
                 assert sample.angular_velocity
-                self._compensator.set_gravity(now, answer.gravity, sample.angular_velocity, now - sample.time)
+                self._compensator.set_gravity(now, answer.gravity.tolist(), sample.angular_velocity, now - sample.time)
                 self._note_tilt(now)
         except ParameterError:
             result.refused_samples += 1
