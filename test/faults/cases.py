@@ -240,19 +240,8 @@ ARMS = (
     FaultCase("can_bridge of the right of two arms killed", send_signal("can_bridge", KILL), BothArmsRig,
         PROCESS_REACTION),
 )
-# fmt: on
 CASES = (
-    *HELD_ROWS,
-    *MOTORS,
-    *DESCENT,
-    *START,
-    *PROCESSES,
-    *EFFORT_COMMANDS,
-    *OUTER_LOOP,
-    *CLOCK,
-    *ARMS,
-    *V3_BOARDS,
-    *RIDES,
-    *LEASES,
-    *OPERATOR,
+    *HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *OUTER_LOOP, *CLOCK, *ARMS, *V3_BOARDS,
+    *RIDES, *LEASES, *OPERATOR,
 )
+# fmt: on

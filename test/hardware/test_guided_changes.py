@@ -117,7 +117,7 @@ def test_a_wearer_who_holds_still_feels_the_new_load_come_slowly_and_nothing_els
     assert arm.top_speed < 0.1
 
 
-@pytest.mark.parametrize(("speed", "most"), [(0.2, 0.1), (1.0, GUIDE_BRAKE + 0.5)])
+@pytest.mark.parametrize(("speed", "most"), [(0.2, 0.1), (1.0, GUIDE_BRAKE + 1.0)])
 def test_a_wearer_who_moves_on_is_not_stopped(speed, most):
     felt = {}
     for is_damped in (True, False):

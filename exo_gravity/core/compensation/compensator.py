@@ -187,7 +187,7 @@ class Compensator(Tilted):
     def _law(self, now: float, theta: Sequence[float]) -> Torque:
         """Return the torque of the chosen law, or of the exact law while the chosen one does not apply."""
         settings = self.settings
-        if isinstance(settings, Settings):
+        if isinstance(settings, Settings) and settings.anfis:
             reason = settings.outside(theta, self._felt(settings, now)[0])
             if reason:
                 self._fallback, self._fallback_until = reason, now + FALLBACK_TIME
