@@ -19,8 +19,8 @@ from exo_gravity.core.safety.limits import JointSample, Limits
 ABSOLUTE = 0.25  # Nm
 RELATIVE = 0.25  # of the expected torque
 SPAN = 0.03  # s of the loop before the last reply, whose commands a reply may answer
-# Nm s, excess times the period of a reply; one reply adds at most half. At 0.15 Nm of noise and 100 Hz, no false alarm
-# in 50 hours: docs/safety.md.
+# Nm s, excess times the period of a reply; one reply adds at most half. No false alarm in 2 hours at 0.15 Nm of noise
+# and 100 Hz: docs/safety.md.
 EVIDENCE = 0.0075
 MOST = 256  # commands noted while a motor is silent
 THERMAL_TIME = 60.0  # s; an assumption for motors of this size: the data sheets state none
