@@ -24,7 +24,7 @@ from exo_gravity.nodes.ros.run import keep_to_this_machine
 from ..support import ROOT
 from .actions import send_signal
 from .fault_case import FaultCase
-from .outer_loop import FLOOD
+from .outer_loop import BE_SOUND, FLOOD
 from .outer_loop_cases import MAX_MOTION, AssistedRig, only_the_assistance_ends
 from .rig import Rig
 
@@ -59,16 +59,17 @@ class HeldRig(Rig):
 
 
 class SuccessorRig(AssistedRig):
-    """After the outer loop that assists the arm another one can be started, which asks for nothing."""
+    """Beside the outer loop that assists the arm another one waits, which asks for nothing."""
 
     _successor: subprocess.Popen[bytes] | None = None
 
     def replace_outer_loop(self) -> float:
-        """Kill the outer loop; once its torque has gone, start the other one. Return when it died (wall clock, s)."""
+        """Kill the outer loop; once its torque has gone, let the other one begin. Return when it died (wall clock)."""
         died = time.time()
         os.kill(self.pid("outer_loop"), signal.SIGKILL)
         self._wait_for("waiting")
-        self._successor = subprocess.Popen([sys.executable, "-m", "test.faults.outer_loop", "0"], cwd=ROOT)
+        assert self._successor is not None
+        self._successor.send_signal(BE_SOUND)
         self._wait_for("assisting")
         return died
 
@@ -77,6 +78,7 @@ class SuccessorRig(AssistedRig):
 
     def bring_to(self, stage: str) -> None:
         self._end_successor()
+        self._successor = subprocess.Popen([sys.executable, "-m", "test.faults.outer_loop", "0"], cwd=ROOT)
         super().bring_to(stage)
 
     def close(self) -> None:
