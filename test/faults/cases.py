@@ -65,6 +65,7 @@ from .rigs import (
     WallRig,
     WearerRig,
 )
+from .supply_cases import SUPPLY
 from .v3_cases import V3_BOARDS
 
 STATES, EFFORTS, TILT, RAW_IMU = "/right/joint_states", "/right/effort_commands", "/imu/pitch_yaw", "/imu/data_raw"
@@ -239,3 +240,4 @@ ARMS = (
 )
 # fmt: on
 CASES = (*HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *OUTER_LOOP, *CLOCK, *ARMS, *V3_BOARDS)
+CASES = (*CASES, *SUPPLY)
