@@ -69,6 +69,7 @@ from .rigs import (
     WallRig,
     WearerRig,
 )
+from .supply_cases import SUPPLY
 from .v3_cases import V3_BOARDS
 from .wearer_cases import ACTIVE_WEARER
 
@@ -245,5 +246,5 @@ ARMS = (
 # fmt: on
 CASES = (
     *(*HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *OUTER_LOOP, *CLOCK, *ARMS, *V3_BOARDS),
-    *(*RIDES, *OWNERSHIP, *LEASES, *OPERATOR, *ACTIVE_WEARER),
+    *(*RIDES, *OWNERSHIP, *LEASES, *OPERATOR, *ACTIVE_WEARER, *SUPPLY),
 )

@@ -208,6 +208,16 @@ MUTATIONS = (
         ("compensator frozen while the wearer pushes down",),
         (Edit(DESCENT, "if self.effort * velocity > 0.0 and speed > DRIVEN_SPEED:", "if False:"),),
     ),
+    Mutation(
+        "powered frames are sent while the supply is cut",
+        ("V3 boards: supply cut for 2 s", "supply cut for 2 s"),
+        (Edit(SAFETY, "if all(silent) and self._sent.powered:", "if False:"),),
+    ),
+    Mutation(
+        "an enable never expires",
+        ("enabled, and the supply cut for 4 s while checking",),
+        (Edit(SAFETY, "elif now - self._since >= self.limits.enable_timeout:", "elif False:"),),
+    ),
 )  # fmt: skip
 
 

@@ -293,7 +293,7 @@ class SafetyMachine:
                 self._refuse("the motors have just returned, switched off: enable them again", now)
             self.is_unreached = False
         is_doubtful = any(supply.unsure)
-        if not self.is_unreached and not is_doubtful:
+        if not (self.is_unreached or is_doubtful or self._is_found_on):
             return OFF
         if not self._is_found_on and (is_doubtful or any(self._readings.silent)):
             return Drive(self._descent.effort, self._descent.damping, True, unsure=supply.unsure)
