@@ -13,6 +13,7 @@ import pytest
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.specs import ENTER, EXIT, MotorReply
 from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, MIT, MIT_V3, WireFormat
+from exo_gravity.core.safety.descent import DAMPING
 from exo_gravity.core.safety.drive import NOTHING, OFF, Drive, State
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus
@@ -140,7 +141,11 @@ def test_a_foreign_command_to_a_v3_board_is_counted_and_opposed(wire, other, mod
     other.send(can.Message(arbitration_id=mode << 8 | 2, data=bytes(8), is_extended_id=True))
     bus.receive_until(now(bus) + 1.0, lambda: bus.foreign_commands > 0)
     assert bus.foreign_commands == 1 and "commands motor 2" in bus.foreign_command
-    assert sent(other) == [(joints[1].command_id, joints[1].command(0.5, 0.0))]
+    [(command_id, data)] = sent(other)
+    answer = joints[1].wire_format.unpack_command(joints[1].spec, data)
+    assert command_id == joints[1].command_id
+    assert answer.torque == pytest.approx(0.5, abs=0.2)  # less a brake by the velocity, one code of it at rest
+    assert answer.kd == pytest.approx(DAMPING, abs=0.01)
     assert bus.is_contested
 
 
@@ -169,8 +174,11 @@ def test_an_exit_that_was_not_ours_is_undone_on_both_kinds_of_board(wire, other)
     other.send(can.Message(arbitration_id=1, data=EXIT, is_extended_id=False))
     other.send(can.Message(arbitration_id=0x102, data=bytes(4), is_extended_id=True))
     bus.receive_until(now(bus) + 1.0, lambda: bus.foreign_commands == 2)
-    first, second = (1, joints[0].command(0.0, 0.0)), (joints[1].command_id, joints[1].command(0.5, 0.0))
-    assert sent(other) == [first, (1, ENTER), first, second, second]
+    answers = sent(other)
+    v3 = joints[1].command_id
+    assert [frame_id for frame_id, _ in answers] == [1, 1, 1, v3, v3]
+    assert answers[1] == (1, ENTER)
+    assert answers[0] == answers[2] and answers[3] == answers[4]  # our commands, which also brake the joint
 
 
 @pytest.mark.parametrize("formats", [(MIT,) * 4, V3], ids=["v2", "v3"])

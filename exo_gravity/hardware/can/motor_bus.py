@@ -4,11 +4,12 @@ The wire formats of the boards (core/wire_formats) may differ. A motor of V1 and
 200-400 us later. A V3 board sends status frames on its own timer: the first one after a command is its reply.
 Frames of other devices are ignored and counted by kind.
 
-A motor obeys every sender. A command to one of our motors that we did not send is answered at once with our own. To
-know it, echoes of our own frames are set apart: most buses return none. Some return them and mark them (`is_rx` is
-false). udp_multicast returns them unmarked, in order. The first frames show whether a bus echoes. SocketCAN sets the
-same mark on every frame from this computer, also on those of another process (Documentation/networking/can.rst of
-Linux, MSG_DONTROUTE): there it does not show an echo.
+A motor obeys every sender. A command to one of our motors that we did not send is answered at once with our own, which
+also brakes the joint: until then the other sender's torque acts, and no damping. To know it, echoes of our own frames
+are set apart: most buses return none. Some return them and mark them (`is_rx` is false). udp_multicast returns them
+unmarked, in order. The first frames show whether a bus echoes. SocketCAN sets the same mark on every frame from this
+computer, also on those of another process (Documentation/networking/can.rst of Linux, MSG_DONTROUTE): there it does not
+show an echo.
 
 A zero command precedes the frames that switch a V1 or V2 board on or off: the motor remembers its last command, and
 ENTER would carry it out. A command switches a V3 board on, so it gets none while the arm is off.
@@ -31,6 +32,7 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, REPLY, Frame, WireFormat
 from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.safety.descent import DAMPING
 from exo_gravity.core.safety.drive import OFF, Drive
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample
 from exo_gravity.hardware.can.can_port import CanPort
@@ -44,6 +46,9 @@ LAST_REPLIES = 0.02  # s for which replies to the last frames are awaited
 LISTEN_TIME = 0.12  # s before the first frame
 SETTLING_TIME = 0.02  # s of it in which late replies to the previous owner may still arrive
 CORRECTION_PERIOD = 0.001  # s between two corrections of a motor: two correcting hosts must not fill the bus
+# Share of the rated torque by which an answer brakes at 1 rad/s, besides the motor's damping. A foreign 6 Nm 500 times
+# a second moved joint 2 at 1.5 rad/s (V3; V1 and V2: 1.4) where our answers came 4 (1) ms late, with it at 0.8 (0.7).
+BRAKE = 1.0
 CONTEST_TIME = 0.5  # s after a foreign command in which another one is expected
 FOREIGN_COMMAND = "foreign command"
 TRIAL = 32  # frames sent until it is known whether the bus echoes
@@ -87,7 +92,7 @@ class MotorBus:
         self._unsure: Sequence[bool] = (False,) * JOINT_COUNT  # of the last powered drive
         self._unconfirmed = set(range(JOINT_COUNT)) if powered else set()  # not known to be off
         self._ids = tuple(motor.command_id for motor in motors)
-        self._commands: list[Frame | None] = [None] * JOINT_COUNT  # last sent
+        self._drive = OFF  # last sent
         self._corrected = [-math.inf] * JOINT_COUNT  # s
         self._foreign_time = -math.inf
         self._note = note
@@ -213,12 +218,11 @@ class MotorBus:
         return ((self._ids[joint], self._motors[joint].command(0.0, 0.0)),)
 
     def _send_commands(self, drive: Drive) -> None:
+        self._drive = drive
         for joint, motor in enumerate(self._motors):
             if joint not in self._asked and (drive.unsure[joint] or not drive.powered):
-                self._commands[joint] = None
                 continue
             command = self._ids[joint], motor.command(drive.effort[joint], drive.damping[joint])
-            self._commands[joint] = None if drive.unsure[joint] else command  # what a foreign command is answered with
             if drive.enter[joint]:
                 self._send_each([(command, *motor.enter)])
             self._send(command)
@@ -254,14 +258,19 @@ class MotorBus:
         self.samples[joint] = JointSample(*reply[1:], self._now())
 
     def _oppose(self, joint: int, foreign: bytes) -> None:
-        """Send our last command again after a foreign one, so that the motor obeys it for less than a millisecond."""
+        """Answer a foreign command with our last one, under full damping and a brake, until our next one."""
         now = self._now()
-        motor, command = self._motors[joint], self._commands[joint]
+        motor = self._motors[joint]
         self.foreign_commands += 1
         self._foreign_time = now
         self.foreign_command = f"another sender commands motor {motor.can_id} (frame [{foreign.hex(' ')}])"
-        if not self._powered or command is None:
+        if not (self._powered and self._drive.powered) or self._drive.unsure[joint]:
             return
+        effort, velocity = self._drive.effort[joint], self.samples[joint].velocity
+        most = max(motor.rated_effort, abs(effort))
+        brake = BRAKE * motor.rated_effort * velocity if math.isfinite(velocity) else 0.0
+        braked = max(-most, min(most, effort - brake))
+        command = self._ids[joint], motor.command(braked, max(DAMPING, self._drive.damping[joint]))
         is_exit = foreign in [data for _, data in motor.exit]
         if is_exit or now - self._corrected[joint] >= CORRECTION_PERIOD:
             self._send_each([(command, *motor.enter) if is_exit else (), (command,)])
