@@ -32,7 +32,6 @@ from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
-START_TIMEOUT = 60.0  # s for the motors to be switched on
 GRACE = 0.5  # s from the end of the script until the arm is let down
 TILT_PERIOD = 0.01  # s between two tilts for the compensator
 CACHED_FRAMES = 64
@@ -130,6 +129,8 @@ class OfflineTrial:
                 if should_stop(now) and not self.trouble:
                     self._abort(now, "stopped by the operator")
             self._follow_script(now)
+        if self._safety.refusal:
+            self._abort(now, f"the arm was never carried: {self._safety.refusal}")
         if self._safety.fault:
             self._abort(now, f"fault: {self._safety.fault.code}: {self._safety.fault.reason}")
         return self._recording()
@@ -187,13 +188,11 @@ class OfflineTrial:
         self._powered = drive.powered
 
     def _follow_script(self, now: float) -> None:
-        """Start the wearer when the motors are on, and let the arm down after the script or the start time-out."""
+        """Start the wearer when the motors are on, and let the arm down after the script."""
         if self._start == math.inf:
             if self._powered:
                 self.arm.device.start(self._wearer, self._delay)
                 self._start = now + self._delay
-            elif now > START_TIMEOUT:
-                self._abort(now, f"the arm was never carried: waiting for {self._safety.waiting_for}")
         elif now > self._start + self.script.duration + GRACE:
             self._safety.disable(now)
 

@@ -27,7 +27,7 @@ from .test_motor_bus import WEIGHTLESS
 MIXED = (MIT, MIT_V3, MIT_V3, MIT)
 OPTIONS = {"bitrate": 1_000_000, "sleep_after_open": 0.01, "timeout": 0.0002}
 POSE = (0.1, 0.2, 0.3, 0.4)
-FIRST_FRAMES = 8  # to motors that are off: a command and EXIT for each
+FIRST_FRAMES = 6  # to motors that are off: EXIT for each, and a command for those that reply to one
 ON = Drive((0.0, 0.5, 0.4, 0.0), NOTHING, True)
 CHANNELS = itertools.count()
 

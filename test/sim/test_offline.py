@@ -143,7 +143,7 @@ def test_a_stop_before_the_arm_is_carried_ends_the_trial_with_the_motors_off_and
 def test_without_a_tilt_the_arm_is_never_carried_and_the_reason_is_given():
     trial = make(tilt=None)
     assert trial.run().carried == ()
-    assert "waiting for effort commands" in trial.trouble and "no trunk tilt yet" in trial.trouble
+    assert "waited for effort commands" in trial.trouble and "no trunk tilt yet" in trial.trouble
 
 
 def test_motors_that_never_reply_are_an_error():

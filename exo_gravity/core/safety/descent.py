@@ -15,7 +15,8 @@ a wearer who pushes does not. It never exceeds `max_effort`, or what the joint c
 
 No model of the arm is needed: masses, tilt and friction may be anything. Where gravity comes to pull the other way, k
 alone holds: an arm of 3.7 Nm then sinks at 0.74 rad/s. V halves whenever the joint swings back, so that a frictionless
-arm comes to rest, and recovers slowly. A joint is down when s and k are zero: it hangs, or lies on something.
+arm comes to rest, and recovers slowly. A joint is down when s is zero and k holds nothing: it hangs, or lies on
+something.
 
 A motor that cannot be reached keeps applying its torque, so s and k of a silent joint are held. When it replies again,
 s continues from the torque that it reports.
@@ -51,6 +52,7 @@ FADE_TIME = 2.0  # s from full torque to none: the wearer has time to take over 
 DAMPING_RISE = 0.2  # s to DAMPING; damping that starts at once would be a torque step
 DAMPING_FADE = 0.4  # s, time constant
 MIN_DAMPING = 0.01  # Nm s/rad; smaller values become zero
+FREE_DAMPING = 0.2  # Nm s/rad that holds no joint: 0.07 Nm at DESCENT_SPEED. A swing without friction keeps so much
 
 
 class JointDescent:
@@ -72,11 +74,13 @@ class JointDescent:
     @property
     def is_down(self) -> bool:
         """Whether neither torque nor damping holds the joint."""
-        return self.effort == 0.0 and self.damping == 0.0
+        return self.effort == 0.0 and self.damping <= FREE_DAMPING
 
     def restart(self, effort: float) -> None:
         """Continue from `effort` (Nm), which the motor is found to apply after a silence, without damping."""
         self.effort = effort
+        self._carried = max(self._carried, effort, key=abs)
+        self._most = max(self._most, abs(effort))
         self.damping = 0.0
         self._fade_rate = _rate_to_fade(effort)
         self._is_rising = True
