@@ -19,6 +19,7 @@ from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
 
 PERIOD = 0.004  # s
+APPROACH = 12.0  # s for the spring to take effect, a guided change, and to bring the arm to the begin of the path
 LED = [[0.2, 0.6, 0.5, 0.6], [0.3, 0.9, 0.8, 0.9], [0.0, 0.5, 0.4, 0.5]]  # rad, where the hand goes, 2 s each
 
 robot = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
@@ -45,11 +46,14 @@ for motor in motors:
 script = TrialScript.parse({"name": "teach", "steps": [{"move": pose, "over": 2.0} for pose in LED]})
 device.start(VirtualWearer(script), delay=1.0)
 poses = [cycle() for _ in range(round((1.0 + script.duration) / PERIOD))]
-path = [number for row, pose in enumerate(poses[::5]) for number in (0.02 * row, *pose)]  # rows of s and four angles
+path = [0.0, *poses[0]]  # rows of s and four angles
+path += [number for row, pose in enumerate(poses[::5]) for number in (APPROACH + 0.02 * row, *pose)]
 
 spring = Spring(stiffness=(3.5, 9.0, 6.0, 3.3), pose=path)
 friction = Friction(share=0.8, coulomb=(0.2, 0.4, 0.2, 0.2))  # as identified: else the spring must overcome it
 compensator.apply(replace(settings, terms=TermSettings(spring=spring, friction=friction)))
+for _ in range(round(APPROACH / PERIOD)):
+    cycle()
 repeated = [cycle() for _ in poses]
-errors = [degrees(dist(a, b)) for a, b in zip(poses, repeated, strict=True)][round(1.0 / PERIOD) :]
+errors = [degrees(dist(a, b)) for a, b in zip(poses, repeated, strict=True)]
 print(f"The arm repeats the way within {max(errors):.1f} degrees, on average {sum(errors) / len(errors):.1f}.")

@@ -130,7 +130,7 @@ MUTATIONS = (
         (
             Edit(
                 DESCENT,
-                "return self.effort == 0.0 and self.damping == 0.0",
+                "return self.effort == 0.0 and self.damping <= FREE_DAMPING",
                 "return self.effort == 0.0",
             ),
             Edit(DESCENT, "free >= REST_TIME and now - rest_since >= REST_TIME", "free >= 0.0"),
@@ -211,7 +211,7 @@ MUTATIONS = (
     Mutation(
         "powered frames are sent while the supply is cut",
         ("V3 boards: supply cut for 2 s", "supply cut for 2 s"),
-        (Edit(SAFETY, "if all(silent) and self._sent.powered:", "if False:"),),
+        (Edit(SAFETY, "if all(readings.silent) and self._sent.powered:", "if False:"),),
     ),
     Mutation(
         "an enable never expires",

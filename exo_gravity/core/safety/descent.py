@@ -30,7 +30,7 @@ from collections.abc import Sequence
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, UNKNOWN, JointSample
 
 REST_TIME = 2.0  # s at rest with nothing holding the arm, until it is down
-LONGEST_REST = 6.0  # s with nothing holding the arm, after which it is down even if the wearer moves it
+LONGEST_REST = 7.5  # s with nothing holding the arm, after which it is down even if the wearer moves it
 DESCENT_TIMEOUT = 40.0  # s for a bridge to let its arm down before its launcher kills it
 LONGEST_SILENCE = 5.0  # s for which the way down waits for a silent motor
 
