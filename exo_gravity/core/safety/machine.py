@@ -312,11 +312,12 @@ class SafetyMachine:
         readings.step(now, joints, self._sent.powered)
         if readings.lost or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):
             self._is_trusted = False
-        self._rest.step(now, readings.joints, readings.silent)
+        counting = tuple(readings.joints)
+        self._rest.step(now, counting, readings.silent)
         if all(readings.silent) and self._sent.powered:
             self._supply.doubt(self._sent.effort)
-        self._is_found_on = self._supply.step(dt, readings.joints, readings.silent)
-        return tuple(readings.joints)
+        self._is_found_on = self._supply.step(dt, counting, readings.silent)
+        return counting
 
     def _let_down(self, now: float) -> None:
         applied = self._delivery.applied(self._sent, self._readings.silent)
