@@ -5,10 +5,11 @@
 # make test-all     the same, then the longer ones (make test-long): studies, browser, 13 poses, video, SROS2
 # make lint         ruff, mypy, ament's flake8 and pep257, shellcheck
 # make docs         these documents as a site, in build/site; a warning is an error
-# make faults       the whole fault matrix on the simulated device, 20 minutes; a table and build/faults.json
+# make faults       the whole fault matrix on the simulated device, 24 minutes; a table and build/faults.json
 # make mutations    deliberate defects, each of which must turn a row of the fault matrix unsafe; 7 minutes
 # make bench        the laws, the loop and the tools against peers, 12 minutes on a quiet machine; QUICK=1: part of it
 # make ordinary     ordinary motors, sensors and computers for an hour of virtual time: no alarm; a table, 10 minutes
+# make motion-monitor  which wrong efforts can_bridge sees, and an hour of a fast wearer, whom it must not disturb; 20 minutes
 # make effort-study  how hard the simulated arm is to move, under every setting, 5 minutes; QUICK=1: part of it
 # make baselines    in place of a model: PID, cube map, learned laws, a growing ANFIS, 6 minutes; build/baselines
 # make imu-report   the trunk's inclination error on recorded motion, here and by VQF and imufusion; TRIALS=FOLDER
@@ -31,7 +32,7 @@ DEMO := imu sim report
 TEST := $(DEMO) panel validate video test
 SETUP := VENV=$(VENV) .ci/setup
 
-.PHONY: demo calibrate-demo calibrate-study test lint docs faults mutations bench ordinary effort-study baselines imu-report \
+.PHONY: demo calibrate-demo calibrate-study test lint docs faults mutations bench motion-monitor ordinary effort-study baselines imu-report \
         socketcan pythons constraints clean ros2-launch two-computers dist panel presses test-all test-long
 
 demo:
@@ -87,6 +88,10 @@ bench:
 ordinary:
 	@$(SETUP) $(TEST)
 	$(BIN)/python -m bench.ordinary
+
+motion-monitor:
+	@$(SETUP) $(TEST)
+	$(BIN)/python -m bench.motion_monitor --hours $(or $(HOURS),1)
 
 effort-study:
 	@$(SETUP) $(TEST)

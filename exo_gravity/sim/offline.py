@@ -21,6 +21,7 @@ import numpy as np
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import DataError
+from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.motors.joint_motor import JointMotor, peaks_of
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import Drive, State
@@ -79,17 +80,24 @@ class OfflineTrial:
     events: (s, text) of everything that went wrong. trouble: why the trial ended before the script, or ''.
     """
 
-    def __init__(self, arm: ArmSetup, script: TrialScript, delay: float) -> None:
+    def __init__(
+        self,
+        arm: ArmSetup,
+        script: TrialScript,
+        delay: float,
+        compensator: Compensator | None = None,
+        wearer: VirtualWearer | None = None,
+    ) -> None:
         self.arm = arm
         self.script = script
         self.events: list[tuple[float, str]] = []
         self.trouble = ""
-        self._wearer = VirtualWearer(script)
+        self._wearer = wearer or VirtualWearer(script)
         self._delay = delay
         self._start = math.inf  # s, of the script
         self._carried: tuple[Span, ...] = ()  # from the first to the last time at which the motors carried the arm
-        self._safety = SafetyMachine(arm.limits, 1.0 / arm.rate, peaks_of(arm.motors))
-        self._compensator = Compensator(arm.settings)
+        self.safety = SafetyMachine(arm.limits, 1.0 / arm.rate, peaks_of(arm.motors))
+        self._compensator = compensator or Compensator(arm.settings)
         # The newest efforts, when the readings that they answer were taken, and whether the joints are to be damped.
         self._efforts: tuple[Sequence[float] | None, float, bool] = (None, -math.inf, False)
         self._reason = ""  # why the compensator has withdrawn
@@ -116,29 +124,29 @@ class OfflineTrial:
 
         should_stop(now) is called once per simulated second, `now` in s. Raises DataError if nothing was recorded.
         """
-        self._safety.enable(0.0)
+        self.safety.enable(0.0)
         second = 0.0
         for cycle in itertools.count():
             now = cycle / self.arm.rate
             self._deliver_tilt(cycle, now)
             self._cycle(now)
-            if self._safety.state in MOTORS_OFF:
+            if self.safety.state in MOTORS_OFF:
                 break
             if now >= second:
                 second += 1.0
                 if should_stop(now) and not self.trouble:
                     self._abort(now, "stopped by the operator")
             self._follow_script(now)
-        if self._safety.refusal:
-            self._abort(now, f"the arm was never carried: {self._safety.refusal}")
-        if self._safety.fault:
-            self._abort(now, f"fault: {self._safety.fault.code}: {self._safety.fault.reason}")
+        if self.safety.refusal:
+            self._abort(now, f"the arm was never carried: {self.safety.refusal}")
+        if self.safety.fault:
+            self._abort(now, f"fault: {self.safety.fault.code}: {self.safety.fault.reason}")
         return self._recording()
 
     def _cycle(self, now: float) -> None:
         arm, effort = self.arm, self._efforts[0]
-        self._exchange(self._safety.step(now, tuple(self._samples), *self._efforts), now)
-        if self._safety.state in CARRIED:
+        self._exchange(self.safety.step(now, tuple(self._samples), *self._efforts), now)
+        if self.safety.state in CARRIED:
             self._carried = ((self._carried[0][0] if self._carried else now, now),)
         position = [joint.position for joint in self._samples]
         if not any(arm.limits.is_silent(now, joint) for joint in self._samples):
@@ -160,11 +168,13 @@ class OfflineTrial:
         if arm.trunk is None:
             if arm.tilt and now - self._tilt_time >= TILT_PERIOD:
                 self._compensator.set_tilt(now, *arm.tilt)
+                self.safety.motion.gravity = Tilt.of(arm.device.side, *arm.tilt).direction
                 self._tilt_time = now
             return
         if reading:
             age, turning = now - taken, reading.angular_velocity
             self._compensator.set_gravity(now, reading.gravity, turning, age)
+            self.safety.motion.gravity = Tilt.of_gravity(arm.device.side, reading.gravity).direction
             self._compensator.set_motion(now, reading.specific_force, turning, age)
         due = cycle % arm.trunk.cycles == 0
         self._reading = (arm.trunk.measure(now, arm.device.trunk) if due else None), now
@@ -194,13 +204,13 @@ class OfflineTrial:
                 self.arm.device.start(self._wearer, self._delay)
                 self._start = now + self._delay
         elif now > self._start + self.script.duration + GRACE:
-            self._safety.disable(now)
+            self.safety.disable(now)
 
     def _abort(self, now: float, why: str) -> None:
         why = f"{why} ({self._reason})" if self._reason else why
         self._note(now, why)
         self.trouble = self.trouble or self.events[-1][1]
-        self._safety.disable(now)
+        self.safety.disable(now)
 
     def _note(self, now: float, text: str) -> None:
         self.events.append((now, f"{self.arm.name}: {text}"))

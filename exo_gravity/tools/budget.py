@@ -141,6 +141,13 @@ def verdict(arm: ArmBudget, wearer: Wearer) -> list[str]:
     return sentences
 
 
+def largest_moment(arm: ArmBudget) -> str:
+    """Return the parameter of `can_bridge` for this load, rounded up."""
+    moments = arm.robot.with_wearer(*arm.load, arm.support).first_moment
+    shown = ", ".join(f"{math.ceil(1000.0 * moment) / 1000.0:g}" for moment in moments)
+    return f"For the can_bridge of {arm.name}, if it never carries more: largest_moment: [{shown}]  # kg m"
+
+
 def _shortage(arm: ArmBudget, number: int) -> str:
     joint, needs = arm.joints[number], arm.joints[number].torque
     motor = motor_for(needs)
@@ -236,6 +243,6 @@ def main(args: Sequence[str] | None = None) -> int:
     segments = ", ".join(f"{name} {mass:.2f} kg at {cog:.3f} m" for name, (mass, cog) in masses)
     print(f"Wearer: {wearer.body_mass:g} kg, {wearer.sex}, table {wearer.table}: {segments}")
     for alike in _mirrored(arms):
-        print("", *table_lines(alike), "", *verdict(alike, wearer), sep="\n")
+        print("", *table_lines(alike), "", *verdict(alike, wearer), largest_moment(alike), sep="\n")
     print(f"\n{written}")
     return int(any(arm.beyond for arm in arms))

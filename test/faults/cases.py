@@ -51,6 +51,7 @@ from .device_faults import (
 )
 from .fault_case import ALL_JOINTS, PROCESS_REACTION, FaultCase
 from .frames import MOTOR_2, foreign_frames, random_frames
+from .monitor_cases import MONITOR
 from .operator_cases import OPERATOR
 from .operator_lease_cases import LEASES
 from .outer_loop_cases import OUTER_LOOP
@@ -246,5 +247,5 @@ ARMS = (
 # fmt: on
 CASES = (
     *(*HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *OUTER_LOOP, *CLOCK, *ARMS, *V3_BOARDS),
-    *(*RIDES, *OWNERSHIP, *LEASES, *OPERATOR, *ACTIVE_WEARER, *SUPPLY),
+    *(*RIDES, *OWNERSHIP, *LEASES, *OPERATOR, *ACTIVE_WEARER, *SUPPLY, *MONITOR),
 )

@@ -24,6 +24,7 @@ COPIED = ("exo_gravity", "test", "config")
 ROW_LIMIT = 240.0  # s for each row, with the start of its nodes
 SAFETY, DESCENT, LIMITS = (f"exo_gravity/core/safety/{name}.py" for name in ("machine", "descent", "limits"))
 GUIDANCE = "exo_gravity/core/compensation/guidance.py"
+MONITOR = "exo_gravity/core/safety/motion_monitor.py"
 ASSIST = "exo_gravity/core/compensation/terms/assist.py"
 LEASE = "exo_gravity/core/safety/lease.py"
 BUS_LOCK, WATCHDOG = "exo_gravity/hardware/ownership/bus_lock.py", "exo_gravity/hardware/ownership/watchdog.py"
@@ -217,6 +218,17 @@ MUTATIONS = (
         "an enable never expires",
         ("enabled, and the supply cut for 4 s while checking",),
         (Edit(SAFETY, "elif now - self._since >= self.limits.enable_timeout:", "elif False:"),),
+    ),
+    Mutation(
+        "unexplained torque is never a fault",
+        ("effort of joint 2 with the wrong sign", "efforts oscillate at 8 Hz"),
+        (Edit(MONITOR, "if not self.impulse[i] <= PATIENCE * full and fault is None:", "if False:"),),
+    ),
+    Mutation(
+        "unexplained torque is passed on, and takes ten times as long",
+        ("effort of joint 2 with the wrong sign",),
+        (Edit(MONITOR, "passed.append(within)", "passed.append(torque)"),
+         Edit(MONITOR, "PATIENCE = 0.02 ", "PATIENCE = 0.2 ")),
     ),
 )  # fmt: skip
 

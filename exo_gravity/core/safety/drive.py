@@ -87,6 +87,10 @@ class FaultCode(str, Enum):
     COMMAND_STALE = "command_stale", "no effort command answers a joint state younger than `command_timeout`"
     COMMAND_WITHDRAWN = "command_withdrawn", "the compensator withdrew its efforts; its diagnostics give the reason"
     COMMAND_IMPOSSIBLE = "command_impossible", "an effort is NaN, beyond 40 Nm, misnamed or missing"
+    UNEXPLAINED_TORQUE = (
+        "unexplained_torque",
+        "no load up to `largest_moment` needs such efforts in this pose, with `largest_addition` beside it",
+    )
     SECOND_COMMANDER = "second_commander", "two publishers send effort commands"
     # The operator
     CONTROL_LOST = "control_lost", "who held control of the arm has not renewed it for 1 s"

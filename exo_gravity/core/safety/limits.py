@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.arm import MAX_MOMENT
 from exo_gravity.core.motors.specs import MOTOR_ERRORS, MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import check_owned, owned
@@ -84,6 +85,20 @@ class Limits:
     enable_timeout: float = owned(10.0, "time for the checks of a start to pass, else it is refused", (2.0, 60.0), "s")
     sign_check_torque: float = owned(
         1.5, "largest test torque of the sign check; 0 skips the check", (0.0, 3.0), "Nm", expert=True
+    )
+    largest_moment: Sequence[float] = owned(
+        (0.0,) * 4,
+        "M1 to M4, the largest first moments of robot plus wearer, as `budget` prints them: efforts that no load up to "
+        "these needs are a fault; zeros: not checked",
+        (0.0, MAX_MOMENT),
+        "kg m",
+    )
+    largest_addition: Sequence[float] = owned(
+        (0.0,) * 4,
+        "what efforts may ask for beside gravity's torque, where `largest_moment` is given: the bounds of assistance "
+        "and terms in use, `inertial`, a calibration",
+        (0.0, 10.0),
+        "Nm",
     )
     #: (4,) rad from `home` at the first start; `limits_of` takes it from the motors
     home_tolerance: Sequence[float] = tuple(HOME_TOLERANCE[name] for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6"))

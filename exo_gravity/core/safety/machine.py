@@ -39,6 +39,7 @@ from exo_gravity.core.safety.descent import DAMPING, DAMPING_RISE, ArmDescent, R
 from exo_gravity.core.safety.drive import CARRYING, DOUBTFUL, NO_ONES, NOTHING, OFF, Drive, Fault, FaultCode, State
 from exo_gravity.core.safety.gate import SignCheck, StartGate, SwitchOnCheck
 from exo_gravity.core.safety.limits import JointSample, Limits, guide_damping
+from exo_gravity.core.safety.motion_monitor import MotionMonitor
 from exo_gravity.core.safety.readings import Readings
 from exo_gravity.core.safety.ride import RideThrough
 from exo_gravity.core.safety.supply import SupplyMonitor
@@ -55,6 +56,7 @@ class SafetyMachine:
     state: the State. fault: the latched Fault or None. waiting_for: what CHECKING or PROVING waits for. refusal: why
     the last enable was refused without a fault, or "". acted: for each limit that has acted, by name, the last time.
     is_unreached: whether a motor that may be on cannot be reached. ride: through late efforts.
+    motion: judges the efforts by gravity alone.
     """
 
     def __init__(self, limits: Limits, period: float, peaks: Peaks | None = None) -> None:
@@ -76,6 +78,7 @@ class SafetyMachine:
         self._is_found_on = False  # by this cycle's replies
         self._is_trusted = False  # zeros and signs
         self._delivery = DeliveryMonitor(limits, self._peaks.effort)
+        self.motion = MotionMonitor(limits)
         self._supply = SupplyMonitor()
         self._gate = StartGate(limits, 0.0)
         self._switch_on = SwitchOnCheck(limits)
@@ -175,6 +178,10 @@ class SafetyMachine:
             self._check_delivery(now, joints, dt)
         if self.state in CARRYING:
             self._watch(now, dt, effort, now - effort_time, held)
+        if effort is not None and self.state in (State.RAMPING_IN, State.ACTIVE):
+            effort, fault = self.motion.step(dt, joints, effort, now - effort_time)
+            if fault:
+                self.trip(*fault, now)
         drive = self._drive(now, joints, effort, damped, dt).within(self._peaks.damping)
         self._sent = drive
         return drive
@@ -244,6 +251,7 @@ class SafetyMachine:
             self.trip(*fault, now)
         elif self._switch_on.done and self._signs.done:
             self._is_trusted = True
+            self.motion.reset()
             self._enter(State.RAMPING_IN, now)
 
     def _carry(

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -20,11 +21,14 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from exo_gravity.core.errors import BusError, ExoGravityError
+from exo_gravity.core.errors import BusError, ExoGravityError, ParameterError
+from exo_gravity.core.model.rotation import Floats3
+from exo_gravity.core.model.tilt import SIDES, Tilt
 from exo_gravity.core.motors.joint_motor import OPTIONS, motors_of, peaks_of, traffic_of
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.params import CAN_BRIDGE, check_bridge, limits_of
+from exo_gravity.core.trunk.tilt_input import TiltInput
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.ownership.handover import ArmOnBus
@@ -42,12 +46,35 @@ from exo_gravity.nodes.can_bridge.operation import (
 )
 from exo_gravity.nodes.ros.parameters import bus_of, declare
 from exo_gravity.nodes.ros.run import keep_to_this_machine, run
+from exo_gravity.nodes.ros.tilt_subscription import TiltSubscription
 
 REPORT_PERIOD = 0.1  # s
+TILT_TIMEOUT = 0.08  # s for which /imu/data goes before /imu/pitch_yaw
 DESCENT_TIMEOUT = 60.0  # s in which a deactivated arm must be down, with its motors off
 REMINDER_PERIOD = 10.0  # s between two reminders that a motor cannot be reached
 # Set by launcher and launch file: the time in s for the watchdog of the dead bridge to let the arm down.
 RECOVER = "EXO_GRAVITY_RECOVER"
+
+
+class _GravityInput(TiltInput):
+    """Tells the loop's monitor where gravity points, as the trunk's tilt arrives; before that it is upright.
+
+    The side is that of the node's namespace: a compensator with the wrong `side` does not decide it.
+    """
+
+    def __init__(self, node: Node, get_loop: Callable[[], ControlLoop | None]) -> None:
+        side = node.get_namespace().rpartition("/")[2]
+        if side not in SIDES:
+            expected = f"0, or the node in a namespace that ends with {' or '.join(SIDES)}"
+            raise ParameterError("largest_moment", "given", expected)
+        super().__init__(side, TILT_TIMEOUT)
+        self._get_loop = get_loop
+        TiltSubscription(node, self, threading.Lock(), lambda topic, error: None, lambda topic: None)
+
+    def _accept(self, now: float, tilt: Tilt, angular_velocity: Floats3, age: float) -> None:
+        super()._accept(now, tilt, angular_velocity, age)
+        if loop := self._get_loop():
+            loop.safety.motion.gravity = self.at(now).direction
 
 
 class CanBridge(LifecycleNode):
@@ -75,6 +102,8 @@ class CanBridge(LifecycleNode):
         rated = [motor.rated_effort for motor in motors]
         self._report = BridgeReport(self, limits.joint_names, traffic, values["rate"], rated, lease)
         BridgeServices(self, lambda: self.loop, motors)
+        if any(limits.largest_moment):
+            _GravityInput(self, lambda: self.loop)
         self.create_timer(REPORT_PERIOD, self._on_report)
         log_limits(self, limits, traffic, values["rate"])
         if values["autostart"]:

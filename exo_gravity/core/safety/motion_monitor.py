@@ -1,0 +1,115 @@
+"""An independent eye on the compensator: torque that gravity cannot account for, and the speed that it can cause.
+
+It shares no code and no masses with the compensator. Its own ground is `largest_moment`, M1..M4 in kg m: the largest
+first moments of the arm, robot plus wearer, about joints 1 to 4, each along its link (M4 = m4 d4, M3 = m3 d3 + m4 l3,
+and so on). Any load from none to these, in the arm's pose and at the trunk's tilt, gives a range of torques for each
+joint, which `largest_addition` widens both ways: what assistance, springs, friction and inertia terms or a calibration
+may add. What is asked for outside that range, beyond a margin, is unexplained.
+
+Unexplained torque is summed over time, with both signs as positive, and forgotten over `MEMORY`. The sum is an impulse:
+it bounds the speed that the motors cause and gravity does not, whatever the wearer does meanwhile. A joint of a link
+with moment M has an inertia of about M l, l = 0.3 m: so the impulse that is permitted, `PATIENCE` times the full load
+g M, is a speed of about g PATIENCE / l.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from exo_gravity.core.safety.drive import NOTHING, Fault, FaultCode
+from exo_gravity.core.safety.limits import MAX_COMMAND, JointSample, Limits
+
+GRAVITY = 9.81  # m/s^2
+UPRIGHT = (0.0, 0.0, 1.0)  # gravity in the arm's base frame while the trunk is upright
+SURPLUS = 1.1  # times the largest moments
+ABSOLUTE = 0.1  # Nm
+RELATIVE = 0.1  # of the full load: 6 degrees of the trunk's tilt
+LATE = 0.02  # s by which a torque that is fresh may answer an old pose
+SLOW = 0.1  # s, time constant; faster than this, torque changes only with the pose
+PATIENCE = 0.02  # s
+MEMORY = 1.0  # s, time constant
+
+
+class MotionMonitor:
+    """The unexplained impulse of each joint. gravity: (3,) unit vector in the arm's base frame; may be set anytime.
+
+    limits.largest_moment: (4,) kg m; zeros switch the monitor off. impulse: (4,) Nm s.
+    """
+
+    def __init__(self, limits: Limits) -> None:
+        self.gravity: tuple[float, float, float] = UPRIGHT
+        self._limits = limits
+        self._load = tuple(GRAVITY * moment for moment in limits.largest_moment)  # Nm
+        one, two, three, four = self._load
+        full = two + three + four
+        self._full = (one + full, full, three + four, four)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past."""
+        self.impulse = list(NOTHING)
+        self._slow: list[float] = []  # the torque, low-passed, (4,) Nm
+
+    @property
+    def used(self) -> tuple[float, ...]:
+        """The share (4,) of the permitted impulse."""
+        return tuple(sum_ / (PATIENCE * full or 1.0) for sum_, full in zip(self.impulse, self._full, strict=True))
+
+    def step(
+        self, dt: float, joints: Sequence[JointSample], effort: Sequence[float], age: float = 0.0
+    ) -> tuple[Sequence[float], Fault | None]:
+        """Return what is explained of the `effort` (4,) Nm in the pose of `joints`, and a fault if too little is.
+
+        age: s since the pose that the effort answers. An impossible effort is returned as it is.
+        """
+        if not self._full[1] or not all(abs(torque) <= MAX_COMMAND for torque in effort):
+            return effort, None
+        fastest = max([abs(joint.velocity) for joint in joints])
+        lowest, highest = self.explained([joint.position for joint in joints])
+        self._slow = self._slow or list(effort)
+        passed: list[float] = []
+        fault: Fault | None = None
+        for i, full in enumerate(self._full):
+            most = self._limits.max_effort[i]
+            torque = max(-most, min(most, effort[i]))
+            margin = ABSOLUTE + self._limits.largest_addition[i] + (RELATIVE + max(LATE, age) * fastest) * full
+            low, high = lowest[i] - margin, highest[i] + margin
+            within = max(low, min(high, torque))
+            passed.append(within)
+            change = torque - self._slow[i]
+            self._slow[i] += min(1.0, dt / SLOW) * change
+            excess = max(abs(torque - within), abs(change) - margin - SLOW * fastest * full)
+            self.impulse[i] += dt * (max(0.0, excess) - self.impulse[i] / MEMORY)
+            if not self.impulse[i] <= PATIENCE * full and fault is None:
+                reason = f"{torque:.2f} Nm asked for, gravity explains {low:.2f} to {high:.2f} Nm"
+                if low <= torque <= high:
+                    reason = f"{change:+.2f} Nm asked for in {SLOW:g} s, in which the arm hardly moved"
+                fault = Fault(FaultCode.UNEXPLAINED_TORQUE, f"{self._limits.joint_names[i]}: {reason}")
+        return passed, fault
+
+    def explained(self, theta: Sequence[float]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return the least and the greatest torque (4,) in Nm that gravity needs at `theta` (4,) rad of any load.
+
+        Potential -g sum(M_n u_n), u_n being how far down link n points; torques are its derivatives.
+        """
+        one, two, three, four = theta
+        x, y, z = self.gravity
+        s1, c1, s2, c2 = math.sin(one), math.cos(one), math.sin(two), math.cos(two)
+        s3, c3, s4, c4 = math.sin(three), math.cos(three), math.sin(three + four), math.cos(three + four)
+        out, ahead = c1 * x + s1 * y, c1 * y - s1 * x  # gravity outwards along link 1, and forwards
+        down, across = s2 * out + c2 * z, s2 * z - c2 * out  # along the hanging link 2, and across it
+        m1, m2, m3, m4 = self._load
+        turn3, turn4 = m3 * (s3 * down - c3 * ahead), m4 * (s4 * down - c4 * ahead)
+        parts = (
+            (-m1 * ahead, -m2 * s2 * ahead, m3 * (s3 * out - c3 * s2 * ahead), m4 * (s4 * out - c4 * s2 * ahead)),
+            (m2 * across, m3 * c3 * across, m4 * c4 * across),
+            (turn3, turn4),
+            (turn4,),
+        )
+        lowest, highest = [], []
+        for torques in parts:
+            up = sum([torque for torque in torques if torque > 0.0])
+            lowest.append(SURPLUS * (sum(torques) - up))
+            highest.append(SURPLUS * up)
+        return tuple(lowest), tuple(highest)

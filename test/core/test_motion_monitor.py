@@ -1,0 +1,121 @@
+"""Torque that gravity cannot account for: what is explained, what is not, and what becomes of a wrong compensator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bench.motion_monitor import HANGING, caught, fed_back, flipped, misread, multiplied, quiet, settings_of, shaken
+from exo_gravity.core.compensation.compensator import Compensator
+from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.model.gravity import gravity_torque
+from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.safety.drive import NOTHING, FaultCode
+from exo_gravity.core.safety.limits import JointSample, Limits
+from exo_gravity.core.safety.motion_monitor import MotionMonitor
+
+ROBOT = settings_of().robot
+LIMITS = Limits(("a", "b", "c", "d"), largest_moment=ROBOT.first_moment)
+PERIOD = 0.004
+RAISED = (0.0, 1.3, 0.2, 0.3)
+
+
+def joints(theta: Sequence[float], velocity: float = 0.0) -> tuple[JointSample, ...]:
+    return tuple(JointSample(angle, velocity, 0.0, None, None, 0.0) for angle in theta)
+
+
+def torque_of(theta: Sequence[float], load: float = 1.0) -> tuple[float, ...]:
+    return tuple(load * gravity_torque(ROBOT, theta))
+
+
+def judge(torque: Sequence[float], theta: Sequence[float] = RAISED, addition: Sequence[float] = NOTHING) -> float:
+    """Return the time in s until the monitor finds a fault in a constant torque; infinity if it finds none."""
+    monitor = MotionMonitor(replace(LIMITS, largest_addition=addition))
+    for cycle in range(500):
+        if monitor.step(PERIOD, joints(theta), torque)[1]:
+            return cycle * PERIOD
+    return math.inf
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_any_load_up_to_the_largest_moments_is_explained_in_any_pose_at_any_tilt(side: str) -> None:
+    random = np.random.default_rng(0)
+    monitor = MotionMonitor(LIMITS)
+    for _ in range(300):
+        theta, tilt = random.uniform(-1.6, 2.5, 4), Tilt.of(side, *random.uniform(-1.5, 1.5, 2))
+        lighter = ArmModel.from_moments(ROBOT.length, random.uniform(0.0, 1.0, 4) * ROBOT.first_moment)
+        monitor.gravity = tilt.direction
+        low, high = monitor.explained(theta)
+        torque = gravity_torque(lighter, theta, tilt.direction)
+        assert np.all(np.array(low) - 1e-3 <= torque) and np.all(torque <= np.array(high) + 1e-3)
+
+
+def test_the_heaviest_load_is_no_fault_and_three_times_it_is() -> None:
+    assert judge(torque_of(RAISED)) == judge(torque_of(RAISED, 0.0)) == math.inf
+    assert judge(torque_of(RAISED, 3.0)) < 0.1
+
+
+def test_a_torque_of_the_wrong_sign_and_one_of_another_pose_are_faults() -> None:
+    assert judge(torque_of(RAISED, -1.0)) < 0.1
+    assert judge(torque_of(RAISED), HANGING) < 0.1
+
+
+@pytest.mark.parametrize("push", [3.0, -6.0])
+def test_what_may_be_added_is_no_fault_but_only_at_its_joint(push: float) -> None:
+    gravity = torque_of(RAISED)
+    pushed = (gravity[0], gravity[1] + push, *gravity[2:])
+    assert judge(pushed) < 0.2
+    assert judge(pushed, addition=(0.0, 3.0, 0.0, 0.0)) == math.inf
+    assert judge(pushed, addition=(3.0, 0.0, 3.0, 3.0)) < 0.2
+
+
+def test_a_torque_may_be_as_old_as_its_ride_while_the_wearer_moves() -> None:
+    moved = joints(HANGING, 2.0)  # on from a pose of 0.18 s ago
+    old = torque_of((HANGING[0], HANGING[1] + 0.36, *HANGING[2:]))
+    for age, is_fault in ((0.0, True), (0.18, False)):
+        monitor = MotionMonitor(LIMITS)
+        faults = [monitor.step(PERIOD, moved, old, age)[1] for _ in range(200)]
+        assert any(faults) is is_fault
+
+
+def test_an_impossible_torque_is_passed_on_to_the_check_that_names_it() -> None:
+    for torque in (math.nan, math.inf, 41.0):
+        assert MotionMonitor(LIMITS).step(PERIOD, joints(RAISED), (0.0, torque, 0.0, 0.0))[1] is None
+
+
+def test_unexplained_torque_is_not_passed_on() -> None:
+    passed, _ = MotionMonitor(LIMITS).step(PERIOD, joints(RAISED), torque_of(RAISED, 2.5))
+    needed = torque_of(RAISED)
+    assert needed[1] < passed[1] < 1.5 * needed[1]
+
+
+def test_an_oscillation_between_two_explained_torques_is_a_fault() -> None:
+    monitor, gravity, fault = MotionMonitor(LIMITS), torque_of(RAISED), None
+    for cycle in range(100):
+        swing = 0.5 + 0.5 * math.sin(16.0 * math.pi * cycle * PERIOD)
+        fault = fault or monitor.step(PERIOD, joints(RAISED), [swing * torque for torque in gravity])[1]
+    assert fault and fault.code is FaultCode.UNEXPLAINED_TORQUE and "hardly moved" in fault.reason
+
+
+def test_without_moments_every_torque_passes() -> None:
+    monitor = MotionMonitor(replace(LIMITS, largest_moment=(0.0,) * 4))
+    assert monitor.step(PERIOD, joints(HANGING), (3.0, 9.0, 3.0, 3.0)) == ((3.0, 9.0, 3.0, 3.0), None)
+
+
+def test_a_wrong_compensator_is_let_down_before_an_arm_that_no_one_holds_is_fast() -> None:
+    tripled = settings_of(robot=ArmModel(ROBOT.length, ROBOT.cog, 3.0 * ROBOT.mass))
+    hanging = caught(tripled, None)
+    assert hanging.fault == "unexplained_torque" and hanging.time < 0.7 and hanging.speed < 0.8
+    for wrong in (multiplied, flipped(1), misread, fed_back, shaken((0.0, 2.0, 0.0, 0.0))):
+        seen = caught(wrong, (0.6, 0.9, 0.3, 0.3) if wrong is misread else (0.0, 0.9, 0.3, 0.3))
+        assert seen.fault == "unexplained_torque" and seen.time < 0.2 and seen.speed < 0.6, wrong
+
+
+def test_a_fast_wearer_is_not_let_down() -> None:
+    settings = settings_of(75.0)
+    seen = quiet(Compensator(settings), 30.0, 3, settings.arm.first_moment)
+    assert not seen.trouble and seen.speed > 3.0 and seen.share < 0.5
