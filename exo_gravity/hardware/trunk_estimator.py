@@ -196,7 +196,7 @@ class TrunkEstimator:
         self._last_rate, self._last_acceleration = rate, acceleration
         self._up = up_in_body(quaternion)
         if acceleration:
-            self._agreement.check(dt, quaternion, self._up, acceleration)
+            self._agreement.check(dt, quaternion, self._up, acceleration, rate)
         self._speed = max(abs(rate[0]) + abs(rate[1]) + abs(rate[2]), self._speed * (1.0 - dt))
         contradiction = self._agreement.contradiction + self._speed * self._clock.offset
         uncertainty.combine(fusion.bias_sigma, self._agreement.square, contradiction)

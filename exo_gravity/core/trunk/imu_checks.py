@@ -27,9 +27,11 @@ TURN_TIME = 1.0  # s over which the two turns are compared
 CLEAR_TURN = 0.04  # of a unit vector: 2.3 degrees
 CLEAR = 6.0  # times the deviation from 1 g, that a turn must also exceed
 UNLIKE, ALIKE = 0.6, 0.3  # share of the gyroscope's turn by which the two differ, with other axes or sign, or without
-PATIENCE = 0.06  # s of unlike turns; like ones reduce them. In good data it was up to 0.04 s
+LEVER, MOST = 0.35 / STANDARD_GRAVITY, 0.3  # s^2: m from the axis of a turn to the IMU, per 1 g; 1 g, at most
+PATIENCE = 0.01  # s 1 g: the velocity that a movement may add beyond this; 0.006 in ordinary motion
+NOTICE = 0.0006  # s 1 g, by which the two differ fully
 FORGET_TIME = 2.0  # s
-AGREEMENT_TIME = 0.2  # s of like turns
+AGREEMENT_TIME = 0.6  # s of like turns
 AT_REST, REST_TIME = 0.03, 3.0  # share of 1 g; s: at rest the estimate is right whatever the gyroscope measures
 
 AVERAGE_TIME, LEAST_TIME = 2.0, 0.5  # s of samples whose mean is gravity; fewer are not judged
@@ -131,6 +133,7 @@ class Agreement:
         self._deviation = 0.0  # of the acceleration's length from 1 g, mean over QUIET_TIME, as a share
         self._up: Floats3 | None = None  # mean over TURN_TIME, like the next one
         self._measured: Floats3 = ZERO
+        self._rate: Floats3 = ZERO  # rad/s, at the last comparison
         self._unlike = self._rest = self._contradicted = 0.0  # s
         self._age = 0.0  # s
         self._mean: Floats3 = ZERO  # in 1 g
@@ -157,7 +160,7 @@ class Agreement:
             expected = f"within {limit:g} degrees of the accelerometer at rest: check the IMU's axes, units and signs"
             raise ParameterError("gravity_in_imu", [round(-component, 2) for component in up], expected)
 
-    def check(self, dt: float, quaternion: Quaternion, up: Floats3, acceleration: Floats3) -> None:
+    def check(self, dt: float, quaternion: Quaternion, up: Floats3, acceleration: Floats3, rate: Floats3) -> None:
         """Compare a fused orientation, and its world z axis `up` in the IMU's axes, with the mean of the accelerations.
 
         The mean is that since the last comparison, CHECK_PERIOD before.
@@ -171,11 +174,15 @@ class Agreement:
         self._sum, self._span, self._count = ZERO, 0.0, 0
         share = 1.0 / (count * STANDARD_GRAVITY)
         mean = total[0] * share, total[1] * share, total[2] * share
-        self._check_turns(span, up, mean)
+        spin_up = math.dist(rate, self._rate) / span if span else 0.0
+        self._rate = rate
+        explained = min(MOST, LEVER * (spin_up + rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2))
+        # Before and just after the first tilt nothing is lost by a refusal.
+        self._check_turns(span, up, mean, explained if self._age > AVERAGE_TIME else 0.0)
         self._check_mean(span, rotated(quaternion, mean))
 
-    def _check_turns(self, dt: float, up: Floats3, acceleration: Floats3) -> None:
-        """Compare the turns. acceleration: in 1 g."""
+    def _check_turns(self, dt: float, up: Floats3, acceleration: Floats3, explained: float) -> None:
+        """Compare the turns. acceleration: in 1 g; explained: the part of it that the rotation may cause."""
         (a, b, c), (x, y, z) = up, acceleration
         norm = math.sqrt(x * x + y * y + z * z)
         x, y, z = x / norm, y / norm, z / norm
@@ -198,13 +205,14 @@ class Agreement:
         if size <= CLEAR * self._deviation:
             return
         difference = math.dist((x - u, y - v, z - w), (a, b, c))
+        excess = difference - UNLIKE * size - explained
         if difference < ALIKE * size:
             self._agreed += dt
-            self._unlike = max(0.0, self._unlike - 2.0 * dt)
+            self._unlike = max(0.0, self._unlike - 2.0 * dt * size)
             self.is_suspect = self.is_suspect and self._agreed < AGREEMENT_TIME
-        elif difference > UNLIKE * size:
-            self._unlike += dt
-            self.contradiction = difference * self._unlike / PATIENCE  # a movement can look like one for 12 ms
+        elif excess > 0.0:
+            self._unlike += dt * excess
+            self.contradiction = difference * self._unlike / NOTICE
             if self._unlike > PATIENCE:
                 expected = "the turn that the accelerometer shows: check the gyroscope's unit, axes and signs"
                 raise Contradiction("turn by angular_velocity", [round(v, 3) for v in (a, b, c)], expected)
