@@ -15,7 +15,7 @@ from .rigs import CommandedRig, V3Rig, WearerRig
 
 GUIDED_SPEED = 0.6  # rad/s
 MOTION = 8.0  # s until an arm that became heavy hangs
-SPRING = {"spring.stiffness": [4.0, 14.0, 7.0, 3.9], "spring.pose": [0.0, 0.0, -0.3, 1.3]}
+SPRING = {"spring.stiffness": [4.0, 14.0, 7.0, 3.8], "spring.pose": [0.0, 0.0, -0.3, 1.3]}
 NO_SPRING = {"spring.stiffness": [0.0] * 4}
 
 
