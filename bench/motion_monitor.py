@@ -68,6 +68,7 @@ class TrueTrunk:
     cycles = 1
 
     def measure(self, now: float, state: TrunkState) -> TrunkReading:
+        """Return the truth."""
         gravity = gravity_in_trunk(state.pitch, state.roll)
         force = state.acceleration - STANDARD_GRAVITY * gravity
         return TrunkReading(gravity.tolist(), force.tolist(), state.angular_velocity)
@@ -83,9 +84,11 @@ class Passive(VirtualWearer):
         self._pose, self._taken, self._last = tuple(pose or HANGING), NO_TORQUE, 0.0
 
     def idle(self, elapsed: float, duration: float) -> bool:
+        """Return False: the wearer may always move."""
         return False
 
     def torque(self, elapsed: float, theta: Sequence[float], velocity: Sequence[float]) -> Torque:
+        """Return the wearer's torque (4,) in Nm."""
         super().torque(elapsed, theta, velocity)  # follows the script's steps
         period, self._last = elapsed - self._last, elapsed
         if elapsed < 0.0:
@@ -114,9 +117,11 @@ class Fast(VirtualWearer):
         self.top = 0.0
 
     def idle(self, elapsed: float, duration: float) -> bool:
+        """Return False: the wearer may always move."""
         return False
 
     def torque(self, elapsed: float, theta: Sequence[float], velocity: Sequence[float]) -> Torque:
+        """Return the wearer's torque (4,) in Nm."""
         if elapsed < 0.0 or elapsed > self.script.duration or self.is_over():
             return NO_TORQUE
         super().torque(elapsed, theta, velocity)  # follows the script's steps
@@ -210,6 +215,7 @@ class Changed(Compensator):
         self._is_wrong = True
 
     def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Answer:
+        """Return the answer that the bridge gets."""
         self.on_step()
         answer = super().step(now, theta, velocity)
         if answer.effort is None or not self._is_wrong or isinstance(self._wrong, Settings):
@@ -225,6 +231,7 @@ class Lively(Compensator):
         self._others, self._next = itertools.cycle((settings, *others)), 20.0
 
     def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Answer:
+        """Return the answer that the bridge gets."""
         if now >= self._next:
             self._next = now + 20.0
             self.apply(next(self._others))
@@ -379,10 +386,12 @@ def multiplied(now: float, theta: Sequence[float], v: Sequence[float], effort: T
 
 
 def flipped(joint: int) -> Change:
+    """Return what reverses the effort of `joint` (0..3)."""
     return lambda now, theta, v, effort: tuple(-tau if n == joint else tau for n, tau in enumerate(effort))
 
 
 def shaken(size: Sequence[float]) -> Change:
+    """Return what adds `size` (4,) Nm at 8 Hz."""
     return lambda now, theta, v, effort: tuple(
         tau + most * math.sin(16.0 * math.pi * now) for tau, most in zip(effort, size, strict=True)
     )
@@ -395,6 +404,7 @@ def fed_back(now: float, theta: Sequence[float], v: Sequence[float], effort: Tor
 
 
 def misread(now: float, theta: Sequence[float], v: Sequence[float], effort: Torque) -> Torque:
+    """Return the paper's static law with the encoder's angle of joint 1 for that to gravity."""
     return tuple(paper_static_torque(ROBOT, theta).tolist())
 
 

@@ -47,15 +47,13 @@ def bows(angle: float, over: float, walk: float) -> list[Step | Shake]:
 
 def day(seed: int, duration: float) -> list[Step | Shake]:
     """Return motions in random order, some of them at the same time."""
-    random, at, parts = np.random.default_rng(seed), STILL_TIME, []
+    random, at = np.random.default_rng(seed), STILL_TIME
+    parts: list[Step | Shake] = []
     while at < duration:
         kind = random.choice(("bow", "bow", "lean", "turn", "sit", "jump", "walk", "clap", "nod"))
         over, length = random.uniform(0.6, 2.0), random.uniform(2.0, 10.0)
         if kind in {"clap", "nod", "walk"}:
             parts.append(Shake(kind, at, length))
-            if kind == "walk":
-                speed = random.uniform(0.3, 1.4) * AHEAD  # m/s, gained and lost in a second
-                parts += [Step(at + t, 1.0, v * speed) for t, v in ((0.0, 0.0), (length, 0.0))]
             over = length if random.random() < 0.7 else 0.0  # or the next one at the same time
         elif kind == "sit":
             parts += [Step(at, 0.8, 0.6 * PITCH - 0.3 * AHEAD), Step(at + 0.5, 0.6, -0.4 * UP)]
