@@ -16,6 +16,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from functools import partial
+from typing import Any
 
 import can
 
@@ -226,7 +227,11 @@ class RealWire:
     clock = COMPUTER_CLOCK
 
     def __init__(self) -> None:
-        self._options = {"interface": INTERFACE, "channel": os.environ["EXO_TEST_CAN_CHANNEL"], "fd": True}
+        self._options: dict[str, Any] = {
+            "interface": INTERFACE,
+            "channel": os.environ["EXO_TEST_CAN_CHANNEL"],
+            "fd": True,
+        }
         self._ends: list[can.BusABC] = []
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
