@@ -90,7 +90,8 @@ class Rig:
 
     def _send(self) -> None:
         if self.is_feeding:
-            states = JointState(name=self.names, position=self.pose, effort=self.applied)
+            still = [0.0] * len(self.names)
+            states = JointState(name=self.names, position=self.pose, velocity=still, effort=self.applied)
             states.header.stamp = to_time(time.time_ns() - round(self.lag * 1e9))
             self.publisher.publish(states)
 
@@ -201,9 +202,9 @@ def test_six_joints_among_others_in_any_order_are_carried_in_the_order_of_the_co
 
 
 def test_gains_and_limits_change_live_and_the_law_does_not(rig):
-    results = rig.node.set_parameters([Parameter("gain", value=[0.5] * 6), Parameter("law", value="exact")])
+    results = rig.node.set_parameters([Parameter("gain", value=[0.9] * 6), Parameter("law", value="exact")])
     assert [result.successful for result in results] == [True, False]
-    rig.wait_until(lambda: np.allclose(rig.commands[-1], np.multiply(0.5, EXPECTED), rtol=0.0, atol=1e-9))
+    rig.wait_until(lambda: np.allclose(rig.commands[-1], np.multiply(0.9, EXPECTED), rtol=0.0, atol=1e-9))
     assert rig.node.set_parameters([Parameter("gain", value=[1.0] * 6)])[0].successful
 
 

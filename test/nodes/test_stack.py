@@ -58,13 +58,13 @@ def test_a_released_arm_stays_follows_live_changes_and_is_let_down_gently(launch
         assert reason in result.reason
 
     # A valid value reaches the arm without a torque step.
-    before = probe.effort_commands[-1].effort[2]
+    before = probe.effort_commands[-1].effort[1]
     probe.effort_commands.clear()
-    assert probe.set_parameters("compensator", gain=[1.0, 1.0, 1.05, 1.0]).successful
-    heavier = ArmModel(ROBOT.length, ROBOT.cog, ROBOT.mass, gain=(1.0, 1.0, 1.05, 1.0))
-    target = gravity_torque(heavier, probe.joint_angles(), tilt.direction)[2]
-    probe.wait_until(lambda: probe.effort_commands and abs(probe.effort_commands[-1].effort[2] - target) < 0.01)
-    steps = np.diff([message.effort[2] for message in probe.effort_commands])
+    assert probe.set_parameters("compensator", gain=[1.0, 1.05, 1.0, 1.0]).successful
+    heavier = ArmModel(ROBOT.length, ROBOT.cog, ROBOT.mass, gain=(1.0, 1.05, 1.0, 1.0))
+    target = gravity_torque(heavier, probe.joint_angles(), tilt.direction)[1]
+    probe.wait_until(lambda: probe.effort_commands and abs(probe.effort_commands[-1].effort[1] - target) < 0.01)
+    steps = np.diff([message.effort[1] for message in probe.effort_commands])
     assert np.abs(steps).max() < 0.5 * abs(target - before)
 
     # No node maps another one's shared memory, on which it could block.

@@ -25,7 +25,7 @@ from exo_gravity.core.safety.limits import GUIDE_SPEED
 
 FADE_TIME = 2.0  # s from the old load to the new one where the joint does not move,
 MAX_FADE_RATE = 4.0  # Nm/s, but no faster than this,
-BLIND_FADE = 5.0  # and so many times slower where the velocity is not known
+LONGEST_FADE = 10.0  # s, of larger arms; and always where the velocity is not known
 SPEED_GAIN = 20.0  # Nm/rad, as of the descent (core/safety/descent.py)
 WATCH = 1.0  # s after the last fade in which a joint that begins to move is still guided
 LARGE = 1.0  # Nm between old and new load; less is slow enough without damping, which a wearer who moves would feel
@@ -83,7 +83,8 @@ class GuidedChange:
             if driven > GUIDE_SPEED:
                 share = min(1.0, share + SPEED_GAIN / size * (driven - GUIDE_SPEED) * dt)
             else:
-                pace = min(1.0 / FADE_TIME, MAX_FADE_RATE / size) / (1.0 if velocity else BLIND_FADE)
+                fastest = max(MAX_FADE_RATE / size, 1.0 / LONGEST_FADE)
+                pace = min(1.0 / FADE_TIME, fastest) if velocity else 1.0 / LONGEST_FADE
                 share = max(0.0, share - pace * (1.0 - max(0.0, driven) / GUIDE_SPEED) * dt)
             shares.append(share)
             ways.append(abs(way))

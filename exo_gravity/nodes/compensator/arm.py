@@ -91,8 +91,7 @@ class ControlledArm:
         problem = self.control.terms.problem if self.control.terms else ""
         if problem:
             return f"gravity compensation alone: {problem}"
-        changing = self._changing(answer)
-        return "" if changing == "none" else f"changing load: {changing}"
+        return "changing load" if answer.remainder else ""
 
     def _changing(self, answer: Answer) -> str:
         """Return which joint has most to go until a change of load is done; 'none' if none is under way."""
