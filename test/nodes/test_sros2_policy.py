@@ -81,6 +81,7 @@ def parameter_file(folder):
             values["can"]["options"]["port"] = ports[name.split("/")[1]]
         if name.endswith("/can_bridge"):
             values["autostart"] = False
+            values["largest_moment"] = [0.1] * 4  # then it reads the trunk's tilt, too
     content["/recorder"] = {"ros__parameters": {"output": str(folder / "bag")}}
     content["/robot_model"] = {"ros__parameters": {"rate": 30.0}}
     content["/panel"] = {"ros__parameters": {"port": free_port(), "output": str(folder)}}
