@@ -39,6 +39,7 @@ INTERRUPTED = 130  # the shell's exit code after Ctrl-C
 
 def main() -> int:
     """Run the cases; return the exit code."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the nodes inherit it: nohup must not hide a row's SIGHUP
     parser = argparse.ArgumentParser(prog="python -m test.faults.run", description="Run the fault matrix.")
     parser.add_argument("--only", default=[""], nargs="+", metavar="TEXT", help="only cases whose name contains TEXT")
     parser.add_argument("--exactly", action="store_true", help="only cases whose name is one of these TEXTs")

@@ -111,7 +111,7 @@ def test_a_session_from_support_to_a_fault_and_back_with_a_recording(clinic):
     page.wait_for_selector("#saved:has-text('params.yaml')")
     (saved,) = (clinic.folder / "out").glob("parameters_*/params.yaml")
     assert yaml.safe_load(saved.read_text())["/right/compensator"]["ros__parameters"]["mode"] == "zero_g"
-    for what in ("record", "set right mode = zero_g", "clear fault right", "enable right", "let down", "save"):
+    for what in ("record", "set right mode = zero_g, support = 0.0", "clear fault right", "enable right", "let down", "save"):
         assert f"127.0.0.1 page 1: {what}: done" in clinic.notes()
     assert "token" not in probe.call(ListParameters, "/panel/list_parameters", ListParameters.Request()).result.names
 
@@ -130,7 +130,7 @@ def test_killing_the_panel_changes_nothing_about_the_arm(clinic):
 @pytest.mark.parametrize("clinic", [{"dead_man": True}], indirect=True, ids=["dead_man"])
 def test_with_dead_man_closing_the_page_lets_the_arm_down(clinic):
     wait_for_state(clinic.page, "active")
-    assert "127.0.0.1 page 1" in clinic.probe.diagnostic("can_bridge", "control held by")
+    clinic.probe.wait_until(lambda: "127.0.0.1 page 1" in clinic.probe.diagnostic("can_bridge", "control held by"))
     clinic.page.context.close()
     clinic.probe.wait_until(lambda: clinic.probe.state == "fault")
     assert clinic.probe.fault == "control_lost"
