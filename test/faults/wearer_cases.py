@@ -33,7 +33,7 @@ LIFT: Steps = [{"move": [0.0, 1.5, 0.3, 1.2], "over": 1.6}]
 PUSH_DOWN: Steps = [{"move": [0.0, 0.3, 0.1, 0.3], "over": 1.0}]
 HOLD: Steps = [{"move": POSE, "over": 5.0}]
 SHAKE = pushes(*[[0.0, 2.0, 0.8, 0.3], [0.0, -2.0, -0.8, -0.3]] * 10)
-THROW = pushes([0.0, 5.0, 0.0, 1.0])
+THROW = pushes([0.0, 2.5, 0.0, 0.2])
 REACH: Steps = [{"move": pose, "over": 0.8} for pose in ([0.3, 1.2, 0.8, 1.2], POSE) * 4]
 
 

@@ -37,6 +37,9 @@ class Clinic:
         return "\n".join(line for line in self.nodes.log if line.startswith("/panel"))
 
 
+RECORDING = 50_000  # bytes of a file into which joint states are written
+
+
 def with_panel(nodes: LaunchedNodes, **parameters: Any) -> str:
     """Add the panel to the parameter file of nodes that have not started; return its address."""
     port = free_port()
@@ -84,6 +87,8 @@ def test_a_session_from_support_to_a_fault_and_back_with_a_recording(clinic):
     wait_for_state(page, "active")
     page.click("#record")
     page.wait_for_selector("#record-stop:enabled")
+    out = clinic.folder / "out"
+    probe.wait_until(lambda: any(path.stat().st_size > RECORDING for path in out.glob("recording_*/bag/*.mcap")))
     page.click('[data-mode="zero_g"]')
     page.click("#ask-yes")
     probe.wait_until(lambda: probe.diagnostic("compensator", "mode") == "zero_g")
@@ -105,13 +110,21 @@ def test_a_session_from_support_to_a_fault_and_back_with_a_recording(clinic):
 
     page.click("#record-stop")
     page.wait_for_selector("#record:enabled")
-    (recording,) = (clinic.folder / "out").glob("recording_*")
-    assert any("page 1: clear fault right: done" in text for text in panel_diagnostics(recording / "bag"))
+    (recording,) = out.glob("recording_*")
+    noted = panel_diagnostics(recording / "bag")
+    assert any("page 1: clear fault right: done" in text for text in noted), noted
     page.click("#save")
     page.wait_for_selector("#saved:has-text('params.yaml')")
     (saved,) = (clinic.folder / "out").glob("parameters_*/params.yaml")
     assert yaml.safe_load(saved.read_text())["/right/compensator"]["ros__parameters"]["mode"] == "zero_g"
-    for what in ("record", "set right mode = zero_g, support = 0.0", "clear fault right", "enable right", "let down", "save"):
+    for what in (
+        "record",
+        "set right mode = zero_g, support = 0.0",
+        "clear fault right",
+        "enable right",
+        "let down",
+        "save",
+    ):
         assert f"127.0.0.1 page 1: {what}: done" in clinic.notes()
     assert "token" not in probe.call(ListParameters, "/panel/list_parameters", ListParameters.Request()).result.names
 
