@@ -144,7 +144,7 @@ def test_a_foreign_command_to_a_v3_board_is_counted_and_opposed(wire, other, mod
     [(command_id, data)] = sent(other)
     answer = joints[1].wire_format.unpack_command(joints[1].spec, data)
     assert command_id == joints[1].command_id
-    assert answer.torque == pytest.approx(0.5, abs=0.2)  # less a brake by the velocity, one code of it at rest
+    assert answer.torque == pytest.approx(0.5, abs=0.2)
     assert answer.kd == pytest.approx(DAMPING, abs=0.01)
     assert bus.is_contested
 
@@ -178,7 +178,7 @@ def test_an_exit_that_was_not_ours_is_undone_on_both_kinds_of_board(wire, other)
     v3 = joints[1].command_id
     assert [frame_id for frame_id, _ in answers] == [1, 1, 1, v3, v3]
     assert answers[1] == (1, ENTER)
-    assert answers[0] == answers[2] and answers[3] == answers[4]  # our commands, which also brake the joint
+    assert answers[0] == answers[2] and answers[3] == answers[4]  # our commands, under damping
 
 
 @pytest.mark.parametrize("formats", [(MIT,) * 4, V3], ids=["v2", "v3"])

@@ -4,8 +4,8 @@ The wire formats of the boards (core/wire_formats) may differ. A motor of V1 and
 200-400 us later. A V3 board sends status frames on its own timer: the first one after a command is its reply.
 Frames of other devices are ignored and counted by kind.
 
-A motor obeys every sender. A command to one of our motors that we did not send is answered at once with our own, which
-also brakes the joint: until then the other sender's torque acts, and no damping. To know it, echoes of our own frames
+A motor obeys every sender. A command to one of our motors that we did not send is answered at once with our own, under
+full damping: until then the other sender's torque acts, and no damping. To know it, echoes of our own frames
 are set apart: most buses return none. Some return them and mark them (`is_rx` is false). udp_multicast returns them
 unmarked, in order. The first frames show whether a bus echoes. SocketCAN sets the same mark on every frame from this
 computer, also on those of another process (Documentation/networking/can.rst of Linux, MSG_DONTROUTE): there it does not
@@ -46,9 +46,6 @@ LAST_REPLIES = 0.02  # s for which replies to the last frames are awaited
 LISTEN_TIME = 0.12  # s before the first frame
 SETTLING_TIME = 0.02  # s of it in which late replies to the previous owner may still arrive
 CORRECTION_PERIOD = 0.001  # s between two corrections of a motor: two correcting hosts must not fill the bus
-# Share of the rated torque by which an answer brakes at 1 rad/s, besides the motor's damping. A foreign 6 Nm 500 times
-# a second moved joint 2 at 1.5 rad/s (V3; V1 and V2: 1.4) where our answers came 4 (1) ms late, with it at 0.8 (0.7).
-BRAKE = 1.0
 CONTEST_TIME = 0.5  # s after a foreign command in which another one is expected
 FOREIGN_COMMAND = "foreign command"
 TRIAL = 32  # frames sent until it is known whether the bus echoes
@@ -258,7 +255,7 @@ class MotorBus:
         self.samples[joint] = JointSample(*reply[1:], self._now())
 
     def _oppose(self, joint: int, foreign: bytes) -> None:
-        """Answer a foreign command with our last one, under full damping and a brake, until our next one."""
+        """Answer a foreign command with our last one, under the motor's full damping until our next one."""
         now = self._now()
         motor = self._motors[joint]
         self.foreign_commands += 1
@@ -266,11 +263,8 @@ class MotorBus:
         self.foreign_command = f"another sender commands motor {motor.can_id} (frame [{foreign.hex(' ')}])"
         if not (self._powered and self._drive.powered) or self._drive.unsure[joint]:
             return
-        effort, velocity = self._drive.effort[joint], self.samples[joint].velocity
-        most = max(motor.rated_effort, abs(effort))
-        brake = BRAKE * motor.rated_effort * velocity if math.isfinite(velocity) else 0.0
-        braked = max(-most, min(most, effort - brake))
-        command = self._ids[joint], motor.command(braked, max(DAMPING, self._drive.damping[joint]))
+        effort, damping = self._drive.effort[joint], self._drive.damping[joint]
+        command = self._ids[joint], motor.command(effort, max(DAMPING, damping))
         is_exit = foreign in [data for _, data in motor.exit]
         if is_exit or now - self._corrected[joint] >= CORRECTION_PERIOD:
             self._send_each([(command, *motor.enter) if is_exit else (), (command,)])
