@@ -20,9 +20,8 @@ from typing import Any, NamedTuple
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.bus_load import REPLY_SHARE
-from exo_gravity.core.safety.descent import DAMPING
 from exo_gravity.core.safety.drive import CARRYING, OFF, Drive, FaultCode, State
-from exo_gravity.core.safety.limits import JointSample
+from exo_gravity.core.safety.limits import DAMPING, JointSample
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.supply import SupplyMonitor
 from exo_gravity.hardware.can.motor_bus import MotorBus
@@ -158,6 +157,11 @@ class ControlLoop:
     def trip_if_carried(self, code: FaultCode, reason: str) -> None:
         """Let the arm down for something that is a fault only while torque is applied."""
         if self.safety.state in CARRYING:
+            self.trip(code, reason)
+
+    def trip_unless_let_down(self, code: FaultCode, reason: str) -> None:
+        """Let the arm down, or refuse its start, for something that does not matter once it is being let down."""
+        if self.safety.state is not State.LETTING_DOWN:
             self.trip(code, reason)
 
     def stop(self, timeout: float | None = None) -> bool:

@@ -4,8 +4,8 @@ import itertools
 
 import pytest
 
-from exo_gravity.core.safety.descent import DAMPING, DESCENT_SPEED, JointDescent
-from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
+from exo_gravity.core.safety.descent import DESCENT_SPEED, JointDescent
+from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE
 
 PERIOD = 0.004  # s
 

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exo_gravity.core.safety.descent import DAMPING, DAMPING_RISE
+from exo_gravity.core.safety.descent import DAMPING_RISE
 from exo_gravity.core.safety.drive import CARRYING, NO_ONES, NOTHING, OFF, Fault, FaultCode, State
-from exo_gravity.core.safety.limits import GUIDE_BRAKE, GUIDE_SPEED, MAX_EFFORT_RATE
+from exo_gravity.core.safety.limits import DAMPING, GUIDE_BRAKE, GUIDE_SPEED, MAX_EFFORT_RATE
 from exo_gravity.core.safety.ride import LONGEST_AGE, LONGEST_RIDE
 
 from ..support.safety_run import EFFORT, LIMITS, PERIOD, SafetyRun

@@ -13,8 +13,8 @@ import pytest
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.specs import ENTER, EXIT, MotorReply
 from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, MIT, MIT_V3, WireFormat
-from exo_gravity.core.safety.descent import DAMPING
 from exo_gravity.core.safety.drive import NOTHING, OFF, Drive, State
+from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop

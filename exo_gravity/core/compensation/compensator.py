@@ -102,8 +102,9 @@ class Compensator(Tilted):
             if not turn <= MAX_TURN:
                 return Answer(None, held)
             held = f"{held}: held on, torque off by at most {turn * self._largest_torque(theta):.2f} Nm"
-        before = self._carried
+        before = None
         if self._pending is not None:
+            before = self._carried
             self._use(self._pending)
         replaced = bool(self._fallback)
         gravity = self._law(now, theta)
@@ -115,10 +116,8 @@ class Compensator(Tilted):
         dt = now - self._limiter.last_answer
         if not 0.0 <= dt <= BREAK:
             self._change.stop()  # the torque ramps in from zero
-        elif before.settings is not s:
-            self._begin(now, theta, velocity, torque, before)
-        elif bool(self._fallback) != replaced:
-            self._begin(now, theta, velocity, torque, None)  # the replaced law may not apply at `theta`
+        elif before is not None or bool(self._fallback) != replaced:
+            self._begin(now, theta, velocity, torque, before)  # without `before`: a replaced law may not apply here
         if not self._change.is_over:
             start = torque
             if self._origin is not None:

@@ -26,7 +26,7 @@ from exo_gravity.core.safety.limits import GUIDE_SPEED
 FADE_TIME = 2.0  # s from the old load to the new one where the joint does not move,
 MAX_FADE_RATE = 4.0  # Nm/s, but no faster than this,
 LONGEST_FADE = 10.0  # s, of larger arms; and always where the velocity is not known
-SPEED_GAIN = 20.0  # Nm/rad, as of the descent (core/safety/descent.py)
+SPEED_GAIN = 20.0  # Nm/rad
 WATCH = 1.0  # s after the last fade in which a joint that begins to move is still guided
 LARGE = 1.0  # Nm between old and new load; less is slow enough without damping, which a wearer who moves would feel
 SMALL = 0.05  # Nm; a smaller difference is nothing to guide

@@ -36,12 +36,8 @@ class EffortLimiter:
         self.last_answer = now
         ramp = min(1.0, (now - self._ramp_start) / RAMP_TIME)
         step = max_effort_rate * min(dt, LONGEST_STEP)
-        self._effort = tuple(
-            [
-                last + max(-step, min(step, ramp * wanted - last))
-                for wanted, last in zip(torque, self._effort, strict=True)
-            ]
-        )
+        pairs = zip(torque, self._effort, strict=True)
+        self._effort = tuple([limited(ramp * wanted, last, math.inf, step) for wanted, last in pairs])
         return self._effort
 
 

@@ -27,7 +27,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, UNKNOWN, JointSample
+from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE, UNKNOWN, JointSample
 
 REST_TIME = 2.0  # s at rest with nothing holding the arm, until it is down
 LONGEST_REST = 7.5  # s with nothing holding the arm, after which it is down even if the wearer moves it
@@ -47,9 +47,8 @@ BRAKE_GAIN = 40.0  # Nm/rad, up to what the joint carried
 RELEASE_GAIN = 60.0  # Nm/rad
 BRAKE_GROWTH = 3.0  # Nm/s beyond it: gravity of an arm of 75 kg changes no faster while it sinks
 MIN_FADE_RATE = 0.5  # Nm/s
-DAMPING = 5.0  # Nm s/rad, the range of kd on the wire: with less the joint swings longer
 FADE_TIME = 2.0  # s from full torque to none: the wearer has time to take over his arm
-DAMPING_RISE = 0.2  # s to DAMPING; damping that starts at once would be a torque step
+DAMPING_RISE = 0.2  # s to DAMPING, less of which lets a joint swing longer; a rise at once would be a torque step
 DAMPING_FADE = 0.4  # s, time constant
 MIN_DAMPING = 0.01  # Nm s/rad; smaller values become zero
 FREE_DAMPING = 0.2  # Nm s/rad that holds no joint: 0.07 Nm at DESCENT_SPEED. A swing without friction keeps so much

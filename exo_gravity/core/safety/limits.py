@@ -21,12 +21,13 @@ from exo_gravity.core.safety.drive import NOTHING, Fault, FaultCode
 
 MAX_COMMAND = 40.0  # Nm: no arm needs half of it, so a larger effort command is wrong
 PEAK_TORQUE = max(spec.peak_torque for spec in MOTORS.values())  # Nm
+DAMPING = 5.0  # Nm s/rad, the range of kd on the wire
 # The soft wall before a joint limit. These figures make it passive, for inertias of 0.005 to 0.3 kg m^2 and any rate:
 # behind the rate limit a spring alone would throw the arm back. The motor applies the damping without delay.
 WALL_WIDTH = 0.1  # rad before a joint limit, as in crisp_controllers
 WALL_STIFFNESS = 25.0  # Nm/rad
 WALL_TORQUE = 5.0  # Nm, largest
-WALL_DAMPING = 5.0  # Nm s/rad, from WALL_EDGE on
+WALL_DAMPING = DAMPING  # from WALL_EDGE on
 WALL_EDGE = 0.02  # rad into the wall over which the damping rises
 WALL_RELEASE = 0.03  # rad/s out of the wall, from which on the spring no longer pushes
 OVERSHOOT = 0.1  # rad past a joint limit that is not yet a fault, because mechanical stops are not infinitely stiff
@@ -35,7 +36,6 @@ MAX_EFFORT_RATE = 50.0  # Nm/s; the full torque of an AK60-6 in 60 ms, slow enou
 # a wearer who holds or moves slowly feels nothing, one who moves on feels 0.5 kg in his hand.
 GUIDE_SPEED = 0.25  # rad/s; above the noise of a motor's velocity
 GUIDE_BRAKE = 1.5  # Nm
-GUIDE_DAMPING = 5.0  # Nm s/rad, the range of kd on the wire
 MAX_TEMPERATURE = 80.0  # degC, an assumption: a motor whose own protection switches it off would drop the arm
 DERATING = 10.0  # degC below MAX_TEMPERATURE over which the permitted torque falls to half
 JUMP = 0.05  # rad that two readings may differ by in addition to what max_velocity allows
@@ -200,7 +200,7 @@ def guide_damping(velocity: float) -> float:
     speed = abs(velocity)
     if not speed > GUIDE_SPEED:
         return 0.0
-    return min(GUIDE_DAMPING * (speed - GUIDE_SPEED), GUIDE_BRAKE) / speed
+    return min(DAMPING * (speed - GUIDE_SPEED), GUIDE_BRAKE) / speed
 
 
 def _derating(temperature: int | None) -> float:

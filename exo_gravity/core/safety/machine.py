@@ -35,10 +35,10 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import Peaks
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.delivery import DeliveryMonitor
-from exo_gravity.core.safety.descent import DAMPING, DAMPING_RISE, ArmDescent, RestTracker
+from exo_gravity.core.safety.descent import DAMPING_RISE, ArmDescent, RestTracker
 from exo_gravity.core.safety.drive import CARRYING, DOUBTFUL, NO_ONES, NOTHING, OFF, Drive, Fault, FaultCode, State
 from exo_gravity.core.safety.gate import SignCheck, StartGate, SwitchOnCheck
-from exo_gravity.core.safety.limits import JointSample, Limits, guide_damping
+from exo_gravity.core.safety.limits import DAMPING, JointSample, Limits, guide_damping
 from exo_gravity.core.safety.motion_monitor import MotionMonitor
 from exo_gravity.core.safety.readings import Readings
 from exo_gravity.core.safety.ride import RideThrough
@@ -320,12 +320,11 @@ class SafetyMachine:
         readings.step(now, joints, self._sent.powered)
         if readings.lost or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):
             self._is_trusted = False
-        counting = tuple(readings.joints)
-        self._rest.step(now, counting, readings.silent)
+        self._rest.step(now, readings.joints, readings.silent)
         if all(readings.silent) and self._sent.powered:
             self._supply.doubt(self._sent.effort)
-        self._is_found_on = self._supply.step(dt, counting, readings.silent)
-        return counting
+        self._is_found_on = self._supply.step(dt, readings.joints, readings.silent)
+        return readings.joints
 
     def _let_down(self, now: float) -> None:
         applied = self._delivery.applied(self._sent, self._readings.silent)

@@ -31,7 +31,7 @@ class Readings:
     """
 
     def __init__(self, limits: Limits) -> None:
-        self.joints: list[JointSample] = [UNKNOWN] * JOINT_COUNT
+        self.joints: tuple[JointSample, ...] = (UNKNOWN,) * JOINT_COUNT
         self.silent: Sequence[bool] = (True,) * JOINT_COUNT
         self.fault: Fault | None = None
         self.lost = True
@@ -46,7 +46,7 @@ class Readings:
         """Take the newest readings `joints` (4,) in the cycle at `now` s; powered: whether the motors are on."""
         limits = self._limits
         longest = TRUSTED_SILENCE if powered else TRUSTED_SILENCE_OFF
-        faults: list[Fault | None] = []
+        faults, counting = list[Fault | None](), list(self.joints)
         self.lost = False
         for i, joint in enumerate(joints):
             if joint.time > self._newest[i]:
@@ -54,10 +54,12 @@ class Readings:
                 moved = abs(joint.position - self.joints[i].position)
                 self.lost |= gap > limits.reply_timeout and moved > limits.home_tolerance[i]
                 self._newest[i], self._missed[i] = joint.time, 0
-                faults.append(self._take(i, joint))
+                counting[i], fault = self._taken(i, joint)
+                faults.append(fault)
             else:
                 self._missed[i] += 1
                 self.lost |= self._missed[i] >= MISSED and now - joint.time > longest
+        self.joints = tuple(counting)
         asked = zip(joints, self._missed, strict=True)
         self.silent = [missed >= MISSED and limits.is_silent(now, joint) for joint, missed in asked]
         if any(self.silent):
@@ -67,12 +69,12 @@ class Readings:
         self.fault = next(filter(None, faults), None)
         self._now = now
 
-    def _take(self, i: int, joint: JointSample) -> Fault | None:
-        """Take a reading; return its fault if the reading before showed one, too."""
+    def _taken(self, i: int, joint: JointSample) -> tuple[JointSample, Fault | None]:
+        """Return the reading that counts now, and the fault of `joint` if the reading before it showed one, too."""
         fault = self._limits.find_fault(i, joint, self.joints[i], self._asked[i])
         is_confirmed = self._is_doubted[i]
         self._is_doubted[i] = fault is not None
         if fault and not is_confirmed and self.joints[i] is not UNKNOWN:
-            return None
-        self.joints[i], self._asked[i] = joint, self._now
-        return fault if is_confirmed else None
+            return self.joints[i], None
+        self._asked[i] = self._now
+        return joint, fault if is_confirmed else None

@@ -32,9 +32,8 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, REPLY, Frame, WireFormat
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.safety.descent import DAMPING
 from exo_gravity.core.safety.drive import OFF, Drive
-from exo_gravity.core.safety.limits import UNKNOWN, JointSample
+from exo_gravity.core.safety.limits import DAMPING, UNKNOWN, JointSample
 from exo_gravity.hardware.can.can_port import CanPort
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 

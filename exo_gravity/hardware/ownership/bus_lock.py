@@ -26,8 +26,8 @@ from typing import Any
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.safety.descent import DAMPING
 from exo_gravity.core.safety.drive import NOTHING, Drive
+from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
 ATTEMPT_TIME = 1.0  # s; a watchdog with nothing to do may take that long to end after its bridge

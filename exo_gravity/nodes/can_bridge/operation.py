@@ -188,8 +188,8 @@ class Operator:
         reason, loop = self.lease.lost(self._now()), self._get_loop()
         if reason:
             self._log.warning(reason)
-        if reason and loop is not None and loop.safety.state is not State.LETTING_DOWN:
-            loop.trip(FaultCode.CONTROL_LOST, reason)
+        if reason and loop is not None:
+            loop.trip_unless_let_down(FaultCode.CONTROL_LOST, reason)
 
     def _on_request(self, message: KeyValue, _info: dict[str, Any]) -> None:
         self._news = self.lease.request(self._now(), message.key, message.value) or self._news
