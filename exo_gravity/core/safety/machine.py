@@ -146,7 +146,7 @@ class SafetyMachine:
 
     def meet(self, now: float) -> None:
         """Find out, under damping, whether motors are on that a dead controller may have left; let them down if so."""
-        self._descent = ArmDescent(now, NOTHING, (DAMPING,) * JOINT_COUNT, self._peaks.effort)
+        self._descent = ArmDescent(now, NOTHING, (DAMPING,) * JOINT_COUNT, self.limits.max_effort)
         self._supply.doubt(NOTHING)
 
     def settled(self, now: float) -> bool:
