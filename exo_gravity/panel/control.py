@@ -155,7 +155,7 @@ class Control:
 
     @property
     def elsewhere(self) -> str:
-        """The name of who else holds control of an arm, in place of the page that holds it here; '' for nobody."""
+        """The name of another operator who holds control of an arm, instead of this panel's page; '' for none."""
         others = [self._arms.other_holder(arm, str(self.holder)) for arm in self._arms.names]
         return next(filter(None, others), "")
 

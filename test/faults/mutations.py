@@ -94,7 +94,7 @@ MUTATIONS = (
         "a second bridge takes the bus",
         ("second can_bridge on the bus",),
         (
-            Edit(BUS_LOCK, "lock.bind(name)", 'lock.bind("")'),  # to a name that nobody has
+            Edit(BUS_LOCK, "lock.bind(name)", 'lock.bind("")'),  # the kernel chooses a free name
             Edit("exo_gravity/hardware/ownership/owned_bus.py", "bus.listen()", "pass"),
         ),
     ),

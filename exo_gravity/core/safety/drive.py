@@ -89,7 +89,7 @@ class FaultCode(str, Enum):
     COMMAND_IMPOSSIBLE = "command_impossible", "an effort is NaN, beyond 40 Nm, misnamed or missing"
     UNEXPLAINED_TORQUE = (
         "unexplained_torque",
-        "no load up to `largest_moment` needs such efforts in this pose, with `largest_addition` beside it",
+        "the efforts exceed what gravity needs of any load up to `largest_moment`, plus `largest_addition`",
     )
     SECOND_COMMANDER = "second_commander", "two publishers send effort commands"
     # The operator

@@ -1,11 +1,11 @@
-"""Who holds control of one arm: a lease with a name, which its holder renews and nobody else can.
+"""Control of one arm: a lease that carries its holder's name, and that only its holder can renew.
 
     hold     takes the lease if it is free, and renews it
     take     takes it from its holder
     release  gives it back: the arm stays as it is
 
-A lease that is not renewed for LEASE_TIME has run out: its holder is gone, and the arm must not be carried without him.
-Without a lease nobody is waited for.
+A lease that is not renewed for LEASE_TIME runs out: its holder is gone, and the arm must not be carried without him.
+While nobody holds the lease, the arm depends on no operator.
 
 LEASE_TIME is chosen for a holder on Wi-Fi that sends three times a second over TCP. A station that roams or scans is
 silent for 0.1 to 0.5 s. TCP sends again 0.2 and 0.6 s after a loss, so after a gap of up to 0.6 s the next message is
@@ -19,7 +19,7 @@ LONGEST_NAME = 64
 
 
 class Lease:
-    """The lease of one arm. Every time is in s on the caller's monotonic clock. holder: a name, '' for nobody."""
+    """The lease of one arm. holder: name of its holder, '' for none. All times are in s on one monotonic clock."""
 
     def __init__(self) -> None:
         self.holder = ""

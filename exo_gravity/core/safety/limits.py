@@ -95,7 +95,7 @@ class Limits:
     )
     largest_addition: Sequence[float] = owned(
         (0.0,) * 4,
-        "what efforts may ask for beside gravity's torque, where `largest_moment` is given: the bounds of assistance "
+        "torque that efforts may add to gravity compensation when `largest_moment` is given: the bounds of assistance "
         "and terms in use, `inertial`, a calibration",
         (0.0, 10.0),
         "Nm",

@@ -191,7 +191,7 @@ def _open_notes(path: Path) -> int:
     try:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode) or status.st_nlink != 1:  # another file's link would be overwritten
-            raise OSError(errno.EINVAL, "not a file of its own")
+            raise OSError(errno.EINVAL, "not a regular file with a single link")
         os.posix_fallocate(descriptor, 0, mmap.PAGESIZE)  # without it, a full disk would end the process later
         return descriptor
     except OSError:

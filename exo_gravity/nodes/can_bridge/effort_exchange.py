@@ -2,7 +2,7 @@
 
 Efforts carry the stamp of the joint state that they answer. The exchange remembers when, on the monotonic clock, each
 stamped state was measured: so the age of an answer does not depend on the wall clock, and an unknown stamp is refused.
-Velocities of zero beside the efforts ask for the motors' damping, while the load changes; others are refused.
+While the load changes, the compensator asks for the motors' damping by velocities of 0. Others are refused.
 """
 
 from __future__ import annotations

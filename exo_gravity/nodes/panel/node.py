@@ -148,7 +148,7 @@ class Arms:
                 client.control.publish(KeyValue(key=self._lessee + page, value=kind))
 
     def other_holder(self, arm: str, page: str) -> str:
-        """Return who holds control of the arm, by its bridge's report, '' if this page or nobody does."""
+        """Return the name of another operator who holds control of the arm, as its bridge reports; '' for none."""
         holder = (self.clients[arm].bridge.at(time.monotonic()) or {}).get(HELD_BY, NOBODY)
         return "" if holder in (NOBODY, self._lessee + page) else str(holder)
 

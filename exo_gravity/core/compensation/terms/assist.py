@@ -10,8 +10,8 @@ least, so that a single late message costs nothing. Then, or at once when a mess
 So it is zero 100 ms after the first missing message was due: at 500 Hz 100 ms after the last one, at 10 Hz 200 ms. Only
 the compensator's `max_effort_rate` can make that longer, for an effort above 2.5 Nm at its default.
 
-The only memory is the torque that is applied. It moves to what the newest message asks for, never past it: whoever
-sends next begins from there, from zero once it has faded, and after a pause of the compensator.
+The input remembers only the torque that it applies. That torque moves towards the newest message and never past it. The
+next sender starts from it, and from zero once it has faded or the compensator has paused.
 """
 
 from __future__ import annotations
