@@ -86,8 +86,10 @@ class JointMotor:
         """The frames that switch the motor off."""
         return self.wire_format.exit(self.can_id)
 
-    def command(self, effort: float, damping: float) -> bytes:
+    def command(self, effort: float, damping: float, stiffness: float = 0.0, position: float = 0.0) -> bytes:
         """Return the data of a command: a joint `effort` in Nm and `damping` in Nm s/rad, clamped to the wire format.
+
+        With a `stiffness` in Nm/rad, the motor also pulls the joint to `position` in rad.
 
         Raises ParameterError on NaN or infinity.
         """
@@ -99,7 +101,8 @@ class JointMotor:
         most = spec.torque_range
         if not -most <= torque <= most and math.isfinite(torque):
             torque = math.copysign(most, torque)
-        return self.wire_format.pack_command(spec, 0.0, 0.0, 0.0, kd, torque)
+        kp = stiffness / self.torque_scale
+        return self.wire_format.pack_command(spec, self.motor_position(position) if kp else 0.0, 0.0, kp, kd, torque)
 
     def joint_reply(self, data: bytes | bytearray) -> MotorReply:
         """Return the content of a reply or status frame in the joint's rad, rad/s and Nm. Raises FrameError."""

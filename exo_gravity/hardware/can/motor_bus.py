@@ -5,11 +5,12 @@ The wire formats of the boards (core/wire_formats) may differ. A motor of V1 and
 Frames of other devices are ignored and counted by kind.
 
 A motor obeys every sender. A command to one of our motors that we did not send is answered at once with our own, under
-full damping: until then the other sender's torque acts, and no damping. To know it, echoes of our own frames
-are set apart: most buses return none. Some return them and mark them (`is_rx` is false). udp_multicast returns them
-unmarked, in order. The first frames show whether a bus echoes. SocketCAN sets the same mark on every frame from this
-computer, also on those of another process (Documentation/networking/can.rst of Linux, MSG_DONTROUTE): there it does not
-show an echo.
+full damping: until then the other sender's torque acts, and no damping. What it moves the joint in between must not add
+up, so for a while all our commands to that motor also hold the joint. To know a foreign command, echoes of our own
+frames are set apart: most buses return none. Some return them and mark them (`is_rx` is false). udp_multicast returns
+them unmarked, in order. The first frames show whether a bus echoes. SocketCAN sets the same mark on every frame from
+this computer, also on those of another process (Documentation/networking/can.rst of Linux, MSG_DONTROUTE): there it
+does not show an echo.
 
 A zero command precedes the frames that switch a V1 or V2 board on or off: the motor remembers its last command, and
 ENTER would carry it out. A command switches a V3 board on, so it gets none while the arm is off.
@@ -46,6 +47,9 @@ LISTEN_TIME = 0.12  # s before the first frame
 SETTLING_TIME = 0.02  # s of it in which late replies to the previous owner may still arrive
 CORRECTION_PERIOD = 0.001  # s between two corrections of a motor: two correcting hosts must not fill the bus
 CONTEST_TIME = 0.5  # s after a foreign command in which another one is expected
+HOLD_STIFFNESS = 60.0  # Nm/rad by which a contested motor holds its joint: the motor applies it without our delay,
+HOLD_REACH = 0.15  # rad at most from where the joint is,
+HOLD_SPEED = 0.3  # rad/s with which the held position follows the joint
 FOREIGN_COMMAND = "foreign command"
 TRIAL = 32  # frames sent until it is known whether the bus echoes
 MOST_AWAITED = 512  # twice the frames that a udp_multicast socket keeps unread
@@ -90,7 +94,8 @@ class MotorBus:
         self._ids = tuple(motor.command_id for motor in motors)
         self._drive = OFF  # last sent
         self._corrected = [-math.inf] * JOINT_COUNT  # s
-        self._foreign_time = -math.inf
+        self._contested = [-math.inf] * JOINT_COUNT  # s of the last foreign command to the motor
+        self._held = [math.nan] * JOINT_COUNT  # rad
         self._note = note
         self._exit_sent = -math.inf
         self._is_confirming = False  # replies now follow an EXIT
@@ -104,7 +109,7 @@ class MotorBus:
     @property
     def is_contested(self) -> bool:
         """Whether another sender commands these motors."""
-        return self._now() - self._foreign_time < CONTEST_TIME
+        return self._now() - max(self._contested) < CONTEST_TIME
 
     def listen(self) -> None:
         """Listen before the first frame. Raises BusError if another host commands these motors."""
@@ -218,7 +223,7 @@ class MotorBus:
         for joint, motor in enumerate(self._motors):
             if joint not in self._asked and (drive.unsure[joint] or not drive.powered):
                 continue
-            command = self._ids[joint], motor.command(drive.effort[joint], drive.damping[joint])
+            command = self._command(joint)
             if drive.enter[joint]:
                 self._send_each([(command, *motor.enter)])
             self._send(command)
@@ -251,19 +256,44 @@ class MotorBus:
         self._answered.add(joint)
         if self._is_confirming and (joint in self._asked or abs(reply.torque) < OFF_EFFORT):
             self._unconfirmed.discard(joint)
-        self.samples[joint] = JointSample(*reply[1:], self._now())
+        now = self._now()
+        self._follow(joint, reply.position, now)
+        self.samples[joint] = JointSample(*reply[1:], now)
+
+    def _follow(self, joint: int, position: float, now: float) -> None:
+        """Let the held position of a contested joint follow it slowly; that of any other joint at once."""
+        if self._is_opposed(joint):
+            away = position - self._held[joint]
+            step = max(HOLD_SPEED * (now - self.samples[joint].time), abs(away) - HOLD_REACH)
+            position = self._held[joint] + math.copysign(min(step, abs(away)), away)
+        self._held[joint] = position
+
+    def _is_opposed(self, joint: int) -> bool:
+        return self._drive.powered and self._now() - self._contested[joint] < CONTEST_TIME
+
+    def _command(self, joint: int) -> Frame:
+        """Return the last drive's command to a motor. If the motor is contested, it also holds the joint."""
+        motor, effort, damping = self._motors[joint], self._drive.effort[joint], self._drive.damping[joint]
+        if self._is_opposed(joint):
+            damping = max(DAMPING, damping)
+            if not math.isnan(self._held[joint]):
+                data = motor.command(effort, damping, HOLD_STIFFNESS, self._held[joint])
+                if data[0] not in self._joint_of:  # or its echo would look like a reply
+                    return self._ids[joint], data
+        return self._ids[joint], motor.command(effort, damping)
 
     def _oppose(self, joint: int, foreign: bytes) -> None:
-        """Answer a foreign command with our last one, under the motor's full damping until our next one."""
+        """Answer a foreign command with our last one, under the motor's full damping; hold the joint meanwhile."""
         now = self._now()
         motor = self._motors[joint]
         self.foreign_commands += 1
-        self._foreign_time = now
+        self._contested[joint] = now
         self.foreign_command = f"another sender commands motor {motor.can_id} (frame [{foreign.hex(' ')}])"
         if not (self._powered and self._drive.powered) or self._drive.unsure[joint]:
             return
-        effort, damping = self._drive.effort[joint], self._drive.damping[joint]
-        command = self._ids[joint], motor.command(effort, max(DAMPING, damping))
+        if foreign in [data for _, data in motor.wire_format.set_zero(motor.can_id)]:
+            self._held[joint] = math.nan  # not held in this contest: a reply may still count from the old zero
+        command = self._command(joint)
         is_exit = foreign in [data for _, data in motor.exit]
         if is_exit or now - self._corrected[joint] >= CORRECTION_PERIOD:
             self._send_each([(command, *motor.enter) if is_exit else (), (command,)])
