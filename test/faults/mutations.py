@@ -196,7 +196,7 @@ MUTATIONS = (
     Mutation(
         "the watchdog of silent motors never hands the bus over",
         ("motors silent for long, then the next can_bridge",),
-        (Edit(WATCHDOG, "is_wanted=is_wanted)", "is_wanted=lambda: False)"),),
+        (Edit(WATCHDOG, "log, clock, is_wanted)", "log, clock, lambda: False)"),),
     ),
     Mutation(
         "the brake of the descent grows without a bound",

@@ -16,8 +16,7 @@ from pathlib import Path
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.drive import NOTHING, OFF, Drive
 from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.ownership.handover import ArmOnBus
-from exo_gravity.hardware.ownership.owned_bus import OwnedBus
+from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, OwnedBus
 
 
 def log(text: str) -> None:

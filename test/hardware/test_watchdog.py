@@ -21,7 +21,7 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.drive import OFF
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
 from exo_gravity.hardware.ownership.bus_lock import BusLock
-from exo_gravity.hardware.ownership.watchdog import Watchdog
+from exo_gravity.hardware.ownership.owned_bus import Watchdog
 
 from .simulated_rig import SimulatedRig, wait_until
 

@@ -16,7 +16,7 @@ from exo_gravity.core.safety.drive import NOTHING, Drive, State
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop, EffortCommand
-from exo_gravity.hardware.ownership.handover import ArmOnBus
+from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, let_down
 
 from .simulated_rig import LIMITS, POSE, Rig
 from .virtual_time import Wire
@@ -66,6 +66,11 @@ class VirtualRig(Rig):
         """Switch the supply of all motors; they come back switched off."""
         for motor in self.device.motors:
             motor.unplugged = not on
+
+    def let_down(self, drive: Drive | None = None, is_wanted: bool = False, **others: Callable[..., object]) -> bool:
+        """Let down the arm that a dead process left with `drive` (default: what holds it); return whether it is off."""
+        options = {"note": lambda drive: None, "log": lambda text: None, **others}
+        return let_down(self.arm, drive or self.drive, clock=self.clock, is_wanted=lambda: is_wanted, **options)
 
     def raising(self) -> tuple[float, ...]:
         """Return the torque (4,) in Nm that carries the arm where it is, and moves it to `POSE`."""

@@ -31,9 +31,7 @@ from exo_gravity.core.safety.params import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.trunk.tilt_input import TiltInput
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.hardware.ownership.handover import ArmOnBus
-from exo_gravity.hardware.ownership.owned_bus import OwnedBus, recover
-from exo_gravity.hardware.ownership.watchdog import Watchdog
+from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, OwnedBus, Watchdog, take_over
 from exo_gravity.hardware.scheduling import request_real_time
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.can_bridge.operation import (
@@ -249,7 +247,7 @@ def run_recovery(patience: float) -> int:
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("can_bridge", automatically_declare_parameters_from_overrides=True)
     try:
-        recover(_declared(node)[1], _owner(node), node.get_logger().error, patience)
+        take_over(_declared(node)[1], _owner(node), node.get_logger().error, patience).release()
         return 0
     except ExoGravityError as error:
         node.get_logger().error(str(error))
