@@ -24,10 +24,10 @@ from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.hardware import ImuSample, TrunkEstimator
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import Clock
 from exo_gravity.hardware.control_loop import ControlLoop, EffortCommand
+from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedImu, VirtualWearer
 from exo_gravity.sim.motor import simulated_motor
 from exo_gravity.tools.inputs.arms import read_arm

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.bus_load import MAX_STATUS_RATE
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import ENTER, EXIT, SET_ZERO, MotorCommand, MotorReply, pack_reply, unpack_command
+from exo_gravity.core.motors.specs import ENTER, EXIT, SET_ZERO, MotorCommand, MotorReply, unpack_command
 from exo_gravity.core.motors.wire_formats import EXTENDED, MASTER_ID, MIT_V3, MODE_CURRENT, Frame
 from exo_gravity.core.params import owned
 
@@ -114,7 +114,7 @@ class SimulatedMotor:
             self.entered = False
         elif data != self._data:  # an arm at rest gets the same command in every cycle
             self._command, self._data = unpack_command(self.joint.spec, data), data
-        return self._reply(position, velocity)
+        return self._state(position, velocity)
 
     def advance(self, position: float, velocity: float, dt: float) -> float:
         """Let `dt` s pass for the motor on a joint at `position` rad and `velocity` rad/s; return its torque in Nm."""
@@ -150,8 +150,8 @@ class SimulatedMotor:
         peak = joint.spec.peak_torque
         return joint.direction * clamp(torque * joint.torque_scale, peak)
 
-    def _readings(self, position: float, velocity: float) -> tuple[float, float, float]:
-        """Return the motor's angle, speed and torque in rad, rad/s and Nm, within the ranges of the wire format."""
+    def _state(self, position: float, velocity: float) -> bytes:
+        """Return the bytes of a reply or status frame, with readings within the ranges of the wire format."""
         joint, spec = self.joint, self.joint.spec
         torque = joint.direction * self.torque(position, velocity) / joint.torque_scale
         if self.firmware.current_noise:
@@ -160,15 +160,15 @@ class SimulatedMotor:
             torque += self._random.gauss(0.0, self.firmware.torque_noise)
         if self.firmware.velocity_filter:
             velocity = self._speed
-        return (
+        readings = (
             clamp(joint.motor_position(position), spec.position_range),
             clamp(joint.direction * velocity, spec.velocity_range),
             clamp(torque, spec.torque_range),
         )
-
-    def _reply(self, position: float, velocity: float) -> bytes:
-        extra = (round(max(-40.0, min(215.0, self.temperature))), self.error) if self.firmware.reply_length == 8 else ()
-        return pack_reply(self.joint.spec, self.joint.can_id, *self._readings(position, velocity), *extra)
+        temperature, error = round(max(-40.0, min(215.0, self.temperature))), self.error
+        is_short = self.firmware.reply_length == 6 and joint.wire_format.replies
+        extra = (None, None) if is_short else (temperature, error)
+        return joint.wire_format.pack_reply(spec, MotorReply(joint.can_id, *readings, *extra))
 
 
 def clamp(value: float, limit: float) -> float:
@@ -208,10 +208,7 @@ class SimulatedV3Motor(SimulatedMotor):
         """Return the status frame of the joint at `position` rad and `velocity` rad/s; None without power."""
         if self.unplugged:
             return None
-        values = self._readings(position, velocity)
-        temperature = round(clamp(self.temperature, 127.0))
-        reply = MotorReply(self.joint.can_id, *values, temperature, self.error)
-        return MIT_V3.status_id(self.joint.can_id), MIT_V3.pack_reply(self.joint.spec, reply)
+        return MIT_V3.status_id(self.joint.can_id), self._state(position, velocity)
 
 
 class StatusTimer:
