@@ -92,9 +92,8 @@ def ask(node):
 
     def ask(service, loop, data=None, zero=0.0):
         motors = [JointMotor(MOTORS["AK60-6"], can_id, zero=zero) for can_id in (1, 2, 3, 4)]
-        response = getattr(BridgeServices(node, lambda: loop, motors), service)(
-            SimpleNamespace(data=data), SimpleNamespace()
-        )
+        services = BridgeServices(node, lambda: loop, motors)
+        response = services.answer(getattr(services, service), SimpleNamespace(data=data), SimpleNamespace())
         assert response.success is (not response.message)
         return response.message
 
@@ -171,7 +170,7 @@ def test_simulated_time_is_refused_beside_a_real_bus_at_the_start_and_live(node)
     node.set_parameters([Parameter("use_sim_time", value=False)])
     operation.refuse_simulated_time(node, "slcan")
     result = node.set_parameters([Parameter("use_sim_time", value=True)])[0]
-    assert not result.successful and result.reason.startswith("use_sim_time must be false with a real bus")
+    assert not result.successful and result.reason.startswith("use_sim_time = True: must be false with a real bus")
 
 
 def test_under_a_clock_that_stands_still_efforts_grow_old(node):

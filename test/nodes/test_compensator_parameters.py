@@ -39,7 +39,7 @@ REFUSALS = [
     ({"wearer.body_mass": 0.9}, "wearer.body_mass = 0.9: must be a number from 10 to 300 kg"),
     ({"wearer.mass": [0.0, 0.0, 9.0, 9.0]}, "total mass in kg = 19.85: must be at most 10 "),
     ({"use_imu": True}, "read-only parameter: use_imu"),
-    ({"suport": 0.5}, "undeclared parameter(s): ['suport']"),
+    ({"suport": 0.5}, "suport = 0.5: must be one of "),
     ({"mode": "two_g"}, "one of one_g, zero_g"),
     ({"gain": [1.0] * 4, "gravity": -1.0}, "gravity out of range"),
 ]

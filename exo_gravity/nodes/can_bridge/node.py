@@ -14,6 +14,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
 import rclpy
@@ -75,6 +76,22 @@ class _GravityInput(TiltInput):
             loop.safety.motion.gravity = self.at(now).direction
 
 
+def _transition(function: Callable[[Any], None]) -> Callable[..., TransitionCallbackReturn]:
+    """Return a transition callback of a method; if that raises, it logs why, which rclpy does not."""
+
+    @wraps(function)
+    def callback(node: CanBridge, _state: LifecycleState) -> TransitionCallbackReturn:
+        try:
+            function(node)
+            return TransitionCallbackReturn.SUCCESS
+        except Exception as error:
+            node.error = str(error) if isinstance(error, BusError) else f"{type(error).__name__}: {error}"
+        node.get_logger().error(node.error)
+        return TransitionCallbackReturn.FAILURE
+
+    return callback
+
+
 class CanBridge(LifecycleNode):
     """The lifecycle node: configure opens the bus, activate starts the loop and arms, deactivate lets the arm down.
 
@@ -94,7 +111,7 @@ class CanBridge(LifecycleNode):
         self._thread_priority = values["thread_priority"]
         self._owned: OwnedBus | None = None  # while configured
         self._bus: MotorBus | None = None  # while inactive
-        self._error = ""  # why the last transition failed
+        self.error = ""  #: why the last transition failed
         self._exchange = EffortExchange(self, limits, lambda: self.loop)
         lease = Operator(self, lambda: self.loop).lease
         rated = [motor.rated_effort for motor in motors]
@@ -108,68 +125,16 @@ class CanBridge(LifecycleNode):
             for trigger in (self.trigger_configure, self.trigger_activate):
                 if trigger() is not TransitionCallbackReturn.SUCCESS:
                     self.close()
-                    raise BusError(self._error)
+                    raise BusError(self.error)
 
     @property
     def failure(self) -> BaseException | None:
         """The exception that ended the control thread, if any."""
         return self.loop.failure if self.loop else None
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+    @_transition
+    def on_configure(self) -> None:
         """Take the bus, open it, and listen."""
-        return self._transition(self._configure)
-
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Start the control loop, and enable the arm once it passes the start gate."""
-        return self._transition(self._activate)
-
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Let the arm down and wait until its motors are off; the bus stays ours for the next activation."""
-        return self._transition(self._deactivate)
-
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Let the arm down, close the bus and release it; also at a shutdown, and after an error in a transition."""
-        return self._transition(self.close)
-
-    on_shutdown = on_error = on_cleanup
-
-    def close(self) -> None:
-        """Let the arm down, send the last frames, close the bus and release it, in any state.
-
-        A motor that cannot be reached may still be on, so this waits for it as long as it takes.
-        """
-        if self.loop is not None:
-            self._stop(self.loop)
-        if self._bus is not None:
-            self._bus.stop()
-            self._bus = None
-        if self._owned is not None:
-            self._owned.close()
-            self._owned = None
-
-    def _stop(self, loop: ControlLoop) -> None:
-        reminder = time.monotonic() + REMINDER_PERIOD
-        while not loop.stop(REPORT_PERIOD):
-            self._report_descent()
-            if loop.safety.is_unreached and time.monotonic() > reminder:
-                self.get_logger().error("a motor does not reply; it may still be powered; trying again")
-                reminder += REMINDER_PERIOD
-        self._report_descent()
-        self.loop = None
-
-    def _transition(self, function: Callable[[], None]) -> TransitionCallbackReturn:
-        """Run a transition; if it raises, log why, which rclpy does not."""
-        try:
-            function()
-            return TransitionCallbackReturn.SUCCESS
-        except BusError as error:
-            self._error = str(error)
-        except Exception as error:
-            self._error = f"{type(error).__name__}: {error}"
-        self.get_logger().error(self._error)
-        return TransitionCallbackReturn.FAILURE
-
-    def _configure(self) -> None:
         self._owned = OwnedBus(self._arm, _owner(self), self.get_logger().error)
         try:
             self._bus = self._owned.open()
@@ -177,7 +142,9 @@ class CanBridge(LifecycleNode):
             self.close()
             raise
 
-    def _activate(self) -> None:
+    @_transition
+    def on_activate(self) -> None:
+        """Start the control loop, and enable the arm once it passes the start gate."""
         self._exchange.forget()
         if self._owned is None:
             raise BusError("the node is not configured")
@@ -197,7 +164,9 @@ class CanBridge(LifecycleNode):
         self._look_at(self._owned.watchdog, loop)
         loop.call(lambda: safety.enable(time.monotonic()))
 
-    def _deactivate(self) -> None:
+    @_transition
+    def on_deactivate(self) -> None:
+        """Let the arm down and wait until its motors are off; the bus stays ours for the next activation."""
         loop, end = self.loop, time.monotonic() + DESCENT_TIMEOUT
         if loop is None:
             raise BusError("the node is not active")
@@ -210,6 +179,33 @@ class CanBridge(LifecycleNode):
             self._report_descent()
             time.sleep(REPORT_PERIOD)
         self._stop(loop)
+
+    def close(self) -> None:
+        """Let the arm down, send the last frames, close the bus and release it, in any state.
+
+        A motor that cannot be reached may still be on, so this waits for it as long as it takes.
+        """
+        if self.loop is not None:
+            self._stop(self.loop)
+        if self._bus is not None:
+            self._bus.stop()
+            self._bus = None
+        if self._owned is not None:
+            self._owned.close()
+            self._owned = None
+
+    # Also at a shutdown, and after an error in a transition.
+    on_cleanup = on_shutdown = on_error = _transition(close)
+
+    def _stop(self, loop: ControlLoop) -> None:
+        reminder = time.monotonic() + REMINDER_PERIOD
+        while not loop.stop(REPORT_PERIOD):
+            self._report_descent()
+            if loop.safety.is_unreached and time.monotonic() > reminder:
+                self.get_logger().error("a motor does not reply; it may still be powered; trying again")
+                reminder += REMINDER_PERIOD
+        self._report_descent()
+        self.loop = None
 
     def _on_report(self) -> None:
         if self.loop is not None and self._owned is not None:

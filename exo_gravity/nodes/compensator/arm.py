@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +30,8 @@ from exo_gravity.core.compensation.settings import URDF_LAW, Settings, UrdfSetti
 from exo_gravity.core.compensation.terms.assist import AssistInput
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.anfis import AnfisLaw
-from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.params import Param
 from exo_gravity.hardware.urdf_arm import UrdfArm
-from exo_gravity.nodes.compensator.budget_watch import BudgetWatch
 from exo_gravity.nodes.ros.hot_path import LATCHED, HotPath
 from exo_gravity.nodes.ros.messages import row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import declare
@@ -40,110 +40,70 @@ from exo_gravity.nodes.ros.sole_publisher import SolePublisher
 ASSIST_PAUSE = 0.002  # s
 DESCRIPTION_TIMEOUT = 10.0  # s in which robot_description must arrive
 
+Read = Callable[[dict[str, Any]], Settings | UrdfSettings]
 
-class ControlledArm:
-    """Parameters, control and reports of the node's arm.
 
-    lock: guards `control`. threads: those that the node starts and stops.
+def declared(node: Node) -> tuple[Sequence[Param], dict[str, Any], Read]:
+    """Declare the parameters of the node's arm. Raises ParameterError.
+
+    Returns their table, their values, and a function that returns the settings that such values describe.
     """
+    given = node.get_parameters_by_prefix("")
+    if "law" not in given or given["law"].value != URDF_LAW:
+        table = compensator_table(given)
+        return table, declare(node, table), _settings
+    table = urdf_table(len(_joint_names(node)), given)
+    _forget_unused(node, {param.name for param in table})
+    values = declare(node, table)
+    model = UrdfArm(_description(node, values), values["joint_names"])
+    return table, values, lambda values: urdf_settings_of(values, model)
 
-    def __init__(self, node: Node, lock: threading.Lock) -> None:
-        given = node.get_parameters_by_prefix("")
-        self._model: UrdfArm | None = None
-        is_urdf = node.has_parameter("law") and node.get_parameter("law").value == URDF_LAW
-        self.table = urdf_table(len(_joint_names(node)), given) if is_urdf else compensator_table(given)
-        if is_urdf:
-            _forget_unused(node, {param.name for param in self.table})
-        self.values = declare(node, self.table)
-        names = self.values["joint_names"]
-        if is_urdf:
-            self._model = UrdfArm(_description(node, self.values), names)
-        self.control = Compensator(self.read(self.values), names)
-        terms = self.control.terms
-        self.threads = [AssistEfforts(node, terms.assist, lock)] if terms else []
-        self._budget = BudgetWatch(node, names) if terms else None
 
-    def read(self, values: dict[str, Any]) -> Settings | UrdfSettings:
-        """Return the settings that parameter values describe, with the file they name. Raises ParameterError."""
-        if self._model is not None:
-            return urdf_settings_of(values, self._model)
-        path = values["anfis_file"]
-        try:
-            anfis = AnfisLaw.load(Path(path).read_text(encoding="utf-8")) if path else None
-        except (OSError, UnicodeDecodeError, DataError) as error:
-            raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
-        return settings_of(values, anfis)
-
-    def update(self) -> None:
-        """Keep the torque budget up to date."""
-        if self._budget and isinstance(self.control.settings, Settings):
-            self._budget.update(self.control.settings)
-
-    def on_motion(self, *sample: Any) -> None:
-        """Use a sample of the trunk's motion."""
-        if self.control.settings.inertial:
-            self.control.set_motion(*sample)
-
-    def concern(self, answer: Answer) -> str:
-        """Return why the arm is not carried as set; '' if it is."""
-        if answer.fallback:
-            return f"the exact law replaces {self.control.settings.law}: {answer.fallback}"
-        problem = self.control.terms.problem if self.control.terms else ""
-        if problem:
-            return f"gravity compensation alone: {problem}"
-        return "changing load" if answer.remainder else ""
-
-    def _changing(self, answer: Answer) -> str:
-        """Return which joint has most to go until a change of load is done; 'none' if none is under way."""
-        if not answer.remainder:
-            return "none"
-        most, name = max(zip(map(abs, answer.remainder), self.values["joint_names"], strict=True))
-        return f"{name}, {most:.1f} Nm to go"
-
-    def report(self, answer: Answer) -> dict[str, object]:
-        """Return the current values for /diagnostics."""
-        s, terms = self.control.settings, self.control.terms
-        values: dict[str, object] = {"law": s.law, "changing load": self._changing(answer)}
-        if isinstance(s, UrdfSettings):
-            carried, limits = f"{s.arm.mass:.3f}", row(s.max_effort)
-            return {**values, "mass carried (kg)": carried, "gain": row(s.gain), "max effort (Nm)": limits}
-        values |= {
-            "law in use": "exact" if answer.fallback else s.law,
-            "mode": s.mode,
-            "support": s.support,
-            "robot mass (kg)": "not known" if s.robot.by_moments else row(s.robot.mass),
-            "robot cog (m)": "not known" if s.robot.by_moments else row(s.robot.cog),
-            "robot moments (kg m)": row((*s.robot.first_moment, *s.robot.off_axis)),
-            "wearer mass (kg)": row(s.wearer_mass),
-            "wearer cog (m)": row(s.wearer_cog),
-            "mass carried (kg)": f"{s.arm.total_mass:.3f}",
-            "max effort (Nm)": row(s.max_effort),
-        }
-        if terms and self._budget:
-            values["terms"] = ", ".join(terms.active) or "none"
-            values["assist"] = terms.assist.report
-            values["inertia tank (J)"] = f"{terms.energy:.2f}"
-            values["budget"] = self._budget.text
-            values["largest support"] = self._budget.largest_support
-        return values
+def _settings(values: dict[str, Any]) -> Settings:
+    """Return the settings of the exoskeleton's own arm, with the file that they name. Raises ParameterError."""
+    path = values["anfis_file"]
+    try:
+        anfis = AnfisLaw.load(Path(path).read_text(encoding="utf-8")) if path else None
+    except (OSError, UnicodeDecodeError, DataError) as error:
+        raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
+    return settings_of(values, anfis)
 
 
 def sentence(s: Settings | UrdfSettings) -> str:
     """Return settings in a sentence for the log."""
     if isinstance(s, UrdfSettings):
         return f"law {s.law}, {len(s.gain)} joints: compensates {s.arm.mass:.2f} kg, at most {row(s.max_effort)} Nm"
-    of_wearer = f", wearer {row(s.wearer_mass)} kg at {row(s.wearer_cog)} m" if any(s.wearer_mass) else ""
     return (
         f"{s.side} arm, law {s.law}, mode {s.mode}, support {s.support:g}: compensates {s.arm.total_mass:.2f} kg, "
-        f"at most {row(s.max_effort)} Nm; robot {_of_robot(s.robot)}{of_wearer}"
+        f"at most {row(s.max_effort)} Nm; robot {row(s.robot.first_moment)} kg m"
     )
 
 
-def _of_robot(robot: ArmModel) -> str:
-    along = f"{row(robot.mass)} kg at {row(robot.cog)} m"
-    if robot.by_moments:
-        along = f"moments {row(robot.first_moment)} kg m"
-    return f"{along}, across the links {row(robot.off_axis)} kg m" if any(robot.off_axis) else along
+def report(control: Compensator, answer: Answer, names: Sequence[str]) -> dict[str, object]:
+    """Return what the arm's settings and terms are, for /diagnostics. names: of the joints."""
+    s, terms = control.settings, control.terms
+    most, name = max(zip(map(abs, answer.remainder), names, strict=False), default=(0.0, ""))
+    values: dict[str, object] = {"law": s.law, "changing load": f"{name}, {most:.1f} Nm to go" if name else "none"}
+    if isinstance(s, UrdfSettings):
+        carried, limits = f"{s.arm.mass:.3f}", row(s.max_effort)
+        return {**values, "mass carried (kg)": carried, "gain": row(s.gain), "max effort (Nm)": limits}
+    values |= {
+        "law in use": "exact" if answer.fallback else s.law,
+        "mode": s.mode,
+        "support": s.support,
+        "robot mass (kg)": "not known" if s.robot.by_moments else row(s.robot.mass),
+        "robot cog (m)": "not known" if s.robot.by_moments else row(s.robot.cog),
+        "robot moments (kg m)": row((*s.robot.first_moment, *s.robot.off_axis)),
+        "wearer mass (kg)": row(s.wearer_mass),
+        "wearer cog (m)": row(s.wearer_cog),
+        "mass carried (kg)": f"{s.arm.total_mass:.3f}",
+        "max effort (Nm)": row(s.max_effort),
+    }
+    if terms:
+        values["terms"] = ", ".join(terms.active) or "none"
+        values["assist"] = terms.assist.report
+        values["inertia tank (J)"] = f"{terms.energy:.2f}"
+    return values
 
 
 class AssistEfforts(HotPath):

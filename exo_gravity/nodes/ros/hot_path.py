@@ -4,7 +4,6 @@ rclpy's executor rebuilds its wait set, services included, for every message. Th
 (measured, there and back at 500 Hz: 35 + 21 % of a core, against 14 + 11 % here; at 2,000 messages a second it is most
 of a core). A flood is shed before Python sees it: the middleware keeps `qos.depth` messages, and a thread rests for
 `pause` between two looks. `WaitSet` and `take_message` are inner interfaces of rclpy, which `wait_for_message` uses.
-Where they have changed, the executor serves a `HotPath` as usual, and only speed is lost.
 """
 
 from __future__ import annotations
@@ -36,12 +35,7 @@ class Unexecuted(CallbackGroup):
         """Return that no entity may be executed."""
         return False
 
-    def beginning_execution(self, entity: Any) -> bool:
-        """Return that no entity may be executed."""
-        return False
-
-    def ending_execution(self, entity: Any) -> None:
-        """Do nothing: no entity is executed."""
+    beginning_execution = ending_execution = can_execute
 
 
 class HotPath:
@@ -58,32 +52,26 @@ class HotPath:
         self._depth, self._pause = qos.depth, pause
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name=topic, daemon=True)
-        subscription = node.create_subscription(msgtype, topic, callback, qos, callback_group=Unexecuted())
-        try:
-            self._wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
-            self._take = subscription.handle.take_message
-        except (AttributeError, TypeError) as error:
-            node.get_logger().warning(f"{topic}: served by the executor, more slowly: rclpy has changed ({error})")
-            node.destroy_subscription(subscription)
-            node.create_subscription(msgtype, topic, callback, qos)
-            self._wait_set, self._take = None, lambda *_: None
-        self._subscription = subscription
+        self._subscription = node.create_subscription(msgtype, topic, callback, qos, callback_group=Unexecuted())
+        self._wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
 
     def start(self) -> None:
         """Start the thread."""
-        if self._wait_set is not None:
-            self._thread.start()
+        self._thread.start()
 
     def poll(self, timeout: float = 0.0) -> None:
         """Call back for each queued message, on the caller's thread; wait up to `timeout` s for the first one.
 
         It ends after as many as the queue holds, however many arrive meanwhile.
         """
-        subscription = self._subscription
-        if timeout > 0.0 and self._wait_set is not None:
-            self._wait(timeout)
+        handle, msgtype = self._subscription.handle, self._subscription.msg_type
+        if timeout > 0.0:
+            with handle:
+                self._wait_set.clear_entities()
+                self._wait_set.add_subscription(handle)
+                self._wait_set.wait(int(timeout * 1e9))
         for _ in range(self._depth):
-            item = self._take(subscription.msg_type, False)
+            item = handle.take_message(msgtype, False)
             if item is None:
                 return
             self._callback(*item)
@@ -101,13 +89,6 @@ class HotPath:
                 time.sleep(self._pause)
         except Exception as error:
             self.failure = error
-
-    def _wait(self, timeout: float) -> None:
-        wait_set, handle = self._wait_set, self._subscription.handle
-        with handle:
-            wait_set.clear_entities()
-            wait_set.add_subscription(handle)
-            wait_set.wait(int(timeout * 1e9))
 
 
 class LossCounter:
@@ -138,15 +119,11 @@ class Drain:
 
     def __init__(self, node: Node, msgtype: type, topic: str, qos: QoSProfile, counts_lost: bool = False) -> None:
         self.topic = topic
-        self._losses = LossCounter() if counts_lost else None
+        self.losses = LossCounter()  #: of messages that did not arrive
+        self._counts_lost = counts_lost
         self._subscription = node.create_subscription(
             msgtype, topic, lambda message: None, qos, raw=True, callback_group=Unexecuted()
         )
-
-    @property
-    def lost(self) -> int:
-        """The number of messages that did not arrive."""
-        return self._losses.lost if self._losses else 0
 
     def take(self) -> list[tuple[int, bytes]]:
         """Return the messages since the last call: time of arrival in ns since 1970, and bytes."""
@@ -156,6 +133,6 @@ class Drain:
             while (item := subscription.handle.take_message(subscription.msg_type, subscription.raw)) is not None:
                 data, about = item
                 taken.append((about["received_timestamp"], bytes(data)))
-                if self._losses:
-                    self._losses.take(about.get("publication_sequence_number") or 0)
+                if self._counts_lost:
+                    self.losses.take(about.get("publication_sequence_number") or 0)
         return taken
