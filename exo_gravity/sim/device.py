@@ -26,7 +26,7 @@ from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, Frame
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim.arm import STEP, SimulatedArm, felt_in_base
-from exo_gravity.sim.motor import SimulatedMotor, SimulatedV3Motor, StatusTimer
+from exo_gravity.sim.motor import SimulatedMotor, SimulatedV3Motor
 from exo_gravity.sim.trunk_motion import TrunkMotion, TrunkState, motion_of
 from exo_gravity.sim.truth import TruthLog
 from exo_gravity.sim.virtual_wearer import VirtualWearer
@@ -173,9 +173,11 @@ class SimulatedDevice:
         """
         outbox: list[tuple[float, Frame]] = []  # replies by the time at which they are due, a heap
         last = time.monotonic()
-        timer = StatusTimer(self.motors, last, self._random)
+        boards = {joint: motor for joint, motor in enumerate(self.motors) if isinstance(motor, SimulatedV3Motor)}
+        periods = {joint: 1.0 / motor.firmware.status_rate for joint, motor in boards.items()}
+        reports = {joint: last + self._random.uniform(0.0, period) for joint, period in periods.items()}  # next
         while not should_stop():
-            due = min(last + IDLE_PERIOD, timer.next, outbox[0][0] if outbox else math.inf)
+            due = min(last + IDLE_PERIOD, *reports.values(), outbox[0][0] if outbox else math.inf)
             frame, age = self._receive(bus, max(0.0, due - time.monotonic()))
             now = time.monotonic()
             self.gaps.note(now, self.powered, frame is not None)
@@ -187,9 +189,12 @@ class SimulatedDevice:
                 heapq.heappush(outbox, (now + delay, reply))
             while outbox and outbox[0][0] <= time.monotonic():
                 _send(bus, heapq.heappop(outbox)[1])
-            for joint in timer.due(last):
-                if frame := self.status(joint):
-                    _send(bus, frame)
+            for joint, period in periods.items():
+                if reports[joint] <= last:
+                    following = reports[joint] + period
+                    reports[joint] = following if following > last else last + period  # missed ones are not made up
+                    if frame := self.status(joint):
+                        _send(bus, frame)
             if not outbox:
                 on_idle(last)
 

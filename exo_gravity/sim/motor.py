@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from exo_gravity.core.errors import ParameterError
@@ -209,28 +208,6 @@ class SimulatedV3Motor(SimulatedMotor):
         if self.unplugged:
             return None
         return MIT_V3.status_id(self.joint.can_id), self._state(position, velocity)
-
-
-class StatusTimer:
-    """When each V3 board among `motors` sends its next status frame, from `now` (s) on."""
-
-    def __init__(self, motors: Sequence[SimulatedMotor], now: float, rng: random.Random) -> None:
-        boards = {joint: motor for joint, motor in enumerate(motors) if isinstance(motor, SimulatedV3Motor)}
-        self._periods = {joint: 1.0 / motor.firmware.status_rate for joint, motor in boards.items()}
-        self._next = {joint: now + rng.uniform(0.0, period) for joint, period in self._periods.items()}
-
-    @property
-    def next(self) -> float:
-        """The time in s of the next status frame; infinity for none."""
-        return min(self._next.values(), default=math.inf)
-
-    def due(self, now: float) -> Iterator[int]:
-        """Yield each joint whose status frame is due at `now` (s), once; frames that were missed are not made up."""
-        for joint, period in self._periods.items():
-            if self._next[joint] <= now:
-                following = self._next[joint] + period
-                self._next[joint] = following if following > now else now + period
-                yield joint
 
 
 def simulated_motor(joint: JointMotor, firmware: Firmware | None = None) -> SimulatedMotor:

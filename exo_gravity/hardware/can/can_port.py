@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 import can
 from can.interfaces.socketcan import SocketcanBus
+from can.interfaces.udp_multicast import UdpMulticastBus
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, Frame
@@ -45,6 +46,8 @@ class CanPort:
         self.name = str(bus.channel_info)
         #: Whether `is_rx` is false only for frames that this port sent.
         self.marks_echoes = not isinstance(bus, SocketcanBus)
+        #: Whether each frame that this port sends comes back to it, unmarked.
+        self.echoes = isinstance(bus, UdpMulticastBus)
         self._bus: can.BusABC | None = bus  # None while a failed one is opened again
         self._clock = clock
         self._reopen = reopen

@@ -7,9 +7,8 @@ Frames of other devices are ignored and counted by kind.
 A motor obeys every sender. A command to one of our motors that we did not send is answered at once with our own, under
 full damping: until then the other sender's torque acts, and no damping. To know it, echoes of our own frames
 are set apart: most buses return none. Some return them and mark them (`is_rx` is false). udp_multicast returns them
-unmarked, in order. The first frames show whether a bus echoes. SocketCAN sets the same mark on every frame from this
-computer, also on those of another process (Documentation/networking/can.rst of Linux, MSG_DONTROUTE): there it does not
-show an echo.
+unmarked, in order. SocketCAN sets the same mark on every frame from this computer, also on those of another process
+(Documentation/networking/can.rst of Linux, MSG_DONTROUTE): there it does not show an echo.
 
 A zero command precedes the frames that switch a V1 or V2 board on or off: the motor remembers its last command, and
 ENTER would carry it out. A command switches a V3 board on, so it gets none while the arm is off.
@@ -47,7 +46,6 @@ SETTLING_TIME = 0.02  # s of it in which late replies to the previous owner may 
 CORRECTION_PERIOD = 0.001  # s between two corrections of a motor: two correcting hosts must not fill the bus
 CONTEST_TIME = 0.5  # s after a foreign command in which another one is expected
 FOREIGN_COMMAND = "foreign command"
-TRIAL = 32  # frames sent until it is known whether the bus echoes
 MOST_AWAITED = 512  # twice the frames that a udp_multicast socket keeps unread
 
 
@@ -78,7 +76,7 @@ class MotorBus:
         self.clock = clock
         self._now = clock.monotonic
         self._port = CanPort(bus, clock, reopen)
-        self._filter = FrameFilter(motors, self._port.marks_echoes)
+        self._filter = FrameFilter(motors, self._port.marks_echoes, self._port.echoes)
         self._motors = tuple(motors)
         self._asked = frozenset(joint for joint, motor in enumerate(motors) if motor.wire_format.replies)
         self._joint_of = {motor.can_id: joint for joint, motor in enumerate(motors)}
@@ -255,9 +253,12 @@ class MotorBus:
 
 
 class FrameFilter:
-    """Knows `motors` and which frames were sent. marks_echoes: whether `is_rx` is false for echoes only."""
+    """Knows `motors` and which frames were sent.
 
-    def __init__(self, motors: Sequence[JointMotor], marks_echoes: bool = True) -> None:
+    marks_echoes: whether `is_rx` is false for echoes only. echoes: whether sent frames come back unmarked.
+    """
+
+    def __init__(self, motors: Sequence[JointMotor], marks_echoes: bool = True, echoes: bool = False) -> None:
         of = {
             motor.wire_format: frozenset(m.can_id for m in motors if m.wire_format == motor.wire_format)
             for motor in motors
@@ -265,17 +266,11 @@ class FrameFilter:
         # The motors of each format, by whether its IDs have 29 bits.
         self._groups = {bits: [each for each in of.items() if each[0].is_extended is bits] for bits in (False, True)}
         self._marks_echoes = marks_echoes
-        self._awaited: deque[Frame] = deque(maxlen=MOST_AWAITED)  # sent, their echoes not yet received
-        self._sent = self._returned = 0
-        self._is_echoing: bool | None = None  # None: not yet known
+        # Sent, their echoes not yet received.
+        self._awaited: deque[Frame] = deque(maxlen=MOST_AWAITED if echoes else 0)
 
     def sent(self, frame: Frame) -> None:
         """Note a frame that is being sent."""
-        if self._is_echoing is False:
-            return
-        if self._is_echoing is None and self._sent >= TRIAL:
-            self._is_echoing = self._returned >= TRIAL // 2
-        self._sent += 1
         self._awaited.append(frame)
 
     def sort(self, message: can.Message) -> tuple[str, int]:
@@ -297,9 +292,8 @@ class FrameFilter:
         return "foreign frame", 0
 
     def _is_echo(self, frame: Frame) -> bool:
-        if self._is_echoing is False or frame not in self._awaited:
+        if frame not in self._awaited:
             return False
         while self._awaited.popleft() != frame:
             pass  # echoes come in order, so those before it are lost
-        self._returned += 1
         return True
