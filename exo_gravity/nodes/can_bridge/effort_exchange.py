@@ -21,9 +21,8 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.drive import FaultCode
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.hardware.control_loop import NO_COMMAND, ControlLoop, EffortCommand
-from exo_gravity.nodes.ros.hot_path import HotPath
+from exo_gravity.nodes.ros.hot_path import HotPath, SolePublisher
 from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, to_nanoseconds
-from exo_gravity.nodes.ros.sole_publisher import SolePublisher
 
 # The control thread reads them once a cycle; the depth lets it notice a second commander. Not reliable: an old effort
 # sent again is useless, and acknowledging each one wakes a thread in both nodes (measured: 2 % of a core).

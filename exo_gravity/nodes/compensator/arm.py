@@ -6,15 +6,12 @@ serial arm, whose URDF comes from a file or from `robot_description`, with gravi
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from rclpy.node import Node
 from rclpy.wait_for_message import wait_for_message
-from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from exo_gravity.core.compensation.compensator import Answer, Compensator
@@ -27,17 +24,14 @@ from exo_gravity.core.compensation.params import (
     urdf_table,
 )
 from exo_gravity.core.compensation.settings import URDF_LAW, Settings, UrdfSettings
-from exo_gravity.core.compensation.terms.assist import AssistInput
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.anfis import AnfisLaw
 from exo_gravity.core.params import Param
 from exo_gravity.hardware.urdf_arm import UrdfArm
-from exo_gravity.nodes.ros.hot_path import LATCHED, HotPath
-from exo_gravity.nodes.ros.messages import row, to_nanoseconds
+from exo_gravity.nodes.ros.hot_path import LATCHED
+from exo_gravity.nodes.ros.messages import row
 from exo_gravity.nodes.ros.parameters import declare
-from exo_gravity.nodes.ros.sole_publisher import SolePublisher
 
-ASSIST_PAUSE = 0.002  # s
 DESCRIPTION_TIMEOUT = 10.0  # s in which robot_description must arrive
 
 Read = Callable[[dict[str, Any]], Settings | UrdfSettings]
@@ -104,28 +98,6 @@ def report(control: Compensator, answer: Answer, names: Sequence[str]) -> dict[s
         values["assist"] = terms.assist.report
         values["inertia tank (J)"] = f"{terms.energy:.2f}"
     return values
-
-
-class AssistEfforts(HotPath):
-    """Passes the newest message on the topic `assist_efforts` to `assist` on a thread, holding `lock`.
-
-    It looks 500 times a second at most, so that an outer loop that floods the topic does not slow the answers down.
-    """
-
-    def __init__(self, node: Node, assist: AssistInput, lock: threading.Lock) -> None:
-        super().__init__(node, JointState, "assist_efforts", self._on_efforts, pause=ASSIST_PAUSE)
-        self._clock = node.get_clock()
-        self._assist = assist
-        self._lock = lock
-        self._sole = SolePublisher(node, "assist_efforts")
-        self._sender = 0  # changes whenever a message comes from another publisher than the one before
-
-    def _on_efforts(self, message: JointState, info: dict[str, Any]) -> None:
-        now = time.monotonic()
-        age = (self._clock.now().nanoseconds - to_nanoseconds(message.header.stamp)) * 1e-9
-        self._sender += self._sole.is_another(info)
-        with self._lock:
-            self._assist.receive(now, message.name, message.effort, now - age, self._sender)
 
 
 def _forget_unused(node: Node, used: set[str]) -> None:

@@ -21,6 +21,7 @@ from exo_gravity.core.compensation.compensator import Answer
 from exo_gravity.core.compensation.limiter import CommandFade, Output
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.trunk.tilt_input import MAX_LEAD
+from exo_gravity.nodes.ros.hot_path import Repeated
 from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, to_nanoseconds, velocity_of
 
 TICK = 0.01  # s between two messages of a fade
@@ -56,7 +57,7 @@ class JointStateInterface:
         self._publisher.publish(self._command)
 
 
-class MultiArrayInterface:
+class MultiArrayInterface(Repeated):
     """Sends Float64MultiArray in the order of `names`; fades to zero when there are no fresh, sound efforts.
 
     values: the compensator's parameters. After a fade zeros follow, so that a controller that starts late has them too,
@@ -64,7 +65,7 @@ class MultiArrayInterface:
     """
 
     def __init__(self, node: Node, names: Sequence[str], values: Mapping[str, Any]) -> None:
-        self.failure: Exception | None = None  # ended the thread
+        super().__init__("fade", self._tick, TICK)
         self.topic = values["multi_array.joint_states"]
         self._names = names
         self._clock = node.get_clock()
@@ -75,8 +76,6 @@ class MultiArrayInterface:
         self._message = Float64MultiArray()
         self._is_late = False  # the last joint state, by its stamp
         self._applied: Sequence[float] = ()  # Nm, what the joints applied before the first effort
-        self._stopping = False
-        self._thread = threading.Thread(target=self._run, name="fade", daemon=True)
         node.create_service(Trigger, "~/clear_fault", self._clear)
 
     @property
@@ -114,28 +113,19 @@ class MultiArrayInterface:
             elif effort := self._fade.take(now, answer.effort, self._applied):
                 self._publish(effort)
 
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
-
     def stop(self) -> None:
         """Fade to zero, and end the thread."""
         with self._lock:
             self._fade.withdraw(time.monotonic(), "the node stops")
-        self._stopping = True
-        if self._thread.ident is not None:
-            self._thread.join()
+        while self._fade.state is Output.FADING and self._thread.is_alive():
+            time.sleep(TICK)
+        super().stop()
 
-    def _run(self) -> None:
-        try:
-            while not self._stopping or self._fade.state is Output.FADING:
-                with self._lock:
-                    effort = self._fade.tick(time.monotonic())
-                    if effort is not None:
-                        self._publish(effort)
-                time.sleep(TICK)
-        except Exception as error:
-            self.failure = error
+    def _tick(self) -> None:
+        with self._lock:
+            effort = self._fade.tick(time.monotonic())
+            if effort is not None:
+                self._publish(effort)
 
     def _publish(self, effort: Sequence[float]) -> None:
         self._message.data = effort

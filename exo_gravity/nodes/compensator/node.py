@@ -24,18 +24,18 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Rate
 from exo_gravity.hardware.scheduling import request_real_time
-from exo_gravity.nodes.compensator.arm import AssistEfforts, declared, report, sentence
+from exo_gravity.nodes.compensator.arm import declared, report, sentence
 from exo_gravity.nodes.compensator.budget_watch import BudgetWatch
 from exo_gravity.nodes.compensator.command_interface import JointStateInterface, MultiArrayInterface
-from exo_gravity.nodes.ros.hot_path import NEWEST, HotPath
-from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row
+from exo_gravity.nodes.ros.hot_path import DISTRUST, NEWEST, HotPath, Repeated, SolePublisher
+from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import values_after
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.sole_publisher import DISTRUST, SolePublisher
 from exo_gravity.nodes.ros.tilt_subscription import TiltSubscription
 
 SILENCE = 0.5  # s without joint states until diagnostics report it
 REPORT_PERIOD = 0.5  # s
+ASSIST_PAUSE = 0.002  # s between two looks, so that an outer loop that floods its topic does not slow the answers down
 MAX_CHANGES = 16  # answers whose reason is new, waiting for the report
 
 
@@ -52,10 +52,14 @@ class CompensatorNode(Node):
         self._names = values["joint_names"]
         self._control = Compensator(self._read(values), self._names)
         self._budget: BudgetWatch | None = None
-        self._threads: list[HotPath | MultiArrayInterface] = []
+        self._threads: list[Repeated] = []
         if self._control.terms:
             self._budget = BudgetWatch(self, self._names)
-            self._threads.append(AssistEfforts(self, self._control.terms.assist, self._lock))
+            self._assist = self._control.terms.assist
+            self._assistant = SolePublisher(self, "assist_efforts")
+            self._assistants = 0  # changes whenever a message comes from another publisher than the one before
+            path = HotPath(self, JointState, "assist_efforts", self._on_assist_efforts, pause=ASSIST_PAUSE)
+            self._threads.append(path)
         self._interface: JointStateInterface | MultiArrayInterface
         if values.get("command_interface") == "multi_array":
             self._interface = MultiArrayInterface(self, self._names, values)
@@ -120,6 +124,13 @@ class CompensatorNode(Node):
         if changed:
             self._changes.append(answer)
             self._changed.trigger()
+
+    def _on_assist_efforts(self, message: JointState, info: dict[str, Any]) -> None:
+        now = time.monotonic()
+        age = (self.get_clock().now().nanoseconds - to_nanoseconds(message.header.stamp)) * 1e-9
+        self._assistants += self._assistant.is_another(info)
+        with self._lock:
+            self._assist.receive(now, message.name, message.effort, now - age, self._assistants)
 
     def _on_motion(self, *sample: Any) -> None:
         """Use a sample of the trunk's motion."""

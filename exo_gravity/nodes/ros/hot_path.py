@@ -8,6 +8,7 @@ of a core). A flood is shed before Python sees it: the middleware keeps `qos.dep
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -19,11 +20,15 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
+
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # reliable
 STOP_CHECK_PERIOD = 0.1  # s
 PAUSE = 0.0004  # s, less than the shortest period of a control loop
 MAX_PUBLISHERS = 4  # of one topic whose messages are counted
+DISTRUST = 0.2  # s for which a topic is not trusted after a second publisher was seen
+COUNT_PERIOD = 0.5  # s between two counts of the publishers
 
 Callback = Callable[[Any, dict[str, Any]], None]
 
@@ -38,7 +43,35 @@ class Unexecuted(CallbackGroup):
     beginning_execution = ending_execution = can_execute
 
 
-class HotPath:
+class Repeated:
+    """Calls `function` on a thread after `start`, with a rest of `pause` s after each call."""
+
+    def __init__(self, name: str, function: Callable[[], None], pause: float) -> None:
+        self.failure: Exception | None = None  #: raised by the function; ends the thread
+        self._function, self._pause = function, pause
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread, before the node is destroyed."""
+        self._stopping = True
+        if self._thread.ident is not None:
+            self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            while not self._stopping:
+                self._function()
+                time.sleep(self._pause)
+        except Exception as error:
+            self.failure = error
+
+
+class HotPath(Repeated):
     """Calls `callback(message, info)` for each message of `topic`: on a thread after `start`, or in each `poll`.
 
     pause: s for which the thread rests after each look; of what arrives meanwhile, it gets the last `qos.depth`.
@@ -47,17 +80,10 @@ class HotPath:
     def __init__(
         self, node: Node, msgtype: type, topic: str, callback: Callback, qos: QoSProfile = NEWEST, pause: float = PAUSE
     ) -> None:
-        self.failure: Exception | None = None  # raised by the callback; ends the thread
-        self._callback = callback
-        self._depth, self._pause = qos.depth, pause
-        self._stopping = False
-        self._thread = threading.Thread(target=self._run, name=topic, daemon=True)
+        super().__init__(topic, lambda: self.poll(STOP_CHECK_PERIOD), pause)
+        self._callback, self._depth = callback, qos.depth
         self._subscription = node.create_subscription(msgtype, topic, callback, qos, callback_group=Unexecuted())
         self._wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
 
     def poll(self, timeout: float = 0.0) -> None:
         """Call back for each queued message, on the caller's thread; wait up to `timeout` s for the first one.
@@ -75,20 +101,6 @@ class HotPath:
             if item is None:
                 return
             self._callback(*item)
-
-    def stop(self) -> None:
-        """End the thread, before the node is destroyed."""
-        self._stopping = True
-        if self._thread.ident is not None:
-            self._thread.join()
-
-    def _run(self) -> None:
-        try:
-            while not self._stopping:
-                self.poll(STOP_CHECK_PERIOD)
-                time.sleep(self._pause)
-        except Exception as error:
-            self.failure = error
 
 
 class LossCounter:
@@ -136,3 +148,43 @@ class Drain:
                 if self._counts_lost:
                     self.losses.take(about.get("publication_sequence_number") or 0)
         return taken
+
+
+class SolePublisher:
+    """Detects a second publisher of `topic` by the `info` of each message, which rclpy passes on.
+
+    Each publisher numbers its messages from 1, so from a single publisher the numbers rise. A second one shows at once,
+    without discovery, which still lists a killed publisher for 20 s. Where the middleware does not number messages, the
+    publishers that discovery lists are counted instead.
+    """
+
+    def __init__(self, node: Node, topic: str, clock: Clock = COMPUTER_CLOCK) -> None:
+        self._node, self._clock = node, clock
+        self._topic = node.resolve_topic_name(topic)
+        self._number = 0
+        self.missed = 0  #: messages that were published and not received, where the middleware numbers them
+        self._count = 1
+        self._counted = -math.inf  # monotonic s
+
+    def is_another(self, info: dict[str, Any]) -> bool:
+        """Return whether this message comes from a different publisher than the previous one."""
+        number = info.get("publication_sequence_number")
+        if number is None:
+            return self._count_publishers() > 1
+        previous, self._number = self._number, number
+        if number <= previous:
+            return True
+        self.missed += number - previous - 1 if previous else 0
+        return False
+
+    def _count_publishers(self) -> int:
+        """Return the number of publishers that discovery lists, at most COUNT_PERIOD old."""
+        now = self._clock.monotonic()
+        if self._counted == -math.inf:
+            self._node.get_logger().warning(
+                f"{self._topic}: the middleware does not number messages: a second publisher is detected up to "
+                f"{COUNT_PERIOD:g} s late"
+            )
+        if now - self._counted > COUNT_PERIOD:
+            self._counted, self._count = now, self._node.count_publishers(self._topic)
+        return self._count

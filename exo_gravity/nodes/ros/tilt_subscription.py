@@ -15,9 +15,8 @@ from sensor_msgs.msg import Imu
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.rotation import unit_quaternion, up_in_body
 from exo_gravity.core.trunk.tilt_input import STILL, Tilted, TiltInput
-from exo_gravity.nodes.ros.hot_path import NEWEST
+from exo_gravity.nodes.ros.hot_path import NEWEST, SolePublisher
 from exo_gravity.nodes.ros.messages import to_nanoseconds
-from exo_gravity.nodes.ros.sole_publisher import SolePublisher
 
 DATA, PITCH_YAW = "/imu/data", "/imu/pitch_yaw"
 NOT_REPORTED = -1.0  # first entry of a covariance (REP-145)
