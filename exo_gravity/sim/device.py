@@ -243,7 +243,8 @@ class SimulatedDevice:
             self._power_returns = math.inf
             for motor in self.motors:
                 motor.unplugged = False
-        torque = list(map(SimulatedMotor.advance, self.motors, theta, velocity, (count * STEP,) * JOINT_COUNT))
+        at = zip(self.motors, theta, velocity, strict=True)
+        torque = [motor.advance(angle, speed, count * STEP) for motor, angle, speed in at]
         given: Torque = NO_TORQUE
         step = None
         if self._trial is not None:

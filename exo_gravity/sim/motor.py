@@ -38,10 +38,6 @@ class Firmware:
     zero_silence: float = 1.0  #: s for which the motor ignores frames after SET_ZERO; users report 0.5 to 1.5
     #: Standard deviation of one reply.
     current_noise: float = owned(0.0, "noise of the torque in replies, as a share of it", (0.0, 0.5))
-    torque_noise: float = 0.0  #: Nm, standard deviation of the torque in one reply
-    #: s, time constant of the current loop. A reply carries the torque that the motor applies when the command arrives.
-    current_lag: float = 0.0
-    velocity_filter: float = 0.0  #: s, time constant of the speed in replies and for damping
     status_rate: float = MAX_STATUS_RATE  #: status frames per s of a V3 board
 
     def __post_init__(self) -> None:
@@ -67,7 +63,6 @@ class SimulatedMotor:
         self.entered = False
         self._command, self._data = _NO_COMMAND, b""
         self._silent_until = -math.inf  # s, after SET_ZERO
-        self._applied, self._speed = 0.0, 0.0  # Nm and rad/s, of current loop and speed filter
         self._random = random.Random(joint.can_id)
 
     @property
@@ -88,10 +83,7 @@ class SimulatedMotor:
     @property
     def steady(self) -> bool:
         """Whether the torque stays constant until the next frame, however the joint moves."""
-        firmware = self.firmware
-        if self.unplugged or firmware.velocity_filter or (firmware.current_lag and self.entered):
-            return False
-        return not (self.entered and (self._command.kp or self._command.kd))
+        return not (self.unplugged or (self.entered and (self._command.kp or self._command.kd)))
 
     def receive(
         self, data: bytes, position: float, velocity: float, now: float, frame_id: int | None = None
@@ -117,31 +109,17 @@ class SimulatedMotor:
 
     def advance(self, position: float, velocity: float, dt: float) -> float:
         """Let `dt` s pass for the motor on a joint at `position` rad and `velocity` rad/s; return its torque in Nm."""
-        filtered, lag = self.firmware.velocity_filter, self.firmware.current_lag
-        self._speed += (velocity - self._speed) * (-math.expm1(-dt / filtered) if filtered else 1.0)
-        if not lag:
-            return self.torque(position, velocity)
-        aim = self._aim(position, velocity)
-        self._applied = self._applied - (aim - self._applied) * math.expm1(-dt / lag) if self.entered else 0.0
-        return self._applied
+        return self.torque(position, velocity)
 
     def torque(self, position: float, velocity: float) -> float:
         """Return the torque in Nm on the joint at `position` rad and `velocity` rad/s.
 
-        The motor's kp (p_des - p) + kd (v_des - v) + t_ff, times `torque_scale`, clamped to the peak torque; behind a
-        current loop, what that has reached.
+        The motor's kp (p_des - p) + kd (v_des - v) + t_ff, times `torque_scale`, clamped to the peak torque.
         """
-        if not self.firmware.current_lag:
-            return self._aim(position, velocity)
-        return self._applied if self.entered and not self.unplugged else 0.0
-
-    def _aim(self, position: float, velocity: float) -> float:
         if self.unplugged:
             self.entered, self._command, self._data, self._silent_until = False, _NO_COMMAND, b"", -math.inf
         if not self.entered:
             return 0.0
-        if self.firmware.velocity_filter:
-            velocity = self._speed
         joint, command = self.joint, self._command
         torque = command.torque + command.kd * (command.velocity - joint.direction * velocity)
         if command.kp:
@@ -155,10 +133,6 @@ class SimulatedMotor:
         torque = joint.direction * self.torque(position, velocity) / joint.torque_scale
         if self.firmware.current_noise:
             torque *= self._random.gauss(1.0, self.firmware.current_noise)
-        if self.firmware.torque_noise:
-            torque += self._random.gauss(0.0, self.firmware.torque_noise)
-        if self.firmware.velocity_filter:
-            velocity = self._speed
         readings = (
             clamp(joint.motor_position(position), spec.position_range),
             clamp(joint.direction * velocity, spec.velocity_range),

@@ -117,7 +117,7 @@ class MultiArrayInterface(Repeated):
         """Fade to zero, and end the thread."""
         with self._lock:
             self._fade.withdraw(time.monotonic(), "the node stops")
-        while self._fade.state is Output.FADING and self._thread.is_alive():
+        while self._fade.state is Output.FADING and not self.failure:
             time.sleep(TICK)
         super().stop()
 
