@@ -65,8 +65,8 @@ DAY = TrialScript.parse(  # what the wearer does while the arm is carried
 class Equipment:
     """Ordinary equipment: the motors' electronics, the arm's friction, the CAN adapter, and a busy computer.
 
-    electronics: None for ideal motors. loss: share of the frames lost each way. batch: s between two deliveries of the adapter. late: how often in 10 ms
-    the bridge is late by LATE, and the compensator.
+    electronics: None for ideal motors. loss: share of the frames lost each way. batch: s between two deliveries of the
+    adapter. late: how often in 10 ms the bridge is late by LATE, and the compensator.
     """
 
     name: str
