@@ -225,6 +225,7 @@ class OrdinaryArm:
             return
         arm, trunk = self.device.arm, self.device.trunk
         theta, velocity = arm.positions, arm.velocities
-        applied = [motor.advance(*at, 0.0) for motor, *at in zip(self.device.motors, theta, velocity, strict=True)]
+        at = zip(self.device.motors, theta, velocity, strict=True)
+        applied = [motor.advance(angle, speed, 0.0) for motor, angle, speed in at]
         wanted = gravity_torque(self._robot, theta, Tilt.of("right", trunk.pitch, trunk.roll).direction)
         self.result.largest_error = max(self.result.largest_error, float(np.max(np.abs(np.subtract(applied, wanted)))))

@@ -103,7 +103,6 @@ class SimulatedDevice:
 
     @property
     def time(self) -> float:
-        """Simulated time in s."""
         return self._steps * STEP
 
     @property
@@ -233,7 +232,6 @@ class SimulatedDevice:
             self._move_base(state)
 
     def _move_base(self, state: TrunkState) -> None:
-        """Let the base of the arm move with the trunk."""
         if state != self._base:
             self._base = state
             self.arm.move_base(*felt_in_base(self.side, state, self.arm.config.links.gravity))

@@ -57,6 +57,9 @@ class SimulatedMotor:
     def __init__(self, joint: JointMotor, firmware: Firmware | None = None) -> None:
         self.joint = joint
         self.firmware = firmware or Firmware()
+        #: Arbitration IDs of the replies, and of the frames that the motor obeys.
+        self.reply_id = MASTER_ID if self.firmware.reply_to_master else joint.can_id
+        self.received_ids: tuple[int, ...] = (joint.can_id,)
         self.unplugged = False
         self.temperature = 30.0
         self.error = 0
@@ -64,16 +67,6 @@ class SimulatedMotor:
         self._command, self._data = _NO_COMMAND, b""
         self._silent_until = -math.inf  # s, after SET_ZERO
         self._random = random.Random(joint.can_id)
-
-    @property
-    def reply_id(self) -> int:
-        """Arbitration ID of the replies."""
-        return MASTER_ID if self.firmware.reply_to_master else self.joint.can_id
-
-    @property
-    def received_ids(self) -> tuple[int, ...]:
-        """Arbitration IDs of the frames that the motor obeys."""
-        return (self.joint.can_id,)
 
     @property
     def damping(self) -> float:
@@ -155,11 +148,7 @@ class SimulatedV3Motor(SimulatedMotor):
     def __init__(self, joint: JointMotor, firmware: Firmware | None = None) -> None:
         super().__init__(joint, firmware)
         self._current_id = EXTENDED | MODE_CURRENT << 8 | joint.can_id
-
-    @property
-    def received_ids(self) -> tuple[int, ...]:
-        """Arbitration IDs of the frames that the board obeys."""
-        return self.joint.command_id, self._current_id
+        self.received_ids = self.joint.command_id, self._current_id
 
     def receive(
         self, data: bytes, position: float, velocity: float, now: float, frame_id: int | None = None

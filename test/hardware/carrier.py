@@ -41,7 +41,7 @@ def main(arm: ArmOnBus, drive: Drive) -> None:
             owned.watchdog.hand_over("a test")
             orders.clear()
         if not is_announced and notes.heartbeat and all(joint.time > 0.0 for joint in bus.samples):
-            print(owned.watchdog.pid, flush=True)
+            print(owned.watchdog.process.pid, flush=True)
             is_announced = True
         time.sleep(max(0.0, end - time.monotonic()))
 

@@ -65,7 +65,7 @@ def test_no_motor_is_switched_on_and_one_without_power_is_missing(wire: Wire) ->
     device.motors[2].unplugged = True
     wire.play(device)
     with scan_of(wire) as bus:
-        assert [answer.can_id for answer in bus.scan(range(1, 6)).answers] == [1, 2, 4]
+        assert [answer.can_id for answer in bus.scan(range(1, 6))[0]] == [1, 2, 4]
         assert set(bus.poll((1, 3))) == {1}
     assert not device.powered
 
@@ -172,4 +172,4 @@ def test_a_v3_board_that_falls_silent_is_missing(wire: Wire) -> None:
 def test_a_v3_board_with_an_id_that_no_parameter_can_have_is_reported(wire: Wire) -> None:
     wire.repeat(frame(0x29C8, bytes(8), is_extended_id=True), 0.01)
     with scan_of(wire) as bus:
-        assert bus.scan(range(1, 4)).problems == ("ID 200: a V3 board; its ID must be from 1 to 126",)
+        assert bus.scan(range(1, 4))[1] == ("ID 200: a V3 board; its ID must be from 1 to 126",)

@@ -143,9 +143,9 @@ def test_a_frozen_watchdog_is_noticed_and_recovers_and_ends_with_its_bridge(rig)
     watchdog = Watchdog(lock, rig.arm, COMPUTER_CLOCK)
     wait_until(lambda: lock.notes.heartbeat)
     assert watchdog.alive
-    os.kill(watchdog.pid, signal.SIGSTOP)
+    os.kill(watchdog.process.pid, signal.SIGSTOP)
     wait_until(lambda: not watchdog.alive)
-    os.kill(watchdog.pid, signal.SIGCONT)
+    os.kill(watchdog.process.pid, signal.SIGCONT)
     wait_until(lambda: watchdog.alive)
     watchdog.close()
     assert not watchdog.alive

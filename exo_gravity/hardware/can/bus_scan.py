@@ -47,13 +47,6 @@ class MotorAnswer(NamedTuple):
     wire_format: str = MIT.name  #: Name of the board's format.
 
 
-class Scan(NamedTuple):
-    """Who answered on a bus."""
-
-    answers: tuple[MotorAnswer, ...]  #: One per motor, by ID.
-    problems: tuple[str, ...]  #: Sentences on what is wrong with the bus or an ID.
-
-
 class BusScan(contextlib.ExitStack):
     """Owns the bus at `address` until `close`, so that no bridge can start meanwhile.
 
@@ -86,8 +79,8 @@ class BusScan(contextlib.ExitStack):
             self.close()
             raise
 
-    def scan(self, can_ids: Iterable[int] = ALL_IDS) -> Scan:
-        """Ask every ID; return who answers, and what is wrong. Raises BusError if the bus fails."""
+    def scan(self, can_ids: Iterable[int] = ALL_IDS) -> tuple[tuple[MotorAnswer, ...], tuple[str, ...]]:
+        """Ask every ID; return who answers, by ID, and what is wrong with the bus or an ID. Raises BusError."""
         found = {can_id: self._v3[can_id] for can_id in can_ids if can_id in self._v3}
         problems: dict[str, None] = {}
         for can_id in sorted(set(can_ids) - set(found)):
@@ -108,7 +101,7 @@ class BusScan(contextlib.ExitStack):
                     break
         for can_id in sorted(can_id for can_id in self._v3 if can_id > MAX_CAN_ID):
             problems[f"ID {can_id}: a V3 board; its ID must be from 1 to {MAX_CAN_ID}"] = None
-        return Scan(tuple(found[can_id] for can_id in sorted(found)), tuple(problems))
+        return tuple(found[can_id] for can_id in sorted(found)), tuple(problems)
 
     def poll(self, can_ids: Iterable[int]) -> dict[int, MotorAnswer]:
         """Return the newest answer of each of these motors; a silent one is missing. Raises BusError."""

@@ -270,7 +270,6 @@ class FrameFilter:
         self._awaited: deque[Frame] = deque(maxlen=MOST_AWAITED if echoes else 0)
 
     def sent(self, frame: Frame) -> None:
-        """Note a frame that is being sent."""
         self._awaited.append(frame)
 
     def sort(self, message: can.Message) -> tuple[str, int]:

@@ -68,12 +68,10 @@ class DriveNotes(ctypes.Structure):
     clock = COMPUTER_CLOCK
 
     def note(self, drive: Drive) -> None:
-        """Note the drive that the motors are about to receive."""
         NOTE.pack_into(self, 0, self.clock.monotonic(), drive.powered, *drive.effort, *drive.damping)
 
     @property
     def drive(self) -> Drive:
-        """The last noted drive."""
         applied = tuple(self._applied)
         return Drive(applied[:JOINT_COUNT], applied[JOINT_COUNT:], bool(self._powered))
 

@@ -46,7 +46,6 @@ class ArmOnBus:
     period: float  #: s of a control cycle.
 
     def open(self) -> can.BusABC:
-        """Open the python-can bus. Raises BusError."""
         return open_bus(*self.address)
 
 
@@ -143,7 +142,7 @@ class Watchdog:
         self._silence = Silence(self._start, LONGEST_LOOK)
         receiver, self._sender = Pipe(duplex=False)
         shared = (lock.descriptor, lock.socket.fileno(), receiver.fileno())
-        self._process = subprocess.Popen(
+        self.process = subprocess.Popen(
             [sys.executable, "-m", "exo_gravity.hardware.ownership.watchdog", *map(str, (os.getpid(), *shared))],
             pass_fds=shared,
             stdin=subprocess.DEVNULL,
@@ -153,11 +152,6 @@ class Watchdog:
         self._sender.send(arm)
 
     @property
-    def pid(self) -> int:
-        """The process ID."""
-        return self._process.pid
-
-    @property
     def is_starting(self) -> bool:
         """Whether the watchdog does not watch yet: no motor may be switched on."""
         return self._notes.heartbeat == 0.0
@@ -165,7 +159,7 @@ class Watchdog:
     @property
     def alive(self) -> bool:
         """Whether the watchdog process runs. Read it several times a second: it must also notice a frozen process."""
-        if self._process.poll() is not None:
+        if self.process.poll() is not None:
             return False
         now, heartbeat = self._clock.monotonic(), self._notes.heartbeat
         if heartbeat == 0.0:
@@ -174,7 +168,7 @@ class Watchdog:
 
     def hand_over(self, reason: str) -> bool:
         """Request the watchdog to kill this process and let the arm down; return whether it is alive."""
-        if self._process.poll() is not None:
+        if self.process.poll() is not None:
             return False
         with contextlib.suppress(OSError):
             self._sender.send(reason)
@@ -187,10 +181,10 @@ class Watchdog:
         if self._notes.drive.powered:
             return
         try:
-            self._process.wait(END_TIME)
+            self.process.wait(END_TIME)
         except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+            self.process.kill()
+            self.process.wait()
 
 
 class OwnedBus:

@@ -40,7 +40,7 @@ from exo_gravity.nodes.can_bridge.operation import (
     BridgeReport,
     BridgeServices,
     Operator,
-    log_limits,
+    log_risks,
     refuse_simulated_time,
 )
 from exo_gravity.nodes.ros.parameters import bus_of, declare
@@ -120,7 +120,7 @@ class CanBridge(LifecycleNode):
         if any(limits.largest_moment):
             _GravityInput(self, lambda: self.loop)
         self.create_timer(REPORT_PERIOD, self._on_report)
-        log_limits(self, limits, traffic, values["rate"])
+        log_risks(self, traffic, values["rate"])
         if values["autostart"]:
             for trigger in (self.trigger_configure, self.trigger_activate):
                 if trigger() is not TransitionCallbackReturn.SUCCESS:
@@ -155,8 +155,7 @@ class CanBridge(LifecycleNode):
         loop = ControlLoop(bus, safety, period, self._exchange.publish, self._exchange.get_efforts, hand_over)
         loop.start()
         try:
-            for refused in request_real_time(self._thread_priority):
-                self.get_logger().warning(refused)
+            request_real_time(self._thread_priority, self.get_logger().warning)
         except BaseException:
             loop.stop()
             raise

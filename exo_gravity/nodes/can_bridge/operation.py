@@ -25,7 +25,6 @@ from exo_gravity.core.numbers import Rate
 from exo_gravity.core.safety.delivery import MotorLoad
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.lease import Lease
-from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, MAX_TEMPERATURE, Limits
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.nodes.ros.hot_path import HotPath
@@ -181,14 +180,9 @@ class Operator:
         self._news = self.lease.request(self._now(), message.key, message.value) or self._news
 
 
-def log_limits(node: Node, limits: Limits, traffic: Traffic, rate: float) -> None:
-    """Log the limits, the bus load at `rate` (Hz), and whether other hosts can command the arm."""
+def log_risks(node: Node, traffic: Traffic, rate: float) -> None:
+    """Log the bus load at `rate` (Hz), and whether other hosts can command the arm."""
     log = node.get_logger()
-    efforts = ", ".join(f"{effort:g}" for effort in limits.max_effort)
-    log.info(
-        f"limits: {efforts} Nm, {MAX_EFFORT_RATE:g} Nm/s, {max(limits.max_velocity):g} rad/s, "
-        f"{MAX_TEMPERATURE:g} degC, effort commands at most {limits.command_timeout * 1000:.0f} ms old"
-    )
     wire, worst = traffic.load(rate), traffic.load(rate, worst=True)
     log.info(
         f"bus load at {rate:g} Hz: {wire.bits_per_second / 1000:.0f} of {traffic.bitrate / 1000:g} kbit/s, "

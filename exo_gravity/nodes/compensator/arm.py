@@ -64,13 +64,9 @@ def _settings(values: dict[str, Any]) -> Settings:
 
 
 def sentence(s: Settings | UrdfSettings) -> str:
-    """Return settings in a sentence for the log."""
-    if isinstance(s, UrdfSettings):
-        return f"law {s.law}, {len(s.gain)} joints: compensates {s.arm.mass:.2f} kg, at most {row(s.max_effort)} Nm"
-    return (
-        f"{s.side} arm, law {s.law}, mode {s.mode}, support {s.support:g}: compensates {s.arm.total_mass:.2f} kg, "
-        f"at most {row(s.max_effort)} Nm; robot {row(s.robot.first_moment)} kg m"
-    )
+    mode = f"{s.side} arm, mode {s.mode}, support {s.support:g}, " if isinstance(s, Settings) else ""
+    mass = s.arm.total_mass if isinstance(s, Settings) else s.arm.mass
+    return f"{mode}law {s.law}: compensates {mass:.2f} kg, at most {row(s.max_effort)} Nm"
 
 
 def report(control: Compensator, answer: Answer, names: Sequence[str]) -> dict[str, object]:

@@ -49,7 +49,6 @@ class JointStateInterface:
         return by_name(message, "position", self._names), velocity_of(message, self._names)
 
     def send(self, now: float, message: JointState, answer: Answer) -> None:
-        """Send the answer to a joint state."""
         self._command.header.stamp = message.header.stamp
         self._command.effort = answer.effort or ()
         self._command.header.frame_id = LATE_TILT if answer.held else ""

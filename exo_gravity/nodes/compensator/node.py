@@ -50,7 +50,8 @@ class CompensatorNode(Node):
         self._lock = threading.Lock()  # guards the control: joint states arrive on another thread
         self._table, values, self._read = declared(self)
         self._names = values["joint_names"]
-        self._control = Compensator(self._read(values), self._names)
+        self._checked = self._read(values)  # the settings that the parameters describe
+        self._control = Compensator(self._checked, self._names)
         self._budget: BudgetWatch | None = None
         self._threads: list[Repeated] = []
         if self._control.terms:
@@ -85,11 +86,10 @@ class CompensatorNode(Node):
         # Only the executor's thread reports: diagnostics and budget are not for two threads.
         self._changed = self.create_guard_condition(self._report_changes)
         self.create_timer(REPORT_PERIOD, self._report_current)
-        self.get_logger().info(sentence(self._control.settings))
+        self.get_logger().info(sentence(self._checked))
         for thread in self._threads:
             thread.start()
-        for refused in request_real_time(values["thread_priority"]):
-            self.get_logger().warning(refused)
+        request_real_time(values["thread_priority"], self.get_logger().warning)
 
     @property
     def failure(self) -> Exception | None:
@@ -97,7 +97,6 @@ class CompensatorNode(Node):
         return next((thread.failure for thread in self._threads if thread.failure), None)
 
     def close(self) -> None:
-        """Stop answering joint states."""
         for thread in reversed(self._threads):
             thread.stop()
 
@@ -133,7 +132,6 @@ class CompensatorNode(Node):
             self._assist.receive(now, message.name, message.effort, now - age, self._assistants)
 
     def _on_motion(self, *sample: Any) -> None:
-        """Use a sample of the trunk's motion."""
         if self._control.settings.inertial:
             self._control.set_motion(*sample)
 
@@ -148,23 +146,17 @@ class CompensatorNode(Node):
 
     def _check_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         try:
-            self._read(values_after(self, self._table, changes))
+            self._checked = self._read(values_after(self, self._table, changes))
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _apply_parameters(self, _changes: list[Parameter]) -> None:
-        try:
-            settings = self._read(values_after(self, self._table))
-        except ParameterError as error:  # checked just before: only a file can have changed since
-            self.get_logger().error(f"parameters not applied: {error}")
-            return
         with self._lock:
-            self._control.apply(settings)
-        self.get_logger().info(sentence(settings))
+            self._control.apply(self._checked)
+        self.get_logger().info(sentence(self._checked))
 
     def _values(self, now: float, answer: Answer) -> dict[str, object]:
-        """Return the current values for /diagnostics."""
         return {
             **self._interface.values,
             "limits acting": ", ".join(f"max_effort ({self._names[joint]})" for joint in answer.clamped) or "none",

@@ -43,7 +43,6 @@ def values_after(node: Node, table: Sequence[Param], changes: Sequence[Parameter
 
 
 def bus_of(node: Node, values: dict[str, Any]) -> tuple[str, str, dict[str, Any]]:
-    """Return interface, channel and options of the node's python-can bus."""
     options = {name: parameter.value for name, parameter in node.get_parameters_by_prefix(OPTIONS).items()}
     return values["can.interface"], values["can.channel"], options
 
@@ -56,13 +55,11 @@ def descriptor_of(param: Param) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(
         description=f"{param.description}{unit}", read_only=param.fixed, dynamic_typing=isinstance(first, float)
     )
-    if param.choices:
-        descriptor.additional_constraints = param.range
-    elif param.bounds and isinstance(param.default, list):
+    if not param.bounds or isinstance(param.default, list):
         descriptor.additional_constraints = param.expected
-    elif param.bounds and isinstance(param.default, float):
+    elif isinstance(param.default, float):
         descriptor.floating_point_range = [FloatingPointRange(from_value=param.bounds[0], to_value=param.bounds[1])]
-    elif param.bounds:
+    else:
         descriptor.integer_range = [IntegerRange(from_value=int(param.bounds[0]), to_value=int(param.bounds[1]))]
     return descriptor
 
