@@ -21,10 +21,11 @@ from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.lease import LEASE_TIME, Lease
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.hardware.control_loop import NO_COMMAND
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.can_bridge.operation import WATCH_PERIOD, BridgeReport, BridgeServices, Operator
-from exo_gravity.nodes.compensator.command_interface import JointStateInterface
+from exo_gravity.nodes.compensator.arm import JointStateInterface
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
 
 from ..hardware.virtual_rig import Carried
@@ -52,7 +53,7 @@ def sent(node, monkeypatch):
     def sent(loop, count, answered=None):
         report = BridgeReport(node, ("a", "b", "c", "elbow"), Traffic(4), 250.0, (3.0, 9.0, 3.0, 3.0), Lease())
         for n in range(count):
-            report.send(loop(n), "none", clock.now if answered is None else answered)
+            report.send(loop(n), NO_COMMAND._replace(answered=clock.now if answered is None else answered), "none")
             clock.now += 0.1
         return reports
 
@@ -181,11 +182,11 @@ def test_under_a_clock_that_stands_still_efforts_grow_old(node):
     for now in (100.0, 100.004, 100.3):
         exchange.publish(now, [JointSample(0.0, 0.0, 0.0, 40, 0, now)] * 4)
     end = time.monotonic() + 20.0
-    while exchange.answered == -math.inf:
+    while exchange.command.answered == -math.inf:
         compensator.publish(JointState(name=limits.joint_names, effort=(0.0,) * 4))
         exchange.get_efforts(time.monotonic() + 0.05)
         assert time.monotonic() < end, exchange.refusal
-    assert exchange.answered == 100.0
+    assert exchange.command.answered == 100.0
 
 
 @pytest.mark.parametrize("held", ["", "trunk tilt older than 80 ms: held on"])

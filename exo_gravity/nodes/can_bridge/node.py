@@ -31,7 +31,7 @@ from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.params import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.trunk.tilt_input import TiltInput
 from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.control_loop import ControlLoop
+from exo_gravity.hardware.control_loop import NO_COMMAND, ControlLoop
 from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, OwnedBus, Watchdog, take_over
 from exo_gravity.hardware.scheduling import request_real_time
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
@@ -43,9 +43,9 @@ from exo_gravity.nodes.can_bridge.operation import (
     log_risks,
     refuse_simulated_time,
 )
+from exo_gravity.nodes.ros.hot_path import TiltSubscription
 from exo_gravity.nodes.ros.parameters import bus_of, declare
 from exo_gravity.nodes.ros.run import keep_to_this_machine, run
-from exo_gravity.nodes.ros.tilt_subscription import TiltSubscription
 
 REPORT_PERIOD = 0.1  # s
 TILT_TIMEOUT = 0.08  # s for which /imu/data goes before /imu/pitch_yaw
@@ -145,7 +145,7 @@ class CanBridge(LifecycleNode):
     @_transition
     def on_activate(self) -> None:
         """Start the control loop, and enable the arm once it passes the start gate."""
-        self._exchange.forget()
+        self._exchange.command = NO_COMMAND
         if self._owned is None:
             raise BusError("the node is not configured")
         bus, self._bus = self._bus or self._owned.open(), None
@@ -209,7 +209,7 @@ class CanBridge(LifecycleNode):
     def _on_report(self) -> None:
         if self.loop is not None and self._owned is not None:
             self._look_at(self._owned.watchdog, self.loop)
-        self._report.send(self.loop, self._exchange.refusal, self._exchange.answered)
+        self._report.send(self.loop, self._exchange.command, self._exchange.refusal)
 
     def _look_at(self, watchdog: Watchdog, loop: ControlLoop) -> None:
         """Let no motor be switched on before the watchdog watches, and none stay on without it."""
@@ -220,7 +220,7 @@ class CanBridge(LifecycleNode):
 
     def _report_descent(self) -> None:
         with contextlib.suppress(Exception):  # whatever the middleware does, the arm comes down
-            self._report.send(self.loop, self._exchange.refusal, self._exchange.answered)
+            self._report.send(self.loop, self._exchange.command, self._exchange.refusal)
 
 
 def _declared(node: Node) -> tuple[dict[str, Any], ArmOnBus]:

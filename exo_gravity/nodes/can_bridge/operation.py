@@ -26,7 +26,7 @@ from exo_gravity.core.safety.delivery import MotorLoad
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.lease import Lease
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
-from exo_gravity.hardware.control_loop import ControlLoop
+from exo_gravity.hardware.control_loop import ControlLoop, EffortCommand
 from exo_gravity.nodes.ros.hot_path import HotPath
 from exo_gravity.nodes.ros.messages import ERROR, HELD_BY, NOBODY, OK, WARN, Diagnostics, milliseconds, row
 from exo_gravity.nodes.ros.run import open_to_others
@@ -211,12 +211,8 @@ class BridgeReport:
         self._slow = SLOW * rate  # Hz
         self._motors = MotorLoad(rated)
 
-    def send(self, loop: ControlLoop | None, refusal: str, answered: float) -> None:
-        """Report on `loop`, None while the node is inactive.
-
-        refusal: why the last message was refused. answered: monotonic s, when the joint states were measured that the
-        newest efforts answer.
-        """
+    def send(self, loop: ControlLoop | None, newest: EffortCommand, refusal: str) -> None:
+        """Report on `loop`, None while the node is inactive. refusal: why the last message was refused."""
         operator = {HELD_BY: self._lease.holder or NOBODY}
         if loop is None:
             self._diagnostics.report(WARN, "inactive", operator)
@@ -233,7 +229,7 @@ class BridgeReport:
             "limits acting": acting or "none",
             "rate (Hz)": f"{rate:.1f}",
             "bus load (%)": f"{100.0 * self._traffic.load(rate).share:.0f}" if rate else "0",
-            "age of efforts (ms)": milliseconds(now - answered),
+            "age of efforts (ms)": milliseconds(now - newest.answered),
             "rides": safety.ride.rides,
             "resume": safety.why_not_resumed or "possible",
             "cycles": loop.cycles,

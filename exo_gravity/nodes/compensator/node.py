@@ -3,7 +3,7 @@
 It answers each joint state at once, with the joint state's stamp, so that `can_bridge` can tell how old the reading is.
 Where there is no safe answer it withdraws: it sends a command without efforts, and puts the reason on /diagnostics. To
 `can_bridge` silence means the same, a little later. An effort controller of ros2_control needs more
-(nodes/compensator/command_interface.py).
+(nodes/compensator/arm.py).
 """
 
 from __future__ import annotations
@@ -24,14 +24,12 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Rate
 from exo_gravity.hardware.scheduling import request_real_time
-from exo_gravity.nodes.compensator.arm import declared, report, sentence
+from exo_gravity.nodes.compensator.arm import JointStateInterface, MultiArrayInterface, declared, report, sentence
 from exo_gravity.nodes.compensator.budget_watch import BudgetWatch
-from exo_gravity.nodes.compensator.command_interface import JointStateInterface, MultiArrayInterface
-from exo_gravity.nodes.ros.hot_path import DISTRUST, NEWEST, HotPath, Repeated, SolePublisher
+from exo_gravity.nodes.ros.hot_path import DISTRUST, NEWEST, HotPath, Repeated, SolePublisher, TiltSubscription
 from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import values_after
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.tilt_subscription import TiltSubscription
 
 SILENCE = 0.5  # s without joint states until diagnostics report it
 REPORT_PERIOD = 0.5  # s

@@ -1,4 +1,4 @@
-"""Subscriptions outside the executor: on a thread with a wait set for one alone, or polled by its owner.
+"""Subscriptions, most of them outside the executor: on a thread with a wait set for one alone, or polled by its owner.
 
 rclpy's executor rebuilds its wait set, services included, for every message. That is most of a message's cost
 (measured, there and back at 500 Hz: 35 + 21 % of a core, against 14 + 11 % here; at 2,000 messages a second it is most
@@ -15,12 +15,19 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Vector3Stamped
 from rclpy.callback_groups import CallbackGroup
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Imu
 
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.rotation import unit_quaternion, up_in_body
+from exo_gravity.core.trunk.tilt_input import STILL, Tilted, TiltInput
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
+from exo_gravity.nodes.ros.messages import to_nanoseconds
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # reliable
@@ -29,6 +36,8 @@ PAUSE = 0.0004  # s, less than the shortest period of a control loop
 MAX_PUBLISHERS = 4  # of one topic whose messages are counted
 DISTRUST = 0.2  # s for which a topic is not trusted after a second publisher was seen
 COUNT_PERIOD = 0.5  # s between two counts of the publishers
+DATA, PITCH_YAW = "/imu/data", "/imu/pitch_yaw"
+NOT_REPORTED = -1.0  # first entry of a covariance (REP-145)
 
 Callback = Callable[[Any, dict[str, Any]], None]
 
@@ -187,3 +196,58 @@ class SolePublisher:
         if now - self._counted > COUNT_PERIOD:
             self._counted, self._count = now, self._node.count_publishers(self._topic)
         return self._count
+
+
+class TiltSubscription:
+    """Passes the trunk's tilt on to `target`, under `lock`: `/imu/data`, and `/imu/pitch_yaw` of who sends that alone.
+
+    on_refusal(topic, error): a message is impossible; the last tilt then grows old. on_intruder(topic): a second
+    publisher sends on it. on_motion(now, specific force (3,) m/s^2, angular velocity (3,) rad/s, age in s): a sample
+    of the trunk's motion, in its axes, under `lock` too.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        target: TiltInput | Tilted,
+        lock: threading.Lock,
+        on_refusal: Callable[[str, ParameterError], object],
+        on_intruder: Callable[[str], object],
+        on_motion: Callable[..., object] | None = None,
+    ) -> None:
+        self._node, self._target, self._lock = node, target, lock
+        self._on_refusal, self._on_intruder, self._on_motion = on_refusal, on_intruder, on_motion
+        self._senders = {topic: SolePublisher(node, topic) for topic in (DATA, PITCH_YAW)}
+        node.create_subscription(Imu, DATA, self._on_data, NEWEST)
+        node.create_subscription(Vector3Stamped, PITCH_YAW, self._on_pitch_yaw, NEWEST)
+
+    def _on_data(self, message: Imu, info: dict[str, Any]) -> None:
+        if message.orientation_covariance[0] == NOT_REPORTED:
+            return  # another driver's raw data
+        q, w, a = message.orientation, message.angular_velocity, message.linear_acceleration
+        rate = STILL if message.angular_velocity_covariance[0] == NOT_REPORTED else (w.x, w.y, w.z)
+
+        def set_gravity(now: float, age: float) -> None:
+            x, y, z = up_in_body(unit_quaternion("orientation", (q.x, q.y, q.z, q.w)))
+            self._target.set_gravity(now, (-x, -y, -z), rate, age)
+            if self._on_motion and message.linear_acceleration_covariance[0] != NOT_REPORTED:
+                self._on_motion(now, (a.x, a.y, a.z), rate, age)
+
+        self._pass_on(DATA, message.header.stamp, info, set_gravity)
+
+    def _on_pitch_yaw(self, message: Vector3Stamped, info: dict[str, Any]) -> None:
+        pitch, roll = message.vector.y, message.vector.x
+        self._pass_on(
+            PITCH_YAW, message.header.stamp, info, lambda now, age: self._target.set_tilt(now, pitch, roll, age)
+        )
+
+    def _pass_on(self, topic: str, stamp: Time, info: dict[str, Any], use: Callable[[float, float], None]) -> None:
+        """Call `use` with the present monotonic time in s, and the age of the stamp in s by the node's clock."""
+        if self._senders[topic].is_another(info):
+            self._on_intruder(topic)
+        age = (self._node.get_clock().now().nanoseconds - to_nanoseconds(stamp)) * 1e-9
+        try:
+            with self._lock:
+                use(time.monotonic(), age)
+        except ParameterError as error:
+            self._on_refusal(topic, error)
