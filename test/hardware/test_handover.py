@@ -24,15 +24,15 @@ def commands(listener: Responder, can_id: int) -> list[MotorCommand]:
 
 
 def test_the_arm_is_lowered_from_the_noted_torques_and_its_motors_are_switched_off():
-    rig, notes = VirtualRig(), []
+    rig = VirtualRig()
     rig.arm = replace(rig.arm, period=PERIOD)
     listener = Responder(rig.wire)
-    assert rig.let_down(note=notes.append)
+    assert rig.let_down()
     torques = [command.torque for command in commands(listener, 2)]
     assert torques[0] == pytest.approx(rig.carrying[1], abs=0.02)
     largest = max(abs(after - before) for before, after in itertools.pairwise(torques))
     assert largest <= MAX_EFFORT_RATE * PERIOD + 2 * MOTORS["AK80-9"].torque_range / 4095
-    assert notes[0].powered and not notes[-1].powered
+    assert not rig.notes.drive.powered
     rig.assert_let_down()
 
 
@@ -54,11 +54,11 @@ def test_a_motor_that_has_lost_its_power_is_not_pushed_by_the_noted_torque():
 def test_a_motor_that_does_not_reply_may_still_be_powered():
     rig = VirtualRig()
     rig.device.bus_silent = True
-    log, notes = [], []
-    assert not rig.let_down(note=notes.append, log=log.append, is_wanted=True)
+    log = []
+    assert not rig.let_down(log=log.append, is_wanted=True)
     assert log == ["a motor does not reply; it may still be powered; trying again"]
-    assert notes[-1].powered
-    assert notes[-1].effort[1] == pytest.approx(rig.carrying[1], abs=0.2)
+    assert rig.notes.drive.powered
+    assert rig.notes.drive.effort[1] == pytest.approx(rig.carrying[1], abs=0.2)
 
 
 @pytest.mark.parametrize("is_adapter", [False, True], ids=["a motor", "the adapter"])

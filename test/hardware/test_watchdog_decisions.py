@@ -79,7 +79,7 @@ class Bridge:
     def guard(self, is_wanted: Callable[[], bool] = lambda: False) -> int:
         """Run the watchdog to its end; return its exit code."""
         inhibit = self.inhibited.append
-        return guard(self.kill, self.notes, self.pipe, self.log.append, self.clock, is_wanted, inhibit)
+        return guard(self.kill, self.notes, self.pipe, self.log.append, is_wanted, inhibit)
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -16,6 +17,7 @@ from exo_gravity.core.safety.drive import NOTHING, Drive, State
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop, EffortCommand
+from exo_gravity.hardware.ownership.bus_lock import DriveNotes
 from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, let_down
 
 from .simulated_rig import LIMITS, POSE, Rig
@@ -67,10 +69,14 @@ class VirtualRig(Rig):
         for motor in self.device.motors:
             motor.unplugged = not on
 
-    def let_down(self, drive: Drive | None = None, is_wanted: bool = False, **others: Callable[..., object]) -> bool:
+    def let_down(
+        self, drive: Drive | None = None, is_wanted: bool = False, log: Callable[[str], None] = lambda text: None
+    ) -> bool:
         """Let down the arm that a dead process left with `drive` (default: what holds it); return whether it is off."""
-        options = {"note": lambda drive: None, "log": lambda text: None, **others}
-        return let_down(self.arm, drive or self.drive, clock=self.clock, is_wanted=lambda: is_wanted, **options)
+        self.notes = DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes)))
+        self.notes.clock = self.clock
+        self.notes.note(drive or self.drive)
+        return let_down(self.arm, self.notes, log, lambda: is_wanted)
 
     def raising(self) -> tuple[float, ...]:
         """Return the torque (4,) in Nm that carries the arm where it is, and moves it to `POSE`."""

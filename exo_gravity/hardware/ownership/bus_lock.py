@@ -21,7 +21,7 @@ import re
 import socket
 import stat
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -54,17 +54,12 @@ class DriveNotes(ctypes.Structure):
     """
 
     _fields_ = (
-        ("time", ctypes.c_double),
+        ("time", ctypes.c_double),  #: s, of the last note
         ("_powered", ctypes.c_double),
-        ("_applied", ctypes.c_double * (2 * JOINT_COUNT)),
-        ("heartbeat", ctypes.c_double),
+        ("_applied", ctypes.c_double * (2 * JOINT_COUNT)),  # effort and damping
+        ("heartbeat", ctypes.c_double),  #: s, at which the watchdog last ran; 0 before it runs
         ("_owner", ctypes.c_char * 512),
     )
-    time: float  #: s, of the last note
-    _powered: float
-    _applied: Sequence[float]  # effort and damping
-    heartbeat: float  #: s, at which the watchdog last ran; 0 before it runs
-    _owner: bytes
     clock = COMPUTER_CLOCK
 
     def note(self, drive: Drive) -> None:
@@ -78,7 +73,7 @@ class DriveNotes(ctypes.Structure):
     @property
     def owner(self) -> str:
         """Who owns the bus, for error messages."""
-        return self._owner.decode(errors="replace")
+        return str(self._owner, errors="replace")
 
     @owner.setter
     def owner(self, text: str) -> None:

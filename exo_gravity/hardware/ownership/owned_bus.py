@@ -26,7 +26,7 @@ from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.hardware.ownership.bus_lock import ATTEMPT_TIME, Address, BusLock
+from exo_gravity.hardware.ownership.bus_lock import ATTEMPT_TIME, Address, BusLock, DriveNotes
 
 OPEN_PERIOD = 0.05  # s between two attempts to open the bus
 FIRST_REPLIES = 0.05  # s in which the motors must reply to the first commands
@@ -49,18 +49,11 @@ class ArmOnBus:
         return open_bus(*self.address)
 
 
-def let_down(
-    arm: ArmOnBus,
-    drive: Drive,
-    note: Callable[[Drive], None],
-    log: Callable[[str], None],
-    clock: Clock,
-    is_wanted: Callable[[], bool],
-) -> bool:
-    """Let down an arm whose motors apply `drive`; return whether its motors have confirmed that they are off.
+def let_down(arm: ArmOnBus, notes: DriveNotes, log: Callable[[str], None], is_wanted: Callable[[], bool]) -> bool:
+    """Let down an arm whose motors apply what is noted; return whether its motors have confirmed that they are off.
 
-    note: called with each drive. log: called with each change worth knowing. is_wanted: whether to give up, because
-    someone else waits for the bus, while the bus or a motor cannot be reached.
+    log: called with each change worth knowing. is_wanted: whether to give up, because someone else waits for the bus,
+    while the bus or a motor cannot be reached.
     """
     bus, is_logged = None, False
     while bus is None:
@@ -72,10 +65,11 @@ def let_down(
             is_logged = True
             if is_wanted():
                 return False
-            clock.sleep(OPEN_PERIOD)
-    motors = MotorBus(bus, arm.motors, powered=True, note=note, reopen=arm.open, clock=clock)
+            notes.clock.sleep(OPEN_PERIOD)
+    drive = notes.drive
+    motors = MotorBus(bus, arm.motors, powered=True, note=notes.note, reopen=arm.open, clock=notes.clock)
     machine = SafetyMachine(arm.limits, arm.period, peaks_of(arm.motors))
-    machine.take_over(*_applied(motors, drive, arm.period), clock.monotonic())
+    machine.take_over(*_applied(motors, drive, arm.period), notes.clock.monotonic())
     loop = ControlLoop(motors, machine, arm.period)
     was_unreached = False
     while not loop.is_off and loop.cycle():
@@ -135,10 +129,10 @@ class Silence:
 class Watchdog:
     """The bridge's end: the watchdog process of `arm`, on the bus that `lock` holds."""
 
-    def __init__(self, lock: BusLock, arm: ArmOnBus, clock: Clock) -> None:
+    def __init__(self, lock: BusLock, arm: ArmOnBus) -> None:
         self._notes = lock.notes
-        self._clock = clock
-        self._start = clock.monotonic()
+        self._now = lock.notes.clock.monotonic
+        self._start = self._now()
         self._silence = Silence(self._start, LONGEST_LOOK)
         receiver, self._sender = Pipe(duplex=False)
         shared = (lock.descriptor, lock.socket.fileno(), receiver.fileno())
@@ -161,18 +155,17 @@ class Watchdog:
         """Whether the watchdog process runs. Read it several times a second: it must also notice a frozen process."""
         if self.process.poll() is not None:
             return False
-        now, heartbeat = self._clock.monotonic(), self._notes.heartbeat
+        now, heartbeat = self._now(), self._notes.heartbeat
         if heartbeat == 0.0:
             return now - self._start < START_TIME
         return self._silence.look(now, heartbeat) < HEARTBEAT_TIMEOUT
 
     def hand_over(self, reason: str) -> bool:
         """Request the watchdog to kill this process and let the arm down; return whether it is alive."""
-        if self.process.poll() is not None:
-            return False
         with contextlib.suppress(OSError):
-            self._sender.send(reason)
-            return True
+            if self.process.poll() is None:
+                self._sender.send(reason)
+                return True
         return False
 
     def close(self) -> None:
@@ -196,12 +189,11 @@ class OwnedBus:
 
     def __init__(self, arm: ArmOnBus, owner: str, log: Callable[[str], None], clock: Clock = COMPUTER_CLOCK) -> None:
         self._arm = arm
-        self._clock = clock
         self._lock = take_over(arm, owner, log, ATTEMPT_TIME, clock)
         #: What the motors receive, for a process that outlives this one.
         self.notes = self._lock.notes
         try:
-            self.watchdog = Watchdog(self._lock, arm, clock)
+            self.watchdog = Watchdog(self._lock, arm)
         except BaseException:
             self._lock.release()
             raise
@@ -209,7 +201,7 @@ class OwnedBus:
     def open(self) -> MotorBus:
         """Open the bus. Raises BusError if it cannot be opened, or if another host commands the motors."""
         arm = self._arm
-        bus = MotorBus(arm.open(), arm.motors, note=self.notes.note, reopen=arm.open, clock=self._clock)
+        bus = MotorBus(arm.open(), arm.motors, note=self.notes.note, reopen=arm.open, clock=self.notes.clock)
         try:
             bus.listen()
         except BusError:
@@ -239,8 +231,8 @@ def take_over(
         elif drive.powered:
             log("the last can_bridge on this bus and its watchdog ended with the motors on: letting the arm down")
         if drive.powered:
-            if not let_down(arm, drive, lock.notes.note, log, clock, lambda: True):
-                Watchdog(lock, arm, clock).close()
+            if not let_down(arm, lock.notes, log, lambda: True):
+                Watchdog(lock, arm).close()
                 raise BusError(f"CAN bus {arm.address[1]}: a motor that may be powered does not reply")
             log("the arm is down, its motors are off")
         return lock

@@ -30,7 +30,6 @@ from queue import SimpleQueue
 import can
 
 from exo_gravity.core.safety.params import FROZEN
-from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.ownership.bus_lock import DriveNotes, is_asked_for, remove_notes
 from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, Silence, let_down
 
@@ -46,7 +45,6 @@ def guard(
     notes: DriveNotes,
     receiver: Connection,
     log: Callable[[str], None],
-    clock: Clock,
     is_wanted: Callable[[], bool],
     inhibit: Callable[[bool], None],
 ) -> int:
@@ -56,6 +54,7 @@ def guard(
     bus. inhibit: called often with whether the computer must not be suspended.
     """
     arm: ArmOnBus | None = None
+    clock = notes.clock
     why, silence = "has died", Silence(clock.monotonic(), 2 * POLL)
     with contextlib.suppress(EOFError, ConnectionError):
         while True:
@@ -76,15 +75,14 @@ def guard(
                 kill()  # it sends nothing from here on, even if it takes long to die
                 why = f"was frozen for {FROZEN * 1000:.0f} ms and has been killed"
                 break
-    drive = notes.drive
-    if not drive.powered:
+    if not notes.drive.powered:
         return 0
     if arm is None:
         log(f"can_bridge {why}: its motors may still be powered")
         return 1
     notes.owner = f"the watchdog (PID {os.getpid()}) of {notes.owner}; it is letting the arm down, wait until it ends"
     log(f"can_bridge {why}: letting the arm down")
-    if let_down(arm, drive, notes.note, log, clock, is_wanted):
+    if let_down(arm, notes, log, is_wanted):
         log("the arm is down, its motors are off")
         return 0
     log("the motors may still be powered: the next can_bridge takes the bus over, and lets the arm down")
@@ -133,7 +131,6 @@ def main() -> None:
         DriveNotes.from_buffer(mmap.mmap(page, mmap.PAGESIZE)),
         Connection(receiver, writable=False),
         log.put,
-        COMPUTER_CLOCK,
         partial(is_asked_for, socket.socket(fileno=lock)),
         SleepInhibitor(INHIBIT if os.path.exists(SYSTEM_BUS) else ()).hold,
     )

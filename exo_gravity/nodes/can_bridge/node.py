@@ -23,8 +23,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from exo_gravity.core.errors import BusError, ExoGravityError, ParameterError
-from exo_gravity.core.model.rotation import Floats3
-from exo_gravity.core.model.tilt import SIDES, Tilt
+from exo_gravity.core.model.tilt import SIDES
 from exo_gravity.core.motors.joint_motor import OPTIONS, motors_of, peaks_of, traffic_of
 from exo_gravity.core.safety.drive import FaultCode
 from exo_gravity.core.safety.machine import SafetyMachine
@@ -34,15 +33,8 @@ from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import NO_COMMAND, ControlLoop
 from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, OwnedBus, Watchdog, take_over
 from exo_gravity.hardware.scheduling import request_real_time
+from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
-from exo_gravity.nodes.can_bridge.operation import (
-    CALL_TIMEOUT,
-    BridgeReport,
-    BridgeServices,
-    Operator,
-    log_risks,
-    refuse_simulated_time,
-)
 from exo_gravity.nodes.ros.hot_path import TiltSubscription
 from exo_gravity.nodes.ros.parameters import bus_of, declare
 from exo_gravity.nodes.ros.run import keep_to_this_machine, run
@@ -55,25 +47,22 @@ REMINDER_PERIOD = 10.0  # s between two reminders that a motor cannot be reached
 RECOVER = "EXO_GRAVITY_RECOVER"
 
 
-class _GravityInput(TiltInput):
-    """Tells the loop's monitor where gravity points, as the trunk's tilt arrives; before that it is upright.
+def _follow_gravity(node: Node, get_loop: Callable[[], ControlLoop | None]) -> None:
+    """Tell the loop's monitor where gravity points, as the trunk's tilt arrives; before that it is upright.
 
     The side is that of the node's namespace: a compensator with the wrong `side` does not decide it.
     """
+    side = node.get_namespace().rpartition("/")[2]
+    if side not in SIDES:
+        expected = f"0, or the node in a namespace that ends with {' or '.join(SIDES)}"
+        raise ParameterError("largest_moment", "given", expected)
+    tilt = TiltInput(side, TILT_TIMEOUT)
 
-    def __init__(self, node: Node, get_loop: Callable[[], ControlLoop | None]) -> None:
-        side = node.get_namespace().rpartition("/")[2]
-        if side not in SIDES:
-            expected = f"0, or the node in a namespace that ends with {' or '.join(SIDES)}"
-            raise ParameterError("largest_moment", "given", expected)
-        super().__init__(side, TILT_TIMEOUT)
-        self._get_loop = get_loop
-        TiltSubscription(node, self, threading.Lock(), lambda topic, error: None, lambda topic: None)
+    def pass_on(now: float) -> None:
+        if loop := get_loop():
+            loop.safety.motion.gravity = tilt.at(now).direction
 
-    def _accept(self, now: float, tilt: Tilt, angular_velocity: Floats3, age: float) -> None:
-        super()._accept(now, tilt, angular_velocity, age)
-        if loop := self._get_loop():
-            loop.safety.motion.gravity = self.at(now).direction
+    TiltSubscription(node, tilt, threading.Lock(), on_tilt=pass_on)
 
 
 def _transition(function: Callable[[Any], None]) -> Callable[..., TransitionCallbackReturn]:
@@ -102,7 +91,7 @@ class CanBridge(LifecycleNode):
     def __init__(self) -> None:
         super().__init__("can_bridge", automatically_declare_parameters_from_overrides=True)
         values, self._arm = _declared(self)
-        refuse_simulated_time(self, self._arm.address[0])
+        operation.refuse_simulated_time(self, self._arm.address[0])
         motors, limits = self._arm.motors, self._arm.limits
         traffic = traffic_of(values, self._arm.address[2])
         check_bridge(values["rate"], motors, limits, traffic.status_rate)
@@ -113,14 +102,14 @@ class CanBridge(LifecycleNode):
         self._bus: MotorBus | None = None  # while inactive
         self.error = ""  #: why the last transition failed
         self._exchange = EffortExchange(self, limits, lambda: self.loop)
-        lease = Operator(self, lambda: self.loop).lease
+        lease = operation.Operator(self, lambda: self.loop).lease
         rated = [motor.rated_effort for motor in motors]
-        self._report = BridgeReport(self, limits.joint_names, traffic, values["rate"], rated, lease)
-        BridgeServices(self, lambda: self.loop, motors)
+        self._report = operation.BridgeReport(self, limits.joint_names, traffic, values["rate"], rated, lease)
+        operation.BridgeServices(self, lambda: self.loop, motors)
         if any(limits.largest_moment):
-            _GravityInput(self, lambda: self.loop)
+            _follow_gravity(self, lambda: self.loop)
         self.create_timer(REPORT_PERIOD, self._on_report)
-        log_risks(self, traffic, values["rate"])
+        operation.log_risks(self, traffic, values["rate"])
         if values["autostart"]:
             for trigger in (self.trigger_configure, self.trigger_activate):
                 if trigger() is not TransitionCallbackReturn.SUCCESS:
@@ -169,7 +158,7 @@ class CanBridge(LifecycleNode):
         loop, end = self.loop, time.monotonic() + DESCENT_TIMEOUT
         if loop is None:
             raise BusError("the node is not active")
-        loop.call(lambda: loop.safety.disable(time.monotonic())).result(CALL_TIMEOUT)
+        loop.call(lambda: loop.safety.disable(time.monotonic())).result(operation.CALL_TIMEOUT)
         while not loop.is_off:
             if loop.failure:
                 raise BusError(f"the control thread has ended: {loop.failure}")
@@ -233,23 +222,15 @@ def _owner(node: Node) -> str:
     return f"{node.get_fully_qualified_name()} (PID {os.getpid()})"
 
 
-def run_recovery(patience: float) -> int:
-    """Let the arm down, if one was left behind; return the exit code, 0 if its motors are off.
-
-    patience: s for the watchdog to do so first.
-    """
+def main() -> None:
+    """Entry point of the executable `can_bridge`; with RECOVER, the exit code is 0 if no motor is on."""
+    if not (patience := os.environ.get(RECOVER)):
+        raise SystemExit(run(CanBridge, priority=20))
     keep_to_this_machine()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("can_bridge", automatically_declare_parameters_from_overrides=True)
     try:
-        take_over(_declared(node)[1], _owner(node), node.get_logger().error, patience).release()
-        return 0
+        take_over(_declared(node)[1], _owner(node), node.get_logger().error, float(patience)).release()
     except ExoGravityError as error:
         node.get_logger().error(str(error))
-        return 1
-
-
-def main() -> None:
-    """Entry point of the executable `can_bridge`."""
-    patience = os.environ.get(RECOVER)
-    raise SystemExit(run_recovery(float(patience)) if patience else run(CanBridge, priority=20))
+        raise SystemExit(1) from None

@@ -22,16 +22,9 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
+from exo_gravity.core.compensation import params
 from exo_gravity.core.compensation.compensator import Answer, Compensator
 from exo_gravity.core.compensation.limiter import CommandFade, Output
-from exo_gravity.core.compensation.params import (
-    COMPENSATOR,
-    MAX_JOINTS,
-    compensator_table,
-    settings_of,
-    urdf_settings_of,
-    urdf_table,
-)
 from exo_gravity.core.compensation.settings import URDF_LAW, Settings, UrdfSettings
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.anfis import AnfisLaw
@@ -56,13 +49,13 @@ def declared(node: Node) -> tuple[Sequence[Param], dict[str, Any], Read]:
     """
     given = node.get_parameters_by_prefix("")
     if "law" not in given or given["law"].value != URDF_LAW:
-        table = compensator_table(given)
+        table = params.compensator_table(given)
         return table, declare(node, table), _settings
-    table = urdf_table(len(_joint_names(node)), given)
+    table = params.urdf_table(len(_joint_names(node)), given)
     _forget_unused(node, {param.name for param in table})
     values = declare(node, table)
     model = UrdfArm(_description(node, values), values["joint_names"])
-    return table, values, lambda values: urdf_settings_of(values, model)
+    return table, values, lambda values: params.urdf_settings_of(values, model)
 
 
 def _settings(values: dict[str, Any]) -> Settings:
@@ -72,7 +65,7 @@ def _settings(values: dict[str, Any]) -> Settings:
         anfis = AnfisLaw.load(Path(path).read_text(encoding="utf-8")) if path else None
     except (OSError, UnicodeDecodeError, DataError) as error:
         raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
-    return settings_of(values, anfis)
+    return params.settings_of(values, anfis)
 
 
 def sentence(s: Settings | UrdfSettings) -> str:
@@ -110,7 +103,7 @@ def report(control: Compensator, answer: Answer, names: Sequence[str]) -> dict[s
 
 def _forget_unused(node: Node, used: set[str]) -> None:
     """Undeclare the parameters of the exoskeleton's own arm, which a file may have, and log them."""
-    unused = [param.name for param in COMPENSATOR if param.name not in used and node.has_parameter(param.name)]
+    unused = [param.name for param in params.COMPENSATOR if param.name not in used and node.has_parameter(param.name)]
     for name in unused:
         node.undeclare_parameter(name)
     if unused:
@@ -119,8 +112,8 @@ def _forget_unused(node: Node, used: set[str]) -> None:
 
 def _joint_names(node: Node) -> list[str]:
     names = list(node.get_parameter("joint_names").value or ()) if node.has_parameter("joint_names") else []
-    if not 1 <= len(set(names)) == len(names) <= MAX_JOINTS:
-        raise ParameterError("joint_names", names, f"1 to {MAX_JOINTS} different joints of the URDF")
+    if not 1 <= len(set(names)) == len(names) <= params.MAX_JOINTS:
+        raise ParameterError("joint_names", names, f"1 to {params.MAX_JOINTS} different joints of the URDF")
     return names
 
 

@@ -203,7 +203,7 @@ class TiltSubscription:
 
     on_refusal(topic, error): a message is impossible; the last tilt then grows old. on_intruder(topic): a second
     publisher sends on it. on_motion(now, specific force (3,) m/s^2, angular velocity (3,) rad/s, age in s): a sample
-    of the trunk's motion, in its axes, under `lock` too.
+    of the trunk's motion, in its axes, under `lock` too. on_tilt(now): `target` has a message of `now`, in s.
     """
 
     def __init__(
@@ -211,12 +211,14 @@ class TiltSubscription:
         node: Node,
         target: TiltInput | Tilted,
         lock: threading.Lock,
-        on_refusal: Callable[[str, ParameterError], object],
-        on_intruder: Callable[[str], object],
-        on_motion: Callable[..., object] | None = None,
+        on_refusal: Callable[[str, ParameterError], object] = lambda topic, error: None,
+        on_intruder: Callable[[str], object] = lambda topic: None,
+        on_motion: Callable[..., object] = lambda *sample: None,
+        on_tilt: Callable[[float], object] = lambda now: None,
     ) -> None:
         self._node, self._target, self._lock = node, target, lock
         self._on_refusal, self._on_intruder, self._on_motion = on_refusal, on_intruder, on_motion
+        self._on_tilt = on_tilt
         self._senders = {topic: SolePublisher(node, topic) for topic in (DATA, PITCH_YAW)}
         node.create_subscription(Imu, DATA, self._on_data, NEWEST)
         node.create_subscription(Vector3Stamped, PITCH_YAW, self._on_pitch_yaw, NEWEST)
@@ -230,7 +232,7 @@ class TiltSubscription:
         def set_gravity(now: float, age: float) -> None:
             x, y, z = up_in_body(unit_quaternion("orientation", (q.x, q.y, q.z, q.w)))
             self._target.set_gravity(now, (-x, -y, -z), rate, age)
-            if self._on_motion and message.linear_acceleration_covariance[0] != NOT_REPORTED:
+            if message.linear_acceleration_covariance[0] != NOT_REPORTED:
                 self._on_motion(now, (a.x, a.y, a.z), rate, age)
 
         self._pass_on(DATA, message.header.stamp, info, set_gravity)
@@ -248,6 +250,8 @@ class TiltSubscription:
         age = (self._node.get_clock().now().nanoseconds - to_nanoseconds(stamp)) * 1e-9
         try:
             with self._lock:
-                use(time.monotonic(), age)
+                now = time.monotonic()
+                use(now, age)
+                self._on_tilt(now)
         except ParameterError as error:
             self._on_refusal(topic, error)
