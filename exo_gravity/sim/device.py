@@ -5,8 +5,8 @@ Physics catches up with the clock in steps of 1 ms before a frame is processed, 
 present state of the arm. A reply is sent 200 to 400 us after its command, as measured on AK motors. V3 boards send
 status frames on their own timer, only in `run`.
 
-udp_multicast returns every frame to its sender, unmarked; most buses do not. A reply is therefore remembered until its
-echo arrives. If many replies were sent and no echo ever arrived, the bus does not echo.
+udp_multicast returns every frame to its sender, unmarked; most buses do not. An echo is known as no command: the first
+byte of a reply is its ID.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import math
 import operator
 import random
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 
 import can
@@ -27,7 +26,7 @@ from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, Frame
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim.arm import STEP, SimulatedArm, felt_in_base
-from exo_gravity.sim.motor import SimulatedMotor, SimulatedV3Motor, StatusTimer
+from exo_gravity.sim.motor import SimulatedMotor, SimulatedV3Motor
 from exo_gravity.sim.trunk_motion import TrunkMotion, TrunkState, motion_of
 from exo_gravity.sim.truth import TruthLog
 from exo_gravity.sim.virtual_wearer import VirtualWearer
@@ -35,7 +34,6 @@ from exo_gravity.sim.virtual_wearer import VirtualWearer
 REPLY_DELAY = (200e-6, 400e-6)  # s
 MAX_CATCH_UP = 0.05  # s of physics simulated at once; after a longer stall the rest of the time is lost
 IDLE_PERIOD = 0.005  # s after which physics advances even without a frame
-MAX_PENDING_ECHOES = 512  # twice the number of frames that a udp_multicast socket buffers
 
 
 class GapMeter:
@@ -63,51 +61,6 @@ class GapMeter:
             self._last_command = now
         self._powered = powered
         self._last_pass = now
-
-
-class CanLink:
-    """Receives commands from `bus` and sends replies to it. Raises BusError when the bus fails."""
-
-    def __init__(self, bus: can.BusABC) -> None:
-        self._bus = bus
-        self._pending: deque[Frame] = deque()  # echoes that have not arrived
-        self._echo_seen = False
-        self._no_echo = False
-
-    def receive(self, timeout: float) -> tuple[Frame | None, float]:
-        """Return the next frame that is not an echo, or None, and its age in s.
-
-        A remote frame is returned without data.
-        """
-        try:
-            message = self._bus.recv(timeout)
-        except can.CanOperationError as error:
-            # On udp_multicast a datagram without a CAN frame raises while it is unpacked: that is not a bus failure.
-            if error.__cause__ is None or isinstance(error.__cause__, OSError):
-                raise BusError(f"receiving on {self._bus.channel_info} failed: {error}") from error
-            return None, 0.0
-        if message is None or message.is_error_frame or message.is_fd:
-            return None, 0.0
-        frame = message.arbitration_id | (EXTENDED if message.is_extended_id else 0), bytes(message.data)
-        if frame in self._pending:
-            self._pending.remove(frame)
-            self._echo_seen = True
-            return None, 0.0
-        return frame, max(0.0, time.time() - message.timestamp)
-
-    def send(self, frame: Frame) -> None:
-        """Send a reply or a status frame."""
-        if not self._no_echo:
-            self._pending.append(frame)
-            if len(self._pending) > MAX_PENDING_ECHOES:
-                self._no_echo = not self._echo_seen
-                self._pending.clear()
-        frame_id, data = frame
-        message = can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED)
-        try:
-            self._bus.send(message)
-        except can.CanError as error:
-            raise BusError(f"sending on {self._bus.channel_info} failed: {error}") from error
 
 
 class SimulatedDevice:
@@ -150,7 +103,6 @@ class SimulatedDevice:
 
     @property
     def time(self) -> float:
-        """Simulated time in s."""
         return self._steps * STEP
 
     @property
@@ -218,13 +170,14 @@ class SimulatedDevice:
 
         on_idle(now), `now` in monotonic s, is called whenever no reply is due, at the latest 5 ms after the last frame.
         """
-        link = CanLink(bus)
         outbox: list[tuple[float, Frame]] = []  # replies by the time at which they are due, a heap
         last = time.monotonic()
-        timer = StatusTimer(self.motors, last, self._random)
+        boards = {joint: motor for joint, motor in enumerate(self.motors) if isinstance(motor, SimulatedV3Motor)}
+        periods = {joint: 1.0 / motor.firmware.status_rate for joint, motor in boards.items()}
+        reports = {joint: last + self._random.uniform(0.0, period) for joint, period in periods.items()}  # next
         while not should_stop():
-            due = min(last + IDLE_PERIOD, timer.next, outbox[0][0] if outbox else math.inf)
-            frame, age = link.receive(max(0.0, due - time.monotonic()))
+            due = min(last + IDLE_PERIOD, *reports.values(), outbox[0][0] if outbox else math.inf)
+            frame, age = self._receive(bus, max(0.0, due - time.monotonic()))
             now = time.monotonic()
             self.gaps.note(now, self.powered, frame is not None)
             self.slip += max(0.0, now - last - MAX_CATCH_UP)
@@ -234,12 +187,31 @@ class SimulatedDevice:
                 delay = self._random.uniform(*REPLY_DELAY) - min(age, REPLY_DELAY[0])
                 heapq.heappush(outbox, (now + delay, reply))
             while outbox and outbox[0][0] <= time.monotonic():
-                link.send(heapq.heappop(outbox)[1])
-            for joint in timer.due(last):
-                if frame := self.status(joint):
-                    link.send(frame)
+                _send(bus, heapq.heappop(outbox)[1])
+            for joint, period in periods.items():
+                if reports[joint] <= last:
+                    following = reports[joint] + period
+                    reports[joint] = following if following > last else last + period  # missed ones are not made up
+                    if frame := self.status(joint):
+                        _send(bus, frame)
             if not outbox:
                 on_idle(last)
+
+    def _receive(self, bus: can.BusABC, timeout: float) -> tuple[Frame | None, float]:
+        """Return the next command, or None, and its age in s. A remote frame is returned without data."""
+        try:
+            message = bus.recv(timeout)
+        except can.CanOperationError as error:
+            # On udp_multicast a datagram without a CAN frame raises while it is unpacked: that is not a bus failure.
+            if error.__cause__ is None or isinstance(error.__cause__, OSError):
+                raise BusError(f"receiving on {bus.channel_info} failed: {error}") from error
+            return None, 0.0
+        if message is None or message.is_error_frame or message.is_fd:
+            return None, 0.0
+        frame_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
+        if frame_id not in self._joint_of_id or list(message.data[:1]) == [frame_id]:
+            return None, 0.0
+        return (frame_id, bytes(message.data)), max(0.0, time.time() - message.timestamp)
 
     def _steady(self, duration: float) -> bool:
         """Return whether no torque changes for `duration` s, so that MuJoCo can make all of its steps at once."""
@@ -260,7 +232,6 @@ class SimulatedDevice:
             self._move_base(state)
 
     def _move_base(self, state: TrunkState) -> None:
-        """Let the base of the arm move with the trunk."""
         if state != self._base:
             self._base = state
             self.arm.move_base(*felt_in_base(self.side, state, self.arm.config.links.gravity))
@@ -270,7 +241,8 @@ class SimulatedDevice:
             self._power_returns = math.inf
             for motor in self.motors:
                 motor.unplugged = False
-        torque = list(map(SimulatedMotor.advance, self.motors, theta, velocity, (count * STEP,) * JOINT_COUNT))
+        at = zip(self.motors, theta, velocity, strict=True)
+        torque = [motor.advance(angle, speed, count * STEP) for motor, angle, speed in at]
         given: Torque = NO_TORQUE
         step = None
         if self._trial is not None:
@@ -281,3 +253,11 @@ class SimulatedDevice:
             self.truth.note(self.time, theta, velocity, torque, self.motors, self._frames, (given, step))
         self.arm.step(list(map(operator.add, torque, given)), count)
         self._steps += count
+
+
+def _send(bus: can.BusABC, frame: Frame) -> None:
+    frame_id, data = frame
+    try:
+        bus.send(can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED))
+    except can.CanError as error:
+        raise BusError(f"sending on {bus.channel_info} failed: {error}") from error

@@ -16,7 +16,7 @@ from rclpy.executors import SingleThreadedExecutor
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 
-from exo_gravity.hardware import ImuSample, TrunkEstimator
+from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 from exo_gravity.nodes.ros.messages import to_nanoseconds, to_time
 
 from ..support.handheld_imu import read_recording

@@ -98,16 +98,6 @@ def test_an_echo_that_the_bus_marks_is_not_taken_for_a_command():
         assert next_reply(host, timeout=0.05) is None
 
 
-def test_on_a_bus_without_echo_a_command_with_the_bytes_of_a_reply_is_executed():
-    options = {"interface": "virtual", "channel": f"device-{next(channels)}"}
-    with running(make_device(), options) as host:
-        for _ in range(device_module.MAX_PENDING_ECHOES + 5):
-            host.send(frame(1, command(0)))
-            reply = next_reply(host)
-        host.send(frame(1, bytes(reply.data)))
-        assert next_reply(host) is not None
-
-
 def test_frames_that_are_not_for_a_motor_are_ignored(options):
     device = make_device()
     foreign_frames = [

@@ -8,9 +8,8 @@ A motor obeys every sender. A command to one of our motors that we did not send 
 full damping: until then the other sender's torque acts, and no damping. What it moves the joint in between must not add
 up, so for a while all our commands to that motor also hold the joint. To know a foreign command, echoes of our own
 frames are set apart: most buses return none. Some return them and mark them (`is_rx` is false). udp_multicast returns
-them unmarked, in order. The first frames show whether a bus echoes. SocketCAN sets the same mark on every frame from
-this computer, also on those of another process (Documentation/networking/can.rst of Linux, MSG_DONTROUTE): there it
-does not show an echo.
+them unmarked, in order. SocketCAN sets the same mark on every frame from this computer, also on those of another process
+(Documentation/networking/can.rst of Linux, MSG_DONTROUTE): there it does not show an echo.
 
 A zero command precedes the frames that switch a V1 or V2 board on or off: the motor remembers its last command, and
 ENTER would carry it out. A command switches a V3 board on, so it gets none while the arm is off.
@@ -24,14 +23,14 @@ from __future__ import annotations
 import contextlib
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from itertools import chain
 
 import can
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, REPLY, Frame, WireFormat
+from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, REPLY, Frame
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import OFF, Drive
 from exo_gravity.core.safety.limits import DAMPING, UNKNOWN, JointSample
@@ -51,10 +50,7 @@ HOLD_STIFFNESS = 60.0  # Nm/rad by which a contested motor holds its joint: the 
 HOLD_REACH = 0.15  # rad at most from where the joint is,
 HOLD_SPEED = 0.3  # rad/s with which the held position follows the joint
 FOREIGN_COMMAND = "foreign command"
-TRIAL = 32  # frames sent until it is known whether the bus echoes
 MOST_AWAITED = 512  # twice the frames that a udp_multicast socket keeps unread
-
-Group = tuple[WireFormat, frozenset[int]]  # the motors of one format
 
 
 class MotorBus:
@@ -84,7 +80,7 @@ class MotorBus:
         self.clock = clock
         self._now = clock.monotonic
         self._port = CanPort(bus, clock, reopen)
-        self._filter = FrameFilter(motors, self._port.marks_echoes)
+        self._filter = FrameFilter(motors, self._port.marks_echoes, self._port.echoes)
         self._motors = tuple(motors)
         self._asked = frozenset(joint for joint, motor in enumerate(motors) if motor.wire_format.replies)
         self._joint_of = {motor.can_id: joint for joint, motor in enumerate(motors)}
@@ -135,19 +131,17 @@ class MotorBus:
         self._note(drive._replace(powered=self.may_be_powered))
         self._is_confirming = not self._powered and self._exit_sent > -math.inf
         self._drain()
-        if drive.powered:
-            self._switch_on(drive)
+        if drive.powered and not self._powered:
+            self._powered, self._exit_sent = True, -math.inf
+            if not any(drive.unsure):
+                self._send_commands(OFF)
+                for motor in self._motors:
+                    self._send(*motor.enter)
         self._send_commands(drive)
         if not drive.powered:
             self._switch_off()
         self._answered.clear()
-        while len(self._answered) < JOINT_COUNT:
-            remaining = deadline - self._now()
-            message = self._port.receive(max(0.0, remaining))
-            if message is not None:
-                self._take(message)
-            if remaining <= 0.0:
-                break
+        self.receive_until(deadline, lambda: len(self._answered) == JOINT_COUNT)
         self._port.confirm()
         return len(self._answered) == JOINT_COUNT
 
@@ -166,7 +160,7 @@ class MotorBus:
         if not all(frames):
             raise BusError(f"set_zero: motor {self._motors[frames.index(())].can_id} has a board without such a frame")
         self._send_commands(OFF)
-        self._send_each(frames)
+        self._send(*chain.from_iterable(frames))
 
     def stop(self) -> bool:
         """Send the last frames, a zero command and EXIT, twice; then close the bus. Never raises.
@@ -195,20 +189,11 @@ class MotorBus:
         """Close the bus without any frame. Never raises."""
         self._port.close()
 
-    def _switch_on(self, drive: Drive) -> None:
-        if self._powered:
-            return
-        self._powered, self._exit_sent = True, -math.inf
-        if not any(drive.unsure):
-            self._send_commands(OFF)
-            self._send_each([motor.enter for motor in self._motors])
-
     def _switch_off(self) -> None:
         period = UNCONFIRMED_EXIT_PERIOD if self._unconfirmed else EXIT_PERIOD
         if self._powered or self._now() - self._exit_sent > period:
             for joint, motor in enumerate(self._motors):
-                zero = () if joint in self._asked else self._zero_command(joint)
-                self._send_each((zero, motor.exit))
+                self._send(*(() if joint in self._asked else self._zero_command(joint)), *motor.exit)
             self._exit_sent = self._now()
         self._powered = False
 
@@ -225,16 +210,13 @@ class MotorBus:
                 continue
             command = self._command(joint)
             if drive.enter[joint]:
-                self._send_each([(command, *motor.enter)])
+                self._send(command, *motor.enter)
             self._send(command)
 
-    def _send_each(self, frames: Iterable[Sequence[Frame]]) -> None:
-        for frame in chain.from_iterable(frames):
-            self._send(frame)
-
-    def _send(self, frame: Frame) -> None:
-        self._filter.sent(frame)
-        self._port.send(frame)
+    def _send(self, *frames: Frame) -> None:
+        for frame in frames:
+            self._filter.sent(frame)
+            self._port.send(frame)
 
     def _drain(self) -> None:
         """Read replies that arrived after their cycle, so that they are not taken for replies to this one."""
@@ -296,28 +278,28 @@ class MotorBus:
         command = self._command(joint)
         is_exit = foreign in [data for _, data in motor.exit]
         if is_exit or now - self._corrected[joint] >= CORRECTION_PERIOD:
-            self._send_each([(command, *motor.enter) if is_exit else (), (command,)])
+            self._send(*((command, *motor.enter) if is_exit else ()), command)
             self._corrected[joint] = now
 
 
 class FrameFilter:
-    """Knows `motors` and which frames were sent. marks_echoes: whether `is_rx` is false for echoes only."""
+    """Knows `motors` and which frames were sent.
 
-    def __init__(self, motors: Sequence[JointMotor], marks_echoes: bool = True) -> None:
-        self._standard = _groups(motors, is_extended=False)
-        self._extended = _groups(motors, is_extended=True)
+    marks_echoes: whether `is_rx` is false for echoes only. echoes: whether sent frames come back unmarked.
+    """
+
+    def __init__(self, motors: Sequence[JointMotor], marks_echoes: bool = True, echoes: bool = False) -> None:
+        of = {
+            motor.wire_format: frozenset(m.can_id for m in motors if m.wire_format == motor.wire_format)
+            for motor in motors
+        }
+        # The motors of each format, by whether its IDs have 29 bits.
+        self._groups = {bits: [each for each in of.items() if each[0].is_extended is bits] for bits in (False, True)}
         self._marks_echoes = marks_echoes
-        self._awaited: deque[Frame] = deque(maxlen=MOST_AWAITED)  # sent, their echoes not yet received
-        self._sent = self._returned = 0
-        self._is_echoing: bool | None = None  # None: not yet known
+        # Sent, their echoes not yet received.
+        self._awaited: deque[Frame] = deque(maxlen=MOST_AWAITED if echoes else 0)
 
     def sent(self, frame: Frame) -> None:
-        """Note a frame that is being sent."""
-        if self._is_echoing is False:
-            return
-        if self._is_echoing is None and self._sent >= TRIAL:
-            self._is_echoing = self._returned >= TRIAL // 2
-        self._sent += 1
         self._awaited.append(frame)
 
     def sort(self, message: can.Message) -> tuple[str, int]:
@@ -325,7 +307,7 @@ class FrameFilter:
         if message.is_error_frame:
             return "error frame", 0
         is_extended = message.is_extended_id
-        groups = self._extended if is_extended else self._standard
+        groups = self._groups[is_extended]
         if message.is_remote_frame or message.is_fd or (is_extended and not groups):
             return "extended, remote or FD frame", 0
         frame_id = message.arbitration_id | EXTENDED if is_extended else message.arbitration_id
@@ -339,14 +321,8 @@ class FrameFilter:
         return "foreign frame", 0
 
     def _is_echo(self, frame: Frame) -> bool:
-        if self._is_echoing is False or frame not in self._awaited:
+        if frame not in self._awaited:
             return False
         while self._awaited.popleft() != frame:
             pass  # echoes come in order, so those before it are lost
-        self._returned += 1
         return True
-
-
-def _groups(motors: Sequence[JointMotor], is_extended: bool) -> tuple[Group, ...]:
-    formats = {motor.wire_format for motor in motors if motor.wire_format.is_extended is is_extended}
-    return tuple((each, frozenset(m.can_id for m in motors if m.wire_format == each)) for each in formats)
