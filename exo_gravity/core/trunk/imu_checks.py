@@ -7,16 +7,17 @@ cannot be the reason. The limits were set on the trials of docs/imu.md.
 from __future__ import annotations
 
 import math
+from operator import eq
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.model.rotation import ZERO, Floats3, Quaternion, rotated
 
 FROZEN_TIME, FROZEN_SAMPLES = 0.1, 10  # s of equal samples, and at least this many
-STUCK_SAMPLES = 5
+STUCK_SAMPLES = 5  # that repeat the value of an axis
 NEAR_GRAVITY = 0.15  # share of 1 g
 TURN = math.radians(3.0)
-STUCK_TURN = 0.1  # of gravity's unit vector along an axis
+STUCK_TURN = 0.09  # of gravity's unit vector along an axis
 
 CHECK_PERIOD = 0.0095  # s between two comparisons of gyroscope and accelerometer
 QUIET_TIME, QUIET = 0.15, 0.1  # s over which the acceleration must be near 1 g, by a share of 1 g
@@ -53,61 +54,51 @@ class EqualValues:
     Gyroscope and accelerometer of a MEMS IMU have noise, so their values differ from sample to sample (measured: no two
     samples in a row were equal in 13,514). A vector of zeros is not judged: some drivers fill in zeros for what the IMU
     does not measure. At rest coarse steps can hide the noise of one axis; so an axis is stuck only if the trunk turned
-    meanwhile: gravity by the estimate along the accelerometer's axis, or the accelerometer away from the estimate.
+    meanwhile: if the accelerometer shows another direction of gravity than the estimate.
     """
 
     def __init__(self) -> None:
         self.duration = 0.0  #: s for which whole samples have been equal
-        self._since, self._count = math.inf, 0  # of equal samples
+        self._since = math.inf  # s, of the first of them
         self._values: tuple[float, ...] = (math.nan,) * 6  # gyroscope and accelerometer
-        self._counts = [0.0] * 6  # of equal values; infinite for a stuck axis
-        self._ups = [0.0] * 6  # the estimate's vertical when the accelerometer's axis began to repeat its value
-        self._any_equal = False  # axes, by the last sample
+        self._repeats = [0.0] * 6  # of each value; infinite for a stuck axis
+        self._any = False  # repeats by the last sample
 
     def check(self, time: float, rate: Floats3, acceleration: Floats3 | None, up: Floats3 | None) -> None:
         """Raise ParameterError once the IMU is frozen, Contradiction once an axis is stuck, at the sample of `time` s.
 
         up: the vertical in the IMU's axes by an estimate from the samples before; None if there is none.
         """
-        last, values = self._values, rate + (acceleration or ZERO)
-        (a, b, c, d, e, f), (u, v, w, x, y, z) = last, values
-        self._values = values
-        if a != u and b != v and c != w and d != x and e != y and f != z and not self._any_equal:
-            self._since, self._count, self.duration = time, 1, 0.0
+        last, self._values = self._values, rate + (acceleration or ZERO)
+        if not any(map(eq, self._values, last)) and not self._any:
+            self._since, self.duration = time, 0.0
             return
-        if values == last and time > self._since:
-            self._count += 1
-            self.duration = time - self._since
-            if self._count >= FROZEN_SAMPLES and self.duration >= FROZEN_TIME and any(values):
-                expected = "different from sample to sample, as noise makes them: the IMU or its driver is frozen"
-                raise ParameterError("angular_velocity and linear_acceleration", list(values), expected)
+        pairs = zip(self._repeats, self._values, last, strict=True)
+        self._repeats = [count + 1.0 if value == before else 0.0 for count, value, before in pairs]
+        self._any, least = any(self._repeats), min(self._repeats)
+        self._since = min(self._since, time) if least else time
+        self.duration = time - self._since
+        if least + 1 >= FROZEN_SAMPLES and self.duration >= FROZEN_TIME and any(self._values):
+            expected = "different from sample to sample, as noise makes them: the IMU or its driver is frozen"
+            raise ParameterError("angular_velocity and linear_acceleration", list(self._values), expected)
+        most = max(self._repeats)
+        if least or most < STUCK_SAMPLES or acceleration is None:
             return
-        self._since, self._count, self.duration = time, 1, 0.0
-        if up is None or acceleration is None:
-            return
-        for axis in range(6):
-            if values[axis] != last[axis]:
-                self._counts[axis] = 0
-            elif self._is_stuck(axis, acceleration, up):
-                self._counts[axis] = math.inf
-                name, shown = ("angular_velocity", rate) if axis < 3 else ("linear_acceleration", acceleration)
-                expected = f"different from sample to sample while the trunk turns: the {'xyz'[axis % 3]} axis is stuck"
-                raise Contradiction(name, shown, expected)
-        self._any_equal = any(self._counts)
+        axis = self._repeats.index(most)
+        if most == math.inf or (up and _should_change(axis, up, acceleration)):
+            self._repeats[axis] = math.inf
+            name, shown = ("angular_velocity", rate) if axis < 3 else ("linear_acceleration", acceleration)
+            expected = f"different from sample to sample while the trunk turns: the {'xyz'[axis % 3]} axis is stuck"
+            raise Contradiction(name, shown, expected)
 
-    def _is_stuck(self, axis: int, acceleration: Floats3, up: Floats3) -> bool:
-        """Count an equal value; return whether it should have changed."""
-        if not self._counts[axis]:
-            self._ups[axis] = up[axis % 3]
-        self._counts[axis] += 1
-        if not STUCK_SAMPLES <= self._counts[axis] < math.inf:
-            return self._counts[axis] == math.inf
-        if axis >= 3:
-            return abs(up[axis - 3] - self._ups[axis]) > STUCK_TURN
-        norm = math.hypot(*acceleration)
-        x, y, z = acceleration
-        is_near = abs(norm / STANDARD_GRAVITY - 1.0) < NEAR_GRAVITY
-        return is_near and math.dist(up, (x / norm, y / norm, z / norm)) > TURN
+
+def _should_change(axis: int, up: Floats3, acceleration: Floats3) -> bool:
+    """Return whether gravity by the estimate is not what the accelerometer shows: for one of its axes, or at all."""
+    x, y, z = (component / STANDARD_GRAVITY for component in acceleration)
+    if axis >= 3:
+        return abs((x, y, z)[axis - 3] - up[axis - 3]) > STUCK_TURN
+    norm = math.hypot(x, y, z)
+    return abs(norm - 1.0) < NEAR_GRAVITY and math.dist(up, (x / norm, y / norm, z / norm)) > TURN
 
 
 class Agreement:
@@ -136,8 +127,8 @@ class Agreement:
         self._rate: Floats3 = ZERO  # rad/s, at the last comparison
         self._unlike = self._rest = self._contradicted = 0.0  # s
         self._age = 0.0  # s
+        self._since = ZERO, 0.0, 0  # since the last comparison: sum of the accelerations, s, samples
         self._mean: Floats3 = ZERO  # in 1 g
-        self._sum, self._span, self._count = ZERO, 0.0, 0  # of accelerations since the last comparison; s; samples
 
     def suspect(self) -> None:
         """Require that the two agree on a turn."""
@@ -161,25 +152,24 @@ class Agreement:
             raise ParameterError("gravity_in_imu", [round(-component, 2) for component in up], expected)
 
     def check(self, dt: float, quaternion: Quaternion, up: Floats3, acceleration: Floats3, rate: Floats3) -> None:
-        """Compare a fused orientation, and its world z axis `up` in the IMU's axes, with the mean of the accelerations.
+        """Compare a fused orientation, and its world z axis `up` in the IMU's axes, with the acceleration.
 
-        The mean is that since the last comparison, CHECK_PERIOD before.
+        This is the mean since the last comparison, CHECK_PERIOD before.
         """
-        (x, y, z), (a, b, c) = self._sum, acceleration
-        total = x + a, y + b, z + c
-        span, count = self._span + dt, self._count + 1
-        if span < CHECK_PERIOD and self._up:
-            self._sum, self._span, self._count = total, span, count
+        (x, y, z), (a, b, c), span, count = acceleration, *self._since
+        x, y, z, dt, count = x + a, y + b, z + c, dt + span, count + 1
+        if dt < CHECK_PERIOD and self._up:
+            self._since = (x, y, z), dt, count
             return
-        self._sum, self._span, self._count = ZERO, 0.0, 0
+        self._since = ZERO, 0.0, 0
         share = 1.0 / (count * STANDARD_GRAVITY)
-        mean = total[0] * share, total[1] * share, total[2] * share
-        spin_up = math.dist(rate, self._rate) / span if span else 0.0
+        mean = share * x, share * y, share * z
+        spin_up = math.dist(rate, self._rate) / dt if dt else 0.0
         self._rate = rate
         explained = min(MOST, LEVER * (spin_up + rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2))
         # Before and just after the first tilt nothing is lost by a refusal.
-        self._check_turns(span, up, mean, explained if self._age > AVERAGE_TIME else 0.0)
-        self._check_mean(span, rotated(quaternion, mean))
+        self._check_turns(dt, up, mean, explained if self._age > AVERAGE_TIME else 0.0)
+        self._check_mean(dt, rotated(quaternion, mean))
 
     def _check_turns(self, dt: float, up: Floats3, acceleration: Floats3, explained: float) -> None:
         """Compare the turns. acceleration: in 1 g; explained: the part of it that the rotation may cause."""
@@ -246,32 +236,32 @@ class ClockCheck:
     def __init__(self) -> None:
         self.offset = 0.0  #: s by which the clock may have gone wrong by the last sample
         self._end = math.inf  # s, of the present window
-        # s from stamp to arrival: shortest in this window and in the last one, before it began to drift, and ever
-        self._shortest = self._last = self._before = self._least = math.inf
-        self._drifts = 0  # windows in a row with a drift, < 0 for a fast clock
+        # s from stamp to arrival: shortest in this window, in the last one, and in all before that
+        self._shortest = self._last = self._least = math.inf
+        self._drift, self._windows = 0.0, 0  # s in how many windows in a row
 
     def check(self, time: float, arrival: float) -> None:
         """Check the stamp `time` of a sample that arrived at `arrival`, both s. Raises Contradiction."""
         lag = arrival - time
-        if lag < self._shortest:
-            self._shortest = lag
+        self._shortest = min(self._shortest, lag)
         if self._end == math.inf:
-            self._end, self._last, self._before = arrival + WINDOW, lag, lag
+            self._end, self._last = arrival + WINDOW, lag
         if arrival >= self._end:
             self._close(MAX_DRIFT * (WINDOW + arrival - self._end))
             self._end = arrival + WINDOW
-        self.offset = abs(lag - self._before) if lag > self._before or self._before <= self._least else 0.0
-        if abs(self._drifts) >= DRIFTING_WINDOWS and abs(self._last - self._before) > MAX_OFFSET:
-            drifted = f"{1e3 * (self._before - self._last):+.0f} ms in {WINDOW * abs(self._drifts):.1f} s"
+        before = self._last - self._drift
+        self.offset = abs(lag - before) if lag > before or before <= self._least else 0.0
+        if self._windows >= DRIFTING_WINDOWS and abs(self._drift) > MAX_OFFSET:
+            drifted = f"{-1e3 * self._drift:+.0f} ms in {WINDOW * self._windows:.1f} s"
             expected = f"by a clock as fast as this computer's, not one that gains {drifted}"
             raise Contradiction("stamp", round(time, 4), expected)
 
     def _close(self, limit: float) -> None:
         """End the window, in which a drift by more than `limit` s is one."""
-        step, least = self._shortest - self._last, min(self._least, self._last)
-        is_slow, is_fast = step > limit, step < -limit and self._last <= least
-        direction = is_slow - is_fast
-        if self._drifts * direction <= 0:
-            self._drifts, self._before = 0, self._last if direction else self._shortest
-        self._drifts += direction
-        self._last, self._least, self._shortest = self._shortest, least, math.inf
+        step, self._least = self._shortest - self._last, min(self._least, self._last)
+        drifts = step > limit or (step < -limit and self._last <= self._least)
+        if not drifts or step * self._drift < 0.0:
+            self._drift, self._windows = 0.0, 0
+        if drifts:
+            self._drift, self._windows = self._drift + step, self._windows + 1
+        self._last, self._shortest = self._shortest, math.inf

@@ -39,16 +39,15 @@ class TiltUncertainty:
     def restart(self) -> None:
         """Begin anew: nothing is known but the accelerometer."""
         self.variance = math.inf  #: of the tilt, rad^2
-        self._lost = 0.0  # rad^2, of gaps and saturation
-        self._run = 0.0  # rad lost in the present run of samples that do not show the rotation
-        self._is_losing = False  # whether the run goes on
+        self._lost = 0.0  # rad^2, of gaps and of runs of samples that did not show the rotation
+        self._run = self._last_run = 0.0  # rad lost in the present run, now and a sample before
         self._start = math.pi  # rad, error of the start
         self._age = 0.0  # s since the start
 
     @property
     def is_lost(self) -> bool:
         """Whether so much rotation was not measured that the estimate must begin anew."""
-        return SIGMAS * SIGMAS * self._lost > MAX_ERROR * MAX_ERROR
+        return SIGMAS * SIGMAS * (self._lost + self._run * self._run) > MAX_ERROR * MAX_ERROR
 
     @property
     def is_settled(self) -> bool:
@@ -57,9 +56,10 @@ class TiltUncertainty:
 
     def advance(self, dt: float, rate: Floats3, last_rate: Floats3) -> None:
         """Add the rotation that was not measured between the last sample and this one, `dt` s later."""
-        if not self._is_losing:
+        if self._run == self._last_run:  # the run is over; what different runs lose has different directions
+            self._lost += self._run * self._run
             self._run = 0.0
-        self._is_losing = False
+        self._last_run = self._run
         if dt <= 0.0:
             return
         self._age += dt
@@ -70,7 +70,7 @@ class TiltUncertainty:
             self._lost += max(LEAST_ACCELERATION**2, self._square) * (share * dt * dt) ** 2
         else:
             change = math.dist(rate, last_rate)
-            acceleration = change / (dt if dt > 0.5 * period else 0.5 * period)
+            acceleration = change / max(dt, 0.5 * period)
             if change * dt > JUMP and acceleration > UNUSUAL * math.sqrt(self._square):
                 self.lose(change * dt)
             self._square += (acceleration * acceleration - self._square) * dt / ACCELERATION_TIME
@@ -81,10 +81,8 @@ class TiltUncertainty:
         self.lose(0.5 * math.sqrt(self._square) * (2.0 * duration - dt) * dt)
 
     def lose(self, angle: float) -> None:
-        """Add an angle in rad; the angles of one run have one direction, those of different runs do not."""
-        self._lost += angle * (angle + 2.0 * self._run)  # the difference of the squares
+        """Add an angle in rad to those of this run of samples, which have one direction."""
         self._run += angle
-        self._is_losing = True
 
     def combine(self, bias_sigma: float, square: float, contradiction: float) -> None:
         """Add up the terms.
@@ -97,4 +95,5 @@ class TiltUncertainty:
         elif self._age >= SETTLE_TIME:  # a movement after a still start does not make it larger again
             self._start = min(self._start, math.sqrt(square) * CORRELATION_TIME / self._age)
         bias, contradiction = BIAS_TIME * bias_sigma, contradiction / SIGMAS
-        self.variance = BASE * BASE + bias * bias + self._start**2 + contradiction * contradiction + self._lost
+        lost = self._lost + self._run * self._run
+        self.variance = BASE * BASE + bias * bias + self._start**2 + contradiction * contradiction + lost

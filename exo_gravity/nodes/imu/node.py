@@ -107,7 +107,7 @@ class ImuNode(Node):
         self._pitch_yaw.publish(tilt)
         data = Imu(header=tilt.header)
         q, rate, acceleration = data.orientation, data.angular_velocity, data.linear_acceleration
-        q.x, q.y, q.z, q.w = orientation.orientation.tolist()
+        q.x, q.y, q.z, q.w = orientation.orientation
         variance = orientation.uncertainty**2
         data.orientation_covariance = np.diag((variance, variance, UNKNOWN_HEADING)).ravel()
         # In the trunk's axes. A covariance of zeros means unknown, one of -1 means not reported (REP-145).
