@@ -32,9 +32,9 @@ class Station(NamedTuple):
     cycles: int = 2
 
     @property
-    def ends(self) -> np.ndarray:
-        """Where the sweep begins and where it turns back, (2, 4) rad."""
-        return np.array(self.theta) + self.amplitude * np.array(((-1.0,), (1.0,)))
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where the sweep begins and where it turns back, (4,) rad each."""
+        return np.array(self.theta) - self.amplitude, np.array(self.theta) + self.amplitude
 
     @property
     def duration(self) -> float:
