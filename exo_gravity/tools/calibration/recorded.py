@@ -158,7 +158,7 @@ def _there_and_back(recording: Recording, there: slice, back: slice, direction: 
         ends = inside[[0, -1]]
         speeds.append(np.abs(np.diff(position[ends], axis=0)[0]) / np.diff(recording.time[ends]))
         sweeps.append((position[inside], _effort(recording, inside).astype(float)))
-    result = average(sweeps, np.zeros((4, 4)))
+    result = average(sweeps)
     sign = np.sign(position[there.stop - 1] - position[there.start])
     speed = np.mean(speeds, axis=0)
     return Observation(result.theta, direction, result.effort, sign * result.friction, result.spread, speed=speed)
