@@ -113,14 +113,13 @@ def _tilted(path: str | Path, side: str, start: int) -> np.ndarray:
     """Return the times in s at which the trunk was not upright; without an IMU it is taken as upright."""
     types = get_typestore(Stores.ROS2_JAZZY)
     times = []
-    for batch in Storage(path).batches(lambda topic, msgtype: (topic, msgtype) == (TILT_TOPIC, TILT_TYPE)):
-        for stamp, data in zip(batch.stamps, batch.data, strict=True):
-            try:
-                message: Any = types.deserialize_cdr(data, TILT_TYPE)
-            except (SerdeError, ValueError) as error:
-                raise DataError(f"{path}: cannot read {TILT_TOPIC} ({error})") from None
-            if not Tilt.of(side, pitch=message.vector.y, roll=message.vector.x).axis_angle <= UPRIGHT:
-                times.append((stamp - start) / 1e9)
+    for *_, stamp, data in Storage(path).messages(lambda topic, msgtype: (topic, msgtype) == (TILT_TOPIC, TILT_TYPE)):
+        try:
+            message: Any = types.deserialize_cdr(data, TILT_TYPE)
+        except (SerdeError, ValueError) as error:
+            raise DataError(f"{path}: cannot read {TILT_TOPIC} ({error})") from None
+        if not Tilt.of(side, pitch=message.vector.y, roll=message.vector.x).axis_angle <= UPRIGHT:
+            times.append((stamp - start) / 1e9)
     return np.array(times)
 
 

@@ -81,13 +81,12 @@ def messages_of(path: Path, topic: str, msgtype: str) -> Iterator[tuple[int, Any
     """Yield stamp in ns and message of each message of `topic` in a recording. Raises DataError if there are none."""
     storage, types = Storage(path), get_typestore(Stores.ROS2_JAZZY)
     found = False
-    for batch in storage.batches(lambda name, kind: (name, kind) == (topic, msgtype)):
-        for stamp, data in zip(batch.stamps, batch.data, strict=True):
-            try:
-                yield stamp, types.deserialize_cdr(data, batch.msgtype)
-            except (SerdeError, ValueError) as error:
-                raise DataError(f"{path}: {topic}: {error}") from None
-            found = True
+    for *_, stamp, data in storage.messages(lambda name, kind: (name, kind) == (topic, msgtype)):
+        try:
+            yield stamp, types.deserialize_cdr(data, msgtype)
+        except (SerdeError, ValueError) as error:
+            raise DataError(f"{path}: {topic}: {error}") from None
+        found = True
     if not found:
         topics = ", ".join(sorted(storage.topics)) or "none"
         raise DataError(f"{path}: no samples of {topic} ({msgtype}); its topics: {topics}")
