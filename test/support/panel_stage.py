@@ -157,7 +157,6 @@ class Stage:
         self._bridge = values_of(CAN_BRIDGE, BUS, "can.options")
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._play, daemon=True)
-        self.server.start()
         self._thread.start()
 
     def close(self) -> None:

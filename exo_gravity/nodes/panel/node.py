@@ -250,7 +250,6 @@ class Panel(Node):
             raise ExoGravityError(missing) from None
         address = (values["host"], values["port"], values["token"])
         self._server = PanelServer(*address, control, self._recordings.report, self._arms.parameters, time.monotonic)
-        self._server.start()
         self.create_timer(STATE_PERIOD, self._send_state)
         self.create_timer(DISCOVERY_PERIOD, self._arms.discover)
         self._log_address(values["host"], values["port"])
