@@ -38,7 +38,6 @@ KEYS: Mapping[str, frozenset[str]] = {
     "trial": frozenset({"name"}),
 }
 GONE = 2.0  # s without a confirmation; longer than a lease lasts, so that the next page finds the arm let down
-FORGOTTEN = 600.0  # s after which a page that is gone loses its number
 MAX_PAGES = 32
 BURST, REFILL = 20.0, 10.0  # requests that a page may send at once, and per second
 
@@ -128,10 +127,11 @@ class Control:
         A known secret is the same page, reloaded. A page holds control from the start if no other does, or if the other
         is gone.
         """
-        self._forget()
         page = self._pages.get(secret)
         now = self._clock()
         if page is None:
+            if len(self._pages) >= MAX_PAGES:  # those that are closed lose their numbers
+                self._pages = {known.secret: known for known in self._pages.values() if known.connected}
             if len(self._pages) >= MAX_PAGES:
                 return None
             self._numbers += 1
@@ -217,12 +217,3 @@ class Control:
             return False
         page.credit -= 1.0
         return True
-
-    def _forget(self) -> None:
-        """Drop pages that are long gone, and any that is closed if there are too many."""
-        now, full = self._clock(), len(self._pages) >= MAX_PAGES
-        for page in list(self._pages.values()):
-            if not page.connected and (full or now - page.seen > FORGOTTEN):
-                del self._pages[page.secret]
-                if page is self.holder:
-                    self.holder = None

@@ -9,7 +9,6 @@ arrive hundreds of times a second: their subscription keeps the newest message o
 from __future__ import annotations
 
 import asyncio
-import concurrent.futures
 import math
 import os
 import time
@@ -26,7 +25,6 @@ from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
@@ -44,6 +42,7 @@ STATE_PERIOD = 0.1  # s between two states that the pages get
 DISCOVERY_PERIOD = 0.5  # s between two searches for nodes
 CALL_TIMEOUT = 3.0  # s, longer than can_bridge itself waits
 ABSENT_TIMEOUT = 0.5  # s, where the service seems to be absent
+LOOK_PERIOD = 0.005  # s between two looks for an answer
 TILT = "/imu/pitch_yaw"
 BRIDGE, COMPENSATOR = "can_bridge", "compensator"
 SHOWN = {BRIDGE: "bridge", COMPENSATOR: "compensator"}  # what the page calls the status of each
@@ -192,20 +191,14 @@ def parameter_request(values: Mapping[str, Any]) -> SetParametersAtomically.Requ
 
 async def call(client: Client, request: Any) -> str:
     """Send `request` at once; return '' if it was carried out, else why not."""
-    done: concurrent.futures.Future[Any] = concurrent.futures.Future()
-
-    def answer(future: Future) -> None:
-        if done.set_running_or_notify_cancel():  # else it came too late
-            done.set_result(future.result())
-
     sent = client.call_async(request)
-    sent.add_done_callback(answer)
-    try:
-        timeout = CALL_TIMEOUT if client.service_is_ready() else ABSENT_TIMEOUT
-        response = await asyncio.wait_for(asyncio.wrap_future(done), timeout)
-    except asyncio.TimeoutError:
-        client.remove_pending_request(sent)
-        return f"{client.srv_name} does not answer"
+    deadline = time.monotonic() + (CALL_TIMEOUT if client.service_is_ready() else ABSENT_TIMEOUT)
+    while not sent.done():
+        if time.monotonic() > deadline:
+            client.remove_pending_request(sent)
+            return f"{client.srv_name} does not answer"
+        await asyncio.sleep(LOOK_PERIOD)
+    response: Any = sent.result()
     result = getattr(response, "result", response)
     if getattr(result, "successful", getattr(result, "success", False)):
         return ""
