@@ -6,7 +6,7 @@ What the firmware of V1 and V2 does (CubeMars driver manual V1.0.15; Ben Katz's 
 - SET_ZERO makes the present angle zero. It gets no reply, and the motor ignores frames while it writes its memory.
 - A command stays in force until the next one: the motor has no time-out.
 
-What a V3 board does (CubeMars driver manual V3.0.0; frames in core/motors/wire_formats/mit_v3.py):
+What a V3 board does (CubeMars driver manual V3.0.0; frames in core/motors/wire_formats.py):
 - A command in MIT mode switches the motor on and stays in force until the next one. A current is a command too; 0 A
   switches the motor off. Other control modes are ignored here.
 - It replies to nothing. It sends its state `status_rate` times a second, on or off.
