@@ -1,22 +1,28 @@
-"""The compensator's node with an outer loop and terms, in virtual time."""
+"""The compensator's node with an outer loop and terms, over real DDS in this process."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.nodes.compensator.node import CompensatorNode
+from exo_gravity.nodes.ros.run import keep_to_this_machine
 
 from ..support.joint_state_feeder import PARTS, POSE
-from ..support.virtual_ros import VirtualRos, start_ros
 
+keep_to_this_machine()
+pytestmark = pytest.mark.real_time  # efforts that are 50 ms late are faded, as they must be
 NAMES = [f"right_{part}" for part in PARTS]
 ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
 GRAVITY = gravity_torque(ROBOT, POSE)
@@ -25,19 +31,36 @@ STILL = (0.0,) * 4
 
 
 class Rig:
-    """A compensator, fed 200 times a second with joint states and, if `assisted`, with efforts of an outer loop."""
+    """A compensator, and a node that plays the bridge and the outer loop. added: (4,) Nm beyond gravity, the newest."""
 
-    def __init__(self, ros: VirtualRos) -> None:
-        start_ros("/right", use_imu=False)
-        self.ros, self.node = ros, CompensatorNode()
-        self.joint_states, self.assist = (
-            self.node.create_publisher(JointState, topic, 1) for topic in ("joint_states", "assist_efforts")
-        )
-        self.velocity, self.names, self.efforts, self.assisted = STILL, NAMES, ASSIST, False
-        ros.clock.every(0.005, self._send)
+    def __init__(self) -> None:
+        names = ["--ros-args", "-r", "__ns:=/right", "-p", "use_imu:=false"]
+        rclpy.init(args=names)
+        self.node = CompensatorNode()
+        self.user = rclpy.create_node("outer_loop")
+        self.executor, self._of_node = SingleThreadedExecutor(), SingleThreadedExecutor()
+        self.executor.add_node(self.user)
+        self._of_node.add_node(self.node)
+        self._closing = False
+        # On a separate thread, so that neither node keeps the other from sending.
+        self._thread = threading.Thread(target=self._spin)
+        self._thread.start()
+        self.joint_states = self.user.create_publisher(JointState, "joint_states", 1)
+        self.assist = self.user.create_publisher(JointState, "assist_efforts", 1)
+        self.added, self.velocity, self.names, self.efforts = np.full(4, np.nan), STILL, NAMES, ASSIST
+        self.values: dict[str, str] = {}
+        self.message = ""
+        self.user.create_subscription(JointState, "effort_commands", self._on_command, 1)
+        self.user.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+        self.assisted, self.without = False, 0  # number of successive commands without addition
+        self.user.create_timer(0.005, self._send)
+
+    def _spin(self) -> None:
+        while not self._closing:
+            self._of_node.spin_once(timeout_sec=0.05)
 
     def _send(self) -> None:
-        stamp = self.ros.now().to_msg()
+        stamp = self.user.get_clock().now().to_msg()
         states = JointState(name=NAMES, position=POSE, velocity=self.velocity)
         states.header.stamp = stamp
         self.joint_states.publish(states)
@@ -46,56 +69,65 @@ class Rig:
             efforts.header.stamp = stamp
             self.assist.publish(efforts)
 
-    @property
-    def message(self) -> str:
-        return self.ros.status("right/compensator").message
+    def _on_command(self, message: JointState) -> None:
+        self.added = np.subtract(message.effort, GRAVITY) if message.effort else np.full(4, np.nan)
+        self.without = self.without + 1 if self.adds(STILL) else 0
 
-    def reports(self, key: str) -> str:
-        """Return the newest value of `key` on /diagnostics."""
-        return {item.key: item.value for item in self.ros.status("right/compensator").values}[key]
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name == "right/compensator":
+                self.message, self.values = status.message, {item.key: item.value for item in status.values}
 
     def set(self, **values: object) -> list[str]:
         """Set parameters (`__` for a dot) and return why each was refused, '' if it was not."""
         changes = [Parameter(name.replace("__", "."), value=value) for name, value in values.items()]
         return [result.reason for result in self.node.set_parameters(changes)]
 
-    def is_assisted(self) -> bool:
-        return self.adds(ASSIST)
+    def wait_until(self, condition: Callable[[], object]) -> None:
+        end = time.monotonic() + 20.0
+        while not condition():
+            assert time.monotonic() < end, (self.added, self.message, self.values)
+            self.executor.spin_once(timeout_sec=0.01)
 
-    def adds(self, torque: tuple[float, ...]) -> bool:
-        """Return whether the newest efforts are gravity's and these, (4,) Nm."""
-        newest = self.ros.messages["/right/effort_commands"][-1:]
-        return bool(newest and newest[0].effort) and np.allclose(np.subtract(newest[0].effort, GRAVITY), torque)
+    def close(self) -> None:
+        self._closing = True
+        self._thread.join()
+        self.node.close()
+        self._of_node.shutdown()
+        self.executor.shutdown()
+        self.user.destroy_node()
+        self.node.destroy_node()
+        rclpy.try_shutdown()
+
+    def adds(self, torque: tuple[float, ...], tolerance: float = 1e-6) -> bool:
+        return bool(np.allclose(self.added, torque, atol=tolerance))
 
 
-@pytest.fixture
-def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
-    """A node that carries the arm, without terms and without efforts of the outer loop."""
-    rig = Rig(VirtualRos(monkeypatch))
-    rig.ros.wait_until(lambda: rig.adds(STILL))
+@pytest.fixture(scope="module")
+def running() -> Iterator[Rig]:
+    rig = Rig()
     yield rig
-    rclpy.try_shutdown()
+    rig.close()
 
 
 @pytest.fixture
-def assisted(rig: Rig) -> Rig:
-    """The same, to which the outer loop's efforts are added."""
-    rig.assisted = True
-    rig.set(assist__max_effort=[1.0] * 4)
-    rig.ros.wait_until(rig.is_assisted)
-    return rig
+def rig(running: Rig) -> Iterator[Rig]:
+    """The node of this module, without terms and without efforts of the outer loop."""
+    yield running
+    running.assisted, running.velocity = False, STILL
+    running.set(assist__max_effort=[0.0] * 4, friction__share=0.0)
+    running.wait_until(lambda: running.adds(STILL))
 
 
 def test_efforts_of_the_outer_loop_are_added_and_the_arm_stays_carried_without_them(rig):
     rig.assisted = True
-    rig.ros.clock.run(2.0)
-    assert rig.adds(STILL) and rig.reports("assist") == "off"
+    rig.wait_until(lambda: rig.adds(STILL) and rig.values.get("assist") == "off")
     assert rig.set(assist__max_effort=[1.0] * 4) == [""]
-    rig.ros.clock.run(2.0)
-    assert rig.is_assisted() and (rig.reports("assist"), rig.reports("terms")) == ("assisting", "assist")
+    rig.wait_until(lambda: rig.adds(ASSIST))
+    rig.wait_until(lambda: rig.values["assist"] == "assisting" and rig.values["terms"] == "assist")
     rig.assisted = False
-    rig.ros.clock.run(2.0)
-    assert rig.adds(STILL) and rig.reports("assist") == "waiting: assist_efforts stopped"
+    rig.wait_until(lambda: rig.adds(STILL))
+    rig.wait_until(lambda: rig.values["assist"] == "waiting: assist_efforts stopped")
     assert rig.message == "compensating"
 
 
@@ -103,35 +135,39 @@ def test_efforts_of_the_outer_loop_are_added_and_the_arm_stays_carried_without_t
     ("names", "efforts", "reason"),
     [(NAMES, (math.nan, 0.0, 0.0, 0.0), "must be numbers within 40 Nm"), (["x", *NAMES[1:]], ASSIST, "must name")],
 )
-def test_wrong_efforts_are_withdrawn_and_reported_while_gravity_compensation_goes_on(assisted, names, efforts, reason):
-    assisted.names, assisted.efforts = names, efforts
-    assisted.ros.clock.run(2.0)
-    assert assisted.adds(STILL)
-    assert assisted.message.startswith("gravity compensation alone: ") and reason in assisted.message
-    assisted.names, assisted.efforts = NAMES, ASSIST
-    assisted.ros.clock.run(2.0)
-    assert assisted.is_assisted() and assisted.message == "compensating"
+def test_wrong_efforts_are_withdrawn_and_reported_while_gravity_compensation_goes_on(rig, names, efforts, reason):
+    rig.assisted = True
+    rig.set(assist__max_effort=[1.0] * 4)
+    rig.wait_until(lambda: rig.adds(ASSIST))
+    rig.names, rig.efforts = names, efforts
+    rig.wait_until(lambda: rig.adds(STILL))
+    rig.wait_until(lambda: rig.message.startswith("gravity compensation alone: ") and reason in rig.message)
+    rig.names, rig.efforts = NAMES, ASSIST
+    rig.wait_until(lambda: rig.adds(ASSIST) and rig.message == "compensating")
 
 
-def test_a_second_outer_loop_ends_the_assistance_of_both(assisted):
-    other = assisted.node.create_publisher(JointState, "assist_efforts", 1)
+def test_a_second_outer_loop_ends_the_assistance_of_both(rig):
+    rig.assisted = True
+    rig.set(assist__max_effort=[1.0] * 4)
+    rig.wait_until(lambda: rig.adds(ASSIST))
+    other = rig.user.create_publisher(JointState, "assist_efforts", 1)
     message = JointState(name=NAMES, effort=(0.0, 1.0, 0.0, 0.0))
 
     def send() -> None:
-        message.header.stamp = assisted.ros.now().to_msg()
+        message.header.stamp = rig.user.get_clock().now().to_msg()
         other.publish(message)
 
-    end = assisted.ros.clock.every(0.007, send)
-    assisted.ros.clock.run(2.0)
-    assert assisted.adds(STILL) and "more than one publisher" in assisted.message
-    end()
-    assisted.ros.wait_until(assisted.is_assisted)
+    timer = rig.user.create_timer(0.007, send)
+    rig.wait_until(lambda: rig.adds(STILL) and "more than one publisher" in rig.message)
+    timer.cancel()
+    rig.wait_until(lambda: rig.adds(ASSIST))
 
 
 def test_terms_are_set_live_and_need_velocities(rig):
     rig.velocity = (0.15, -0.15, 0.0, 0.0)  # a change of load waits for slow joints
+    rig.wait_until(lambda: rig.adds(STILL))
     assert rig.set(friction__coulomb=[0.2, 0.4, 0.2, 0.2], friction__share=0.5) == ["", ""]
-    rig.ros.wait_until(lambda: rig.adds((0.1, -0.2, 0.0, 0.0)))
-    rig.ros.wait_until(lambda: rig.reports("terms") == "friction")
+    rig.wait_until(lambda: rig.adds((0.1, -0.2, 0.0, 0.0)))
+    rig.wait_until(lambda: rig.values["terms"] == "friction")
     rig.velocity = ()
-    rig.ros.wait_until(lambda: rig.adds(STILL))
+    rig.wait_until(lambda: rig.adds(STILL))
