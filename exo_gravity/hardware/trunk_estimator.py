@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.rotation import ZERO, Floats3, Quaternion, product, unit_quaternion, up_in_body
+from exo_gravity.core.model.rotation import ZERO, Floats3, Quaternion, plus, product, unit_quaternion, up_in_body
 from exo_gravity.core.model.tilt import angle_between, pitch_roll, rotation_matrix
 from exo_gravity.core.numbers import one_float
 from exo_gravity.core.trunk.imu_checks import Agreement, ClockCheck, Contradiction, EqualValues
@@ -74,8 +74,8 @@ class TrunkOrientation(NamedTuple):
 class TrunkEstimator:
     """Follows one IMU; where VQF is installed, it need not report its orientation."""
 
-    _why: str  # there is no orientation yet
-    _speed: float  # rad/s, the highest in the last second
+    _agreement = Agreement()
+    _speed = 0.0  # rad/s, the highest in the last second
     _up: Floats3 | None  # the world's z axis in the IMU's axes, by the last sample
     _last_rate: Floats3 | None
     _last_acceleration: Floats3 | None
@@ -104,8 +104,7 @@ class TrunkEstimator:
         limit = f"accelerometer_range = {strongest:.4g} m/s^2 along each axis"
         self._accelerometer = "linear_acceleration", strongest, limit
         self._fusion = VqfFusion(self._period) if VQF else None
-        self._uncertainty = TiltUncertainty(self._period)
-        self._equal, self._agreement, self._clock = EqualValues(), Agreement(), ClockCheck()
+        self._equal, self._clock = EqualValues(), ClockCheck()
         self._is_fused: bool | None = None  # None before the first sample
         self._time = -math.inf
         self._restart("no sample yet")
@@ -134,8 +133,7 @@ class TrunkEstimator:
             if arrival is not None:
                 self._clock.check(self._time, arrival)
         except Contradiction as error:
-            self._agreement.suspect()
-            self._restart(f"{error.name} must be {error.expected}")
+            self._restart(f"{error.name} must be {error.expected}", is_suspect=True)
             raise
         if self._agreement.is_suspect or not self._uncertainty.is_settled:
             return None
@@ -160,7 +158,7 @@ class TrunkEstimator:
 
     def _fused(self, sample: ImuSample) -> Quaternion:
         """Return the IMU's orientation, world from IMU, by gyroscope and accelerometer."""
-        fusion, uncertainty = self._fusion, self._uncertainty
+        fusion = self._fusion
         if fusion is None:
             raise ParameterError("orientation", None, "reported by the IMU, or install vqf to fuse it")
         rate, is_saturated = in_range(sample.angular_velocity, *self._gyroscope)
@@ -168,23 +166,18 @@ class TrunkEstimator:
         check_living(force, self._last_acceleration)
         acceleration = None if is_cut else force
         dt = self._step(sample, rate, acceleration, None if is_saturated else self._up)
-        last_rate = self._last_rate or rate
-        uncertainty.advance(dt, rate, last_rate)
-        if self._equal.duration:
-            uncertainty.repeat(dt, self._equal.duration)
-        elif is_saturated:
-            uncertainty.lose(OVERSHOOT * self._gyroscope[1] * dt)
-        if uncertainty.is_lost:
+        unknown = OVERSHOOT * self._gyroscope[1] if is_saturated else 0.0
+        self._uncertainty.advance(dt, rate, self._last_rate or rate, unknown, self._equal.duration)
+        if self._uncertainty.is_lost:
             self._restart("too much rotation was not measured")
-            last_rate = rate
-        quaternion = fusion.advance(dt, rate, last_rate, acceleration)
+        quaternion = fusion.advance(dt, rate, self._last_rate or rate, acceleration)
         self._last_rate, self._last_acceleration = rate, acceleration
         self._up = up_in_body(quaternion)
         if acceleration:
             self._agreement.check(dt, quaternion, self._up, acceleration, rate)
         self._speed = max(abs(rate[0]) + abs(rate[1]) + abs(rate[2]), self._speed * (1.0 - dt))
         contradiction = self._agreement.contradiction + self._speed * self._clock.offset
-        uncertainty.combine(fusion.bias_sigma, self._agreement.square, contradiction)
+        self._uncertainty.combine(fusion.bias_sigma, self._agreement.square, contradiction)
         return quaternion
 
     def _step(self, sample: ImuSample, rate: Floats3, acceleration: Floats3 | None, up: Floats3 | None) -> float:
@@ -201,13 +194,13 @@ class TrunkEstimator:
         self._is_fused, self._clock = is_fused, ClockCheck()
         return 0.0
 
-    def _restart(self, why: str) -> None:
+    def _restart(self, why: str, is_suspect: bool = False) -> None:
         """Begin anew with the next sample, or the present one."""
         if self._fusion:
             self._fusion.restart()
-        self._uncertainty.restart()
-        self._agreement.restart()
-        self._why = why
+        self._uncertainty = TiltUncertainty(self._period)
+        self._agreement = Agreement(is_suspect or self._agreement.is_suspect)
+        self._why = why  # there is no orientation yet
         self._speed = 0.0
         self._up = self._last_rate = self._last_acceleration = None
 
@@ -223,10 +216,8 @@ class VqfFusion:
 
     def __init__(self, period: float) -> None:
         """Create a fusion for samples that are usually `period` s apart."""
-        self._period = period
+        self._period = self._due = period  # s; for which the accelerometer has not been passed on
         self._vqf = VQF(period)
-        self._rate, self._acceleration = np.zeros(3), np.zeros(3)  # reused
-        self._due = period  # s for which the accelerometer has not been passed on
         self._count = 0
         self._read_bias()
 
@@ -242,20 +233,15 @@ class VqfFusion:
         rate, last_rate: of this sample and the last one, each of the period that it ends; over several periods those
         between the two are interpolated. acceleration: None if it is not known.
         """
-        vqf, period, scaled = self._vqf, self._period, self._rate
-        periods = dt / period
-        share = 0.5 - 0.5 / periods if periods > 1.0 else 0.0  # of the last rate
-        (x, y, z), (u, v, w), (a, b, c) = rate, last_rate, self.bias
-        scaled[0] = a + (x + share * (u - x) - a) * periods
-        scaled[1] = b + (y + share * (v - y) - b) * periods
-        scaled[2] = c + (z + share * (w - z) - c) * periods
-        self._due += dt
-        count = round(self._due / period)
-        self._due -= count * period
-        measured = self._acceleration
-        if acceleration:
-            measured[0], measured[1], measured[2] = acceleration
+        vqf, periods = self._vqf, dt / self._period
+        (x, y, z), (a, b, c) = rate, self.bias
+        if periods > 1.0:
+            x, y, z = plus(rate, plus(last_rate, rate, -1.0), 0.5 - 0.5 / periods)
+        scaled = np.array((a + periods * (x - a), b + periods * (y - b), c + periods * (z - c)))
+        count = round((self._due + dt) / self._period)
+        self._due += dt - count * self._period
         if acceleration and count:
+            measured = np.array(acceleration)
             vqf.update(scaled, measured)
             for _ in range(1, count):
                 vqf.updateAcc(measured)

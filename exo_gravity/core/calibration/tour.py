@@ -203,8 +203,8 @@ class Tour:
                 sweeps.append((np.array(position), np.array(remainder)))
                 directions += direction
             ways = np.min([np.abs(position[-1] - position[0]) for position, _ in sweeps[-2:]], axis=0)
-            followed = np.asarray(ways / (2.0 * WINDOW * station.amplitude))
-            was_known, sticks = any(self._friction), bool(followed.min() < FOLLOWED)
+            followed = ways / (2.0 * WINDOW * station.amplitude)
+            was_known, sticks = any(self._friction), bool(np.min(followed) < FOLLOWED)
             if station.speed >= STEADY_SPEED:
                 friction = np.maximum(average(sweeps[-2:]).friction, self._friction if sticks else 0.0)
                 self._friction, self._tracker.friction = friction.tolist(), friction

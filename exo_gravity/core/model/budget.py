@@ -76,7 +76,8 @@ class Workspace:
 
     def points(self, count: int = SAMPLES) -> np.ndarray:
         """Return random points (count, 6), uniform over the workspace and the same in every call."""
-        return np.random.default_rng(0).uniform(*self.bounds, (count, JOINT_COUNT + 2))
+        low, high = self.bounds
+        return np.random.default_rng(0).uniform(low, high, (count, JOINT_COUNT + 2))
 
 
 @dataclass(frozen=True)
@@ -165,15 +166,14 @@ def budget(
 
     needs, shortages = need(starts), shortage(starts)
     joints = []
-    for joint, limits in enumerate(zip(rated, peak, strict=True)):
-        worst, torque = _worst(lambda at, n=joint: need(at)[:, n], workspace, starts, needs[:, joint])
-        _, short = _worst(lambda at, n=joint: shortage(at)[:, n], workspace, starts, shortages[:, joint])
+    for joint in range(JOINT_COUNT):
+        worst, torque = _worst(lambda at: need(at)[:, joint], workspace, starts, needs[:, joint])  # noqa: B023
+        _, short = _worst(lambda at: shortage(at)[:, joint], workspace, starts, shortages[:, joint])  # noqa: B023
         # The search can find an overloaded pose that no sample shows. Then the share must not be 1.
-        shares = (
-            min(float(np.mean(needs[-len(points) :, joint] <= limit)), 0.9999 if torque > limit else 1.0)
-            for limit in limits
-        )
-        joints.append(JointBudget(*map(float, limits), torque, worst, *shares, None if short > 0.0 else -short))
+        limits = float(rated[joint]), float(peak[joint])
+        sampled = needs[-len(points) :, joint]
+        within = [min(float(np.mean(sampled <= most)), 0.9999 if torque > most else 1.0) for most in limits]
+        joints.append(JointBudget(*limits, torque, worst, within[0], within[1], None if short > 0.0 else -short))
     return tuple(joints)
 
 

@@ -84,8 +84,11 @@ class MotorSpec:
 
     def with_ranges(self, velocity_range: float, torque_range: float) -> MotorSpec:
         """Return this motor with another firmware's wire ranges in rad/s and Nm, which no CAN message reports."""
-        given = {"velocity_range": velocity_range, "torque_range": torque_range}
-        return replace(self, **{name: one_float(name, value, *WIRE_RANGE_BOUNDS) for name, value in given.items()})
+        return replace(
+            self,
+            velocity_range=one_float("velocity_range", velocity_range, *WIRE_RANGE_BOUNDS),
+            torque_range=one_float("torque_range", torque_range, *WIRE_RANGE_BOUNDS),
+        )
 
 
 MOTORS = {
@@ -163,8 +166,9 @@ def unpack_reply(spec: MotorSpec, data: bytes | bytearray) -> MotorReply:
     """Return the content of a reply. Raises FrameError unless it is 6 or 8 bytes."""
     if len(data) not in (6, 8):
         raise FrameError(data, "a reply of 6 or 8 bytes")
-    values = unpack_fields(spec, int.from_bytes(data[:6], "big"), *MotorReply._fields[1:4])
-    return MotorReply(data[0], *values, *((data[6] - 40, data[7]) if len(data) == 8 else (None, None)))
+    position, velocity, torque = unpack_fields(spec, int.from_bytes(data[:6], "big"), *MotorReply._fields[1:4])
+    temperature, error = (data[6] - 40, data[7]) if len(data) == 8 else (None, None)
+    return MotorReply(data[0], position, velocity, torque, temperature, error)
 
 
 def pack_fields(spec: MotorSpec, **values: float) -> int:

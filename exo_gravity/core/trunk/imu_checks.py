@@ -7,20 +7,21 @@ cannot be the reason. The limits were set on the trials of docs/imu.md.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from operator import eq
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.rotation import ZERO, Floats3, Quaternion, rotated
+from exo_gravity.core.model.rotation import ZERO, Floats3, Quaternion, dot, plus, rotated
 
 FROZEN_TIME, FROZEN_SAMPLES = 0.1, 10  # s of equal samples, and at least this many
-STUCK_SAMPLES = 5  # that repeat the value of an axis
+STUCK_SAMPLES, NO_REPEATS = 5, (0.0,) * 6  # that repeat the value of an axis; of each axis
 NEAR_GRAVITY = 0.15  # share of 1 g
 TURN = math.radians(3.0)
 STUCK_TURN = 0.09  # of gravity's unit vector along an axis
 
 CHECK_PERIOD = 0.0095  # s between two comparisons of gyroscope and accelerometer
-QUIET_TIME, QUIET = 0.15, 0.1  # s over which the acceleration must be near 1 g, by a share of 1 g
+QUIET_TIME, QUIET = 0.15, 0.1  # s over which the deviation from 1 g is averaged; share of 1 g
 MAX_CONTRADICTION = math.radians(20.0)
 CONTRADICTION_TIME = 0.5  # s; less than the time to settle, so that a wrong orientation is never used
 
@@ -57,12 +58,10 @@ class EqualValues:
     meanwhile: if the accelerometer shows another direction of gravity than the estimate.
     """
 
-    def __init__(self) -> None:
-        self.duration = 0.0  #: s for which whole samples have been equal
-        self._since = math.inf  # s, of the first of them
-        self._values: tuple[float, ...] = (math.nan,) * 6  # gyroscope and accelerometer
-        self._repeats = [0.0] * 6  # of each value; infinite for a stuck axis
-        self._any = False  # repeats by the last sample
+    duration = 0.0  #: s for which whole samples have been equal
+    _since = math.inf  # s, of the first of them
+    _values: tuple[float, ...] = (math.nan,) * 6  # gyroscope and accelerometer
+    _repeats: tuple[float, ...] = NO_REPEATS  # of each value
 
     def check(self, time: float, rate: Floats3, acceleration: Floats3 | None, up: Floats3 | None) -> None:
         """Raise ParameterError once the IMU is frozen, Contradiction once an axis is stuck, at the sample of `time` s.
@@ -70,26 +69,23 @@ class EqualValues:
         up: the vertical in the IMU's axes by an estimate from the samples before; None if there is none.
         """
         last, self._values = self._values, rate + (acceleration or ZERO)
-        if not any(map(eq, self._values, last)) and not self._any:
-            self._since, self.duration = time, 0.0
+        if not any(map(eq, self._values, last)):
+            self._since, self.duration, self._repeats = time, 0.0, NO_REPEATS
             return
         pairs = zip(self._repeats, self._values, last, strict=True)
-        self._repeats = [count + 1.0 if value == before else 0.0 for count, value, before in pairs]
-        self._any, least = any(self._repeats), min(self._repeats)
+        repeats = self._repeats = tuple([count + 1.0 if value == before else 0.0 for count, value, before in pairs])
+        least, most = min(repeats), max(repeats)
         self._since = min(self._since, time) if least else time
         self.duration = time - self._since
         if least + 1 >= FROZEN_SAMPLES and self.duration >= FROZEN_TIME and any(self._values):
             expected = "different from sample to sample, as noise makes them: the IMU or its driver is frozen"
             raise ParameterError("angular_velocity and linear_acceleration", list(self._values), expected)
-        most = max(self._repeats)
-        if least or most < STUCK_SAMPLES or acceleration is None:
+        axis = repeats.index(most)
+        if least or most < STUCK_SAMPLES or not up or not acceleration or not _should_change(axis, up, acceleration):
             return
-        axis = self._repeats.index(most)
-        if most == math.inf or (up and _should_change(axis, up, acceleration)):
-            self._repeats[axis] = math.inf
-            name, shown = ("angular_velocity", rate) if axis < 3 else ("linear_acceleration", acceleration)
-            expected = f"different from sample to sample while the trunk turns: the {'xyz'[axis % 3]} axis is stuck"
-            raise Contradiction(name, shown, expected)
+        name, shown = ("angular_velocity", rate) if axis < 3 else ("linear_acceleration", acceleration)
+        expected = f"different from sample to sample while the trunk turns: the {'xyz'[axis % 3]} axis is stuck"
+        raise Contradiction(name, shown, expected)
 
 
 def _should_change(axis: int, up: Floats3, acceleration: Floats3) -> bool:
@@ -112,39 +108,27 @@ class Agreement:
     deviation of the acceleration from its mean times the time for which it keeps its direction.
     """
 
-    def __init__(self) -> None:
-        self.is_suspect = False  #: whether the two must agree on a turn, or the trunk rest, before the estimate is used
-        self._agreed = 0.0  # s
-        self.restart()
+    contradiction = 0.0  #: rad by which the two turns differ, while they clearly do
+    square = 0.0  #: of the acceleration's deviation from its mean, in shares of 1 g
+    _deviation = 0.0  # of the acceleration's length from 1 g, mean over QUIET_TIME, as a share
+    _means: Sequence[float] = ()  # over TURN_TIME, of gravity's direction by the estimate and of the acceleration's
+    _rate = ZERO  # rad/s, at the last comparison
+    _unlike = _agreed = _rest = _contradicted = _age = 0.0  # s
+    _mean = ZERO  # acceleration in the world, in 1 g
+    _since = ZERO, 0.0, 0  # the last comparison: sum of the accelerations, s, samples
 
-    def restart(self) -> None:
-        """Begin anew with the next sample. Whether the two have agreed before is kept."""
-        self.contradiction = 0.0  #: rad by which the two turns differ, while they clearly do
-        self.square = 0.0  #: of the acceleration's deviation from its mean, in shares of 1 g
-        self._deviation = 0.0  # of the acceleration's length from 1 g, mean over QUIET_TIME, as a share
-        self._up: Floats3 | None = None  # mean over TURN_TIME, like the next one
-        self._measured: Floats3 = ZERO
-        self._rate: Floats3 = ZERO  # rad/s, at the last comparison
-        self._unlike = self._rest = self._contradicted = 0.0  # s
-        self._age = 0.0  # s
-        self._since = ZERO, 0.0, 0  # since the last comparison: sum of the accelerations, s, samples
-        self._mean: Floats3 = ZERO  # in 1 g
-
-    def suspect(self) -> None:
-        """Require that the two agree on a turn."""
-        self.is_suspect, self._agreed = True, 0.0
+    def __init__(self, is_suspect: bool = False) -> None:
+        #: whether the two must agree on a turn, or the trunk rest, before the estimate is used
+        self.is_suspect = is_suspect
 
     def check_reported(self, dt: float, up: Floats3, acceleration: Floats3) -> None:
         """Check a reported orientation: one that the driver does not have, or upside down.
 
         up: the world's z axis in the IMU's axes. Raises ParameterError.
         """
-        x, y, z = acceleration
-        norm = math.hypot(x, y, z)
-        now = abs(norm / STANDARD_GRAVITY - 1.0)
-        self._deviation += (now - self._deviation) * min(1.0, dt / QUIET_TIME)
-        if self._deviation < QUIET and now < QUIET:
-            contradicts = up[0] * x + up[1] * y + up[2] * z < norm * math.cos(MAX_CONTRADICTION)
+        norm = math.hypot(*acceleration)
+        if abs(norm / STANDARD_GRAVITY - 1.0) < QUIET:
+            contradicts = dot(up, acceleration) < norm * math.cos(MAX_CONTRADICTION)
             self._contradicted = self._contradicted + dt if contradicts else 0.0
         if self._contradicted > CONTRADICTION_TIME:
             limit = math.degrees(MAX_CONTRADICTION)
@@ -156,45 +140,37 @@ class Agreement:
 
         This is the mean since the last comparison, CHECK_PERIOD before.
         """
-        (x, y, z), (a, b, c), span, count = acceleration, *self._since
-        x, y, z, dt, count = x + a, y + b, z + c, dt + span, count + 1
-        if dt < CHECK_PERIOD and self._up:
-            self._since = (x, y, z), dt, count
+        total, span, count = self._since
+        total, dt, count = plus(acceleration, total), dt + span, count + 1
+        if dt < CHECK_PERIOD and self._means:
+            self._since = total, dt, count
             return
         self._since = ZERO, 0.0, 0
-        share = 1.0 / (count * STANDARD_GRAVITY)
-        mean = share * x, share * y, share * z
+        mean = plus(ZERO, total, 1.0 / (count * STANDARD_GRAVITY))
         spin_up = math.dist(rate, self._rate) / dt if dt else 0.0
         self._rate = rate
-        explained = min(MOST, LEVER * (spin_up + rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2))
         # Before and just after the first tilt nothing is lost by a refusal.
-        self._check_turns(dt, up, mean, explained if self._age > AVERAGE_TIME else 0.0)
+        explained = min(MOST, LEVER * (spin_up + dot(rate, rate))) if self._age > AVERAGE_TIME else 0.0
+        self._check_turns(dt, up, mean, explained)
         self._check_mean(dt, rotated(quaternion, mean))
 
     def _check_turns(self, dt: float, up: Floats3, acceleration: Floats3, explained: float) -> None:
         """Compare the turns. acceleration: in 1 g; explained: the part of it that the rotation may cause."""
-        (a, b, c), (x, y, z) = up, acceleration
-        norm = math.sqrt(x * x + y * y + z * z)
-        x, y, z = x / norm, y / norm, z / norm
+        norm = math.hypot(*acceleration)
         self._deviation += (abs(norm - 1.0) - self._deviation) * min(1.0, dt / QUIET_TIME)
-        share = dt / TURN_TIME
-        (d, e, f), (u, v, w) = (self._up, self._measured) if self._up else (up, (x, y, z))
-        d, e, f = d + share * (a - d), e + share * (b - e), f + share * (c - f)
-        u, v, w = u + share * (x - u), v + share * (y - v), w + share * (z - w)
-        self._up, self._measured = (d, e, f), (u, v, w)
+        now = [*up, acceleration[0] / norm, acceleration[1] / norm, acceleration[2] / norm]
+        means = [mean + dt / TURN_TIME * (v - mean) for mean, v in zip(self._means or now, now, strict=True)]
+        turned = [v - mean for mean, v in zip(means, now, strict=True)]
+        size, difference = math.hypot(*turned[:3]), math.dist(turned[:3], turned[3:])
+        self._means, self.contradiction = means, 0.0
         self._unlike -= self._unlike * dt / FORGET_TIME
-        self.contradiction = 0.0
-        a, b, c = a - d, b - e, c - f
-        size = math.sqrt(a * a + b * b + c * c)
         if size <= CLEAR_TURN:
-            if self.is_suspect:
-                self._rest = self._rest + dt if self._deviation < AT_REST else 0.0
-                self.is_suspect = self._rest < REST_TIME
+            self._rest = self._rest + dt if self._deviation < AT_REST else 0.0
+            self.is_suspect = self.is_suspect and self._rest < REST_TIME
             return
         self._rest = 0.0
         if size <= CLEAR * self._deviation:
             return
-        difference = math.dist((x - u, y - v, z - w), (a, b, c))
         excess = difference - UNLIKE * size - explained
         if difference < ALIKE * size:
             self._agreed += dt
@@ -205,18 +181,17 @@ class Agreement:
             self.contradiction = difference * self._unlike / NOTICE
             if self._unlike > PATIENCE:
                 expected = "the turn that the accelerometer shows: check the gyroscope's unit, axes and signs"
-                raise Contradiction("turn by angular_velocity", [round(v, 3) for v in (a, b, c)], expected)
+                raise Contradiction("turn by angular_velocity", [round(v, 3) for v in turned[:3]], expected)
 
     def _check_mean(self, dt: float, acceleration: Floats3) -> None:
         """Compare the mean acceleration in the world, in 1 g, with gravity."""
         self._age += dt
-        span = self._age if self._age < AVERAGE_TIME else AVERAGE_TIME
+        span = min(self._age, AVERAGE_TIME)
         share = dt / span if dt else 1.0
-        (u, v, w), (x, y, z) = self._mean, acceleration
-        x, y, z = x - u, y - v, z - w
-        self._mean = u, v, w = u + share * x, v + share * y, w + share * z
-        self.square += share * ((1.0 - share) * (x * x + y * y + z * z) - self.square)
-        shift = math.sqrt(u * u + v * v + (w - 1.0) ** 2)
+        change = plus(acceleration, self._mean, -1.0)
+        self._mean = u, v, w = plus(self._mean, change, share)
+        self.square += share * ((1.0 - share) * dot(change, change) - self.square)
+        shift = math.hypot(u, v, w - 1.0)
         if shift < OFFSET or self._age < LEAST_TIME:
             return
         limit = OFFSET + (WALK + DIRECTION_TIME * math.sqrt(self.square)) / span
@@ -233,12 +208,10 @@ class ClockCheck:
     shortest time from stamp to arrival in each WINDOW must not grow, or fall below all before, from window to window.
     """
 
-    def __init__(self) -> None:
-        self.offset = 0.0  #: s by which the clock may have gone wrong by the last sample
-        self._end = math.inf  # s, of the present window
-        # s from stamp to arrival: shortest in this window, in the last one, and in all before that
-        self._shortest = self._last = self._least = math.inf
-        self._drift, self._windows = 0.0, 0  # s in how many windows in a row
+    offset = 0.0  #: s by which the clock may have gone wrong by the last sample
+    _end = math.inf  # s, of the present window
+    _shortest = _last = _least = math.inf  # s from stamp to arrival: in this window, the last one, and all before that
+    _drift, _windows = 0.0, 0  # s in how many windows in a row
 
     def check(self, time: float, arrival: float) -> None:
         """Check the stamp `time` of a sample that arrived at `arrival`, both s. Raises Contradiction."""

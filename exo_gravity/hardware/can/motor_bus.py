@@ -8,8 +8,8 @@ A motor obeys every sender. A command to one of our motors that we did not send 
 full damping: until then the other sender's torque acts, and no damping. What it moves the joint in between must not add
 up, so for a while all our commands to that motor also hold the joint. To know a foreign command, echoes of our own
 frames are set apart: most buses return none. Some return them and mark them (`is_rx` is false). udp_multicast returns
-them unmarked, in order. SocketCAN sets the same mark on every frame from this computer, also on those of another process
-(Documentation/networking/can.rst of Linux, MSG_DONTROUTE): there it does not show an echo.
+them unmarked, in order. SocketCAN sets the same mark on every frame from this computer, also on those of another
+process (Documentation/networking/can.rst of Linux, MSG_DONTROUTE): there it does not show an echo.
 
 A zero command precedes the frames that switch a V1 or V2 board on or off: the motor remembers its last command, and
 ENTER would carry it out. A command switches a V3 board on, so it gets none while the arm is off.

@@ -103,7 +103,9 @@ class Spring(TermParameters):
             raise ParameterError("times of the path in spring.pose", times[:3].tolist(), "rising from 0 s")
         speeds = np.linalg.norm(np.diff(poses, axis=0), axis=1) / np.diff(times)
         if np.any(speeds > MAX_PATH_SPEED):
-            raise ParameterError("speed of the path in spring.pose", speeds.max(), f"at most {MAX_PATH_SPEED:g} rad/s")
+            raise ParameterError(
+                "speed of the path in spring.pose", float(np.max(speeds)), f"at most {MAX_PATH_SPEED:g} rad/s"
+            )
         for name, value in (("pose", numbers), ("times", tuple(times.tolist())), ("ways", poses.T)):
             object.__setattr__(self, name, value)
 
