@@ -157,11 +157,11 @@ class MotorBus:
         self._send_commands(OFF)
         self._send(*chain.from_iterable(frames))
 
-    def stop(self) -> bool:
+    def stop(self) -> None:
         """Send the last frames, a zero command and EXIT, twice; then close the bus. Never raises.
 
-        Returns whether the motors are off, as far as their replies show. If not, they stay noted as powered. Nothing is
-        sent to motors that were never switched on or off: another owner may have left them on.
+        Motors whose replies do not show that they are off stay noted as powered. Nothing is sent to motors that were
+        never switched on or off: another owner may have left them on.
         """
         for _ in range(2 if self.may_be_powered or self._exit_sent > -math.inf else 0):
             self._is_confirming = True
@@ -178,7 +178,6 @@ class MotorBus:
         if not self._unconfirmed:
             self._note(OFF)
         self._port.close()
-        return not self._unconfirmed
 
     def close(self) -> None:
         """Close the bus without any frame. Never raises."""
