@@ -42,8 +42,7 @@ class CanPort:
     """
 
     def __init__(self, bus: can.BusABC, clock: Clock, reopen: Callable[[], can.BusABC] | None = None) -> None:
-        #: Name of the bus.
-        self.name = str(bus.channel_info)
+        self.name = str(bus.channel_info)  #: name of the bus
         #: Whether `is_rx` is false only for frames that this port sent.
         self.marks_echoes = not isinstance(bus, SocketcanBus)
         #: Whether each frame that this port sends comes back to it, unmarked.

@@ -67,12 +67,9 @@ class MotorBus:
     ) -> None:
         #: The newest reading of each joint, UNKNOWN before the first reply.
         self.samples: list[JointSample] = [UNKNOWN] * JOINT_COUNT
-        #: Count of frames that were not replies of these motors, by kind.
-        self.ignored: Counter[str] = Counter()
-        #: Count of commands to these motors from another sender.
-        self.foreign_commands = 0
-        #: The last of them, in words.
-        self.foreign_command = ""
+        self.ignored: Counter[str] = Counter()  #: count of frames that were not replies of these motors, by kind
+        self.foreign_commands = 0  #: count of commands to these motors from another sender
+        self.foreign_command = ""  #: the last of them, in words
         self.clock = clock
         self._now = clock.monotonic
         self._port = CanPort(bus, clock, reopen)
