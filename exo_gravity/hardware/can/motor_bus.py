@@ -206,7 +206,7 @@ class MotorBus:
 
     def _send(self, *frames: Frame) -> None:
         for frame in frames:
-            self._filter.sent(frame)
+            self._filter.awaited.append(frame)
             self._port.send(frame)
 
     def _drain(self) -> None:
@@ -262,11 +262,8 @@ class FrameFilter:
         # The motors of each format, by whether its IDs have 29 bits.
         self._groups = {bits: [each for each in of.items() if each[0].is_extended is bits] for bits in (False, True)}
         self._marks_echoes = marks_echoes
-        # Sent, their echoes not yet received.
-        self._awaited: deque[Frame] = deque(maxlen=MOST_AWAITED if echoes else 0)
-
-    def sent(self, frame: Frame) -> None:
-        self._awaited.append(frame)
+        #: Frames that were sent and whose echoes have not been received.
+        self.awaited: deque[Frame] = deque(maxlen=MOST_AWAITED if echoes else 0)
 
     def sort(self, message: can.Message) -> tuple[str, int]:
         """Return REPLY or FOREIGN_COMMAND with the motor's ID, or the kind of a frame that does not matter with 0."""
@@ -287,8 +284,8 @@ class FrameFilter:
         return "foreign frame", 0
 
     def _is_echo(self, frame: Frame) -> bool:
-        if frame not in self._awaited:
+        if frame not in self.awaited:
             return False
-        while self._awaited.popleft() != frame:
+        while self.awaited.popleft() != frame:
             pass  # echoes come in order, so those before it are lost
         return True

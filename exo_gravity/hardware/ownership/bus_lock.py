@@ -150,12 +150,11 @@ def bus_name(address: Address) -> str:
     parts = [interface, channel, *([str(options["port"])] if "port" in options else [])]
     path = Path(channel.partition("@")[0])  # slcan: DEVICE@BITRATE
     with contextlib.suppress(OSError, ValueError):
-        if path.is_absolute() and path.is_char_device():
+        if interface == "socketcan":  # it may have alternative names
+            parts[1] = socket.if_indextoname(socket.if_nametoindex(channel))
+        elif path.is_absolute() and path.is_char_device():
             device = path.stat()
             parts = ["device", str(os.major(device.st_rdev)), str(os.minor(device.st_rdev))]
-    if interface == "socketcan":
-        with contextlib.suppress(OSError):  # it may have alternative names
-            parts[1] = socket.if_indextoname(socket.if_nametoindex(channel))
     return re.sub(r"[^\w.:-]", "_", "_".join(parts))[-80:]
 
 
