@@ -107,7 +107,7 @@ class Simulator(Node):
     def _move_trunk(self) -> None:
         device, largest = self._device, TRUNK_SPEED * self._trunk_period
         state = device.trunk
-        if device.trunk_moves:  # by the script: the trunk stays where that leaves it
+        if device.trunk_motion:  # by the script: the trunk stays where that leaves it
             self._trunk_target = state.pitch, state.roll
         else:
             pitch_step, roll_step = (

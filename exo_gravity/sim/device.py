@@ -68,7 +68,7 @@ class SimulatedDevice:
         self._steps = 0
         self._clock = 0.0  # s elapsed, of which `time` is the part in whole steps
         self._trial: tuple[VirtualWearer, float] | None = None  # the wearer, and the time at which the script starts
-        self._motion: TrunkMotion | None = None  # of the wearer's current step
+        self.trunk_motion: TrunkMotion | None = None  #: of the wearer's current step; None if that moves no trunk
         self._trunk_step: int | None = None  # the step that it belongs to
         self._base = TrunkState()  # the arm's base moves like this
         self._frames = [0] * JOINT_COUNT  # received by each motor
@@ -91,12 +91,7 @@ class SimulatedDevice:
     @property
     def trunk(self) -> TrunkState:
         """The trunk's tilt and motion."""
-        return self._base if self._motion else TrunkState(self.pitch, self.roll)
-
-    @property
-    def trunk_moves(self) -> bool:
-        """Whether the wearer's current step moves the trunk."""
-        return self._motion is not None
+        return self._base if self.trunk_motion else TrunkState(self.pitch, self.roll)
 
     def return_power(self, delay: float) -> None:
         """Return the power of unplugged motors in `delay` s; they come back switched off."""
@@ -104,7 +99,7 @@ class SimulatedDevice:
 
     def start(self, wearer: VirtualWearer, delay: float = 0.0) -> None:
         """Let `wearer` start the script in `delay` s; replaces any other wearer."""
-        self._trial, self._trunk_step, self._motion = (wearer, self.time + delay), None, None
+        self._trial, self._trunk_step, self.trunk_motion = (wearer, self.time + delay), None, None
 
     def advance(self, duration: float) -> None:
         """Advance by `duration` s in whole steps; a remainder is kept for the next call."""
@@ -205,9 +200,9 @@ class SimulatedDevice:
         if elapsed >= 0.0 and index != self._trunk_step:
             self._trunk_step = index
             step = script.steps[index] if index < len(script.steps) else None
-            self._motion = motion_of(step, self.pitch, self.roll) if step else None
-        if self._motion:
-            state = self._motion.at(since)
+            self.trunk_motion = motion_of(step, self.pitch, self.roll) if step else None
+        if self.trunk_motion:
+            state = self.trunk_motion.at(since)
             self.pitch, self.roll = state.pitch, state.roll
             self._move_base(state)
 

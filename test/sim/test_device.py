@@ -125,14 +125,14 @@ def test_the_trunk_bows_and_stays_bowed(device):
     device.pitch, device.roll = 0.1, -0.06
     perform(device, {"hold": 0.5}, {"bow": 0.5, "over": 1.0}, {"hold": 0.5})
     device.advance(0.4)
-    assert (device.pitch, device.trunk_moves) == (0.1, False)
+    assert (device.pitch, device.trunk_motion) == (0.1, None)
     device.advance(0.6)
-    assert device.trunk_moves
+    assert device.trunk_motion
     assert device.trunk.pitch == device.pitch == pytest.approx(0.3, abs=0.001)
     assert device.trunk.pitch_rate == pytest.approx(0.4 * 1.875, rel=0.01)
     device.advance(1.0)
     assert (device.pitch, device.roll) == pytest.approx((0.5, -0.06), abs=1e-6)
-    assert not device.trunk_moves
+    assert not device.trunk_motion
     assert device.trunk[2:] == (0.0,) * 4 + ((0.0,) * 3,)
 
 
