@@ -29,14 +29,13 @@ import can
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, REPLY, Frame
+from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, REPLY, Frame, WireFormat
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import OFF, Drive
 from exo_gravity.core.safety.limits import DAMPING, UNKNOWN, JointSample
 from exo_gravity.hardware.can.can_port import CanPort
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
-MAX_STALE_FRAMES = 256  # frames read before each cycle: the capacity of udp_multicast, more than any cycle produces
 EXIT_PERIOD = 0.5  # s between two EXIT frames to motors that are off, in case one was lost,
 UNCONFIRMED_EXIT_PERIOD = 0.02  # s, and to motors that have not replied since the first EXIT
 OFF_EFFORT = 0.2  # Nm that a V3 board may report when it is off: it reports unasked, so a frame alone proves nothing
@@ -122,7 +121,8 @@ class MotorBus:
             self._unconfirmed.update(joint for joint, is_unsure in enumerate(drive.unsure) if not is_unsure)
         self._note(drive._replace(powered=self.may_be_powered))
         self._is_confirming = not self._powered and self._exit_sent > -math.inf
-        self._drain()
+        for message in self._port.waiting():  # replies that arrived after their cycle are not replies to this one
+            self._take(message)
         if drive.powered and not self._powered:
             self._powered, self._exit_sent = True, -math.inf
             if not any(drive.unsure):
@@ -209,14 +209,6 @@ class MotorBus:
             self._filter.awaited.append(frame)
             self._port.send(frame)
 
-    def _drain(self) -> None:
-        """Read replies that arrived after their cycle, so that they are not taken for replies to this one."""
-        for _ in range(MAX_STALE_FRAMES):
-            message = self._port.waiting()
-            if message is None:
-                return
-            self._take(message)
-
     def _take(self, message: can.Message) -> None:
         kind, can_id = self._filter.sort(message)
         if kind != REPLY:
@@ -255,12 +247,11 @@ class FrameFilter:
     """
 
     def __init__(self, motors: Sequence[JointMotor], marks_echoes: bool = True, echoes: bool = False) -> None:
-        of = {
-            motor.wire_format: frozenset(m.can_id for m in motors if m.wire_format == motor.wire_format)
-            for motor in motors
-        }
         # The motors of each format, by whether its IDs have 29 bits.
-        self._groups = {bits: [each for each in of.items() if each[0].is_extended is bits] for bits in (False, True)}
+        self._groups: dict[bool, list[tuple[WireFormat, frozenset[int]]]] = {False: [], True: []}
+        for board in {motor.wire_format for motor in motors}:
+            can_ids = frozenset(motor.can_id for motor in motors if motor.wire_format == board)
+            self._groups[board.is_extended].append((board, can_ids))
         self._marks_echoes = marks_echoes
         #: Frames that were sent and whose echoes have not been received.
         self.awaited: deque[Frame] = deque(maxlen=MOST_AWAITED if echoes else 0)
