@@ -36,33 +36,6 @@ MAX_CATCH_UP = 0.05  # s of physics simulated at once; after a longer stall the 
 IDLE_PERIOD = 0.005  # s after which physics advances even without a frame
 
 
-class GapMeter:
-    """Measures gaps in s while the motors are on; both start again when the motors are switched on.
-
-    longest_stall: between two passes of the device's loop. longest_silence: in which no command arrived.
-    """
-
-    def __init__(self) -> None:
-        self.longest_stall = 0.0
-        self.longest_silence = 0.0
-        self._powered = False
-        self._last_pass = 0.0
-        self._last_command = 0.0
-
-    def note(self, now: float, powered: bool, commanded: bool) -> None:
-        """Note one pass at `now` s: whether a motor was on before it, and whether a command arrived in it."""
-        if powered and not self._powered:
-            self.longest_stall = self.longest_silence = 0.0
-            self._last_pass = self._last_command = now
-        if powered:
-            self.longest_stall = max(self.longest_stall, now - self._last_pass)
-            self.longest_silence = max(self.longest_silence, now - self._last_command)
-        if commanded:
-            self._last_command = now
-        self._powered = powered
-        self._last_pass = now
-
-
 class SimulatedDevice:
     """An arm with four motors, on a trunk that moves, and optionally a wearer who moves both.
 
@@ -71,8 +44,8 @@ class SimulatedDevice:
     May be set from any thread: `pitch` and `roll` of the trunk in rad; `bus_silent` (frames pass in neither direction,
     and the motors keep their last commands); `cut_off`, the same for each motor (4,); `encoder_error` (4,) rad, added
     to the angle that a motor reads; and the faults of each motor. truth: receives every physics step, None for no log.
-    To be read: `time`, s simulated; `slip`, s that `run` has lost against real time; `gaps`, the longest interruptions
-    of `run`.
+    To be read: `time`, s simulated; `slip`, s that `run` has lost against real time; and in s since the motors were
+    switched on, `longest_stall` between two passes of `run`, `longest_silence` in which no command arrived.
     """
 
     def __init__(self, arm: SimulatedArm, motors: Sequence[SimulatedMotor], side: str = "right") -> None:
@@ -89,13 +62,13 @@ class SimulatedDevice:
         self.encoder_error: Sequence[float] = (0.0,) * JOINT_COUNT
         self.truth: TruthLog | None = None
         self.slip = 0.0
-        self.gaps = GapMeter()
+        self.longest_stall = self.longest_silence = 0.0
         self._joint_of_id = {can_id: joint for joint, motor in enumerate(motors) for can_id in motor.received_ids}
         self._random = random.Random(0)  # of the delays of replies
         self._steps = 0
         self._clock = 0.0  # s elapsed, of which `time` is the part in whole steps
         self._trial: tuple[VirtualWearer, float] | None = None  # the wearer, and the time at which the script starts
-        self._motion: TrunkMotion | None = None  # of the wearer's current step
+        self.trunk_motion: TrunkMotion | None = None  #: of the wearer's current step; None if that moves no trunk
         self._trunk_step: int | None = None  # the step that it belongs to
         self._base = TrunkState()  # the arm's base moves like this
         self._frames = [0] * JOINT_COUNT  # received by each motor
@@ -118,12 +91,7 @@ class SimulatedDevice:
     @property
     def trunk(self) -> TrunkState:
         """The trunk's tilt and motion."""
-        return self._base if self._motion else TrunkState(self.pitch, self.roll)
-
-    @property
-    def trunk_moves(self) -> bool:
-        """Whether the wearer's current step moves the trunk."""
-        return self._motion is not None
+        return self._base if self.trunk_motion else TrunkState(self.pitch, self.roll)
 
     def return_power(self, delay: float) -> None:
         """Return the power of unplugged motors in `delay` s; they come back switched off."""
@@ -131,7 +99,7 @@ class SimulatedDevice:
 
     def start(self, wearer: VirtualWearer, delay: float = 0.0) -> None:
         """Let `wearer` start the script in `delay` s; replaces any other wearer."""
-        self._trial, self._trunk_step, self._motion = (wearer, self.time + delay), None, None
+        self._trial, self._trunk_step, self.trunk_motion = (wearer, self.time + delay), None, None
 
     def advance(self, duration: float) -> None:
         """Advance by `duration` s in whole steps; a remainder is kept for the next call."""
@@ -171,7 +139,8 @@ class SimulatedDevice:
         on_idle(now), `now` in monotonic s, is called whenever no reply is due, at the latest 5 ms after the last frame.
         """
         outbox: list[tuple[float, Frame]] = []  # replies by the time at which they are due, a heap
-        last = time.monotonic()
+        last = heard = time.monotonic()
+        was_on = False
         boards = {joint: motor for joint, motor in enumerate(self.motors) if isinstance(motor, SimulatedV3Motor)}
         periods = {joint: 1.0 / motor.firmware.status_rate for joint, motor in boards.items()}
         reports = {joint: last + self._random.uniform(0.0, period) for joint, period in periods.items()}  # next
@@ -179,7 +148,13 @@ class SimulatedDevice:
             due = min(last + IDLE_PERIOD, *reports.values(), outbox[0][0] if outbox else math.inf)
             frame, age = self._receive(bus, max(0.0, due - time.monotonic()))
             now = time.monotonic()
-            self.gaps.note(now, self.powered, frame is not None)
+            is_on = self.powered
+            if is_on and not was_on:
+                self.longest_stall, self.longest_silence, heard = 0.0, 0.0, now
+            elif is_on:
+                self.longest_stall = max(self.longest_stall, now - last)
+                self.longest_silence = max(self.longest_silence, now - heard)
+            was_on, heard = is_on, now if frame else heard
             self.slip += max(0.0, now - last - MAX_CATCH_UP)
             self.advance(min(now - last, MAX_CATCH_UP))
             last = now
@@ -225,9 +200,9 @@ class SimulatedDevice:
         if elapsed >= 0.0 and index != self._trunk_step:
             self._trunk_step = index
             step = script.steps[index] if index < len(script.steps) else None
-            self._motion = motion_of(step, self.pitch, self.roll) if step else None
-        if self._motion:
-            state = self._motion.at(since)
+            self.trunk_motion = motion_of(step, self.pitch, self.roll) if step else None
+        if self.trunk_motion:
+            state = self.trunk_motion.at(since)
             self.pitch, self.roll = state.pitch, state.roll
             self._move_base(state)
 

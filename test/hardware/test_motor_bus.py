@@ -210,6 +210,6 @@ def test_a_marked_command_is_an_echo_only_on_a_bus_that_marks_nothing_else() -> 
 @pytest.mark.parametrize("marks_echoes", [True, False])
 def test_a_command_that_we_sent_is_an_echo_when_it_comes_back(marks_echoes: bool) -> None:
     frames = FrameFilter(MOTORS_OF_ARM, marks_echoes, echoes=True)
-    frames.sent((1, COMMAND))
+    frames.awaited.append((1, COMMAND))
     assert frames.sort(frame(1, COMMAND)) == ("echo", 0)
     assert frames.sort(frame(1, COMMAND)) == (FOREIGN_COMMAND, 1)

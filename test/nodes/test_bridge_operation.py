@@ -171,7 +171,7 @@ def test_simulated_time_is_refused_beside_a_real_bus_at_the_start_and_live(node)
     node.set_parameters([Parameter("use_sim_time", value=False)])
     operation.refuse_simulated_time(node, "slcan")
     result = node.set_parameters([Parameter("use_sim_time", value=True)])[0]
-    assert not result.successful and result.reason.startswith("use_sim_time = True: must be false with a real bus")
+    assert not result.successful and "read-only parameter: use_sim_time" in result.reason
 
 
 def test_under_a_clock_that_stands_still_efforts_grow_old(node):

@@ -22,7 +22,7 @@ from exo_gravity.core.motors.joint_motor import MAX_CAN_ID
 from exo_gravity.core.motors.specs import MOTORS, pack_command
 from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, MIT, MIT_V3, REPLY, Frame
 from exo_gravity.hardware.can.can_port import CanPort, open_bus
-from exo_gravity.hardware.can.motor_bus import LISTEN_TIME, MAX_STALE_FRAMES
+from exo_gravity.hardware.can.motor_bus import LISTEN_TIME
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.ownership.bus_lock import Address, BusLock
 
@@ -108,7 +108,7 @@ class BusScan(contextlib.ExitStack):
         reporting = set(can_ids) & set(self._v3)
         asked = [self._ask(can_id, is_alone=False)[0] for can_id in can_ids if can_id not in reporting]
         found = {answer.can_id: answer for answers in asked for answer in answers}
-        self._drain()
+        list(self._port.waiting())  # read: what came before is no answer
         before = self._v3.copy()
         for _ in self._frames(STATUS_TIME if reporting else 0.0):
             if all(self._v3[can_id] is not before[can_id] for can_id in reporting):
@@ -129,7 +129,7 @@ class BusScan(contextlib.ExitStack):
 
         is_alone: whether to wait for further replies after the first.
         """
-        self._drain()
+        list(self._port.waiting())  # read: what came before is no answer
         self._port.send((can_id, NOTHING))
         answers: list[MotorAnswer] = []
         others: list[Frame] = []
@@ -144,12 +144,6 @@ class BusScan(contextlib.ExitStack):
                 break
         self._port.confirm()
         return answers, others
-
-    def _drain(self) -> None:
-        """Read the frames that have arrived, but not forever: two motors with one ID may keep answering each other."""
-        for _ in range(MAX_STALE_FRAMES):
-            if self._port.waiting() is None:
-                break
 
     def _frames(self, duration: float) -> Iterator[tuple[can.Message, str, MotorAnswer | None]]:
         """Yield the data frames that arrive within `duration` s, what each is, and the answer in it."""

@@ -7,7 +7,7 @@ again is a new device, which only a newly opened bus can reach. Opening may bloc
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any, TypeVar
 
@@ -21,6 +21,7 @@ from exo_gravity.hardware.clock import Clock
 
 REOPEN_AFTER = 0.02  # s of failures in a row after which the bus is opened again
 REOPEN_PERIOD = 0.1  # s between two attempts
+MAX_STALE_FRAMES = 256  # the capacity of udp_multicast, more than any cycle produces
 Result = TypeVar("Result")
 
 
@@ -42,8 +43,7 @@ class CanPort:
     """
 
     def __init__(self, bus: can.BusABC, clock: Clock, reopen: Callable[[], can.BusABC] | None = None) -> None:
-        #: Name of the bus.
-        self.name = str(bus.channel_info)
+        self.name = str(bus.channel_info)  #: name of the bus
         #: Whether `is_rx` is false only for frames that this port sent.
         self.marks_echoes = not isinstance(bus, SocketcanBus)
         #: Whether each frame that this port sends comes back to it, unmarked.
@@ -64,14 +64,16 @@ class CanPort:
         """Return the next frame, or None if there is none within `timeout` s. Raises BusError."""
         return self._guarded(lambda bus: bus.recv(timeout))
 
-    def waiting(self) -> can.Message | None:
-        """Return the next frame that has already arrived, or None. Raises BusError.
+    def waiting(self) -> Iterator[can.Message]:
+        """Yield the frames that have already arrived, but not forever: others may keep sending. Raises BusError.
 
         An slcan adapter acknowledges each frame with a separate line, for which python-can returns None.
         """
-        while (message := self.receive(0.0)) is None and self._guarded(_has_lines):
-            pass
-        return message
+        for _ in range(MAX_STALE_FRAMES):
+            while (message := self.receive(0.0)) is None:
+                if not self._guarded(_has_lines):
+                    return
+            yield message
 
     def confirm(self) -> None:
         """Note that the bus works: its last failure, if any, was not the first of a row."""

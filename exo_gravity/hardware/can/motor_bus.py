@@ -30,14 +30,13 @@ import can
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, REPLY, Frame
+from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, REPLY, Frame, WireFormat
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import OFF, Drive
 from exo_gravity.core.safety.limits import DAMPING, UNKNOWN, JointSample
 from exo_gravity.hardware.can.can_port import CanPort
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
-MAX_STALE_FRAMES = 256  # frames read before each cycle: the capacity of udp_multicast, more than any cycle produces
 EXIT_PERIOD = 0.5  # s between two EXIT frames to motors that are off, in case one was lost,
 UNCONFIRMED_EXIT_PERIOD = 0.02  # s, and to motors that have not replied since the first EXIT
 OFF_EFFORT = 0.2  # Nm that a V3 board may report when it is off: it reports unasked, so a frame alone proves nothing
@@ -71,12 +70,9 @@ class MotorBus:
     ) -> None:
         #: The newest reading of each joint, UNKNOWN before the first reply.
         self.samples: list[JointSample] = [UNKNOWN] * JOINT_COUNT
-        #: Count of frames that were not replies of these motors, by kind.
-        self.ignored: Counter[str] = Counter()
-        #: Count of commands to these motors from another sender.
-        self.foreign_commands = 0
-        #: The last of them, in words.
-        self.foreign_command = ""
+        self.ignored: Counter[str] = Counter()  #: count of frames that were not replies of these motors, by kind
+        self.foreign_commands = 0  #: count of commands to these motors from another sender
+        self.foreign_command = ""  #: the last of them, in words
         self.clock = clock
         self._now = clock.monotonic
         self._port = CanPort(bus, clock, reopen)
@@ -130,7 +126,8 @@ class MotorBus:
             self._unconfirmed.update(joint for joint, is_unsure in enumerate(drive.unsure) if not is_unsure)
         self._note(drive._replace(powered=self.may_be_powered))
         self._is_confirming = not self._powered and self._exit_sent > -math.inf
-        self._drain()
+        for message in self._port.waiting():  # replies that arrived after their cycle are not replies to this one
+            self._take(message)
         if drive.powered and not self._powered:
             self._powered, self._exit_sent = True, -math.inf
             if not any(drive.unsure):
@@ -162,11 +159,11 @@ class MotorBus:
         self._send_commands(OFF)
         self._send(*chain.from_iterable(frames))
 
-    def stop(self) -> bool:
+    def stop(self) -> None:
         """Send the last frames, a zero command and EXIT, twice; then close the bus. Never raises.
 
-        Returns whether the motors are off, as far as their replies show. If not, they stay noted as powered. Nothing is
-        sent to motors that were never switched on or off: another owner may have left them on.
+        Motors whose replies do not show that they are off stay noted as powered. Nothing is sent to motors that were
+        never switched on or off: another owner may have left them on.
         """
         for _ in range(2 if self.may_be_powered or self._exit_sent > -math.inf else 0):
             self._is_confirming = True
@@ -183,7 +180,6 @@ class MotorBus:
         if not self._unconfirmed:
             self._note(OFF)
         self._port.close()
-        return not self._unconfirmed
 
     def close(self) -> None:
         """Close the bus without any frame. Never raises."""
@@ -215,16 +211,8 @@ class MotorBus:
 
     def _send(self, *frames: Frame) -> None:
         for frame in frames:
-            self._filter.sent(frame)
+            self._filter.awaited.append(frame)
             self._port.send(frame)
-
-    def _drain(self) -> None:
-        """Read replies that arrived after their cycle, so that they are not taken for replies to this one."""
-        for _ in range(MAX_STALE_FRAMES):
-            message = self._port.waiting()
-            if message is None:
-                return
-            self._take(message)
 
     def _take(self, message: can.Message) -> None:
         kind, can_id = self._filter.sort(message)
@@ -289,18 +277,14 @@ class FrameFilter:
     """
 
     def __init__(self, motors: Sequence[JointMotor], marks_echoes: bool = True, echoes: bool = False) -> None:
-        of = {
-            motor.wire_format: frozenset(m.can_id for m in motors if m.wire_format == motor.wire_format)
-            for motor in motors
-        }
         # The motors of each format, by whether its IDs have 29 bits.
-        self._groups = {bits: [each for each in of.items() if each[0].is_extended is bits] for bits in (False, True)}
+        self._groups: dict[bool, list[tuple[WireFormat, frozenset[int]]]] = {False: [], True: []}
+        for board in {motor.wire_format for motor in motors}:
+            can_ids = frozenset(motor.can_id for motor in motors if motor.wire_format == board)
+            self._groups[board.is_extended].append((board, can_ids))
         self._marks_echoes = marks_echoes
-        # Sent, their echoes not yet received.
-        self._awaited: deque[Frame] = deque(maxlen=MOST_AWAITED if echoes else 0)
-
-    def sent(self, frame: Frame) -> None:
-        self._awaited.append(frame)
+        #: Frames that were sent and whose echoes have not been received.
+        self.awaited: deque[Frame] = deque(maxlen=MOST_AWAITED if echoes else 0)
 
     def sort(self, message: can.Message) -> tuple[str, int]:
         """Return REPLY or FOREIGN_COMMAND with the motor's ID, or the kind of a frame that does not matter with 0."""
@@ -321,8 +305,8 @@ class FrameFilter:
         return "foreign frame", 0
 
     def _is_echo(self, frame: Frame) -> bool:
-        if frame not in self._awaited:
+        if frame not in self.awaited:
             return False
-        while self._awaited.popleft() != frame:
+        while self.awaited.popleft() != frame:
             pass  # echoes come in order, so those before it are lost
         return True

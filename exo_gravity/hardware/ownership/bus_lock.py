@@ -95,20 +95,17 @@ class BusLock:
         clock: Clock = COMPUTER_CLOCK,
         asks: bool = False,
     ) -> None:
-        #: The lock, for the watchdog to inherit.
-        self.socket = _lock(address, patience, clock, asks)
+        self.socket = _lock(address, patience, clock, asks)  #: the lock, for the watchdog to inherit
         #: Why the notes of the last owner are not known, '' if they are. The motors count as powered then.
         self.problem = ""
         path = notes_file(address)
         try:
-            #: Of the notes, for the watchdog to inherit.
-            self.descriptor = _open_notes(path)
+            self.descriptor = _open_notes(path)  #: of the notes, for the watchdog to inherit
         except OSError as error:
             self.problem = f"{path}: {error.strerror}"
             self.descriptor = os.memfd_create("exo_gravity")
             os.ftruncate(self.descriptor, mmap.PAGESIZE)
-        #: The shared page.
-        self.notes = DriveNotes.from_buffer(mmap.mmap(self.descriptor, mmap.PAGESIZE))
+        self.notes = DriveNotes.from_buffer(mmap.mmap(self.descriptor, mmap.PAGESIZE))  #: the shared page
         self.notes.clock = clock
         if not math.isfinite(sum(self.notes.drive.effort + self.notes.drive.damping)):
             self.problem = f"{path}: damaged"
@@ -153,12 +150,11 @@ def bus_name(address: Address) -> str:
     parts = [interface, channel, *([str(options["port"])] if "port" in options else [])]
     path = Path(channel.partition("@")[0])  # slcan: DEVICE@BITRATE
     with contextlib.suppress(OSError, ValueError):
-        if path.is_absolute() and path.is_char_device():
+        if interface == "socketcan":  # it may have alternative names
+            parts[1] = socket.if_indextoname(socket.if_nametoindex(channel))
+        elif path.is_absolute() and path.is_char_device():
             device = path.stat()
             parts = ["device", str(os.major(device.st_rdev)), str(os.minor(device.st_rdev))]
-    if interface == "socketcan":
-        with contextlib.suppress(OSError):  # it may have alternative names
-            parts[1] = socket.if_indextoname(socket.if_nametoindex(channel))
     return re.sub(r"[^\w.:-]", "_", "_".join(parts))[-80:]
 
 

@@ -190,8 +190,7 @@ class OwnedBus:
     def __init__(self, arm: ArmOnBus, owner: str, log: Callable[[str], None], clock: Clock = COMPUTER_CLOCK) -> None:
         self._arm = arm
         self._lock = take_over(arm, owner, log, ATTEMPT_TIME, clock)
-        #: What the motors receive, for a process that outlives this one.
-        self.notes = self._lock.notes
+        self.notes = self._lock.notes  #: what the motors receive, for a process that outlives this one
         try:
             self.watchdog = Watchdog(self._lock, arm)
         except BaseException:

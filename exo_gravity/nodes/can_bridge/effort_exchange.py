@@ -45,7 +45,7 @@ class EffortExchange:
         self.command = NO_COMMAND  #: the newest from the compensator
         self._measured = -math.inf  # monotonic s, when the last published joint state was measured
         self._published: OrderedDict[int, float] = OrderedDict()
-        self.commander = SolePublisher(node, "effort_commands")
+        self._commander = SolePublisher(node, "effort_commands")
         self._publisher = node.create_publisher(JointState, "joint_states", 1)
         self._joint_states = JointState(name=list(limits.joint_names))  # one message, reused
         self._efforts = HotPath(node, JointState, "effort_commands", self._on_efforts, EFFORTS)
@@ -76,7 +76,7 @@ class EffortExchange:
         if loop is None:
             return
         answered = self._published.get(to_nanoseconds(message.header.stamp))
-        if self.commander.is_another(info):
+        if self._commander.is_another(info):
             self.refusal = "a second publisher of effort_commands"
             self.command = EffortCommand(None, time.monotonic())  # fails the start gate
             loop.trip_if_carried(FaultCode.SECOND_COMMANDER, "more than one publisher of effort_commands")

@@ -135,8 +135,7 @@ class CanBridge(LifecycleNode):
     def on_activate(self) -> None:
         """Start the control loop, and enable the arm once it passes the start gate."""
         self._exchange.command = NO_COMMAND
-        if self._owned is None:
-            raise BusError("the node is not configured")
+        assert self._owned, "the node is not configured"
         bus, self._bus = self._bus or self._owned.open(), None
         period = self._arm.period
         safety = SafetyMachine(self._arm.limits, period, peaks_of(self._arm.motors))
@@ -156,8 +155,7 @@ class CanBridge(LifecycleNode):
     def on_deactivate(self) -> None:
         """Let the arm down and wait until its motors are off; the bus stays ours for the next activation."""
         loop, end = self.loop, time.monotonic() + DESCENT_TIMEOUT
-        if loop is None:
-            raise BusError("the node is not active")
+        assert loop, "the node is not active"
         loop.call(lambda: loop.safety.disable(time.monotonic())).result(operation.CALL_TIMEOUT)
         while not loop.is_off:
             if loop.failure:

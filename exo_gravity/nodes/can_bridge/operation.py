@@ -9,12 +9,11 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent import futures
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 from diagnostic_msgs.msg import KeyValue
-from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.msg import ParameterDescriptor, ParameterType
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
@@ -42,8 +41,6 @@ CALL_TIMEOUT = 2.0  # s that a service waits for the control thread
 
 UNREACHED = "a motor that was on does not reply and may still be powered, unless its supply is cut: cut it"
 
-Response = TypeVar("Response", SetBool.Response, Trigger.Response)
-
 
 def refuse_simulated_time(node: Node, interface: str) -> None:
     """Refuse `use_sim_time`, now and live, unless the python-can `interface` leads to a simulated device.
@@ -53,18 +50,11 @@ def refuse_simulated_time(node: Node, interface: str) -> None:
     """
     if interface in SIMULATED:
         return
-    expected = (
-        f"false with a real bus (can.interface {interface}): it stamps the joint states with a clock that can stop"
-    )
-    refusal = ParameterError("use_sim_time", True, expected)
+    why = f"with a real bus (can.interface {interface}): it stamps the joint states with a clock that can stop"
     if node.get_parameter("use_sim_time").value:
-        raise refusal
-
-    def check(changes: list[Parameter]) -> SetParametersResult:
-        is_asked = any(change.name == "use_sim_time" and change.value for change in changes)
-        return SetParametersResult(successful=not is_asked, reason=str(refusal))
-
-    node.add_on_set_parameters_callback(check)
+        raise ParameterError("use_sim_time", True, f"false {why}")
+    fixed = ParameterDescriptor(type=ParameterType.PARAMETER_BOOL, description=f"always false {why}", read_only=True)
+    node.set_descriptor("use_sim_time", fixed)
 
 
 class BridgeServices:
@@ -113,7 +103,7 @@ class BridgeServices:
         loop.set_zero()
         return ""
 
-    def answer(self, function: Callable[[ControlLoop, Any], str], request: Any, response: Response) -> Response:
+    def answer(self, function: Callable[[ControlLoop, Any], str], request: Any, response: Any) -> Any:
         """Run `function` on the control thread, and wait for the motors' zeros if it has set them.
 
         A call that has timed out never runs later: an arm must not be enabled after its operator was refused.

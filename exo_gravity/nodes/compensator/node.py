@@ -130,7 +130,7 @@ class CompensatorNode(Node):
             self._assist.receive(now, message.name, message.effort, now - age, self._assistants)
 
     def _on_motion(self, *sample: Any) -> None:
-        if self._control.settings.inertial:
+        if self._control.settings.inertial:  # each sample takes a fit, under the lock
             self._control.set_motion(*sample)
 
     def _withdraw(self, topic: str) -> None:

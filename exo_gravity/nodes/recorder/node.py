@@ -146,7 +146,7 @@ class Recorder(Node):
 
     def _losses(self) -> tuple[int, int]:
         """Return how many messages of joints and IMU did not arrive, and how many were not written."""
-        return sum(drain.losses.lost for drain in self._drains), self._writer.lost
+        return sum(drain.lost for drain in self._drains), self._writer.lost
 
     def _report_losses(self) -> tuple[int, int]:
         lost = self._losses()

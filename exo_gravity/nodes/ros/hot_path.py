@@ -118,7 +118,7 @@ class LossCounter:
         self.lost = 0
         self._newest: deque[int] = deque(maxlen=MAX_PUBLISHERS)  # number of each publisher's last message
 
-    def take(self, number: int) -> None:
+    def count(self, number: int) -> None:
         """Count the message `number`, 0 if it has none.
 
         It continues the nearest lower number, or is the first of a new publisher.
@@ -131,15 +131,15 @@ class LossCounter:
             self._newest.append(number)
 
 
-class Drain:
+class Drain(LossCounter):
     """A subscription to `topic` that queues up to `qos.depth` serialised messages until `take` is called.
 
     The middleware notes their time of arrival. counts_lost: whether to count the messages that did not arrive.
     """
 
     def __init__(self, node: Node, msgtype: type, topic: str, qos: QoSProfile, counts_lost: bool = False) -> None:
+        super().__init__()
         self.topic = topic
-        self.losses = LossCounter()  #: of messages that did not arrive
         self._counts_lost = counts_lost
         self._subscription = node.create_subscription(
             msgtype, topic, lambda message: None, qos, raw=True, callback_group=Unexecuted()
@@ -154,7 +154,7 @@ class Drain:
                 data, about = item
                 taken.append((about["received_timestamp"], bytes(data)))
                 if self._counts_lost:
-                    self.losses.take(about.get("publication_sequence_number") or 0)
+                    self.count(about.get("publication_sequence_number") or 0)
         return taken
 
 
