@@ -9,8 +9,9 @@ was carried comes from the key `state` of its can_bridge on /diagnostics, never 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
-from itertools import groupby
+from collections.abc import Sequence
+from itertools import groupby, islice
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -20,28 +21,32 @@ from rosbags.serde import SerdeError
 from exo_gravity.bag import content
 from exo_gravity.bag.content import COMMANDS, JOINT_STATE, STATES, STEPS, Bag, Event, arm_of, leaf
 from exo_gravity.bag.joints import FIELDS, TYPES, JointArrays
-from exo_gravity.bag.storage import Batch, Storage
+from exo_gravity.bag.storage import Storage
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trial.recording import Recording, ScriptedStep, Span
 
+BATCH_SIZE = 5_000  # messages that are decoded at once
 MAX_COMMAND_AGE = 200_000_000  # ns; an older command is no longer in force
 MAX_CLOCK_OFFSET = 1_000_000_000  # ns between stamp and arrival
+CARRIED = (State.RAMPING_IN.value, State.ACTIVE.value)
+STATE_GAP = 1.0  # s; can_bridge reports its state twice a second, except while it ends
+TOPIC = itemgetter(0)
 
-OnRead = Callable[[int, int], None]  # (bytes done, bytes in total)
 
-
-def read_bag(path: str | Path, on_read: OnRead = lambda done, size: None) -> Bag:
+def read_bag(path: str | Path) -> Bag:
     """Read a recording: a rosbag2 folder, or an .mcap or .db3 file, complete or cut short.
 
     Raises DataError, one sentence, if there is nothing to report: no recording, an empty one, or no arm in it.
     """
     storage, contents = Storage(path), _Contents()
-    for batch in storage.batches(content.is_wanted):
-        contents.add(batch)
-        on_read(storage.done, storage.size)
+    messages = storage.messages(content.is_wanted)
+    while batch := list(islice(messages, BATCH_SIZE)):
+        for topic, rows in groupby(sorted(batch, key=TOPIC), TOPIC):
+            _, types, stamps, data = zip(*rows, strict=True)
+            contents.add(topic, types[0], stamps, data)
     if storage.cut_short:
-        contents.is_cut = True
+        contents.is_partial = contents.is_cut = True
         contents.notes.append(f"the recording was cut short ({storage.cut_short}): what was written before is reported")
     states = sorted(name for name in contents.joints if leaf(name) == STATES)
     if not states and not contents.problems:
@@ -55,11 +60,11 @@ def read_bag(path: str | Path, on_read: OnRead = lambda done, size: None) -> Bag
     recordings = tuple(r for name in states if (r := contents.recording(name, start)))
     if not recordings:
         raise DataError(f"{path}: {'; '.join(contents.problems)}")
-    log = contents.log
-    if log.losses:
-        contents.notes.append(f"the recorder lost messages: {log.losses}")
-    notes, problems, is_partial = tuple(contents.notes), tuple(contents.problems), contents.is_cut or contents.is_open
-    return Bag(Path(path), start, recordings, log.events(start), log.parameters, notes, problems, is_partial)
+    if contents.losses:
+        contents.notes.append(f"the recorder lost messages: {contents.losses}")
+    events = tuple(Event((stamp - start) / 1e9, text) for stamp, text in sorted(contents.events))
+    notes, problems = tuple(contents.notes), tuple(contents.problems)
+    return Bag(Path(path), start, recordings, events, contents.parameters, notes, problems, contents.is_partial)
 
 
 class _Contents:
@@ -67,98 +72,37 @@ class _Contents:
 
     def __init__(self) -> None:
         self.joints: dict[str, JointArrays] = {}
-        self.log = EventLog()
+        self.parameters: dict[str, str] = {}
+        self.losses = ""
+        self.events: list[tuple[int, str]] = []  # stamp and text of faults and changed parameters
         self.notes: list[str] = []
         self.problems: list[str] = []
         self.is_cut = False  # the file was cut short
-        self.is_open = False  # an arm was not down at the end
+        self.is_partial = False  # it was, or an arm was not down at the end
         self._unreadable: set[str] = set()
-
-    def add(self, batch: Batch) -> None:
-        """Add a batch. An unreadable topic becomes a problem, and its later messages are ignored."""
-        if batch.topic in self._unreadable:
-            return
-        try:
-            if batch.msgtype == JOINT_STATE:
-                if batch.topic not in self.joints:
-                    fields = FIELDS if leaf(batch.topic) == STATES else ("effort",)
-                    self.joints[batch.topic] = JointArrays(batch.topic, fields)
-                self.joints[batch.topic].add(batch.stamps, batch.data)
-                return
-            for stamp, data in zip(batch.stamps, batch.data, strict=True):
-                self.log.add(batch.topic, stamp, TYPES.deserialize_cdr(data, batch.msgtype))
-        except (DataError, SerdeError, ValueError, KeyError) as error:
-            self._unreadable.add(batch.topic)
-            self.joints.pop(batch.topic, None)
-            text = str(error)
-            self.problems.append(text if batch.topic in text else f"{batch.topic}: {text}")
-
-    def recording(self, states: str, start: int) -> Recording | None:
-        """Return the arm whose joint states are on the topic `states`; None if it is unreadable, which is a problem."""
-        name = arm_of(states)
-        names = self.joints[states].names
-        try:
-            arrival, stamp, values = self.joints[states].arrays()
-            stamped = bool(np.all(np.diff(stamp) >= 0) and abs(np.median(arrival - stamp)) < MAX_CLOCK_OFFSET)
-            clock, values = _in_order(stamp if stamped else arrival, values)
-            command = self._commands(states, names, clock, stamped)
-            position, velocity, effort = np.moveaxis(values, 1, 0)
-            time = (clock - start) / 1e9
-            end = float(time[-1])
-            if open_end := self.log.open_end(name, start, end, self.is_cut):
-                self.notes.append(open_end)
-                self.is_open = True
-            steps, carried = self.log.steps(name, start), self.log.carried(name, start, end)
-            return Recording(name, names, time, position, velocity, effort, command, steps, carried)
-        except DataError as error:
-            self.problems.append(str(error))
-            return None
-
-    def _commands(self, states: str, names: Sequence[str], clock: np.ndarray, stamped: bool) -> np.ndarray:
-        """Return the effort (n, 4) that was in force at each time of `clock`, NaN where there was none."""
-        result = np.full((len(clock), len(names)), np.nan, np.float32)
-        topic = states.removesuffix(STATES) + COMMANDS
-        if topic not in self.joints:
-            self.notes.append(f"{topic} was not recorded: the torque error is unknown")
-            return result
-        arrival, stamp, values = self.joints[topic].arrays()
-        given = self.joints[topic].names
-        if sorted(given) != sorted(names):
-            problem = f"joint names differ: {', '.join(given)}; {states} has {', '.join(names)}"
-            self.problems.append(f"{topic}: {problem}: the torque error is unknown")
-            return result
-        sent, values = _in_order(stamp if stamped else arrival, values)
-        effort = values[:, 0, [given.index(name) for name in names]]
-        last = np.searchsorted(sent, clock, "left") - 1
-        known = (last >= 0) & (clock - sent[last] < MAX_COMMAND_AGE)
-        result[known] = effort[last[known]]
-        return result
-
-
-def _in_order(clock: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return clock (n,) and values (n, ...) sorted by time."""
-    if np.all(np.diff(clock) >= 0):
-        return clock, values
-    order = np.argsort(clock, kind="stable")
-    return clock[order], values[order]
-
-
-CARRIED = (State.RAMPING_IN.value, State.ACTIVE.value)
-STATE_GAP = 1.0  # s; can_bridge reports its state twice a second, except while it ends
-
-
-class EventLog:
-    """Collects script steps, faults, changed parameters, the parameters at the start, and what the recorder lost."""
-
-    def __init__(self) -> None:
-        self.parameters: dict[str, str] = {}
-        self.losses = ""
-        self._events: list[tuple[int, str]] = []
         self._steps: dict[str, list[tuple[int, str, float]]] = {}  # arm -> (stamp, action, duration)
         self._states: dict[str, list[tuple[int, str]]] = {}  # arm -> (stamp, state)
         self._last: dict[str, tuple[int, str]] = {}  # node -> level and text of its last status
 
-    def add(self, topic: str, stamp: int, message: Any) -> None:
+    def add(self, topic: str, msgtype: str, stamps: Sequence[int], messages: Sequence[bytes]) -> None:
+        """Add messages that arrived at `stamps` ns. An unreadable topic becomes a problem, and its rest is ignored."""
+        if topic in self._unreadable:
+            return
+        try:
+            if msgtype == JOINT_STATE:
+                fields = FIELDS if leaf(topic) == STATES else ("effort",)
+                joints = self.joints.get(topic) or self.joints.setdefault(topic, JointArrays(topic, fields))
+                joints.add(stamps, messages)
+                return
+            for stamp, data in zip(stamps, messages, strict=True):
+                self._add(topic, stamp, TYPES.deserialize_cdr(data, msgtype))
+        except (DataError, SerdeError, ValueError, LookupError) as error:
+            self._unreadable.add(topic)
+            self.joints.pop(topic, None)
+            text = str(error)
+            self.problems.append(text if topic in text else f"{topic}: {text}")
+
+    def _add(self, topic: str, stamp: int, message: Any) -> None:
         """Add one decoded message that arrived at `stamp` ns. Raises DataError for an invalid step."""
         if leaf(topic) == STEPS:
             try:
@@ -172,7 +116,7 @@ class EventLog:
                 self._add_status(stamp, status)
         elif topic == content.PARAMETER_EVENTS:
             for parameter in message.changed_parameters:
-                self._events.append((stamp, f"{message.node}: {parameter.name} = {_value(parameter.value)}"))
+                self.events.append((stamp, f"{message.node}: {parameter.name} = {_value(parameter.value)}"))
         elif topic == content.LOSSES:
             self.losses = message.data
         else:
@@ -183,61 +127,92 @@ class EventLog:
         level = int(status.level)
         last = self._last.get(status.name, (0, ""))
         if level > 0 and (level, status.message) != last:
-            self._events.append((stamp, f"{status.name}: {status.message}"))
+            self.events.append((stamp, f"{status.name}: {status.message}"))
         elif level == 0 and last[0] > 0:
-            self._events.append((stamp, f"{status.name}: OK, {status.message}"))
+            self.events.append((stamp, f"{status.name}: OK, {status.message}"))
         self._last[status.name] = (level, status.message)
-        state = next((entry.value for entry in status.values if entry.key == "state"), "")
-        if state:
-            self._states.setdefault(arm_of(status.name), []).append((stamp, state))
+        for entry in status.values:
+            if entry.key == "state" and entry.value:
+                self._states.setdefault(arm_of(status.name), []).append((stamp, entry.value))
 
-    def events(self, start: int) -> tuple[Event, ...]:
-        """Return faults, warnings and changed parameters in order; start: ns of time 0."""
-        return tuple(Event((stamp - start) / 1e9, text) for stamp, text in sorted(self._events))
+    def recording(self, topic: str, start: int) -> Recording | None:
+        """Return the arm whose joint states are on `topic`; None if it is unreadable, which is a problem."""
+        name, names = arm_of(topic), self.joints[topic].names
+        arrival, stamp, values = self.joints[topic].arrays()
+        stamped = bool(np.all(np.diff(stamp) >= 0) and abs(np.median(arrival - stamp)) < MAX_CLOCK_OFFSET)
+        clock, values = _in_order(stamp if stamped else arrival, values)
+        command = self._commands(topic, names, clock, stamped)
+        time = (clock - start) / 1e9
+        carried = self._carried(name, start, float(time[-1]))
+        try:
+            position, velocity, effort = np.moveaxis(values, 1, 0)
+            steps = self._script(name, start)
+            return Recording(name, names, time, position, velocity, effort, command, steps, carried)
+        except DataError as error:
+            self.problems.append(str(error))
+            return None
 
-    def steps(self, arm: str, start: int) -> tuple[ScriptedStep, ...]:
+    def _commands(self, states: str, names: Sequence[str], clock: np.ndarray, stamped: bool) -> np.ndarray:
+        """Return the effort (n, 4) that was in force at each time of `clock`, NaN where there was none."""
+        result = np.full((len(clock), len(names)), np.nan, np.float32)
+        topic = states.removesuffix(STATES) + COMMANDS
+        if topic not in self.joints:
+            self.notes.append(f"{topic} was not recorded: the torque error is unknown")
+            return result
+        given = self.joints[topic].names
+        if sorted(given) != sorted(names):
+            problem = f"joint names differ: {', '.join(given)}; {states} has {', '.join(names)}"
+            self.problems.append(f"{topic}: {problem}: the torque error is unknown")
+            return result
+        arrival, stamp, values = self.joints[topic].arrays()
+        sent, values = _in_order(stamp if stamped else arrival, values)
+        effort = values[:, 0, [given.index(name) for name in names]]
+        last = np.searchsorted(sent, clock, "left") - 1
+        known = (last >= 0) & (clock - sent[last] < MAX_COMMAND_AGE)
+        result[known] = effort[last[known]]
+        return result
+
+    def _script(self, arm: str, start: int) -> tuple[ScriptedStep, ...]:
         """Return the script steps of an arm; each ends when the next one begins, at the latest."""
         steps = [((stamp - start) / 1e9, action, duration) for stamp, action, duration in self._steps.get(arm, [])]
         ends = [*(begin for begin, _, _ in steps[1:]), float("inf")]
         return tuple(ScriptedStep(name, at, min(at + s, end)) for (at, name, s), end in zip(steps, ends, strict=False))
 
-    def carried(self, arm: str, start: int, end: float) -> tuple[Span, ...] | None:
+    def _carried(self, arm: str, start: int, end: float) -> tuple[Span, ...] | None:
         """Return when the arm was carried, by its reported states; None if no state of it was recorded.
 
-        end: s, of the arm's recording. An arm that is carried in the last state before it is carried until then.
+        end: s, of the arm's recording. An arm that is carried in the last state before it is carried until then. What
+        the recording does not show of the arm's way down becomes a note.
         """
         if arm not in self._states:
             return None
-        states = self._in_order(arm, start)
+        states = sorted(((stamp - start) / 1e9, state) for stamp, state in self._states[arm])
         groups = [list(group) for carried, group in groupby(states, lambda state: state[1] in CARRIED) if carried]
         spans = [(group[0][0], group[-1][0]) for group in groups]
         time, last = states[-1]
         if last in CARRIED and 0.0 < end - time < STATE_GAP:
             spans[-1] = spans[-1][0], end
+        if self.is_cut or end - time < STATE_GAP:  # else the joint states go on: they show the way down
+            if last in CARRIED:
+                missing = "while the arm is carried: it does not show how the arm was let down"
+            else:
+                missing = "before the arm was down" if last == State.LETTING_DOWN.value else ""
+            if missing:
+                self.notes.append(f"{arm}: the recording ends {missing}")
+                self.is_partial = True
         return tuple(spans)
 
-    def open_end(self, arm: str, start: int, end: float, is_cut: bool) -> str:
-        """Return what the recording does not show of the arm's way down, as a sentence, or ''.
 
-        end: s, of the arm's recording. is_cut: whether its file was cut short.
-        """
-        time, last = self._in_order(arm, start)[-1] if arm in self._states else (0.0, "")
-        if end - time >= STATE_GAP and not is_cut:
-            return ""  # the joint states go on: they show the way down
-        if last in CARRIED:
-            return f"{arm}: the recording ends while the arm is carried: it does not show how the arm was let down"
-        if last == State.LETTING_DOWN.value:
-            return f"{arm}: the recording ends before the arm was down"
-        return ""
-
-    def _in_order(self, arm: str, start: int) -> list[tuple[float, str]]:
-        return sorted(((stamp - start) / 1e9, state) for stamp, state in self._states[arm])
+def _in_order(clock: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return clock (n,) and values (n, ...) sorted by time."""
+    order = np.argsort(clock, kind="stable")
+    return clock[order], values[order]
 
 
 def _value(value: Any) -> object:
     """Return the Python value of a rcl_interfaces/ParameterValue."""
-    fields = ("", "bool", "integer", "double", "string", "byte_array", "bool_array", "integer_array", "double_array")
-    if not 0 < value.type < len(fields):
-        return list(value.string_array_value) if value.type == len(fields) else "not set"
-    found = getattr(value, f"{fields[value.type]}_value")
+    fields = ("bool", "integer", "double", "string", "byte_array", "bool_array", "integer_array", "double_array")
+    if value.type == 0:
+        return "not set"
+    found = getattr(value, f"{(*fields, 'string_array')[value.type - 1]}_value")
     return found.tolist() if hasattr(found, "tolist") else found

@@ -13,7 +13,7 @@ import itertools
 import queue
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
 
@@ -23,7 +23,7 @@ from rosbags.rosbag2.metadata import parse_qos
 from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from exo_gravity.bag.storage import Batch, McapMessages, Storage
+from exo_gravity.bag.storage import Storage
 from exo_gravity.core.errors import DataError
 
 FLUSH_PERIOD = 0.5  # s
@@ -49,7 +49,7 @@ def _opened(folder: Path) -> Writer:
 
 
 class BagWriter:
-    """A recording in the new folder `path`; usable as a context manager.
+    """A recording in the new folder `path`.
 
     Call `add_topic`, `write` and `close` from one thread; only `close` waits for the disk. `error` is what ended the
     recording early, None if nothing did. `count` messages were written, `lost` were not.
@@ -96,12 +96,6 @@ class BagWriter:
         """Write the queued messages, the index and metadata.yaml. A failure is in `error`."""
         self._ending.set()
         self._thread.join()
-
-    def __enter__(self) -> BagWriter:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _run(self) -> None:
         flush_at = time.monotonic() + FLUSH_PERIOD
@@ -161,21 +155,21 @@ def repair(path: str | Path) -> tuple[Path, int]:
         raise DataError(f"{other}: must be an .mcap file; try `ros2 bag reindex`")
     folder = source.path.resolve().with_name(f"{source.path.resolve().stem}_repaired")
     types, connections, count = get_typestore(Stores.ROS2_JAZZY), dict[str, Connection](), 0
-    batches = itertools.chain.from_iterable(map(_described, source.files))
-    if (first := next(batches, None)) is None:
+    messages = source.messages(lambda topic, msgtype: bool(msgtype))
+    if (first := next(messages, None)) is None:
         raise DataError(f"{folder}: not written: the recording has no message")
     try:
         writer = _opened(folder)
-        for batch, definition, qos in itertools.chain([first], batches):
-            if batch.topic not in connections:
-                if batch.msgtype not in types.fielddefs:
-                    types.register(get_types_from_msg(definition, batch.msgtype))
-                connections[batch.topic] = writer.add_connection(
-                    batch.topic, batch.msgtype, typestore=types, offered_qos_profiles=parse_qos(qos)
+        for topic, msgtype, stamp, data in itertools.chain([first], messages):
+            if topic not in connections:
+                definition, qos = source.announced[topic]
+                if msgtype not in types.fielddefs:
+                    types.register(get_types_from_msg(definition, msgtype))
+                connections[topic] = writer.add_connection(
+                    topic, msgtype, typestore=types, offered_qos_profiles=parse_qos(qos)
                 )
-            for stamp, data in zip(batch.stamps, batch.data, strict=True):
-                writer.write(connections[batch.topic], stamp, data)
-            count += len(batch.stamps)
+            writer.write(connections[topic], stamp, data)
+            count += 1
         writer.close()
         with Reader(folder) as reader:
             found = sum(1 for _ in reader.messages())
@@ -184,11 +178,3 @@ def repair(path: str | Path) -> tuple[Path, int]:
     if found != count:
         raise DataError(f"{folder}: {found} messages can be read: must be {count}")
     return folder, count
-
-
-def _described(file: Path) -> Iterator[tuple[Batch, str, str]]:
-    """Yield each batch of an MCAP file with the definition of its type and its quality of service."""
-    with file.open("rb") as stream:
-        messages = McapMessages(stream, {}, lambda topic, msgtype: bool(msgtype))
-        for batch in messages.batches():
-            yield batch, *messages.announced[batch.topic]

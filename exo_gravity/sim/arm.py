@@ -115,8 +115,8 @@ def felt_in_base(side: str, state: TrunkState, gravity: float) -> tuple[Vector, 
     Gravity less acceleration in m/s^2, angular velocity in rad/s, angular acceleration in rad/s^2. gravity: m/s^2.
     """
     felt = gravity * gravity_in_trunk(state.pitch, state.roll) - state.acceleration
-    turning = (in_base(side, vector, turning=True) for vector in (state.angular_velocity, state.angular_acceleration))
-    return (in_base(side, felt.tolist()), *turning)
+    spin, spin_up = state.angular_velocity, state.angular_acceleration
+    return in_base(side, felt.tolist()), in_base(side, spin, turning=True), in_base(side, spin_up, turning=True)
 
 
 class SimulatedArm:

@@ -64,7 +64,6 @@ def _repair(path: Path) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     from rich.console import Console
-    from rich.progress import Progress
 
     from exo_gravity.bag.reader import read_bag
     from exo_gravity.tools.reporting import trial_report
@@ -77,9 +76,8 @@ def _run(options: argparse.Namespace) -> int:
     path, screen = Path(options.bag), Console(stderr=True)
     try:
         clip = video.requested(options.video, options.video_speed)
-        with Progress(console=screen, transient=True, disable=not screen.is_terminal) as progress:
-            task = progress.add_task(f"reading {path.name}", total=None)
-            bag = read_bag(path, lambda done, size: progress.update(task, completed=done, total=size))
+        with screen.status(f"reading {path.name}"):
+            bag = read_bag(path)
         report = trial_report.analyse(bag, criteria, options.min_hold)
         beside = path.resolve().with_name(f"{path.resolve().stem}_report")
         written = trial_report.write(report, options.output or beside)

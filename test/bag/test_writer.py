@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import threading
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -43,7 +44,7 @@ def joint_state(k):
 
 @pytest.fixture
 def bag(tmp_path):
-    with BagWriter(tmp_path / "bag") as writer:
+    with closing(BagWriter(tmp_path / "bag")) as writer:
         writer.add_topic("/right/joint_states", JOINT_STATE, RELIABLE)
         writer.add_topic("/right/wearer_step", STRING, offered_qos(True, True, 1))
         writer.write([("/right/joint_states", START + k, joint_state(k)) for k in range(100)])
@@ -93,12 +94,12 @@ def test_an_existing_folder_is_not_overwritten(bag):
 
 
 def test_an_unknown_type_is_refused_by_name(tmp_path):
-    with BagWriter(tmp_path / "bag") as writer, pytest.raises(DataError, match="my_msgs/msg/Mine"):
+    with closing(BagWriter(tmp_path / "bag")) as writer, pytest.raises(DataError, match="my_msgs/msg/Mine"):
         writer.add_topic("/mine", "my_msgs/msg/Mine", RELIABLE)
 
 
 def test_queued_messages_are_written_before_the_end(tmp_path):
-    with BagWriter(tmp_path / "bag") as writer:
+    with closing(BagWriter(tmp_path / "bag")) as writer:
         writer.add_topic("/right/joint_states", JOINT_STATE, RELIABLE)
         for k in range(1500):
             writer.write([("/right/joint_states", START + k, joint_state(k))])
@@ -110,7 +111,7 @@ def test_messages_that_a_slow_disk_cannot_take_are_counted_and_the_recording_goe
     monkeypatch.setattr("exo_gravity.bag.writer.MAX_WAITING", 10)
     write = BagWriter._take
     monkeypatch.setattr(BagWriter, "_take", lambda self, messages: ready.wait() and write(self, messages))
-    with BagWriter(tmp_path / "bag") as writer:
+    with closing(BagWriter(tmp_path / "bag")) as writer:
         writer.add_topic("/right/joint_states", JOINT_STATE, RELIABLE)
         for k in range(20):
             writer.write([("/right/joint_states", START + k, joint_state(k))])
@@ -121,7 +122,7 @@ def test_messages_that_a_slow_disk_cannot_take_are_counted_and_the_recording_goe
 
 
 def test_a_message_that_cannot_be_written_is_counted_and_the_others_are_written(tmp_path):
-    with BagWriter(tmp_path / "bag") as writer:
+    with closing(BagWriter(tmp_path / "bag")) as writer:
         writer.add_topic("/right/joint_states", JOINT_STATE, RELIABLE)
         good = [("/right/joint_states", START + k, joint_state(k)) for k in range(4)]
         writer.write([*good[:2], ("/nowhere", START, b""), ("/right/joint_states", -1, b""), *good[2:]])
@@ -150,7 +151,7 @@ def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path):
 def cut(tmp_path):
     """The folder of a recording whose file ends within a chunk, without metadata.yaml."""
     recording = made.trial([[0.1, 0.4, 0.5, 0.6], [-0.2, 0.8, 0.3, 0.9]], hold=3.0, rate=200.0)
-    with BagWriter(tmp_path / "bag") as writer:
+    with closing(BagWriter(tmp_path / "bag")) as writer:
         for topic, msgtype in {item[0]: item[1] for item in made.messages(recording)}.items():
             writer.add_topic(topic, msgtype, offered_qos("step" not in topic, "step" in topic, 1))
         writer.write([(topic, stamp, data) for topic, _, stamp, data in made.messages(recording)])

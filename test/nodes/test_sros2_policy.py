@@ -120,8 +120,8 @@ def nodes_with_recorded_parameters(bag):
     """Return the nodes whose parameters are in a recording, which may still grow."""
     types, wanted = get_typestore(Stores.ROS2_JAZZY), lambda topic, msgtype: topic == "/recorder/parameters"
     try:
-        batches = Storage(bag).batches(wanted)
-        texts = [types.deserialize_cdr(data, batch.msgtype).data for batch in batches for data in batch.data]
+        messages = Storage(bag).messages(wanted)
+        texts = [types.deserialize_cdr(data, msgtype).data for _, msgtype, _, data in messages]
     except DataError:  # the recording is still empty
         return set()
     return {text.partition(":")[0].strip() for text in texts}

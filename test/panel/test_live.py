@@ -60,8 +60,8 @@ def carried_on_page(nodes: LaunchedNodes, probe: RosProbe, browser: Browser, url
 def panel_diagnostics(bag: Path) -> list[str]:
     """Return the messages of the panel in a recording."""
     types = get_typestore(Stores.ROS2_JAZZY)
-    batches = Storage(bag).batches(lambda topic, msgtype: topic == "/diagnostics")
-    arrays = [types.deserialize_cdr(data, batch.msgtype) for batch in batches for data in batch.data]
+    messages = Storage(bag).messages(lambda topic, msgtype: topic == "/diagnostics")
+    arrays = [types.deserialize_cdr(data, msgtype) for _, msgtype, _, data in messages]
     return [status.message for array in arrays for status in array.status if status.name == "panel"]
 
 

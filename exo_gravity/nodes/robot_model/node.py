@@ -156,13 +156,14 @@ class ViewedArm:
         self.problem = "" if now - self._time < STALE else f"no messages on {self.states_topic}"
         try:
             names = self.description.limits.joint_names
-            readings = [by_name(self.states, field, names) for field in ("position", "velocity", "effort")]
+            fields = ("position", "velocity", "effort")
+            theta, velocity, effort = (by_name(self.states, field, names) for field in fields)
         except ParameterError as error:
             self.problem = self.problem or f"{self.states_topic}: {error.name} must be {error.expected}"
         if self.problem:
             return None
         status = self._status if now - self._status_time < STALE_STATE else ("", "")
-        return ArmView(self.description, *readings, *status)
+        return ArmView(self.description, theta, velocity, effort, *status)
 
     def _on_states(self, message: JointState, _info: dict[str, Any]) -> None:
         self.states, self._time = message, time.monotonic()
