@@ -72,6 +72,13 @@ class Access:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request or live connection."""
+        left = MAX_BODY
+
+        async def limited() -> Message:
+            nonlocal left
+            message = await receive()
+            left -= len(message.get("body", b""))
+            return message if left >= 0 else {"type": "http.disconnect"}  # a proxy need not say how long a request is
 
         async def confined(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -82,10 +89,10 @@ class Access:
 
         refusal = self._refusal(HTTPConnection(scope))
         if refusal is None and _is_login(scope):
-            request = Request(scope, receive)
+            request = Request(scope, limited)
             given = parse_qs((await request.body()).decode("utf-8", "replace")).get("token", [""])[0]
             refusal = self._opened_by(given, request)
-        await (refusal or self._app)(scope, receive, confined)
+        await (refusal or self._app)(scope, limited, confined)
 
     def allows_host(self, host: str) -> bool:
         """Return whether a request with this header `Host` may be answered."""
@@ -117,7 +124,7 @@ class Access:
         changes = scope.get("method") not in ("GET", "HEAD")  # a live connection has no method
         if changes and not is_same_origin(headers.get("origin", ""), headers.get("host", "")):
             return PlainTextResponse("403: this request does not come from the panel's page", 403)
-        if "transfer-encoding" in headers or int(headers.get("content-length", "0")) > MAX_BODY:
+        if int(headers.get("content-length", "0")) > MAX_BODY:
             return PlainTextResponse("413: too long", 413)
         if _is_login(scope) or self.allows(connection.cookies.get(COOKIE, "")):
             return None

@@ -188,6 +188,15 @@ def test_a_request_that_is_not_json_or_too_long_is_refused(stage, content):
     assert stage.arms.calls == []
 
 
+def test_a_request_without_its_length_lets_down_unless_it_is_too_long(stage):
+    headers = {"origin": stage.url.rstrip("/")}
+    for padding, status in ((b"", 200), (b" " * 5000, 500)):
+        stage.arms.calls.clear()
+        parts = iter((b'{"do": ', b'"let_down"}', padding))
+        answer = httpx.post(stage.url + "action", content=parts, headers=headers, verify=False)
+        assert (answer.status_code, bool(stage.arms.calls)) == (status, status == 200)
+
+
 def test_the_operator_enables_and_a_watching_page_lets_down(stages):
     stage = stages()
     with live(stage) as one, live(stage) as other:
