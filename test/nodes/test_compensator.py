@@ -172,6 +172,7 @@ def test_one_file_sets_different_support_for_the_two_arms(tmp_path, launch, prob
         feed(side)
         expected = gravity_torque(ROBOT.with_wearer(*WEARER, support), POSE)
         probe.wait_until(lambda c=commands[side], e=expected: c and np.allclose(c[-1].effort, e, atol=1e-9))
+        probe.wait_until(lambda side=side: f"/{side}/compensator" in probe.statuses)  # may come after its efforts
         values = {item.key: item.value for item in probe.statuses[f"/{side}/compensator"].values}
         assert values["support"] == str(support)
         assert values["wearer mass (kg)"] == "0, 0, 2.032, 1.672"
