@@ -51,10 +51,11 @@ calibrate-study:
 	@$(SETUP) $(TEST) calibrate
 	$(BIN)/python -m bench.calibration
 
-# Tests of running nodes need a machine that keeps up with them: they run alone.
+# Tests of running nodes need a machine that keeps up with them: they run alone. The other ones share a module's nodes
+# and simulations: each file runs in one process.
 test:
 	@$(SETUP) $(TEST)
-	$(BIN)/python -m pytest test -n auto -m "not (real_time or browser or thorough)"
+	$(BIN)/python -m pytest test -n auto --dist loadfile -m "not (real_time or browser or thorough)"
 	$(BIN)/python -m pytest test/hardware test/nodes -m "real_time and not thorough"
 
 test-all: test test-long
@@ -64,8 +65,7 @@ test-long:
 	@mkdir -p build
 	@command -v chromium chromium-browser >/dev/null || ! test -w /var/lib/dpkg || \
 		(apt-get update && apt-get install --yes chromium) >build/chromium.log 2>&1 || true
-	$(BIN)/python -m pytest bench -n auto
-	$(BIN)/python -m pytest test -n auto -m "(browser or thorough) and not real_time"
+	$(BIN)/python -m pytest bench test -n auto --dist loadfile -m "(browser or thorough) and not real_time"
 	$(BIN)/python -m pytest test -m "(browser or thorough) and real_time"
 
 lint:

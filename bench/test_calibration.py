@@ -77,7 +77,6 @@ def test_trouble_is_reported_by_name_and_nothing_is_fitted(
 
 
 @pytest.mark.timeout(400)
-@pytest.mark.thorough
 def test_a_random_device_is_calibrated_from_motors_to_an_arm_that_holds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -89,7 +88,6 @@ def test_a_random_device_is_calibrated_from_motors_to_an_arm_that_holds(
 
 
 @pytest.mark.timeout(300)
-@pytest.mark.thorough
 def test_the_arm_of_the_demo_falls_before_and_stays_after(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with patch.object(live, "run_tour", run_tour([])):
         assert demo.main(tmp_path / "demo") == 0

@@ -65,13 +65,13 @@ def wobble(run, seconds, width=0.02, hertz=3.0):
     return replaced
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(st.floats(0.001, 0.2), st.floats(0.1, 10.0))
 def test_along_a_path_across_the_edge_of_the_box_the_torque_neither_steps_nor_chatters(width, hertz):
     run = CompensatorRun(law="anfis", anfis=learned())
     run.cycle(2.0)
     run.efforts.clear()
-    replaced = wobble(run, 4.0, width, hertz)
+    replaced = wobble(run, 3.0, width, hertz)
     # The laws differ by up to 2 Nm, which fades over 2 s; the exact law changes by up to 3 Nm/rad along the path.
     remainders = 2.0 * PERIOD / FADE_TIME
     path = 3.0 * width * 2 * math.pi * hertz * PERIOD

@@ -44,11 +44,10 @@ def test_after_a_fault_the_arm_is_let_down_gently_and_the_fault_stays_latched(sp
     arm.silent.clear()
     arm.changes = [{} for _ in range(4)]
     arm.effort, arm.effort_age = EFFORT, 0.002
-    arm.cycle(10.0)
-    assert arm.machine.state is State.FAULT
+    arm.until(State.FAULT)
     assert arm.drive == OFF
     assert max(arm.steps) <= MAX_EFFORT_RATE * PERIOD * 1.0001
-    arm.cycle(10.0)
+    arm.cycle(1.0)
     assert arm.machine.state is State.FAULT
 
 
@@ -70,7 +69,7 @@ def test_a_silent_motors_torque_is_held_and_lowered_from_what_it_applies_when_it
     arm.silent.add(1)
     arm.cycle(4.9)
     assert arm.machine.state is State.LETTING_DOWN
-    arm.cycle(30.0)
+    arm.cycle(10.0)
     assert arm.machine.state is State.FAULT
     assert arm.machine.is_unreached
     assert arm.drive.powered and arm.drive.effort == (0.0, -4.0, 0.0, 0.0)
@@ -79,9 +78,8 @@ def test_a_silent_motors_torque_is_held_and_lowered_from_what_it_applies_when_it
     arm.cycle(0.5)
     assert arm.machine.state is State.LETTING_DOWN
     assert arm.drive.damping[1] == DAMPING
-    arm.cycle(10.0)
+    arm.until(State.FAULT)
     assert max(arm.steps) <= MAX_EFFORT_RATE * PERIOD * 1.0001
-    assert arm.machine.state is State.FAULT
     assert arm.drive == OFF
     assert arm.fault_code == "motor_silent"
 
@@ -240,9 +238,7 @@ def let_down_by(code: FaultCode) -> SafetyRun:
     for step in range(46):  # as a One-G descent leaves a shoulder that no gravity turns back
         arm.changes[0].update(position=0.02 * step)
         arm.cycle(0.02)
-    arm.cycle(10.0)
-    assert arm.machine.state is State.FAULT
-    return arm
+    return arm.until(State.FAULT)
 
 
 @pytest.mark.parametrize("code", sorted(NO_ONES))
@@ -269,7 +265,7 @@ def test_resume_is_refused_after_any_other_fault_and_in_any_other_state():
     arm.machine.trip(FaultCode.COMMAND_STALE, "test", arm.now)
     arm.cycle()
     assert not arm.machine.resume(arm.now)
-    arm.cycle(10.0)
+    arm.until(State.FAULT)
     arm.silent.add(1)
     arm.cycle(0.5)
     arm.silent.clear()

@@ -183,16 +183,15 @@ def test_the_thread_runs_the_cycles_until_the_loop_is_stopped():
     assert not loop.cycle()
 
 
-@pytest.mark.parametrize("echoes", [False, True], ids=["", "echoed"])
 @pytest.mark.parametrize(
-    ("data", "period"),
+    ("data", "period", "echoes"),
     [
-        (EXIT, 0.1),
-        (EXIT, 0.004),
-        (MOTORS_OF_ARM[1].command(6.0, 0.0), 0.002),
-        (MOTORS_OF_ARM[1].command(0.0, 0.0), 0.01),
+        (EXIT, 0.1, False),
+        (EXIT, 0.004, True),
+        (MOTORS_OF_ARM[1].command(6.0, 0.0), 0.002, False),
+        (MOTORS_OF_ARM[1].command(0.0, 0.0), 0.01, True),
     ],
-    ids=["EXIT at 10 Hz", "EXIT at 250 Hz", "6 Nm at 500 Hz", "0 Nm at 100 Hz"],
+    ids=["EXIT at 10 Hz", "EXIT at 250 Hz, echoed", "6 Nm at 500 Hz", "0 Nm at 100 Hz, echoed"],
 )
 def test_foreign_commands_are_opposed_at_once_and_the_arm_is_let_down(data: bytes, period: float, echoes: bool):
     arm = Carried(echoes)

@@ -101,7 +101,7 @@ def test_the_arm_of_a_bridge_that_ends_is_let_down_by_the_watchdog_which_holds_i
         carrier.order("hand over")
     else:
         carrier.kill(signal.SIGKILL if end == "killed" else signal.SIGSTOP)
-    assert carrier.process.wait(5) == -signal.SIGKILL
+    assert carrier.process.wait(30) == -signal.SIGKILL
     with pytest.raises(BusError, match=rf"held by the watchdog \(PID {carrier.watchdog}\) of /right/can_bridge"):
         BusLock(rig.arm.address, "another")
     assert carrier.log().endswith("letting the arm down\nERROR the arm is down, its motors are off\n")
@@ -140,8 +140,7 @@ def test_a_full_pipe_of_the_log_does_not_delay_the_watchdog(rig, carry):
 def test_a_frozen_watchdog_is_noticed_and_recovers_and_ends_with_its_bridge(rig):
     lock = BusLock(rig.arm.address, "a test")
     watchdog = Watchdog(lock, rig.arm)
-    wait_until(lambda: lock.notes.heartbeat)
-    assert watchdog.alive
+    wait_until(lambda: lock.notes.heartbeat and watchdog.alive)
     os.kill(watchdog.process.pid, signal.SIGSTOP)
     wait_until(lambda: not watchdog.alive)
     os.kill(watchdog.process.pid, signal.SIGCONT)

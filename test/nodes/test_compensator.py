@@ -69,13 +69,13 @@ def set_at_once(probe: RosProbe, values: Mapping[str, Any], atomically: bool) ->
 
 
 @pytest.mark.thorough
-def test_a_thousand_valid_and_invalid_changes_neither_step_the_torque_nor_stop_the_node(launch, probe, feed):
+def test_300_valid_and_invalid_changes_neither_step_the_torque_nor_stop_the_node(launch, probe, feed):
     nodes = launch(without=OTHER_NODES, compensator={**NO_IMU, "max_effort": [3.0, 18.0, 9.0, 9.0]})
     feed()
     commands = probe.effort_commands
     probe.wait_until(lambda: probe.status_contains("compensator", "compensating") and len(commands) > 300)
     accepted = 0
-    for number, change in enumerate(random_changes(1000, ROBOT.length.tolist())):
+    for number, change in enumerate(random_changes(300, ROBOT.length.tolist())):
         results = set_at_once(probe, change.values, atomically=number % 2 == 1)
         assert all(result.successful or len(result.reason.split()) > 3 for result in results)
         assert not (change.invalid and all(result.successful for result in results)), change.values
@@ -83,7 +83,7 @@ def test_a_thousand_valid_and_invalid_changes_neither_step_the_torque_nor_stop_t
     assert nodes.launcher.dead() is None
     before = len(commands)
     probe.wait_until(lambda: len(commands) > before + 20)
-    assert accepted > 400
+    assert accepted > 120
     assert all(len(command.effort) == 4 for command in commands)
     excess, step_count = largest_excess(commands, rate=50.0)
     assert excess <= 1e-9 and step_count > 300
@@ -172,6 +172,7 @@ def test_one_file_sets_different_support_for_the_two_arms(tmp_path, launch, prob
         feed(side)
         expected = gravity_torque(ROBOT.with_wearer(*WEARER, support), POSE)
         probe.wait_until(lambda c=commands[side], e=expected: c and np.allclose(c[-1].effort, e, atol=1e-9))
+        probe.wait_until(lambda side=side: f"/{side}/compensator" in probe.statuses)  # may come after its efforts
         values = {item.key: item.value for item in probe.statuses[f"/{side}/compensator"].values}
         assert values["support"] == str(support)
         assert values["wearer mass (kg)"] == "0, 0, 2.032, 1.672"

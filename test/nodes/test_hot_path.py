@@ -121,7 +121,7 @@ def test_a_poll_ends_although_messages_arrive_faster_than_it_takes_them(pair):
 
 
 def test_of_a_flood_the_thread_takes_the_newest_message_once_in_each_pause(executor):
-    pair = Pair(executor.get_nodes()[0], NEWEST, pause=0.5)
+    pair = Pair(executor.get_nodes()[0], NEWEST, pause=1.5)  # longer than this process may not be run
     pair.hot.start()
     pair.send("a")
     pair.wait_until(lambda: pair.received)

@@ -63,6 +63,11 @@ class ImuNode:
         self.tilts[stamp] = message.vector
         self.received = max(self.received, self._number[stamp])
 
+    def forget(self):
+        """Forget what came before; the next sample starts the estimate anew after a gap."""
+        self.tilts.clear()
+        self.reported.clear()
+
     def _on_diagnostics(self, message):
         self.reported += message.status
         values = {pair.key: pair.value for pair in self.reported[-1].values}
@@ -101,11 +106,12 @@ class ImuNode:
         return float(stamp)
 
 
-@pytest.fixture
-def imu(request, monkeypatch):
-    """A node whose IMU is aligned with the trunk, or mounted as the test's parameter states."""
-    monkeypatch.setenv("EXO_GRAVITY_SUPERVISED", "1")
-    imu = ImuNode(getattr(request, "param", UPRIGHT))
+@pytest.fixture(scope="module")
+def node(request):
+    """A node whose IMU is aligned with the trunk, or mounted as the module's parameter states."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("EXO_GRAVITY_SUPERVISED", "1")
+        imu = ImuNode(getattr(request, "param", UPRIGHT))
     try:
         imu.wait_until(lambda: imu.publisher.get_subscription_count() and imu.reports("waiting"))
         yield imu
@@ -113,11 +119,18 @@ def imu(request, monkeypatch):
         imu.close()
 
 
+@pytest.fixture
+def imu(node):
+    """The same with no tilts and reports yet."""
+    node.forget()
+    return node
+
+
 def test_every_sample_of_a_recording_gives_the_tilt_of_the_estimator_with_its_covariance(imu):
     messages = {}
     imu.node.create_subscription(Imu, "/imu/data", lambda m: messages.update({to_nanoseconds(m.header.stamp): m}), 1000)
     estimator, expected = TrunkEstimator(UPRIGHT), {}
-    for moment, rate, acceleration in zip(*(column[:3000] for column in read_recording()), strict=True):
+    for moment, rate, acceleration in zip(*(column[:1000] for column in read_recording()), strict=True):
         stamp = round(moment * 1e9)
         answer = estimator.update(ImuSample(stamp * 1e-9, np.radians(rate).tolist(), (G * acceleration).tolist()))
         if answer is not None:
@@ -147,8 +160,8 @@ def test_a_refusal_is_reported_with_its_reason_and_gives_no_tilt(imu):
     for k in range(30):
         imu.send(stamp + 0.01 * (k + 1), noise=0.0)
     imu.wait_until(lambda: imu.reports("the IMU or its driver is frozen") and imu.received == imu.sent)
-    late = [number for number in imu.tilts if number > round((stamp + 0.11) * 1e9)]
-    assert not late and round((stamp + 0.09) * 1e9) in imu.tilts
+    imu.wait_until(lambda: round((stamp + 0.09) * 1e9) in imu.tilts)
+    assert not [number for number in imu.tilts if number > round((stamp + 0.11) * 1e9)]
 
 
 def test_samples_of_a_second_driver_are_an_error_and_give_no_tilt(imu):
@@ -157,17 +170,15 @@ def test_samples_of_a_second_driver_are_an_error_and_give_no_tilt(imu):
     imu.wait_until(lambda: imu.publisher.get_subscription_count())
     before = imu.received
     while imu.received == before:  # samples are lost until the node has matched the new publisher too
-        stamp_of_second += 0.001
+        stamp_of_second += 1.0  # after such a gap one sample is not enough, however long this process was not run
         imu.send(stamp_of_second, acceleration=(0.0, 1.0, 9.7))
         imu.executor.spin_once(timeout_sec=0.05)
     imu.wait_until(lambda: imu.reports("more than one publisher of /imu/data_raw", DiagnosticStatus.ERROR))
-    imu.publisher, imu.sent = first, imu.received
-    imu.send(stamp_of_second + 0.01)
-    imu.wait_until(lambda: imu.received >= imu.sent)
     assert max(imu.tilts) == round(stamp * 1e9)
+    imu.publisher, imu.sent = first, imu.received
 
 
-@pytest.mark.parametrize("imu", [MOUNTING.as_quat()], indirect=True, ids=["turned"])
+@pytest.mark.parametrize("node", [MOUNTING.as_quat()], indirect=True, ids=["turned"])
 def test_a_turned_imu_gives_tilt_rate_and_acceleration_in_the_trunks_axes(imu):
     messages = []
     imu.node.create_subscription(Imu, "/imu/data", messages.append, 50)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ pytestmark = pytest.mark.real_time
 
 POSE = [0.1, 0.8, 0.7, 0.6]  # rad
 RATE = SIMULATED["can_bridge"]["rate"]  # Hz
+Observed = TypeVar("Observed")
 ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
 
 
@@ -28,71 +30,67 @@ ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585,
 def script(tmp_path: Path) -> str:
     """The path of a trial script that moves the arm to `POSE` and lets go."""
     path = tmp_path / "to_pose.yaml"
-    path.write_text(yaml.safe_dump({"name": "to_pose", "steps": [{"move": POSE, "over": 2.0}, {"hold": 60.0}]}))
+    path.write_text(yaml.safe_dump({"name": "to_pose", "steps": [{"move": POSE, "over": 1.5}, {"hold": 60.0}]}))
     return str(path)
 
 
-def test_a_released_arm_stays_follows_live_changes_and_is_let_down_gently(launch, probe, script, listen):
-    nodes = launch()
+def while_carried(probe: RosProbe, script: str, observe: Callable[[], Observed]) -> Observed:
+    """Return what `observe` returns of the arm in the script's pose; again if a busy machine let it down meanwhile."""
+    while True:
+        probe.bring_to(script)
+        probe.states.clear()
+        observed = observe()
+        if set(probe.states) <= {"active"}:
+            return observed
+
+
+def test_an_arm_stays_follows_live_changes_and_after_a_fault_is_carried_by_its_operator_alone(
+    launch, probe, script, listen
+):
+    # Under its own launcher, the compensator's death does not stop the other nodes.
+    nodes = launch(without=("compensator",))
+    compensator = launch(without=("can_bridge", "simulator", "imu"))
     listener = listen(nodes)
-    probe.bring_to(script)
-    released = probe.joint_angles()
-    seen = len(probe.joint_states)
-    probe.wait_until(lambda: len(probe.joint_states) > seen + 3.0 * RATE)
-    drift = np.degrees(np.subtract(probe.joint_angles(), released))
-    assert np.abs(drift).max() < 0.5
-    tilt = Tilt.of("right", 0.10, -0.06)
-    expected = gravity_torque(ROBOT, probe.joint_angles(), tilt.direction)
-    np.testing.assert_allclose(probe.effort_commands[-1].effort, expected, atol=0.03)
 
-    # Invalid values are refused with a sentence.
-    for name, value, reason in (
-        ("robot__mass", [0.6, 0.5, 0.6], "must be 4 numbers"),
-        ("robot__mass", [0.6, 0.5, 900.0, 0.2], "from 0 to 20"),
-        ("robot__cog", [0.0, 0.0, 0.4, 0.0], "within its link"),
-        ("law", "magic", "one of exact"),
-        ("side", "left", "read-only"),
-    ):
-        result = probe.set_parameters("compensator", **{name: value})
-        assert not result.successful
-        assert reason in result.reason
+    def hold_and_change() -> tuple[float, float, float]:
+        """Return the drift in degrees, the error of the efforts in Nm, and the largest step of a change beside it."""
+        assert probe.set_parameters("compensator", gain=[1.0] * 4).successful
+        released, seen = probe.joint_angles(), len(probe.joint_states)
+        probe.wait_until(lambda: len(probe.joint_states) > seen + 2.0 * RATE)
+        drift = np.degrees(np.abs(np.subtract(probe.joint_angles(), released)).max())
+        tilt = Tilt.of("right", 0.10, -0.06)
+        before = probe.effort_commands[-1].effort
+        error = np.abs(np.subtract(before, gravity_torque(ROBOT, probe.joint_angles(), tilt.direction))).max()
+        probe.effort_commands.clear()
+        assert probe.set_parameters("compensator", gain=[1.0, 1.05, 1.0, 1.0]).successful
+        heavier = ArmModel(ROBOT.length, ROBOT.cog, ROBOT.mass, gain=(1.0, 1.05, 1.0, 1.0))
+        target = gravity_torque(heavier, probe.joint_angles(), tilt.direction)[1]
+        probe.wait_until(
+            lambda: (
+                probe.state != "active"
+                or any(command.effort and abs(command.effort[1] - target) < 0.01 for command in probe.effort_commands)
+            )
+        )
+        steps = np.diff([message.effort[1] for message in probe.effort_commands if message.effort])
+        return drift, error, np.abs(steps).max() / abs(target - before[1])
 
-    # A valid value reaches the arm without a torque step.
-    before = probe.effort_commands[-1].effort[1]
-    probe.effort_commands.clear()
-    assert probe.set_parameters("compensator", gain=[1.0, 1.05, 1.0, 1.0]).successful
-    heavier = ArmModel(ROBOT.length, ROBOT.cog, ROBOT.mass, gain=(1.0, 1.05, 1.0, 1.0))
-    target = gravity_torque(heavier, probe.joint_angles(), tilt.direction)[1]
-    probe.wait_until(lambda: probe.effort_commands and abs(probe.effort_commands[-1].effort[1] - target) < 0.01)
-    steps = np.diff([message.effort[1] for message in probe.effort_commands])
-    assert np.abs(steps).max() < 0.5 * abs(target - before)
+    drift, error, step = while_carried(probe, script, hold_and_change)
+    assert drift < 0.5 and error < 0.03 and step < 0.5
 
     # No node maps another one's shared memory, on which it could block.
-    for node in ("can_bridge", "compensator", "simulator"):
-        maps = Path(f"/proc/{nodes.process(node).pid}/maps").read_text()
+    for process in (*map(nodes.process, ("can_bridge", "simulator")), compensator.process("compensator")):
+        maps = Path(f"/proc/{process.pid}/maps").read_text()
         assert "librmw_fastrtps" in maps
         assert "fastrtps_port" not in maps
 
-    # Ctrl-C to the bridge: the arm is let down, then the motors are switched off, then all nodes stop.
-    probe.joint_states.clear()
-    nodes.process("can_bridge").send_signal(signal.SIGINT)
-    probe.wait_until(lambda: nodes.have_ended)
-    assert nodes.ended_node == ("/right/can_bridge", 0)
-    assert max(max(map(abs, message.velocity)) for message in probe.joint_states) < 1.0
-    assert abs(probe.joint_angles()[2]) < 0.2  # friction holds it there
-    assert listener.motors_are_off()
-
-
-def test_only_the_operator_clears_the_fault_after_the_compensator_died(launch, probe):
-    # Under its own launcher, the compensator's death does not stop the other nodes.
-    launch(without=("compensator", "imu"))
-    compensator = launch(without=("can_bridge", "simulator", "imu"), compensator=NO_IMU)
+    # Without a compensator the arm is let down, and only the operator clears the fault.
     probe.wait_until_carried()
+    probe.joint_states.clear()
     compensator.process("compensator").send_signal(signal.SIGKILL)
-    probe.wait_until(lambda: probe.state == "letting down")
-    assert probe.fault == "command_stale"
     probe.wait_until(lambda: probe.state == "fault")
-    launch(without=("can_bridge", "simulator", "imu"), compensator=NO_IMU)
+    assert probe.fault == "command_stale"
+    assert abs(probe.joint_angles()[2]) < 0.2  # friction holds it there
+    launch(without=("can_bridge", "simulator", "imu"))
     probe.effort_commands.clear()
     probe.wait_until(lambda: len(probe.effort_commands) > 100)
     assert (probe.state, probe.fault) == ("fault", "command_stale")
@@ -100,6 +98,13 @@ def test_only_the_operator_clears_the_fault_after_the_compensator_died(launch, p
     assert probe.trigger("clear_fault").success
     probe.wait_until(lambda: probe.state == "disabled")
     probe.wait_until_carried()
+
+    # Ctrl-C to the bridge: the arm is let down, then the motors are switched off, then all nodes stop.
+    nodes.process("can_bridge").send_signal(signal.SIGINT)
+    probe.wait_until(lambda: nodes.have_ended)
+    assert nodes.ended_node == ("/right/can_bridge", 0)
+    assert max(max(map(abs, message.velocity)) for message in probe.joint_states) < 1.0
+    assert listener.motors_are_off()
 
 
 @pytest.fixture(scope="module")

@@ -39,7 +39,7 @@ def test_a_compensator_without_a_parameter_file_starts_and_waits_for_joint_state
         probe.wait_until(lambda: probe.status_contains("compensator", "waiting for joint_states"))
     finally:
         process.send_signal(signal.SIGINT)
-        assert process.wait(10) == 0
+        assert process.wait(30) == 0
 
 
 @pytest.mark.thorough

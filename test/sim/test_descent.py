@@ -82,13 +82,12 @@ class Lowered:
         fastest = 0.0
         for _ in range(round(duration / 0.001)):
             self.device.advance(0.001)
-            fastest = max(fastest, float(np.abs(self.arm.velocities).max()))
+            fastest = max(fastest, *map(abs, self.arm.velocities))
         self._now += duration
         return fastest
 
 
-@pytest.mark.parametrize("friction", [0.0, 0.01, 0.05, 0.2, 0.5])
-@pytest.mark.parametrize("body_mass", [0.0, 75.0])
+@pytest.mark.parametrize(("friction", "body_mass"), [(0.0, 0.0), (0.5, 0.0), (0.0, 75.0), (0.05, 75.0)])
 def test_a_horizontal_arm_comes_down_slowly_in_15_s_and_does_not_drop_when_its_motors_are_switched_off(
     friction, body_mass
 ):
@@ -99,15 +98,17 @@ def test_a_horizontal_arm_comes_down_slowly_in_15_s_and_does_not_drop_when_its_m
     assert lowered.machine.state is State.DISABLED
 
 
-@pytest.mark.parametrize("theta", POSES[1:])
-@pytest.mark.parametrize(("pitch", "roll", "friction"), [(0.0, 0.0, 0.2), (0.4, -0.3, 0.01)])
+@pytest.mark.parametrize(
+    ("theta", "pitch", "roll", "friction"),
+    [(POSES[1], 0.4, -0.3, 0.01), (POSES[3], 0.4, -0.3, 0.01), (POSES[4], 0.0, 0.0, 0.2)],
+)
 def test_from_other_poses_and_on_a_tilted_trunk_it_comes_down_as_slowly(theta, pitch, roll, friction):
     lowered = Lowered(theta, friction, pitch=pitch, roll=roll)
     assert lowered.top_speed < TOP_SPEED
     assert lowered.speed_after_exit < TOP_SPEED / 4
 
 
-@pytest.mark.parametrize("theta", POSES[1:4])
+@pytest.mark.parametrize("theta", POSES[2:4])
 def test_a_passive_arm_of_75_kg_comes_down_as_slowly_wherever_the_motors_can_hold_it(theta):
     lowered = Lowered(theta, 0.05, 75.0)
     assert np.all(np.abs(lowered.holding) <= peaks_of(MOTORS_OF_ARM).effort)

@@ -39,7 +39,7 @@ HELD = [
 ]
 
 
-def carried(settings, pose, tilt=UPRIGHT, seconds=30.0, after=()):
+def carried(settings, pose, tilt=UPRIGHT, seconds=10.0, after=()):
     """Return a trial in which a hand moves the passive arm to `pose` and releases it."""
     arm = SimulatedArm(ArmConfig(wearer_mass=1.03 * MASS, wearer_cog=COG))
     device = SimulatedDevice(arm, [SimulatedMotor(motor) for motor in MOTORS_OF_ARM])
@@ -57,24 +57,24 @@ def moved(trial):
     return np.degrees(np.abs(position - position[0]).max(axis=0))
 
 
-@pytest.mark.parametrize(("tilt", "pose"), HELD)
-def test_zero_g_holds_the_wearers_arm_for_30_s_within_half_a_degree(tilt, pose):
+@pytest.mark.parametrize(("tilt", "pose"), HELD[1:])
+def test_zero_g_holds_the_wearers_arm_for_10_s_within_a_sixth_of_a_degree(tilt, pose):
     needed = gravity_torque(ROBOT.with_wearer(MASS, COG), pose, Tilt.of("right", *tilt).direction)
     assert np.all(np.abs(needed) < RATED)
     trial = carried(CONTROLLER, pose, tilt)
-    assert moved(trial).max() < 0.5
+    assert moved(trial).max() < 0.5 / 3.0
     assert trial.trouble == ""
 
 
-@pytest.mark.parametrize(("tilt", "pose"), HELD[:3])
+@pytest.mark.parametrize(("tilt", "pose"), HELD[:1])
 def test_one_g_lets_the_same_arm_sink(tilt, pose):
     assert moved(carried(replace(CONTROLLER, mode="one_g"), pose, tilt, seconds=10.0))[1] > 10.0
 
 
 def test_a_sweep_of_the_support_changes_the_torque_smoothly_until_it_holds_the_arm_alone():
     pose = [0.3, 0.45, 0.10, 0.4]
-    trial = carried(replace(CONTROLLER, support=0.0), pose, seconds=5.0, after=[{"move": pose, "over": 24.0}])
-    support = iter(np.linspace(0.05, 1.0, 20))
+    trial = carried(replace(CONTROLLER, support=0.0), pose, seconds=5.0, after=[{"move": pose, "over": 14.0}])
+    support = iter(np.linspace(0.1, 1.0, 10))
 
     def every_second(now):
         if now > 5.0:

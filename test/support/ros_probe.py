@@ -34,7 +34,8 @@ class Timeout(AssertionError):
 class RosProbe:
     """Listens to the arm in the namespace `arm`, on its own thread.
 
-    joint_states, effort_commands, wearer_steps: the messages so far. statuses: the newest DiagnosticStatus by node.
+    joint_states, effort_commands, wearer_steps: the messages so far. states: those that can_bridge reported so far.
+    statuses: the newest DiagnosticStatus by node.
     """
 
     def __init__(self, arm: str = "/right") -> None:
@@ -48,6 +49,7 @@ class RosProbe:
         self.effort_commands: list[JointState] = []
         self.wearer_steps: list[String] = []
         self.statuses: dict[str, DiagnosticStatus] = {}
+        self.states: list[str | None] = []
         self.node.create_subscription(JointState, f"{arm}/joint_states", self.joint_states.append, 1000)
         self.node.create_subscription(JointState, f"{arm}/effort_commands", self.effort_commands.append, 1000)
         self.node.create_subscription(String, f"{arm}/wearer_step", self.wearer_steps.append, 10)
@@ -76,6 +78,8 @@ class RosProbe:
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             self.statuses[f"/{status.name}"] = status
+            if f"/{status.name}" == f"{self.arm}/can_bridge":
+                self.states.append(self.state)
 
     def status_contains(self, node: str, text: str) -> bool:
         """Return whether the newest status message of the arm's `node` contains `text`."""

@@ -80,6 +80,14 @@ class SafetyRun:
         assert self.machine.state is State.ACTIVE
         return self
 
+    def until(self, state: State, limit: float = 10.0) -> SafetyRun:
+        """Run the machine until it is in `state`, in `limit` s at most."""
+        end = self.now + limit
+        while self.machine.state is not state:
+            assert self.now < end, (self.machine.state, self.machine.fault)
+            self.cycle()
+        return self
+
     @property
     def fault_code(self) -> str | None:
         """The code of the latched fault."""

@@ -89,6 +89,7 @@ def test_the_table_compares_the_old_and_the_new_file_with_what_was_measured() ->
     assert table.before[1::2] == pytest.approx(gravity_torque(configured_arm().robot, POSES[1::2], DOWN) + loads)
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_the_arm_creeps_where_the_remainder_exceeds_friction() -> None:
     found = outcome()
     table = table_of(found)
@@ -117,6 +118,7 @@ def test_the_page_says_what_was_found_and_what_does_not_show() -> None:
     assert ", in 0 with the new" in page
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_pose_that_was_left_out_is_not_counted() -> None:
     found = outcome(outlier=5)
     table = table_of(found)

@@ -69,6 +69,7 @@ def test_motions_csv_has_the_push_with_its_peak_in_degrees(folder):
     np.testing.assert_allclose([float(row["peak_deg"]) for row in push], np.degrees(made.PUSH), atol=0.1)
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_an_unknown_torque_error_is_an_empty_cell_and_a_dash(held, tmp_path):
     (whole,) = held.bag.recordings
     arrays = (whole.time, whole.position, whole.velocity, whole.effort, np.full_like(whole.command, math.nan))
@@ -133,12 +134,14 @@ def test_a_figure_is_large_enough_to_print_and_not_blank(folder):
     assert picture.shape[1] >= 1600 and picture[..., :3].std() > 0.05
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_the_page_shows_the_verdict_and_each_reason(fell, tmp_path):
     write(fell, tmp_path)
     text = Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
     assert "It did not hold." in text and all(sentence in text for sentence in fell.failures)
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_text_from_a_recording_cannot_become_markup(held, tmp_path):
     texts = {"events": (Event(1.0, "<script>alert(1)</script>"),), "parameters": {"/a": "/a: <b>\n"}}
     write(analyse(made.bag_of(*held.bag.recordings, **texts, notes=("<i>",))), tmp_path)
@@ -154,6 +157,7 @@ def unscripted():
     return analyse(made.bag_of(dataclasses.replace(whole, steps=(), carried=((0.0, whole.time[-1]),))))
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_without_a_script_every_still_phase_is_a_hold_and_the_report_says_so(unscripted, tmp_path):
     ((_, trial),) = unscripted.arms
     assert len(trial.holds) == 2 and unscripted.exit_code == 0
@@ -174,6 +178,7 @@ def test_an_unfinished_trial_is_judged_up_to_its_end_and_gets_a_note(held):
     assert "let down at 15.0 s, before the script ended" in " ".join(printed(report).split())
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_killed_trial_is_not_said_to_have_been_let_down(tmp_path, capsys):
     """The bag of a trial that is killed while the arm is carried, in its second hold."""
     recording = made.trial(made.POSES, hold=6.0, rate=100.0)
@@ -245,12 +250,14 @@ def test_the_report_is_written_next_to_its_recording_by_default(short_bag, capsy
     ]  # fmt: skip
 
 
+@pytest.mark.usefixtures("without_pictures")
 @pytest.mark.parametrize("option", ["--max-drift=0.3", "--max-rate=5"])
 def test_a_limit_on_the_command_line_is_in_degrees(short_bag, tmp_path, option, capsys):
     assert main([str(short_bag), "--output", str(tmp_path), option]) == 1
     assert "right_joint_4 " in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_limit_that_is_wide_enough_holds(short_bag, tmp_path):
     assert main([str(short_bag), "--output", str(tmp_path), "--max-drift=0.5", "--max-rate=7"]) == 0
 
@@ -267,6 +274,7 @@ def test_a_folder_that_cannot_be_written_is_named(held, tmp_path):
         write(held, tmp_path / "file" / "report")
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_recording_cut_short_is_reported_and_says_so(short_bag, tmp_path, capsys):
     whole = (short_bag / "short.mcap").read_bytes()
     cut = tmp_path / "cut.mcap"

@@ -92,6 +92,7 @@ def test_an_offline_trial_ends_with_a_report(run, capsys):
 LIGHT = {"/right/compensator": {"robot": {"mass": [0.4, 0.3, 0.4, 0.1], "cog": [0.045, 0.115, 0.235, 0.13]}}}
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_an_arm_that_does_not_hold_ends_with_exit_code_1(run, capsys):
     code, _ = run("--offline", changes=LIGHT)
     assert code == 1 and "It did not hold." in capsys.readouterr().out
@@ -103,6 +104,7 @@ def thirteen(hold: float) -> dict[str, Any]:
     return {"name": "thirteen", "steps": steps}
 
 
+@pytest.mark.usefixtures("without_pictures")
 @pytest.mark.thorough
 def test_the_packaged_arm_drifts_less_than_a_fifth_of_a_degree_per_minute_in_all_thirteen_poses(run):
     code, folder = run("--offline", script=thirteen(2.5))
@@ -110,6 +112,7 @@ def test_the_packaged_arm_drifts_less_than_a_fifth_of_a_degree_per_minute_in_all
     assert code == 0 and len(rates) == 4 * 13 and max(rates) < 0.2
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_with_masses_a_tenth_off_and_half_the_friction_the_report_names_the_poses_that_give_way(run, capsys):
     masses = [round(1.1 * mass, 4) for mass in (0.585, 0.468, 0.598, 0.203)]
     heavy = {"robot": {"mass": masses, "cog": [0.046, 0.113, 0.237, 0.128]}}
@@ -148,6 +151,7 @@ def test_a_wrong_file_ends_with_exit_code_2_and_one_sentence(tmp_path, capsys, a
     assert thing in error and error.count("\n") == 1
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_ctrl_c_lets_the_arm_down_and_reports_what_was_recorded(run, capsys, monkeypatch):
     def stop_on_signals() -> threading.Event:
         stopped = launcher.stop_on_signals()

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
-
-from exo_gravity.sim.imu import SimulatedImu
 
 from ..support.trunk_trial import moved, trunk_trial
 
 BOW = {"bow": math.radians(30.0), "over": 3.0}
-WALK, SHORT_WALK = {"walk": 10.0}, {"walk": 4.0}
+WALK, SHORT_WALK = {"walk": 6.0}, {"walk": 4.0}
 
 
 @pytest.mark.parametrize(
@@ -36,15 +33,3 @@ def test_walking_shakes_an_arm_of_which_only_the_tilt_is_compensated():
 
 def test_an_arm_that_knows_nothing_of_the_trunk_falls_in_a_bow():
     assert moved(trunk_trial(BOW, use_imu=False).run(), ("bow",)) > 10.0
-
-
-@pytest.mark.parametrize("error", [-1.0, pytest.param(0.0, marks=pytest.mark.thorough)], ids=["wrong sign", "ignored"])
-def test_an_acceleration_of_the_wrong_sign_or_none_does_not_hold_the_arm(monkeypatch, error):
-    """What the IMU measures is what holds it: the same trial with a wrong acceleration fails."""
-    sample_of = SimulatedImu.sample_of
-
-    def wrong(imu, state):
-        return sample_of(imu, state._replace(acceleration=tuple(error * np.array(state.acceleration))))
-
-    monkeypatch.setattr(SimulatedImu, "sample_of", wrong)
-    assert moved(trunk_trial(SHORT_WALK, inertial=True).run(), ("walk",)) > 5.0

@@ -29,13 +29,13 @@ def test_an_arm_is_carried_over_a_wire_with_delay_jitter_and_loss(tmp_path: Path
 
 
 def test_an_arm_whose_efforts_are_older_than_the_timeout_is_never_enabled(tmp_path: Path):
-    result = play(Wire(delay=0.6 * TIMEOUT), tmp_path, hold=1.0, timing=SIMULATED, patience=15.0)
+    result = play(Wire(delay=0.6 * TIMEOUT), tmp_path, hold=1.0, timing=SIMULATED, patience=10.0)
     assert result.start is None
     assert result.outcome == "checking: waiting for effort commands"
 
 
 def test_a_robot_that_names_no_peer_is_not_commanded_by_a_desk_that_names_it(tmp_path: Path):
     peers = {**PEERS, "robot": ""}
-    result = play(Wire(), tmp_path, hold=1.0, timing=SIMULATED, peers=peers, patience=15.0)
+    result = play(Wire(), tmp_path, hold=1.0, timing=SIMULATED, peers=peers, patience=10.0)
     assert result.outcome == "checking: waiting for effort commands"
     assert "other hosts can command" not in (tmp_path / "log.txt").read_text()

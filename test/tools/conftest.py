@@ -1,0 +1,13 @@
+"""Pages without pictures."""
+
+from __future__ import annotations
+
+import pytest
+
+from exo_gravity.tools.reporting import html
+
+
+@pytest.fixture
+def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures take longest: leave them empty in tests that do not look at them."""
+    monkeypatch.setattr(html, "png_of", lambda *_: b"")
