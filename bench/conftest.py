@@ -10,6 +10,7 @@ HERE = Path(__file__).parent
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the studies' tests: they run with the other long ones."""
     for item in items:
         if HERE in item.path.parents:
             item.add_marker("thorough")
