@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from ..hardware.simulated_rig import wait_until
 from .network import ADDRESSES, Network, Wire
 
 COUNT = 300
@@ -56,5 +57,5 @@ def test_every_process_in_the_namespaces_ends_with_the_network():
         child = int(left_behind.stdout.readline())
         holders = dict(network._namespaces)
         assert len(holders) == 3
-    for process in (*holders.values(), child):
-        assert not Path(f"/proc/{process}/exe").exists()  # it may be a zombie until its parent notices
+    for process in (*holders.values(), child):  # it may be a zombie until its parent notices
+        wait_until(lambda path=Path(f"/proc/{process}/exe"): not path.exists())
