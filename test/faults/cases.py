@@ -145,7 +145,7 @@ MOTORS = (
         outcomes=("motor_silent",)),
     FaultCase("bus silent for 3 s", in_turn(SILENCE, pause(3.0), END_SILENCE), unreached=ALL_JOINTS,
         outcomes=("motor_silent",)),
-    FaultCase("motor 2 reports an error", ERROR, clear=NO_ERROR, outcomes=("motor_error",), in_tests=True),
+    FaultCase("motor 2 reports an error", ERROR, clear=NO_ERROR, outcomes=("motor_error",)),
     FaultCase("motor 2 at 95 degC", simulator(fault__temperature=[30.0, 95.0, 30.0, 30.0]),
         clear=simulator(fault__temperature=[30.0] * 4), outcomes=("over_temperature",)),
     FaultCase("joint 2 jumps by a motor turn, then clear and enable", JUMP, afterwards=refused_on_the_wrong_angle,

@@ -29,8 +29,7 @@ class FaultCase:
     fault codes or states; () for any. unreached: joints (0..3) whose motors no frame can reach. unpowered: joints that
     fall, because a motor has no power, so that nothing can brake them. steps_from: s after the fault from which on
     torque steps count, where the fault itself is a step. speed_limit, driven_limit: rad/s of any joint. work_limit: J
-    of any motor. check: of the arm's true motion. in_tests: whether the tests run it too. ends_rig: whether the rig is
-    spent although its nodes run on.
+    of any motor. check: of the arm's true motion. ends_rig: whether the rig is spent although its nodes run on.
     """
 
     name: str
@@ -48,7 +47,6 @@ class FaultCase:
     driven_limit: float = MAX_SPEED
     work_limit: float = MAX_WORK
     check: Check = lambda records: ""
-    in_tests: bool = False
     ends_rig: bool = False
 
     @property

@@ -41,7 +41,7 @@ def test_an_arm_whose_bridge_and_watchdog_were_killed_is_let_down_by_the_launche
 
 @pytest.mark.thorough
 def test_the_launcher_states_that_motors_may_still_be_powered(nodes, probe, monkeypatch):
-    monkeypatch.setattr(launcher, "DESCENT_TIMEOUT", 10.0)
+    monkeypatch.setattr(launcher, "DESCENT_TIMEOUT", 5.0)
     monkeypatch.setattr(launcher, "RECOVERY", {"EXO_GRAVITY_RECOVER": "2"})
     (watchdog,) = children(nodes.process("can_bridge").pid)
     assert probe.set_parameters("simulator", fault__bus_silent=True).successful

@@ -14,9 +14,7 @@ import pytest
 import yaml
 
 from exo_gravity.tools import launcher, trial
-from exo_gravity.tools.launcher import OnLine
 from exo_gravity.tools.trial import main
-from exo_gravity.tools.trials import run as running
 
 from ..support import csv_rows
 from ..support.ports import own_ports
@@ -167,60 +165,6 @@ def test_ctrl_c_lets_the_arm_down_and_reports_what_was_recorded(run, capsys, mon
     assert code == 1 and (folder / "report.html").exists()
     text = capsys.readouterr().out
     assert "stopped by the operator" in text and "slipped" not in text
-
-
-class Listening(launcher.Launcher):
-    """Calls `react(self)` when a node first prints a line that contains `phrase`."""
-
-    phrase = ""
-
-    def __init__(self, params: Path, on_line: OnLine) -> None:
-        reacted = False
-
-        def listen(node: str, line: str) -> None:
-            nonlocal reacted
-            on_line(node, line)
-            if self.phrase in line and not reacted:
-                reacted = True
-                self.react()
-
-        super().__init__(params, listen)
-
-    def react(self) -> None:
-        raise NotImplementedError
-
-
-@pytest.mark.thorough
-@pytest.mark.real_time
-def test_a_killed_recorder_ends_the_trial_with_a_report_of_what_it_wrote(run, capsys, monkeypatch):
-    class KillRecorder(Listening):
-        phrase = "wearer: hold"
-
-        def react(self) -> None:
-            threading.Timer(2.0, self.process("/recorder").kill).start()
-
-    monkeypatch.setattr(running, "Launcher", KillRecorder)
-    code, folder = run(script={"name": "long", "steps": [SHORT["steps"][0], {"hold": 90.0}]})
-    assert code == 1 and (folder / "report.html").exists()
-    assert "the recorder ended with exit code -9 before the trial was done" in capsys.readouterr().out
-
-
-@pytest.mark.thorough
-@pytest.mark.real_time
-def test_a_node_that_the_computer_does_not_run_ends_a_simulated_trial_with_exit_code_3(run, capsys, monkeypatch):
-    class FreezeNode(Listening):
-        phrase = "wearer: hold"
-
-        def react(self) -> None:
-            process = self.process("/right/simulator")
-            process.send_signal(signal.SIGSTOP)
-            threading.Timer(0.4, process.send_signal, (signal.SIGCONT,)).start()
-
-    monkeypatch.setattr(running, "Launcher", FreezeNode)
-    monkeypatch.setattr(running, "ATTEMPTS", 1)
-    code, _ = run()
-    last = capsys.readouterr().out.splitlines()[-1]
-    assert code == 3 and last.startswith("trial: this computer was too busy: right/simulator was not run for ")
 
 
 @pytest.mark.thorough

@@ -1,4 +1,4 @@
-"""An arm whose compensator runs on another computer: carried over a fair wire, never enabled over a slow one."""
+"""An arm whose compensator runs on another computer: carried over a fair wire; `make two-computers` has worse ones."""
 
 from __future__ import annotations
 
@@ -26,12 +26,6 @@ def test_an_arm_is_carried_over_a_wire_with_delay_jitter_and_loss(tmp_path: Path
     assert 0.0 < result.measured.missed < 0.2
     assert "ROS_STATIC_PEERS=10.77.0.2: other hosts can command this arm" in (tmp_path / "log.txt").read_text()
     assert (tmp_path / "bag_desk").is_dir()
-
-
-def test_an_arm_whose_efforts_are_older_than_the_timeout_is_never_enabled(tmp_path: Path):
-    result = play(Wire(delay=0.6 * TIMEOUT), tmp_path, hold=1.0, timing=SIMULATED, patience=10.0)
-    assert result.start is None
-    assert result.outcome == "checking: waiting for effort commands"
 
 
 def test_a_robot_that_names_no_peer_is_not_commanded_by_a_desk_that_names_it(tmp_path: Path):
