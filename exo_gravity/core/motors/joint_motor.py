@@ -17,8 +17,8 @@ from exo_gravity.core.motors.wire_formats import FORMATS, MIT, Frame, WireFormat
 from exo_gravity.core.numbers import one_float
 from exo_gravity.core.params import Param
 
-# In the format `mit` the first byte of a reply is the motor's ID. The first byte of our commands is 0x7f or 0x80,
-# because their position is always 0. With IDs below 0x7f a command echoed by the bus cannot look like a reply.
+# In the format `mit` the first byte of a reply is the motor's ID. The position of our commands is 0, unless they hold a
+# joint (`MotorBus`), so their first byte is 0x7f or 0x80: with IDs below 0x7f their echoes cannot look like replies.
 MAX_CAN_ID = 126
 TORQUE_SCALE_BOUNDS = (0.2, 2.0)
 OPTIONS = "can.options"  # parameters below this prefix go to python-can unchanged

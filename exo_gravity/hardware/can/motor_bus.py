@@ -201,10 +201,11 @@ class MotorBus:
 
     def _send_commands(self, drive: Drive) -> None:
         self._drive = drive
+        now = self._now()
         for joint, motor in enumerate(self._motors):
             if joint not in self._asked and (drive.unsure[joint] or not drive.powered):
                 continue
-            command = self._command(joint)
+            command = self._command(joint, now)
             if drive.enter[joint]:
                 self._send(command, *motor.enter)
             self._send(command)
@@ -232,19 +233,19 @@ class MotorBus:
 
     def _follow(self, joint: int, position: float, now: float) -> None:
         """Let the held position of a contested joint follow it slowly; that of any other joint at once."""
-        if self._is_opposed(joint):
+        if self._is_opposed(joint, now):
             away = position - self._held[joint]
             step = max(HOLD_SPEED * (now - self.samples[joint].time), abs(away) - HOLD_REACH)
             position = self._held[joint] + math.copysign(min(step, abs(away)), away)
         self._held[joint] = position
 
-    def _is_opposed(self, joint: int) -> bool:
-        return self._drive.powered and self._now() - self._contested[joint] < CONTEST_TIME
+    def _is_opposed(self, joint: int, now: float) -> bool:
+        return self._drive.powered and now - self._contested[joint] < CONTEST_TIME
 
-    def _command(self, joint: int) -> Frame:
+    def _command(self, joint: int, now: float) -> Frame:
         """Return the last drive's command to a motor. If the motor is contested, it also holds the joint."""
         motor, effort, damping = self._motors[joint], self._drive.effort[joint], self._drive.damping[joint]
-        if self._is_opposed(joint):
+        if self._is_opposed(joint, now):
             damping = max(DAMPING, damping)
             if not math.isnan(self._held[joint]):
                 data = motor.command(effort, damping, HOLD_STIFFNESS, self._held[joint])
@@ -263,7 +264,7 @@ class MotorBus:
             return
         if foreign in [data for _, data in motor.wire_format.set_zero(motor.can_id)]:
             self._held[joint] = math.nan  # not held in this contest: a reply may still count from the old zero
-        command = self._command(joint)
+        command = self._command(joint, now)
         is_exit = foreign in [data for _, data in motor.exit]
         if is_exit or now - self._corrected[joint] >= CORRECTION_PERIOD:
             self._send(*((command, *motor.enter) if is_exit else ()), command)
