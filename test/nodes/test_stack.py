@@ -53,7 +53,7 @@ def test_an_arm_stays_follows_live_changes_and_after_a_fault_is_carried_by_its_o
     listener = listen(nodes)
 
     def hold_and_change() -> tuple[float, float, float]:
-        """Return the drift in degrees, the error of the efforts in Nm, and the largest step of a change beside it."""
+        """Return the drift in degrees, the error of the efforts in Nm, and the largest step as a share of a change."""
         assert probe.set_parameters("compensator", gain=[1.0] * 4).successful
         released, seen = probe.joint_angles(), len(probe.joint_states)
         probe.wait_until(lambda: len(probe.joint_states) > seen + 2.0 * RATE)

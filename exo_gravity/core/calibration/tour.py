@@ -71,7 +71,7 @@ class Tour:
         self._line_time = math.inf  # s; it is over
         self._skipped = 0  # poses
         self._awaits_plan = False
-        self._plan: tuple[Station | None, str] = (None, "")  # the next pose, None for home, or why there is none
+        self._plan: tuple[Station | None, str] = (None, "")  # the next pose, or None to go home, and the trouble
         self._sweep: list[tuple[Sequence[float], np.ndarray, Sequence[float]]] | None = None  # its samples
         self._friction = [0.0] * JOINT_COUNT  # Nm, 0 until it is measured
         self._unexplained = [0.0] * JOINT_COUNT  # s

@@ -5,7 +5,7 @@
     release  gives it back: the arm stays as it is
 
 A lease that is not renewed for LEASE_TIME runs out: its holder is gone, and the arm must not be carried without him.
-While nobody holds the lease, the arm depends on no operator.
+While no one holds the lease, the arm is carried without an operator.
 
 LEASE_TIME is chosen for a holder on Wi-Fi that sends three times a second over TCP. A station that roams or scans is
 silent for 0.1 to 0.5 s. TCP sends again 0.2 and 0.6 s after a loss, so after a gap of up to 0.6 s the next message is

@@ -120,8 +120,8 @@ class BusScan(contextlib.ExitStack):
             heard = message.arbitration_id
             if (kind == COMMAND) if message.is_extended_id else (heard <= MAX_CAN_ID):
                 raise BusError(
-                    f"CAN bus {self.name} is in use: a frame with ID {heard} was heard; stop the other host; if there "
-                    "is none, two motors with one ID answer each other: switch their power off"
+                    f"CAN bus {self.name} is in use: a frame with ID {heard} was heard; stop the other host. Without "
+                    "another host, two motors share an ID and answer each other: switch off their power"
                 )
 
     def _ask(self, can_id: int, is_alone: bool = True) -> tuple[list[MotorAnswer], list[Frame]]:

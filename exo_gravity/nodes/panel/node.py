@@ -46,7 +46,7 @@ LOOK_PERIOD = 0.005  # s between two looks for an answer
 TILT = "/imu/pitch_yaw"
 BRIDGE, COMPENSATOR = "can_bridge", "compensator"
 SHOWN = {BRIDGE: "bridge", COMPENSATOR: "compensator"}  # what the page calls the status of each
-ASKED = {  # what a page may ask of an arm besides `set`: a service, and the request to it
+ASKED = {  # service and request for each request of a page but `set`
     "let_down": (SetBool, f"{BRIDGE}/enable", SetBool.Request(data=False)),
     "enable": (SetBool, f"{BRIDGE}/enable", SetBool.Request(data=True)),
     "clear_fault": (Trigger, f"{BRIDGE}/clear_fault", Trigger.Request()),

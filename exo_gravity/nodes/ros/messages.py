@@ -18,7 +18,7 @@ from sensor_msgs.msg import JointState
 from exo_gravity.core.errors import ParameterError
 
 OK, WARN, ERROR, STALE = (getattr(DiagnosticStatus, level) for level in ("OK", "WARN", "ERROR", "STALE"))
-HELD_BY, NOBODY = "control held by", "nobody"  # a key in can_bridge's status, and its value while nobody does
+HELD_BY, NOBODY = "control held by", "nobody"  # key in can_bridge's status; value without an operator
 LATE_TILT = "late tilt"  # frame_id of efforts that are computed from one
 
 PERIOD = 0.45  # s; a little less than a multiple of the nodes' timer periods, which jitter
