@@ -109,9 +109,8 @@ def test_an_acknowledgement_does_not_hide_late_replies_which_are_not_taken_for_n
     adapter, motors, channel, acknowledges
 ) -> None:
     adapter.acknowledges = acknowledges
-    before = adapter.obeyed
     motors.exchange(OFF, time.monotonic())
-    wait_until(lambda: adapter.obeyed == before + FIRST_FRAMES)
+    wait_until(lambda: adapter.passed == FIRST_FRAMES)
     unread, lengths = adapter.unread, 0
     with can.Bus(interface="virtual", channel=channel) as other:
         for joint in joints_of(MIXED):

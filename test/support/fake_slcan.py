@@ -23,17 +23,19 @@ import can
 
 BITRATES = {"S0": 10, "S1": 20, "S2": 50, "S3": 100, "S4": 125, "S5": 250, "S6": 500, "S7": 800, "S8": 1000}  # kbit/s
 OK, REFUSED = b"\r", b"\a"
+FRAME_SENT = (b"z\r", b"Z\r")  # with an 11-bit or a 29-bit ID
 
 
 class FakeSlcan:
     """The adapter, plugged in at `path` until `close`; `bus` is its wire.
 
-    kbit_s: bit rate that was set. is_open: whether O was received. obeyed: commands carried out and acknowledged.
+    kbit_s: bit rate that was set. is_open: whether O was received. passed: frames of the program that were sent and
+    acknowledged.
     """
 
     def __init__(self, path: Path, bus: can.BusABC) -> None:
         self.kbit_s = 0
-        self.obeyed = 0
+        self.passed = 0
         self.acknowledges = True
         self._path = path
         self._bus = bus
@@ -78,14 +80,15 @@ class FakeSlcan:
             if select.select([self._master], [], [], 0.0)[0]:
                 *lines, rest = (rest + os.read(self._master, 4096)).split(b"\r")
                 for line in lines:
-                    self._write(self._obey(line.decode()))
-                    self.obeyed += 1
+                    answer = self._obey(line.decode())
+                    self._write(answer)
+                    self.passed += answer in FRAME_SENT
             message = self._bus.recv(0.0005)
             if message is not None and self.is_open and not message.is_error_frame and not message.is_fd:
                 self._write(_line(message))
 
     def _write(self, data: bytes) -> None:
-        if self.acknowledges or data not in (b"z\r", b"Z\r"):
+        if self.acknowledges or data not in FRAME_SENT:
             os.write(self._master, data)
 
     def _obey(self, line: str) -> bytes:
@@ -100,7 +103,7 @@ class FakeSlcan:
                 return REFUSED
             frame_id = int(line[1 : digits + 1], 16)
             self._bus.send(can.Message(arbitration_id=frame_id, data=data, is_extended_id=digits == 8))
-            return b"z\r" if digits == 3 else b"Z\r"
+            return FRAME_SENT[digits == 8]
         elif line:
             return REFUSED
         return OK
