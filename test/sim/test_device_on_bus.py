@@ -159,16 +159,16 @@ def test_a_failing_bus_ends_the_run_with_a_bus_error():
 
 
 class BusyBus:
-    """A bus on which four commands arrive at once; `events` keeps the order of replies and other work."""
+    """A bus on which four commands arrive at once, and its clock; `events`: the order of replies and other work."""
 
     def __init__(self):
-        self.events = []
+        self.now, self.events = 0.0, []
         self._waiting = [frame(can_id, command(can_id - 1)) for can_id in (1, 2, 3, 4)]
 
     def recv(self, timeout):
         if self._waiting:
             return self._waiting.pop(0)
-        time.sleep(timeout)
+        self.now += timeout
 
     def send(self, message):
         self.events.append(message.data[0])
@@ -177,8 +177,9 @@ class BusyBus:
         self.events.append("aside")
 
 
-def test_other_work_waits_until_every_command_has_been_answered():
+def test_other_work_waits_until_every_command_has_been_answered(monkeypatch):
     bus = BusyBus()
+    monkeypatch.setattr(device_module, "time", SimpleNamespace(monotonic=lambda: bus.now, time=lambda: bus.now))
     make_device().run(bus, lambda: "aside" in bus.events, bus.aside)
     assert sorted(bus.events[:-1]) == [1, 2, 3, 4]
 
