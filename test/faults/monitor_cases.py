@@ -14,10 +14,11 @@ from exo_gravity.tools.inputs.parameter_file import load
 
 from ..support import CONFIG
 from ..support.launched_nodes import LaunchedNodes, Parameters
+from ..support.ros_probe import HOME
 from .actions import simulator
 from .command_cases import change_message
 from .fault_case import FaultCase
-from .rig import HOME, Rig
+from .rig import Rig
 from .rigs import UPRIGHT, CommandedRig
 
 COMPENSATOR = load(CONFIG / "sim.yaml")["/right/compensator"]

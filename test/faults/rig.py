@@ -7,7 +7,6 @@ motors were switched off.
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 import signal
 import subprocess
@@ -22,12 +21,10 @@ import yaml
 from exo_gravity.tools.inputs.parameter_file import load
 
 from ..support.launched_nodes import REAL, SIMULATED, LaunchedNodes, Parameters, children, full_name, prefer
-from ..support.ros_probe import RosProbe
+from ..support.ros_probe import TO_HOME, RosProbe
 from ..support.truth import Truth
 
 RAISED = (0.0, 1.3, 0.0, 0.3)  # rad, nearly horizontal
-HOME = [0.0, 0.05, 0.05, 0.05]  # rad, hanging and within the limits
-HELP_TIME = 20.0  # s for which the wearer holds it there
 NEAR = 0.15  # rad from the pose, in which the arm need not be moved again
 CARRY_LIMIT = 60.0  # s for the nodes to start and bring the arm to a stage
 SIMULATOR = ("simulator",)
@@ -51,8 +48,7 @@ class Rig:
     def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
         self.folder, self.shipped_timeouts = folder, shipped_timeouts
         self.script = self.write_script("pose", [{"move": list(self.pose), "over": 1.0}, {"hold": 600.0}])
-        # The hand stays: a joint with little friction would swing out of its limits again.
-        self._home = self.write_script("home", [{"move": HOME, "over": 1.0}, {"move": HOME, "over": HELP_TIME}])
+        self._home = self.write_script("home", TO_HOME)
         self.probe = RosProbe()
         device = self._device_nodes()
         self.nodes = [*self._make_nodes(device.bus["port"]), device]
@@ -107,18 +103,8 @@ class Rig:
                 self.probe.wait_until(lambda: abs(self.true_velocity(1)) > 0.2)
 
     def get_carried(self, probe: RosProbe) -> None:
-        """Wait until the arm is carried; the wearer moves an arm that hangs outside its limits or away from home."""
-        helped = -math.inf
-        while probe.state != "active":
-            misplaced = probe.fault == "implausible_zero" or probe.status_contains("can_bridge", "to be moved")
-            if misplaced and time.monotonic() > helped + HELP_TIME:
-                helped = time.monotonic()
-                probe.set_parameters("simulator", trial=str(self._home))
-            if probe.state == "fault":
-                probe.trigger("clear_fault")
-            elif probe.state == "disabled":
-                probe.enable(True)
-            probe.wait_for_report()
+        """Wait until the arm of `probe` is carried, with the wearer's help."""
+        probe.get_carried(self._home)
 
     def _wait_for_states(self, count: float) -> None:
         seen = len(self.probe.joint_states)

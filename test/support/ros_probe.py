@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -25,6 +26,9 @@ from exo_gravity.nodes.ros.run import keep_to_this_machine
 keep_to_this_machine()
 
 InvalidHandle = rclpy_implementation.InvalidHandle
+HOME = [0.0, 0.05, 0.05, 0.05]  # rad, hanging and within the limits
+HELP_TIME = 20.0  # s for which the wearer holds it there: a joint with little friction would swing out of its limits
+TO_HOME: list[dict[str, Any]] = [{"move": HOME, "over": 1.0}, {"move": HOME, "over": HELP_TIME}]  # a script's steps
 
 
 class Timeout(AssertionError):
@@ -185,6 +189,23 @@ class RosProbe:
             self.enable(True)  # refused while the bridge enables by itself
             self.wait_for_report()
             self.wait_until(lambda: self.state in ("active", "fault", "disabled"))  # disabled: the enable has expired
+
+    def get_carried(self, home: object) -> None:
+        """Wait until the arm is carried; the wearer moves one that hangs outside its limits or away from home.
+
+        home: path of a script with the steps TO_HOME.
+        """
+        helped = -math.inf
+        while self.state != "active":
+            misplaced = self.fault == "implausible_zero" or self.status_contains("can_bridge", "to be moved")
+            if misplaced and time.monotonic() > helped + HELP_TIME:
+                helped = time.monotonic()
+                self.set_parameters("simulator", trial=str(home))
+            if self.state == "fault":
+                self.trigger("clear_fault")
+            elif self.state == "disabled":
+                self.enable(True)
+            self.wait_for_report()
 
     def bring_to(self, script: object) -> None:
         """Let the virtual wearer move the carried arm by the trial script at the path `script`, and release it."""
