@@ -4,6 +4,7 @@ In virtual time, or on the bus that EXO_TEST_CAN_INTERFACE and EXO_TEST_CAN_CHAN
 """
 
 import can
+import numpy as np
 import pytest
 
 from exo_gravity.core.errors import BusError
@@ -111,14 +112,18 @@ def test_a_motor_that_another_sender_commands_holds_its_joint_for_a_while(bus, d
     received(other)
     bus.exchange(ON, now(bus) + 1.0)
     command = commands(other, contested)[-1]
-    assert command.kp == pytest.approx(HOLD_STIFFNESS, abs=0.1)
+    assert command.kp == pytest.approx(HOLD_STIFFNESS, rel=0.02)
     assert command.kd == pytest.approx(DAMPING, abs=0.01)
     assert command.position == pytest.approx(contested.motor_position(0.2), abs=0.01)
     bus.exchange(ON, now(bus) + 1.0)
     assert commands(other, MOTORS_OF_ARM[2])[-1].kp == 0.0
+    stiffness = [command.kp]
     while bus.is_contested:
+        received(other)
         bus.exchange(ON, now(bus) + 1.0)
+        stiffness.append(commands(other, contested)[-1].kp)
         bus.receive_until(now(bus) + 0.002)
+    assert max(-np.diff(stiffness)) < 0.02 * HOLD_STIFFNESS  # ended at once, it would be a torque step
     received(other)
     bus.exchange(ON, now(bus) + 1.0)
     assert commands(other, contested)[-1].kp == 0.0

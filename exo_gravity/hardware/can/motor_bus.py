@@ -44,7 +44,7 @@ LAST_REPLIES = 0.02  # s for which replies to the last frames are awaited
 LISTEN_TIME = 0.12  # s before the first frame
 SETTLING_TIME = 0.02  # s of it in which late replies to the previous owner may still arrive
 CORRECTION_PERIOD = 0.001  # s between two corrections of a motor: two correcting hosts must not fill the bus
-CONTEST_TIME = 0.5  # s after a foreign command in which another one is expected
+CONTEST_TIME = 0.5  # s after a foreign command in which another one is expected; the hold fades meanwhile
 HOLD_STIFFNESS = 60.0  # Nm/rad by which a contested motor holds its joint: the motor applies it without our delay,
 HOLD_REACH = 0.15  # rad at most from where the joint is,
 HOLD_SPEED = 0.3  # rad/s with which the held position follows the joint
@@ -233,22 +233,23 @@ class MotorBus:
 
     def _follow(self, joint: int, position: float, now: float) -> None:
         """Let the held position of a contested joint follow it slowly; that of any other joint at once."""
-        if self._is_opposed(joint, now):
+        if self._hold(joint, now):
             away = position - self._held[joint]
             step = max(HOLD_SPEED * (now - self.samples[joint].time), abs(away) - HOLD_REACH)
             position = self._held[joint] + math.copysign(min(step, abs(away)), away)
         self._held[joint] = position
 
-    def _is_opposed(self, joint: int, now: float) -> bool:
-        return self._drive.powered and now - self._contested[joint] < CONTEST_TIME
+    def _hold(self, joint: int, now: float) -> float:
+        """Return the share of its stiffness by which a contested motor holds its joint; it fades, without a step."""
+        return max(0.0, 1.0 - (now - self._contested[joint]) / CONTEST_TIME) if self._drive.powered else 0.0
 
     def _command(self, joint: int, now: float) -> Frame:
         """Return the last drive's command to a motor. If the motor is contested, it also holds the joint."""
         motor, effort, damping = self._motors[joint], self._drive.effort[joint], self._drive.damping[joint]
-        if self._is_opposed(joint, now):
+        if hold := self._hold(joint, now):
             damping = max(DAMPING, damping)
             if not math.isnan(self._held[joint]):
-                data = motor.command(effort, damping, HOLD_STIFFNESS, self._held[joint])
+                data = motor.command(effort, damping, hold * HOLD_STIFFNESS, self._held[joint])
                 if data[0] not in self._joint_of:  # or its echo would look like a reply
                     return self._ids[joint], data
         return self._ids[joint], motor.command(effort, damping)
