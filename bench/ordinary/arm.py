@@ -130,7 +130,7 @@ class OrdinaryArm:
         while self.clock.monotonic() < end:
             self._start(carried)
         self.result.time = self.clock.monotonic() - self._begin
-        self.loop.abandon()
+        self.loop.bus.close()
         return self.result
 
     def _start(self, carried: float) -> None:

@@ -37,7 +37,8 @@ def carrying(effort, cycles=0):
     safety.state = State.ACTIVE
     samples = [JointSample(0.5, 2.0, torque, 40, 0, 0.0) for torque in (0.0, 0.0, 0.0, effort)]
     counts = dict.fromkeys(("late", "incomplete", "cycle_errors"), 0)
-    return SimpleNamespace(safety=safety, samples=samples, ignored={}, failure=None, cycles=cycles, **counts)
+    bus = SimpleNamespace(ignored={})
+    return SimpleNamespace(safety=safety, samples=samples, bus=bus, failure=None, cycles=cycles, **counts)
 
 
 @pytest.fixture
@@ -114,7 +115,7 @@ def standing():
     def set_zero():
         loop.zeroed += 1
 
-    loop.call, loop.set_zero = call, set_zero
+    loop.call, loop.bus = call, SimpleNamespace(set_zero=set_zero)
     loop.safety.step(0.0, loop.samples, None, 0.0)
     return loop
 

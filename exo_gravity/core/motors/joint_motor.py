@@ -73,17 +73,25 @@ class JointMotor:
     @property
     def command_id(self) -> int:
         """The arbitration ID of commands to this motor."""
-        return self.wire_format.command_id(self.can_id)
+        return self.wire_format.first_id + self.can_id
 
     @property
     def enter(self) -> tuple[Frame, ...]:
         """The frames that switch the motor on, before its next command."""
-        return self.wire_format.enter(self.can_id)
+        return self._own(self.wire_format.on)
 
     @property
     def exit(self) -> tuple[Frame, ...]:
         """The frames that switch the motor off."""
-        return self.wire_format.exit(self.can_id)
+        return self._own(self.wire_format.off)
+
+    @property
+    def set_zero(self) -> tuple[Frame, ...]:
+        """The frames that make the motor's present angle zero; none if its board has no such frame."""
+        return self._own(self.wire_format.zero)
+
+    def _own(self, frames: Sequence[Frame]) -> tuple[Frame, ...]:
+        return tuple((first + self.can_id, data) for first, data in frames)
 
     def command(self, effort: float, damping: float, stiffness: float = 0.0, position: float = 0.0) -> bytes:
         """Return the data of a command: a joint `effort` in Nm and `damping` in Nm s/rad, clamped to the wire format.
@@ -172,9 +180,8 @@ def _motor_of(given: Mapping[str, Any]) -> JointMotor:
         own = getattr(usual, name)
         if given[name] == getattr(plain, name) != own:
             raise ParameterError(name, given[name], f"{own:g} or 0 for an {plain.name} with wire_format = {board.name}")
-    ranges = (given[name] or getattr(usual, name) for name in ("velocity_range", "torque_range"))
-    per_ampere = given["torque_per_ampere"] or usual.torque_per_ampere
-    spec = replace(usual.with_ranges(*ranges), torque_per_ampere=per_ampere)
+    own_ranges = ("velocity_range", "torque_range", "torque_per_ampere")
+    spec = replace(usual, **{name: given[name] for name in own_ranges if given[name]})
     return JointMotor(spec, given["can_id"], given["direction"], given["zero"], given["torque_scale"], board)
 
 

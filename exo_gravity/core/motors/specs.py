@@ -15,7 +15,7 @@ code is exactly 0 Nm.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -42,7 +42,10 @@ MOTOR_ERRORS = {
 
 @dataclass(frozen=True)
 class MotorSpec:
-    """A motor type: the ranges of its wire format, which are not physical limits, and its physical limits."""
+    """A motor type: the ranges of its wire format, which are not physical limits, and its physical limits.
+
+    No CAN message reports the ranges; some firmware has others. Raises ParameterError.
+    """
 
     name: str
     #: rad/s, Nm: the wire range is +- this value
@@ -63,6 +66,10 @@ class MotorSpec:
     kp_max: float = 500.0
     kd_max: float = 5.0
 
+    def __post_init__(self) -> None:
+        for name in ("velocity_range", "torque_range"):
+            one_float(name, getattr(self, name), *WIRE_RANGE_BOUNDS)
+
     @cached_property
     def fields(self) -> dict[str, tuple[float, float, int, float, float]]:
         """Of each field on the wire: lowest and highest value, bits, codes per unit and units per code."""
@@ -81,14 +88,6 @@ class MotorSpec:
     def standstill(self) -> float:
         """The velocity in rad/s that the motor decodes from a command of 0 rad/s."""
         return unpack_fields(self, pack_fields(self, velocity=0.0), "velocity")[0]
-
-    def with_ranges(self, velocity_range: float, torque_range: float) -> MotorSpec:
-        """Return this motor with another firmware's wire ranges in rad/s and Nm, which no CAN message reports."""
-        return replace(
-            self,
-            velocity_range=one_float("velocity_range", velocity_range, *WIRE_RANGE_BOUNDS),
-            torque_range=one_float("torque_range", torque_range, *WIRE_RANGE_BOUNDS),
-        )
 
 
 MOTORS = {

@@ -78,22 +78,6 @@ class WireFormat:
         """Return the motor with the usual ranges of this format."""
         return spec
 
-    def command_id(self, motor_id: int) -> int:
-        """Return the arbitration ID of commands to a motor."""
-        return self.first_id + motor_id
-
-    def enter(self, motor_id: int) -> tuple[Frame, ...]:
-        """Return the frames that switch a motor on."""
-        return tuple((first + motor_id, data) for first, data in self.on)
-
-    def exit(self, motor_id: int) -> tuple[Frame, ...]:
-        """Return the frames that switch a motor off."""
-        return tuple((first + motor_id, data) for first, data in self.off)
-
-    def set_zero(self, motor_id: int) -> tuple[Frame, ...]:
-        """Return the frames that make the present angle zero."""
-        return tuple((first + motor_id, data) for first, data in self.zero)
-
     # Data of a command, as in `core.motors.specs`.
     pack_command = staticmethod(specs.pack_command)
     unpack_command = staticmethod(specs.unpack_command)
@@ -120,10 +104,9 @@ class WireFormat:
 
 
 class V3Format(WireFormat):
-    """The frames of V3 boards; the methods are those of `WireFormat`."""
+    """The frames of V3 boards. The ranges are those of manual V3.0.0; a frame of any control mode is a command."""
 
     def ranged(self, spec: MotorSpec) -> MotorSpec:
-        """Return the motor with the ranges of manual V3.0.0."""
         velocity_range, torque_range = V3_RANGES[spec.name]
         return replace(spec, position_range=V3_POSITION_RANGE, velocity_range=velocity_range, torque_range=torque_range)
 
@@ -133,21 +116,17 @@ class V3Format(WireFormat):
 
     @staticmethod
     def pack_command(spec: MotorSpec, position: float, velocity: float, kp: float, kd: float, torque: float) -> bytes:
-        """Return the 8 bytes of a command: kp, kd, position, velocity, torque."""
         word = specs.pack_fields(spec, kp=kp, kd=kd, position=position, velocity=velocity, torque=torque)
         return word.to_bytes(8, "big")
 
     @staticmethod
     def unpack_command(spec: MotorSpec, data: bytes | bytearray) -> MotorCommand:
-        """Return the content of a command. Raises FrameError."""
         if len(data) != 8:
             raise FrameError(data, "8 bytes")
-        order = "kp", "kd", "position", "velocity", "torque"
-        kp, kd, position, velocity, torque = specs.unpack_fields(spec, int.from_bytes(data, "big"), *order)
-        return MotorCommand(position, velocity, kp, kd, torque)
+        kp, kd, *rest = specs.unpack_fields(spec, int.from_bytes(data, "big"), "kp", "kd", *MotorReply._fields[1:4])
+        return MotorCommand(*rest[:2], kp, kd, rest[2])
 
     def pack_reply(self, spec: MotorSpec, reply: MotorReply) -> bytes:
-        """Return the 8 bytes of a status frame. Raises ParameterError for a value beyond its range."""
         numbers = []
         for name, value, step in zip(MotorReply._fields[1:4], reply[1:4], _steps(spec), strict=True):
             limit = 0x7FFF * step
@@ -157,7 +136,6 @@ class V3Format(WireFormat):
         return _STATUS.pack(*numbers, max(-128, min(127, reply.temperature or 0)), reply.error or 0)
 
     def unpack_reply(self, spec: MotorSpec, motor_id: int, data: bytes | bytearray) -> MotorReply:
-        """Return the content of a status frame. Raises FrameError."""
         if len(data) != 8:
             raise FrameError(data, "a status frame of 8 bytes")
         position, speed, current, temperature, error = _STATUS.unpack(data)
@@ -165,7 +143,6 @@ class V3Format(WireFormat):
         return MotorReply(motor_id, position * steps[0], speed * steps[1], current * steps[2], temperature, error)
 
     def classify(self, frame_id: int, data: bytes | bytearray, motor_ids: frozenset[int]) -> tuple[str, int]:
-        """Return what a frame with a 29-bit ID is; a frame of any control mode is a command."""
         motor_id, kind = frame_id & 0xFF, (frame_id & ID_BITS) >> 8
         if motor_id not in motor_ids:
             return OTHER, 0

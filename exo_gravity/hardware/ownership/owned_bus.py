@@ -77,7 +77,7 @@ def let_down(arm: ArmOnBus, notes: DriveNotes, log: Callable[[str], None], is_wa
             log("a motor does not reply; it may still be powered; trying again")
         was_unreached = machine.is_unreached
         if was_unreached and is_wanted():
-            loop.abandon()
+            motors.close()
             return False
     loop.stop()
     return not motors.may_be_powered

@@ -18,7 +18,7 @@ from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity.core.errors import BusError, ParameterError
-from exo_gravity.core.motors.bus_load import Traffic
+from exo_gravity.core.motors.bus_load import REPLY_SHARE, Traffic
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import Rate
 from exo_gravity.core.safety.delivery import MotorLoad
@@ -100,7 +100,7 @@ class BridgeServices:
             return "refused: a motor does not reply"
         if not safety.settled(now):
             return "refused: the arm is not at rest"
-        loop.set_zero()
+        loop.bus.set_zero()
         return ""
 
     def answer(self, function: Callable[[ControlLoop, Any], str], request: Any, response: Any) -> Any:
@@ -163,8 +163,8 @@ class Operator:
         reason, loop = self.lease.lost(self._now()), self._get_loop()
         if reason:
             self._log.warning(reason)
-        if reason and loop is not None:
-            loop.trip_unless_let_down(FaultCode.CONTROL_LOST, reason)
+        if reason and loop is not None and loop.safety.state is not State.LETTING_DOWN:
+            loop.trip(FaultCode.CONTROL_LOST, reason)
 
     def _on_request(self, message: KeyValue, _info: dict[str, Any]) -> None:
         self._news = self.lease.request(self._now(), message.key, message.value) or self._news
@@ -173,13 +173,13 @@ class Operator:
 def log_risks(node: Node, traffic: Traffic, rate: float) -> None:
     """Log the bus load at `rate` (Hz), and whether other hosts can command the arm."""
     log = node.get_logger()
-    wire, worst = traffic.load(rate), traffic.load(rate, worst=True)
     log.info(
-        f"bus load at {rate:g} Hz: {wire.bits_per_second / 1000:.0f} of {traffic.bitrate / 1000:g} kbit/s, "
-        f"{wire.share:.0%} of the bus, {worst.share:.0%} at worst; the bus is full at {int(wire.largest_rate)} Hz"
+        f"bus load at {rate:g} Hz: {traffic.load(rate):.0%} of {traffic.bitrate / 1000:g} kbit/s, "
+        f"{traffic.load(rate, worst=True):.0%} at worst; the bus is full at {int(traffic.largest_rate)} Hz"
     )
-    if warning := traffic.warning(rate):
-        log.warning(warning)
+    if traffic.is_crowded(rate):
+        fitting = int(REPLY_SHARE * traffic.largest_rate)
+        log.warning(f"replies may be late at {rate:g} Hz: at most {fitting} Hz leave them time")
     if opening := open_to_others():
         log.warning(f"{opening}: other hosts can command this arm; unset it, or enforce SROS2")
 
@@ -218,14 +218,14 @@ class BridgeReport:
             "refusal": safety.refusal or "none",
             "limits acting": acting or "none",
             "rate (Hz)": f"{rate:.1f}",
-            "bus load (%)": f"{100.0 * self._traffic.load(rate).share:.0f}" if rate else "0",
+            "bus load (%)": f"{100.0 * self._traffic.load(rate):.0f}" if rate else "0",
             "age of efforts (ms)": milliseconds(now - newest.answered),
             "rides": safety.ride.rides,
             "resume": safety.why_not_resumed or "possible",
             "cycles": loop.cycles,
             "late cycles": loop.late,
             "incomplete cycles": loop.incomplete,
-            "frames ignored": ", ".join(f"{kind}: {n}" for kind, n in sorted(loop.ignored.items())) or "none",
+            "frames ignored": ", ".join(f"{kind}: {n}" for kind, n in sorted(dict(loop.bus.ignored).items())) or "none",
             "publishing errors": f"{loop.cycle_errors}, last: {loop.cycle_error}" if loop.cycle_errors else "none",
             "last refused message": refusal,
         }
