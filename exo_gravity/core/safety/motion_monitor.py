@@ -107,9 +107,6 @@ class MotionMonitor:
             (turn3, turn4),
             (turn4,),
         )
-        lowest, highest = [], []
-        for torques in parts:
-            up = sum([torque for torque in torques if torque > 0.0])
-            lowest.append(SURPLUS * (sum(torques) - up))
-            highest.append(SURPLUS * up)
-        return tuple(lowest), tuple(highest)
+        lowest = tuple([SURPLUS * sum([min(0.0, torque) for torque in torques]) for torques in parts])
+        highest = tuple([SURPLUS * sum([max(0.0, torque) for torque in torques]) for torques in parts])
+        return lowest, highest

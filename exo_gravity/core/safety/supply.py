@@ -38,11 +38,6 @@ class SupplyMonitor:
         return tuple(map(operator.and_, self.unsure, self._were_silent))
 
     @property
-    def all_unsure(self) -> bool:
-        """Whether no motor is known to be on."""
-        return all(self.unsure)
-
-    @property
     def are_off(self) -> bool:
         """Whether every motor in doubt has replied for READ_TIME without torque."""
         doubtful = [heard for heard, is_unsure in zip(self._heard, self.unsure, strict=True) if is_unsure]
