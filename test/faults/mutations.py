@@ -111,7 +111,7 @@ MUTATIONS = (
     Mutation(
         "a second commander is ignored",
         ("second publisher of efforts",),
-        (Edit("exo_gravity/nodes/can_bridge/effort_exchange.py", "if self.commander.is_another(info):", "if False:"),),
+        (Edit("exo_gravity/nodes/can_bridge/effort_exchange.py", "if self._commander.is_another(info):", "if False:"),),
     ),
     Mutation(
         "stale efforts are accepted",
