@@ -76,6 +76,7 @@ class SimulatedDevice:
 
     @property
     def time(self) -> float:
+        """Simulated time in s."""
         return self._steps * STEP
 
     @property

@@ -56,6 +56,7 @@ class CanPort:
         self._is_closing = False
 
     def send(self, frame: Frame) -> None:
+        """Send a frame. Raises BusError."""
         frame_id, data = frame
         message = can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED)
         self._guarded(lambda bus: bus.send(message))

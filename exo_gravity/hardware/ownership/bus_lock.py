@@ -63,10 +63,12 @@ class DriveNotes(ctypes.Structure):
     clock = COMPUTER_CLOCK
 
     def note(self, drive: Drive) -> None:
+        """Note what the motors are about to receive."""
         NOTE.pack_into(self, 0, self.clock.monotonic(), drive.powered, *drive.effort, *drive.damping)
 
     @property
     def drive(self) -> Drive:
+        """What the motors received last."""
         applied = tuple(self._applied)
         return Drive(applied[:JOINT_COUNT], applied[JOINT_COUNT:], bool(self._powered))
 

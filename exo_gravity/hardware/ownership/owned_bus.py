@@ -46,6 +46,7 @@ class ArmOnBus:
     period: float  #: s of a control cycle.
 
     def open(self) -> can.BusABC:
+        """Open the bus. Raises BusError."""
         return open_bus(*self.address)
 
 

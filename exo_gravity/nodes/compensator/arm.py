@@ -69,6 +69,7 @@ def _settings(values: dict[str, Any]) -> Settings:
 
 
 def sentence(s: Settings | UrdfSettings) -> str:
+    """Return what is compensated, for the log."""
     mode = f"{s.side} arm, mode {s.mode}, support {s.support:g}, " if isinstance(s, Settings) else ""
     mass = s.arm.total_mass if isinstance(s, Settings) else s.arm.mass
     return f"{mode}law {s.law}: compensates {mass:.2f} kg, at most {row(s.max_effort)} Nm"
@@ -152,6 +153,7 @@ class JointStateInterface:
         return by_name(message, "position", self._names), velocity_of(message, self._names)
 
     def send(self, now: float, message: JointState, answer: Answer) -> None:
+        """Publish the answer to the joint states of `message`."""
         self._command.header.stamp = message.header.stamp
         self._command.effort = answer.effort or ()
         self._command.header.frame_id = LATE_TILT if answer.held else ""

@@ -95,6 +95,7 @@ class CompensatorNode(Node):
         return next((thread.failure for thread in self._threads if thread.failure), None)
 
     def close(self) -> None:
+        """End the threads."""
         for thread in reversed(self._threads):
             thread.stop()
 

@@ -43,6 +43,7 @@ def values_after(node: Node, table: Sequence[Param], changes: Sequence[Parameter
 
 
 def bus_of(node: Node, values: dict[str, Any]) -> tuple[str, str, dict[str, Any]]:
+    """Return python-can's interface and channel, and its options, that the node's parameters name."""
     options = {name: parameter.value for name, parameter in node.get_parameters_by_prefix(OPTIONS).items()}
     return values["can.interface"], values["can.channel"], options
 
