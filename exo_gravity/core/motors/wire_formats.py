@@ -104,9 +104,10 @@ class WireFormat:
 
 
 class V3Format(WireFormat):
-    """The frames of V3 boards. The ranges are those of manual V3.0.0; a frame of any control mode is a command."""
+    """The frames of V3 boards; the methods are those of `WireFormat`."""
 
     def ranged(self, spec: MotorSpec) -> MotorSpec:
+        """Return the motor with the ranges of manual V3.0.0."""
         velocity_range, torque_range = V3_RANGES[spec.name]
         return replace(spec, position_range=V3_POSITION_RANGE, velocity_range=velocity_range, torque_range=torque_range)
 
@@ -116,17 +117,20 @@ class V3Format(WireFormat):
 
     @staticmethod
     def pack_command(spec: MotorSpec, position: float, velocity: float, kp: float, kd: float, torque: float) -> bytes:
+        """Return the data of a command."""
         word = specs.pack_fields(spec, kp=kp, kd=kd, position=position, velocity=velocity, torque=torque)
         return word.to_bytes(8, "big")
 
     @staticmethod
     def unpack_command(spec: MotorSpec, data: bytes | bytearray) -> MotorCommand:
+        """Return the content of a command. Raises FrameError."""
         if len(data) != 8:
             raise FrameError(data, "8 bytes")
         kp, kd, *rest = specs.unpack_fields(spec, int.from_bytes(data, "big"), "kp", "kd", *MotorReply._fields[1:4])
         return MotorCommand(*rest[:2], kp, kd, rest[2])
 
     def pack_reply(self, spec: MotorSpec, reply: MotorReply) -> bytes:
+        """Return the data of a status frame. Raises ParameterError."""
         numbers = []
         for name, value, step in zip(MotorReply._fields[1:4], reply[1:4], _steps(spec), strict=True):
             limit = 0x7FFF * step
@@ -136,6 +140,7 @@ class V3Format(WireFormat):
         return _STATUS.pack(*numbers, max(-128, min(127, reply.temperature or 0)), reply.error or 0)
 
     def unpack_reply(self, spec: MotorSpec, motor_id: int, data: bytes | bytearray) -> MotorReply:
+        """Return the content of a status frame. Raises FrameError."""
         if len(data) != 8:
             raise FrameError(data, "a status frame of 8 bytes")
         position, speed, current, temperature, error = _STATUS.unpack(data)
@@ -143,6 +148,7 @@ class V3Format(WireFormat):
         return MotorReply(motor_id, position * steps[0], speed * steps[1], current * steps[2], temperature, error)
 
     def classify(self, frame_id: int, data: bytes | bytearray, motor_ids: frozenset[int]) -> tuple[str, int]:
+        """Return what a frame is: one of any control mode is a command."""
         motor_id, kind = frame_id & 0xFF, (frame_id & ID_BITS) >> 8
         if motor_id not in motor_ids:
             return OTHER, 0
