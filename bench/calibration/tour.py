@@ -20,7 +20,7 @@ from exo_gravity.core.calibration.params import CALIBRATOR, tour_of
 from exo_gravity.core.calibration.tour import Tour
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.motors.joint_motor import JointMotor, motors_of, peaks_of
+from exo_gravity.core.motors.joint_motor import JointMotor, motors_of
 from exo_gravity.core.motors.specs import ENTER, EXIT
 from exo_gravity.core.safety.drive import Drive, State
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
@@ -57,7 +57,7 @@ class Player:
 
     def play(self) -> None:
         """Play until the motors are off."""
-        safety = SafetyMachine(self.limits, 1.0 / self.rate, peaks_of(self.motors))
+        safety = SafetyMachine(self.limits, 1.0 / self.rate, self.motors)
         safety.enable(0.0)
         effort: Torque | None = None
         answered, began = -math.inf, False

@@ -112,7 +112,15 @@ class ControlLoop:
             return False
         try:
             if not (self._is_stopping and self.is_off):
-                self._try_cycle()
+                try:
+                    self._control(self._due)
+                    self._errors = 0
+                except Exception as error:
+                    self._errors += 1
+                    if self._errors == MAX_ERRORS:
+                        raise
+                    self.safety.trip(FaultCode.INTERNAL_ERROR, f"{type(error).__name__}: {error}", self._now())
+                self._due = self._wait(self._due + self.period)
                 return True
         except BaseException as error:  # whatever happened, the arm must come down
             self.failure = error
@@ -164,17 +172,6 @@ class ControlLoop:
         self._due = self._now()
         while self.cycle():
             pass
-
-    def _try_cycle(self) -> None:
-        try:
-            self._control(self._due)
-            self._errors = 0
-        except Exception as error:
-            self._errors += 1
-            if self._errors == MAX_ERRORS:
-                raise
-            self.safety.trip(FaultCode.INTERNAL_ERROR, f"{type(error).__name__}: {error}", self._now())
-        self._due = self._wait(self._due + self.period)
 
     def _resign(self, reason: str) -> None:
         """Hand the arm over to the watchdog, which ends this process; without one, lower the arm."""

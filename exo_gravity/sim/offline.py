@@ -22,7 +22,7 @@ from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.motors.joint_motor import JointMotor, peaks_of
+from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import Drive, State
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
@@ -96,7 +96,7 @@ class OfflineTrial:
         self._delay = delay
         self._start = math.inf  # s, of the script
         self._carried: tuple[Span, ...] = ()  # from the first to the last time at which the motors carried the arm
-        self.safety = SafetyMachine(arm.limits, 1.0 / arm.rate, peaks_of(arm.motors))
+        self.safety = SafetyMachine(arm.limits, 1.0 / arm.rate, arm.motors)
         self._compensator = compensator or Compensator(arm.settings)
         # The newest efforts, when the readings that they answer were taken, and whether the joints are to be damped.
         self._efforts: tuple[Sequence[float] | None, float, bool] = (None, -math.inf, False)

@@ -101,7 +101,7 @@ MUTATIONS = (
     Mutation(
         "a soft wall without damping",
         ("elbow pushed into the soft wall",),
-        (Edit(LIMITS, "return tuple(WALL_DAMPING * min(", "return tuple(0.0 * min("),),
+        (Edit(LIMITS, "damping.append(WALL_DAMPING * min(", "damping.append(0.0 * min("),),
     ),
     Mutation(
         "torque delivery is not checked",

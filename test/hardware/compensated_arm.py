@@ -9,7 +9,6 @@ from typing import Any
 from exo_gravity.core.compensation.compensator import JOINTS, Answer, Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.model.wearer import Wearer
-from exo_gravity.core.motors.joint_motor import peaks_of
 from exo_gravity.core.motors.wire_formats import MIT, WireFormat
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import State
@@ -91,7 +90,7 @@ class CompensatedArm:
         low, high = (-1.65, -0.17, -0.78, -0.17), (1.65, 3.14, 2.53, 3.14)
         limits = Limits(JOINTS, low, high, (5.0, 5.0, 5.0, 6.0), limit, sign_check_torque=0.0)
         bus = MotorBus(self.wire.open(), motors, reopen=self.wire.open, clock=self.clock)
-        self.safety = SafetyMachine(limits, cycle, peaks_of(motors))
+        self.safety = SafetyMachine(limits, cycle, motors)
         self.loop = ControlLoop(bus, self.safety, cycle, get_efforts=self._get_efforts)
         self.person = Person(pose)
         self.device.start(self.person, 3.0)

@@ -9,7 +9,6 @@ import numpy as np
 
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.model.wearer import Wearer
-from exo_gravity.core.motors.joint_motor import peaks_of
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trial.script import TrialScript
@@ -47,7 +46,7 @@ class RidingArm:
         self.records: list[tuple[list[float], ...]] = []
         self.wire.play(self.device, self._look)
         limits = replace(LIMITS, sign_check_torque=0.0, max_velocity=(6.0,) * 4)
-        self.safety = SafetyMachine(limits, CYCLE, peaks_of(MOTORS_OF_ARM))
+        self.safety = SafetyMachine(limits, CYCLE, MOTORS_OF_ARM)
         bus = MotorBus(self.wire.open(), MOTORS_OF_ARM, clock=self.clock, reopen=self.wire.open)
         self.loop = ControlLoop(bus, self.safety, CYCLE, get_efforts=self._efforts)
         self._command = NO_COMMAND

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import can
 
 from exo_gravity.core.model.gravity import gravity_torque
-from exo_gravity.core.motors.joint_motor import peaks_of
 from exo_gravity.core.motors.wire_formats import MIT, WireFormat
 from exo_gravity.core.safety.drive import NOTHING, Drive, State
 from exo_gravity.core.safety.machine import SafetyMachine
@@ -96,7 +95,7 @@ class Carried:
         self.motors = MotorBus(
             self.wire.open(), self.rig.motors, note=self.drives.append, reopen=self.wire.open, clock=self.clock
         )
-        self.safety = SafetyMachine(QUICK, CYCLE, peaks_of(self.rig.motors))
+        self.safety = SafetyMachine(QUICK, CYCLE, self.rig.motors)
         self.failure_of_efforts: Exception | None = None
         self._is_raised = False
         self.loop = ControlLoop(self.motors, self.safety, CYCLE, get_efforts=self._get_efforts, **options)

@@ -8,7 +8,7 @@ import pytest
 
 from exo_gravity.core import Tilt, gravity_torque
 from exo_gravity.core.model.wearer import Wearer
-from exo_gravity.core.motors.joint_motor import JointMotor, peaks_of
+from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
 from exo_gravity.core.safety.drive import OFF, State
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
@@ -44,7 +44,7 @@ class Lowered:
         self.arm.reset(theta)
         links = config.links.with_wearer(mass, cog)
         self.holding = gravity_torque(links, theta, Tilt.of("right", pitch, roll).direction)
-        self.machine = SafetyMachine(LIMITS, 1.0 / RATE, peaks_of(self.motors))
+        self.machine = SafetyMachine(LIMITS, 1.0 / RATE, self.motors)
         self.top_speed = self.speed_after_exit = 0.0
         self.switched_on_again = False
         self._samples = [UNKNOWN] * 4
@@ -110,7 +110,7 @@ def test_from_other_poses_and_on_a_tilted_trunk_it_comes_down_as_slowly(theta, p
 @pytest.mark.parametrize("theta", POSES[1:4])
 def test_a_passive_arm_of_75_kg_comes_down_as_slowly_wherever_the_motors_can_hold_it(theta):
     lowered = Lowered(theta, 0.05, 75.0)
-    assert np.all(np.abs(lowered.holding) <= peaks_of(MOTORS_OF_ARM).effort)
+    assert np.all(np.abs(lowered.holding) <= [motor.peak_effort for motor in MOTORS_OF_ARM])
     assert lowered.top_speed < TOP_SPEED
     assert lowered.speed_after_exit < TOP_SPEED / 4
 

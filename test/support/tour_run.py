@@ -17,7 +17,7 @@ from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.model.kinematics import LinkInertia
 from exo_gravity.core.model.moments import load_moments, moments_of
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.motors.joint_motor import JointMotor, peaks_of
+from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
 from exo_gravity.core.safety.drive import Drive, State
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
@@ -82,7 +82,7 @@ class TourRun:
         moments = moments_of(self.assumed) + load_moments(self.assumed.length.tolist(), *self.load)
         guess = TorqueGuess(self.assumed.length, moments, tilt, self.assumed.gravity)
         tour = Tour(self.limits, guess, itinerary or BestPoses(self.limits, 12, 230.0), self.rate, self.load)
-        safety = SafetyMachine(self.limits, 1.0 / self.rate, peaks_of(MOTORS_AS_MOUNTED))
+        safety = SafetyMachine(self.limits, 1.0 / self.rate, MOTORS_AS_MOUNTED)
         safety.enable(0.0)
         samples: list[JointSample] = [UNKNOWN] * 4
         effort: Torque | None = None

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.bus_load import BITRATE, Traffic
@@ -122,20 +122,6 @@ class JointMotor:
     def motor_position(self, joint_position: float) -> float:
         """Return the motor angle in rad for a joint angle in rad."""
         return self.direction * joint_position + self.zero
-
-
-class Peaks(NamedTuple):
-    """The most that the motors of an arm apply at its joints."""
-
-    #: (4,) Nm
-    effort: tuple[float, ...]
-    #: (4,) Nm s/rad
-    damping: tuple[float, ...] = (math.inf,) * 4
-
-
-def peaks_of(motors: Sequence[JointMotor]) -> Peaks:
-    """Return what `motors` apply at most."""
-    return Peaks(tuple(motor.peak_effort for motor in motors), tuple(motor.peak_damping for motor in motors))
 
 
 # fmt: off

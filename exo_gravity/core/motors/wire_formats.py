@@ -126,8 +126,9 @@ class V3Format(WireFormat):
         """Return the content of a command. Raises FrameError."""
         if len(data) != 8:
             raise FrameError(data, "8 bytes")
-        kp, kd, *rest = specs.unpack_fields(spec, int.from_bytes(data, "big"), "kp", "kd", *MotorReply._fields[1:4])
-        return MotorCommand(*rest[:2], kp, kd, rest[2])
+        order = "kp", "kd", "position", "velocity", "torque"
+        kp, kd, position, velocity, torque = specs.unpack_fields(spec, int.from_bytes(data, "big"), *order)
+        return MotorCommand(position, velocity, kp, kd, torque)
 
     def pack_reply(self, spec: MotorSpec, reply: MotorReply) -> bytes:
         """Return the data of a status frame. Raises ParameterError."""

@@ -5,7 +5,6 @@ Every fault has a code for programs and a sentence for people.
 
 from __future__ import annotations
 
-import operator
 from enum import Enum
 from typing import NamedTuple
 
@@ -41,12 +40,6 @@ class Drive(NamedTuple):
     enter: tuple[bool, ...] = (False, False, False, False)
     #: (4,) which motors may be on or off: they are sent nothing that could switch them on
     unsure: tuple[bool, ...] = (False, False, False, False)
-
-    def within(self, peak_damping: tuple[float, ...]) -> Drive:
-        """Return the drive with no more damping than `peak_damping` (4,) Nm s/rad."""
-        if not any(map(operator.gt, self.damping, peak_damping)):
-            return self
-        return self._replace(damping=tuple(map(min, self.damping, peak_damping)))
 
 
 OFF = Drive(NOTHING, NOTHING, False)

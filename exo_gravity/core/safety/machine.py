@@ -32,7 +32,7 @@ import operator
 from collections.abc import Sequence
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.joint_motor import Peaks
+from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DAMPING_RISE, SETTLING_TIME, ArmDescent, RestTracker
@@ -51,7 +51,7 @@ class SafetyMachine:
     """Decides, cycle by cycle, what the motors of one arm receive. Not thread-safe: one thread owns it.
 
     period: s of a cycle. After a pause the torque continues as if only one period had passed: it never catches up.
-    peaks: the most that the motors apply; by default `max_effort`, and any damping.
+    motors: of the arm, which bound its torque and damping; by default `max_effort` does, and nothing.
 
     state: the State. fault: the latched Fault or None. waiting_for: what CHECKING or PROVING waits for. refusal: why
     the last enable was refused without a fault, or "". acted: for each limit that has acted, by name, the last time.
@@ -59,7 +59,7 @@ class SafetyMachine:
     motion: judges the efforts by gravity alone.
     """
 
-    def __init__(self, limits: Limits, period: float, peaks: Peaks | None = None) -> None:
+    def __init__(self, limits: Limits, period: float, motors: Sequence[JointMotor] = ()) -> None:
         self.limits = limits
         self.state = State.DISABLED
         self.fault: Fault | None = None
@@ -68,7 +68,7 @@ class SafetyMachine:
         self.is_unreached = False
         self.ride = RideThrough(limits.command_timeout)
         self._period = period
-        self._peaks = peaks or Peaks(tuple(limits.max_effort))
+        self._peak_damping = [motor.peak_damping for motor in motors] or [math.inf] * JOINT_COUNT
         self._since = self._calm_since = 0.0
         self._now, self._dt = -math.inf, 0.0  # of the present cycle
         self._sent = OFF  # last sent to the motors
@@ -77,7 +77,7 @@ class SafetyMachine:
         self._readings = Readings(limits)
         self._is_found_on = False  # by this cycle's replies
         self._is_trusted = False  # zeros and signs
-        self._delivery = DeliveryMonitor(limits, self._peaks.effort)
+        self._delivery = DeliveryMonitor(limits, [motor.peak_effort for motor in motors] or limits.max_effort)
         self.motion = MotionMonitor(limits)
         self._supply = SupplyMonitor()
         self._switch_on = SwitchOnCheck(limits)
@@ -182,7 +182,8 @@ class SafetyMachine:
             self._trip(fault)
         if self.state is State.PROVING:
             self._prove()
-        self._sent = self._drive(effort or NOTHING, damped).within(self._peaks.damping)
+        drive = self._drive(effort or NOTHING, damped)
+        self._sent = drive._replace(damping=tuple(map(min, drive.damping, self._peak_damping)))
         return self._sent
 
     def _drive(self, effort: Sequence[float], damped: bool) -> Drive:
@@ -251,14 +252,14 @@ class SafetyMachine:
             ramp = min(1.0, (self._now - self._since) / RAMP_TIME)
             if ramp == 1.0:
                 self._enter(State.ACTIVE)
-        shaped, acted = self.limits.shape(effort, ramp, joints, self._sent.effort, self._dt)
+        shaped, walls, acted = self.limits.shape(effort, ramp, joints, self._sent.effort, self._dt)
         self.acted.update(dict.fromkeys(acted, self._now))
         # A wall's damping rises at once, since it already rises with the position. That of a ride or a changing load
         # rises over DAMPING_RISE, and any damping falls so.
         step = DAMPING / DAMPING_RISE * self._dt
         guided = [guide_damping(joint.velocity) if damped else 0.0 for joint in joints]
         wanted = (DAMPING,) * len(guided) if self.ride.is_riding else guided
-        columns = zip(self.limits.wall_damping(joints), wanted, self._sent.damping, strict=True)
+        columns = zip(walls, wanted, self._sent.damping, strict=True)
         damping = tuple(max(wall, last - step, min(last + step, most)) for wall, most, last in columns)
         return Drive(shaped, damping, True)
 

@@ -24,7 +24,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from exo_gravity.core.errors import BusError, ExoGravityError, ParameterError
 from exo_gravity.core.model.tilt import SIDES
-from exo_gravity.core.motors.joint_motor import OPTIONS, motors_of, peaks_of, traffic_of
+from exo_gravity.core.motors.joint_motor import OPTIONS, motors_of, traffic_of
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.params import CAN_BRIDGE, check_bridge, limits_of
@@ -138,7 +138,7 @@ class CanBridge(LifecycleNode):
         assert self._owned, "the node is not configured"
         bus, self._bus = self._bus or self._owned.open(), None
         period = self._arm.period
-        safety = SafetyMachine(self._arm.limits, period, peaks_of(self._arm.motors))
+        safety = SafetyMachine(self._arm.limits, period, self._arm.motors)
         hand_over = self._owned.watchdog.hand_over
         loop = ControlLoop(bus, safety, period, self._exchange.publish, self._exchange.get_efforts, hand_over)
         loop.start()
