@@ -124,7 +124,11 @@ class ControlLoop:
                 return True
         except BaseException as error:  # whatever happened, the arm must come down
             self.failure = error
-            self._resign(f"{type(error).__name__}: {error}")
+            if self.bus.may_be_powered:  # the watchdog ends this process; without one, the arm is lowered here
+                with contextlib.suppress(Exception):
+                    if self._hand_over(f"the control loop failed: {type(error).__name__}: {error}"):
+                        self._clock.sleep(HAND_OVER_TIME)
+                lower(self.bus, self._drive, self.period)
         self.bus.stop()
         self._has_ended = True
         return False
@@ -172,14 +176,6 @@ class ControlLoop:
         self._due = self._now()
         while self.cycle():
             pass
-
-    def _resign(self, reason: str) -> None:
-        """Hand the arm over to the watchdog, which ends this process; without one, lower the arm."""
-        if self.bus.may_be_powered:
-            with contextlib.suppress(Exception):
-                if self._hand_over(f"the control loop failed: {reason}"):
-                    self._clock.sleep(HAND_OVER_TIME)
-            lower(self.bus, self._drive, self.period)
 
     def _control(self, due: float) -> None:
         efforts = self._efforts(due)

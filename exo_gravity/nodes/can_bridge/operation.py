@@ -210,7 +210,8 @@ class BridgeReport:
         now, safety = time.monotonic(), loop.safety
         acting = ", ".join(sorted(limit for limit, acted in tuple(safety.acted.items()) if acted > now - RECENT))
         rate = self._rate.update(now, loop.cycles)
-        self._motors.update(now, loop.samples)
+        samples = loop.samples
+        loads = self._motors.update(now, samples)
         values: dict[str, object] = {
             "state": safety.state.value,
             "fault": safety.fault.code if safety.fault else "none",
@@ -229,8 +230,7 @@ class BridgeReport:
             "publishing errors": f"{loop.cycle_errors}, last: {loop.cycle_error}" if loop.cycle_errors else "none",
             "last refused message": refusal,
         }
-        columns = self._names, loop.samples, self._motors.power, self._motors.rms, self._motors.share
-        for name, joint, power, rms, share in zip(*columns, strict=True):
+        for name, joint, (power, rms, share) in zip(self._names, samples, loads, strict=True):
             values[f"{name} temperature (degC)"] = joint.temperature
             values[f"{name} torque (Nm)"] = row([joint.effort], 2)
             values[f"{name} power (W)"] = row([power], 1)
@@ -239,7 +239,7 @@ class BridgeReport:
         warnings = [f"limited by {acting}"] if acting else []
         if now - safety.ride.ended < RECENT:
             warnings.append(f"riding through: {safety.ride.why}")
-        hot = [name for name, share in zip(self._names, self._motors.share, strict=True) if share > 1.0]
+        hot = [name for name, (_, _, share) in zip(self._names, loads, strict=True) if share > 1.0]
         if hot:
             warnings.append(f"above rated torque for too long: {', '.join(hot)}")
         if 0.0 < rate < self._slow:
