@@ -19,13 +19,13 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.drive import EffortCommand, State
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import Clock
-from exo_gravity.hardware.control_loop import ControlLoop, EffortCommand
+from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedImu, VirtualWearer
 from exo_gravity.tools.inputs.arms import read_arm

@@ -11,17 +11,16 @@ last noted drive; without a watchdog, the loop lowers the arm without the state 
 from __future__ import annotations
 
 import contextlib
-import math
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from queue import SimpleQueue
-from typing import Any, NamedTuple
+from typing import Any
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.bus_load import REPLY_SHARE
 from exo_gravity.core.safety.descent import RestTracker
-from exo_gravity.core.safety.drive import OFF, Drive, FaultCode, State
+from exo_gravity.core.safety.drive import NO_COMMAND, OFF, Drive, EffortCommand, FaultCode, State
 from exo_gravity.core.safety.limits import DAMPING, JointSample
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.supply import SupplyMonitor
@@ -37,18 +36,6 @@ HAND_OVER_TIME = 0.5  # s in which a watchdog that takes over has ended this pro
 LOWERING_FADE = 10.0  # s in which the torque fades
 REST_TIME = 10.0  # s for which the joints must be at rest
 REPLY_TIMEOUT = 0.1  # s without a reply after which a motor's position is not known
-
-
-class EffortCommand(NamedTuple):
-    """What the motors are to apply."""
-
-    effort: Sequence[float] | None  #: (4,) Nm, or None to withdraw.
-    answered: float  #: s, when the joint states that it answers were taken.
-    damped: bool = False  #: whether the load is changing, so that the motors are to damp the joints.
-    held: bool = False  #: Whether it is computed from a tilt that is late.
-
-
-NO_COMMAND = EffortCommand(None, -math.inf)
 
 
 class ControlLoop:
@@ -186,7 +173,7 @@ class ControlLoop:
             self.safety.trip(FaultCode.MOTOR_SILENT, f"the computer was suspended for {suspended:.0f} s", now)
         if self._is_stopping:
             self.safety.disable(now)
-        drive = self._drive = self.safety.step(now, tuple(self.bus.samples), *efforts)
+        drive = self._drive = self.safety.step(now, tuple(self.bus.samples), efforts)
         try:
             complete = self.bus.exchange(drive, now + REPLY_SHARE * self.period)
         except BusError as error:

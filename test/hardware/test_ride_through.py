@@ -9,11 +9,11 @@ import numpy as np
 
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.model.wearer import Wearer
-from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.safety.drive import NO_COMMAND, EffortCommand, FaultCode, State
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.control_loop import NO_COMMAND, ControlLoop, EffortCommand
+from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.sim import ArmConfig, VirtualWearer
 from exo_gravity.sim.arm import DEFAULT_LINKS
 

@@ -12,10 +12,10 @@ import can
 
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.motors.wire_formats import MIT, WireFormat
-from exo_gravity.core.safety.drive import NOTHING, Drive, State
+from exo_gravity.core.safety.drive import NOTHING, Drive, EffortCommand, State
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.control_loop import ControlLoop, EffortCommand
+from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.ownership.bus_lock import DriveNotes
 from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, let_down
 

@@ -17,11 +17,10 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.bus_load import Traffic
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS
-from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.safety.drive import NO_COMMAND, FaultCode, State
 from exo_gravity.core.safety.lease import LEASE_TIME, Lease
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.hardware.control_loop import NO_COMMAND
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.can_bridge.operation import WATCH_PERIOD, BridgeReport, BridgeServices, Operator
@@ -116,7 +115,7 @@ def standing():
         loop.zeroed += 1
 
     loop.call, loop.bus = call, SimpleNamespace(set_zero=set_zero)
-    loop.safety.step(0.0, loop.samples, None, 0.0)
+    loop.safety.step(0.0, loop.samples, NO_COMMAND)
     return loop
 
 

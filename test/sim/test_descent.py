@@ -1,6 +1,5 @@
 """The way down, judged by the simulated arm's true motion: slow, to the ground in time, and no drop at the end."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +9,7 @@ from exo_gravity.core import Tilt, gravity_torque
 from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
-from exo_gravity.core.safety.drive import OFF, State
+from exo_gravity.core.safety.drive import NO_COMMAND, OFF, State
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
@@ -58,7 +57,7 @@ class Lowered:
             self._take(motor, self.device.exchange(motor.can_id, ENTER))
         self.machine.take_over(self.holding.tolist(), (0.0,) * 4, 0.0)
         while self._now < 60.0:
-            drive = self.machine.step(self._now, tuple(self._samples), None, -math.inf)
+            drive = self.machine.step(self._now, tuple(self._samples), NO_COMMAND)
             if drive == OFF:
                 break
             self.switched_on_again = self.switched_on_again or any(drive.enter)

@@ -19,7 +19,7 @@ from exo_gravity.core.model.moments import load_moments, moments_of
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
-from exo_gravity.core.safety.drive import Drive, State
+from exo_gravity.core.safety.drive import Drive, EffortCommand, State
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trial.script import TrialScript
@@ -91,7 +91,7 @@ class TourRun:
         for cycle in range(round(LONGEST * self.rate)):
             now = cycle / self.rate
             queue = [*queue, effort][-1 - self.late :]
-            drive = safety.step(now, tuple(samples), queue[0], answered)
+            drive = safety.step(now, tuple(samples), EffortCommand(queue[0], answered))
             powered = self._exchange(device, drive, powered, samples, now)
             if not any(self.limits.is_silent(now, joint) for joint in samples):
                 position, velocity = [row.position for row in samples], [row.velocity for row in samples]

@@ -5,6 +5,8 @@ Every fault has a code for programs and a sentence for people.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from enum import Enum
 from typing import NamedTuple
 
@@ -25,6 +27,18 @@ class State(str, Enum):
 
 # The states in which torque is applied on request.
 CARRYING = (State.PROVING, State.RAMPING_IN, State.ACTIVE)
+
+
+class EffortCommand(NamedTuple):
+    """What the motors are asked to apply."""
+
+    effort: Sequence[float] | None  #: (4,) Nm, or None to withdraw.
+    answered: float  #: s, when the joint states that it answers were taken.
+    damped: bool = False  #: whether the load is changing, so that the motors are to damp the joints.
+    held: bool = False  #: Whether it is computed from a tilt that is late.
+
+
+NO_COMMAND = EffortCommand(None, -math.inf)
 
 
 class Drive(NamedTuple):

@@ -36,7 +36,18 @@ from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DAMPING_RISE, SETTLING_TIME, ArmDescent, RestTracker
-from exo_gravity.core.safety.drive import CARRYING, DOUBTFUL, NO_ONES, NOTHING, OFF, Drive, Fault, FaultCode, State
+from exo_gravity.core.safety.drive import (
+    CARRYING,
+    DOUBTFUL,
+    NO_ONES,
+    NOTHING,
+    OFF,
+    Drive,
+    EffortCommand,
+    Fault,
+    FaultCode,
+    State,
+)
 from exo_gravity.core.safety.gate import CALM, SignCheck, SwitchOnCheck, missing_for_a_start
 from exo_gravity.core.safety.limits import DAMPING, JointSample, Limits, guide_damping
 from exo_gravity.core.safety.motion_monitor import MotionMonitor
@@ -152,21 +163,9 @@ class SafetyMachine:
         """Return whether no replying joint has moved for a while."""
         return now - self._rest.since >= SETTLING_TIME
 
-    def step(
-        self,
-        now: float,
-        joints: Sequence[JointSample],
-        effort: Sequence[float] | None,
-        effort_time: float,
-        damped: bool = False,
-        held: bool = False,
-    ) -> Drive:
-        """Return what the motors receive in the cycle at `now` s.
-
-        joints: the 4 newest readings. effort: (4,) Nm requested, None if withdrawn or never requested; effort_time:
-        when the joint readings that it answers were taken. damped: whether the joints are to be damped too, because the
-        load changes; held: whether the efforts are computed from a tilt that is late. All times are on one clock.
-        """
+    def step(self, now: float, joints: Sequence[JointSample], command: EffortCommand) -> Drive:
+        """Return what the motors receive in the cycle at `now` s; joints: the 4 newest readings."""
+        effort, effort_time, damped, held = command
         now = max(now, self._now)  # a call may carry a slightly later time than the cycle that follows it
         age = now - effort_time
         self._now, self._dt = now, min(now - self._now, self._period)
@@ -174,7 +173,10 @@ class SafetyMachine:
         if self.state is State.CHECKING:
             self._check(effort is not None and age <= self.limits.command_timeout)
         if self._sent.powered:
-            self._check_delivery()
+            fault = self._delivery.step(self._dt, self._readings.joints, self._sent.effort, self._sent.damping)
+            is_proven = self.state in (State.RAMPING_IN, State.ACTIVE) or self._switch_on.done
+            if fault and self.state in CARRYING and is_proven:
+                self._trip(fault)
         if self.state in CARRYING:
             self._watch(effort is not None, age, held)
         if effort is not None and self.state in (State.RAMPING_IN, State.ACTIVE):
@@ -218,12 +220,6 @@ class SafetyMachine:
             self._enter(State.PROVING)
         elif self._now - self._since >= limits.enable_timeout:
             self._refuse(f"not enabled within {limits.enable_timeout:g} s: waited for {self.waiting_for}")
-
-    def _check_delivery(self) -> None:
-        fault = self._delivery.step(self._dt, self._readings.joints, self._sent.effort, self._sent.damping)
-        is_proven = self.state in (State.RAMPING_IN, State.ACTIVE) or self._switch_on.done
-        if fault and self.state in CARRYING and is_proven:
-            self._trip(fault)
 
     def _watch(self, is_requested: bool, age: float, held: bool) -> None:
         fault = self._readings.fault

@@ -18,9 +18,9 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.safety.drive import CARRYING, FaultCode
+from exo_gravity.core.safety.drive import CARRYING, NO_COMMAND, EffortCommand, FaultCode
 from exo_gravity.core.safety.limits import JointSample, Limits
-from exo_gravity.hardware.control_loop import NO_COMMAND, ControlLoop, EffortCommand
+from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.nodes.ros.hot_path import HotPath, SolePublisher
 from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, to_nanoseconds
 

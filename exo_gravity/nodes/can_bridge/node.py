@@ -25,12 +25,12 @@ from rclpy.signals import SignalHandlerOptions
 from exo_gravity.core.errors import BusError, ExoGravityError, ParameterError
 from exo_gravity.core.model.tilt import SIDES
 from exo_gravity.core.motors.joint_motor import OPTIONS, motors_of, traffic_of
-from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.safety.drive import NO_COMMAND, FaultCode, State
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.params import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.trunk.tilt_input import TiltInput
 from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.control_loop import NO_COMMAND, ControlLoop
+from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, OwnedBus, Watchdog, take_over
 from exo_gravity.hardware.scheduling import request_real_time
 from exo_gravity.nodes.can_bridge import operation

@@ -22,10 +22,10 @@ from exo_gravity.core.motors.bus_load import REPLY_SHARE, Traffic
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import Rate
 from exo_gravity.core.safety.delivery import MotorLoad
-from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.safety.drive import EffortCommand, FaultCode, State
 from exo_gravity.core.safety.lease import Lease
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
-from exo_gravity.hardware.control_loop import ControlLoop, EffortCommand
+from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.nodes.ros.hot_path import HotPath
 from exo_gravity.nodes.ros.messages import ERROR, HELD_BY, NOBODY, OK, WARN, Diagnostics, milliseconds, row
 from exo_gravity.nodes.ros.run import open_to_others
