@@ -21,8 +21,7 @@
 A compensator that is late for a moment is waited for (ride.py): the last torque stays, and damping rises.
 
 Zeros and signs are trusted once they were checked, until a motor may have lost its turn count (readings.py), or a fault
-casts doubt on them (`DOUBTFUL`). Until then `resume` carries an arm on from any pose after a fault that was no one's
-(`NO_ONES`).
+casts doubt on them. Until then `resume` carries an arm on from any pose after a fault that was no one's.
 """
 
 from __future__ import annotations
@@ -36,18 +35,7 @@ from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DAMPING_RISE, SETTLING_TIME, ArmDescent, RestTracker
-from exo_gravity.core.safety.drive import (
-    CARRYING,
-    DOUBTFUL,
-    NO_ONES,
-    NOTHING,
-    OFF,
-    Drive,
-    EffortCommand,
-    Fault,
-    FaultCode,
-    State,
-)
+from exo_gravity.core.safety.drive import CARRYING, NOTHING, OFF, Drive, EffortCommand, Fault, FaultCode, State
 from exo_gravity.core.safety.gate import CALM, SignCheck, SwitchOnCheck, missing_for_a_start
 from exo_gravity.core.safety.limits import DAMPING, JointSample, Limits, guide_damping
 from exo_gravity.core.safety.motion_monitor import MotionMonitor
@@ -125,7 +113,7 @@ class SafetyMachine:
         """Why `resume` would be refused; '' if it would not."""
         if self.state is not State.FAULT or self.fault is None:
             return f"the arm is {self.state.value}, must be in fault"
-        if self.fault.code not in NO_ONES:
+        if not self.fault.code.is_no_ones:
             return f"{self.fault.code} has a cause to look for: then clear the fault and enable the arm"
         return "" if self._is_trusted else "zeros are no longer sure: let the arm hang, clear the fault, enable the arm"
 
@@ -138,7 +126,7 @@ class SafetyMachine:
 
         While the arm is off only a foreign command is a fault: it may have switched a motor on.
         """
-        if code in DOUBTFUL:
+        if code.casts_doubt:
             self._is_trusted = False
         if self.state is State.FAULT or (self.state is State.DISABLED and code is not FaultCode.FOREIGN_COMMAND):
             return
