@@ -92,18 +92,14 @@ class JointDescent:
         if self.effort * velocity > 0.0 and speed > DRIVEN_SPEED:
             self._approach(0.0, RELEASE_GAIN * (speed - DRIVEN_SPEED), dt)
         elif excess and self._carried * velocity < 0.0:
-            self._brake(excess, dt)
+            if abs(self.effort) < abs(self._carried):
+                self._approach(self._carried, BRAKE_GAIN * excess, dt)
+            elif abs(self.effort) < self._most:
+                rate = min(BRAKE_GROWTH, BRAKE_GAIN * excess)
+                self._approach(math.copysign(self._most, self._carried), rate, dt)
         else:
             self._approach(0.0, self._fade_rate, dt)
         self._step_damping(dt, excess)
-
-    def _brake(self, excess: float, dt: float) -> None:
-        """Let the torque grow against a joint that sinks by `excess` rad/s too fast."""
-        if abs(self.effort) < abs(self._carried):
-            self._approach(self._carried, BRAKE_GAIN * excess, dt)
-        elif abs(self.effort) < self._most:
-            rate = min(BRAKE_GROWTH, BRAKE_GAIN * excess)
-            self._approach(math.copysign(self._most, self._carried), rate, dt)
 
     def _approach(self, effort: float, rate: float, dt: float) -> None:
         """Bring the torque nearer to `effort` (Nm), by at most `rate` (Nm/s)."""
