@@ -33,12 +33,9 @@ REPLY_SHARE = 0.8  # of a cycle in which replies are awaited
 class Traffic:
     """The motors on one bus, and its bit rate. Raises ParameterError."""
 
-    #: motors of V1 and V2 boards
-    replying: int
-    #: motors of V3 boards
-    reporting: int = 0
-    #: bit/s
-    bitrate: int = BITRATE
+    replying: int  #: motors of V1 and V2 boards
+    reporting: int = 0  #: motors of V3 boards
+    bitrate: int = BITRATE  #: bit/s
 
     def __post_init__(self) -> None:
         if not isinstance(self.bitrate, int) or not 10_000 <= self.bitrate <= 1_000_000:

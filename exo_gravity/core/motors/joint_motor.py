@@ -31,16 +31,11 @@ class JointMotor:
     """One motor on one joint. Raises ParameterError."""
 
     spec: MotorSpec
-    #: 1 to MAX_CAN_ID
-    can_id: int
-    #: 1 or -1: joint angle = direction * (motor angle - zero)
-    direction: int = 1
-    #: motor angle in rad at which the joint angle is 0
-    zero: float = 0.0
-    #: real output torque per commanded Nm (users report 0.75 for one AK80-9)
-    torque_scale: float = 1.0
-    #: of the motor's board
-    wire_format: WireFormat = MIT
+    can_id: int  #: 1 to MAX_CAN_ID
+    direction: int = 1  #: 1 or -1: joint angle = direction * (motor angle - zero)
+    zero: float = 0.0  #: motor angle in rad at which the joint angle is 0
+    torque_scale: float = 1.0  #: real output torque per commanded Nm (users report 0.75 for one AK80-9)
+    wire_format: WireFormat = MIT  #: of the motor's board
 
     def __post_init__(self) -> None:
         if not isinstance(self.can_id, int) or not 1 <= self.can_id <= MAX_CAN_ID:

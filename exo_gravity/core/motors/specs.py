@@ -54,14 +54,10 @@ class MotorSpec:
     #: Nm at the output
     rated_torque: float
     peak_torque: float
-    #: turns of the motor per turn of the output
-    gear_ratio: int
-    #: of the motor
-    pole_pairs: int
-    #: Nm at the output, rated torque by rated current; only V3 boards report a current
-    torque_per_ampere: float
-    #: rad: the wire range is +- this value
-    position_range: float = 12.5
+    gear_ratio: int  #: turns of the motor per turn of the output
+    pole_pairs: int  #: of the motor
+    torque_per_ampere: float  #: Nm at the output, rated torque by rated current; only V3 boards report a current
+    position_range: float = 12.5  #: rad: the wire range is +- this value
     #: Nm/rad, Nm s/rad: the wire range starts at 0
     kp_max: float = 500.0
     kd_max: float = 5.0
@@ -110,16 +106,11 @@ class MotorReply(NamedTuple):
     """The content of a reply."""
 
     motor_id: int
-    #: rad
-    position: float
-    #: rad/s
-    velocity: float
-    #: Nm
-    torque: float
-    #: degC, None from firmware that replies with 6 bytes
-    temperature: int | None
-    #: a code of MOTOR_ERRORS, None from firmware that replies with 6 bytes
-    error: int | None
+    position: float  #: rad
+    velocity: float  #: rad/s
+    torque: float  #: Nm
+    temperature: int | None  #: degC, None from firmware that replies with 6 bytes
+    error: int | None  #: a code of MOTOR_ERRORS, None from firmware that replies with 6 bytes
 
 
 def pack_command(spec: MotorSpec, position: float, velocity: float, kp: float, kd: float, torque: float) -> bytes:

@@ -56,16 +56,13 @@ class WireFormat:
     The arbitration IDs of the fields are those of motor 0: a motor adds its own ID.
     """
 
-    #: the value of the parameter `wire_format`
-    name: str = "mit"
+    name: str = "mit"  #: the value of the parameter `wire_format`
     #: whether a motor replies to each command, and only then; if not, it sends its state on its own timer
     replies: bool = True
-    #: of commands
-    first_id: int = 0
+    first_id: int = 0  #: of commands
     #: frames that switch a motor on, before its first command; none if the command itself does
     on: tuple[Frame, ...] = ((0, ENTER),)
-    #: frames that switch a motor off
-    off: tuple[Frame, ...] = ((0, EXIT),)
+    off: tuple[Frame, ...] = ((0, EXIT),)  #: frames that switch a motor off
     #: frames that make the present angle zero; none if the board has no such frame
     zero: tuple[Frame, ...] = ((0, SET_ZERO),)
 

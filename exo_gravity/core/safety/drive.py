@@ -44,12 +44,9 @@ NO_COMMAND = EffortCommand(None, -math.inf)
 class Drive(NamedTuple):
     """What the motors receive in one cycle."""
 
-    #: (4,) Nm
-    effort: tuple[float, ...]
-    #: (4,) Nm s/rad
-    damping: tuple[float, ...]
-    #: whether the motors are to be on
-    powered: bool
+    effort: tuple[float, ...]  #: (4,) Nm
+    damping: tuple[float, ...]  #: (4,) Nm s/rad
+    powered: bool  #: whether the motors are to be on
     #: (4,) which motors must be switched on again, because they are found off
     enter: tuple[bool, ...] = (False, False, False, False)
     #: (4,) which motors may be on or off: they are sent nothing that could switch them on

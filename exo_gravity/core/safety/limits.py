@@ -47,18 +47,12 @@ HOME_TOLERANCE = {"AK60-6": 0.5, "AK80-9": 0.34}
 class JointSample(NamedTuple):
     """The newest reading of one joint."""
 
-    #: rad
-    position: float
-    #: rad/s
-    velocity: float
-    #: Nm
-    effort: float
-    #: degC, None if the firmware reports none
-    temperature: int | None
-    #: a code of MOTOR_ERRORS, None if the firmware reports none
-    error: int | None
-    #: s on the caller's clock
-    time: float
+    position: float  #: rad
+    velocity: float  #: rad/s
+    effort: float  #: Nm
+    temperature: int | None  #: degC, None if the firmware reports none
+    error: int | None  #: a code of MOTOR_ERRORS, None if the firmware reports none
+    time: float  #: s on the caller's clock
 
 
 UNKNOWN = JointSample(math.nan, math.nan, math.nan, None, None, -math.inf)

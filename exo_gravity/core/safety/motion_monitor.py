@@ -34,8 +34,7 @@ MEMORY = 1.0  # s, time constant
 class MotionMonitor:
     """The unexplained impulse of each joint. gravity: (3,) unit vector in the arm's base frame; may be set anytime.
 
-    limits.largest_moment: (4,) kg m; zeros switch the monitor off. impulse: (4,) Nm s, at most PATIENCE times
-    full: (4,) Nm, the full load of each joint.
+    limits.largest_moment: (4,) kg m; zeros switch the monitor off. impulse: (4,) Nm s. full: (4,) Nm, the largest load.
     """
 
     def __init__(self, limits: Limits) -> None:
