@@ -66,11 +66,6 @@ class WireFormat:
     #: frames that make the present angle zero; none if the board has no such frame
     zero: tuple[Frame, ...] = ((0, SET_ZERO),)
 
-    @property
-    def is_extended(self) -> bool:
-        """Whether the arbitration IDs have 29 bits."""
-        return self.first_id >= EXTENDED
-
     def ranged(self, spec: MotorSpec) -> MotorSpec:
         """Return the motor with the usual ranges of this format."""
         return spec
@@ -90,7 +85,7 @@ class WireFormat:
     def classify(self, frame_id: int, data: bytes | bytearray, motor_ids: frozenset[int]) -> tuple[str, int]:
         """Return what a frame is, REPLY, COMMAND or OTHER, and the ID of the motor in `motor_ids`, 0 for none.
 
-        The frame's ID has `is_extended` bits. The first byte of a command is never its motor's ID.
+        The first byte of a command is never its motor's ID.
         """
         length = len(data)
         if length in (6, 8) and data[0] in motor_ids and frame_id in (MASTER_ID, data[0]):

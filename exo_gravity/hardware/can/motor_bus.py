@@ -281,7 +281,7 @@ class FrameFilter:
         self._groups: dict[bool, list[tuple[WireFormat, frozenset[int]]]] = {False: [], True: []}
         for board in {motor.wire_format for motor in motors}:
             can_ids = frozenset(motor.can_id for motor in motors if motor.wire_format == board)
-            self._groups[board.is_extended].append((board, can_ids))
+            self._groups[board.first_id >= EXTENDED].append((board, can_ids))
         self._marks_echoes = marks_echoes
         #: Frames that were sent and whose echoes have not been received.
         self.awaited: deque[Frame] = deque(maxlen=MOST_AWAITED if echoes else 0)
