@@ -121,6 +121,11 @@ def tour_parameters(
         "first_moment": expected[:4],
         "off_axis": expected[4:],
     }
+    simulator = nodes.get(f"{arm.namespace}/simulator")
+    if simulator and (mass := changes.get("tour.load_mass")):
+        # The simulated device cannot be reached by hand: it carries the weight as a wearer's forearm would.
+        wearer = {"mass": [0.0, 0.0, 0.0, mass], "cog": [0.0, 0.0, 0.0, changes["tour.load_lever"]]}
+        simulator["ros__parameters"]["wearer"] = wearer
     nodes[f"{arm.namespace}/calibrator"] = {"ros__parameters": {**values, **changes}}
     return nodes
 

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from exo_gravity.core.calibration.identification import Identified, Observation, columns
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.model.moments import load_moments, regressor
+from exo_gravity.core.numbers import Vector
 from exo_gravity.tools.calibration.result import CalibrationResult, Curve, plain, value_text
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.reporting import html
@@ -102,7 +103,7 @@ def _drift(table: TorqueTable) -> Iterator[str]:
         yield f"With {friction} the arm creeps {count}."
 
 
-def _degrees(theta: Sequence[float]) -> str:
+def _degrees(theta: Vector) -> str:
     return " ".join(f"{angle:.0f}" for angle in np.degrees(theta))
 
 

@@ -20,6 +20,7 @@ import yaml
 
 from exo_gravity.core.calibration.identification import Identified, Observation
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.numbers import Vector
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.inputs.parameter_file import load
 
@@ -59,7 +60,7 @@ class CalibrationResult:
     arm: ConfiguredArm | None = None  #: as configured before
     observations: tuple[Observation, ...] = ()
     identified: Identified | None = None
-    suggestion: tuple[float, ...] | None = None  #: the next best pose, (4,) rad, None if none is wanted
+    suggestion: Vector | None = None  #: the next best pose, (4,) rad, None if none is wanted
     curves: tuple[Curve, ...] = ()  #: of each joint
 
 
