@@ -35,7 +35,6 @@ from exo_gravity.tools.calibration.live import Say, tour_parameters
 from exo_gravity.tools.calibration.recorded import observations_of
 from exo_gravity.tools.calibration.result import CalibrationResult, Change, Curve
 from exo_gravity.tools.inputs.arms import ConfiguredArm
-from exo_gravity.tools.launcher import Stopping, stop_on_signals
 
 SCALE_POSES = 8  # of each tour of `calibrate scale`
 LEAN = "Lean the stand forward or back by about 10 degrees (12 at most from upright): this shows the IMU's heading"
@@ -58,7 +57,7 @@ def calibrate_gravity(options: argparse.Namespace, arm: ConfiguredArm, say: Say)
 
 def _observations(
     options: argparse.Namespace, arm: ConfiguredArm, say: Say, changes: Mapping[str, Any], request: str = "",
-    moments: np.ndarray | None = None, stopping: Stopping | None = None,
+    moments: np.ndarray | None = None,
 ) -> list[Observation]:  # fmt: skip
     """Return what a tour measures, or what `options.bag` shows.
 
@@ -69,7 +68,7 @@ def _observations(
     nodes = tour_parameters(options.params, arm, changes, moments)
     if request and f"{arm.namespace}/simulator" not in nodes:
         options.ask(request)
-    return live.run_tour(options, nodes, say, stopping).complete(options.record)
+    return live.run_tour(options, nodes, say).complete(options.record)
 
 
 def calibrate_scale(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
@@ -78,15 +77,15 @@ def calibrate_scale(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -
     load_moments(arm.robot.length.tolist(), mass, lever)
     if mass * lever < LEAST_MOMENT:
         raise ParameterError("mass times lever", mass * lever, f"at least {LEAST_MOMENT:g} kg m")
-    stopping, poses = None if options.bag else stop_on_signals(), {"tour.poses": SCALE_POSES}
-    bare = _observations(options, arm, say, poses, stopping=stopping)
+    poses = {"tour.poses": SCALE_POSES}
+    bare = _observations(options, arm, say, poses)
     if options.bag:
         weighed = [one._replace(load_mass=mass, load_lever=lever) for one in bare]
         bare = [one._replace(effort=gravity_torque(arm.robot, one.theta, one.direction)) for one in bare]
     else:
         hang = f"Hang {mass:g} kg on link 4, {lever:g} m from the elbow. {LEAN}"
         changes = {**poses, "tour.load_mass": mass, "tour.load_lever": lever}
-        weighed = _observations(options, arm, say, changes, hang, stopping=stopping)
+        weighed = _observations(options, arm, say, changes, hang)
     return moments_from(arm, bare + weighed)
 
 
