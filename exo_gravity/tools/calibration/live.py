@@ -35,9 +35,6 @@ from exo_gravity.tools.launcher import Launcher, stop_on_signals
 KEPT = ("can_bridge", "simulator")  # the arm's nodes that run during a calibration, with the shared /imu
 REFRESH_PERIOD = 0.1  # s, of what the person is shown
 STOPPED = "stopped by Ctrl-C"
-ATTEMPTS = 3  # of a tour on the simulated device
-# Parts of the lines of nodes on a busy computer: the simulated device itself is never late.
-LATE = ("command_stale", "motor_silent", "no joint states for", "trunk tilt older", "was frozen for", "stalled for")
 
 Say = Callable[[Any], None]
 
@@ -74,7 +71,6 @@ class LiveTour:
     measured: list[Observation] = field(default_factory=list)
     trouble: str = ""  #: why it ended early, or ''
     done: bool = False  #: whether it is complete
-    was_late: bool = False  #: whether this computer did not run the nodes in time
 
     def follow(self, line: str, record: Path, say: Say) -> None:
         """Take one line of `calibrator`; ignore half a line, which a killed node leaves."""
@@ -132,25 +128,13 @@ def tour_parameters(
 def run_tour(options: argparse.Namespace, nodes: Mapping[str, Any], say: Say) -> LiveTour:
     """Run `nodes`, the content of a parameter file, until the tour is done or has failed; the arm is then down.
 
-    options: output (the log goes into the same folder) and record. A tour of the simulated device for which this
-    computer was too busy is repeated. Raises ParameterError for a wrong file.
+    options: output (the log goes into the same folder) and record. Raises ParameterError for a wrong file.
     """
-    is_simulated = any(node.endswith("/simulator") for node in nodes)
-    for attempt in range(2, ATTEMPTS + 1):
-        tour = _run_once(options, nodes, say)
-        if not (is_simulated and tour.trouble and tour.was_late) or tour.trouble == STOPPED:
-            return tour
-        say(f"this computer was too busy ({tour.trouble}): attempt {attempt} of {ATTEMPTS}")
-    return _run_once(options, nodes, say)
-
-
-def _run_once(options: argparse.Namespace, nodes: Mapping[str, Any], say: Say) -> LiveTour:
     tour, last_errors = LiveTour(), dict[str, str]()
     handlers = [(number, signal.getsignal(number)) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
     ending = stop_on_signals()
 
     def on_line(node: str, line: str) -> None:
-        tour.was_late = tour.was_late or any(sign in line for sign in LATE)
         if node.endswith("/calibrator") and line.startswith("{"):
             tour.follow(line, options.record, say)
             if tour.done or tour.trouble:
