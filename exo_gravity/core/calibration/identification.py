@@ -22,7 +22,6 @@ from exo_gravity.core.calibration.pose_fit import (
     ANGLE,
     COUNT,
     DISTURBED,
-    FACTOR,
     MOMENT,
     OFFSET,
     SCALE,
@@ -102,15 +101,17 @@ def identify(observations: Sequence[Observation], length: Vector, gravity: float
     used, solution = _bounded(rows.only(keep))
     _check_fit(solution.residual, used.effort)
     direction, hidden = np.asarray(observations[-1].direction, dtype=float), solution.hidden > HIDDEN
-    _check_known(hidden, len(observations), direction, gravity)
-    unknowns, covariance = _in_kilograms(solution, np.where(hidden, START, solution.unknowns))
+    is_relative = not np.any(used.load)
+    _check_known(hidden, len(observations), direction, gravity, is_relative)
+    unknowns = np.where(hidden, START, solution.unknowns)
+    # Student's distribution: for few poses two standard errors would cover less than 95 %.
+    covariance = solution.covariance * (1.0 + 1.25 / (solution.freedom.min() + 6.0)) ** 2
     error = np.where(hidden, np.inf, np.sqrt(np.diag(covariance)))
     moments, scale = unknowns[MOMENT], np.exp(unknowns[SCALE])
     check_physical(moments, error[MOMENT], scale, direction, gravity)
     residual = rows.effort - rows.predicted(solution.unknowns)
     held_out = residual.copy()
     held_out[keep], _ = without_each_pose(solution, used.sigma)
-    is_relative = not np.any(used.load)
     return Identified(
         moments,
         error[MOMENT],
@@ -139,10 +140,10 @@ def _rows(observations: Sequence[Observation], length: Vector, gravity: float) -
             raise DataError(f"pose {index + 1}: {name} = {values[index].tolist()}: must be finite numbers")
     load = np.array([load_moments(length, one.load_mass, one.load_lever) for one in observations])
     free = np.ones(COUNT, dtype=bool)
-    free[FACTOR] = free[ANGLE] = bool(np.any(load))
+    free[ANGLE] = is_weighed = bool(np.any(load))
     one = np.eye(COUNT)
-    product = one[SCALE][1:].sum(axis=0, keepdims=True)  # of the scales of joints 2 to 4: 1, the weight gives the rest
-    anchor = np.vstack((one[ANGLE] / BESIDE_ERROR, one[TILT] / TILT_ERROR, product / EXACT))
+    product = one[SCALE][1:].sum(axis=0, keepdims=True)  # of the scales of joints 2 to 4: 1 without a weight
+    anchor = np.vstack((one[ANGLE] / BESIDE_ERROR, one[TILT] / TILT_ERROR, product * (not is_weighed) / EXACT))
     return Rows(along_axes(theta, gravity), direction, load, effort, np.hypot(spread, LEAST_SPREAD), free, anchor)
 
 
@@ -166,19 +167,6 @@ def _bounded(rows: Rows) -> tuple[Rows, Solution]:
     return used, replace(bounded, covariance=covariance)
 
 
-def _in_kilograms(solution: Solution, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the unknowns (23,) and their covariance (23, 23) without the factor by which a weight seems too heavy."""
-    factor = unknowns[FACTOR]
-    change = np.eye(COUNT)
-    change[MOMENT, MOMENT] /= factor
-    change[MOMENT, FACTOR] = -unknowns[MOMENT] / factor**2
-    change[SCALE, FACTOR] = -1.0 / factor
-    unknowns[MOMENT] /= factor
-    unknowns[SCALE] -= math.log(factor)
-    # Student's distribution: for few poses two standard errors would cover less than 95 %.
-    return unknowns, (1.0 + 1.25 / (solution.freedom.min() + 6.0)) ** 2 * change @ solution.covariance @ change.T
-
-
 def _check_fit(residual: np.ndarray, effort: np.ndarray) -> None:
     """Raise DataError if half of the residuals (n, 4) in Nm of a joint are large compared with its efforts (n, 4)."""
     typical, peak = np.median(np.abs(residual), axis=0), np.abs(effort).max(axis=0)
@@ -187,11 +175,11 @@ def _check_fit(residual: np.ndarray, effort: np.ndarray) -> None:
         raise DataError(f"the poses do not fit one arm: {misfit}. {DISTURBED}")
 
 
-def _check_known(hidden: np.ndarray, count: int, direction: np.ndarray, gravity: float) -> None:
-    """Raise DataError that names the missing pose if `count` poses do not show `hidden` (23,) of joints 2 to 4."""
+def _check_known(hidden: np.ndarray, count: int, direction: np.ndarray, gravity: float, is_relative: bool) -> None:
+    """Raise DataError that names what is missing if `count` poses do not show `hidden` (22,) of joints 2 to 4."""
     missing = hidden.copy()
     missing[list(FIRST_JOINT)] = False
-    if missing[FACTOR]:
+    if np.all(missing[SCALE][1:]) and not is_relative:
         raise DataError("the weight shows no common factor: hang a heavier one, or hold it with a horizontal forearm")
     if np.any(missing):
         names = ", ".join(NAMES[index] for index in np.flatnonzero(missing))
@@ -224,12 +212,12 @@ def check_physical(
 
 
 def _unknown(unknowns: np.ndarray, covariance: np.ndarray, hidden: np.ndarray, relative: bool) -> tuple[str, ...]:
-    """Return what the poses do not show, and what would, in sentences; unknowns and `hidden`: (23,)."""
+    """Return what the poses do not show, and what would, in sentences; unknowns and `hidden`: (22,)."""
     sentences = []
     if relative:
         sentences.append("A common factor of all torque scales and moments: hang a known weight on link 4.")
-    if np.any(hidden[:FACTOR]):
-        names = ", ".join(NAMES[index] for index in np.flatnonzero(hidden[:FACTOR]))
+    if np.any(hidden[: ANGLE.start]):
+        names = ", ".join(NAMES[index] for index in np.flatnonzero(hidden[: ANGLE.start]))
         sentences.append(f"{names}: joint 1 carries nothing while its axis is vertical: {LEAN}.")
     for joint, along, across in ((4, 3, 7), (3, 2, 6)):
         angle = math.degrees(math.atan2(unknowns[across], unknowns[along]))
