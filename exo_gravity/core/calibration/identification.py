@@ -53,6 +53,7 @@ LEAST_TILT = 1.0  # deg worth a sentence
 # Unknowns of joint 1, which carries nothing while its axis is vertical.
 FIRST_JOINT = (0, MOMENTS.index("W"), SCALE.start, OFFSET.start)
 PER_JOINT = tuple(f"{what} {n + 1}" for what in ("torque scale", "offset") for n in range(JOINT_COUNT))
+UNKNOWN = np.eye(COUNT)  # one row for each
 NAMES = (*MOMENTS, *PER_JOINT)
 LEAN = "lean the stand by 10 to 14 degrees to the arm's side, where the arm still hangs close to its home"
 
@@ -99,7 +100,10 @@ def identify(observations: Sequence[Observation], length: Vector, gravity: float
     rows = _rows(observations, length, gravity)
     keep, rejected = without_outliers(rows)
     used, solution = _bounded(rows.only(keep))
-    _check_fit(solution.residual, used.effort)
+    typical, peak = np.median(np.abs(solution.residual), axis=0), np.abs(used.effort).max(axis=0)
+    for joint in np.flatnonzero(typical > np.maximum(MISFIT * peak, LEAST_MISFIT)):
+        misfit = f"joint {joint + 1} is {typical[joint]:.2f} Nm off in half of the poses"
+        raise DataError(f"the poses do not fit one arm: {misfit}. {DISTURBED}")
     direction, hidden = np.asarray(observations[-1].direction, dtype=float), solution.hidden > HIDDEN
     is_relative = not np.any(used.load)
     _check_known(hidden, len(observations), direction, gravity, is_relative)
@@ -134,25 +138,20 @@ def _rows(observations: Sequence[Observation], length: Vector, gravity: float) -
     """Return the observations as arrays, with what is held. Raises DataError that names the observation."""
     if not observations:
         raise DataError("no pose was observed")
-    theta, direction, effort, spread = columns(observations)
-    for name, values in (("theta", theta), ("direction", direction), ("effort", effort), ("spread", spread)):
+    theta, direction, effort, spread = found = columns(observations)
+    for name, values in zip(("theta", "direction", "effort", "spread"), found, strict=True):
         for index in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
             raise DataError(f"pose {index + 1}: {name} = {values[index].tolist()}: must be finite numbers")
     load = np.array([load_moments(length, one.load_mass, one.load_lever) for one in observations])
-    free = np.ones(COUNT, dtype=bool)
-    free[ANGLE] = is_weighed = bool(np.any(load))
-    one = np.eye(COUNT)
-    product = one[SCALE][1:].sum(axis=0, keepdims=True)  # of the scales of joints 2 to 4: 1 without a weight
-    anchor = np.vstack((one[ANGLE] / BESIDE_ERROR, one[TILT] / TILT_ERROR, product * (not is_weighed) / EXACT))
-    return Rows(along_axes(theta, gravity), direction, load, effort, np.hypot(spread, LEAST_SPREAD), free, anchor)
+    product = UNKNOWN[SCALE][1:].sum(axis=0, keepdims=True)  # of the scales of joints 2 to 4: 1 without a weight
+    product *= not np.any(load)
+    anchor = np.vstack((UNKNOWN[ANGLE] / BESIDE_ERROR, UNKNOWN[TILT] / TILT_ERROR, product / EXACT))
+    return Rows(along_axes(theta, gravity), direction, load, effort, np.hypot(spread, LEAST_SPREAD), anchor)
 
 
 def columns(observations: Sequence[Observation]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return theta (n, 4) rad, direction (n, 3), effort and spread (n, 4) Nm of the observations."""
-    theta, direction, effort, spread = (
-        np.array([getattr(one, name) for one in observations], dtype=float)
-        for name in ("theta", "direction", "effort", "spread")
-    )
+    theta, direction, effort, spread = (np.array([one[i] for one in observations], dtype=float) for i in (0, 1, 2, 4))
     return theta, direction, effort, spread
 
 
@@ -161,18 +160,10 @@ def _bounded(rows: Rows) -> tuple[Rows, Solution]:
     used, solution = final(rows)
     if solution.unknowns[0] >= 0.0:
         return used, solution
-    used, bounded = final(replace(rows, free=rows.free & (np.arange(COUNT) != 0)))
+    used, bounded = final(replace(rows, anchor=np.vstack((rows.anchor, UNKNOWN[:1] / EXACT))))
     covariance = bounded.covariance.copy()
     covariance[0, 0] = solution.covariance[0, 0]
     return used, replace(bounded, covariance=covariance)
-
-
-def _check_fit(residual: np.ndarray, effort: np.ndarray) -> None:
-    """Raise DataError if half of the residuals (n, 4) in Nm of a joint are large compared with its efforts (n, 4)."""
-    typical, peak = np.median(np.abs(residual), axis=0), np.abs(effort).max(axis=0)
-    for joint in np.flatnonzero(typical > np.maximum(MISFIT * peak, LEAST_MISFIT)):
-        misfit = f"joint {joint + 1} is {typical[joint]:.2f} Nm off in half of the poses"
-        raise DataError(f"the poses do not fit one arm: {misfit}. {DISTURBED}")
 
 
 def _check_known(hidden: np.ndarray, count: int, direction: np.ndarray, gravity: float, is_relative: bool) -> None:
@@ -205,10 +196,8 @@ def check_physical(
     for across, along in ((6, 2), (7, 3)):
         if abs(moments[across]) > moments[along]:
             angle = math.degrees(math.atan2(moments[across], moments[along]))
-            raise DataError(
-                f"{MOMENTS[across]} = {moments[across]:.3f} kg m exceeds {MOMENTS[along]}: "
-                f"the zero of joint {along + 1} seems {angle:.0f} degrees off"
-            )
+            seems = f"the zero of joint {along + 1} seems {angle:.0f} degrees off"
+            raise DataError(f"{MOMENTS[across]} = {moments[across]:.3f} kg m exceeds {MOMENTS[along]}: {seems}")
 
 
 def _unknown(unknowns: np.ndarray, covariance: np.ndarray, hidden: np.ndarray, relative: bool) -> tuple[str, ...]:
@@ -221,10 +210,8 @@ def _unknown(unknowns: np.ndarray, covariance: np.ndarray, hidden: np.ndarray, r
         sentences.append(f"{names}: joint 1 carries nothing while its axis is vertical: {LEAN}.")
     for joint, along, across in ((4, 3, 7), (3, 2, 6)):
         angle = math.degrees(math.atan2(unknowns[across], unknowns[along]))
-        sentences.append(
-            f"{MOMENTS[across]} of link {joint} from an error of joint {joint}'s zero: it looks like one of "
-            f"{angle:+.1f} degrees; check the zero with a level or at a stop."
-        )
+        looks = f"it looks like one of {angle:+.1f} degrees; check the zero with a level or at a stop."
+        sentences.append(f"{MOMENTS[across]} of link {joint} from an error of joint {joint}'s zero: {looks}")
     elbow, elbow_error = math.degrees(unknowns[ANGLE][0]), math.degrees(math.sqrt(covariance[ANGLE, ANGLE][0, 0]))
     if elbow and abs(elbow) > max(3.0 * elbow_error, LEAST_ZERO_ERROR):
         sentences.append(f"The weight shows joint 3's zero {elbow:+.1f} +- {elbow_error:.1f} degrees off.")

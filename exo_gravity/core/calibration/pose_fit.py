@@ -56,7 +56,6 @@ class Rows:
     load: np.ndarray  #: (n, 8) kg m, moments of the weight
     effort: np.ndarray  #: (n, 4) Nm
     sigma: np.ndarray  #: (n, 4) Nm, standard error of `effort`
-    free: np.ndarray = field(default_factory=lambda: np.ones(COUNT, dtype=bool))  #: (22,), the unknowns to be solved
     #: (k, 22), linear combinations of the unknowns that are 0, divided by their standard errors
     anchor: np.ndarray = field(default_factory=lambda: np.zeros((0, COUNT)))
 
@@ -115,20 +114,19 @@ def solve(rows: Rows, start: np.ndarray = START, weight: np.ndarray | float = 1.
     for _ in range(STEPS):
         poses = (rows.jacobian(unknowns) * root[..., None]).reshape(-1, COUNT)
         whitened = np.vstack((poses, rows.anchor))
-        natural = NATURAL * rows.free
-        left, size, right = np.linalg.svd(whitened * natural, full_matrices=False)
+        left, size, right = np.linalg.svd(whitened * NATURAL, full_matrices=False)
         known = size > 1.0
-        inverse = natural[:, None] * (right[known].T / size[known]) @ left[:, known].T
+        inverse = NATURAL[:, None] * (right[known].T / size[known]) @ left[:, known].T
         residual = rows.effort - rows.predicted(unknowns)
         step = inverse @ np.append(root * residual, -rows.anchor @ unknowns)
         if np.all(np.abs(step) < 1e-9 * NATURAL):
             break
         # A scale that jumps by more than a factor of 1.6 in one step has left the range of the linear model.
         unknowns = unknowns + step / max(1.0, 2.0 * float(np.abs(step[SCALE]).max()))
-    hidden = np.where(rows.free, 1.0 - np.diag(inverse @ whitened), 0.0)  # a projection, up to the units
-    free = rows.free & (np.arange(COUNT) < ANGLE.start)
-    size = np.linalg.svd((poses * NATURAL)[:, free], compute_uv=False)
-    singular_values = np.append(size, np.zeros(int(free.sum()) - len(size)))
+    hidden = 1.0 - np.diag(inverse @ whitened)  # a projection, up to the units
+    singular_values = np.zeros(ANGLE.start)
+    size = np.linalg.svd((poses * NATURAL)[:, : ANGLE.start], compute_uv=False)
+    singular_values[: len(size)] = size
     hat = (poses @ inverse[:, : residual.size]).reshape(2 * residual.shape)
     return Solution(unknowns, inverse @ inverse.T, hidden, singular_values, residual, hat, inverse)
 
