@@ -163,7 +163,7 @@ def _bounded(rows: Rows) -> tuple[Rows, Solution]:
     used, bounded = final(replace(rows, anchor=np.vstack((rows.anchor, UNKNOWN[:1] / EXACT))))
     covariance = bounded.covariance.copy()
     covariance[0, 0] = solution.covariance[0, 0]
-    return used, replace(bounded, covariance=covariance)
+    return used, replace(bounded, unknowns=bounded.unknowns * (np.arange(COUNT) > 0), covariance=covariance)
 
 
 def _check_known(hidden: np.ndarray, count: int, direction: np.ndarray, gravity: float, is_relative: bool) -> None:
