@@ -21,7 +21,7 @@ from exo_gravity.tools import calibrate
 from exo_gravity.tools.calibration.result import Change, write_changes
 from exo_gravity.tools.inputs.parameter_file import packaged_config
 from exo_gravity.tools.reporting.html import FAINT, INK, JOINT_COLOURS, make_plain
-from exo_gravity.tools.reporting.table import degrees, joint_labels
+from exo_gravity.tools.reporting.table import joint_labels
 from exo_gravity.tools.trials.offline import OfflineTrial, simulated_trials
 
 SIMULATOR, COMPENSATOR = "/right/simulator", "/right/compensator"
@@ -63,7 +63,7 @@ def away(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     hold = _hold(recording)
     first, last = np.searchsorted(recording.time, (hold.start, hold.end))
     position = recording.position[first:last]
-    return recording.time[first:last] - hold.start, degrees(position - position[0])
+    return recording.time[first:last] - hold.start, np.degrees(position - position[0])
 
 
 def _hold(recording: Recording) -> ScriptedStep:

@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import sys
 from collections.abc import Sequence
 from datetime import datetime
@@ -108,7 +109,7 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
     bag: Bag | None
     if options.offline:
         if clip:
-            video.select_backend()  # before the simulated device imports MuJoCo
+            os.environ["MUJOCO_GL"] = video.backend()  # before the simulated device imports MuJoCo
         with extras("trial", "sim"):
             from exo_gravity.tools.trials.offline import run_offline, simulated_trials
         trials = simulated_trials(params, script)

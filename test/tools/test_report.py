@@ -276,13 +276,6 @@ def test_a_recording_cut_short_is_reported_and_says_so(short_bag, tmp_path, caps
     assert len(csv_rows(tmp_path / "out" / "holds.csv")) >= 4
 
 
-def test_without_matplotlib_the_report_is_written_without_figures_and_says_so(short_bag, tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    assert main([str(short_bag), "--output", str(tmp_path / "out")]) == 0
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"holds.csv", "motions.csv", "report.html"}
-    assert "matplotlib is not installed" in " ".join(capsys.readouterr().out.split())
-
-
 def test_without_the_bag_library_the_missing_extra_is_named_and_help_still_works(short_bag, capsys, monkeypatch):
     for module in ("exo_gravity.bag.reader", "exo_gravity.bag.storage"):
         monkeypatch.delitem(sys.modules, module, raising=False)

@@ -72,7 +72,7 @@ def _sections(result: CalibrationResult) -> Iterator[str]:
     if result.changes and not result.refusals:
         yield html.heading("New values")
         rows = ((c.node, c.name, value_text(plain(c.value)), c.note) for c in result.changes if c.name)
-        yield html.table(("node", "parameter", "value", "note"), rows)
+        yield html.table(("node", "parameter", "value", "note"), [((), rows)])
     if found and result.arm:
         table = TorqueTable.of(found, result.arm, result.observations)
         caption = "Predicted against measured torque: on the line, the file is right."

@@ -6,7 +6,8 @@ frames, which keeps it small.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,51 +24,88 @@ from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.params import CAN_BRIDGE
 from exo_gravity.core.trial.recording import Recording
-from exo_gravity.core.view.scene import AMBER, ARROW, GREEN, GREY, LINE, RED, SPHERE, ArmView, Shape, arm_shapes
+from exo_gravity.core.view.scene import ARROW, LINE, SPHERE, ArmView, Shape, arm_shapes
 from exo_gravity.core.view.urdf import ArmDescription, described, joint_names, urdf
 from exo_gravity.tools.reporting.table import shown
 
 SIZE, GIF_SIZE = (640, 480), (480, 360)  # pixels
-COLOURS = 128  # of a GIF
+COLOURS, SAMPLES = 256, 12  # of a GIF, and the frames of which these are
 LINE_HEIGHT = 0.042  # of the picture's height
 INK = (40, 44, 52)
-SWATCH = 12  # pixels
 NO_TORQUE = 0.05  # Nm, below which a motor is off
 STEPS = {"move": "the wearer moves the arm", "hold": "hands off", "push": "a push"}
+MAX_SHAPES = 4000
+AZIMUTH = {"left": 215.0, "right": 145.0}  # deg, of the camera: in front, on the arm's side
+BOTH_SIDES, ELEVATION, DISTANCE = 165.0, -8.0, 1.75  # deg, deg, m
+CENTRE = 0.28  # m below the shoulders, what the camera looks at
+FIELD_OF_VIEW = 38.0  # deg
+GEOMS = {
+    LINE: mujoco.mjtGeom.mjGEOM_CAPSULE,
+    ARROW: mujoco.mjtGeom.mjGEOM_ARROW,
+    SPHERE: mujoco.mjtGeom.mjGEOM_SPHERE,
+}
+SKY = ((0.97, 0.98, 1.0), (0.80, 0.84, 0.89))  # above and below
 
-OnFrame = Callable[[int], None]  # number of frames drawn
 
-
-def write_clip(bag: Bag, path: Path, times: Sequence[float], frame_rate: int, on_frame: OnFrame) -> None:
+def write_clip(bag: Bag, path: Path, times: Sequence[float], frame_rate: int, drawn: Iterable[float]) -> None:
     """Write a clip with a frame for each of `times` (s) in the recording, `frame_rate` per second.
 
-    Raises DataError if the arms are not described, or the clip cannot be drawn or written.
+    drawn: the same times, iterated while the frames are drawn. Raises DataError if the arms are not described, or the
+    clip cannot be drawn or written.
     """
-    arms = [_description(bag.parameters, recording.name) for recording in bag.recordings]
-    write, size = (_write_gif, GIF_SIZE) if path.suffix.lower() == ".gif" else (_write_mp4, SIZE)
+    is_gif = path.suffix.lower() == ".gif"
     try:
-        stage = Stage(arms, *size)
+        with closing(Stage(bag, *(GIF_SIZE if is_gif else SIZE))) as stage:
+            if is_gif:
+                few = [np.asarray(stage.picture(time)) for time in times[:: 1 + len(times) // SAMPLES]]
+                found = np.unique(np.reshape(few, (1, -1, 3)), axis=1)  # each once: a torque is drawn by few pixels
+                palette = Image.fromarray(found).quantize(COLOURS)
+                first, *others = (stage.picture(t).quantize(palette=palette, dither=Image.Dither.NONE) for t in drawn)
+                first.save(path, save_all=True, append_images=others, duration=round(1000 / frame_rate), loop=0)
+                return
+            with iio.imopen(path, "w", plugin="pyav") as file:
+                file.init_video_stream("libx264", fps=frame_rate)
+                for time in drawn:
+                    file.write_frame(np.asarray(stage.picture(time)))
     except ParameterError as error:
         raise DataError(f"{bag.path}: {error}") from None
-    try:
-        write(_pictures(stage, list(zip(arms, bag.recordings, strict=True)), times, on_frame), path, frame_rate)
     except OSError as error:
         raise DataError(f"{path}: cannot be written ({error.strerror or error})") from None
-    finally:
-        stage.close()
 
 
-def _pictures(
-    stage: Stage, arms: Sequence[tuple[ArmDescription, Recording]], times: Sequence[float], on_frame: OnFrame
-) -> Iterator[Image.Image]:
-    for i, time in enumerate(times, 1):
-        views = [_view(arm, recording, time) for arm, recording in arms]
-        shapes: list[Shape] = [shape for view in views for shape in arm_shapes(view)]
-        picture = Image.fromarray(stage.frame([angle for view in views for angle in view.theta], shapes))
+class Stage:
+    """Draws frames of `width` x `height` pixels. Raises DataError if OpenGL does not work here."""
+
+    def __init__(self, bag: Bag, width: int, height: int) -> None:
+        arms = [_description(bag.parameters, recording.name) for recording in bag.recordings]
+        self._arms = list(zip(arms, bag.recordings, strict=True))
+        self._model = _model(arms, width, height)
+        self._data = mujoco.MjData(self._model)
+        names = [name for four in joint_names(arms) for name in four]
+        self._at = [int(self._model.joint(name).qposadr[0]) for name in names]
+        self._camera = _camera(arms)
+        try:
+            self._renderer = mujoco.Renderer(self._model, height, width, max_geom=MAX_SHAPES)
+        except Exception as error:  # EGL, GLX and OSMesa raise what they like
+            raise DataError(f"OpenGL does not draw here ({type(error).__name__}: {error})") from None
+        self.close = self._renderer.close
+
+    def picture(self, time: float) -> Image.Image:
+        """Return the picture of the recording at `time` s."""
+        views = [_view(arm, recording, time) for arm, recording in self._arms]
+        self._data.qpos[self._at] = [angle for view in views for angle in view.theta]
+        mujoco.mj_forward(self._model, self._data)
+        self._renderer.update_scene(self._data, self._camera)
+        for view in views:
+            for shape in arm_shapes(view):
+                _add(self._renderer.scene, shape)
+        picture = Image.fromarray(self._renderer.render())
+        height = LINE_HEIGHT * picture.height
         torques = (f"{view.arm.side} {' '.join(shown(effort, 2) for effort in view.effort)} Nm" for view in views)
-        _write_caption(picture, (f"{time:.1f} s  {_step(arms[0][1], time)}", *torques))
-        on_frame(i)
-        yield picture
+        caption = "\n".join((f"{time:.1f} s  {_step(self._arms[0][1], time)}", *torques))
+        font = ImageFont.load_default(height)
+        ImageDraw.Draw(picture).text((height / 2, height / 2), caption, INK, font)
+        return picture
 
 
 def _view(arm: ArmDescription, recording: Recording, time: float) -> ArmView:
@@ -97,40 +135,6 @@ def _step(recording: Recording, time: float) -> str:
     return "let down" if recording.carried and time > recording.carried[0][0] else "start-up checks"
 
 
-def _write_caption(picture: Image.Image, lines: Sequence[str]) -> None:
-    height = LINE_HEIGHT * picture.height
-    font, draw = ImageFont.load_default(height), ImageDraw.Draw(picture)
-    for i, line in enumerate(lines):
-        draw.text((height / 2, height / 2 + 1.2 * height * i), line, INK, font)
-
-
-def _write_mp4(pictures: Iterator[Image.Image], path: Path, frame_rate: int) -> None:
-    with iio.imopen(path, "w", plugin="pyav") as file:
-        file.init_video_stream("libx264", fps=frame_rate)
-        for picture in pictures:
-            file.write_frame(np.asarray(picture))
-
-
-def _write_gif(pictures: Iterator[Image.Image], path: Path, frame_rate: int) -> None:
-    """Write frames in one palette; Pillow stores of each frame only what has changed."""
-    first = next(pictures)
-    palette = _palette(first)
-    frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in (first, *pictures)]
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=round(1000 / frame_rate), loop=0)
-
-
-def _palette(picture: Image.Image) -> Image.Image:
-    """Return the colours of a picture and those of torques and states, which it may not show yet."""
-    sample = picture.copy()
-    draw = ImageDraw.Draw(sample)
-    for i, colour in enumerate((GREEN, AMBER, RED, GREY)):
-        for j, share in enumerate((0.5, 0.75, 1.0)):  # in shade and in light
-            corner = SWATCH * i, SWATCH * j
-            shade = tuple(round(255 * share * part) for part in colour[:3])
-            draw.rectangle((*corner, corner[0] + SWATCH, corner[1] + SWATCH), shade)
-    return sample.quantize(COLOURS, dither=Image.Dither.NONE)
-
-
 def _description(parameters: Mapping[str, str], name: str) -> ArmDescription:
     """Return the arm `name` from the nodes' parameters in a recording; the default for one that their version lacked.
 
@@ -147,47 +151,6 @@ def _description(parameters: Mapping[str, str], name: str) -> ArmDescription:
         return described(*values)
     except ParameterError as error:
         raise DataError(f"{name}: the recording's parameters do not describe the arm: {error}") from None
-
-
-MAX_SHAPES = 4000
-AZIMUTH = {"left": 215.0, "right": 145.0}  # deg, of the camera: in front, on the arm's side
-BOTH_SIDES, ELEVATION, DISTANCE = 165.0, -8.0, 1.75  # deg, deg, m
-CENTRE = 0.28  # m below the shoulders, what the camera looks at
-FIELD_OF_VIEW = 38.0  # deg
-GEOMS = {
-    LINE: mujoco.mjtGeom.mjGEOM_CAPSULE,
-    ARROW: mujoco.mjtGeom.mjGEOM_ARROW,
-    SPHERE: mujoco.mjtGeom.mjGEOM_SPHERE,
-}
-SKY = ((0.97, 0.98, 1.0), (0.80, 0.84, 0.89))  # above and below
-
-
-class Stage:
-    """Draws frames of `width` x `height` pixels. Raises DataError if OpenGL does not work here."""
-
-    def __init__(self, arms: Sequence[ArmDescription], width: int, height: int) -> None:
-        self._model = _model(arms, width, height)
-        self._data = mujoco.MjData(self._model)
-        names = [name for four in joint_names(arms) for name in four]
-        self._at = [int(self._model.joint(name).qposadr[0]) for name in names]
-        self._camera = _camera(arms)
-        try:
-            self._renderer = mujoco.Renderer(self._model, height, width, max_geom=MAX_SHAPES)
-        except Exception as error:  # EGL, GLX and OSMesa raise what they like
-            raise DataError(f"OpenGL does not draw here ({type(error).__name__}: {error})") from None
-
-    def frame(self, angles: Iterable[float], shapes: Iterable[Shape]) -> np.ndarray:
-        """Return the picture (height, width, 3) uint8 of the arms at `angles`, rad, four for each arm in order."""
-        self._data.qpos[self._at] = list(angles)
-        mujoco.mj_forward(self._model, self._data)
-        self._renderer.update_scene(self._data, self._camera)
-        for shape in shapes:
-            _add(self._renderer.scene, shape)
-        return np.asarray(self._renderer.render())
-
-    def close(self) -> None:
-        """Free what OpenGL holds."""
-        self._renderer.close()
 
 
 def _model(arms: Sequence[ArmDescription], width: int, height: int) -> Any:

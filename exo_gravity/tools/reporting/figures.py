@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from exo_gravity.core.trial.analysis import HoldCriteria, TrialAnalysis
 from exo_gravity.core.trial.recording import Recording, in_blocks
 from exo_gravity.tools.reporting.html import FAINT, HOLD_COLOUR, INK, JOINT_COLOURS, PUSH_COLOUR, make_plain
-from exo_gravity.tools.reporting.table import degrees, joint_labels, per_minute
+from exo_gravity.tools.reporting.table import joint_labels, per_minute
 
 INTERVALS = 2_000  # per curve
 WIDTH = 11.0  # inches
@@ -26,13 +26,13 @@ def overview(recording: Recording, analysis: TrialAnalysis) -> Figure:
     figure = Figure(figsize=(WIDTH, 8.2), layout="constrained")
     axes = figure.subplots(3, 1, sharex=True, height_ratios=(1.25, 1.0, 1.25))
     panels = (
-        ("Position (deg)", degrees(1.0), recording.position),
-        ("Velocity (deg/s)", degrees(1.0), recording.velocity),
-        ("Torque (Nm)", 1.0, recording.effort),
+        ("Position (deg)", np.degrees(recording.position)),
+        ("Velocity (deg/s)", np.degrees(recording.velocity)),
+        ("Torque (Nm)", recording.effort),
     )
-    for axis, (label, scale, values) in zip(axes, panels, strict=True):
+    for axis, (label, values) in zip(axes, panels, strict=True):
         for column, name, colour in zip(values.T, joint_labels(recording), JOINT_COLOURS, strict=True):
-            axis.plot(*_envelope(recording.time, scale * column), color=colour, lw=1.1, label=name)
+            axis.plot(*_envelope(recording.time, column), color=colour, lw=1.1, label=name)
         for hold in analysis.holds:
             axis.axvspan(hold.start, hold.end, color=HOLD_COLOUR, lw=0, zorder=0, label="hold")
         for motion in analysis.motions:
@@ -63,13 +63,12 @@ def overview(recording: Recording, analysis: TrialAnalysis) -> Figure:
 def drift(recording: Recording, analysis: TrialAnalysis, criteria: HoldCriteria) -> Figure:
     """Return the deviation of each joint from the start of each hold, and the drift rate of each hold."""
     figure, blocks = Figure(figsize=(WIDTH, 6.6), layout="constrained"), in_blocks(recording)
-    grid = figure.add_gridspec(2, 4, height_ratios=(1.0, 1.1))
-    first = figure.add_subplot(grid[0, 0])
-    axes = [first, *(figure.add_subplot(grid[0, joint], sharex=first, sharey=first) for joint in (1, 2, 3))]
+    upper, lower = figure.subfigures(2, 1, height_ratios=(1.0, 1.1))
+    axes = upper.subplots(1, 4, sharex=True, sharey=True)
     for joint, (axis, name) in enumerate(zip(axes, joint_labels(recording), strict=True)):
         for hold in analysis.holds:
             within = blocks.between(hold.start, hold.end)
-            angle = degrees(blocks.mean[within, joint])
+            angle = np.degrees(blocks.mean[within, joint])
             time, away = blocks.time[within] - hold.start, angle - angle[:START].mean()
             axis.plot(time, away, color=JOINT_COLOURS[joint], lw=0.9, alpha=0.75)
         axis.set_title(name, fontsize=10, color=JOINT_COLOURS[joint], loc="left", weight="bold")
@@ -77,11 +76,10 @@ def drift(recording: Recording, analysis: TrialAnalysis, criteria: HoldCriteria)
         axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
         make_plain(axis)
         axis.margins(x=0)
-        axis.tick_params(labelleft=joint == 0)
-    first.set_ylabel("Deviation from the start (deg)")
+    axes[0].set_ylabel("Deviation from the start (deg)")
     reach = max([0.1, *(abs(value) for axis in axes for value in axis.dataLim.intervaly if math.isfinite(value))])
-    first.set_ylim(-1.15 * reach, 1.15 * reach)
-    _rates(figure.add_subplot(grid[1, :]), recording, analysis, criteria)
+    axes[0].set_ylim(-1.15 * reach, 1.15 * reach)
+    _rates(lower.subplots(), recording, analysis, criteria)
     return figure
 
 

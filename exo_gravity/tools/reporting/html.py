@@ -7,7 +7,7 @@ palette is that of Okabe and Ito (2008), told apart with any colour vision.
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 from io import BytesIO
 from typing import TYPE_CHECKING
@@ -20,7 +20,6 @@ DPI = 150
 JOINT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 INK, FAINT, GRID_LINE = "#222222", "#9AA3AB", "#D5DADF"
 HOLD_COLOUR, PUSH_COLOUR = "#E8EEF4", "#F9E3B4"
-Rows = Iterable[Sequence[str]]
 
 STYLE = """
 :root { color-scheme: light; }
@@ -38,9 +37,9 @@ th, td { padding: .15rem .6rem; text-align: right; white-space: nowrap; }
 th { font-weight: 600; vertical-align: bottom; }
 thead { border-bottom: 2px solid #9aa3ab; } tbody { border-bottom: 1px solid #d5dadf; }
 tbody th { font-weight: inherit; text-align: left; }
-.joint::before { content: "●"; color: var(--c); margin-right: .4rem; }
+.joints th::before { content: "●"; margin-right: .4rem; }
 pre { background: #f4f6f8; padding: .7rem 1rem; overflow-x: auto; font-size: .85rem; }
-"""
+""" + "\n".join(f".joints tr:nth-child({n}) th::before {{ color: {c}; }}" for n, c in enumerate(JOINT_COLOURS, 1))
 
 
 def document(title: str, when: str, body: Iterable[str]) -> str:
@@ -65,27 +64,9 @@ def heading(text: str, level: int = 3) -> str:
     return f"<h{level}>{escape(text)}</h{level}>"
 
 
-def paragraph(text: str) -> str:
-    """Return a paragraph."""
-    return f"<p>{escape(text)}</p>"
-
-
 def bullets(title: str, lines: Iterable[str]) -> str:
     """Return a heading and a list, or '' if there are no lines."""
-    items = _items(lines)
-    return heading(title) + items if items else ""
-
-
-def explained(terms: Mapping[str, str]) -> str:
-    """Return the page's last paragraph: what each term means."""
-    return (
-        f"<footer><p>{' '.join(f'<b>{escape(term)}</b> {escape(text)}' for term, text in terms.items())}</p></footer>"
-    )
-
-
-def folded(summary: str, text: str) -> str:
-    """Return preformatted text that a click unfolds, or '' for no text."""
-    return f"<details><summary>{escape(summary)}</summary><pre>{escape(text)}</pre></details>" if text else ""
+    return (items := _items(lines)) and heading(title) + items
 
 
 def make_plain(axis: Axes) -> None:
@@ -110,39 +91,25 @@ def picture(png: bytes, caption: str) -> str:
     return f'<figure><img alt="{escape(caption)}" src="{source}"><figcaption>{escape(caption)}</figcaption></figure>'
 
 
-def table(heads: Sequence[str], rows: Rows) -> str:
-    """Return a table; the first cell of a row is its heading."""
-    lines = "".join(f'<tr><th scope="row">{escape(first)}</th>{_cells(rest)}</tr>' for first, *rest in rows)
-    return _table(heads, f"<tbody>{lines}</tbody>")
+def table(heads: Sequence[str], groups: Iterable[tuple[Sequence[str], Iterable[Sequence[str]]]], kind: str = "") -> str:
+    """Return a table of groups: the cells that the rows of a group share, which come first, and the rows.
 
-
-def joint_table(heads: Sequence[str], groups: Iterable[tuple[Sequence[str], Rows]]) -> str:
-    """Return a table of groups with one row for each joint, whose first cell is the joint's name.
-
-    groups: the cells that the rows of a group share, which come first, and the rows.
+    The first cell of a row is its heading. kind: 'joints', if the rows of each group are those of the joints.
     """
-    return _table(heads, "".join(_group(shared, list(rows)) for shared, rows in groups))
-
-
-def _group(shared: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [
-        f'<th scope="row" class="joint" style="--c:{colour}">{escape(joint)}</th>{_cells(cells)}'
-        for (joint, *cells), colour in zip(rows, JOINT_COLOURS, strict=True)
-    ]
-    spans = "".join(f'<td rowspan="{len(rows)}">{_broken(cell)}</td>' for cell in shared)
-    return f"<tbody><tr>{spans}{'</tr><tr>'.join(lines)}</tr></tbody>"
-
-
-def _table(heads: Sequence[str], body: str) -> str:
-    head = "".join(f'<th scope="col">{_broken(text)}</th>' if text else "<td></td>" for text in heads)
+    head = "".join(f'<th scope="col">{_text(text)}</th>' if text else "<td></td>" for text in heads)
+    body = ""
+    for shared, rows in groups:
+        lines = [f'<th scope="row">{_text(first)}</th>{_cells(rest)}' for first, *rest in rows]
+        lines[0] = _cells(shared, f' rowspan="{len(lines)}"') + lines[0]
+        body += f'<tbody class="{kind}"><tr>{"</tr><tr>".join(lines)}</tr></tbody>'
     return f'<div class="scroll" tabindex="0"><table><thead><tr>{head}</tr></thead>{body}</table></div>'
 
 
-def _cells(cells: Iterable[str]) -> str:
-    return "".join(f"<td>{escape(cell)}</td>" for cell in cells)
+def _cells(cells: Iterable[str], span: str = "") -> str:
+    return "".join(f"<td{span}>{_text(cell)}</td>" for cell in cells)
 
 
-def _broken(text: str) -> str:
+def _text(text: str) -> str:
     return escape(text).replace("\n", "<br>")
 
 

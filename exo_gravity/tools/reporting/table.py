@@ -6,7 +6,7 @@ import csv
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich import box
@@ -17,18 +17,10 @@ from exo_gravity.core.trial.analysis import Hold, Motion, TrialAnalysis
 from exo_gravity.core.trial.recording import Recording
 from exo_gravity.tools.reporting import html
 
-Numbers = TypeVar("Numbers", float, np.ndarray)
-Row = dict[str, Any]
 
-
-def degrees(values: Numbers) -> Numbers:
-    """Return radians in degrees, or rad/s in degrees per second."""
-    return values * math.degrees(1.0)
-
-
-def per_minute(values: Numbers) -> Numbers:
+def per_minute(values: Any) -> Any:
     """Return rad/s in degrees per minute."""
-    return values * math.degrees(60.0)
+    return 60.0 * np.degrees(values)
 
 
 class Column(NamedTuple):
@@ -43,21 +35,21 @@ class Column(NamedTuple):
 
 
 HOLDS = (
-    Column("pose_deg", "Pose\ndeg", 1, lambda hold: degrees(hold.pose)),
+    Column("pose_deg", "Pose\ndeg", 1, lambda hold: np.degrees(hold.pose)),
     Column("drift_deg_per_min", "Drift\ndeg/min", 2, lambda hold: per_minute(hold.drift_rate)),
     Column(
         "drift_uncertainty_deg_per_min", "±\ndeg/min", 2, lambda hold: per_minute(hold.drift_rate_uncertainty), True
     ),
-    Column("drift_deg", "Total drift\ndeg", 2, lambda hold: degrees(hold.drift), spare=5),
-    Column("stray_in_10_s_deg", "Within 10 s\ndeg", 2, lambda hold: degrees(hold.stray), True, 1),
-    Column("rms_velocity_deg_per_s", "RMS velocity\ndeg/s", 2, lambda hold: degrees(hold.velocity_rms), True, 4),
+    Column("drift_deg", "Total drift\ndeg", 2, lambda hold: np.degrees(hold.drift), spare=5),
+    Column("stray_in_10_s_deg", "Within 10 s\ndeg", 2, lambda hold: np.degrees(hold.stray), True, 1),
+    Column("rms_velocity_deg_per_s", "RMS velocity\ndeg/s", 2, lambda hold: np.degrees(hold.velocity_rms), True, 4),
     Column("rms_torque_nm", "RMS torque\nNm", 2, lambda hold: hold.torque_rms, spare=2),
     Column("torque_error_nm", "Torque error\nNm", 3, lambda hold: hold.torque_error, True, 3),
 )
 MOTIONS = (
-    Column("peak_deg", "Peak\ndeg", 1, lambda motion: degrees(motion.peak)),
-    Column("residual_deg", "Residual\ndeg", 1, lambda motion: degrees(motion.residual)),
-    Column("peak_speed_deg_per_s", "Peak speed\ndeg/s", 0, lambda motion: degrees(motion.speed), spare=1),
+    Column("peak_deg", "Peak\ndeg", 1, lambda motion: np.degrees(motion.peak)),
+    Column("residual_deg", "Residual\ndeg", 1, lambda motion: np.degrees(motion.residual)),
+    Column("peak_speed_deg_per_s", "Peak speed\ndeg/s", 0, lambda motion: np.degrees(motion.speed), spare=1),
 )
 # What the columns mean
 TERMS = {
@@ -84,29 +76,23 @@ def shown(value: float, digits: int) -> str:
     return f"{round(float(value), digits) + 0.0:.{digits}f}" if math.isfinite(value) else "–"
 
 
-def hold_rows(recording: Recording, analysis: TrialAnalysis) -> Iterator[Row]:
-    """Yield one row for each hold and joint."""
-    for number, hold in enumerate(analysis.holds, 1):
-        shared = {"hold": number, "start_s": hold.start, "duration_s": hold.duration, "after": hold.after}
-        yield from _rows(recording, shared, hold, HOLDS)
+def write_csv(path: Path, arms: Iterable[tuple[Recording, TrialAnalysis]]) -> None:
+    """Write holds.csv or motions.csv, a row for each joint; an unknown number is an empty cell.
 
-
-def motion_rows(recording: Recording, analysis: TrialAnalysis) -> Iterator[Row]:
-    """Yield one row for each motion between holds and joint."""
-    for number, motion in enumerate(analysis.motions, 1):
-        shared = {"motion": number, "kind": motion.kind, "start_s": motion.start, "until_still_s": motion.until_still}
-        yield from _rows(recording, shared, motion, MOTIONS)
-
-
-def _rows(recording: Recording, shared: Row, of: Hold | Motion, columns: Sequence[Column]) -> Iterator[Row]:
-    for joint, name in enumerate(recording.joint_names):
-        numbers = {column.key: column.of(of)[joint] for column in columns}
-        yield {"arm": recording.name, **shared, "joint": name, **numbers}
-
-
-def write_csv(path: Path, rows: Iterable[Row]) -> None:
-    """Write rows with a header; an unknown number is an empty cell. Without rows no file is written."""
-    rows = [{key: _csv_value(value) for key, value in row.items()} for row in rows]
+    Without holds or motions no file is written.
+    """
+    rows: list[dict[str, str]] = []
+    for recording, analysis in arms:
+        for number, one in enumerate(getattr(analysis, path.stem), 1):
+            if isinstance(one, Hold):
+                shared = {"hold": number, "start_s": one.start, "duration_s": one.duration, "after": one.after}
+            else:
+                shared = {"motion": number, "kind": one.kind, "start_s": one.start, "until_still_s": one.until_still}
+            numbers = {column.key: column.of(one) for column in (HOLDS if isinstance(one, Hold) else MOTIONS)}
+            for joint, name in enumerate(recording.joint_names):
+                row = {"arm": recording.name, **shared, "joint": name}
+                row |= {key: values[joint] for key, values in numbers.items()}
+                rows.append({key: _csv_value(value) for key, value in row.items()})
     if rows:
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, rows[0])
@@ -114,9 +100,9 @@ def write_csv(path: Path, rows: Iterable[Row]) -> None:
             writer.writerows(rows)
 
 
-def _csv_value(value: Any) -> Any:
+def _csv_value(value: Any) -> str:
     if isinstance(value, str | int):
-        return value
+        return str(value)
     return f"{value:.6g}" if math.isfinite(value) else ""
 
 
@@ -140,7 +126,7 @@ def arm_section(recording: Recording, analysis: TrialAnalysis, figures: Iterable
     yield html.heading(f"Arm: {recording.name}", 2)
     yield from figures
     if not analysis.holds:
-        yield html.paragraph("No hold was found.")
+        yield "<p>No hold was found.</p>"
     for title, found, heads, columns in _tables(analysis):
         groups = []
         for number, one in enumerate(found, 1):
@@ -148,34 +134,32 @@ def arm_section(recording: Recording, analysis: TrialAnalysis, figures: Iterable
             groups.append((_shared(number, one), list(zip(joint_labels(recording), *cells, strict=True))))
         if groups:
             yield html.heading(title)
-            yield html.joint_table((*heads, "", *(column.heading for column in columns)), groups)
+            yield html.table((*heads, "", *(column.heading for column in columns)), groups, "joints")
 
 
 def print_tables(console: Console, recording: Recording, analysis: TrialAnalysis) -> None:
-    """Print the holds and motions of one arm; a cell holds the four joints in order."""
+    """Print the holds and motions of one arm; a cell holds the four joints in order.
+
+    Where the table is wider than the console, spare columns are left out: they are in the CSV files.
+    """
     console.print(f"\n[bold]{recording.name}[/], joints in order: {', '.join(joint_labels(recording))}")
     for _, found, heads, columns in _tables(analysis):
-        if shown_here := [one for one in found if isinstance(one, Hold) or one.kind != "move"]:
-            console.print(_terminal_table(shown_here, heads, columns, console.width))
-
-
-def _terminal_table(
-    found: Sequence[Hold | Motion], heads: Sequence[str], columns: Sequence[Column], width: int
-) -> Table:
-    """Return the table; where it is wider than `width`, without spare columns, which are in the CSV files."""
-    shared = zip(*(_shared(number, one) for number, one in enumerate(found, 1)), strict=True)
-    cells = {head: list(column) for head, column in zip(heads, shared, strict=True)}
-    cells |= {column.heading: _cells([column.of(one) for one in found], column) for column in columns}
-    for column in sorted(columns, key=lambda column: -column.spare):
-        used = sum(2 + max(map(len, (*head.split("\n"), *texts))) for head, texts in cells.items())
-        if used > width and column.spare:
-            del cells[column.heading]
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for head in cells:
-        table.add_column(head, justify="right", no_wrap=True)
-    for row in zip(*cells.values(), strict=True):
-        table.add_row(*row)
-    return table
+        rows = [one for one in found if isinstance(one, Hold) or one.kind != "move"]
+        if not rows:
+            continue
+        shared = zip(*(_shared(number, one) for number, one in enumerate(rows, 1)), strict=True)
+        cells = {head: list(column) for head, column in zip(heads, shared, strict=True)}
+        cells |= {column.heading: _cells([column.of(one) for one in rows], column) for column in columns}
+        for column in sorted(columns, key=lambda column: -column.spare):
+            used = sum(2 + max(map(len, (*head.split("\n"), *texts))) for head, texts in cells.items())
+            if used > console.width and column.spare:
+                del cells[column.heading]
+        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+        for head in cells:
+            table.add_column(head, justify="right", no_wrap=True)
+        for row in zip(*cells.values(), strict=True):
+            table.add_row(*row)
+        console.print(table)
 
 
 def _cells(rows: Sequence[np.ndarray], column: Column) -> list[str]:

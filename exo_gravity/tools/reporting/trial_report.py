@@ -6,23 +6,18 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
-from importlib.util import find_spec
+from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.markup import escape
+from rich.markup import escape as marked
 
 from exo_gravity.bag.content import Bag
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.trial.analysis import MIN_HOLD, HoldCriteria, TrialAnalysis, failures
 from exo_gravity.core.trial.analysis import analyse as analyse_arm
 from exo_gravity.core.trial.recording import Recording
-from exo_gravity.tools.cli import missing
-from exo_gravity.tools.reporting import html, table
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from exo_gravity.tools.reporting import figures, html, table
 
 MAX_EVENTS = 200
 EARLY = 0.2  # s; can_bridge publishes its state every 0.1 s, so a shorter gap to the script's end means nothing
@@ -81,8 +76,6 @@ def analyse(bag: Bag, criteria: HoldCriteria | None = None, min_hold: float = MI
 
 def _reservations(bag: Bag) -> Iterator[str]:
     """Yield what is missing, and what the report does instead."""
-    if not find_spec("matplotlib"):
-        yield f"no figures: {missing('matplotlib', 'report')}"
     unscripted = [recording.name for recording in bag.recordings if not recording.steps]
     if unscripted:
         yield f"{', '.join(unscripted)}: the recording has no trial script: every still phase is taken for a hold"
@@ -100,17 +93,20 @@ def _reservations(bag: Bag) -> Iterator[str]:
 def write(report: Report, folder: str | Path) -> list[Path]:
     """Write holds.csv, motions.csv, a PNG of each figure and report.html into `folder`; return the files.
 
-    Without matplotlib the figures are left out. Raises DataError if the folder can't be written.
+    Raises DataError if the folder can't be written.
     """
     folder = Path(folder)
     sections: list[str] = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for kind, rows in (("holds", table.hold_rows), ("motions", table.motion_rows)):
-            table.write_csv(folder / f"{kind}.csv", (row for arm in report.arms for row in rows(*arm)))
+        for name in ("holds.csv", "motions.csv"):
+            table.write_csv(folder / name, report.arms)
         for recording, analysis in report.arms:
+            drawn = {"overview": figures.overview(recording, analysis)}
+            if analysis.holds:
+                drawn["drift"] = figures.drift(recording, analysis, report.criteria)
             pictures = []
-            for kind, figure in _figures(report, recording, analysis).items():
+            for kind, figure in drawn.items():
                 png = html.png_of(figure)
                 (folder / f"{recording.name.replace('/', '_')}_{kind}.png").write_bytes(png)
                 pictures.append(html.picture(png, CAPTIONS[kind]))
@@ -127,11 +123,11 @@ def print_report(report: Report, console: Console | None = None) -> None:
     for recording, analysis in report.arms:
         table.print_tables(console, recording, analysis)
     for note in report.notes:
-        console.print(f"[yellow]Note:[/] {escape(note)}.")
+        console.print(f"[yellow]Note:[/] {marked(note)}.")
     for problem in report.bag.problems:
-        console.print(f"[red]Not reported:[/] {escape(problem)}.")
+        console.print(f"[red]Not reported:[/] {marked(problem)}.")
     for sentence in report.failures:
-        console.print(f"[red]{escape(sentence)}.[/]")
+        console.print(f"[red]{marked(sentence)}.[/]")
     console.print("[red bold]It did not hold.[/]" if report.failures else f"[green bold]{report.held}[/]")
 
 
@@ -141,27 +137,19 @@ def report_console() -> Console:
     return console if console.is_terminal else Console(highlight=False, width=140)
 
 
-def _figures(report: Report, recording: Recording, analysis: TrialAnalysis) -> dict[str, Figure]:
-    if not find_spec("matplotlib"):
-        return {}
-    from exo_gravity.tools.reporting import figures
-
-    drift = {"drift": figures.drift(recording, analysis, report.criteria)} if analysis.holds else {}
-    return {"overview": figures.overview(recording, analysis), **drift}
-
-
 def _page(report: Report, sections: Sequence[str]) -> str:
     bag = report.bag
-    length = max((float(recording.time[-1]) for recording in bag.recordings), default=0.0)
+    length = max(float(recording.time[-1]) for recording in bag.recordings)
     events = [f"{table.shown(event.time, 1)} s  {event.text}" for event in bag.events]
     more = [f"and {len(events) - MAX_EVENTS} more"] if len(events) > MAX_EVENTS else []
     parameters = "\n".join(bag.parameters[node].rstrip() for node in sorted(bag.parameters))
-    held = html.verdict("It did not hold." if report.failures else report.held, report.failures, not report.failures)
-    ending = (
-        html.explained(table.TERMS),
+    ending = [
+        f"<footer><p>{' '.join(f'<b>{term}</b> {meaning}' for term, meaning in table.TERMS.items())}</p></footer>",
         html.bullets("Notes", [*bag.problems, *report.notes]),
         html.bullets("Faults and changed parameters", events[:MAX_EVENTS] + more),
-        html.folded("Parameters at the start", parameters),
-    )
+    ]
+    if parameters:
+        ending.append(f"<details><summary>Parameters at the start</summary><pre>{escape(parameters)}</pre></details>")
+    held = html.verdict("It did not hold." if report.failures else report.held, report.failures, not report.failures)
     when = f"{report.start:%Y-%m-%d %H:%M:%S}, {length:.0f} s, {bag.path}"
     return html.document(report.title, when, [held, *sections, *ending])

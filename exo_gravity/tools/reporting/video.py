@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import sys
 from ctypes.util import find_library
 from importlib.util import find_spec
 from pathlib import Path
@@ -74,25 +73,17 @@ def requested(video: str | None, speed: float) -> Clip | None:
 
 
 def backend() -> str:
-    """Return the name by which MuJoCo draws without a screen; MUJOCO_GL, if set, decides. '' on other systems.
+    """Return the name by which MuJoCo draws without a screen; MUJOCO_GL, if set, decides.
 
     Raises DataError if no library for it is found.
     """
     chosen = os.environ.get("MUJOCO_GL", "disabled")
-    if chosen == "disabled" and not sys.platform.startswith("linux"):
-        return ""
     if chosen not in ("disabled", *BACKENDS.values()):
         return chosen
     for library, name in BACKENDS.items():
         if chosen in ("disabled", name) and find_library(library):
             return name
     raise DataError(NO_GRAPHICS)
-
-
-def select_backend() -> None:
-    """Let MuJoCo draw; call it before MuJoCo is imported in this process. Raises DataError as `backend` does."""
-    if name := backend():
-        os.environ["MUJOCO_GL"] = name
 
 
 def frame_times(end: float, clip: Clip) -> list[float]:
@@ -103,13 +94,13 @@ def frame_times(end: float, clip: Clip) -> list[float]:
 
 def write(bag: Bag, clip: Clip, console: Console) -> None:
     """Write the clip of a recording, and print where it is. Raises DataError."""
-    select_backend()
-    from rich.progress import Progress
+    os.environ["MUJOCO_GL"] = backend()
+    from rich.progress import track
 
     from exo_gravity.tools.reporting.clip import write_clip
 
     times = frame_times(min(float(recording.time[-1]) for recording in bag.recordings), clip)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task(f"drawing {clip.path.name}", total=len(times))
-        write_clip(bag, clip.path, times, clip.frame_rate, lambda done: progress.update(task, completed=done))
+    hidden = not console.is_terminal
+    drawn = track(times, f"drawing {clip.path.name}", console=console, transient=True, disable=hidden)
+    write_clip(bag, clip.path, times, clip.frame_rate, drawn)
     console.print(f"Clip: {clip.path}", markup=False, soft_wrap=True)
