@@ -32,6 +32,10 @@ DEMO := imu sim report
 TEST := $(DEMO) panel validate video test
 SETUP := VENV=$(VENV) .ci/setup
 
+# Where it is set, as in many containers, each process would compile every library that it imports anew: a node takes
+# three times as long to start.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo calibrate-demo calibrate-study test lint docs faults mutations bench motion-monitor ordinary effort-study baselines imu-report \
         socketcan pythons constraints clean ros2-launch two-computers dist panel presses test-all test-long
 

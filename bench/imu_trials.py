@@ -12,7 +12,7 @@ import numpy as np
 from vqf import VQF
 
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.hardware import ImuSample, TrunkEstimator
+from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 
 EXCERPTS = Path(__file__).parent.parent / "test" / "data" / "broad"
 ALIGNED = (0.0, 0.0, 0.0, 1.0)

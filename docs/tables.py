@@ -22,7 +22,7 @@ from exo_gravity.core.safety.drive import FaultCode
 from exo_gravity.core.safety.params import CAN_BRIDGE
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.core.view.urdf import ROBOT_MODEL
-from exo_gravity.panel.params import PANEL
+from exo_gravity.panel.view import PANEL
 from exo_gravity.sim.params import SIMULATOR
 
 DOCS = Path(__file__).parent

@@ -26,18 +26,18 @@ from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.tools.inputs.parameter_file import (
     ABSOLUTE_TOPICS,
     ENDED_WELL,
+    OBSERVERS,
     RECOVERY,
     RECOVERY_TIMEOUT,
     STOP_TIMEOUT,
     SUPERVISED,
-    Stages,
     check_buses,
     chosen,
     executable,
     in_namespace,
-    is_observer,
     load,
     packaged_config,
+    stages,
 )
 
 LONGEST_STOP = DESCENT_TIMEOUT + RECOVERY_TIMEOUT  # s until the last bridge is done; `launch` then ends the others
@@ -57,7 +57,7 @@ class Stopping:
 
     def __init__(self, nodes: dict[str, Node]) -> None:
         self._nodes = nodes
-        self._stages = Stages.of(nodes)
+        self._stages = stages(nodes)
         self._running: set[str] = set()
         self._terminated: set[str] = set()
         self._is_stopping = False
@@ -81,7 +81,7 @@ class Stopping:
 
     def _on_exit(self, event: ProcessExited, context: LaunchContext) -> list[LaunchDescriptionEntity]:
         name = self._name(event.action)
-        if name in self._stages.bridges and event.returncode not in ENDED_WELL:
+        if name in self._stages[0] and event.returncode not in ENDED_WELL:
             # Not a process action, because `launch` starts none once it is stopping.
             task = context.asyncio_loop.create_task(_recover(event))
             task.add_done_callback(lambda _: context.emit_event_sync(Recovered(name, event.returncode)))
@@ -101,7 +101,7 @@ class Stopping:
         self._running.discard(name)
         if self._is_stopping:
             return self._stop_next()
-        if is_observer(name):
+        if name.endswith(OBSERVERS):
             return []
         raise RuntimeError(f"{name} ended with exit code {code}; all nodes stop")
 

@@ -1,9 +1,12 @@
 """Which package may import which, and the rules for every file."""
 
 import ast
+import importlib
 import sys
 from collections.abc import Callable
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "exo_gravity"
@@ -141,3 +144,16 @@ def test_no_class_name_is_used_twice() -> None:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 where.setdefault(node.name, []).append(name(path))
     assert not {found: paths for found, paths in where.items() if len(paths) > 1}
+
+
+@pytest.mark.parametrize(
+    ("module", "names"),
+    [
+        ("core", "ArmModel Tilt Wearer gravity_torque paper_mobile_torque paper_static_torque"),
+        ("core.motors", "MOTORS pack_command pack_reply unpack_command unpack_reply"),
+        ("hardware", "ImuSample TrunkEstimator"),
+    ],
+)
+def test_the_library_has_the_names_that_others_import(module: str, names: str) -> None:
+    library = importlib.import_module(f"exo_gravity.{module}")
+    assert not [missing for missing in names.split() if not hasattr(library, missing)]

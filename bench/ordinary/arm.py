@@ -24,17 +24,18 @@ from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.hardware import ImuSample, TrunkEstimator
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import Clock
 from exo_gravity.hardware.control_loop import ControlLoop, EffortCommand
-from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedImu, VirtualWearer
-from exo_gravity.sim.motor import simulated_motor
+from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
+from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedImu, VirtualWearer
 from exo_gravity.tools.inputs.arms import read_arm
 from exo_gravity.tools.inputs.parameter_file import load, packaged_config
 from test.hardware.virtual_time import VirtualClock, Wire
 from test.support.imu_drivers import Timing
 from test.support.simulated_device import joints_of
+
+from .motors import Electronics, motor_of
 
 LATE = 0.02  # s by which a busy computer is late
 LOOK_PERIOD = 0.01  # s between two comparisons with the truth
@@ -62,14 +63,14 @@ DAY = TrialScript.parse(  # what the wearer does while the arm is carried
 
 @dataclass(frozen=True)
 class Equipment:
-    """Ordinary equipment: the motors' firmware, the arm's friction, the CAN adapter, and a busy computer.
+    """Ordinary equipment: the motors' electronics, the arm's friction, the CAN adapter, and a busy computer.
 
-    loss: share of the frames lost each way. batch: s between two deliveries of the adapter. late: how often in 10 ms
-    the bridge is late by LATE, and the compensator.
+    electronics: None for ideal motors. loss: share of the frames lost each way. batch: s between two deliveries of the
+    adapter. late: how often in 10 ms the bridge is late by LATE, and the compensator.
     """
 
     name: str
-    firmware: Firmware
+    electronics: Electronics | None
     friction: tuple[float, float] = (0.2, 0.0)  #: Nm, Coulomb's and Stribeck's
     loss: float = 0.0
     batch: float = 0.0
@@ -103,7 +104,7 @@ class OrdinaryArm:
         motors = joints_of((MIT_V3 if is_v3 else MIT,) * 4)
         coulomb, stribeck = equipment.friction
         config = ArmConfig(robot, coulomb_friction=(coulomb,) * 4, stribeck_friction=(stribeck,) * 4)
-        boards = [simulated_motor(joint, equipment.firmware) for joint in motors]
+        boards = [motor_of(joint, equipment.electronics) for joint in motors]
         self.device = SimulatedDevice(SimulatedArm(config), boards)
         self.clock = VirtualClock()
         self._robot = robot
@@ -224,6 +225,7 @@ class OrdinaryArm:
             return
         arm, trunk = self.device.arm, self.device.trunk
         theta, velocity = arm.positions, arm.velocities
-        applied = [motor.torque(*at) for motor, *at in zip(self.device.motors, theta, velocity, strict=True)]
+        at = zip(self.device.motors, theta, velocity, strict=True)
+        applied = [motor.advance(angle, speed, 0.0) for motor, angle, speed in at]
         wanted = gravity_torque(self._robot, theta, Tilt.of("right", trunk.pitch, trunk.roll).direction)
         self.result.largest_error = max(self.result.largest_error, float(np.max(np.abs(np.subtract(applied, wanted)))))

@@ -4,31 +4,31 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from exo_gravity.sim import Firmware
 from test.support.imu_drivers import ordinary_drivers
 
 from .arm import Equipment, OrdinaryArm, Result
+from .motors import Electronics
 
 MARGIN = 120.0  # s; the last start may take that long
 CARRIED = 24.0  # s, of each start
 EQUIPMENT = (
-    Equipment("quick motors", Firmware(current_lag=0.001, velocity_filter=0.005, torque_noise=0.15), (0.1, 0.1), 0.01),
+    Equipment("quick motors", Electronics(0.001, 0.005, torque_noise=0.15), (0.1, 0.1), 0.01),
     Equipment(
         "slow motors, batches",
-        Firmware(current_lag=0.008, velocity_filter=0.001, torque_noise=0.03),
+        Electronics(0.008, 0.001, torque_noise=0.03),
         (0.3, 0.2),
         loss=0.03,
         batch=0.001,
     ),
     Equipment(
         "noisy motors, busy computer",
-        Firmware(current_lag=0.004, velocity_filter=0.003, torque_noise=0.15),
+        Electronics(0.004, 0.003, torque_noise=0.15),
         (0.2, 0.1),
         loss=0.03,
         batch=0.001,
         late=0.1,
     ),
-    Equipment("ideal motors, busy computer", Firmware(), late=0.1),
+    Equipment("ideal motors, busy computer", None, late=0.1),
 )
 RATES = (100.0, 250.0, 500.0)  # Hz
 V3_RATES = (100.0, 250.0, 400.0)  # Hz: each cycle waits for a status frame

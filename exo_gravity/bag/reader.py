@@ -145,7 +145,9 @@ class _Contents:
         time = (clock - start) / 1e9
         carried = self._carried(name, start, float(time[-1]))
         try:
-            return Recording(name, names, time, *np.moveaxis(values, 1, 0), command, self._script(name, start), carried)
+            position, velocity, effort = np.moveaxis(values, 1, 0)
+            steps = self._script(name, start)
+            return Recording(name, names, time, position, velocity, effort, command, steps, carried)
         except DataError as error:
             self.problems.append(str(error))
             return None

@@ -76,25 +76,29 @@ class Param:
         Raises ParameterError if the type, the length of a list or a value is wrong.
         """
         is_list = isinstance(value, Sequence) and not isinstance(value, str)
-        items, kind = list(value) if is_list else [value], type(self.default)
-        if kind is list:
-            kind = type(self.default[0]) if self.default else str
-            if not is_list or (len(items) != len(self.default or items) and not self.any_length):
-                raise ParameterError(self.name, value, self.expected)
-        elif is_list:
-            raise ParameterError(self.name, value, self.expected)
+        items: list[Any] = list(value) if is_list else [value]
+        kind, count = self._kind_and_count
         if kind is float:
             items = [float(item) if type(item) is int else item for item in items]
-        if self.required and not (items and all(item != "" for item in items)):
+        if self.required and (not items or "" in items):
             raise ParameterError(self.name, value, f"set to {self.expected}")
-        if not all(self._allows(item, kind) for item in items):
+        fits = is_list == isinstance(self.default, list) and count in (None, len(items))
+        low, high = self.bounds or (None, None)
+        for item in items:
+            fits = fits and type(item) is kind and (not self.choices or item in self.choices)
+            fits = fits and (low is None or low <= item <= high)
+        if not fits:
             raise ParameterError(self.name, value, self.expected)
-        return items if isinstance(self.default, list) else items[0]
+        return items if is_list else items[0]
 
-    def _allows(self, item: Any, kind: type[Any]) -> bool:
-        if type(item) is not kind or (self.choices and item not in self.choices):
-            return False
-        return self.bounds is None or self.bounds[0] <= item <= self.bounds[1]
+    @property
+    def _kind_and_count(self) -> tuple[type[Any], int | None]:
+        """The type of a value or of a list's entries, and how many there are; None for any number."""
+        if not isinstance(self.default, list):
+            return type(self.default), 1
+        if not self.default:
+            return str, None
+        return type(self.default[0]), None if self.any_length else len(self.default)
 
     @property
     def range(self) -> str:
@@ -107,13 +111,10 @@ class Param:
     @property
     def expected(self) -> str:
         """A description of the permitted values, for error messages."""
+        kind, count = self._kind_and_count
+        text = KINDS[kind] if kind is bool else f"a {KINDS[kind]}"
         if isinstance(self.default, list):
-            kind = KINDS[type(self.default[0]) if self.default else str]
-            is_free = self.any_length or not self.default
-            text = f"a list of {kind}s" if is_free else f"{len(self.default)} {kind}s"
-        else:
-            kind = KINDS[type(self.default)]
-            text = kind if isinstance(self.default, bool) else f"a {kind}"
+            text = f"{count or 'a list of'} {KINDS[kind]}s"
         return f"{text}{', ' if self.choices else ' '}{self.range}".rstrip()
 
 

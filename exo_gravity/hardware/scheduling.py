@@ -11,6 +11,7 @@ import contextlib
 import ctypes
 import os
 import threading
+from collections.abc import Callable
 
 PR_SET_TIMERSLACK = 29  # prctl(2), in <sys/prctl.h>
 # Flags of mlockall(2), in <sys/mman.h>: pages mapped now, pages mapped later, and only once they are used.
@@ -27,21 +28,19 @@ def favour(priority: int) -> None:
         os.setpriority(os.PRIO_PROCESS, 0, -priority)
 
 
-def request_real_time(priority: int) -> list[str]:
-    """Request real-time scheduling and locked memory; return one sentence for each request that was not permitted.
+def request_real_time(priority: int, log: Callable[[str], object]) -> None:
+    """Request real-time scheduling and locked memory; log a sentence for each request that is not permitted.
 
     priority: SCHED_FIFO priority for all threads of this process except the caller's. It includes the middleware's
     threads, which deliver the messages. 0 requests nothing.
     """
-    refused: list[str] = []
     if not priority:
-        return refused
+        return
     try:
         for thread in map(int, os.listdir("/proc/self/task")):
             if thread != threading.get_native_id():
                 os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
     except PermissionError:
-        refused.append(f"thread_priority {priority} is not permitted: raise the rtprio limit in limits.conf")
+        log(f"thread_priority {priority} is not permitted: raise the rtprio limit in limits.conf")
     if ctypes.CDLL(None).mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT):
-        refused.append("locked memory is not permitted: raise the memlock limit in limits.conf")
-    return refused
+        log("locked memory is not permitted: raise the memlock limit in limits.conf")

@@ -12,16 +12,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.rotation import ZERO, Floats3, Quaternion, product, unit_quaternion, up_in_body
+from exo_gravity.core.model.rotation import ZERO, Floats3, Quaternion, plus, product, unit_quaternion, up_in_body
 from exo_gravity.core.model.tilt import angle_between, pitch_roll, rotation_matrix
 from exo_gravity.core.numbers import one_float
 from exo_gravity.core.trunk.imu_checks import Agreement, ClockCheck, Contradiction, EqualValues
-from exo_gravity.core.trunk.imu_sample import ACCELEROMETER_RANGE, GYROSCOPE_RANGE, ImuSample, Ranges, three_floats
-from exo_gravity.core.trunk.uncertainty import OVERSHOOT, SETTLE_TIME, TiltUncertainty
+from exo_gravity.core.trunk.imu_sample import (
+    ACCELEROMETER_RANGE,
+    ACCELEROMETER_RANGES,
+    GYROSCOPE_RANGE,
+    GYROSCOPE_RANGES,
+    ImuSample,
+    check_living,
+    in_range,
+    three_floats,
+)
+from exo_gravity.core.trunk.uncertainty import OVERSHOOT, TiltUncertainty
 
 try:
     from vqf import VQF
@@ -37,43 +47,35 @@ MAX_JUMP = 0.01  # rad by which rounding may turn a reported orientation
 BIAS_INTERVAL = 10  # samples; the bias changes slowly
 
 
-class TrunkOrientation:
+class TrunkOrientation(NamedTuple):
     """The trunk's orientation by one sample."""
 
-    __slots__ = ("_down", "_imu_from_trunk", "_world_from_imu", "uncertainty")
-
-    def __init__(self, down: Floats3, world_from_imu: Quaternion, imu_from_trunk: Quaternion, sigma: float) -> None:
-        #: one standard deviation of the tilt, rad
-        self.uncertainty = sigma
-        self._down, self._world_from_imu, self._imu_from_trunk = down, world_from_imu, imu_from_trunk
+    #: (x, y, z, w), world from trunk; its heading is arbitrary
+    orientation: Quaternion
+    #: one standard deviation of the tilt, rad
+    uncertainty: float
 
     @property
     def gravity(self) -> np.ndarray:
         """Its unit vector (3,) in the trunk's axes (x forward, y left, z up)."""
-        return np.array(self._down)
+        return -np.array(up_in_body(self.orientation))
 
     @property
     def pitch(self) -> float:
         """In rad (REP-103: > 0 bows forward)."""
-        return pitch_roll(self._down)[0]
+        return pitch_roll(self.gravity)[0]
 
     @property
     def roll(self) -> float:
         """In rad (> 0 leans right)."""
-        return pitch_roll(self._down)[1]
-
-    @property
-    def orientation(self) -> np.ndarray:
-        """(x, y, z, w), world from trunk; its heading is arbitrary."""
-        return np.array(product(self._world_from_imu, self._imu_from_trunk))
+        return pitch_roll(self.gravity)[1]
 
 
 class TrunkEstimator:
     """Follows one IMU; where VQF is installed, it need not report its orientation."""
 
-    _why: str  # there is no orientation yet
-    _age: float  # s of a reported orientation
-    _speed: float  # rad/s, the highest in the last second
+    _agreement = Agreement()
+    _speed = 0.0  # rad/s, the highest in the last second
     _up: Floats3 | None  # the world's z axis in the IMU's axes, by the last sample
     _last_rate: Floats3 | None
     _last_acceleration: Floats3 | None
@@ -92,16 +94,17 @@ class TrunkEstimator:
         """
         #: (3, 3), trunk from IMU
         self.rotation = rotation_matrix(rotation_trunk_from_imu, "rotation_trunk_from_imu")
-        self._rows = (-self.rotation).tolist()  # of gravity, which points down
-        x, y, z, w = map(float, rotation_trunk_from_imu)
+        x, y, z, w = unit_quaternion("rotation_trunk_from_imu", rotation_trunk_from_imu)
         self._imu_from_trunk = (-x, -y, -z, w)
         self._period = 1.0 / one_float("rate", rate, 2.0 / MAX_GAP, 10_000.0, "Hz")
-        self._ranges = Ranges(gyroscope_range, accelerometer_range)
+        fastest = one_float("gyroscope_range", gyroscope_range, *GYROSCOPE_RANGES, "rad/s")
+        strongest = one_float("accelerometer_range", accelerometer_range, *ACCELEROMETER_RANGES, "m/s^2")
+        limit = f"gyroscope_range = {fastest:.4g} rad/s about each axis (is it in deg/s?)"
+        self._gyroscope = "angular_velocity", fastest, limit
+        limit = f"accelerometer_range = {strongest:.4g} m/s^2 along each axis"
+        self._accelerometer = "linear_acceleration", strongest, limit
         self._fusion = VqfFusion(self._period) if VQF else None
-        self._uncertainty = TiltUncertainty(self._period)
-        self._equal = EqualValues()
-        self._agreement = Agreement()
-        self._clock = ClockCheck()
+        self._equal, self._clock = EqualValues(), ClockCheck()
         self._is_fused: bool | None = None  # None before the first sample
         self._time = -math.inf
         self._restart("no sample yet")
@@ -114,15 +117,9 @@ class TrunkEstimator:
     @property
     def settling(self) -> str:
         """Why there is no orientation yet; empty once there is."""
-        if self._is_fused and self._agreement.is_suspect:
+        if self._agreement.is_suspect:
             return f"until gyroscope and accelerometer agree on a turn of the trunk; {self._why}"
-        return "" if self._is_settled else self._why
-
-    @property
-    def _is_settled(self) -> bool:
-        if not self._is_fused:
-            return self._age >= SETTLE_TIME
-        return self._uncertainty.is_settled and not self._agreement.is_suspect
+        return "" if self._uncertainty.is_settled else self._why
 
     def update(self, sample: ImuSample, arrival: float | None = None) -> TrunkOrientation | None:
         """Process a sample; return the trunk's orientation, or None while it is not sure enough.
@@ -132,65 +129,46 @@ class TrunkEstimator:
         or if what it measures contradicts itself or the samples before it.
         """
         try:
-            quaternion = self._follow(sample)
+            quaternion = self._fused(sample) if sample.orientation is None else self._reported(sample)
             if arrival is not None:
                 self._clock.check(self._time, arrival)
         except Contradiction as error:
-            self._agreement.suspect()
-            self._restart(f"{error.name} must be {error.expected}")
+            self._restart(f"{error.name} must be {error.expected}", is_suspect=True)
             raise
-        if not self._is_settled:
+        if self._agreement.is_suspect or not self._uncertainty.is_settled:
             return None
-        assert self._up
-        (x, y, z), (p, q, r) = self._up, self._rows
-        down = p[0] * x + p[1] * y + p[2] * z, q[0] * x + q[1] * y + q[2] * z, r[0] * x + r[1] * y + r[2] * z
-        sigma = math.sqrt(self._uncertainty.variance) if self._is_fused else REPORTED_SIGMA
-        return TrunkOrientation(down, quaternion, self._imu_from_trunk, sigma)
+        return TrunkOrientation(product(quaternion, self._imu_from_trunk), math.sqrt(self._uncertainty.variance))
 
-    def _follow(self, sample: ImuSample) -> Quaternion:
-        """Return the IMU's orientation, world from IMU."""
-        is_fused, is_saturated = sample.orientation is None, False
-        acceleration: Floats3 | None
-        if is_fused:
-            if self._fusion is None:
-                raise ParameterError("orientation", None, "reported by the IMU, or install vqf to fuse it")
-            rate, is_saturated = self._ranges.angular_velocity(sample.angular_velocity)
-            acceleration = self._ranges.acceleration(sample.acceleration, self._last_acceleration)
-        else:
-            quaternion = unit_quaternion("orientation", sample.orientation)
-            given, force = sample.angular_velocity, sample.acceleration
-            rate = ZERO if given is None else three_floats("angular_velocity", given)
-            acceleration = None if force is None else three_floats("linear_acceleration", force)
-        time = float(sample.time)
-        dt = time - self._time
-        if not math.isfinite(time) or -MAX_GAP <= dt <= 0.0:  # far in the past: another clock, like a gap
-            raise ParameterError("stamp", time, "a finite number, later than the last stamp")
-        self._equal.check(time, rate, acceleration, self._up if is_fused and not is_saturated else None)
-        if not 0.0 < dt <= MAX_GAP or is_fused is not self._is_fused:
-            self._restart(f"gap of {dt:.2f} s" if is_fused is self._is_fused else "started")
-            self._is_fused, dt, self._clock = is_fused, 0.0, ClockCheck()
-        self._time = time
-        if is_fused:
-            return self._fuse(dt, rate, acceleration, is_saturated)
-        self._age += dt
+    def _reported(self, sample: ImuSample) -> Quaternion:
+        """Return the orientation that the IMU reports, world from IMU."""
+        quaternion = unit_quaternion("orientation", sample.orientation)
+        given, force = sample.angular_velocity, sample.acceleration
+        rate = ZERO if given is None else three_floats("angular_velocity", given)
+        acceleration = None if force is None else three_floats("linear_acceleration", force)
+        dt = self._step(sample, rate, acceleration, None)
         up = up_in_body(quaternion)
         if self._up and angle_between(up, self._up) > MAX_REPORTED_RATE * max(dt, self._period) + MAX_JUMP:
             self._restart("orientation jumped")
         self._up = up
+        self._uncertainty.advance(dt, ZERO, ZERO)
+        self._uncertainty.variance = REPORTED_SIGMA**2
         if acceleration:
             self._agreement.check_reported(dt, up, acceleration)
         return quaternion
 
-    def _fuse(self, dt: float, rate: Floats3, acceleration: Floats3 | None, is_saturated: bool) -> Quaternion:
-        """Return the IMU's orientation `dt` s after the last sample; 0 for the first one."""
-        fusion, uncertainty = self._fusion, self._uncertainty
-        assert fusion
-        uncertainty.advance(dt, rate, self._last_rate or rate)
-        if self._equal.duration:
-            uncertainty.repeat(dt, self._equal.duration)
-        elif is_saturated:
-            uncertainty.lose(OVERSHOOT * self._ranges.gyroscope * dt)
-        if uncertainty.is_lost:
+    def _fused(self, sample: ImuSample) -> Quaternion:
+        """Return the IMU's orientation, world from IMU, by gyroscope and accelerometer."""
+        fusion = self._fusion
+        if fusion is None:
+            raise ParameterError("orientation", None, "reported by the IMU, or install vqf to fuse it")
+        rate, is_saturated = in_range(sample.angular_velocity, *self._gyroscope)
+        force, is_cut = in_range(sample.acceleration, *self._accelerometer)
+        check_living(force, self._last_acceleration)
+        acceleration = None if is_cut else force
+        dt = self._step(sample, rate, acceleration, None if is_saturated else self._up)
+        unknown = OVERSHOOT * self._gyroscope[1] if is_saturated else 0.0
+        self._uncertainty.advance(dt, rate, self._last_rate or rate, unknown, self._equal.duration)
+        if self._uncertainty.is_lost:
             self._restart("too much rotation was not measured")
         quaternion = fusion.advance(dt, rate, self._last_rate or rate, acceleration)
         self._last_rate, self._last_acceleration = rate, acceleration
@@ -199,17 +177,31 @@ class TrunkEstimator:
             self._agreement.check(dt, quaternion, self._up, acceleration, rate)
         self._speed = max(abs(rate[0]) + abs(rate[1]) + abs(rate[2]), self._speed * (1.0 - dt))
         contradiction = self._agreement.contradiction + self._speed * self._clock.offset
-        uncertainty.combine(fusion.bias_sigma, self._agreement.square, contradiction)
+        self._uncertainty.combine(fusion.bias_sigma, self._agreement.square, contradiction)
         return quaternion
 
-    def _restart(self, why: str) -> None:
+    def _step(self, sample: ImuSample, rate: Floats3, acceleration: Floats3 | None, up: Floats3 | None) -> float:
+        """Return the time in s since the last sample, 0 if the estimate begins with this one; check both."""
+        time, is_fused = float(sample.time), sample.orientation is None
+        dt = time - self._time
+        if not math.isfinite(time) or -MAX_GAP <= dt <= 0.0:  # far in the past: another clock, like a gap
+            raise ParameterError("stamp", time, "a finite number, later than the last stamp")
+        self._equal.check(time, rate, acceleration, up)
+        self._time = time
+        if 0.0 < dt <= MAX_GAP and is_fused is self._is_fused:
+            return dt
+        self._restart(f"gap of {dt:.2f} s" if is_fused is self._is_fused else "started")
+        self._is_fused, self._clock = is_fused, ClockCheck()
+        return 0.0
+
+    def _restart(self, why: str, is_suspect: bool = False) -> None:
         """Begin anew with the next sample, or the present one."""
         if self._fusion:
             self._fusion.restart()
-        self._uncertainty.restart()
-        self._agreement.restart()
-        self._why = why
-        self._age = self._speed = 0.0
+        self._uncertainty = TiltUncertainty(self._period)
+        self._agreement = Agreement(is_suspect or self._agreement.is_suspect)
+        self._why = why  # there is no orientation yet
+        self._speed = 0.0
         self._up = self._last_rate = self._last_acceleration = None
 
 
@@ -224,10 +216,8 @@ class VqfFusion:
 
     def __init__(self, period: float) -> None:
         """Create a fusion for samples that are usually `period` s apart."""
-        self._period = period
+        self._period = self._due = period  # s; for which the accelerometer has not been passed on
         self._vqf = VQF(period)
-        self._rate, self._acceleration = np.zeros(3), np.zeros(3)  # reused
-        self._due = period  # s for which the accelerometer has not been passed on
         self._count = 0
         self._read_bias()
 
@@ -243,20 +233,15 @@ class VqfFusion:
         rate, last_rate: of this sample and the last one, each of the period that it ends; over several periods those
         between the two are interpolated. acceleration: None if it is not known.
         """
-        vqf, period, scaled = self._vqf, self._period, self._rate
-        periods = dt / period
-        share = 0.5 - 0.5 / periods if periods > 1.0 else 0.0  # of the last rate
-        (x, y, z), (u, v, w), (a, b, c) = rate, last_rate, self.bias
-        scaled[0] = a + (x + share * (u - x) - a) * periods
-        scaled[1] = b + (y + share * (v - y) - b) * periods
-        scaled[2] = c + (z + share * (w - z) - c) * periods
-        self._due += dt
-        count = round(self._due / period)
-        self._due -= count * period
-        measured = self._acceleration
-        if acceleration:
-            measured[0], measured[1], measured[2] = acceleration
+        vqf, periods = self._vqf, dt / self._period
+        (x, y, z), (a, b, c) = rate, self.bias
+        if periods > 1.0:
+            x, y, z = plus(rate, plus(last_rate, rate, -1.0), 0.5 - 0.5 / periods)
+        scaled = np.array((a + periods * (x - a), b + periods * (y - b), c + periods * (z - c)))
+        count = round((self._due + dt) / self._period)
+        self._due += dt - count * self._period
         if acceleration and count:
+            measured = np.array(acceleration)
             vqf.update(scaled, measured)
             for _ in range(1, count):
                 vqf.updateAcc(measured)

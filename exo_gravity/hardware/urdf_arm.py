@@ -8,14 +8,13 @@ comes as a vector in the root link's axes, so that the base may tilt.
 from __future__ import annotations
 
 import math
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 
 import numpy as np
 
 from exo_gravity.core.errors import ParameterError
 
-TURNING = ("revolute", "continuous")
+TURNING = "JointModelR"  # how Pinocchio's names of revolute and continuous joints begin
 
 
 class UrdfArm:
@@ -27,13 +26,6 @@ class UrdfArm:
     """
 
     def __init__(self, text: str, joint_names: Sequence[str]) -> None:
-        types = _joint_types(text)
-        for name in joint_names:
-            if types.get(name) not in TURNING:
-                found = f"; it is {types[name]}" if name in types else ""
-                turning = ", ".join(name for name, kind in types.items() if kind in TURNING)
-                expected = f"turning joints of the URDF ({turning or 'it has none'}){found}"
-                raise ParameterError("joint_names", name, expected)
         try:
             import pinocchio as pin
         except ImportError:
@@ -41,19 +33,25 @@ class UrdfArm:
         try:
             self._model = pin.buildModelFromXML(text)
         except (RuntimeError, ValueError) as error:
-            raise ParameterError("urdf", _beginning(text), f"a URDF that Pinocchio reads ({error})") from None
+            expected = f"a URDF that Pinocchio reads, without xacro elements: run xacro first ({error})"
+            raise ParameterError("urdf", f"{text[:60].strip()} ...", expected) from None
         self._data = self._model.createData()
         self._gravity_torque = pin.computeGeneralizedGravity
         self._q = pin.neutral(self._model)
-        numbers = [self._model.getJointId(name) for name in joint_names]
-        joints = [self._model.joints[number] for number in numbers]
+        numbers = dict(zip(self._model.names, range(self._model.njoints), strict=True))
+        turning = [name for name, n in numbers.items() if n and self._model.joints[n].shortname().startswith(TURNING)]
+        for name in joint_names:
+            if name not in turning:
+                expected = f"turning joints of the URDF ({', '.join(turning) or 'it has none'})"
+                raise ParameterError("joint_names", name, expected)
+        joints = [self._model.joints[numbers[name]] for name in joint_names]
         # A continuous joint has two coordinates, cosine and sine.
         self._places = [(joint.idx_q, joint.nq == 2) for joint in joints]
         self._order = [joint.idx_v for joint in joints]
         limits = (float(self._model.effortLimit[index]) for index in self._order)
         self.max_effort = tuple(limit if 0.0 < limit < math.inf else 0.0 for limit in limits)
         pin.computeSubtreeMasses(self._model, self._data)
-        self.mass = max(self._data.mass[number] for number in numbers)
+        self.mass = max(self._data.mass[numbers[name]] for name in joint_names)
         if not self.mass > 0.0:
             raise ParameterError("mass of the URDF's links", self.mass, "above 0 kg: it lacks inertial elements")
 
@@ -71,21 +69,3 @@ class UrdfArm:
         self._model.gravity.linear = np.array(gravity)
         torque = self._gravity_torque(self._model, self._data, q)
         return tuple(float(torque[index]) for index in self._order)
-
-
-def _joint_types(text: str) -> dict[str, str]:
-    """Return the type of each joint in the URDF `text` by name. Raises ParameterError."""
-    try:
-        robot = ElementTree.fromstring(text)
-        problem = "" if robot.tag == "robot" else "a URDF, whose outermost element is robot"
-    except ElementTree.ParseError as error:
-        problem = f"the XML of a URDF ({error})"
-    if not problem and any("xacro" in element.tag for element in robot.iter()):
-        problem = "a URDF without xacro elements: run xacro first"
-    if problem:
-        raise ParameterError("urdf", _beginning(text), problem)
-    return {joint.get("name", ""): joint.get("type", "") for joint in robot.findall("joint")}
-
-
-def _beginning(text: str) -> str:
-    return f"{text[:60].strip()} ..."

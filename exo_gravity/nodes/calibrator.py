@@ -26,12 +26,10 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.tilt_input import TiltInput
-from exo_gravity.nodes.ros.hot_path import NEWEST, HotPath
+from exo_gravity.nodes.ros.hot_path import NEWEST, HotPath, SolePublisher, TiltSubscription
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, by_name
 from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.sole_publisher import SolePublisher
-from exo_gravity.nodes.ros.tilt_subscription import TiltSubscription
 
 REPORT_PERIOD = 0.1  # s
 PLAN_PERIOD = 0.05  # s

@@ -107,7 +107,7 @@ class Simulator(Node):
     def _move_trunk(self) -> None:
         device, largest = self._device, TRUNK_SPEED * self._trunk_period
         state = device.trunk
-        if device.trunk_moves:  # by the script: the trunk stays where that leaves it
+        if device.trunk_motion:  # by the script: the trunk stays where that leaves it
             self._trunk_target = state.pitch, state.roll
         else:
             pitch_step, roll_step = (
@@ -150,17 +150,17 @@ class Simulator(Node):
         self._device.start(self._wearer, delay)
 
     def _report(self) -> None:
-        device, gaps = self._device, self._device.gaps
+        device = self._device
         values: dict[str, object] = {
             "motors": "on" if device.powered else "off",
-            "longest stall (ms)": f"{1000.0 * gaps.longest_stall:.0f}",
-            "longest silence (ms)": f"{1000.0 * gaps.longest_silence:.0f}",
+            "longest stall (ms)": f"{1000.0 * device.longest_stall:.0f}",
+            "longest silence (ms)": f"{1000.0 * device.longest_silence:.0f}",
             "time lost (ms)": f"{1000.0 * device.slip:.0f}",
             "disconnected": "yes" if device.disconnected else "no",
         }
         level, message = OK, "running"
-        if gaps.longest_stall > MAX_CATCH_UP:
-            level, message = WARN, f"stalled for {1000.0 * gaps.longest_stall:.0f} ms: this computer is too busy"
+        if device.longest_stall > MAX_CATCH_UP:
+            level, message = WARN, f"stalled for {1000.0 * device.longest_stall:.0f} ms: this computer is too busy"
         elif device.disconnected:
             level, message = WARN, "a simulated fault disconnects a motor"
         self._diagnostics.report(level, message, values)

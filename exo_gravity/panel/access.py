@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import hmac
 import ipaddress
+import re
 import secrets
 from collections import deque
 from collections.abc import Callable
-from urllib.parse import SplitResult, parse_qs, urlsplit
+from pathlib import Path
+from urllib.parse import parse_qs
 
 from starlette.datastructures import MutableHeaders
 from starlette.requests import HTTPConnection, Request
@@ -22,7 +24,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 ATTEMPTS, ATTEMPT_WINDOW = 5, 60.0  # wrong tokens of one address, and of all addresses ten times as many, in s
 COOKIE = "exo_gravity_panel"
 MAX_BODY = 4096  # bytes of a request
-POLICY_VIOLATION = 1008  # why a live connection was closed
 # Nothing from elsewhere, no inline script or style, and no frame around the page, in which a press could be stolen.
 CONFINED = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
@@ -41,36 +42,54 @@ HEADERS = {
 
 def is_loopback(host: str) -> bool:
     """Return whether `host`, a name or an address, is this machine alone."""
-    if host == "localhost":
-        return True
     try:
-        return ipaddress.ip_address(host).is_loopback
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
 
 
+def is_same_origin(origin: str, host: str) -> bool:
+    """Return whether the page at `origin` (a header's value) came from the server that `host` names."""
+    return host != "" and origin.lower() in (f"http://{host.lower()}", f"https://{host.lower()}")
+
+
 class Access:
-    """The token, and the cookie of those who gave it.
+    """Passes on to `app` the requests and live connections of those who may use the panel.
 
     host: the address at which the panel listens. token: '' for none on loopback, and for a random one elsewhere.
     clock: monotonic s.
     """
 
-    def __init__(self, host: str, token: str, clock: Callable[[], float]) -> None:
+    def __init__(self, app: ASGIApp, host: str, token: str, clock: Callable[[], float]) -> None:
         self.on_loopback = is_loopback(host)
         self.token = token or ("" if self.on_loopback else secrets.token_urlsafe(24))
-        self._clock = clock
+        self.is_open = not self.token  #: whether no token is needed
         self.session = secrets.token_urlsafe(24)  #: the cookie's value: not the token, and another after each start
+        self._app = app
+        self._clock = clock
         self._failures: deque[tuple[float, str]] = deque(maxlen=10 * ATTEMPTS)
+        self._form = (Path(__file__).parent / "static" / "login.html").read_text(encoding="utf-8")
 
-    @property
-    def is_open(self) -> bool:
-        """Whether no token is needed."""
-        return not self.token
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request or live connection."""
+
+        async def confined(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                answer = MutableHeaders(scope=message)
+                answer["content-security-policy"] = REPORT if scope["path"].startswith("/report/") else CONFINED
+                answer.update(HEADERS)
+            await send(message)
+
+        refusal = self._refusal(HTTPConnection(scope))
+        if refusal is None and _is_login(scope):
+            request = Request(scope, receive)
+            given = parse_qs((await request.body()).decode("utf-8", "replace")).get("token", [""])[0]
+            refusal = self._opened_by(given, request)
+        await (refusal or self._app)(scope, receive, confined)
 
     def allows_host(self, host: str) -> bool:
         """Return whether a request with this header `Host` may be answered."""
-        return not self.is_open or is_loopback(_split(f"//{host}").hostname or "")
+        return not self.is_open or is_loopback(re.sub(r":\d*$", "", host).strip("[]"))
 
     def allows(self, session: str) -> bool:
         """Return whether a request with this cookie may see anything."""
@@ -90,87 +109,29 @@ class Access:
             self._failures.append((now, address))
         return right
 
-
-def is_same_origin(origin: str, host: str) -> bool:
-    """Return whether the page at `origin` (a header's value) came from the server that `host` names."""
-    parts = _split(origin)
-    return parts.scheme in ("http", "https") and parts.netloc.lower() == host.lower() != ""
-
-
-def _split(address: str) -> SplitResult:
-    try:
-        return urlsplit(address)
-    except ValueError:  # an unclosed [
-        return SplitResult("", "", "", "", "")
-
-
-def _equal(one: str, other: str) -> bool:
-    return hmac.compare_digest(one.encode(), other.encode())
-
-
-class Guard:
-    """Passes on to `app` what `access` allows. form: the page that asks for the token."""
-
-    def __init__(self, app: ASGIApp, access: Access, form: str) -> None:
-        self._app = app
-        self._access = access
-        self._form = form
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request or live connection."""
-        connection = HTTPConnection(scope)
-        refusal = self._refusal(connection)
-        if scope["type"] == "websocket":
-            if refusal is None:
-                await self._app(scope, receive, send)
-            else:
-                await receive()
-                await send({"type": "websocket.close", "code": POLICY_VIOLATION})
-            return
-
-        async def confined(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                answer = MutableHeaders(scope=message)
-                answer["content-security-policy"] = REPORT if scope["path"].startswith("/report/") else CONFINED
-                answer.update(HEADERS)
-            await send(message)
-
-        if refusal is None and scope["path"] == "/login":
-            refusal = await self._login(Request(scope, receive))
-        await (refusal or self._app)(scope, receive, confined)
-
     def _refusal(self, connection: HTTPConnection) -> Response | None:
         """Return the answer to a request that must not pass, None if it may."""
-        scope, host = connection.scope, connection.headers.get("host", "")
-        if not self._access.allows_host(host):
+        scope, headers = connection.scope, connection.headers
+        if not self.allows_host(headers.get("host", "")):
             return PlainTextResponse("403: the panel answers on loopback only: see docs/panel.md", 403)
-        changes = scope["type"] == "websocket" or scope["method"] not in ("GET", "HEAD")
-        if changes and not is_same_origin(connection.headers.get("origin", ""), host):
+        changes = scope.get("method") not in ("GET", "HEAD")  # a live connection has no method
+        if changes and not is_same_origin(headers.get("origin", ""), headers.get("host", "")):
             return PlainTextResponse("403: this request does not come from the panel's page", 403)
-        if scope["path"] == "/login" or self._access.allows(connection.cookies.get(COOKIE, "")):
+        if "transfer-encoding" in headers or int(headers.get("content-length", "0")) > MAX_BODY:
+            return PlainTextResponse("413: too long", 413)
+        if _is_login(scope) or self.allows(connection.cookies.get(COOKIE, "")):
             return None
-        given = connection.query_params.get("token", "") if scope["type"] == "http" else ""
-        if given and self._access.is_token(given, address_of(connection)):
-            return self._opened(connection)  # the address with the token, as the log shows it
-        return self._ask(failed=bool(given))
+        return self._opened_by(connection.query_params.get("token", ""), connection)  # as the log shows it
 
-    async def _login(self, request: Request) -> Response:
-        if request.method != "POST":
-            return RedirectResponse("/", 303)
-        body = await body_of(request)
-        given = parse_qs(body.decode("utf-8", "replace")).get("token", [""])[0]
-        right = len(body) <= MAX_BODY and self._access.is_token(given, address_of(request))
-        return self._opened(request) if right else self._ask(failed=True)
-
-    def _opened(self, connection: HTTPConnection) -> Response:
+    def _opened_by(self, given: str, connection: HTTPConnection) -> Response:
+        """Return the session's cookie if `given` is the token, else the page that asks for it."""
+        if not given or not self.is_token(given, address_of(connection)):
+            note = "The token is wrong, or too many were tried: wait a minute." if given else ""
+            return Response(self._form.replace("<!-- note -->", note), 401, media_type="text/html")
         answer = RedirectResponse("/", 303)
         secure = connection.headers.get("origin", "").startswith("https:")
-        answer.set_cookie(COOKIE, self._access.session, httponly=True, samesite="strict", secure=secure)
+        answer.set_cookie(COOKIE, self.session, httponly=True, samesite="strict", secure=secure)
         return answer
-
-    def _ask(self, failed: bool) -> Response:
-        note = "The token is wrong, or too many were tried: wait a minute." if failed else ""
-        return Response(self._form.replace("<!-- note -->", note), 401, media_type="text/html")
 
 
 def address_of(connection: HTTPConnection) -> str:
@@ -178,11 +139,9 @@ def address_of(connection: HTTPConnection) -> str:
     return connection.client.host if connection.client else "unknown"
 
 
-async def body_of(request: Request) -> bytes:
-    """Return the body; more than MAX_BODY bytes, and not all of them, if it is too long."""
-    body = b""
-    async for part in request.stream():
-        body += part
-        if len(body) > MAX_BODY:
-            break
-    return body
+def _is_login(scope: Scope) -> bool:
+    return (scope["path"], scope.get("method")) == ("/login", "POST")
+
+
+def _equal(one: str, other: str) -> bool:
+    return hmac.compare_digest(one.encode(), other.encode())

@@ -28,7 +28,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from exo_gravity.core.errors import ExoGravityError, ParameterError
-from exo_gravity.panel.params import SETTABLE
+from exo_gravity.panel.view import SETTABLE
 
 # The kinds of requests, and the keys that each has besides "do".
 KEYS: Mapping[str, frozenset[str]] = {
@@ -38,7 +38,6 @@ KEYS: Mapping[str, frozenset[str]] = {
     "trial": frozenset({"name"}),
 }
 GONE = 2.0  # s without a confirmation; longer than a lease lasts, so that the next page finds the arm let down
-FORGOTTEN = 600.0  # s after which a page that is gone loses its number
 MAX_PAGES = 32
 BURST, REFILL = 20.0, 10.0  # requests that a page may send at once, and per second
 
@@ -106,11 +105,11 @@ class Reply(NamedTuple):
 class Control:
     """The pages, which of them holds control, and what is done for them.
 
-    arms: has their `names` and, for each kind of request with the key "arm", a coroutine function that takes the arm,
-    and `set` the values too; `lease(page, kind)`, which sends a page's request for control to all arms, and
-    `other_holder(arm, page)`, the name of who else holds control of an arm. files: has the names of the `trials` and
-    such functions for the other requests, of which `trial` takes a name. Each returns '' or why it failed. note: called
-    with a sentence for the log and the recording. clock: monotonic s.
+    arms: has their `names`; a coroutine function `ask(kind, arm, values)` for each request with the key "arm";
+    `lease(page, kind)`, which sends a page's request for control to all arms, and `other_holder(arm, page)`, the name
+    of who else holds control of an arm. files: has the names of the `trials` and a coroutine function for each other
+    request, of which `trial` takes a name. Each returns '' or why it failed. note: called with a sentence for the log
+    and the recording. clock: monotonic s.
     """
 
     def __init__(self, arms: Any, files: Any, note: Callable[[str], object], clock: Callable[[], float]) -> None:
@@ -128,10 +127,11 @@ class Control:
         A known secret is the same page, reloaded. A page holds control from the start if no other does, or if the other
         is gone.
         """
-        self._forget()
         page = self._pages.get(secret)
         now = self._clock()
         if page is None:
+            if len(self._pages) >= MAX_PAGES:  # those that are closed lose their numbers
+                self._pages = {known.secret: known for known in self._pages.values() if known.connected}
             if len(self._pages) >= MAX_PAGES:
                 return None
             self._numbers += 1
@@ -187,24 +187,20 @@ class Control:
         return Reply(status, text)
 
     async def _carry_out(self, action: Action, page: Page | None) -> str:
-        problem = ""
-        if action.kind == "let_down":
-            problem = await self._let_down([action.arm] if action.arm else self._arms.names)
-        elif action.kind in ("take", "release"):
+        if action.kind in ("take", "release"):
             self.holder = page if action.kind == "take" else None
             self._arms.lease(str(page), action.kind)
-        else:
-            function = getattr(self._arms if action.arm else self._files, action.kind)
-            problem = await function(*filter(None, (action.arm, action.values, action.name)))
-        return problem
-
-    async def _let_down(self, arms: Collection[str]) -> str:
-        """Let `arms` down, all at once; return '' or which failed and why. Raises nothing."""
-        if not arms:
-            return "no arm is present"
-        results = await asyncio.gather(*map(self._arms.let_down, arms), return_exceptions=True)
-        problems = [_described(result) if isinstance(result, BaseException) else result for result in results]
-        return "; ".join(f"{arm}: {problem}" for arm, problem in zip(arms, problems, strict=True) if problem)
+            return ""
+        if action.kind != "let_down":
+            if action.arm:
+                return str(await self._arms.ask(action.kind, action.arm, action.values))
+            return str(await getattr(self._files, action.kind)(*filter(None, (action.name,))))
+        arms = [action.arm] if action.arm else self._arms.names  # all at once, and none waits for another
+        asked = (self._arms.ask("let_down", arm, {}) for arm in arms)
+        results = await asyncio.gather(*asked, return_exceptions=True)
+        problems = [f"{type(r).__name__}: {r}" if isinstance(r, BaseException) else r for r in results]
+        failed = [f"{arm}: {problem}" for arm, problem in zip(arms, problems, strict=True) if problem]
+        return "; ".join(failed) if arms else "no arm is present"
 
     def _log(self, text: str) -> None:
         try:
@@ -221,16 +217,3 @@ class Control:
             return False
         page.credit -= 1.0
         return True
-
-    def _forget(self) -> None:
-        """Drop pages that are long gone, and any that is closed if there are too many."""
-        now, full = self._clock(), len(self._pages) >= MAX_PAGES
-        for page in list(self._pages.values()):
-            if not page.connected and (full or now - page.seen > FORGOTTEN):
-                del self._pages[page.secret]
-                if page is self.holder:
-                    self.holder = None
-
-
-def _described(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}"

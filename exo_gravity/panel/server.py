@@ -13,7 +13,6 @@ up.
 from __future__ import annotations
 
 import asyncio
-import json
 import socket
 import threading
 from collections.abc import Callable, Mapping
@@ -24,13 +23,13 @@ from typing import Any
 import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.panel.access import MAX_BODY, Access, Guard, address_of, body_of
+from exo_gravity.panel.access import Access, address_of
 from exo_gravity.panel.control import Control, Page
 
 FOLDER = Path(__file__).parent
@@ -42,7 +41,7 @@ FULL, REPLACED = 4000, 4001  # why a live connection was closed: too many pages;
 
 
 class PanelServer:
-    """Serves the panel at `host` and `port`.
+    """Serves the panel at `host` and `port`, on a thread.
 
     report: returns the report of a trial by name, or None. parameters: returns those in force by node. clock: of
     `access`, monotonic s.
@@ -58,7 +57,6 @@ class PanelServer:
         parameters: Callable[[], Mapping[str, Any]],
         clock: Callable[[], float],
     ) -> None:
-        self.access = Access(host, token, clock)
         self.state = NONE_YET  #: what the pages show, replaced by a new object in any thread
         self.setup = NONE_YET  #: what changes rarely, replaced likewise
         self._control = control
@@ -71,23 +69,23 @@ class PanelServer:
             Route("/report/{name}", self._on_report),
             Route("/parameters", lambda request: JSONResponse(parameters())),
             WebSocketRoute("/live", self._on_live),
+            Route("/login", lambda request: RedirectResponse("/")),
             Mount("/static", StaticFiles(directory=FOLDER / "static")),
         ]
-        form = (FOLDER / "static" / "login.html").read_text(encoding="utf-8")
-        self._socket = _listen(host, port)
+        self.access = Access(Starlette(routes=routes), host, token, clock)
+        try:
+            family = socket.AF_INET6 if ":" in host else socket.AF_INET
+            self._socket = socket.create_server((host, port), family=family)
+        except OSError as error:
+            expected = f"a free address ({error.strerror or error})"
+            raise ParameterError("host, port", f"{host}, {port}", expected) from None
         config = uvicorn.Config(
-            Guard(Starlette(routes=routes), self.access, form),
-            log_level="warning", access_log=False, server_header=False, proxy_headers=False, lifespan="off",
-            ws_max_size=1024, ws_per_message_deflate=False, ws_ping_interval=5.0, ws_ping_timeout=10.0,
-            timeout_graceful_shutdown=1,
+            self.access, loop="asyncio", log_level="warning", access_log=False, server_header=False,
+            proxy_headers=False, lifespan="off", ws_max_size=1024, ws_per_message_deflate=False, ws_ping_interval=5.0,
+            ws_ping_timeout=10.0, timeout_graceful_shutdown=1,
         )  # fmt: skip
         self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(
-            target=lambda: asyncio.run(self._server.serve([self._socket])), name="panel", daemon=True
-        )
-
-    def start(self) -> None:
-        """Start to serve, on a thread."""
+        self._thread = threading.Thread(target=self._server.run, args=([self._socket],), name="panel", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
@@ -102,6 +100,7 @@ class PanelServer:
         return self._thread.is_alive()
 
     async def _on_live(self, connection: WebSocket) -> None:
+        """Send to a page and receive its confirmations until it closes."""
         await connection.accept()
         with suppress(WebSocketDisconnect, asyncio.TimeoutError, ValueError, KeyError):
             hello = await asyncio.wait_for(connection.receive_json(), HELLO_TIMEOUT)
@@ -109,23 +108,19 @@ class PanelServer:
             if page is None:
                 await connection.close(FULL)
                 return
-            await self._attend(connection, page)
-
-    async def _attend(self, connection: WebSocket, page: Page) -> None:
-        """Send to a page and receive its confirmations until it closes."""
-        if page.secret in self._connections:
-            await self._connections[page.secret].close(REPLACED)
-        self._connections[page.secret] = connection
-        sender = asyncio.create_task(self._send(connection, page))
-        try:
-            while True:
-                _given(await connection.receive_json(), "seen", int)
-                self._control.confirm(page)
-        finally:
-            sender.cancel()
-            if self._connections.get(page.secret) is connection:
-                del self._connections[page.secret]
-                page.connected = False
+            if page.secret in self._connections:
+                await self._connections[page.secret].close(REPLACED)
+            self._connections[page.secret] = connection
+            sender = asyncio.create_task(self._send(connection, page))
+            try:
+                while True:
+                    _given(await connection.receive_json(), "seen", int)
+                    self._control.confirm(page)
+            finally:
+                sender.cancel()
+                if self._connections.get(page.secret) is connection:
+                    del self._connections[page.secret]
+                    page.connected = False
 
     async def _send(self, connection: WebSocket, page: Page) -> None:
         """Send the page's number, then setup and state whenever they are new, until it is cancelled."""
@@ -144,11 +139,8 @@ class PanelServer:
             await asyncio.sleep(SEND_PERIOD)
 
     async def _on_action(self, request: Request) -> Response:
-        body = await body_of(request)
-        if len(body) > MAX_BODY:
-            return PlainTextResponse("413: too long", 413)
         try:
-            content = json.loads(body)
+            content = await request.json()
         except ValueError:
             return JSONResponse({"error": "the request is not JSON"}, 400)
         secret = request.headers.get("x-panel-page", "")
@@ -165,11 +157,3 @@ def _given(message: Any, key: str, kind: type) -> Any:
     if not isinstance(message, dict) or type(message.get(key)) is not kind:
         raise ValueError(f"{key} must be given")
     return message[key]
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    try:
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        return socket.create_server((host, port), family=family)
-    except OSError as error:
-        raise ParameterError("host, port", f"{host}, {port}", f"a free address ({error.strerror or error})") from None

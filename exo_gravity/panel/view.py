@@ -1,17 +1,39 @@
-"""What the page shows: the state of an arm, ten times a second; its limits and settings; the arms' URDF."""
+"""The parameters of `panel`, those of other nodes that its page may change, and what the page shows of the arms."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain, repeat, zip_longest
 from typing import Any
 
+from exo_gravity.core.compensation.params import COMPENSATOR
 from exo_gravity.core.errors import ExoGravityError
+from exo_gravity.core.params import Param
 from exo_gravity.core.view.urdf import described, urdf
-from exo_gravity.panel.params import SETTABLE
+
+# fmt: off
+PANEL = (
+    Param("host", "127.0.0.1", "address of the page; other than loopback only with a token", fixed=True),
+    Param("port", 8080, "TCP port of the page", (1, 65535), fixed=True),
+    Param("token", "", "secret that opens the page; empty: none on loopback, elsewhere a random one in the log",
+          fixed=True),
+    Param("dead_man", False, "let the arms down when the page that holds control has been gone for 1 s", fixed=True),
+    Param("language", "en", "language of the page until its user chooses another", choices=("en", "de"), fixed=True),
+    Param("trials", "", "folder with trial scripts; empty: those of the package", fixed=True),
+    Param("output", "recordings", "folder for recordings, trials and saved parameters", fixed=True),
+)
+# fmt: on
+# What the page may change on a compensator. Every limit stays with the compensator and the bridge.
+SETTABLE = {
+    param.name: param
+    for param in COMPENSATOR
+    if param.name in ("support", "mode", "wearer.body_mass", "wearer.sex", "wearer.segment_length")
+}
 
 Values = Mapping[str, Any]
+NUMBERS = ("position", "velocity", "effort")
 SILENT = 1.5  # s without diagnostics or joint states after which the last ones are not shown any more
 
 
@@ -31,14 +53,9 @@ def joint_rows(
     names: Sequence[str], position: Sequence[float], velocity: Sequence[float], effort: Sequence[float]
 ) -> list[dict[str, Any]]:
     """Return name, angle in rad, speed in rad/s and torque in Nm of each joint; None for a number that is not known."""
-
-    def rounded(values: Sequence[float], index: int) -> float | None:
-        return round(values[index], 4) if index < len(values) and math.isfinite(values[index]) else None
-
-    columns = {"position": position, "velocity": velocity, "effort": effort}
-    return [
-        {"name": name, **{key: rounded(values, n) for key, values in columns.items()}} for n, name in enumerate(names)
-    ]
+    rows = zip_longest(position, velocity, effort, fillvalue=math.nan)
+    known = ([round(x, 4) if math.isfinite(x) else None for x in row] for row in chain(rows, repeat((math.nan,) * 3)))
+    return [{"name": name, **dict(zip(NUMBERS, row, strict=True))} for name, row in zip(names, known, strict=False)]
 
 
 def setup_of(nodes: Mapping[str, tuple[Values, Values]]) -> dict[str, Any]:

@@ -48,6 +48,7 @@ _STILL = (0.0, 0.0, 0.0)
 # published motor tables) and 0.1 to 0.25 kg of carbon tube, bracket and cuff.
 DEFAULT_LINKS = ArmModel((0.05, 0.13, 0.30, 0.30), (0.045, 0.115, 0.235, 0.13), (0.60, 0.46, 0.61, 0.20))
 
+_BALL = '<joint type="ball"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
 _FRICTION_STIFFNESS = 'solreffriction=".002 1" solimpfriction=".9999 .9999 .001"'
 _STOP_STIFFNESS = 'solreflimit=".004 1" solimplimit=".99 .999 .001"'
 
@@ -97,16 +98,15 @@ class ArmConfig:
             )
 
 
-def in_base(side: str, vector: Sequence[float]) -> Vector:
-    """Return a vector (3,) of the trunk's axes in the base frame of the `side` arm, of which the right is a mirror."""
-    x, y, z = vector
-    return (y if side == "left" else -y), x, -z
+def in_base(side: str, vector: Sequence[float], turning: bool = False) -> Vector:
+    """Return a vector (3,) of the trunk's axes in the base frame of the `side` arm, of which the right is a mirror.
 
-
-def rotation_in_base(side: str, vector: Sequence[float]) -> Vector:
-    """Return an angular velocity or acceleration (3,) of the trunk in the base frame; a mirror reverses rotations."""
+    turning: whether it is an angular velocity or acceleration, which a mirror reverses.
+    """
     x, y, z = vector
-    return (y, x, -z) if side == "left" else (y, -x, z)
+    if side == "left":
+        return y, x, -z
+    return (y, -x, z) if turning else (-y, x, -z)
 
 
 def felt_in_base(side: str, state: TrunkState, gravity: float) -> tuple[Vector, Vector, Vector]:
@@ -115,8 +115,8 @@ def felt_in_base(side: str, state: TrunkState, gravity: float) -> tuple[Vector, 
     Gravity less acceleration in m/s^2, angular velocity in rad/s, angular acceleration in rad/s^2. gravity: m/s^2.
     """
     felt = gravity * gravity_in_trunk(state.pitch, state.roll) - state.acceleration
-    turning, spin_up = state.angular_velocity, state.angular_acceleration
-    return in_base(side, felt.tolist()), rotation_in_base(side, turning), rotation_in_base(side, spin_up)
+    spin, spin_up = state.angular_velocity, state.angular_acceleration
+    return in_base(side, felt.tolist()), in_base(side, spin, turning=True), in_base(side, spin_up, turning=True)
 
 
 class SimulatedArm:
@@ -127,8 +127,13 @@ class SimulatedArm:
 
     def __init__(self, config: ArmConfig | None = None) -> None:
         self.config = config or ArmConfig()
-        self.model = mujoco.MjModel.from_xml_string(_mjcf(self.config))
+        xml = _mjcf(self.config)
+        self.model = mujoco.MjModel.from_xml_string(xml)
         self.data = mujoco.MjData(self.model)
+        # The same arm on a base that can turn: its torques for a given motion of the base.
+        on_ball = xml.replace("<worldbody>", f"<worldbody><body>{_BALL}").replace("</worldbody>", "</body></worldbody>")
+        self._turning_model = mujoco.MjModel.from_xml_string(on_ball)
+        self._turning_data = mujoco.MjData(self._turning_model)
         # Views of `data`, whose arrays stay in place: each lookup of an attribute costs as much as its use.
         self._theta, self._velocity, self._torque = self.data.qpos, self.data.qvel, self.data.qfrc_applied
         self._coulomb, self._stribeck, self._speed = map(
@@ -168,10 +173,9 @@ class SimulatedArm:
         gravity: m/s^2, less the acceleration of the base's origin. angular_velocity rad/s, angular_acceleration
         rad/s^2: of the base, against the world.
         """
-        self.model.opt.gravity[:] = gravity
+        self.model.opt.gravity[:] = self._turning_model.opt.gravity[:] = gravity
         self._turns = any(angular_velocity) or any(angular_acceleration)
-        self._rotation = np.array(angular_velocity), np.array(angular_acceleration)
-        self.data.xfrc_applied[:] = 0.0
+        self._turning_data.qvel[:3], self._turning_data.qacc[:3] = angular_velocity, angular_acceleration
 
     def step(self, torque: Sequence[float], count: int = 1) -> None:
         """Apply `torque`, (4,) Nm of motors and wearer together, for `count` times STEP."""
@@ -184,8 +188,18 @@ class SimulatedArm:
             self.model.dof_frictionloss[:] = self._coulomb + self._stribeck * fading
             mujoco.mj_step1(self.model, self.data)
             if self._turns:
-                _apply_rotation(self.model, self.data, *self._rotation)
+                self._torque[:] = torque + self.data.qfrc_bias - self._turning_bias()
             mujoco.mj_step2(self.model, self.data)
+
+    def _turning_bias(self) -> np.ndarray:
+        """Return the torque (4,) in Nm of gravity and inertia at constant joint velocities, on a base that turns."""
+        model, data = self._turning_model, self._turning_data
+        data.qpos[4:], data.qvel[3:] = self._theta, self._velocity
+        for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
+            compute(model, data)
+        bias = np.empty(3 + JOINT_COUNT)
+        mujoco.mj_rne(model, data, 1, bias)
+        return bias[3:]
 
 
 def _mjcf(config: ArmConfig) -> str:
@@ -224,38 +238,3 @@ def _tube(length: float, centre: str, mass: float) -> str:
     along = mass * _TUBE_RADIUS**2
     across = along / 2 + mass * length**2 / 12
     return f'<inertial pos="{centre}" mass="{mass}" diaginertia="{along} {across} {across}"/>'
-
-
-def _apply_rotation(
-    model: mujoco.MjModel, data: mujoco.MjData, angular_velocity: np.ndarray, angular_acceleration: np.ndarray
-) -> None:
-    """Set the forces on each link of a base that turns by (3,) rad/s and rad/s^2 about its origin, in its own axes.
-
-    For link i with mass m, inertia I, centre of gravity at r, velocity v and angular velocity w relative to the base:
-    force  -m (alpha x r + omega x (omega x r) + 2 omega x v),
-    torque -(I (alpha + omega x w) + (omega + w) x I (omega + w) - w x I w), of which MuJoCo adds w x I w itself.
-    """
-    links = slice(1, None)
-    place, mass = data.xipos[links], model.body_mass[links, np.newaxis]
-    rotation = data.ximat[links].reshape(-1, 3, 3)
-    inertia = (rotation * model.body_inertia[links, np.newaxis]) @ rotation.transpose(0, 2, 1)
-    turning, speed = data.cvel[links, :3], data.cvel[links, 3:]
-    velocity = speed + _cross(turning, place - data.subtree_com[1])
-    spin, spin_up = _matrix(angular_velocity), _matrix(angular_acceleration)
-    force = place @ (spin_up + spin @ spin).T + velocity @ (2.0 * spin.T)
-    total = turning + angular_velocity
-    change = inertia @ (angular_acceleration + turning @ spin.T)[..., np.newaxis]
-    momentum, relative = inertia @ total[..., np.newaxis], inertia @ turning[..., np.newaxis]
-    data.xfrc_applied[links, :3] = -mass * force
-    data.xfrc_applied[links, 3:] = _cross(turning, relative[..., 0]) - _cross(total, momentum[..., 0]) - change[..., 0]
-
-
-def _matrix(vector: np.ndarray) -> np.ndarray:
-    """Return the matrix (3, 3) that multiplies a vector by the cross product with `vector`."""
-    x, y, z = vector
-    return np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the cross products (n, 3) of rows; `numpy.cross` takes five times as long."""
-    return a[:, (1, 2, 0)] * b[:, (2, 0, 1)] - a[:, (2, 0, 1)] * b[:, (1, 2, 0)]

@@ -5,8 +5,8 @@ Physics catches up with the clock in steps of 1 ms before a frame is processed, 
 present state of the arm. A reply is sent 200 to 400 us after its command, as measured on AK motors. V3 boards send
 status frames on their own timer, only in `run`.
 
-udp_multicast returns every frame to its sender, unmarked; most buses do not. A reply is therefore remembered until its
-echo arrives. If many replies were sent and no echo ever arrived, the bus does not echo.
+udp_multicast returns every frame to its sender, unmarked; most buses do not. An echo is known as no command: the first
+byte of a reply is its ID.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import math
 import operator
 import random
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 
 import can
@@ -27,7 +26,7 @@ from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, Frame
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim.arm import STEP, SimulatedArm, felt_in_base
-from exo_gravity.sim.motor import SimulatedMotor, SimulatedV3Motor, StatusTimer
+from exo_gravity.sim.motor import SimulatedMotor, SimulatedV3Motor
 from exo_gravity.sim.trunk_motion import TrunkMotion, TrunkState, motion_of
 from exo_gravity.sim.truth import TruthLog
 from exo_gravity.sim.virtual_wearer import VirtualWearer
@@ -35,79 +34,6 @@ from exo_gravity.sim.virtual_wearer import VirtualWearer
 REPLY_DELAY = (200e-6, 400e-6)  # s
 MAX_CATCH_UP = 0.05  # s of physics simulated at once; after a longer stall the rest of the time is lost
 IDLE_PERIOD = 0.005  # s after which physics advances even without a frame
-MAX_PENDING_ECHOES = 512  # twice the number of frames that a udp_multicast socket buffers
-
-
-class GapMeter:
-    """Measures gaps in s while the motors are on; both start again when the motors are switched on.
-
-    longest_stall: between two passes of the device's loop. longest_silence: in which no command arrived.
-    """
-
-    def __init__(self) -> None:
-        self.longest_stall = 0.0
-        self.longest_silence = 0.0
-        self._powered = False
-        self._last_pass = 0.0
-        self._last_command = 0.0
-
-    def note(self, now: float, powered: bool, commanded: bool) -> None:
-        """Note one pass at `now` s: whether a motor was on before it, and whether a command arrived in it."""
-        if powered and not self._powered:
-            self.longest_stall = self.longest_silence = 0.0
-            self._last_pass = self._last_command = now
-        if powered:
-            self.longest_stall = max(self.longest_stall, now - self._last_pass)
-            self.longest_silence = max(self.longest_silence, now - self._last_command)
-        if commanded:
-            self._last_command = now
-        self._powered = powered
-        self._last_pass = now
-
-
-class CanLink:
-    """Receives commands from `bus` and sends replies to it. Raises BusError when the bus fails."""
-
-    def __init__(self, bus: can.BusABC) -> None:
-        self._bus = bus
-        self._pending: deque[Frame] = deque()  # echoes that have not arrived
-        self._echo_seen = False
-        self._no_echo = False
-
-    def receive(self, timeout: float) -> tuple[Frame | None, float]:
-        """Return the next frame that is not an echo, or None, and its age in s.
-
-        A remote frame is returned without data.
-        """
-        try:
-            message = self._bus.recv(timeout)
-        except can.CanOperationError as error:
-            # On udp_multicast a datagram without a CAN frame raises while it is unpacked: that is not a bus failure.
-            if error.__cause__ is None or isinstance(error.__cause__, OSError):
-                raise BusError(f"receiving on {self._bus.channel_info} failed: {error}") from error
-            return None, 0.0
-        if message is None or message.is_error_frame or message.is_fd:
-            return None, 0.0
-        frame = message.arbitration_id | (EXTENDED if message.is_extended_id else 0), bytes(message.data)
-        if frame in self._pending:
-            self._pending.remove(frame)
-            self._echo_seen = True
-            return None, 0.0
-        return frame, max(0.0, time.time() - message.timestamp)
-
-    def send(self, frame: Frame) -> None:
-        """Send a reply or a status frame."""
-        if not self._no_echo:
-            self._pending.append(frame)
-            if len(self._pending) > MAX_PENDING_ECHOES:
-                self._no_echo = not self._echo_seen
-                self._pending.clear()
-        frame_id, data = frame
-        message = can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED)
-        try:
-            self._bus.send(message)
-        except can.CanError as error:
-            raise BusError(f"sending on {self._bus.channel_info} failed: {error}") from error
 
 
 class SimulatedDevice:
@@ -118,8 +44,8 @@ class SimulatedDevice:
     May be set from any thread: `pitch` and `roll` of the trunk in rad; `bus_silent` (frames pass in neither direction,
     and the motors keep their last commands); `cut_off`, the same for each motor (4,); `encoder_error` (4,) rad, added
     to the angle that a motor reads; and the faults of each motor. truth: receives every physics step, None for no log.
-    To be read: `time`, s simulated; `slip`, s that `run` has lost against real time; `gaps`, the longest interruptions
-    of `run`.
+    To be read: `time`, s simulated; `slip`, s that `run` has lost against real time; and in s since the motors were
+    switched on, `longest_stall` between two passes of `run`, `longest_silence` in which no command arrived.
     """
 
     def __init__(self, arm: SimulatedArm, motors: Sequence[SimulatedMotor], side: str = "right") -> None:
@@ -136,13 +62,13 @@ class SimulatedDevice:
         self.encoder_error: Sequence[float] = (0.0,) * JOINT_COUNT
         self.truth: TruthLog | None = None
         self.slip = 0.0
-        self.gaps = GapMeter()
+        self.longest_stall = self.longest_silence = 0.0
         self._joint_of_id = {can_id: joint for joint, motor in enumerate(motors) for can_id in motor.received_ids}
         self._random = random.Random(0)  # of the delays of replies
         self._steps = 0
         self._clock = 0.0  # s elapsed, of which `time` is the part in whole steps
         self._trial: tuple[VirtualWearer, float] | None = None  # the wearer, and the time at which the script starts
-        self._motion: TrunkMotion | None = None  # of the wearer's current step
+        self.trunk_motion: TrunkMotion | None = None  #: of the wearer's current step; None if that moves no trunk
         self._trunk_step: int | None = None  # the step that it belongs to
         self._base = TrunkState()  # the arm's base moves like this
         self._frames = [0] * JOINT_COUNT  # received by each motor
@@ -166,12 +92,7 @@ class SimulatedDevice:
     @property
     def trunk(self) -> TrunkState:
         """The trunk's tilt and motion."""
-        return self._base if self._motion else TrunkState(self.pitch, self.roll)
-
-    @property
-    def trunk_moves(self) -> bool:
-        """Whether the wearer's current step moves the trunk."""
-        return self._motion is not None
+        return self._base if self.trunk_motion else TrunkState(self.pitch, self.roll)
 
     def return_power(self, delay: float) -> None:
         """Return the power of unplugged motors in `delay` s; they come back switched off."""
@@ -179,7 +100,7 @@ class SimulatedDevice:
 
     def start(self, wearer: VirtualWearer, delay: float = 0.0) -> None:
         """Let `wearer` start the script in `delay` s; replaces any other wearer."""
-        self._trial, self._trunk_step, self._motion = (wearer, self.time + delay), None, None
+        self._trial, self._trunk_step, self.trunk_motion = (wearer, self.time + delay), None, None
 
     def advance(self, duration: float) -> None:
         """Advance by `duration` s in whole steps; a remainder is kept for the next call."""
@@ -218,15 +139,23 @@ class SimulatedDevice:
 
         on_idle(now), `now` in monotonic s, is called whenever no reply is due, at the latest 5 ms after the last frame.
         """
-        link = CanLink(bus)
         outbox: list[tuple[float, Frame]] = []  # replies by the time at which they are due, a heap
-        last = time.monotonic()
-        timer = StatusTimer(self.motors, last, self._random)
+        last = heard = time.monotonic()
+        was_on = False
+        boards = {joint: motor for joint, motor in enumerate(self.motors) if isinstance(motor, SimulatedV3Motor)}
+        periods = {joint: 1.0 / motor.firmware.status_rate for joint, motor in boards.items()}
+        reports = {joint: last + self._random.uniform(0.0, period) for joint, period in periods.items()}  # next
         while not should_stop():
-            due = min(last + IDLE_PERIOD, timer.next, outbox[0][0] if outbox else math.inf)
-            frame, age = link.receive(max(0.0, due - time.monotonic()))
+            due = min(last + IDLE_PERIOD, *reports.values(), outbox[0][0] if outbox else math.inf)
+            frame, age = self._receive(bus, max(0.0, due - time.monotonic()))
             now = time.monotonic()
-            self.gaps.note(now, self.powered, frame is not None)
+            is_on = self.powered
+            if is_on and not was_on:
+                self.longest_stall, self.longest_silence, heard = 0.0, 0.0, now
+            elif is_on:
+                self.longest_stall = max(self.longest_stall, now - last)
+                self.longest_silence = max(self.longest_silence, now - heard)
+            was_on, heard = is_on, now if frame else heard
             self.slip += max(0.0, now - last - MAX_CATCH_UP)
             self.advance(min(now - last, MAX_CATCH_UP))
             last = now
@@ -234,12 +163,31 @@ class SimulatedDevice:
                 delay = self._random.uniform(*REPLY_DELAY) - min(age, REPLY_DELAY[0])
                 heapq.heappush(outbox, (now + delay, reply))
             while outbox and outbox[0][0] <= time.monotonic():
-                link.send(heapq.heappop(outbox)[1])
-            for joint in timer.due(last):
-                if frame := self.status(joint):
-                    link.send(frame)
+                _send(bus, heapq.heappop(outbox)[1])
+            for joint, period in periods.items():
+                if reports[joint] <= last:
+                    following = reports[joint] + period
+                    reports[joint] = following if following > last else last + period  # missed ones are not made up
+                    if frame := self.status(joint):
+                        _send(bus, frame)
             if not outbox:
                 on_idle(last)
+
+    def _receive(self, bus: can.BusABC, timeout: float) -> tuple[Frame | None, float]:
+        """Return the next command, or None, and its age in s. A remote frame is returned without data."""
+        try:
+            message = bus.recv(timeout)
+        except can.CanOperationError as error:
+            # On udp_multicast a datagram without a CAN frame raises while it is unpacked: that is not a bus failure.
+            if error.__cause__ is None or isinstance(error.__cause__, OSError):
+                raise BusError(f"receiving on {bus.channel_info} failed: {error}") from error
+            return None, 0.0
+        if message is None or message.is_error_frame or message.is_fd:
+            return None, 0.0
+        frame_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
+        if frame_id not in self._joint_of_id or list(message.data[:1]) == [frame_id]:
+            return None, 0.0
+        return (frame_id, bytes(message.data)), max(0.0, time.time() - message.timestamp)
 
     def _steady(self, duration: float) -> bool:
         """Return whether no torque changes for `duration` s, so that MuJoCo can make all of its steps at once."""
@@ -253,14 +201,13 @@ class SimulatedDevice:
         if elapsed >= 0.0 and index != self._trunk_step:
             self._trunk_step = index
             step = script.steps[index] if index < len(script.steps) else None
-            self._motion = motion_of(step, self.pitch, self.roll) if step else None
-        if self._motion:
-            state = self._motion.at(since)
+            self.trunk_motion = motion_of(step, self.pitch, self.roll) if step else None
+        if self.trunk_motion:
+            state = self.trunk_motion.at(since)
             self.pitch, self.roll = state.pitch, state.roll
             self._move_base(state)
 
     def _move_base(self, state: TrunkState) -> None:
-        """Let the base of the arm move with the trunk."""
         if state != self._base:
             self._base = state
             self.arm.move_base(*felt_in_base(self.side, state, self.arm.config.links.gravity))
@@ -270,7 +217,8 @@ class SimulatedDevice:
             self._power_returns = math.inf
             for motor in self.motors:
                 motor.unplugged = False
-        torque = list(map(SimulatedMotor.advance, self.motors, theta, velocity, (count * STEP,) * JOINT_COUNT))
+        at = zip(self.motors, theta, velocity, strict=True)
+        torque = [motor.advance(angle, speed, count * STEP) for motor, angle, speed in at]
         given: Torque = NO_TORQUE
         step = None
         if self._trial is not None:
@@ -281,3 +229,11 @@ class SimulatedDevice:
             self.truth.note(self.time, theta, velocity, torque, self.motors, self._frames, (given, step))
         self.arm.step(list(map(operator.add, torque, given)), count)
         self._steps += count
+
+
+def _send(bus: can.BusABC, frame: Frame) -> None:
+    frame_id, data = frame
+    try:
+        bus.send(can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED))
+    except can.CanError as error:
+        raise BusError(f"sending on {bus.channel_info} failed: {error}") from error

@@ -6,7 +6,7 @@ What the firmware of V1 and V2 does (CubeMars driver manual V1.0.15; Ben Katz's 
 - SET_ZERO makes the present angle zero. It gets no reply, and the motor ignores frames while it writes its memory.
 - A command stays in force until the next one: the motor has no time-out.
 
-What a V3 board does (CubeMars driver manual V3.0.0; frames in core/motors/wire_formats/mit_v3.py):
+What a V3 board does (CubeMars driver manual V3.0.0; frames in core/motors/wire_formats.py):
 - A command in MIT mode switches the motor on and stays in force until the next one. A current is a command too; 0 A
   switches the motor off. Other control modes are ignored here.
 - It replies to nothing. It sends its state `status_rate` times a second, on or off.
@@ -16,13 +16,12 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.bus_load import MAX_STATUS_RATE
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import ENTER, EXIT, SET_ZERO, MotorCommand, MotorReply, pack_reply, unpack_command
+from exo_gravity.core.motors.specs import ENTER, EXIT, SET_ZERO, MotorCommand, MotorReply, unpack_command
 from exo_gravity.core.motors.wire_formats import EXTENDED, MASTER_ID, MIT_V3, MODE_CURRENT, Frame
 from exo_gravity.core.params import owned
 
@@ -39,10 +38,6 @@ class Firmware:
     zero_silence: float = 1.0  #: s for which the motor ignores frames after SET_ZERO; users report 0.5 to 1.5
     #: Standard deviation of one reply.
     current_noise: float = owned(0.0, "noise of the torque in replies, as a share of it", (0.0, 0.5))
-    torque_noise: float = 0.0  #: Nm, standard deviation of the torque in one reply
-    #: s, time constant of the current loop. A reply carries the torque that the motor applies when the command arrives.
-    current_lag: float = 0.0
-    velocity_filter: float = 0.0  #: s, time constant of the speed in replies and for damping
     status_rate: float = MAX_STATUS_RATE  #: status frames per s of a V3 board
 
     def __post_init__(self) -> None:
@@ -62,24 +57,16 @@ class SimulatedMotor:
     def __init__(self, joint: JointMotor, firmware: Firmware | None = None) -> None:
         self.joint = joint
         self.firmware = firmware or Firmware()
+        #: Arbitration IDs of the replies, and of the frames that the motor obeys.
+        self.reply_id = MASTER_ID if self.firmware.reply_to_master else joint.can_id
+        self.received_ids: tuple[int, ...] = (joint.can_id,)
         self.unplugged = False
         self.temperature = 30.0
         self.error = 0
         self.entered = False
         self._command, self._data = _NO_COMMAND, b""
         self._silent_until = -math.inf  # s, after SET_ZERO
-        self._applied, self._speed = 0.0, 0.0  # Nm and rad/s, of current loop and speed filter
         self._random = random.Random(joint.can_id)
-
-    @property
-    def reply_id(self) -> int:
-        """Arbitration ID of the replies."""
-        return MASTER_ID if self.firmware.reply_to_master else self.joint.can_id
-
-    @property
-    def received_ids(self) -> tuple[int, ...]:
-        """Arbitration IDs of the frames that the motor obeys."""
-        return (self.joint.can_id,)
 
     @property
     def damping(self) -> float:
@@ -89,10 +76,7 @@ class SimulatedMotor:
     @property
     def steady(self) -> bool:
         """Whether the torque stays constant until the next frame, however the joint moves."""
-        firmware = self.firmware
-        if self.unplugged or firmware.velocity_filter or (firmware.current_lag and self.entered):
-            return False
-        return not (self.entered and (self._command.kp or self._command.kd))
+        return not (self.unplugged or (self.entered and (self._command.kp or self._command.kd)))
 
     def receive(
         self, data: bytes, position: float, velocity: float, now: float, frame_id: int | None = None
@@ -114,35 +98,21 @@ class SimulatedMotor:
             self.entered = False
         elif data != self._data:  # an arm at rest gets the same command in every cycle
             self._command, self._data = unpack_command(self.joint.spec, data), data
-        return self._reply(position, velocity)
+        return self._state(position, velocity)
 
     def advance(self, position: float, velocity: float, dt: float) -> float:
         """Let `dt` s pass for the motor on a joint at `position` rad and `velocity` rad/s; return its torque in Nm."""
-        filtered, lag = self.firmware.velocity_filter, self.firmware.current_lag
-        self._speed += (velocity - self._speed) * (-math.expm1(-dt / filtered) if filtered else 1.0)
-        if not lag:
-            return self.torque(position, velocity)
-        aim = self._aim(position, velocity)
-        self._applied = self._applied - (aim - self._applied) * math.expm1(-dt / lag) if self.entered else 0.0
-        return self._applied
+        return self.torque(position, velocity)
 
     def torque(self, position: float, velocity: float) -> float:
         """Return the torque in Nm on the joint at `position` rad and `velocity` rad/s.
 
-        The motor's kp (p_des - p) + kd (v_des - v) + t_ff, times `torque_scale`, clamped to the peak torque; behind a
-        current loop, what that has reached.
+        The motor's kp (p_des - p) + kd (v_des - v) + t_ff, times `torque_scale`, clamped to the peak torque.
         """
-        if not self.firmware.current_lag:
-            return self._aim(position, velocity)
-        return self._applied if self.entered and not self.unplugged else 0.0
-
-    def _aim(self, position: float, velocity: float) -> float:
         if self.unplugged:
             self.entered, self._command, self._data, self._silent_until = False, _NO_COMMAND, b"", -math.inf
         if not self.entered:
             return 0.0
-        if self.firmware.velocity_filter:
-            velocity = self._speed
         joint, command = self.joint, self._command
         torque = command.torque + command.kd * (command.velocity - joint.direction * velocity)
         if command.kp:
@@ -150,25 +120,21 @@ class SimulatedMotor:
         peak = joint.spec.peak_torque
         return joint.direction * clamp(torque * joint.torque_scale, peak)
 
-    def _readings(self, position: float, velocity: float) -> tuple[float, float, float]:
-        """Return the motor's angle, speed and torque in rad, rad/s and Nm, within the ranges of the wire format."""
+    def _state(self, position: float, velocity: float) -> bytes:
+        """Return the bytes of a reply or status frame, with readings within the ranges of the wire format."""
         joint, spec = self.joint, self.joint.spec
         torque = joint.direction * self.torque(position, velocity) / joint.torque_scale
         if self.firmware.current_noise:
             torque *= self._random.gauss(1.0, self.firmware.current_noise)
-        if self.firmware.torque_noise:
-            torque += self._random.gauss(0.0, self.firmware.torque_noise)
-        if self.firmware.velocity_filter:
-            velocity = self._speed
-        return (
+        readings = (
             clamp(joint.motor_position(position), spec.position_range),
             clamp(joint.direction * velocity, spec.velocity_range),
             clamp(torque, spec.torque_range),
         )
-
-    def _reply(self, position: float, velocity: float) -> bytes:
-        extra = (round(max(-40.0, min(215.0, self.temperature))), self.error) if self.firmware.reply_length == 8 else ()
-        return pack_reply(self.joint.spec, self.joint.can_id, *self._readings(position, velocity), *extra)
+        temperature, error = round(max(-40.0, min(215.0, self.temperature))), self.error
+        is_short = self.firmware.reply_length == 6 and joint.wire_format.replies
+        extra = (None, None) if is_short else (temperature, error)
+        return joint.wire_format.pack_reply(spec, MotorReply(joint.can_id, *readings, *extra))
 
 
 def clamp(value: float, limit: float) -> float:
@@ -182,11 +148,7 @@ class SimulatedV3Motor(SimulatedMotor):
     def __init__(self, joint: JointMotor, firmware: Firmware | None = None) -> None:
         super().__init__(joint, firmware)
         self._current_id = EXTENDED | MODE_CURRENT << 8 | joint.can_id
-
-    @property
-    def received_ids(self) -> tuple[int, ...]:
-        """Arbitration IDs of the frames that the board obeys."""
-        return self.joint.command_id, self._current_id
+        self.received_ids = self.joint.command_id, self._current_id
 
     def receive(
         self, data: bytes, position: float, velocity: float, now: float, frame_id: int | None = None
@@ -208,32 +170,7 @@ class SimulatedV3Motor(SimulatedMotor):
         """Return the status frame of the joint at `position` rad and `velocity` rad/s; None without power."""
         if self.unplugged:
             return None
-        values = self._readings(position, velocity)
-        temperature = round(clamp(self.temperature, 127.0))
-        reply = MotorReply(self.joint.can_id, *values, temperature, self.error)
-        return MIT_V3.status_id(self.joint.can_id), MIT_V3.pack_reply(self.joint.spec, reply)
-
-
-class StatusTimer:
-    """When each V3 board among `motors` sends its next status frame, from `now` (s) on."""
-
-    def __init__(self, motors: Sequence[SimulatedMotor], now: float, rng: random.Random) -> None:
-        boards = {joint: motor for joint, motor in enumerate(motors) if isinstance(motor, SimulatedV3Motor)}
-        self._periods = {joint: 1.0 / motor.firmware.status_rate for joint, motor in boards.items()}
-        self._next = {joint: now + rng.uniform(0.0, period) for joint, period in self._periods.items()}
-
-    @property
-    def next(self) -> float:
-        """The time in s of the next status frame; infinity for none."""
-        return min(self._next.values(), default=math.inf)
-
-    def due(self, now: float) -> Iterator[int]:
-        """Yield each joint whose status frame is due at `now` (s), once; frames that were missed are not made up."""
-        for joint, period in self._periods.items():
-            if self._next[joint] <= now:
-                following = self._next[joint] + period
-                self._next[joint] = following if following > now else now + period
-                yield joint
+        return MIT_V3.status_id(self.joint.can_id), self._state(position, velocity)
 
 
 def simulated_motor(joint: JointMotor, firmware: Firmware | None = None) -> SimulatedMotor:

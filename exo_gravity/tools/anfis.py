@@ -14,15 +14,12 @@ after Kaufman 1975). 100 evaluations achieve what thousands of epochs do not.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import Progress
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 from scipy.linalg import qr, solve_triangular
@@ -32,12 +29,11 @@ from threadpoolctl import threadpool_limits
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.bag.storage import Storage
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.anfis import INPUTS, JOINTS, UPRIGHT, Anfis, AnfisLaw, grades, scaled
+from exo_gravity.core.model.anfis import INPUTS, UPRIGHT, Anfis, AnfisLaw, grades, scaled
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.trial.analysis import analyse
-from exo_gravity.core.trial.recording import Recording
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.inputs.references import gravload
 
@@ -50,8 +46,6 @@ RIDGE = 1e-6  # keeps consequents that the data do not determine near 0; noisy d
 NARROWEST, WIDEST = 0.8, 4.0
 FARTHEST = 2.0  # largest distance of a centre from the middle of the box, in the same units
 MAX_EVALUATIONS = 100
-
-OnEvaluation = Callable[[int, float], None]  # (number of the evaluation, RMSE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,8 +92,13 @@ def from_bag(path: str | Path, configured: ConfiguredArm, functions: int) -> Sam
         expected = ", ".join(configured.joint_names)
         raise DataError(f"{path}: the joints are {', '.join(recording.joint_names)}: must be {expected}")
     order = [recording.joint_names.index(name) for name in configured.joint_names]
-    angle, torque = (part[:, order] for part in held(recording, _tilted(path, configured.side, bag.start)))
-    kept = np.all((angle >= configured.low) & (angle <= configured.high), axis=1)
+    tilted = _tilted(path, configured.side, bag.start)
+    holds = [h for h in analyse(recording).holds if not np.any((tilted >= h.start) & (tilted <= h.end))]
+    spans = [(recording.time >= hold.start) & (recording.time <= hold.end) for hold in holds]
+    angle = np.array([hold.pose for hold in holds]).reshape(-1, JOINT_COUNT)[:, order]
+    torque = np.array([recording.effort[span].mean(axis=0) for span in spans]).reshape(-1, JOINT_COUNT)[:, order]
+    known = np.isfinite(torque) & (angle >= configured.low) & (angle <= configured.high)
+    kept = np.all(known, axis=1)
     angle, torque = angle[kept, 1:], torque[kept, 1:]
     checked = np.arange(len(angle)) % HELD_OUT == HELD_OUT - 1
     if len(angle) < HELD_OUT:
@@ -108,22 +107,6 @@ def from_bag(path: str | Path, configured: ConfiguredArm, functions: int) -> Sam
     _check_coverage(scaled(angle[~checked], low, high), functions)
     source = f"recording {Path(path).name}, {len(angle)} holds"
     return Samples(angle[~checked], torque[~checked], angle[checked], torque[checked], low, high, source)
-
-
-def held(recording: Recording, tilted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean angle (m, 4) rad and measured torque (m, 4) Nm of each hold.
-
-    tilted: times in s at which the trunk was not upright; their holds are left out.
-    """
-    angle, torque = [], []
-    for hold in analyse(recording).holds:
-        within = (recording.time >= hold.start) & (recording.time <= hold.end)
-        if not np.any((tilted >= hold.start) & (tilted <= hold.end)):
-            angle.append(hold.pose)
-            torque.append(recording.effort[within].mean(axis=0))
-    angles, means = (np.array(values, dtype=float).reshape(-1, JOINT_COUNT) for values in (angle, torque))
-    known = np.all(np.isfinite(means), axis=1)
-    return angles[known], means[known]
 
 
 def _tilted(path: str | Path, side: str, start: int) -> np.ndarray:
@@ -165,17 +148,14 @@ class Trained:
 class Projection:
     """The residual as a function of the premises alone: all centres, then the logarithms of all widths."""
 
-    def __init__(
-        self, inputs: np.ndarray, output: np.ndarray, functions: int, ridge: float, on_evaluation: OnEvaluation
-    ) -> None:
-        self.inputs, self.functions, self.ridge = inputs, functions, ridge
+    def __init__(self, inputs: np.ndarray, output: np.ndarray, functions: int, ridge: float) -> None:
+        self.inputs, self.functions = inputs, functions
         self.extended = np.column_stack((np.ones(len(inputs)), inputs))
         consequents = functions ** inputs.shape[1] * self.extended.shape[1]
+        # The ridge as extra rows keeps full rank: no pivoting, and no squared condition number.
+        self.ridge = ridge * np.eye(consequents)
         self.target = np.concatenate((output, np.zeros(consequents)))
-        self.evaluations = 0
-        self.on_evaluation = on_evaluation
-        self._solved: np.ndarray | None = None  # the premises that the attributes below belong to
-        self._residual = self.target
+        self._solved: np.ndarray | None = None  # the premises that the attributes set by `_solve` belong to
 
     def residual(self, premises: np.ndarray) -> np.ndarray:
         """Return the residual of the samples, then of the ridge."""
@@ -183,13 +163,24 @@ class Projection:
         return self._residual
 
     def jacobian(self, premises: np.ndarray) -> np.ndarray:
-        """Return Kaufman's Jacobian: the derivative at fixed consequents, minus what the consequents compensate for."""
+        """Return Kaufman's Jacobian: the derivative at fixed consequents, minus what the consequents compensate for.
+
+        With e = -((u - centre) / sigma)^2 / 2 the grades are a softmax: d output / d e_q is the sum of
+        strength (f - output) over the rules with function q.
+        """
         self._solve(premises)
-        derivative = self._derivative()
-        projected = np.zeros((len(self.target), derivative.shape[1]))
-        projected[: len(derivative)] = derivative
-        projected -= self._basis @ (self._basis[: len(derivative)].T @ derivative)
-        return np.asarray(-projected)
+        count, dimension = self.inputs.shape
+        rule = self.extended @ self._consequent.T
+        output = (self._strength * rule).sum(axis=1, keepdims=True)
+        excess = (self._strength * (rule - output)).reshape(count, *(self.functions,) * dimension)
+        axes = range(1, dimension + 1)
+        by_exponent = np.stack([excess.sum(axis=tuple(a for a in axes if a != axis)) for axis in axes], axis=1)
+        distance = (self.inputs[:, :, None] - self._centre) / self._sigma
+        parts = by_exponent * distance / self._sigma, by_exponent * distance**2
+        derivative = np.hstack([part.reshape(count, -1) for part in parts])
+        jacobian = self._basis @ (self._basis[:count].T @ derivative)
+        jacobian[:count] -= derivative
+        return np.asarray(jacobian)
 
     def model(self, premises: np.ndarray) -> Anfis:
         """Return the model with these premises and their consequents."""
@@ -200,60 +191,28 @@ class Projection:
         """Solve the consequents for these premises, unless the last call did."""
         if self._solved is not None and np.array_equal(premises, self._solved):
             return
-        centre, width = premises.reshape(2, 1, self.inputs.shape[1], self.functions)
-        self._centre, self._sigma = centre, np.exp(width)
-        self._share = grades(self._centre, self._sigma, self.inputs)[0]  # (n, d, k)
-        strength = self._share[:, 0]
-        for axis in range(1, self.inputs.shape[1]):
-            strength = (strength[:, :, None] * self._share[:, axis, None, :]).reshape(len(strength), -1)
-        design = (strength[:, :, None] * self.extended[:, None, :]).reshape(len(strength), -1)
-        # The ridge as extra rows keeps full rank: no pivoting, and no squared condition number.
-        self._basis, triangle = qr(
-            np.vstack((design, self.ridge * np.eye(design.shape[1]))), mode="economic", check_finite=False
-        )
+        count, dimension = self.inputs.shape
+        self._centre, width = premises.reshape(2, 1, dimension, self.functions)
+        self._sigma = np.exp(width)
+        share = grades(self._centre, self._sigma, self.inputs)[0]  # (n, d, k)
+        strength = share[:, 0]
+        for axis in range(1, dimension):
+            strength = (strength[:, :, None] * share[:, axis, None, :]).reshape(count, -1)
+        self._strength = strength
+        design = (strength[:, :, None] * self.extended[:, None, :]).reshape(count, -1)
+        self._basis, triangle = qr(np.vstack((design, self.ridge)), mode="economic", check_finite=False)
         in_basis = self._basis.T @ self.target
         self._residual = self.target - self._basis @ in_basis
         self._consequent = solve_triangular(triangle, in_basis).reshape(-1, self.extended.shape[1])
         self._solved = premises.copy()
-        self.evaluations += 1
-        samples = self._residual[: len(self.inputs)]
-        self.on_evaluation(self.evaluations, float(np.sqrt(np.mean(samples**2))))
-
-    def _derivative(self) -> np.ndarray:
-        """Return d output / d premises (n, 2 d k) at fixed consequents.
-
-        With e = -((u - centre) / sigma)^2 / 2 the grades are a softmax: d output / d e_q = grade_q (G_q - output),
-        where G_q is the output of the rules with function q alone.
-        """
-        count, dimension, functions = self._share.shape
-        rule = (self.extended @ self._consequent.T).reshape(count, *(functions,) * dimension)
-        distance = (self.inputs[:, :, None] - self._centre) / self._sigma
-        by_centre, by_width = np.empty((2, count, dimension, functions))
-        for axis in range(dimension):
-            alone = np.moveaxis(rule, axis + 1, 1)
-            for other in reversed([i for i in range(dimension) if i != axis]):
-                share = self._share[:, other].reshape(count, *(1,) * (alone.ndim - 2), functions)
-                alone = (alone * share).sum(axis=-1)
-            share = self._share[:, axis]
-            by_exponent = share * (alone - (share * alone).sum(axis=1, keepdims=True))
-            by_centre[:, axis] = by_exponent * distance[:, axis] / self._sigma[0, axis]
-            by_width[:, axis] = by_exponent * distance[:, axis] ** 2
-        return np.hstack((by_centre.reshape(count, -1), by_width.reshape(count, -1)))
 
 
 def train(
-    inputs: np.ndarray,
-    output: np.ndarray,
-    functions: int = 4,
-    *,
-    ridge: float = RIDGE,
-    max_evaluations: int = MAX_EVALUATIONS,
-    on_evaluation: OnEvaluation = lambda evaluation, rmse: None,
+    inputs: np.ndarray, output: np.ndarray, functions: int = 4, ridge: float = RIDGE, max_evaluations: int | None = None
 ) -> Trained:
     """Return an ANFIS of `functions` Gaussians per input, trained on inputs (n, d) in -1..1 and output (n,).
 
-    on_evaluation(evaluation, RMSE) is called after each evaluation of the premises. Raises DataError if there are fewer
-    samples than consequents.
+    Raises DataError if there are fewer samples than consequents.
     """
     dimension = inputs.shape[1]
     consequents = functions**dimension * (dimension + 1)
@@ -265,13 +224,11 @@ def train(
     high = np.repeat((FARTHEST, np.log(WIDEST)), count)
     centre = np.tile(np.linspace(-1.0, 1.0, functions), dimension)
     start = np.concatenate((centre, np.full(count, np.log(1.05 * NARROWEST))))
-    problem = Projection(inputs, output, functions, ridge, on_evaluation)
-    found = least_squares(
-        problem.residual, start, problem.jacobian, (low, high), max_nfev=max_evaluations, ftol=1e-4, xtol=1e-8
-    )
+    problem = Projection(inputs, output, functions, ridge)
+    most = max_evaluations or MAX_EVALUATIONS
+    found = least_squares(problem.residual, start, problem.jacobian, (low, high), max_nfev=most, ftol=1e-4, xtol=1e-8)
     model = problem.model(found.x)
-    rmse = float(np.sqrt(np.mean((model.output(inputs)[:, 0] - output) ** 2)))
-    return Trained(model, rmse, problem.evaluations, time.perf_counter() - started)
+    return Trained(model, _rmse(model.output(inputs)[:, 0] - output), found.nfev, time.perf_counter() - started)
 
 
 def train_law(
@@ -279,29 +236,16 @@ def train_law(
 ) -> tuple[AnfisLaw, list[Trained]]:
     """Return the law for `arm` trained on `samples`, and the training results of joints 2, 3 and 4."""
     inputs = scaled(samples.angle, samples.low, samples.high)
-    results = []
     # Threads gain nothing on matrices this small, and wait for each other on busy cores: 73 s instead of 2 s.
-    with threadpool_limits(1), Progress(console=Console(stderr=True), transient=True) as progress:
-        for joint, torque in zip(JOINTS, samples.torque.T, strict=True):
-            show = _progress_line(progress, joint)
-            results.append(
-                train(inputs, torque, functions, ridge=ridge, max_evaluations=MAX_EVALUATIONS, on_evaluation=show)
-            )
+    with threadpool_limits(1):
+        results = [train(inputs, torque, functions, ridge) for torque in samples.torque.T]
     parts = (np.concatenate([getattr(r.model, part) for r in results]) for part in ("centre", "sigma", "consequent"))
     model = Anfis(*parts)
     held_out = model.output(scaled(samples.held_out_angle, samples.low, samples.high)) - samples.held_out_torque
-    error = {
-        "training": [result.rmse for result in results],
-        "held_out": np.sqrt(np.mean(held_out**2, axis=0)).tolist(),
-    }
+    error = {"training": [result.rmse for result in results], "held_out": list(map(_rmse, held_out.T))}
     box = tuple(samples.low.tolist()), tuple(samples.high.tolist())
     return AnfisLaw(model, *box, arm.first_moment[1:], arm.gravity, samples.source, error), results
 
 
-def _progress_line(progress: Progress, joint: str) -> OnEvaluation:
-    task = progress.add_task("", total=MAX_EVALUATIONS)
-
-    def show(evaluation: int, rmse: float) -> None:
-        progress.update(task, completed=evaluation, description=f"training joint {joint}: RMSE {rmse:.2e} Nm")
-
-    return show
+def _rmse(error: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(error**2)))

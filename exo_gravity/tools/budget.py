@@ -34,7 +34,7 @@ from exo_gravity.core.model.budget import (
     rounded_down,
     torque_at,
 )
-from exo_gravity.core.model.wearer import SEX, TABLES, TYPICAL_LENGTH, LinkLoad, Wearer
+from exo_gravity.core.model.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
 from exo_gravity.core.numbers import one_float
 from exo_gravity.tools.cli import missing
 from exo_gravity.tools.inputs.arms import ConfiguredArm, configured_arms, named
@@ -49,6 +49,7 @@ HEADINGS = (
     ("", "", "rated", "peak", "needs", "within", "within", "", "support"),
     ("joint", "motor", "Nm", "Nm", "Nm", "rated", "peak", "worst pose; pitch, roll (deg)", "within rated"),
 )
+LINE = "  {:<22}{:<8}{:>7}{:>7}{:>8}{:>10}{:>10}   {:<32}{:>12}"
 CELLS = 31  # of a map, along each axis
 REST = 60  # random settings of the angles that a map does not show, the same for each cell
 OTHER = (1, 2, 3, 2)  # the second axis of each joint's map: the angle that affects it most
@@ -59,17 +60,16 @@ class ArmBudget:
     """What each joint of an arm needs to carry its wearer's arm."""
 
     name: str  #: of the arm's namespace
-    robot: ArmModel  #: without the wearer
-    motors: tuple[str, ...]
+    carrying: ArmModel  #: with its share of the wearer's arm
+    support: float  #: 0..1, that share
+    motors: Sequence[str]
     workspace: Workspace
-    load: LinkLoad  #: of the wearer's arm
-    support: float  #: 0..1, the share of that load
     joints: tuple[JointBudget, ...]
 
     @property
     def beyond(self) -> list[int]:
         """Indices of the joints that need more than rated torque somewhere."""
-        return [number for number, joint in enumerate(self.joints) if joint.overloaded]
+        return [number for number, joint in enumerate(self.joints) if joint.torque > joint.rated]
 
 
 def arm_budget(configured: ConfiguredArm, wearer: Wearer, support: float, max_tilt: float) -> ArmBudget:
@@ -77,22 +77,23 @@ def arm_budget(configured: ConfiguredArm, wearer: Wearer, support: float, max_ti
 
     Raises ParameterError if the wearer does not fit the robot.
     """
-    motors = tuple(configured.can_bridge["motor"])
-    workspace = Workspace(configured.limits.position_min, configured.limits.position_max, max_tilt)
+    motors, robot = configured.can_bridge["motor"], configured.robot
+    workspace = Workspace(configured.low, configured.high, max_tilt)
     with named(f"{configured.namespace}/compensator"):
-        load = wearer.on_links(configured.robot.length)
+        load = wearer.on_links(robot.length)
         torques = motor_torques(motors, configured.can_bridge["torque_scale"])
-        joints = budget(configured.robot, load, support, workspace, *torques)
-    return ArmBudget(configured.namespace, configured.robot, motors, workspace, load, support, joints)
+        joints = budget(robot, load, support, workspace, *torques)
+        carrying = robot.with_wearer(*load, support)
+    return ArmBudget(configured.namespace, carrying, support, motors, workspace, joints)
 
 
 def table_lines(arm: ArmBudget) -> Iterator[str]:
     """Yield the lines of a table with one row per joint."""
     yield f"{arm.name} at support {arm.support:g}, trunk tilt up to {math.degrees(arm.workspace.max_tilt):g} deg"
-    yield from (_line(*heading) for heading in HEADINGS)
+    yield from (LINE.format(*heading).rstrip() for heading in HEADINGS)
     for number, joint in enumerate(arm.joints):
         *pose, pitch, roll = (f"{angle:.0f}" for angle in np.degrees(joint.worst) + 0.0)  # + 0.0: no minus zero
-        yield _line(
+        yield LINE.format(
             f"{number + 1} {JOINTS[number]}",
             arm.motors[number],
             f"{joint.rated:.3g}",
@@ -107,22 +108,18 @@ def table_lines(arm: ArmBudget) -> Iterator[str]:
 
 def _mirrored(arms: Sequence[ArmBudget]) -> list[ArmBudget]:
     """Return the arms whose tables differ; one table names all arms that share it."""
-    tables: dict[tuple[str, ...], list[ArmBudget]] = {}
+    tables: dict[tuple[str, ...], ArmBudget] = {}
     for arm in arms:
-        tables.setdefault(tuple(table_lines(replace(arm, name=""))), []).append(arm)
-    return [replace(alike[0], name=" and ".join(arm.name for arm in alike)) for alike in tables.values()]
-
-
-def _line(*cells: str) -> str:
-    joint, motor, rated, peak, needs, within_rated, within_peak, pose, support = cells
-    torques = f"{rated:>7}{peak:>7}{needs:>8}{within_rated:>10}{within_peak:>10}"
-    return f"  {joint:<22}{motor:<8}{torques}   {pose:<32}{support:>12}".rstrip()
+        table = tuple(table_lines(replace(arm, name="")))
+        tables[table] = replace(arm, name=f"{tables[table].name} and {arm.name}") if table in tables else arm
+    return list(tables.values())
 
 
 def verdict(arm: ArmBudget, wearer: Wearer) -> list[str]:
     """Return the conclusion in sentences: what is beyond the motors, which motor would do, which support fits."""
     support = "Full Zero-G" if arm.support == 1.0 else f"Support {arm.support:g}"
     what = f"{support} of a wearer of {wearer.body_mass:g} kg"
+    sentences = [f"{what} is within rated torque everywhere on {arm.name}."]
     if arm.beyond:
         sentences = [f"{what} is beyond the motors of {arm.name}."]
         sentences += [_shortage(arm, number) for number in arm.beyond]
@@ -131,20 +128,15 @@ def verdict(arm: ArmBudget, wearer: Wearer) -> list[str]:
         )
         if any(motor_for(arm.joints[number].torque) == "AK80-64" for number in arm.beyond):
             sentences.append("AK80-64 has a 64:1 gear: the wearer can hardly move it by hand.")
-    else:
-        sentences = [f"{what} is within rated torque everywhere on {arm.name}."]
-    largest = largest_support(arm.joints)
-    if largest is None:
-        sentences.append("The robot alone needs more than rated torque somewhere: no support stays within it.")
-    else:
-        sentences.append(f"The largest support within rated torque everywhere is {largest:g}.")
-    return sentences
+    fits = largest_support(arm.joints)
+    if fits is None:
+        return [*sentences, "The robot alone needs more than rated torque somewhere: no support stays within it."]
+    return [*sentences, f"The largest support within rated torque everywhere is {fits:g}."]
 
 
 def largest_moment(arm: ArmBudget) -> str:
     """Return the parameter of `can_bridge` for this load, rounded up."""
-    moments = arm.robot.with_wearer(*arm.load, arm.support).first_moment
-    shown = ", ".join(f"{math.ceil(1000.0 * moment) / 1000.0:g}" for moment in moments)
+    shown = ", ".join(f"{math.ceil(1000.0 * moment) / 1000.0:g}" for moment in arm.carrying.first_moment)
     return f"For the can_bridge of {arm.name}, if it never carries more: largest_moment: [{shown}]  # kg m"
 
 
@@ -189,7 +181,7 @@ def _joint_figure(arm: ArmBudget, joint: int) -> Figure:
     points = np.tile(rest, (CELLS * CELLS, 1))
     grid = np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2)
     points[:, [joint, other]] = np.repeat(grid, len(rest), axis=0)
-    torque = np.abs(torque_at(arm.robot.with_wearer(*arm.load, arm.support), points)[:, joint])
+    torque = np.abs(torque_at(arm.carrying, points)[:, joint])
     largest = torque.reshape(CELLS, CELLS, len(rest)).max(axis=-1)
     figure = Figure(figsize=(6.5, 5.2), layout="constrained")
     axis = figure.subplots()
@@ -200,9 +192,8 @@ def _joint_figure(arm: ArmBudget, joint: int) -> Figure:
         if largest.min() < limit < largest.max():
             lines = axis.contour(*angles, largest, [limit], colors="white", linestyles=style)
             outline: list[Any] = [withStroke(linewidth=2.5, foreground=INK)]
-            lines.set_path_effects(outline)
-            for text in axis.clabel(lines, fmt=f"{limit:g} Nm"):
-                text.set_path_effects(outline)
+            for artist in (lines, *axis.clabel(lines, fmt=f"{limit:g} Nm")):
+                artist.set_path_effects(outline)
     axis.set_title(f"{arm.name} joint {joint + 1}, {JOINTS[joint]}: {arm.motors[joint]}", loc="left", weight="bold")
     axis.set_xlabel(f"Joint {joint + 1} (deg)")
     axis.set_ylabel(f"Joint {other + 1} (deg); maximum over the other joints and the trunk's tilt")

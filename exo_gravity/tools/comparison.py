@@ -9,42 +9,36 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 from itertools import groupby, product
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import track
 
 from exo_gravity.core.model.anfis import AnfisLaw
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import gravity_torque, paper_mobile_torque, paper_static_torque
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.tools.anfis import GRID, Trained, from_gravload, train_law
-from exo_gravity.tools.inputs.arms import ConfiguredArm, with_cog_at_link_ends
+from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.inputs.references import PAPER_ANALYTICAL, PAPER_ANFIS, PAPER_SECONDS, REFERENCES, gravload
 
 TILTS = (0, 5, 10, 20, 30)  # degrees
-CHUNK = 2_000  # poses between two updates of the progress bar
 ROUNDING = 1e-12  # Nm; the exact law may differ this much from a reference
 LINK_ENDS, CONFIGURED = "at the link ends", "as configured"
 FLOOR, CEILING = 1e-7, 1.0  # Nm, ends of the colour scale
 FIGURE_GRID = (56, 56, 7)  # positions of joints 2, 3, 4 in the workspace figure
-# Overlapping lines stay visible, because the wider ones are drawn first.
-STYLES: dict[str, dict[str, Any]] = {
-    "EQ2-EQ5": {"color": "tab:orange", "marker": "s", "linewidth": 4, "markersize": 7},
-    "EQ1m-EQ4m": {"color": "tab:red", "marker": "D", "linewidth": 2},
-    "ANFIS": {"color": "tab:blue", "marker": "^", "linestyle": "--"},
-    "exact": {"color": "tab:green", "marker": "o"},
-}
+# Overlapping lines stay visible, because the first are wider.
+STYLES = {"EQ2-EQ5": "s-", "EQ1m-EQ4m": "D-", "ANFIS": "^--", "exact": "o-"}
 
 
-class Case(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Case:
     """Poses of an arm, each with a trunk tilt."""
 
     cog: str  #: which centres of gravity
@@ -52,18 +46,21 @@ class Case(NamedTuple):
     limit: int  #: of the tilt, degrees
     arm: ArmModel
     theta: np.ndarray  #: (n, 4) rad
-    direction: np.ndarray  #: (n, 3); this and the following (n,) rad as in `core.model.tilt.Tilt`
-    axis_angle: np.ndarray
-    beta: np.ndarray
-    phi: np.ndarray
+    tilts: Sequence[Tilt]  #: (n,)
+
+    @property
+    def direction(self) -> np.ndarray:
+        """Gravity's unit vectors in the arm's base frame, (n, 3)."""
+        return np.array([tilt.direction for tilt in self.tilts])
 
     def torques(self, anfis: AnfisLaw) -> dict[str, np.ndarray]:
         """Return the torques (n, 4) in Nm by each law; the ANFIS also outside its training box."""
-        axis_first = np.column_stack((self.axis_angle, self.theta[:, 1:]))  # with the paper's theta_1
+        axis, beta, phi = np.array([(tilt.axis_angle, tilt.beta, tilt.phi) for tilt in self.tilts]).T
+        axis_first = np.column_stack((axis, self.theta[:, 1:]))  # with the paper's theta_1
         return {
             "exact": gravity_torque(self.arm, self.theta, self.direction),
             "EQ2-EQ5": paper_static_torque(self.arm, axis_first),
-            "EQ1m-EQ4m": paper_mobile_torque(self.arm, axis_first, self.beta, self.phi),
+            "EQ1m-EQ4m": paper_mobile_torque(self.arm, axis_first, beta, phi),
             "ANFIS": self.arm.gain * np.pad(anfis.torques(self.theta[:, 1:]), ((0, 0), (1, 0))),
         }
 
@@ -83,11 +80,6 @@ class Row:
     largest: float
     rms_torque: float
 
-    @property
-    def share(self) -> float:
-        """RMSE / RMS torque; NaN for a joint without gravity torque."""
-        return self.rmse / self.rms_torque if self.rms_torque > 1e-12 else math.nan
-
 
 def cases(cog: str, configured: ConfiguredArm, count: int) -> Iterator[Case]:
     """Yield the 1,053 positions, then `count` random poses for each of `TILTS`."""
@@ -95,7 +87,8 @@ def cases(cog: str, configured: ConfiguredArm, count: int) -> Iterator[Case]:
     for limit in TILTS:
         rng, bound = np.random.default_rng(limit), math.radians(limit)
         theta = rng.uniform(configured.low, configured.high, (count, 4))
-        yield _case(cog, "random", limit, configured, theta, rng.uniform(-bound, bound, (count, 2)))
+        tilts = [Tilt.of(configured.side, *tilt) for tilt in rng.uniform(-bound, bound, (count, 2)).tolist()]
+        yield Case(cog, "random", limit, configured.robot, theta, tilts)
 
 
 def _upright(cog: str, configured: ConfiguredArm, counts: Sequence[int]) -> tuple[Case, list[np.ndarray]]:
@@ -103,13 +96,7 @@ def _upright(cog: str, configured: ConfiguredArm, counts: Sequence[int]) -> tupl
     box = zip(configured.low[1:], configured.high[1:], counts, strict=True)
     angles = [np.linspace(low, high, n) for low, high, n in box]
     theta = np.array(list(product((0.0,), *angles)))
-    return _case(cog, "workspace", 0, configured, theta, np.zeros((len(theta), 2))), angles
-
-
-def _case(cog: str, positions: str, limit: int, configured: ConfiguredArm, theta: np.ndarray, tilt: np.ndarray) -> Case:
-    tilts = [Tilt.of(configured.side, pitch, roll) for pitch, roll in tilt.tolist()]
-    felt = (np.array([getattr(t, name) for t in tilts]) for name in ("direction", "axis_angle", "beta", "phi"))
-    return Case(cog, positions, limit, configured.robot, theta, *felt)
+    return Case(cog, "workspace", 0, configured.robot, theta, [Tilt.of(configured.side)] * len(theta)), angles
 
 
 def compare(case: Case, torque: dict[str, np.ndarray], reference: str, expected: np.ndarray) -> list[Row]:
@@ -145,63 +132,42 @@ def evaluate(cog: str, configured: ConfiguredArm, count: int) -> Part:
     references = {name: build(configured.robot) for name, build in REFERENCES.items()}
     law, trained = train_law(from_gravload(configured), configured.robot)
     rows: list[Row] = []
-    total = (math.prod(GRID) + len(TILTS) * count) * len(references)
-    with Progress(console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(f"comparing, CoGs {cog}", total=total)
-        for case in cases(cog, configured, count):
-            torque = case.torques(law)
-            for name, reference in references.items():
-                expected = []
-                for start in range(0, len(case.theta), CHUNK):
-                    chunk = slice(start, start + CHUNK)
-                    expected.append(reference(case.theta[chunk], case.direction[chunk]))
-                    progress.update(task, advance=len(expected[-1]))
-                rows += compare(case, torque, name, np.concatenate(expected))
+    runs = list(product(cases(cog, configured, count), references))
+    for case, name in track(runs, f"comparing, CoGs {cog}", console=Console(stderr=True), transient=True):
+        rows += compare(case, case.torques(law), name, references[name](case.theta, case.direction))
     return Part(configured, rows, law, trained)
 
 
-@dataclass(frozen=True)
-class Validation:
-    """The comparison as a whole."""
-
-    link_ends: Part  #: with the paper's assumptions, d_n = l_n
-    as_configured: Part  #: with the configured centres of gravity
-
-    @classmethod
-    def of(cls, configured: ConfiguredArm, count: int) -> Validation:
-        """Return the comparison of an arm over `count` random poses per tilt limit."""
-        ends = replace(configured, robot=with_cog_at_link_ends(configured.robot))
-        return cls(evaluate(LINK_ENDS, ends, count), evaluate(CONFIGURED, configured, count))
-
-    @property
-    def rows(self) -> list[Row]:
-        """The rows of both parts."""
-        return self.link_ends.rows + self.as_configured.rows
-
-    def checks(self) -> Iterator[tuple[bool, str]]:
-        """Yield (held, sentence) for each check."""
-        exact = [row for row in self.rows if row.law == "exact"]
-        largest = max(row.largest for row in exact)
-        compared = sum(row.count for row in exact if row.joint == 1)
-        names = " and ".join(dict.fromkeys(row.reference for row in exact))
-        yield (
-            largest <= ROUNDING,
-            f"exact law within {ROUNDING:g} Nm of {names} in {compared:,} comparisons: largest {largest:.1e} Nm",
-        )
-        upright = [row for row in self.link_ends.rows if row.law.startswith("EQ") and not row.limit]
-        largest = max(row.largest for row in upright)
-        yield largest <= ROUNDING, f"EQ2-EQ5 and EQ1m-EQ4m too, with d_n = l_n, trunk upright: largest {largest:.1e} Nm"
-        for kind, where in (("training", "at the training positions"), ("held_out", "between them")):
-            ratios = [paper / ours for ours, paper in zip(self.link_ends.law.error[kind], PAPER_ANFIS, strict=True)]
-            shares = ", ".join(f"1/{ratio:.0f}" for ratio in ratios)
-            yield min(ratios) >= 1.0, f"ANFIS {where}: RMSE {shares} of the paper's, joints 2, 3, 4"
+def checks(link_ends: Part, as_configured: Part) -> Iterator[tuple[bool, str]]:
+    """Yield (held, sentence) for each check; link_ends: the results under the paper's assumption d_n = l_n."""
+    exact = [row for row in link_ends.rows + as_configured.rows if row.law == "exact"]
+    largest = max(row.largest for row in exact)
+    compared = sum(row.count for row in exact if row.joint == 1)
+    names = " and ".join(REFERENCES)
+    yield (
+        largest <= ROUNDING,
+        f"exact law within {ROUNDING:g} Nm of {names} in {compared:,} comparisons: largest {largest:.1e} Nm",
+    )
+    largest = max(row.largest for row in link_ends.rows if row.law.startswith("EQ") and not row.limit)
+    yield largest <= ROUNDING, f"EQ2-EQ5 and EQ1m-EQ4m too, with d_n = l_n, trunk upright: largest {largest:.1e} Nm"
+    for kind, where in (("training", "at the training positions"), ("held_out", "between them")):
+        ratios = [paper / ours for ours, paper in zip(link_ends.law.error[kind], PAPER_ANFIS, strict=True)]
+        shares = ", ".join(f"1/{ratio:.0f}" for ratio in ratios)
+        yield min(ratios) >= 1.0, f"ANFIS {where}: RMSE {shares} of the paper's, joints 2, 3, 4"
 
 
-def tables(validation: Validation) -> Iterator[str]:
+def tables(link_ends: Part, as_configured: Part) -> Iterator[str]:
     """Yield the lines of all tables."""
-    yield from _law_table(validation.rows)
+    yield f"{'RMSE of law - reference, Nm':<28}" + "".join(f"{f'joint {joint}':>10}" for joint in range(1, 5))
+    rows = link_ends.rows + as_configured.rows
+    for (cog, positions, limit, count), case in groupby(rows, lambda r: (r.cog, r.positions, r.limit, r.count)):
+        tilt = f"trunk tilted by up to {limit} degrees" if limit else "trunk upright"
+        yield f"CoGs {cog}; {count:,} {positions} positions; {tilt}"
+        for (law, reference), line in groupby(case, lambda r: (r.law, r.reference)):
+            if reference == "gravload" or law == "exact":
+                yield f"{f'  {law} - {reference}':<28}" + "".join(f"{row.rmse:>10.1e}" for row in line)
     yield "\nThe paper's comparison (d_n = l_n, g = 9.8 m/s^2, torques in Nm, not scaled)"
-    yield from _paper_table(validation.link_ends)
+    yield from _paper_table(link_ends)
 
 
 def _paper_table(part: Part) -> Iterator[str]:
@@ -223,31 +189,14 @@ def _paper_table(part: Part) -> Iterator[str]:
         yield f"{name:<34}{''.join(f'{value:>10.2e}' for value in values)}   {training}".rstrip()
 
 
-def _law_table(rows: Iterable[Row]) -> Iterator[str]:
-    """Yield the lines of RMSE, largest error and RMSE / RMS torque for each case, law and joint."""
-    yield f"{'law - reference; Nm':<22}" + "".join(f"{f'joint {joint}':^24}" for joint in range(1, 5))
-    yield f"{'':<22}" + "".join(f"{'RMSE':>9}{'largest':>9}{'share':>6}" for _ in range(4))
-    for (cog, positions, limit, count), case in groupby(rows, lambda r: (r.cog, r.positions, r.limit, r.count)):
-        tilt = f"trunk tilted by up to {limit} degrees" if limit else "trunk upright"
-        yield f"CoGs {cog}; {count:,} {positions} positions; {tilt}"
-        for (law, reference), line in groupby(case, lambda r: (r.law, r.reference)):
-            if reference == "gravload" or law == "exact":
-                yield f"{f'  {law} - {reference}':<22}" + "".join(map(_cell, line))
-
-
-def _cell(row: Row) -> str:
-    share = "-" if math.isnan(row.share) else f"{100 * row.share:.0f}%"
-    return f"{row.rmse:>9.1e}{row.largest:>9.1e}{share:>6}"
-
-
-def write(validation: Validation, output: Path) -> list[str]:
+def write(link_ends: Part, as_configured: Part, output: Path) -> list[str]:
     """Write the rows as CSV, one column per field in Nm (`limit` in degrees), and the figures; return the names."""
-    rows = validation.rows
+    rows = link_ends.rows + as_configured.rows
     with (output / "laws.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=list(asdict(rows[0])))
         writer.writeheader()
-        writer.writerows(asdict(row) for row in rows)
-    _workspace_figure(validation.as_configured).savefig(output / "workspace.png", dpi=130)
+        writer.writerows(map(asdict, rows))
+    _workspace_figure(as_configured).savefig(output / "workspace.png", dpi=130)
     _tilt_figure(rows).savefig(output / "tilt.png", dpi=130)
     return ["laws.csv", "workspace.png", "tilt.png"]
 
@@ -266,10 +215,8 @@ def _workspace_figure(part: Part) -> Figure:
                 norm=LogNorm(FLOOR, CEILING), cmap="viridis", rasterized=True,
             )  # fmt: skip
             axis.set_title(f"{name}: joint {joint}", fontsize=10)
-    for axis in grid[-1]:
-        axis.set_xlabel("joint 2, abduction (degrees)")
-    for axis in grid[:, 0]:
-        axis.set_ylabel("joint 3, flexion (degrees)")
+    figure.supxlabel("joint 2, abduction (degrees)")
+    figure.supylabel("joint 3, flexion (degrees)")
     figure.colorbar(image, ax=grid, label="RMSE over the elbow's range (Nm)", extend="min")
     figure.suptitle("Error against gravload over the workspace, trunk upright, configured centres of gravity")
     return figure
@@ -278,21 +225,17 @@ def _workspace_figure(part: Part) -> Figure:
 def _tilt_figure(rows: Sequence[Row]) -> Figure:
     """Draw the RMSE of each law over the tilt limit: one column per joint, one row per set of centres of gravity."""
     rows = [row for row in rows if row.positions == "random" and row.reference == "gravload"]
-    cogs = list(dict.fromkeys(row.cog for row in rows))
     figure = Figure(figsize=(13, 6.4), layout="constrained")
-    grid = figure.subplots(len(cogs), 4, sharex=True, sharey="col", squeeze=False)
-    for (cog, line), joint in product(zip(cogs, grid, strict=True), range(1, 5)):
-        axis = line[joint - 1]
-        for law, style in STYLES.items():
-            chosen = [row for row in rows if (row.cog, row.joint, row.law) == (cog, joint, law)]
-            label = f"{law} (at most {max(row.rmse for row in rows if row.law == law):.2g} Nm)"
-            axis.plot([row.limit for row in chosen], [row.rmse for row in chosen], label=label, **style)
-        axis.set_title(f"joint {joint}, CoGs {cog}", fontsize=10)
-        axis.grid(alpha=0.3)
-    for axis in grid[-1]:
-        axis.set_xlabel("tilt up to (degrees)")
-    for axis in grid[:, 0]:
-        axis.set_ylabel("RMSE (Nm)")
+    grid = figure.subplots(2, 4, sharex=True, sharey="col")
+    for cog, line in zip((LINK_ENDS, CONFIGURED), grid, strict=True):
+        for joint, axis in enumerate(line, start=1):
+            for (law, style), width in zip(STYLES.items(), (4, 2, 1.5, 1.5), strict=True):
+                chosen = [(row.limit, row.rmse) for row in rows if (row.cog, row.joint, row.law) == (cog, joint, law)]
+                axis.plot(*zip(*chosen, strict=True), style, label=law, linewidth=width)
+            axis.set_title(f"joint {joint}, CoGs {cog}", fontsize=10)
+            axis.grid(alpha=0.3)
+    figure.supxlabel("tilt up to (degrees)")
+    figure.supylabel("RMSE (Nm)")
     figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(STYLES))
     figure.suptitle("Error against gravload over trunk tilt, random poses; the ANFIS was trained upright")
     return figure

@@ -8,14 +8,13 @@ launcher dies, the nodes stop by themselves: each watches its standard input, wh
 If a bridge dies, its watchdog lets the arm down. If both die, the launcher starts the bridge's executable once more, to
 let the arm down and nothing else.
 
-`--only PATTERN` starts a part of the nodes, for an arm whose nodes run on two computers.
-
 Exit code 0: stopped by Ctrl-C, SIGTERM or a closed terminal. 1: a node ended, or motors may still be powered. 2: wrong
 use or wrong file.
 """
 
 from __future__ import annotations
 
+import _thread
 import argparse
 import contextlib
 import os
@@ -33,23 +32,24 @@ from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.tools.cli import require_ros
 from exo_gravity.tools.inputs.parameter_file import (
     ENDED_WELL,
+    OBSERVERS,
     RECOVERY,
     RECOVERY_TIMEOUT,
     STOP_TIMEOUT,
     SUPERVISED,
-    Stages,
     check_buses,
     chosen,
     executable,
-    is_observer,
     load,
     node_names,
     packaged_config,
+    stages,
 )
 
 LOG_FORMAT = "{severity} {message}"
 
 OnLine = Callable[[str, str], None]  # (node, line of its log)
+Stopping = threading.Event
 
 
 def print_line(node: str, line: str) -> None:
@@ -111,7 +111,7 @@ class Launcher:
 
     def dead(self) -> tuple[str, int] | None:
         """Return the name and exit code of a node that has ended, None while all run. An observer may end alone."""
-        codes = ((node, self.exit_code(node)) for node in list(self._processes) if not is_observer(node))
+        codes = ((node, self.exit_code(node)) for node in list(self._processes) if not node.endswith(OBSERVERS))
         return next(((node, code) for node, code in codes if code is not None), None)
 
     def stop(self) -> None:
@@ -119,7 +119,7 @@ class Launcher:
 
         Sets `maybe_powered` to the bridges whose motors may still be on.
         """
-        bridges, others, recorders = Stages.of(self._processes)
+        bridges, others, recorders = stages(self._processes)
         self._terminate(bridges, DESCENT_TIMEOUT)
         self.maybe_powered = [node for node in bridges if not self._is_off(node)]
         self._terminate(others, STOP_TIMEOUT)
@@ -181,36 +181,13 @@ class Launcher:
                 self._on_line(node, line.rstrip())
 
 
-class StopFlag:
-    """A flag that is set once. Unlike threading.Event it is safe to set in a signal handler that interrupts `set`."""
-
-    def __init__(self) -> None:
-        self._set = False
-
-    def set(self, *_: object) -> None:
-        """Set the flag; usable as a signal handler."""
-        self._set = True
-
-    def is_set(self) -> bool:
-        """Return whether the flag is set."""
-        return self._set
-
-    def wait(self, timeout: float) -> bool:
-        """Sleep for `timeout` s, or until a signal; return whether the flag is set."""
-        if not self._set:
-            time.sleep(timeout)
-        return self._set
-
-
-Stopping = StopFlag | threading.Event
-
-
-def stop_on_signals() -> StopFlag:
-    """Return a flag that Ctrl-C, SIGTERM or a closed terminal sets; nohup keeps the last one away."""
-    stopping = StopFlag()
+def stop_on_signals() -> Stopping:
+    """Return an event that Ctrl-C, SIGTERM or a closed terminal sets; nohup keeps the last one away."""
+    stopping = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, stopping.set)
+            # On a thread, which waits where the handler interrupts a holder of the event's lock.
+            signal.signal(number, lambda *_: _thread.start_new_thread(stopping.set, ()))
     return stopping
 
 

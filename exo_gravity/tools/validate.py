@@ -12,12 +12,13 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.model.tilt import SIDES
 from exo_gravity.tools.cli import extras
-from exo_gravity.tools.inputs.arms import configured_arm
+from exo_gravity.tools.inputs.arms import configured_arm, with_cog_at_link_ends
 
 COUNT, QUICK_COUNT = 100_000, 2_000  # random poses per limit of the tilt
 
@@ -34,16 +35,17 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
 
 def _run(options: argparse.Namespace) -> bool:
     """Run the comparison and print it; return whether all checks held."""
-    from exo_gravity.tools.comparison import Validation, tables, write
+    from exo_gravity.tools.comparison import CONFIGURED, LINK_ENDS, checks, evaluate, tables, write
 
     configured = configured_arm(options.params, options.side)
     output = Path(options.output)
     output.mkdir(parents=True, exist_ok=True)
-    validation = Validation.of(configured, QUICK_COUNT if options.quick else COUNT)
-    print("\n".join(tables(validation)))
-    written = write(validation, output)
-    print()
-    verdicts = list(validation.checks())
+    count = QUICK_COUNT if options.quick else COUNT
+    ends = replace(configured, robot=with_cog_at_link_ends(configured.robot))
+    parts = evaluate(LINK_ENDS, ends, count), evaluate(CONFIGURED, configured, count)
+    print(*tables(*parts), "", sep="\n")
+    written = write(*parts, output)
+    verdicts = list(checks(*parts))
     for held, sentence in verdicts:
         print(f"{'held' if held else 'FAILED':<7}{sentence}")
     print(f"Written: {', '.join(written)} in {output}")

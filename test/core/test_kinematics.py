@@ -13,7 +13,7 @@ from exo_gravity.core import ArmModel
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.kinematics import LinkInertia, least_inertia, turning_torque
 from exo_gravity.sim import ArmConfig, SimulatedArm
-from exo_gravity.sim.arm import DEFAULT_LINKS, rotation_in_base
+from exo_gravity.sim.arm import DEFAULT_LINKS, in_base
 from exo_gravity.tools.inputs.references import OFFSET, pinocchio_model
 
 from .test_gravity_oracles import random_arm
@@ -85,7 +85,7 @@ def left_behind(side, angular_acceleration, theta, torque):
     """Return by how much (4,) rad/s^2 the arm's joints accelerate on a base that turns, without gravity."""
     arm = SimulatedArm(ArmConfig(**FREE))
     arm.reset(theta)
-    arm.move_base((0.0,) * 3, (0.0,) * 3, rotation_in_base(side, angular_acceleration))
+    arm.move_base((0.0,) * 3, (0.0,) * 3, in_base(side, angular_acceleration, turning=True))
     arm.step(torque)
     return arm.data.qacc.copy()
 

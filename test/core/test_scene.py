@@ -48,23 +48,23 @@ def test_the_pose_is_that_of_the_description(side):
     data, rng = model.createData(), np.random.default_rng(1)
     for theta in rng.uniform(-math.pi, math.pi, (50, 4)):
         pinocchio.framesForwardKinematics(model, data, theta)
-        pose = arm_pose(arm(side), theta)
+        origins, axes, _ = arm_pose(arm(side), theta)
         frames = [data.oMf[model.getFrameId(name)] for name in arm(side).links]
-        assert pose.origins == pytest.approx(np.array([frame.translation for frame in frames]), abs=1e-12)
+        assert origins == pytest.approx(np.array([frame.translation for frame in frames]), abs=1e-12)
         # The description's own axes, in the frames of the links, which turn about them.
         local = [(0, 0, -1), (1, 0, 0), (0, -1, 0), (0, -1, 0)]
         mirrored = [(0, 0, 1), (-1, 0, 0), (0, -1, 0), (0, -1, 0)]
         turned = [f.rotation @ a for f, a in zip(frames, local if side == "left" else mirrored, strict=False)]
-        assert pose.axes == pytest.approx(np.array(turned), abs=1e-12)
+        assert axes == pytest.approx(np.array(turned), abs=1e-12)
 
 
 def test_the_range_of_each_joint_is_an_arc_on_which_the_link_points_at_its_angle():
     theta = (0.3, 0.8, 0.5, 1.0)
-    pose = arm_pose(arm(), theta)
+    origins, _, _ = arm_pose(arm(), theta)
     shapes = lines(arm_shapes(view(theta)), "limits")
     for n, (arc, needle) in enumerate(zip(shapes[0::2], shapes[1::2], strict=True)):
-        assert np.linalg.norm(arc.points - pose.origins[n], axis=1) == pytest.approx(RANGE_RADIUS)
-        link = pose.origins[n + 1] - pose.origins[n]
+        assert np.linalg.norm(arc.points - origins[n], axis=1) == pytest.approx(RANGE_RADIUS)
+        link = origins[n + 1] - origins[n]
         start, tip = needle.points
         assert (tip - start) / RANGE_RADIUS == pytest.approx(link / np.linalg.norm(link), abs=1e-12)
 
@@ -76,10 +76,10 @@ def test_a_joint_near_its_limit_is_red():
 
 def test_a_torque_spans_its_share_of_the_limit_in_its_direction_and_is_red_at_the_limit():
     shapes = lines(arm_shapes(view(effort=(0.0, 4.5, -1.0, 3.0))), "torques")
-    pose = arm_pose(arm(), STILL)
+    origins, axes, _ = arm_pose(arm(), STILL)
     for n, share in enumerate((0.0, 0.5, -1.0 / 3.0, 1.0)):
-        start, end = ((shapes[n].points[i] - pose.origins[n]) / TORQUE_RADIUS for i in (0, -1))
-        turn = math.atan2(np.cross(start, end) @ pose.axes[n], start @ end)
+        start, end = ((shapes[n].points[i] - origins[n]) / TORQUE_RADIUS for i in (0, -1))
+        turn = math.atan2(np.cross(start, end) @ axes[n], start @ end)
         assert math.remainder(turn - share * TORQUE_SPAN, math.tau) == pytest.approx(0.0, abs=1e-9)
     assert [shape.colour for shape in shapes] == [GREEN, GREEN, GREEN, RED]
 

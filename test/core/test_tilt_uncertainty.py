@@ -38,8 +38,7 @@ def test_an_estimate_that_has_lost_nothing_has_vqfs_own_error():
 def test_saturated_samples_add_up_over_a_run():
     uncertainty = settled()
     for _ in range(3):
-        uncertainty.advance(0.001, STILL, STILL)
-        uncertainty.lose(OVERSHOOT * RANGE * 0.001)
+        uncertainty.advance(0.001, STILL, STILL, unknown=OVERSHOOT * RANGE)
     assert added(uncertainty) == pytest.approx(3 * OVERSHOOT * RANGE * 0.001, rel=0.01)
 
 
@@ -59,23 +58,20 @@ def test_one_lost_sample_adds_less_than_a_long_gap():
 def test_repeated_samples_add_by_the_square_of_their_time():
     uncertainty = settled(acceleration=100.0)
     for k in range(1, 4):
-        uncertainty.advance(0.01, STILL, STILL)
-        uncertainty.repeat(0.01, 0.01 * k)
+        uncertainty.advance(0.01, STILL, STILL, repeated=0.01 * k)
     assert added(uncertainty) == pytest.approx(0.5 * 100.0 * 0.03**2, rel=0.1)
 
 
 def test_what_was_lost_decays_and_too_much_makes_the_estimate_begin_anew():
     uncertainty = settled()
-    uncertainty.lose(OVERSHOOT * RANGE * 0.002)
+    uncertainty.advance(0.002, STILL, STILL, unknown=OVERSHOOT * RANGE)
     before = added(uncertainty)
     assert not uncertainty.is_lost
     for _ in range(round(100 * DECAY_TIME)):
         uncertainty.advance(0.01, STILL, STILL)
     assert added(uncertainty) == pytest.approx(before / math.e, rel=0.02)
-    uncertainty.lose(OVERSHOOT * RANGE * 0.004)
+    uncertainty.advance(0.004, STILL, STILL, unknown=OVERSHOOT * RANGE)
     assert added(uncertainty) > 0.03 and uncertainty.is_lost and not uncertainty.is_settled
-    uncertainty.restart()
-    assert not uncertainty.is_lost and not uncertainty.is_settled
 
 
 def test_a_start_in_motion_takes_longer_and_an_unknown_bias_and_a_contradiction_widen_it():

@@ -83,7 +83,7 @@ MUTATIONS = (
     Mutation(
         "the watchdog never acts",
         ("can_bridge killed",),
-        (Edit(WATCHDOG, "    if not drive.powered:\n", "    if True:\n"),),
+        (Edit(WATCHDOG, "    if not notes.drive.powered:\n", "    if True:\n"),),
     ),
     Mutation(
         "a motor that was switched off is not switched on again",
@@ -111,7 +111,7 @@ MUTATIONS = (
     Mutation(
         "a second commander is ignored",
         ("second publisher of efforts",),
-        (Edit("exo_gravity/nodes/can_bridge/effort_exchange.py", "if self._commander.is_another(info):", "if False:"),),
+        (Edit("exo_gravity/nodes/can_bridge/effort_exchange.py", "if self.commander.is_another(info):", "if False:"),),
     ),
     Mutation(
         "stale efforts are accepted",
@@ -196,7 +196,7 @@ MUTATIONS = (
     Mutation(
         "the watchdog of silent motors never hands the bus over",
         ("motors silent for long, then the next can_bridge",),
-        (Edit(WATCHDOG, "is_wanted=is_wanted)", "is_wanted=lambda: False)"),),
+        (Edit(WATCHDOG, "let_down(arm, notes, log, is_wanted)", "let_down(arm, notes, log, lambda: False)"),),
     ),
     Mutation(
         "the brake of the descent grows without a bound",

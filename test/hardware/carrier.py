@@ -16,8 +16,7 @@ from pathlib import Path
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.drive import NOTHING, OFF, Drive
 from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.ownership.handover import ArmOnBus
-from exo_gravity.hardware.ownership.owned_bus import OwnedBus
+from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, OwnedBus
 
 
 def log(text: str) -> None:
@@ -42,7 +41,7 @@ def main(arm: ArmOnBus, drive: Drive) -> None:
             owned.watchdog.hand_over("a test")
             orders.clear()
         if not is_announced and notes.heartbeat and all(joint.time > 0.0 for joint in bus.samples):
-            print(owned.watchdog.pid, flush=True)
+            print(owned.watchdog.process.pid, flush=True)
             is_announced = True
         time.sleep(max(0.0, end - time.monotonic()))
 

@@ -20,7 +20,7 @@ from exo_gravity.hardware.ownership.bus_lock import (
     is_asked_for,
     notes_file,
 )
-from exo_gravity.hardware.ownership.owned_bus import OwnedBus, recover
+from exo_gravity.hardware.ownership.owned_bus import OwnedBus, take_over
 
 from .simulated_rig import MOTORS_OF_ARM, NoWatchdog
 from .virtual_rig import VirtualRig
@@ -183,7 +183,7 @@ def test_the_arm_that_a_dead_owner_left_with_its_motors_on_is_let_down_first(is_
     rig, log = VirtualRig(), []
     leave_on(rig)
     if is_recovery:
-        recover(rig.arm, "a recovery", log.append, 1.0, rig.clock)
+        take_over(rig.arm, "a recovery", log.append, clock=rig.clock).release()
     else:
         OwnedBus(rig.arm, "the next owner", log.append, rig.clock).close()
     assert log == [ENDED, "the arm is down, its motors are off"]

@@ -65,7 +65,7 @@ def test_no_motor_is_switched_on_and_one_without_power_is_missing(wire: Wire) ->
     device.motors[2].unplugged = True
     wire.play(device)
     with scan_of(wire) as bus:
-        assert [answer.can_id for answer in bus.scan(range(1, 6)).answers] == [1, 2, 4]
+        assert [answer.can_id for answer in bus.scan(range(1, 6))[0]] == [1, 2, 4]
         assert set(bus.poll((1, 3))) == {1}
     assert not device.powered
 
@@ -86,15 +86,15 @@ def test_two_motors_with_one_id_are_reported(wire: Wire) -> None:
 @pytest.mark.parametrize(
     ("reply", "problem"),
     [
-        (frame(3, bytes((3, 1, 2, 3, 4))), "ID 3: a reply of 5 bytes, must be 6 or 8"),
-        (frame(3, bytes((9, 0x80, 0, 0x80, 8, 0))), "ID 3: the reply says that it is from motor 9"),
-        (frame(77, bytes((3, 0x80, 0, 0x80, 8, 0))), "ID 3: a reply with ID 77, must be 3 or 0"),
+        (frame(3, bytes((3, 1, 2, 3, 4))), "a frame with ID 3 [03 01 02 03 04]"),
+        (frame(3, bytes((9, 0x80, 0, 0x80, 8, 0))), "a frame with ID 3 [09 80 00 80 08 00]"),
+        (frame(77, bytes((3, 0x80, 0, 0x80, 8, 0))), "a frame with ID 77 [03 80 00 80 08 00]"),
     ],
 )
 def test_a_reply_that_fits_no_motor_is_reported(wire: Wire, reply: can.Message, problem: str) -> None:
     Responder(wire, lambda message: [reply] if message.arbitration_id == 3 else [])
     with scan_of(wire) as bus:
-        assert bus.scan(range(1, 6)) == ((), (problem,))
+        assert bus.scan(range(1, 6)) == ((), (f"ID 3: {problem} follows a command, and is no motor's reply",))
 
 
 def test_a_late_reply_is_not_taken_for_a_second_motor(wire: Wire) -> None:
@@ -172,4 +172,4 @@ def test_a_v3_board_that_falls_silent_is_missing(wire: Wire) -> None:
 def test_a_v3_board_with_an_id_that_no_parameter_can_have_is_reported(wire: Wire) -> None:
     wire.repeat(frame(0x29C8, bytes(8), is_extended_id=True), 0.01)
     with scan_of(wire) as bus:
-        assert bus.scan(range(1, 4)).problems == ("ID 200: a V3 board; its ID must be from 1 to 126",)
+        assert bus.scan(range(1, 4))[1] == ("ID 200: a V3 board; its ID must be from 1 to 126",)

@@ -9,7 +9,7 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, MotorCommand, unpack_command
 from exo_gravity.core.safety.drive import NOTHING, Drive
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
-from exo_gravity.hardware.ownership.handover import ArmOnBus, let_down
+from exo_gravity.hardware.ownership.owned_bus import ArmOnBus
 
 from .simulated_rig import LIMITS, MOTORS_OF_ARM, PERIOD
 from .virtual_rig import VirtualRig
@@ -23,34 +23,30 @@ def commands(listener: Responder, can_id: int) -> list[MotorCommand]:
     return [unpack_command(spec, data) for data in frames if data[0] != can_id and data not in (ENTER, EXIT)]
 
 
-def let_down_of(rig: VirtualRig, drive: Drive | None = None, **options: object) -> bool:
-    return let_down(rig.arm, drive or rig.drive, clock=rig.clock, **options)
-
-
 def test_the_arm_is_lowered_from_the_noted_torques_and_its_motors_are_switched_off():
-    rig, notes = VirtualRig(), []
+    rig = VirtualRig()
     rig.arm = replace(rig.arm, period=PERIOD)
     listener = Responder(rig.wire)
-    assert let_down_of(rig, note=notes.append)
+    assert rig.let_down()
     torques = [command.torque for command in commands(listener, 2)]
     assert torques[0] == pytest.approx(rig.carrying[1], abs=0.02)
     largest = max(abs(after - before) for before, after in itertools.pairwise(torques))
     assert largest <= MAX_EFFORT_RATE * PERIOD + 2 * MOTORS["AK80-9"].torque_range / 4095
-    assert notes[0].powered and not notes[-1].powered
+    assert not rig.notes.drive.powered
     rig.assert_let_down()
 
 
 def test_the_noted_damping_is_kept():
     rig = VirtualRig()
     listener = Responder(rig.wire)
-    assert let_down_of(rig, Drive(rig.carrying, (5.0,) * 4, True))
+    assert rig.let_down(Drive(rig.carrying, (5.0,) * 4, True))
     assert min(command.kd for command in commands(listener, 2)[:50]) == pytest.approx(5.0, abs=0.01)
 
 
 def test_a_motor_that_has_lost_its_power_is_not_pushed_by_the_noted_torque():
     """The operator cut the supply: the motors are off, and the arm hangs."""
     rig = VirtualRig(pose=NOTHING, carried=False)
-    assert let_down_of(rig, Drive((0.0, 6.0, 2.0, 1.0), NOTHING, True))
+    assert rig.let_down(Drive((0.0, 6.0, 2.0, 1.0), NOTHING, True))
     assert rig.top_speed < 0.01
     assert rig.motors_on == [False] * 4
 
@@ -58,11 +54,11 @@ def test_a_motor_that_has_lost_its_power_is_not_pushed_by_the_noted_torque():
 def test_a_motor_that_does_not_reply_may_still_be_powered():
     rig = VirtualRig()
     rig.device.bus_silent = True
-    log, notes = [], []
-    assert not let_down_of(rig, note=notes.append, log=log.append, is_endless=False)
+    log = []
+    assert not rig.let_down(log=log.append, is_wanted=True)
     assert log == ["a motor does not reply; it may still be powered; trying again"]
-    assert notes[-1].powered
-    assert notes[-1].effort[1] == pytest.approx(rig.carrying[1], abs=0.2)
+    assert rig.notes.drive.powered
+    assert rig.notes.drive.effort[1] == pytest.approx(rig.carrying[1], abs=0.2)
 
 
 @pytest.mark.parametrize("is_adapter", [False, True], ids=["a motor", "the adapter"])
@@ -80,7 +76,7 @@ def test_an_arm_that_is_reached_again_late_is_let_down(is_adapter):
     else:
         rig.device.cut_off = (False, True, False, False)
         rig.clock.later(6.0, lambda: setattr(rig.device, "cut_off", (False,) * 4))
-    assert let_down_of(rig, log=log.append)
+    assert rig.let_down(log=log.append)
     assert log == ["a motor does not reply; it may still be powered; trying again"]
     assert rig.clock.monotonic() > start + 6.0
     rig.assert_let_down()
@@ -90,13 +86,13 @@ def test_a_bus_that_cannot_be_opened_is_tried_again_and_the_log_is_honest():
     rig, log = VirtualRig(), []
     rig.wire.refusal = BusError("CAN bus can0 cannot be opened")
     rig.clock.later(1.0, lambda: setattr(rig.wire, "refusal", None))
-    assert let_down_of(rig, log=log.append)
-    assert log == ["CAN bus can0 cannot be opened; the motors may still be powered; trying again"]
+    assert rig.let_down(log=log.append)
+    assert log == ["CAN bus can0 cannot be opened; the motors may still be powered"]
     rig.assert_let_down()
 
 
 def test_a_single_attempt_at_a_bus_that_cannot_be_opened_fails_with_the_reason():
-    log = []
-    arm = ArmOnBus(("no_such_interface", "x", {}), MOTORS_OF_ARM, LIMITS, PERIOD)
-    assert not let_down(arm, Drive(NOTHING, NOTHING, True), log=log.append, is_endless=False)
+    rig, log = VirtualRig(), []
+    rig.arm = ArmOnBus(("no_such_interface", "x", {}), MOTORS_OF_ARM, LIMITS, PERIOD)
+    assert not rig.let_down(log=log.append, is_wanted=True)
     assert "CAN bus no_such_interface x" in log[0]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from exo_gravity.hardware import ImuSample, TrunkEstimator
+from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 
 from ..support.imu_drivers import DURATION, Timing, driven, even, ordinary_drivers, swaying_trunk, true_stamps
 from ..support.imu_faults import bowing_trunk, follow, sampled

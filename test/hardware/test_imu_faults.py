@@ -14,7 +14,7 @@ import pytest
 
 from bench.imu_trials import read_trials
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.hardware import ImuSample, TrunkEstimator
+from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 
 from ..support.imu_faults import (
     STILL_TIME,

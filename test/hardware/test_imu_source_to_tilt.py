@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from exo_gravity.hardware import TrunkEstimator
 from exo_gravity.hardware.imu_sources import open_source
+from exo_gravity.hardware.trunk_estimator import TrunkEstimator
 
 from ..support.fake_imu.bus import FakeBus, FakeTime
 from ..support.fake_imu.chip import Motion

@@ -9,10 +9,11 @@ import pytest
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, SET_ZERO, pack_reply, unpack_command
+from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, SET_ZERO, MotorCommand, pack_reply, unpack_command
 from exo_gravity.core.safety.drive import NOTHING, OFF, Drive
+from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.hardware.can.can_port import open_bus
-from exo_gravity.hardware.can.motor_bus import FOREIGN_COMMAND, FrameFilter, MotorBus
+from exo_gravity.hardware.can.motor_bus import CONTEST_TIME, FOREIGN_COMMAND, HOLD_STIFFNESS, FrameFilter, MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 
 from ..support.simulated_device import frame
@@ -95,6 +96,46 @@ def test_stop_switches_every_motor_off_twice(bus, other):
     assert [can_id for can_id, data in received(other) if data == EXIT] == [1, 2, 3, 4, 1, 2, 3, 4]
 
 
+def commands(bus: can.BusABC, motor: JointMotor) -> list[MotorCommand]:
+    """Return the commands to `motor` that were received."""
+    sent = [data for can_id, data in received(bus) if can_id == motor.can_id and data[0] != motor.can_id]
+    return [unpack_command(motor.spec, data) for data in sent if data != SET_ZERO]
+
+
+def test_a_motor_that_another_sender_commands_holds_its_joint_for_a_while(bus, device, other):
+    contested = MOTORS_OF_ARM[1]
+    bus.exchange(ON, now(bus) + 1.0)
+    end = now(bus) + CONTEST_TIME
+    other.send(frame(2, contested.command(1.0, 0.0)))
+    bus.receive_until(end, lambda: bus.foreign_commands > 0)
+    received(other)
+    bus.exchange(ON, now(bus) + 1.0)
+    command = commands(other, contested)[-1]
+    assert command.kp == pytest.approx(HOLD_STIFFNESS, abs=0.1)
+    assert command.kd == pytest.approx(DAMPING, abs=0.01)
+    assert command.position == pytest.approx(contested.motor_position(0.2), abs=0.01)
+    bus.exchange(ON, now(bus) + 1.0)
+    assert commands(other, MOTORS_OF_ARM[2])[-1].kp == 0.0
+    while bus.is_contested:
+        bus.exchange(ON, now(bus) + 1.0)
+        bus.receive_until(now(bus) + 0.002)
+    received(other)
+    bus.exchange(ON, now(bus) + 1.0)
+    assert commands(other, contested)[-1].kp == 0.0
+
+
+def test_after_a_foreign_set_zero_the_motor_damps_and_does_not_hold(bus, device, other):
+    bus.exchange(ON, now(bus) + 1.0)
+    received(other)
+    other.send(frame(2, SET_ZERO))
+    bus.receive_until(now(bus) + 1.0, lambda: bus.foreign_commands > 0)
+    for _ in range(3):
+        bus.exchange(ON, now(bus) + 0.1)
+    answers = commands(other, MOTORS_OF_ARM[1])
+    assert {command.kp for command in answers} == {0.0}
+    assert {command.kd for command in answers} == {DAMPING}
+
+
 def test_set_zero_is_refused_while_the_motors_are_on(bus, other):
     bus.exchange(ON, now(bus))
     with pytest.raises(BusError, match="motors are on"):
@@ -168,7 +209,7 @@ def test_a_marked_command_is_an_echo_only_on_a_bus_that_marks_nothing_else() -> 
 
 @pytest.mark.parametrize("marks_echoes", [True, False])
 def test_a_command_that_we_sent_is_an_echo_when_it_comes_back(marks_echoes: bool) -> None:
-    frames = FrameFilter(MOTORS_OF_ARM, marks_echoes)
-    frames.sent((1, COMMAND))
+    frames = FrameFilter(MOTORS_OF_ARM, marks_echoes, echoes=True)
+    frames.awaited.append((1, COMMAND))
     assert frames.sort(frame(1, COMMAND)) == ("echo", 0)
     assert frames.sort(frame(1, COMMAND)) == (FOREIGN_COMMAND, 1)

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from bench.ordinary.__main__ import is_quiet
+from bench.ordinary.motors import Electronics, OrdinaryMotor
 from bench.ordinary.rows import EQUIPMENT, Row
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import ENTER, EXIT
+
+from ..sim.test_motor import SPEC, TORQUE_CODE, command, reply_to
 
 ROWS = (
     Row(EQUIPMENT[1], False, 250.0, "loop, work of 0.5 and 2 ms"),
@@ -19,3 +25,34 @@ def test_ordinary_equipment_carries_an_arm_without_an_alarm(row):
     assert is_quiet(result), result
     assert result.starts and not result.refused_samples
     assert 0.0 < result.largest_error < 0.5
+
+
+def entered(*electronics: float) -> OrdinaryMotor:
+    motor = OrdinaryMotor(JointMotor(SPEC, 5), Electronics(*electronics))
+    motor.receive(ENTER, 0.0, 0.0, 0.0)
+    return motor
+
+
+def test_a_reply_carries_the_torque_applied_when_its_command_arrives_and_the_current_loop_follows():
+    motor = entered(0.004, 1e-9)
+    assert abs(reply_to(motor, command(torque=2.0)).torque) <= TORQUE_CODE
+    for _ in range(4):
+        motor.advance(0.0, 0.0, 0.001)
+    assert reply_to(motor, command(torque=-1.0)).torque == pytest.approx(2.0 * (1.0 - np.exp(-1.0)), abs=TORQUE_CODE)
+    assert motor.torque(0.0, 0.0) > 1.2
+    motor.receive(EXIT, 0.0, 0.0, 0.0)
+    assert motor.torque(0.0, 0.0) == 0.0
+
+
+def test_a_filtered_speed_is_replied_and_damps():
+    motor = entered(1e-9, 0.005)
+    motor.receive(command(kd=1.0), 0.0, 0.0, 0.0)
+    assert motor.advance(0.0, 1.0, 0.005) == pytest.approx(np.exp(-1.0) - 1.0, abs=0.03)
+    speed = reply_to(motor, command(), velocity=1.0).velocity
+    assert speed == pytest.approx(1.0 - np.exp(-1.0), abs=2 * SPEC.velocity_range / 4095)
+
+
+def test_noise_of_the_torque_does_not_depend_on_the_torque():
+    motor = entered(1e-9, 1e-9, 0.1)
+    replied = [reply_to(motor, command()).torque for _ in range(500)]
+    assert np.std(replied) == pytest.approx(0.1, rel=0.2)

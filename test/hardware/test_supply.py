@@ -12,7 +12,6 @@ from exo_gravity.core.safety.drive import NOTHING, Drive, State
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.hardware.ownership.handover import let_down
 
 from .simulated_rig import LIMITS
 from .virtual_rig import CYCLE, QUICK, Carried, VirtualRig
@@ -107,7 +106,7 @@ def test_the_watchdog_leaves_motors_off_whose_supply_returns(wire_format: WireFo
 
     rig.clock.later(0.5, lambda: rig.switch_supply(False))
     rig.clock.later(0.5 + duration, release)
-    assert let_down(rig.arm, rig.drive, clock=rig.clock)
+    assert rig.let_down()
     assert watches and not watches[0].was_on
 
 

@@ -10,8 +10,7 @@ from vqf import VQF
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.tilt import gravity_in_trunk
-from exo_gravity.hardware import ImuSample, TrunkEstimator
-from exo_gravity.hardware.trunk_estimator import MAX_GAP
+from exo_gravity.hardware.trunk_estimator import MAX_GAP, ImuSample, TrunkEstimator
 
 from ..support.handheld_imu import read_recording
 

@@ -79,10 +79,10 @@ def test_the_exoskeletons_own_description_gives_the_torques_of_the_exact_law(sid
 
 
 @pytest.mark.parametrize(("text", "joint", "problem"), [
-    ("<robot", "j", "the XML of a URDF"),
-    ("<sdf/>", "j", "whose outermost element is robot"),
+    ("<robot", "j", "a URDF that Pinocchio reads"),
+    ("<sdf/>", "j", "a URDF that Pinocchio reads"),
     ("<robot xmlns:xacro='http://wiki.ros.org/xacro'><xacro:include/></robot>", "j", "run xacro first"),
-    (ONE_LINK.format(mass=1, kind="prismatic"), "j", "it is prismatic"),
+    (ONE_LINK.format(mass=1, kind="prismatic"), "j", "it has none"),
     (ONE_LINK.format(mass=1, kind="revolute"), "k", r"turning joints of the URDF \(j\)"),
     (ONE_LINK.format(mass=0, kind="revolute"), "j", "above 0 kg"),
     (ONE_LINK.replace('child link="link"', 'child link="x"').format(mass=1, kind="revolute"), "j", "Pinocchio reads"),

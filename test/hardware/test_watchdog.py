@@ -19,9 +19,8 @@ import pytest
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.drive import OFF
-from exo_gravity.hardware.clock import COMPUTER_CLOCK
 from exo_gravity.hardware.ownership.bus_lock import BusLock
-from exo_gravity.hardware.ownership.watchdog import Watchdog
+from exo_gravity.hardware.ownership.owned_bus import Watchdog
 
 from .simulated_rig import SimulatedRig, wait_until
 
@@ -140,12 +139,12 @@ def test_a_full_pipe_of_the_log_does_not_delay_the_watchdog(rig, carry):
 
 def test_a_frozen_watchdog_is_noticed_and_recovers_and_ends_with_its_bridge(rig):
     lock = BusLock(rig.arm.address, "a test")
-    watchdog = Watchdog(lock, rig.arm, COMPUTER_CLOCK)
+    watchdog = Watchdog(lock, rig.arm)
     wait_until(lambda: lock.notes.heartbeat)
     assert watchdog.alive
-    os.kill(watchdog.pid, signal.SIGSTOP)
+    os.kill(watchdog.process.pid, signal.SIGSTOP)
     wait_until(lambda: not watchdog.alive)
-    os.kill(watchdog.pid, signal.SIGCONT)
+    os.kill(watchdog.process.pid, signal.SIGCONT)
     wait_until(lambda: watchdog.alive)
     watchdog.close()
     assert not watchdog.alive

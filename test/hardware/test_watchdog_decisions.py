@@ -13,8 +13,8 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.drive import OFF
 from exo_gravity.core.safety.params import FROZEN
 from exo_gravity.hardware.ownership.bus_lock import BusLock, DriveNotes
-from exo_gravity.hardware.ownership.owned_bus import OwnedBus
-from exo_gravity.hardware.ownership.watchdog import HEARTBEAT_TIMEOUT, LONGEST_LOOK, Silence, SleepInhibitor, guard
+from exo_gravity.hardware.ownership.owned_bus import HEARTBEAT_TIMEOUT, LONGEST_LOOK, OwnedBus, Silence
+from exo_gravity.hardware.ownership.watchdog import SleepInhibitor, guard
 
 from ..support.launched_nodes import children
 from .virtual_rig import CYCLE, VirtualRig
@@ -50,7 +50,8 @@ class Bridge:
     def __init__(self) -> None:
         self.rig = VirtualRig()
         self.clock = self.rig.clock
-        self.notes = DriveNotes(mmap.mmap(-1, mmap.PAGESIZE), self.clock)
+        self.notes = DriveNotes.from_buffer(mmap.mmap(-1, mmap.PAGESIZE))
+        self.notes.clock = self.clock
         self.notes.owner = "/right/can_bridge (PID 1)"
         self.pipe = Pipe(self.clock)
         self.pipe.messages.append(self.rig.arm)
@@ -78,7 +79,7 @@ class Bridge:
     def guard(self, is_wanted: Callable[[], bool] = lambda: False) -> int:
         """Run the watchdog to its end; return its exit code."""
         inhibit = self.inhibited.append
-        return guard(self.kill, self.notes, self.pipe, self.log.append, self.clock, is_wanted, inhibit)
+        return guard(self.kill, self.notes, self.pipe, self.log.append, is_wanted, inhibit)
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -16,7 +17,8 @@ from exo_gravity.core.safety.drive import NOTHING, Drive, State
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop, EffortCommand
-from exo_gravity.hardware.ownership.handover import ArmOnBus
+from exo_gravity.hardware.ownership.bus_lock import DriveNotes
+from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, let_down
 
 from .simulated_rig import LIMITS, POSE, Rig
 from .virtual_time import Wire
@@ -66,6 +68,15 @@ class VirtualRig(Rig):
         """Switch the supply of all motors; they come back switched off."""
         for motor in self.device.motors:
             motor.unplugged = not on
+
+    def let_down(
+        self, drive: Drive | None = None, is_wanted: bool = False, log: Callable[[str], None] = lambda text: None
+    ) -> bool:
+        """Let down the arm that a dead process left with `drive` (default: what holds it); return whether it is off."""
+        self.notes = DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes)))
+        self.notes.clock = self.clock
+        self.notes.note(drive or self.drive)
+        return let_down(self.arm, self.notes, log, lambda: is_wanted)
 
     def raising(self) -> tuple[float, ...]:
         """Return the torque (4,) in Nm that carries the arm where it is, and moves it to `POSE`."""

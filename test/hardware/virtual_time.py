@@ -19,6 +19,7 @@ from functools import partial
 from typing import Any
 
 import can
+from can.interfaces.udp_multicast import UdpMulticastBus
 
 from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, Frame
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
@@ -118,6 +119,10 @@ class VirtualBus(can.BusABC):
             raise self._wire.error
 
 
+class EchoingBus(VirtualBus, UdpMulticastBus):
+    """One end of a `Wire` that echoes, known by its type as udp_multicast is."""
+
+
 class Responder:
     """Answers each frame on `wire` with those that `answer` returns, at once. received: all frames."""
 
@@ -192,7 +197,7 @@ class Wire:
         if self.refusal:
             raise self.refusal
         self.opened += 1
-        bus = VirtualBus(self)
+        bus = EchoingBus(self) if self._echoes else VirtualBus(self)
         self.ends.append(bus)
         return bus
 

@@ -9,7 +9,7 @@ import pytest
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from exo_gravity.nodes.ros.sole_publisher import COUNT_PERIOD, SolePublisher
+from exo_gravity.nodes.ros.hot_path import COUNT_PERIOD, SolePublisher
 
 from ..hardware.virtual_time import VirtualClock
 

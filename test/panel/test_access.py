@@ -1,6 +1,7 @@
 """The token and the sessions that it opens; which host and origin a request may name."""
 
 import pytest
+from starlette.responses import PlainTextResponse
 
 from exo_gravity.panel.access import ATTEMPT_WINDOW, ATTEMPTS, Access, is_loopback, is_same_origin
 
@@ -10,6 +11,10 @@ class Clock:
 
     def __call__(self) -> float:
         return self.now
+
+
+def access_at(host, token="", clock=None):
+    return Access(PlainTextResponse("never reached"), host, token, clock or Clock())
 
 
 @pytest.mark.parametrize(
@@ -30,25 +35,25 @@ def test_only_loopback_addresses_are_loopback(host, expected):
 
 
 def test_on_loopback_no_token_is_needed_and_elsewhere_a_random_one_is_made():
-    assert Access("127.0.0.1", "", Clock()).is_open
-    one, other = (Access("0.0.0.0", "", Clock()) for _ in range(2))
+    assert access_at("127.0.0.1").is_open
+    one, other = (access_at("0.0.0.0") for _ in range(2))
     assert not one.is_open
     assert len(one.token) >= 32
     assert one.token != other.token
-    assert not Access("127.0.0.1", "given", Clock()).is_open
+    assert not access_at("127.0.0.1", "given").is_open
 
 
 def test_without_a_token_only_a_loopback_name_may_be_asked_for():
-    access = Access("127.0.0.1", "", Clock())
+    access = access_at("127.0.0.1")
     for host in ("127.0.0.1:8080", "localhost:8080", "[::1]:8080"):
         assert access.allows_host(host)
     for host in ("panel.example.org:8080", "", "127.0.0.1.example.org", "[bad"):
         assert not access.allows_host(host)
-    assert Access("0.0.0.0", "secret", Clock()).allows_host("panel.example.org")
+    assert access_at("0.0.0.0", "secret").allows_host("panel.example.org")
 
 
 def test_the_cookie_is_a_secret_of_its_own():
-    access, other = (Access("0.0.0.0", "secret", Clock()) for _ in range(2))
+    access, other = (access_at("0.0.0.0", "secret") for _ in range(2))
     session = access.session
     assert len(session) >= 32 and session != other.session
     assert access.allows(session)
@@ -58,7 +63,7 @@ def test_the_cookie_is_a_secret_of_its_own():
 
 def test_wrong_tokens_block_their_address_for_a_while_and_no_other():
     clock = Clock()
-    access = Access("0.0.0.0", "secret", clock)
+    access = access_at("0.0.0.0", "secret", clock)
     for _ in range(ATTEMPTS):
         assert not access.is_token("wrong", "10.0.0.1")
     assert not access.is_token("secret", "10.0.0.1")
@@ -68,7 +73,7 @@ def test_wrong_tokens_block_their_address_for_a_while_and_no_other():
 
 
 def test_wrong_tokens_from_many_addresses_block_all():
-    access = Access("0.0.0.0", "secret", Clock())
+    access = access_at("0.0.0.0", "secret")
     for n in range(10 * ATTEMPTS):
         access.is_token("wrong", f"10.0.1.{n}")
     assert not access.is_token("secret", "10.0.0.1")

@@ -12,7 +12,6 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.specs import ENTER, SET_ZERO, unpack_reply
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, VirtualWearer
-from exo_gravity.sim.device import GapMeter
 
 from ..support.simulated_device import RAISED, SPECS, command, make_device
 
@@ -113,49 +112,6 @@ def test_two_motors_with_the_same_id_are_rejected(ids):
         make_device(ids=ids)
 
 
-def passes(meter, times, powered=True, commanded=True):
-    for now in times:
-        meter.note(now, powered, commanded)
-
-
-def test_a_device_that_runs_regularly_has_short_gaps():
-    meter = GapMeter()
-    passes(meter, (0.0, 0.002, 0.004, 0.006))
-    assert meter.longest_stall == pytest.approx(0.002)
-    assert meter.longest_silence == pytest.approx(0.002)
-
-
-def test_a_device_that_is_not_run_is_a_stall_and_a_silence():
-    meter = GapMeter()
-    passes(meter, (0.0, 0.002, 0.142, 0.144))
-    assert meter.longest_stall == pytest.approx(0.14)
-    assert meter.longest_silence == pytest.approx(0.14)
-
-
-def test_a_controller_that_sends_nothing_is_a_silence_but_no_stall():
-    meter = GapMeter()
-    passes(meter, (0.0, 0.002))
-    passes(meter, (0.002 * n for n in range(2, 42)), commanded=False)
-    assert meter.longest_stall == pytest.approx(0.002)
-    assert meter.longest_silence == pytest.approx(0.08)
-
-
-def test_gaps_while_the_motors_are_off_do_not_count():
-    meter = GapMeter()
-    passes(meter, (0.0, 0.3), powered=False, commanded=False)
-    passes(meter, (0.6, 0.602))
-    assert meter.longest_stall == meter.longest_silence == pytest.approx(0.002)
-
-
-def test_the_measurement_starts_again_when_the_motors_are_switched_on_again():
-    meter = GapMeter()
-    passes(meter, (0.0, 0.3))
-    passes(meter, (0.4,), powered=False)
-    assert meter.longest_stall == pytest.approx(0.3)
-    passes(meter, (0.5, 0.502))
-    assert meter.longest_stall == pytest.approx(0.002)
-
-
 @pytest.fixture
 def device():
     return make_device()
@@ -169,14 +125,14 @@ def test_the_trunk_bows_and_stays_bowed(device):
     device.pitch, device.roll = 0.1, -0.06
     perform(device, {"hold": 0.5}, {"bow": 0.5, "over": 1.0}, {"hold": 0.5})
     device.advance(0.4)
-    assert (device.pitch, device.trunk_moves) == (0.1, False)
+    assert (device.pitch, device.trunk_motion) == (0.1, None)
     device.advance(0.6)
-    assert device.trunk_moves
+    assert device.trunk_motion
     assert device.trunk.pitch == device.pitch == pytest.approx(0.3, abs=0.001)
     assert device.trunk.pitch_rate == pytest.approx(0.4 * 1.875, rel=0.01)
     device.advance(1.0)
     assert (device.pitch, device.roll) == pytest.approx((0.5, -0.06), abs=1e-6)
-    assert not device.trunk_moves
+    assert not device.trunk_motion
     assert device.trunk[2:] == (0.0,) * 4 + ((0.0,) * 3,)
 
 

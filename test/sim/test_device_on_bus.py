@@ -13,7 +13,7 @@ import can
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.specs import ENTER, unpack_reply
+from exo_gravity.core.motors.specs import ENTER, EXIT, unpack_reply
 from exo_gravity.sim import Firmware
 from exo_gravity.sim import device as device_module
 
@@ -96,16 +96,6 @@ def test_an_echo_that_the_bus_marks_is_not_taken_for_a_command():
         host.send(frame(1, command(0)))
         assert next_reply(host) is not None
         assert next_reply(host, timeout=0.05) is None
-
-
-def test_on_a_bus_without_echo_a_command_with_the_bytes_of_a_reply_is_executed():
-    options = {"interface": "virtual", "channel": f"device-{next(channels)}"}
-    with running(make_device(), options) as host:
-        for _ in range(device_module.MAX_PENDING_ECHOES + 5):
-            host.send(frame(1, command(0)))
-            reply = next_reply(host)
-        host.send(frame(1, bytes(reply.data)))
-        assert next_reply(host) is not None
 
 
 def test_frames_that_are_not_for_a_motor_are_ignored(options):
@@ -217,3 +207,39 @@ def test_physics_catches_up_after_a_late_wake_up_and_more_than_50_ms_count_as_sl
     device.run(bus, bus.done)
     assert device.time == pytest.approx(simulated, abs=1e-9)
     assert device.slip == pytest.approx(slip)
+
+
+class ScriptedBus:
+    """A bus on which each wait takes a time and ends with a frame, as `script` says: pairs of s and data, or None."""
+
+    def __init__(self, script):
+        self.now, self.script = 0.0, list(script)
+
+    def recv(self, timeout):
+        wait, data = self.script.pop(0)
+        self.now += wait
+        return None if data is None else frame(1, data, timestamp=self.now)
+
+    def send(self, message):
+        pass
+
+
+REGULAR = [(0.002, command(0))] * 5
+
+
+@pytest.mark.parametrize(
+    ("script", "stall", "silence"),
+    [
+        ([(0.3, None), (0.6, ENTER), *REGULAR], 0.002, 0.002),
+        ([(0.0, ENTER), *REGULAR, (0.138, command(0)), *REGULAR], 0.138, 0.138),
+        ([(0.0, ENTER), *REGULAR, *[(0.002, None)] * 39, (0.002, EXIT), (0.5, None)], 0.002, 0.08),
+        ([(0.0, ENTER), *REGULAR, (0.3, EXIT), (0.4, ENTER), *REGULAR], 0.002, 0.002),
+    ],
+    ids=["regular", "stalled", "no commands", "switched on again"],
+)
+def test_stalls_and_silence_are_measured_while_the_motors_are_on(monkeypatch, script, stall, silence):
+    bus, device = ScriptedBus(script), make_device()
+    clock = SimpleNamespace(monotonic=lambda: bus.now, time=lambda: bus.now)
+    monkeypatch.setattr(device_module, "time", clock)
+    device.run(bus, lambda: not bus.script)
+    assert (device.longest_stall, device.longest_silence) == (pytest.approx(stall), pytest.approx(silence))

@@ -212,28 +212,3 @@ def test_a_motor_that_is_plugged_in_again_keeps_only_its_zero():
 def test_an_impossible_length_of_replies_is_rejected_by_name():
     with pytest.raises(ParameterError, match="reply_length"):
         Firmware(reply_length=7)
-
-
-def test_a_reply_carries_the_torque_applied_when_its_command_arrives_and_the_current_loop_follows():
-    motor = entered(Firmware(current_lag=0.004))
-    assert abs(reply_to(motor, command(torque=2.0)).torque) <= TORQUE_CODE
-    for _ in range(4):
-        motor.advance(0.0, 0.0, 0.001)
-    assert reply_to(motor, command(torque=-1.0)).torque == pytest.approx(2.0 * (1.0 - np.exp(-1.0)), abs=TORQUE_CODE)
-    assert motor.torque(0.0, 0.0) > 1.2
-    motor.receive(EXIT, 0.0, 0.0, 0.0)
-    assert motor.torque(0.0, 0.0) == 0.0
-
-
-def test_a_filtered_speed_is_replied_and_damps():
-    motor = entered(Firmware(velocity_filter=0.005))
-    motor.receive(command(kd=1.0), 0.0, 0.0, 0.0)
-    assert motor.advance(0.0, 1.0, 0.005) == pytest.approx(np.exp(-1.0) - 1.0, abs=0.03)
-    speed = reply_to(motor, command(), velocity=1.0).velocity
-    assert speed == pytest.approx(1.0 - np.exp(-1.0), abs=2 * SPEC.velocity_range / 4095)
-
-
-def test_noise_of_the_torque_does_not_depend_on_the_torque():
-    motor = entered(Firmware(torque_noise=0.1))
-    replied = [reply_to(motor, command()).torque for _ in range(500)]
-    assert np.std(replied) == pytest.approx(0.1, rel=0.2)

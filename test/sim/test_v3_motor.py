@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import random
 from dataclasses import replace
+from types import SimpleNamespace
 
+import can
+import numpy as np
 import pytest
 
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
-from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
-from exo_gravity.sim import Firmware, SimulatedMotor, SimulatedV3Motor, simulated_motor
-from exo_gravity.sim.motor import StatusTimer
+from exo_gravity.core.motors.wire_formats import ID_BITS, MIT, MIT_V3
+from exo_gravity.sim import Firmware, SimulatedV3Motor, simulated_motor
+from exo_gravity.sim import device as device_module
 
 from ..support.simulated_device import make_device
 
@@ -71,10 +73,27 @@ def test_on_a_device_it_ignores_frames_of_v1_boards_and_sends_no_reply():
     assert device.status(1) is None
 
 
-def test_status_frames_come_at_their_rate_and_missed_ones_are_not_made_up():
-    motors = [simulated_motor(JOINT, Firmware(status_rate=100.0)), SimulatedMotor(JointMotor(MOTORS["AK60-6"], 1))]
-    timer = StatusTimer(motors, 0.0, random.Random(1))
-    sent = [joint for step in range(1000) for joint in timer.due(step * 0.001)]
-    assert sent == [0] * len(sent) and len(sent) == pytest.approx(100, abs=1)
-    assert len(list(timer.due(11.0))) <= 2
-    assert 11.0 < timer.next <= 11.01
+class StatusBus:
+    """A bus without commands, whose waits take as long as they may, and 1 s once. sent: times and IDs of frames."""
+
+    channel_info = "a test"
+
+    def __init__(self) -> None:
+        self.now, self.sent = 0.0, []
+
+    def recv(self, timeout: float) -> None:
+        self.now += 1.0 if 5.0 < self.now < 6.0 else max(timeout, 1e-4)
+
+    def send(self, message: can.Message) -> None:
+        self.sent.append((self.now, message.arbitration_id))
+
+
+def test_status_frames_come_at_their_rate_and_missed_ones_are_not_made_up(monkeypatch):
+    bus = StatusBus()
+    monkeypatch.setattr(device_module, "time", SimpleNamespace(monotonic=lambda: bus.now))
+    device = make_device(Firmware(status_rate=100.0), formats=(MIT, MIT_V3, MIT, MIT))
+    device.run(bus, lambda: bus.now > 10.0)
+    times = [now for now, frame_id in bus.sent]
+    assert {frame_id for _, frame_id in bus.sent} == {MIT_V3.status_id(2) & ID_BITS}
+    assert len(times) == pytest.approx(900, abs=5)
+    assert np.diff(times).min() > 0.009 and np.diff(times).max() == pytest.approx(1.0, abs=0.02)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from bench.imu_trials import angles
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.hardware import ImuSample, TrunkEstimator
+from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 
 G = 9.80665
 STILL_TIME = 3.0  # s at the start of each motion

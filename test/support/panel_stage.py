@@ -22,6 +22,7 @@ from .ports import free_port
 LEAVES = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
 BUS = {"can.interface": "virtual", "can.channel": "stage"}
 PERIOD = 0.1  # s between two states
+STATE_AFTER = {"let_down": "letting down", "enable": "active", "resume": "active", "clear_fault": "disabled"}
 
 
 @dataclass
@@ -55,39 +56,22 @@ class PlayedArms:
     def other_holder(self, arm: str, page: str) -> str:
         return self.others.get(arm, "")
 
-    async def let_down(self, arm: str) -> str:
-        return self._change("let_down", arm, "letting down" if self.states[arm] == "active" else self.states[arm])
-
-    async def enable(self, arm: str) -> str:
-        return self._change("enable", arm, "active")
-
-    async def clear_fault(self, arm: str) -> str:
-        if not self.problem:
+    async def ask(self, kind: str, arm: str, values: Mapping[str, Any]) -> str:
+        self.calls.append((kind, arm, str(dict(values))) if values else (kind, arm))
+        if arm in self.errors:
+            raise self.errors[arm]
+        if self.problem:
+            return self.problem
+        self.settings[arm].update(values)
+        if kind in ("clear_fault", "resume"):
             self.faults.pop(arm, None)
-        return self._change("clear_fault", arm, "disabled")
-
-    async def resume(self, arm: str) -> str:
-        if not self.problem:
-            self.faults.pop(arm, None)
-        return self._change("resume", arm, "active")
-
-    async def set(self, arm: str, values: Mapping[str, Any]) -> str:
-        self.calls.append(("set", arm, str(dict(values))))
-        if not self.problem:
-            self.settings[arm].update(values)
-        return self.problem
+        if kind != "let_down" or self.states[arm] == "active":
+            self.states[arm] = STATE_AFTER.get(kind, self.states[arm])
+        return ""
 
     def fail(self, arm: str, code: str) -> None:
         """Latch a fault."""
         self.faults[arm], self.states[arm] = code, "fault"
-
-    def _change(self, call: str, arm: str, state: str) -> str:
-        self.calls.append((call, arm))
-        if arm in self.errors:
-            raise self.errors[arm]
-        if not self.problem:
-            self.states[arm] = state
-        return self.problem
 
     def state(self, name: str, now: float) -> dict[str, Any]:
         """Return the state of one arm as the node makes it."""
@@ -157,7 +141,6 @@ class Stage:
         self._bridge = values_of(CAN_BRIDGE, BUS, "can.options")
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._play, daemon=True)
-        self.server.start()
         self._thread.start()
 
     def close(self) -> None:

@@ -92,7 +92,7 @@ class TermsRun:
             theta.append(reply.position)
             velocity.append(reply.velocity)
         self._gravity.append(LAWS["exact"](self.links, theta, UPRIGHT))
-        self._extra.append(self.terms.torque(100.0 + device.time, theta, velocity, self._gravity[-1]))
+        self._extra.append(self.terms.torque(100.0 + device.time, theta, velocity))
         while len(self._extra) > self._late:
             self._extra.popleft()
             self._gravity.popleft()

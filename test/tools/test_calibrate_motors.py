@@ -17,7 +17,7 @@ import yaml
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
-from exo_gravity.hardware.can.bus_scan import BusScan, MotorAnswer, Scan
+from exo_gravity.hardware.can.bus_scan import BusScan, MotorAnswer
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice, simulated_motor
 from exo_gravity.tools.calibrate import main
@@ -69,9 +69,9 @@ class Arm(BusScan):
         self.detour: Iterable[float] | None = None  # rad, where the hand moves the arm once, before all else
         self._now = 0.0
 
-    def scan(self, can_ids: Iterable[int] = ()) -> Scan:
+    def scan(self, can_ids: Iterable[int] = ()) -> tuple[tuple[MotorAnswer, ...], tuple[str, ...]]:
         """Return who answers."""
-        return Scan(tuple(sorted(self.poll(self.ids).values())), self.problems)
+        return tuple(sorted(self.poll(self.ids).values())), self.problems
 
     def poll(self, can_ids: Iterable[int]) -> dict[int, MotorAnswer]:
         """Return the answers of the motors that are not silent."""

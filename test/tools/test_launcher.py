@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.tools.inputs.parameter_file import Stages, chosen, in_namespace, load, node_names
+from exo_gravity.tools.inputs.parameter_file import chosen, in_namespace, load, node_names, stages
 from exo_gravity.tools.launcher import Launcher, main, stop_on_signals
 
 NODES = Path(__file__).parents[2] / "exo_gravity" / "nodes"
@@ -47,7 +47,7 @@ def test_a_closed_terminal_stops_the_launcher_as_ctrl_c_does():
     finally:
         for number, handler in zip(numbers, handlers, strict=True):
             signal.signal(number, handler)
-    assert stopping.is_set()
+    assert stopping.wait(10.0)
 
 
 def test_the_node_names_are_the_modules_with_an_entry_point():
@@ -110,7 +110,7 @@ NAMES = ["/recorder", "/imu", "/left/can_bridge", "/left/compensator", "/right/c
 
 
 def test_bridges_stop_first_and_recorders_last():
-    assert Stages.of(NAMES) == (["/left/can_bridge", "/right/can_bridge"], ["/imu", "/left/compensator"], ["/recorder"])
+    assert stages(NAMES) == (["/left/can_bridge", "/right/can_bridge"], ["/imu", "/left/compensator"], ["/recorder"])
 
 
 @pytest.mark.parametrize(

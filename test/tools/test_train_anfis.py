@@ -79,7 +79,7 @@ def test_the_reported_errors_are_those_of_the_saved_law(learned):
 
 def test_the_projected_gradient_is_that_of_finite_differences():
     inputs = RNG.uniform(-1, 1, (60, 2))
-    problem = Projection(inputs, np.sin(3 * inputs[:, 0]) * inputs[:, 1], 3, RIDGE, lambda step, rmse: None)
+    problem = Projection(inputs, np.sin(3 * inputs[:, 0]) * inputs[:, 1], 3, RIDGE)
     premises = np.concatenate((RNG.uniform(-1, 1, 6), RNG.uniform(-0.3, 0.3, 6)))
 
     def cost(at):

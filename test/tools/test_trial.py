@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from exo_gravity.tools import launcher, trial
-from exo_gravity.tools.launcher import OnLine, StopFlag
+from exo_gravity.tools.launcher import OnLine
 from exo_gravity.tools.trial import main
 from exo_gravity.tools.trials import run as running
 
@@ -149,7 +149,7 @@ def test_a_wrong_file_ends_with_exit_code_2_and_one_sentence(tmp_path, capsys, a
 
 
 def test_ctrl_c_lets_the_arm_down_and_reports_what_was_recorded(run, capsys, monkeypatch):
-    def stop_on_signals() -> StopFlag:
+    def stop_on_signals() -> threading.Event:
         stopped = launcher.stop_on_signals()
         threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
         return stopped

@@ -22,7 +22,6 @@ from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.trial.script import Step, TrialScript
 from exo_gravity.tools import trial
-from exo_gravity.tools.launcher import StopFlag
 from exo_gravity.tools.reporting import trial_report
 from exo_gravity.tools.trial import criteria_for, missing_holds, read_script, shortest_hold
 from exo_gravity.tools.trials import run as running
@@ -296,7 +295,7 @@ class Attempts:
         self.ends = list(ends)
         monkeypatch.setattr(running, "run_nodes", lambda *arguments: self.ends.pop(0))
         monkeypatch.setattr("exo_gravity.bag.reader.read_bag", self._no_recording)
-        monkeypatch.setattr(trial, "stop_on_signals", StopFlag)
+        monkeypatch.setattr(trial, "stop_on_signals", threading.Event)
 
     @staticmethod
     def _no_recording(path: Path) -> None:

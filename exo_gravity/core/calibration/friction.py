@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.calibration.motion import MAX_SPEED, Station
-from exo_gravity.core.calibration.poses import measurable
+from exo_gravity.core.calibration.poses import hanging
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.safety.limits import Limits
 
@@ -32,7 +32,7 @@ class FrictionCurve(NamedTuple):
     viscous: float  #: Nm s/rad
     stribeck: float  #: Nm, 0 if the data show none
     stribeck_speed: float  #: rad/s
-    error: tuple[float, float, float]  #: standard errors of coulomb, viscous and stribeck
+    error: tuple[float, ...]  #: (3,), standard errors of coulomb, viscous and stribeck
 
     def at(self, speed: np.ndarray) -> np.ndarray:
         """Return the friction (n,) in Nm at `speed` (n,) rad/s, above 0."""
@@ -42,12 +42,8 @@ class FrictionCurve(NamedTuple):
 
 def friction_stations(limits: Limits) -> list[Station]:
     """Return sweeps through the hanging arm at each of `SPEEDS`; the first lets the controller learn the friction."""
-    stations = []
-    for speed in (0.1, *SPEEDS):
-        amplitude = max(AMPLITUDE[0], min(AMPLITUDE[1], speed * SWEEP_TIME))
-        low, high = measurable(limits, amplitude)
-        stations.append(Station(tuple(np.clip(limits.home, low + 0.1, high - 0.1).tolist()), speed, amplitude, 2))
-    return stations
+    amplitudes = np.clip(np.array((0.1, *SPEEDS)) * SWEEP_TIME, *AMPLITUDE).tolist()
+    return [hanging(limits, *sweep) for sweep in zip((0.1, *SPEEDS), amplitudes, strict=True)]
 
 
 def fit_friction(speed: np.ndarray, torque: np.ndarray) -> FrictionCurve:
@@ -55,28 +51,27 @@ def fit_friction(speed: np.ndarray, torque: np.ndarray) -> FrictionCurve:
 
     Raises DataError for fewer than 3 speeds, or less than a factor of 2 between them.
     """
-    speed, torque = np.asarray(speed, dtype=float), np.asarray(torque, dtype=float)
-    if len(np.unique(speed)) < 3:
-        raise DataError(f"friction was measured at {len(np.unique(speed))} speeds, must be at least 3")
+    speeds = len(np.unique(speed))
+    if speeds < 3:
+        raise DataError(f"friction was measured at {speeds} speeds, must be at least 3")
     if speed.max() < LEAST_RATIO * speed.min():
         measured = f"from {speed.min():.2f} to {speed.max():.2f} rad/s"
         raise DataError(f"friction was measured {measured}, the fastest must be {LEAST_RATIO:g} times the slowest")
-    best = _fit(speed, torque, 1.0, with_stribeck=False)
-    if len(np.unique(speed)) > 3:
-        fits = [_fit(speed, torque, float(own), with_stribeck=True) for own in STRIBECK_SPEEDS]
+    best = _fit(speed, torque)
+    if speeds > 3:
+        fits = [_fit(speed, torque, own) for own in STRIBECK_SPEEDS.tolist()]
         stribeck = min(fits, key=lambda fit: float(np.sum((fit.at(speed) - torque) ** 2)))
         if stribeck.stribeck > SIGNIFICANT * stribeck.error[2]:
             best = stribeck
     return best
 
 
-def _fit(speed: np.ndarray, torque: np.ndarray, stribeck_speed: float, with_stribeck: bool) -> FrictionCurve:
-    columns = np.stack((np.ones_like(speed), speed, np.exp(-((speed / stribeck_speed) ** 2))), axis=1)
-    used = columns if with_stribeck else columns[:, :2]
-    values, *_ = np.linalg.lstsq(used, torque, rcond=None)
-    freedom = len(speed) - used.shape[1]
-    scatter = float(np.sum((used @ values - torque) ** 2)) / freedom if freedom > 0 else 0.0
-    variance = max(scatter, RESOLUTION**2) * np.diag(np.linalg.pinv(used.T @ used))
+def _fit(speed: np.ndarray, torque: np.ndarray, stribeck_speed: float = 0.0) -> FrictionCurve:
+    """Return the fit with this Stribeck speed, 0 for a fit without Stribeck friction."""
+    columns = [np.ones_like(speed), speed, *([np.exp(-((speed / stribeck_speed) ** 2))] if stribeck_speed else [])]
+    matrix = np.stack(columns, axis=1)
+    values, *_ = np.linalg.lstsq(matrix, torque, rcond=None)
+    scatter = float(np.sum((matrix @ values - torque) ** 2)) / max(1, len(speed) - len(columns))
+    errors = np.sqrt(max(scatter, RESOLUTION**2) * np.diag(np.linalg.pinv(matrix.T @ matrix)))
     coulomb, viscous, stribeck = (*values.tolist(), 0.0)[:3]
-    errors = (*np.sqrt(variance).tolist(), 0.0)
-    return FrictionCurve(coulomb, viscous, stribeck, stribeck_speed, (errors[0], errors[1], errors[2]))
+    return FrictionCurve(coulomb, viscous, stribeck, stribeck_speed or 1.0, (*errors.tolist(), 0.0)[:3])

@@ -30,20 +30,18 @@ from exo_gravity.core.calibration.pose_fit import (
     TILT,
     Rows,
     Solution,
+    along_axes,
     final,
-    turned_regressor,
     without_each_pose,
     without_outliers,
 )
 from exo_gravity.core.calibration.poses import missing_pose
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.moments import MOMENTS, load_moments, regressor
+from exo_gravity.core.model.moments import MOMENTS, load_moments
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 
 LEAST_SPREAD = 0.003  # Nm; about half a code of an AK motor's 12-bit torque
-# Moments across and along the links between which an angle turns a weight: Y3 and M3, Y4 and M4, Z and M4.
-BESIDE = ((6, 2), (7, 3), (5, 3))
 BESIDE_ERROR = 0.05  # rad, of a weight's place; 3 degrees
 TILT_ERROR = 0.05  # rad about each axis, of gravity's measured direction: an IMU's mounting, mostly its heading
 EXACT = 1e-6  # error of a value that is held
@@ -140,24 +138,12 @@ def _rows(observations: Sequence[Observation], length: Vector, gravity: float) -
         for index in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
             raise DataError(f"pose {index + 1}: {name} = {values[index].tolist()}: must be finite numbers")
     load = np.array([load_moments(length, one.load_mass, one.load_lever) for one in observations])
-    beside = np.zeros((*load.shape, len(BESIDE)))
-    for angle, (across, along) in enumerate(BESIDE):
-        beside[:, across, angle] = load[:, along]
     free = np.ones(COUNT, dtype=bool)
     free[FACTOR] = free[ANGLE] = bool(np.any(load))
     one = np.eye(COUNT)
     product = one[SCALE][1:].sum(axis=0, keepdims=True)  # of the scales of joints 2 to 4: 1, the weight gives the rest
     anchor = np.vstack((one[ANGLE] / BESIDE_ERROR, one[TILT] / TILT_ERROR, product / EXACT))
-    return Rows(
-        regressor(theta, direction, gravity),
-        turned_regressor(theta, direction, gravity),
-        load,
-        beside,
-        effort,
-        np.hypot(spread, LEAST_SPREAD),
-        free,
-        anchor,
-    )
+    return Rows(along_axes(theta, gravity), direction, load, effort, np.hypot(spread, LEAST_SPREAD), free, anchor)
 
 
 def columns(observations: Sequence[Observation]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -26,8 +26,10 @@ MOMENT = slice(0, 8)
 SCALE = slice(8, 12)
 OFFSET = slice(12, 16)
 FACTOR = 16
-ANGLE = slice(17, 20)  # of the load along Y3, Y4 and Z
+ANGLE = slice(17, 20)  # of the load, from M3 to Y3, from M4 to Y4, and from M4 to Z
+ALONG, ACROSS = [2, 3, 3], [6, 7, 5]  # indices of these moments
 TILT = slice(20, 23)  # rotation vector of gravity in the base frame
+TURN = np.cross(np.eye(3), np.eye(3)[:, None])  # (3, 3, 3): v @ TURN has the rows v x X, v x Y and v x Z
 COUNT = 23
 # kg m, logarithm, Nm, 1, rad, rad: a combination of unknowns that may be wrong by this much is not known.
 NATURAL = np.repeat((0.1, 0.3, 0.3, 0.3, 0.3, 0.1), (len(MOMENTS), JOINT_COUNT, JOINT_COUNT, 1, 3, 3))
@@ -37,6 +39,7 @@ START = np.array((0.0, *TYPICAL_MOMENTS[1:4], *np.zeros(12), 1.0, *np.zeros(6)))
 HUBER = 2.0  # standard errors beyond which a residual's weight falls
 POOLING = 6.0  # degrees of freedom with which all joints together inform the error of each
 STEPS = 40
+TINY = 1e-20  # of the complex step: no difference is taken, so nothing is lost to rounding
 MEDIAN_SQUARE = 0.455  # of a standard normal variable
 MEDIAN_CAUSED = 3.36  # of the sum of four such squares
 LEAST_OUTLIER = 0.03  # Nm, and this share of the peak effort: a smaller error does no harm, nor does a hand cause it
@@ -50,10 +53,9 @@ OUTLIER = 32.0  # such a sum from which a pose is left out: of good poses, one i
 class Rows:
     """What is fitted, for n poses."""
 
-    regressor: np.ndarray  #: (n, 4, 8) Nm per kg m
-    turned: np.ndarray  #: (n, 4, 8, 3), change of `regressor` with each component of the tilt
+    along: np.ndarray  #: (n, 4, 8, 3) Nm per kg m, the torque with gravity along each axis of the base frame
+    direction: np.ndarray  #: (n, 3), gravity's unit vector in the base frame, as measured
     load: np.ndarray  #: (n, 8) kg m, moments of the weight
-    beside: np.ndarray  #: (n, 8, 3), change of `load` with each angle
     effort: np.ndarray  #: (n, 4) Nm
     sigma: np.ndarray  #: (n, 4) Nm, standard error of `effort`
     free: np.ndarray = field(default_factory=lambda: np.ones(COUNT, dtype=bool))  #: (23,), the unknowns to be solved
@@ -62,31 +64,22 @@ class Rows:
 
     def only(self, keep: np.ndarray) -> Rows:
         """Return the poses that `keep` (n,) selects."""
-        names = ("regressor", "turned", "load", "beside", "effort", "sigma")
+        names = ("along", "direction", "load", "effort", "sigma")
         return replace(self, **{name: getattr(self, name)[keep] for name in names})
 
     def predicted(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the commanded effort (n, 4) in Nm."""
-        torque = np.einsum("njk,nk->nj", self.regressor + self.turned @ unknowns[TILT], self._moments(unknowns))
+        turn = np.eye(len(MOMENTS), dtype=unknowns.dtype)
+        turn[ALONG, ACROSS] = unknowns[ANGLE]
+        moments = unknowns[MOMENT] + unknowns[FACTOR] * (self.load @ turn)
+        direction = self.direction + self.direction @ (unknowns[TILT] @ TURN)
+        torque = np.einsum("njka,nka->nj", self.along, moments[:, :, None] * direction[:, None, :])
         return np.asarray(torque * np.exp(-unknowns[SCALE]) + unknowns[OFFSET])
 
-    def _moments(self, unknowns: np.ndarray) -> np.ndarray:
-        """Return the moments (n, 8) in kg m, with the load."""
-        return np.asarray(unknowns[MOMENT] + unknowns[FACTOR] * (self.load + self.beside @ unknowns[ANGLE]))
-
     def jacobian(self, unknowns: np.ndarray) -> np.ndarray:
-        """Return the derivative of `predicted` by the unknowns, (n, 4, 23)."""
-        result = np.zeros((*self.effort.shape, COUNT))
-        share = np.exp(-unknowns[SCALE])[:, None]
-        result[..., MOMENT] = (self.regressor + self.turned @ unknowns[TILT]) * share
-        joints = np.arange(JOINT_COUNT)
-        result[:, joints, SCALE.start + joints] = unknowns[OFFSET] - self.predicted(unknowns)
-        result[:, joints, OFFSET.start + joints] = 1.0
-        load = self.load + self.beside @ unknowns[ANGLE]
-        result[..., FACTOR] = np.einsum("njk,nk->nj", result[..., MOMENT], load)
-        result[..., ANGLE] = unknowns[FACTOR] * (result[..., MOMENT] @ self.beside)
-        result[..., TILT] = np.einsum("njkt,nk->njt", self.turned, self._moments(unknowns)) * share
-        return result
+        """Return the derivative of `predicted` by the unknowns, (n, 4, 23), exact to rounding by complex steps."""
+        steps = (self.predicted(unknowns + 1j * TINY * one).imag for one in np.eye(COUNT))
+        return np.stack(list(steps), axis=-1) / TINY
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,55 +95,44 @@ class Solution:
     inverse: np.ndarray  #: (23, 4 n + k), change of the unknowns with each effort and condition, divided by its error
 
     @property
+    def left(self) -> np.ndarray:
+        """The part (n, 4) of each residual's variance that the fit leaves, 0..1."""
+        return np.asarray(1.0 - np.einsum("njnj->nj", self.hat))
+
+    @property
     def freedom(self) -> np.ndarray:
         """Degrees of freedom of each joint's residuals, (4,)."""
-        return np.asarray(1.0 - np.einsum("njnj->nj", self.hat)).sum(axis=0)
+        return np.asarray(np.maximum(self.left.sum(axis=0), 0.0))
 
 
-def turned_regressor(theta: np.ndarray, direction: np.ndarray, gravity: float) -> np.ndarray:
-    """Return the change of `regressor` (n, 4, 8, 3) with a small rotation vector of `direction` (n, 3), in rad."""
-    along = np.stack([regressor(theta, axis, gravity) for axis in np.eye(3)], axis=-1)  # linear in the direction
-    turn = np.stack([np.cross(axis, direction) for axis in np.eye(3)], axis=-1)
-    return np.asarray(np.einsum("njka,nat->njkt", along, turn))
+def along_axes(theta: np.ndarray, gravity: float) -> np.ndarray:
+    """Return `Rows.along` of the poses `theta` (n, 4) rad."""
+    return np.stack([regressor(theta, axis, gravity) for axis in np.eye(3)], axis=-1)
 
 
-def solve(rows: Rows, start: np.ndarray = START, weight: np.ndarray | None = None) -> Solution:
-    """Return the least-squares solution from `start` (23,); weight: (n, 4) of the squared residuals, 1 by default."""
-    root = np.sqrt(np.ones_like(rows.effort) if weight is None else weight) / rows.sigma
-    unknowns, step = start.copy(), np.full(COUNT, np.inf)
+def solve(rows: Rows, start: np.ndarray = START, weight: np.ndarray | float = 1.0) -> Solution:
+    """Return the least-squares solution from `start` (23,); weight: (n, 4) of the squared residuals."""
+    root = np.sqrt(weight) / rows.sigma
+    unknowns = start
     for _ in range(STEPS):
-        jacobian = (rows.jacobian(unknowns) * root[..., None]).reshape(-1, COUNT)
-        residual = np.append(root * (rows.effort - rows.predicted(unknowns)), -rows.anchor @ unknowns)
-        inverse = _inverse(np.vstack((jacobian, rows.anchor)), rows.free)
-        step = inverse @ residual
-        # A scale that jumps by more than a factor of 1.6 in one step has left the range of the linear model.
-        unknowns = unknowns + step / max(1.0, 2.0 * float(np.abs(step[SCALE]).max()))
+        poses = (rows.jacobian(unknowns) * root[..., None]).reshape(-1, COUNT)
+        whitened = np.vstack((poses, rows.anchor))
+        natural = NATURAL * rows.free
+        left, size, right = np.linalg.svd(whitened * natural, full_matrices=False)
+        known = size > 1.0
+        inverse = natural[:, None] * (right[known].T / size[known]) @ left[:, known].T
+        residual = rows.effort - rows.predicted(unknowns)
+        step = inverse @ np.append(root * residual, -rows.anchor @ unknowns)
         if np.all(np.abs(step) < 1e-9 * NATURAL):
             break
-    return _solution(rows, unknowns, root)
-
-
-def _inverse(whitened: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Return the pseudo-inverse (23, m) of `whitened` (m, 23), without what is not known."""
-    natural = NATURAL * free
-    left, size, right = np.linalg.svd(whitened * natural, full_matrices=False)
-    known = size > 1.0
-    return np.asarray(natural[:, None] * (right[known].T / size[known]) @ left[:, known].T)
-
-
-def _solution(rows: Rows, unknowns: np.ndarray, root: np.ndarray) -> Solution:
-    jacobian = (rows.jacobian(unknowns) * root[..., None]).reshape(-1, COUNT)
-    inverse = _inverse(np.vstack((jacobian, rows.anchor)), rows.free)
-    covariance = inverse @ inverse.T
-    known = inverse @ np.vstack((jacobian, rows.anchor))  # a projection, up to the units
-    hidden = np.where(rows.free, 1.0 - np.diag(known), 0.0)
+        # A scale that jumps by more than a factor of 1.6 in one step has left the range of the linear model.
+        unknowns = unknowns + step / max(1.0, 2.0 * float(np.abs(step[SCALE]).max()))
+    hidden = np.where(rows.free, 1.0 - np.diag(inverse @ whitened), 0.0)  # a projection, up to the units
     free = rows.free & (np.arange(COUNT) < FACTOR)  # a weight that hangs is known, and so is the common factor
-    size = np.linalg.svd((jacobian * NATURAL)[:, free], compute_uv=False)
+    size = np.linalg.svd((poses * NATURAL)[:, free], compute_uv=False)
     singular_values = np.append(size, np.zeros(int(free.sum()) - len(size)))
-    count = len(rows.effort)
-    hat = (jacobian @ inverse[:, : 4 * count]).reshape(count, 4, count, 4)
-    residual = rows.effort - rows.predicted(unknowns)
-    return Solution(unknowns, covariance, hidden, singular_values, residual, hat, inverse)
+    hat = (poses @ inverse[:, : residual.size]).reshape(2 * residual.shape)
+    return Solution(unknowns, inverse @ inverse.T, hidden, singular_values, residual, hat, inverse)
 
 
 def robust(rows: Rows) -> tuple[Rows, Solution]:
@@ -158,10 +140,9 @@ def robust(rows: Rows) -> tuple[Rows, Solution]:
     solution = solve(rows)
     for _ in range(4):
         squares = (solution.residual / rows.sigma) ** 2
-        share = np.maximum(0.2, 1.0 - np.einsum("njnj->nj", solution.hat))
-        typical = np.median(squares / share, axis=0) / MEDIAN_SQUARE
-        factor = np.maximum(1.0, _pooled(typical, np.maximum(solution.freedom, 0.0)))
-        size = np.sqrt(squares / share / factor)
+        squares /= np.maximum(0.2, solution.left)
+        factor = np.maximum(1.0, _pooled(np.median(squares, axis=0) / MEDIAN_SQUARE, solution.freedom))
+        size = np.sqrt(squares / factor)
         solution = solve(rows, solution.unknowns, np.minimum(1.0, HUBER / np.maximum(size, 1e-9)))
     return replace(rows, sigma=rows.sigma * np.sqrt(factor)), solution
 
@@ -173,9 +154,8 @@ def final(rows: Rows) -> tuple[Rows, Solution]:
     """
     scaled, solution = rows, solve(rows)
     for _ in range(3):
-        freedom = np.maximum(solution.freedom, 0.0)
         squares = ((solution.residual / rows.sigma) ** 2).sum(axis=0)
-        factor = _pooled(squares / np.maximum(freedom, 1e-9), freedom)
+        factor = _pooled(squares / np.maximum(solution.freedom, 1e-9), solution.freedom)
         scaled = replace(rows, sigma=rows.sigma * np.sqrt(factor))
         solution = solve(scaled, solution.unknowns)
     return scaled, replace(solution, covariance=solution.covariance + _common_error(scaled, solution))

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from exo_gravity.core.calibration.motion import AMPLITUDE, LEAD, Line, Station
-from exo_gravity.core.calibration.pose_fit import COUNT, MOMENT, NATURAL, START, TYPICAL_MOMENTS, Rows
+from exo_gravity.core.calibration.pose_fit import COUNT, MOMENT, NATURAL, START, TILT, TYPICAL_MOMENTS, Rows, along_axes
 from exo_gravity.core.calibration.tracking import TorqueGuess
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.moments import regressor
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 from exo_gravity.core.safety.limits import WALL_WIDTH, Limits
 
@@ -37,11 +36,9 @@ class FixedStations:
 
     def __init__(self, stations: Sequence[Station]) -> None:
         self.count = len(stations)
-        self._left: Iterator[Station] = iter(stations)
+        self._left = iter(stations)
 
-    def next(
-        self, taken: np.ndarray, position: np.ndarray, elapsed: float, guess: TorqueGuess, friction: Sequence[float]
-    ) -> Station | None:
+    def next(self, *_: object) -> Station | None:
         """Return the next of the given stations."""
         return next(self._left, None)
 
@@ -56,11 +53,9 @@ class BestPoses:
         self.count = count
         self._limits = limits
         self._duration = duration
-        low, high = measurable(limits, AMPLITUDE)
-        # Friction is not known at first: the first pose keeps a distance from the soft walls.
-        self._home = np.clip(limits.home, low + FIRST_EDGE, high - FIRST_EDGE)
-        self._candidates = candidates(limits)
+        self._first = hanging(limits)
         self._is_started = False
+        self._candidates = candidates(limits)
 
     def next(
         self, taken: np.ndarray, position: np.ndarray, elapsed: float, guess: TorqueGuess, friction: Sequence[float]
@@ -75,16 +70,15 @@ class BestPoses:
             return None
         if not len(taken) and not self._is_started:
             self._is_started = True
-            return Station(tuple(self._home.tolist()))
+            return self._first
         in_time = np.flatnonzero(self._is_in_time(self.count - len(taken), position, elapsed))
         for deviations in DEVIATIONS:
-            can = self._is_holdable(self._candidates[in_time], position, guess, friction, deviations)
-            possible = in_time[can]
+            possible = in_time[self._is_holdable(self._candidates[in_time], position, guess, friction, deviations)]
             if len(possible):
                 break
         else:
             raise DataError("no further pose can be held within max_effort: is it too small for the arm?")
-        seen, poses = list(taken) or [self._home], self._candidates[possible]
+        seen, poses = list(taken) or [self._first.theta], self._candidates[possible]
         index = possible[next_pose(seen, poses, guess.tilt.direction, guess.common_moments, guess.gravity)]
         pose = self._candidates[index]
         self._candidates = np.delete(self._candidates, index, axis=0)  # chosen once, even if a joint sticks there
@@ -92,13 +86,12 @@ class BestPoses:
 
     def _is_in_time(self, left: int, position: np.ndarray, elapsed: float) -> np.ndarray:
         """Return which candidates (n,) leave enough time for the others of the `left` poses and for the way home."""
-        sweeps = Station(tuple(self._home.tolist())).duration
         home, way = (
             np.array([Line(pose, candidate).duration + LEAD for candidate in self._candidates])
-            for pose in (self._home, position)
+            for pose in (np.array(self._first.theta), position)
         )
         budget = (self._duration - elapsed - home) / left
-        fits = way + sweeps <= budget * (TIME_SHARE if left > 1 else 1.0)
+        fits = way + self._first.duration <= budget * (TIME_SHARE if left > 1 else 1.0)
         return np.asarray(fits if fits.any() else way + home <= (way + home).min() + 1.0)
 
     def _is_holdable(
@@ -123,6 +116,12 @@ class BestPoses:
 
 
 Itinerary = FixedStations | BestPoses
+
+
+def hanging(limits: Limits, speed: float = 0.1, amplitude: float = AMPLITUDE) -> Station:
+    """Return the hanging arm, off the soft walls by FIRST_EDGE: friction is not known there at first."""
+    low, high = measurable(limits, amplitude)
+    return Station(tuple(np.clip(limits.home, low + FIRST_EDGE, high - FIRST_EDGE).tolist()), speed, amplitude)
 
 
 def candidates(limits: Limits) -> np.ndarray:
@@ -174,11 +173,10 @@ def missing_pose(hidden: np.ndarray, direction: Vector, gravity: float) -> str:
 
 def _sensitivity(theta: np.ndarray, direction: Vector, moments: Vector, gravity: float) -> np.ndarray:
     """Return the derivative of the efforts in the poses (n, 4) by the unknowns, divided by their noise: (n, 4, 23)."""
-    rows = regressor(theta, direction, gravity)
-    torque = rows @ np.asarray(moments)
-    noise = np.hypot(NOISE, NOISE_SHARE * torque)
-    no_load = np.zeros((len(theta), rows.shape[2]))
-    poses = Rows(rows, np.zeros((*rows.shape, 3)), no_load, np.zeros((*no_load.shape, 3)), torque, noise)
+    nothing = np.zeros((len(theta), JOINT_COUNT))
+    down, no_load = np.broadcast_to(direction, (len(theta), 3)), np.zeros((len(theta), len(moments)))
+    rows = Rows(along_axes(theta, gravity), down, no_load, nothing, nothing)
     unknowns = START.copy()
     unknowns[MOMENT] = moments
-    return np.asarray(poses.jacobian(unknowns) / noise[..., None])
+    noise = np.hypot(NOISE, NOISE_SHARE * rows.predicted(unknowns))
+    return np.asarray(rows.jacobian(unknowns) / noise[..., None] * (np.arange(COUNT) < TILT.start))

@@ -9,28 +9,27 @@ efforts.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from exo_gravity.core.calibration.identification import Observation
-from exo_gravity.core.calibration.motion import FOLLOWED, LEAD, Line, Station, Visit
+from exo_gravity.core.calibration.motion import LEAD, WINDOW, Line, Station, average
 from exo_gravity.core.calibration.poses import Itinerary
 from exo_gravity.core.calibration.tracking import TorqueGuess, Tracker, inertia_of
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.model.gravity import Torque
-from exo_gravity.core.model.kinematics import LinkInertia
 from exo_gravity.core.model.tilt import Tilt, angle_between
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.limits import Limits
 
-SETTLING = 0.1  # s at rest after the way to a pose
 # rad behind the reference, from which on it slows down, and at which it stops and waits for the arm.
 SLOW_ERROR, STOP_ERROR = 0.04, 0.08
+FOLLOWED = 0.5  # of the way of the reference, that each joint must follow in a valid sweep
+MAX_FAILURES = 3  # pairs of sweeps in which a joint may stick: each shows the controller more of its friction
 MAX_SKIPPED = 2  # poses in which a joint may stick
 STEADY_SPEED = 0.05  # rad/s of a sweep, from which on its friction is that of the motion between poses
 REFRESH_PERIOD = 0.1  # s between two estimates of the mass matrix, and of how uncertain the expected torque is
-ANGLE_STEP = 0.01  # rad, for the slope of the expected torque
 # What stops a tour.
 MAX_ERROR = 0.12  # rad between a joint and the slow reference
 FASTEST = 1.0  # rad/s of a joint; a light joint that leaves its friction reaches 0.5
@@ -44,66 +43,11 @@ MAX_TILT = 0.1  # rad by which the stand or the trunk may tilt during the tour
 MAX_UNREST = (0.12, 0.25, 0.05)  # Nm, share of friction, share of the torque: between two passes of the same pose
 
 
-class TourWatch:
-    """Finds the first trouble of a tour, as a sentence that names joint, value and limit; '' while all is well.
-
-    tilt: of the trunk or the stand at the start.
-    """
-
-    def __init__(self, limits: Limits, tilt: Tilt) -> None:
-        self._names = limits.joint_names
-        self._max_effort = limits.max_effort
-        self._tilt = tilt
-        self._unexplained = [0.0] * JOINT_COUNT  # s
-
-    def motion(
-        self, dt: float, position: Sequence[float], velocity: Sequence[float], wanted: Sequence[float], tilt: Tilt
-    ) -> str:
-        """Return what is wrong with the motion: position, wanted (4,) rad, velocity (4,) rad/s, after `dt` s."""
-        if dt > MAX_GAP:
-            return f"no joint states for {dt * 1000:.0f} ms, the limit is {MAX_GAP * 1000:.0f}: is a motor silent?"
-        if (moved := angle_between(tilt.direction, self._tilt.direction)) > MAX_TILT:
-            return f"the trunk tilted by {moved:.2f} rad during the measurement, the limit is {MAX_TILT:g}"
-        for name, angle, speed, goal in zip(self._names, position, velocity, wanted, strict=True):
-            if not abs(goal - angle) <= MAX_ERROR:
-                reason = "a hand is on the arm, or the joint is blocked"
-                return f"{name}: {abs(goal - angle):.2f} rad off its path, the limit is {MAX_ERROR:g}: {reason}"
-            if not abs(speed) <= FASTEST:
-                return f"{name}: {speed:.2f} rad/s, the limit is {FASTEST:g}: it slipped or was pushed"
-        return ""
-
-    def torque(self, dt: float, tracker: Tracker, uncertain: Sequence[float], friction: Sequence[float]) -> str:
-        """Return which joint is saturated, or needs a torque that neither weight nor friction explains.
-
-        uncertain: (4,) Nm, standard deviation of the expected torque. friction: (4,) Nm, 0 while it is unknown.
-        """
-        for name, time, most in zip(self._names, tracker.saturated.tolist(), self._max_effort, strict=True):
-            if time > SATURATION:
-                return f"{name}: saturated: the pose needs more than max_effort = {most:g} Nm"
-        columns = zip(self._names, tracker.correction.tolist(), uncertain, friction, strict=True)
-        for i, (name, torque, deviation, slide) in enumerate(columns):
-            limit = MAX_CORRECTION + DEVIATIONS * deviation + (0.5 * slide if slide else UNKNOWN_FRICTION)
-            self._unexplained[i] = self._unexplained[i] + dt if abs(torque) > limit else 0.0
-            if self._unexplained[i] > PERSISTENCE:
-                reason = "is a hand on the arm?"
-                return f"{name}: {torque:.2f} Nm beyond its weight and friction, the limit is {limit:.2f}: {reason}"
-        return ""
-
-    def unrest(self, change: Sequence[float], effort: Sequence[float], friction: Sequence[float]) -> str:
-        """Return which joint's torque changed between two passes of a pose: change, effort, friction (4,) Nm."""
-        for name, between, torque, slide in zip(self._names, change, effort, friction, strict=True):
-            limit = MAX_UNREST[0] + MAX_UNREST[1] * abs(slide) + MAX_UNREST[2] * abs(torque)
-            if between > limit:
-                reason = "the arm was touched, or the joint slips"
-                return f"{name}: {between:.2f} Nm between two passes of a pose, the limit is {limit:.2f}: {reason}"
-        return ""
-
-
 class Tour:
     """One tour. Call `wait` for each joint state until the arm is carried, then `step`; and `plan` again and again.
 
-    measured: so far. trouble: why it ended early, or ''. done: whether the arm hangs again after the last pose.
-    progress: what it does, as a sentence. elapsed: s since the first step.
+    measured: so far. trouble: why it ended early, as a sentence that names joint, value and limit, or ''. done: whether
+    the arm hangs again after the last pose. progress: what it does, as a sentence. elapsed: s since the first step.
     """
 
     def __init__(
@@ -120,21 +64,19 @@ class Tour:
         self._load = load
         self._most = np.array(limits.max_effort)
         self._tracker = Tracker(rate, limits.max_effort)
-        self._inertia = self._known_inertia()
-        self._matrix = np.eye(JOINT_COUNT)
-        self._watch = TourWatch(limits, guess.tilt)
+        self._first_tilt = guess.tilt
         self._now = -math.inf
+        self._lines: Iterator[Line] = iter(())
         self._line = Line(np.zeros(JOINT_COUNT), np.zeros(JOINT_COUNT))
-        self._line_time = 0.0  # s
-        self._pause = 0.0  # s after the line
+        self._line_time = math.inf  # s; it is over
         self._skipped = 0  # poses
         self._awaits_plan = False
-        self._plan: tuple[Station | None, str] | None = None  # the next pose, None for home, or why there is none
-        self._is_sweeping = False
-        self._visit: Visit | None = None
+        self._plan: tuple[Station | None, str] = (None, "")  # the next pose, None for home, or why there is none
+        self._sweep: list[tuple[Sequence[float], np.ndarray, Sequence[float]]] | None = None  # its samples
         self._friction = [0.0] * JOINT_COUNT  # Nm, 0 until it is measured
-        self._uncertain: Sequence[float] = (0.0,) * JOINT_COUNT
+        self._unexplained = [0.0] * JOINT_COUNT  # s
         self._refreshed = -math.inf
+        self._matrix, self._uncertain = np.eye(JOINT_COUNT), [0.0] * JOINT_COUNT
         self._effort: Torque = (0.0,) * JOINT_COUNT
 
     def wait(self, position: Sequence[float], tilt: Tilt) -> Torque:
@@ -149,148 +91,153 @@ class Tour:
         """
         if self.trouble:
             return None
+        expected = self.wait(position, tilt)
         if self.done:  # the bridge lets the arm down: it is no longer watched
-            torque = self._guess.torque(position) + self._tracker.correction
-            return tuple(np.clip(torque, -self._most, self._most).tolist())
-        self._guess.tilt = tilt
+            return tuple(np.clip(expected + self._tracker.correction, -self._most, self._most).tolist())
         if self._now == -math.inf:
-            self._watch = TourWatch(self._limits, tilt)
-            self._now = now
-            self._await_plan(np.array(position))
+            self._first_tilt, self._now = tilt, now
+            self._lines, self._line = self._way(np.array(position)), Line(np.array(position), np.array(position))
         dt, self._now = now - self._now, now
         self.elapsed += dt
-        if self._line_time > self._line.duration + self._pause:
-            self._next_line()
+        if self._line_time > self._line.duration and not self._awaits_plan:
+            self._line, self._line_time = next(self._lines), -LEAD
         goal, heading = self._line.at(self._line_time)
         error = goal - position
-        behind = float(np.abs(error).max())
-        pace = max(0.0, min(1.0, (STOP_ERROR - behind) / (STOP_ERROR - SLOW_ERROR)))
+        pace = max(0.0, min(1.0, (STOP_ERROR - float(np.abs(error).max())) / (STOP_ERROR - SLOW_ERROR)))
         self._line_time += pace * dt
-        self.trouble = self.trouble or self._watch.motion(dt, position, velocity, goal.tolist(), tilt)
+        self.trouble = self.trouble or self._wrong_motion(dt, error.tolist(), velocity, tilt)
         if not self.trouble:
-            if self._visit and self._is_sweeping and self._line.is_measured(self._line_time):
-                self._visit.note(position, self._effort, tilt.direction)  # the effort of the last cycle
+            if self._sweep is not None and self._line.is_measured(self._line_time):
+                # The effort of the last cycle brought the arm here.
+                self._sweep.append((position, np.subtract(self._effort, expected), tilt.direction))
             # Friction is compensated before the motion begins: a joint that breaks away late would jump.
             coming = self._line.at(self._line_time + LEAD)[1] if self._line_time < LEAD else heading
-            self.trouble = self._carry(dt, position, pace * heading - velocity, error, coming)
+            if now - self._refreshed > REFRESH_PERIOD:
+                self._refresh(position)
+            speed_error = pace * heading - velocity
+            self._effort = self._tracker.step(dt, error, speed_error, coming, expected, self._matrix)
+            self.trouble = self._wrong_torque(dt)
         return None if self.trouble else self._effort
 
-    def _carry(
-        self, dt: float, position: Sequence[float], speed_error: np.ndarray, error: np.ndarray, heading: np.ndarray
-    ) -> str:
-        """Set the effort of this cycle; return what is wrong with it, or ''."""
-        if self._now - self._refreshed > REFRESH_PERIOD:
-            self._refreshed = self._now
-            self._uncertain = self._guess.torques(np.array([position]))[1][0].tolist()
-            self._matrix = self._inertia.matrix(position)
-        expected = self._guess.torque(position)
-        self._effort = self._tracker.step(dt, error, speed_error, heading, expected, self._matrix)
-        return self._watch.torque(dt, self._tracker, self._uncertain, self._friction)
+    def _refresh(self, position: Sequence[float]) -> None:
+        """Estimate the mass matrix at `position` (4,) rad, and how uncertain the expected torque is there."""
+        self._refreshed = self._now
+        moments = self._guess.common_moments[:JOINT_COUNT]
+        self._matrix = inertia_of(self._guess.length, moments, self._load).matrix(position)
+        self._uncertain = self._guess.torques(np.array([position]))[1][0].tolist()
 
-    def _next_line(self) -> None:
-        """Begin the next sweep, or after the last one the way to the next pose."""
-        end = self._line.at(math.inf)[0]
-        if self._awaits_plan:
-            if self._plan:
-                self._go_on(end, *self._plan)
-            return
-        if self._visit is None:
-            self.done, self.progress = True, "done"
-            return
-        if self._is_sweeping:
-            self._end_sweep(self._visit)
-            if self._visit.has_failed:
-                self._skip(self._visit)
-        if self._visit.is_complete and not self.trouble:
-            self._finish(self._visit)
-        if self.trouble:
-            return
-        if self._visit.is_complete or self._visit.has_failed:
-            self._await_plan(end)
-        else:
-            self._start(self._visit.line, 0.0, is_sweeping=True)
+    def _wrong_motion(self, dt: float, error: Sequence[float], velocity: Sequence[float], tilt: Tilt) -> str:
+        """Return what is wrong after `dt` s with the motion, or ''; error: (4,) rad, velocity: (4,) rad/s."""
+        if dt > MAX_GAP:
+            return f"no joint states for {dt * 1000:.0f} ms, the limit is {MAX_GAP * 1000:.0f}: is a motor silent?"
+        if (moved := angle_between(tilt.direction, self._first_tilt.direction)) > MAX_TILT:
+            return f"the trunk tilted by {moved:.2f} rad during the measurement, the limit is {MAX_TILT:g}"
+        for name, behind, speed in zip(self._limits.joint_names, error, velocity, strict=True):
+            if not abs(behind) <= MAX_ERROR:
+                reason = "a hand is on the arm, or the joint is blocked"
+                return f"{name}: {abs(behind):.2f} rad off its path, the limit is {MAX_ERROR:g}: {reason}"
+            if not abs(speed) <= FASTEST:
+                return f"{name}: {speed:.2f} rad/s, the limit is {FASTEST:g}: it slipped or was pushed"
+        return ""
 
-    def _skip(self, visit: Visit) -> None:
-        """Leave out a pose in which a joint sticks; the tour ends if that happens often."""
-        self._skipped += 1
-        if self._skipped > MAX_SKIPPED:
-            joint, share = min(visit.stuck_joints.items(), key=lambda item: item[1])
-            name = self._limits.joint_names[joint]
-            self.trouble = f"{name}: it sticks: it follows {share:.0%} of a slow motion, must be {FOLLOWED:.0%}"
-
-    def _end_sweep(self, visit: Visit) -> None:
-        """Improve what is known of friction; sweep again what passed without it, or what a joint did not follow."""
-        friction = visit.end_sweep()
-        if friction is None:
-            return
-        was_known, stuck = any(self._friction), visit.stuck_joints
-        if visit.station.speed >= STEADY_SPEED:
-            self._friction = np.maximum(np.maximum(0.0, friction), self._friction if stuck else 0.0).tolist()
-            self._tracker.friction = np.array(self._friction)
-        if stuck or not was_known:
-            visit.start_again(failed=bool(stuck))
-
-    def _finish(self, visit: Visit) -> None:
-        """Keep what was measured, and improve the expected torque with it."""
-        (theta, effort, friction, spread, unrest), direction = visit.result()
-        self.trouble = self._watch.unrest(unrest.tolist(), effort.tolist(), friction.tolist())
-        if self.trouble:
-            return
-        found = Observation(theta, direction, effort, friction, spread, *self._load, visit.station.speed)
-        self.measured.append(found)
-        here = theta.tolist()
-        before = self._guess.torque(here)
-        self._guess.learn(theta, effort, spread)
-        self._tracker.shift(np.subtract(self._guess.torque(here), before))
-        self._inertia = self._known_inertia()
-
-    def _known_inertia(self) -> LinkInertia:
-        return inertia_of(self._guess.length, self._guess.common_moments[:JOINT_COUNT], self._load)
-
-    def _shape(self, station: Station) -> tuple[np.ndarray, np.ndarray]:
-        """Return how the expected torque changes at a station: slope and bend, as for `average`."""
-        steps = ANGLE_STEP * np.eye(JOINT_COUNT)
-        torque = self._guess.torques
-        after, before = (torque(np.array(station.theta) + sign * steps)[0] for sign in (1.0, -1.0))
-        low, middle, high = torque(np.array(station.theta) + ANGLE_STEP * np.array(((-1.0,), (0.0,), (1.0,))))[0]
-        return (after - before).T / (2.0 * ANGLE_STEP), (low - 2.0 * middle + high) / ANGLE_STEP**2
+    def _wrong_torque(self, dt: float) -> str:
+        """Return which joint is saturated, or needs a torque that neither weight nor friction explains, or ''."""
+        for i, name in enumerate(self._limits.joint_names):
+            if self._tracker.saturated[i] > SATURATION:
+                return f"{name}: saturated: the pose needs more than max_effort = {self._most[i]:g} Nm"
+        for i, name in enumerate(self._limits.joint_names):
+            friction, torque = self._friction[i], self._tracker.correction[i]
+            limit = MAX_CORRECTION + DEVIATIONS * self._uncertain[i] + (0.5 * friction or UNKNOWN_FRICTION)
+            self._unexplained[i] = self._unexplained[i] + dt if abs(torque) > limit else 0.0
+            if self._unexplained[i] > PERSISTENCE:
+                reason = "is a hand on the arm?"
+                return f"{name}: {torque:.2f} Nm beyond its weight and friction, the limit is {limit:.2f}: {reason}"
+        return ""
 
     def plan(self) -> None:
         """Choose the next pose if one is due. It takes 0.1 s and more: not on the thread of `step`.
 
         Any error of the choice ends the tour: without a next pose the arm would be held for ever.
         """
-        if not self._awaits_plan or self._plan:
+        if not self._awaits_plan:
             return
         try:
             taken = np.array([measured.theta for measured in self.measured]).reshape(-1, JOINT_COUNT)
             position = self._line.at(math.inf)[0]
-            station = self._itinerary.next(taken, position, self.elapsed, self._guess, self._friction)
-            self._plan = (station, "")
+            self._plan = self._itinerary.next(taken, position, self.elapsed, self._guess, self._friction), ""
         except ExoGravityError as error:
             self._plan = (None, str(error))
         except Exception as error:
             self._plan = (None, f"the next pose could not be chosen: {type(error).__name__}: {error}")
-
-    def _await_plan(self, position: np.ndarray) -> None:
-        """Hold the arm at `position` until the next pose is chosen."""
-        self._visit = None
-        self._start(Line(position, position), 0.0)
-        self._plan = None
-        self._awaits_plan = True
-
-    def _go_on(self, position: np.ndarray, station: Station | None, trouble: str) -> None:
-        """Begin the way from `position` to the next pose, or home after the last."""
         self._awaits_plan = False
-        self.trouble = trouble
-        if station:
+
+    def _way(self, position: np.ndarray) -> Iterator[Line]:
+        """Yield each line of the tour from `position` (4,) rad when it begins; the arm is held until `plan` chose."""
+        home = np.array(self._limits.home)
+        while True:
+            self._awaits_plan = True
+            yield Line(position, position)
+            station, self.trouble = self._plan
+            if station is None:
+                break
             angles = " ".join(f"{math.degrees(angle):.0f}" for angle in station.theta)
             self.progress = f"pose {len(self.measured) + 1} of {self._itinerary.count}: {angles} deg"
-            self._visit = Visit(station, *self._shape(station))
-            self._start(Line(position, station.low), SETTLING)
-        else:
-            self._visit, self.progress = None, "back to the hanging arm"
-            self._start(Line(position, np.array(self._limits.home)), SETTLING)
+            yield Line(position, station.ends[0])
+            yield from self._sweeps(station)
+            position = station.ends[0]
+        self.progress = "back to the hanging arm"
+        yield Line(position, home)
+        self.done, self.progress = True, "done"
+        yield Line(home, home)
 
-    def _start(self, line: Line, pause: float, is_sweeping: bool = False) -> None:
-        self._line, self._line_time, self._pause, self._is_sweeping = line, -LEAD, pause, is_sweeping
+    def _sweeps(self, station: Station) -> Iterator[Line]:
+        """Yield each sweep until enough were good, or a joint sticks too often; keep what they show."""
+        low, high = station.ends
+        failures, sweeps, directions = 0, list[tuple[np.ndarray, np.ndarray]](), list[Sequence[float]]()
+        while len(sweeps) < 2 * station.cycles:
+            for ends in ((low, high), (high, low)):
+                self._sweep = []
+                yield Line(*ends, station.speed)
+                position, remainder, direction = zip(*self._sweep, strict=True)
+                self._sweep = None
+                sweeps.append((np.array(position), np.array(remainder)))
+                directions += direction
+            ways = np.min([np.abs(position[-1] - position[0]) for position, _ in sweeps[-2:]], axis=0)
+            followed = ways / (2.0 * WINDOW * station.amplitude)
+            was_known, sticks = any(self._friction), bool(np.min(followed) < FOLLOWED)
+            if station.speed >= STEADY_SPEED:
+                friction = np.maximum(average(sweeps[-2:]).friction, self._friction if sticks else 0.0)
+                self._friction, self._tracker.friction = friction.tolist(), friction
+            # Sweep again what passed without friction, or what a joint did not follow.
+            if sticks or not was_known:
+                sweeps, directions = [], []
+            failures += sticks
+            if failures > MAX_FAILURES:
+                self._skip(followed)
+                return
+        self._keep(station, sweeps, np.mean(directions, axis=0))
+
+    def _skip(self, followed: np.ndarray) -> None:
+        """Leave out a pose in which a joint sticks; the tour ends if that happens often."""
+        self._skipped += 1
+        if self._skipped > MAX_SKIPPED:
+            name, share = self._limits.joint_names[int(np.argmin(followed))], followed.min()
+            self.trouble = f"{name}: it sticks: it follows {share:.0%} of a slow motion, must be {FOLLOWED:.0%}"
+
+    def _keep(self, station: Station, sweeps: list[tuple[np.ndarray, np.ndarray]], direction: np.ndarray) -> None:
+        """Keep what the `sweeps` show, and improve the expected torque with it, unless the passes differ."""
+        direction = direction / np.linalg.norm(direction)
+        theta, remainder, friction, spread, unrest = average(sweeps)
+        effort = remainder + self._guess.torques(theta[None], direction)[0][0]
+        allowed = np.dot(MAX_UNREST, (np.ones(JOINT_COUNT), np.abs(friction), np.abs(effort)))
+        for name, change, limit in zip(self._limits.joint_names, unrest, allowed, strict=True):
+            if change > limit:
+                reason = "the arm was touched, or the joint slips"
+                self.trouble = (
+                    f"{name}: {change:.2f} Nm between two passes of a pose, the limit is {limit:.2f}: {reason}"
+                )
+                return
+        self.measured.append(Observation(theta, direction, effort, friction, spread, *self._load, station.speed))
+        before = self._guess.torque(theta.tolist())
+        self._guess.learn(theta, effort, spread)
+        self._tracker.shift(np.subtract(self._guess.torque(theta.tolist()), before))

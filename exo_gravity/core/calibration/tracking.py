@@ -66,9 +66,12 @@ class TorqueGuess:
         law = LAWS["exact"]
         return tuple(law(arm, theta, self.tilt)[joint] for joint, arm in enumerate(self._arms))
 
-    def torques(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the expected torque and its standard deviation, both (n, 4) Nm, at `theta` (n, 4) rad."""
-        rows = regressor(theta, self.tilt.direction, self.gravity)
+    def torques(self, theta: np.ndarray, direction: Vector | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the expected torque and its standard deviation, both (n, 4) Nm, at `theta` (n, 4) rad.
+
+        direction: (3,), gravity's unit vector in the base frame; by default as at present.
+        """
+        rows = regressor(theta, self.tilt.direction if direction is None else direction, self.gravity)
         mean = np.einsum("njk,jk->nj", rows, self._mean)
         variance = np.einsum("njk,jkl,njl->nj", rows, self._covariance, rows)
         return mean, np.sqrt(np.maximum(variance, 0.0))

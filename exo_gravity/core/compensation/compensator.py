@@ -45,11 +45,7 @@ class Answer(NamedTuple):
     held: str = ""  #: why the last tilt is held on, and the bound of the error in Nm; or ''
 
 
-class CarriedLoad(NamedTuple):
-    """What the compensator carries."""
-
-    settings: Settings | UrdfSettings
-    active: Active = Active()  #: the terms on top of it
+Load = tuple[Settings | UrdfSettings, Active]  # what the compensator carries, and the terms on top of it
 
 
 class Compensator(Tilted):
@@ -67,7 +63,7 @@ class Compensator(Tilted):
         self._nothing = (0.0,) * len(settings.max_effort)
         self._limiter = EffortLimiter(len(settings.max_effort))
         self._change = GuidedChange(len(settings.max_effort))
-        self._origin: CarriedLoad | None = None  # where the change began; None where no settings say
+        self._origin: Load | None = None  # where the change began; None where no settings say
         self._torque: Torque = self._nothing  # the last, before ramp and rate limit
         self._pending: Settings | UrdfSettings | None = None
         self._fallback = ""  # why the exact law replaces the chosen one
@@ -104,13 +100,13 @@ class Compensator(Tilted):
             held = f"{held}: held on, torque off by at most {turn * self._largest_torque(theta):.2f} Nm"
         before = None
         if self._pending is not None:
-            before = self._carried
+            before = self.settings, self.terms.now if self.terms else Active()
             self._use(self._pending)
         replaced = bool(self._fallback)
         gravity = self._law(now, theta)
         if not all(map(math.isfinite, gravity)):
             return Answer(None, f"torque {list(gravity)} Nm from the law is not finite")
-        added = self.terms.torque(now, theta, velocity, gravity) if velocity and self.terms else self._nothing
+        added = self.terms.torque(now, theta, velocity) if velocity and self.terms else self._nothing
         s = self.settings
         torque = clamped(map(operator.add, gravity, added), s.max_effort)
         dt = now - self._limiter.last_answer
@@ -134,15 +130,8 @@ class Compensator(Tilted):
         """Return the most in Nm that gravity takes of any joint at `theta` (n,) rad, whatever its direction."""
         settings = self.settings
         tilts = [Tilt.of_gravity(settings.side, axis) for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
-        if isinstance(settings, Settings):
-            torques = [settings.torque(theta, tilt, exact=True) for tilt in tilts]
-        else:
-            torques = [settings.torque(theta, tilt) for tilt in tilts]
+        torques = [settings.torque(theta, tilt, exact=True) for tilt in tilts]
         return max(math.hypot(*components) for components in zip(*torques, strict=True))
-
-    @property
-    def _carried(self) -> CarriedLoad:
-        return CarriedLoad(self.settings, self.terms.now) if self.terms else CarriedLoad(self.settings)
 
     def _use(self, settings: Settings | UrdfSettings) -> None:
         if settings.law != self.settings.law:
@@ -158,7 +147,7 @@ class Compensator(Tilted):
         theta: Sequence[float],
         velocity: Sequence[float] | None,
         torque: Torque,
-        before: CarriedLoad | None,
+        before: Load | None,
     ) -> None:
         """Begin a change to `torque` (n,) Nm, from `before` or from where an unfinished change began.
 
@@ -173,49 +162,45 @@ class Compensator(Tilted):
             ways.append((change.unexplained, origin, change))
         _, self._origin, self._change = min(ways, key=operator.itemgetter(0))
 
-    def _torque_of(
-        self, load: CarriedLoad, now: float, theta: Sequence[float], velocity: Sequence[float] | None
-    ) -> Torque:
+    def _torque_of(self, load: Load, now: float, theta: Sequence[float], velocity: Sequence[float] | None) -> Torque:
         """Return the torque (n,) in Nm that `load` would need here, clamped as it was."""
-        gravity = self._gravity(load.settings, now, theta)
+        settings, active = load
+        felt = self._felt(settings, now)
+        gravity = self._gravity(settings, theta, felt, bool(settings.outside(theta, felt[0])))
         if not velocity or self.terms is None:
-            return clamped(gravity, load.settings.max_effort)
-        added = self.terms.torque_of(load.active, gravity)
-        return clamped(map(operator.add, gravity, added), load.settings.max_effort)
+            return clamped(gravity, settings.max_effort)
+        return clamped(map(operator.add, gravity, self.terms.torque_of(active)), settings.max_effort)
 
     def _law(self, now: float, theta: Sequence[float]) -> Torque:
         """Return the torque of the chosen law, or of the exact law while the chosen one does not apply."""
-        settings = self.settings
-        if isinstance(settings, Settings) and settings.anfis:
-            reason = settings.outside(theta, self._felt(settings, now)[0])
-            if reason:
-                self._fallback, self._fallback_until = reason, now + FALLBACK_TIME
-            elif now >= self._fallback_until:
-                self._fallback = ""
-        return self._gravity(settings, now, theta, bool(self._fallback))
+        felt = self._felt(self.settings, now)
+        reason = self.settings.outside(theta, felt[0])
+        if reason:
+            self._fallback, self._fallback_until = reason, now + FALLBACK_TIME
+        elif now >= self._fallback_until:
+            self._fallback = ""
+        return self._gravity(self.settings, theta, felt, bool(self._fallback))
 
-    def _felt(self, settings: Settings, now: float) -> tuple[Tilt, Felt | None]:
+    def _felt(self, settings: Settings | UrdfSettings, now: float) -> tuple[Tilt, Felt | None]:
         """Return the tilt of what the trunk feels as gravity, and its motion if that is compensated, too."""
         tilt = self._tilt.at(now)
-        felt = self._motion.at(now, settings.shoulder_from_imu) if settings.inertial and settings.use_imu else None
+        if not (isinstance(settings, Settings) and settings.inertial and settings.use_imu):
+            return tilt, None
+        felt = self._motion.at(now, settings.shoulder_from_imu)
         if felt:
             magnitude = math.hypot(*felt.gravity) / STANDARD_GRAVITY
             tilt = Tilt.of_gravity(settings.side, felt.gravity)._replace(magnitude=magnitude)
         return tilt, felt
 
     def _gravity(
-        self, settings: Settings | UrdfSettings, now: float, theta: Sequence[float], exact: bool | None = None
+        self, settings: Settings | UrdfSettings, theta: Sequence[float], felt: tuple[Tilt, Felt | None], exact: bool
     ) -> Torque:
-        """Return the torque (n,) in Nm of the law of `settings`; exact: None for where that law does not apply."""
-        if not isinstance(settings, Settings):
-            return settings.torque(theta, self._tilt.at(now))
-        tilt, felt = self._felt(settings, now)
-        if exact is None:
-            exact = bool(settings.outside(theta, tilt))
+        """Return the torque (n,) in Nm of the law of `settings`, or of the exact law."""
+        tilt, motion = felt
         torque = settings.torque(theta, tilt, exact)
-        if felt is None:
+        if motion is None or not isinstance(settings, Settings):
             return torque
-        turning = turning_torque(settings.arm, settings.side, theta, felt.angular_acceleration)
+        turning = turning_torque(settings.arm, settings.side, theta, motion.angular_acceleration)
         return tuple(map(operator.add, torque, turning))
 
 

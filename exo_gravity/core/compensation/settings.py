@@ -114,7 +114,11 @@ class UrdfSettings:
     tilt_timeout: float  #: s
     use_imu: bool  #: False assumes that the root link's z axis points up
 
-    def torque(self, theta: Sequence[float], tilt: Tilt) -> Torque:
+    def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = True) -> Torque:
         """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad."""
         torque = self.arm.torque(theta, [self.gravity * component for component in tilt.gravity_in_trunk])
         return tuple([gain * tau for gain, tau in zip(self.gain, torque, strict=True)])
+
+    def outside(self, theta: Sequence[float], tilt: Tilt) -> str:
+        """Return '': the law applies everywhere."""
+        return ""

@@ -11,9 +11,8 @@ these and improves one coordinate after another until nothing gets worse.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -25,7 +24,6 @@ from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats, one_float
 
 Cost = Callable[[np.ndarray], np.ndarray]  # points (n, 6) -> (n,)
 
-BRIDGE_PARAMETERS = ("motor", "torque_scale", "position_min", "position_max")  # of `can_bridge`, that a budget needs
 USUAL_TILT = 20.0  # deg of trunk pitch and roll, in both directions, that a budget covers by default
 SAMPLES = 50_000  # random poses, which give shares to within 0.5 %
 STARTS = 5  # poses from which the worst one is sought, because a search can end in a local maximum
@@ -48,12 +46,11 @@ def motor_for(torque: float) -> str | None:
     return min((name for name in FAMILY if FAMILY[name][0] >= torque), key=lambda name: FAMILY[name][0], default=None)
 
 
-def motor_torques(motors: Sequence[str], torque_scale: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return rated and peak torque (4,) in Nm of `motors` whose real torque is `torque_scale` times the command."""
+def motor_torques(motors: Sequence[str], torque_scale: Vector) -> np.ndarray:
+    """Return rated and peak torque (2, 4) in Nm of `motors` whose real torque is `torque_scale` times the command."""
     # A motor that gives less than commanded already reaches its rated current when its rated torque is commanded.
     scale = np.minimum(four_floats("torque_scale", torque_scale, 0.2, 2.0), 1.0)
-    rated, peak = (np.array([FAMILY[motor][which] for motor in motors]) for which in (0, 1))
-    return scale * rated, scale * peak
+    return np.asarray(scale * np.transpose([FAMILY[motor] for motor in motors]))
 
 
 @dataclass(frozen=True)
@@ -72,14 +69,15 @@ class Workspace:
         one_float("max_tilt", self.max_tilt, 0.0, np.pi / 2, "rad")
 
     @property
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest point (6,): four joint angles, then pitch and roll of the trunk, in rad."""
+    def bounds(self) -> np.ndarray:
+        """Lowest and highest point (2, 6): four joint angles, then pitch and roll of the trunk, in rad."""
         tilt = np.repeat(self.max_tilt, 2)
-        return np.append(self.position_min, -tilt), np.append(self.position_max, tilt)
+        return np.array(((*self.position_min, *-tilt), (*self.position_max, *tilt)))
 
     def points(self, count: int = SAMPLES) -> np.ndarray:
         """Return random points (count, 6), uniform over the workspace and the same in every call."""
-        return np.random.default_rng(0).uniform(*self.bounds, (count, JOINT_COUNT + 2))
+        low, high = self.bounds
+        return np.random.default_rng(0).uniform(low, high, (count, JOINT_COUNT + 2))
 
 
 @dataclass(frozen=True)
@@ -94,40 +92,6 @@ class JointBudget:
     within_peak: float  #: the same for peak torque
     #: the largest support 0..1 at which the joint stays within rated torque everywhere; None: the robot needs more
     support: float | None
-
-    @property
-    def overloaded(self) -> bool:
-        """Whether the joint needs more than rated torque in some pose."""
-        return self.torque > self.rated
-
-
-@dataclass(frozen=True)
-class BudgetRequest:
-    """A budget to compute; two are equal if their budgets are."""
-
-    robot: ArmModel  #: the arm without a wearer
-    load: tuple[tuple[float, ...], tuple[float, ...]]  #: mass (4,) kg and centre of gravity (4,) m on each link
-    support: float  #: share 0..1 of the wearer's arm that is carried
-    bridge: tuple[tuple[Any, ...], ...]  #: values of `BRIDGE_PARAMETERS`, (4,) each
-    max_tilt: float  #: largest trunk pitch and roll in either direction, rad
-
-    @classmethod
-    def of(
-        cls, robot: ArmModel, load: tuple[Vector, Vector], support: float, bridge: Mapping[str, Any], use_imu: bool
-    ) -> BudgetRequest:
-        """Return the request for `robot`; bridge: the parameter values of its `can_bridge`.
-
-        use_imu: whether the trunk may tilt, by USUAL_TILT.
-        """
-        mass, cog = (tuple(map(float, values)) for values in load)
-        chosen = tuple(tuple(bridge[name]) for name in BRIDGE_PARAMETERS)
-        return cls(robot, (mass, cog), support, chosen, math.radians(USUAL_TILT) if use_imu else 0.0)
-
-    def joints(self, pause: Callable[[], None]) -> tuple[JointBudget, ...]:
-        """Return the budget of each joint; pause: as in `budget`. Raises ParameterError."""
-        motors, torque_scale, low, high = self.bridge
-        torques = motor_torques(motors, torque_scale)
-        return budget(self.robot, self.load, self.support, Workspace(low, high, self.max_tilt), *torques, pause)
 
 
 def largest_support(joints: Sequence[JointBudget]) -> float | None:
@@ -146,7 +110,7 @@ def overload(names: Sequence[str], joints: Sequence[JointBudget]) -> str:
     needs = [
         f"{name} needs {joint.torque:.1f} Nm in its worst pose (rated {joint.rated:.3g}, peak {joint.peak:.3g})"
         for name, joint in zip(names, joints, strict=True)
-        if joint.overloaded
+        if joint.torque > joint.rated
     ]
     if not needs:
         return ""
@@ -192,34 +156,29 @@ def budget(
 
     points = workspace.points()
     starts = np.vstack((points[: SAMPLES // 5] * (1, 1, 1, 1, 0, 0), points))  # those with an upright trunk first
-    own, added = torques(starts)
-    needs = np.abs(own + support * added)
 
-    def of_joint(joint: int) -> JointBudget:
-        def need(at: np.ndarray) -> np.ndarray:
-            own, added = torques(at)
-            torque: np.ndarray = np.abs(own + support * added)
-            return torque[:, joint]
+    def need(at: np.ndarray) -> np.ndarray:
+        own, added = torques(at)
+        return np.asarray(np.abs(own + support * added))
 
-        def shortage(at: np.ndarray) -> np.ndarray:
-            own, added = torques(at)
-            return -_support(own[:, joint], added[:, joint], rated[joint])
+    def shortage(at: np.ndarray) -> np.ndarray:
+        return -_support(*torques(at), np.asarray(rated))
 
-        worst, torque = _worst(need, workspace, starts, needs[:, joint])
-        _, short = _worst(shortage, workspace, starts, -_support(own[:, joint], added[:, joint], rated[joint]))
+    needs, shortages = need(starts), shortage(starts)
+    joints = []
+    for joint in range(JOINT_COUNT):
+        worst, torque = _worst(lambda at: need(at)[:, joint], workspace, starts, needs[:, joint])  # noqa: B023
+        _, short = _worst(lambda at: shortage(at)[:, joint], workspace, starts, shortages[:, joint])  # noqa: B023
         # The search can find an overloaded pose that no sample shows. Then the share must not be 1.
-        within_rated, within_peak = (
-            min(float(np.mean(needs[-len(points) :, joint] <= limit)), 0.9999 if torque > limit else 1.0)
-            for limit in (rated[joint], peak[joint])
-        )
-        largest = None if short > 0.0 else -short
-        return JointBudget(float(rated[joint]), float(peak[joint]), torque, worst, within_rated, within_peak, largest)
-
-    return tuple(map(of_joint, range(JOINT_COUNT)))
+        limits = float(rated[joint]), float(peak[joint])
+        sampled = needs[-len(points) :, joint]
+        within = [min(float(np.mean(sampled <= most)), 0.9999 if torque > most else 1.0) for most in limits]
+        joints.append(JointBudget(*limits, torque, worst, within[0], within[1], None if short > 0.0 else -short))
+    return tuple(joints)
 
 
-def _support(own: np.ndarray, added: np.ndarray, limit: float) -> np.ndarray:
-    """Return the largest support (n,), at most 1, with |own + support added| <= limit; negative if there is none."""
+def _support(own: np.ndarray, added: np.ndarray, limit: np.ndarray) -> np.ndarray:
+    """Return the largest support (n, 4), at most 1, with |own + support added| <= limit; negative if there is none."""
     room = limit - np.sign(added) * own  # in the direction of the wearer's torque
     support = np.divide(room, np.abs(added), out=np.ones_like(room), where=np.abs(added) > 1e-9)
     return np.where(np.abs(own) > limit, -1.0, np.minimum(support, 1.0))

@@ -10,7 +10,7 @@ n bytes of data has (ISO 11898-1; Bosch, CAN Specification 2.0)
 A 29-bit ID adds 18 ID + 1 SRR + 1 r1 bits.
 After 5 equal bits the sender inserts a stuff bit of the opposite value, which is part of the next run. A frame has at
 most (34 + 8 n - 1) // 4 stuff bits (Davis et al. 2007, "Controller Area Network schedulability analysis", eq. 1). The
-actual number depends on the bytes: the TYPICAL figures are means over this arm's frames (test/core/test_bus_load.py).
+actual number depends on the bytes (test/core/test_bus_load.py).
 """
 
 from __future__ import annotations
@@ -21,12 +21,8 @@ from typing import NamedTuple
 from exo_gravity.core.errors import ParameterError
 
 BITRATE = 1_000_000  # bit/s, of AK motors as delivered
-# Mean bits of a frame of 8 bytes over the poses, speeds and torques of an arm that is being carried.
-TYPICAL_COMMAND, TYPICAL_REPLY = 124, 118
-TYPICAL_V3_COMMAND, TYPICAL_STATUS = 146, 141
-STUFFED = 34  # bits without the data that are subject to stuffing
-PLAIN = 13  # bits that are never stuffed
-LONGER = 20  # bits that a 29-bit ID adds
+# Bits of a frame of 8 bytes: the mean over the poses, speeds and torques of an arm that is being carried, and the most.
+COMMAND, REPLY, V3_COMMAND, STATUS = (124, 135), (118, 135), (146, 160), (141, 160)
 # Status frames a second that are to be set on V3 boards: the most they can send, because each cycle waits for one; on a
 # slow bus fewer, or four boards would fill it.
 MAX_STATUS_RATE, SLOW_STATUS_RATE = 500.0, 200.0
@@ -42,12 +38,6 @@ class Load(NamedTuple):
     share: float
     #: cycles/s that fill the bus
     largest_rate: float
-
-
-def frame_bits(data_bytes: int, is_extended: bool = False) -> tuple[int, int]:
-    """Return the bits of a frame with `data_bytes` (0..8): without stuff bits, and with as many as possible."""
-    stuffed = STUFFED + LONGER * is_extended + 8 * data_bytes
-    return stuffed + PLAIN, stuffed + PLAIN + (stuffed - 1) // 4
 
 
 @dataclass(frozen=True)
@@ -72,11 +62,8 @@ class Traffic:
 
     def load(self, rate: float, worst: bool = False) -> Load:
         """Return the bus load of `rate` (> 0) cycles a second, for typical or for `worst` stuffing."""
-        exchange, command, status = TYPICAL_COMMAND + TYPICAL_REPLY, TYPICAL_V3_COMMAND, TYPICAL_STATUS
-        if worst:
-            exchange = 2 * frame_bits(8)[1]
-            command = status = frame_bits(8, is_extended=True)[1]
-        cycle = self.replying * exchange + self.reporting * command
+        command, reply, v3_command, status = (bits[worst] for bits in (COMMAND, REPLY, V3_COMMAND, STATUS))
+        cycle = self.replying * (command + reply) + self.reporting * v3_command
         unasked = self.reporting * self.status_rate * status  # bit/s
         used = rate * cycle + unasked
         return Load(used, used / self.bitrate, max(0.0, self.bitrate - unasked) / cycle)
@@ -86,11 +73,9 @@ class Traffic:
         typical = self.load(rate)
         if typical.share > 1.0:
             motors, needed = self.replying + self.reporting, typical.bits_per_second / 1000.0
+            fits = f"at most {int(typical.largest_rate)} Hz, the capacity of the CAN bus"
             raise ParameterError(
-                "rate",
-                rate,
-                f"at most {int(typical.largest_rate)} Hz, the capacity of the CAN bus: {motors} motors need "
-                f"{needed:.0f} kbit/s of its {self.bitrate / 1000.0:g}",
+                "rate", rate, f"{fits}: {motors} motors need {needed:.0f} kbit/s of its {self.bitrate / 1000.0:g}"
             )
         return typical
 

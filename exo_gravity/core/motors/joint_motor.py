@@ -14,6 +14,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.bus_load import BITRATE, Traffic
 from exo_gravity.core.motors.specs import MOTORS, WIRE_RANGE_BOUNDS, MotorReply, MotorSpec
 from exo_gravity.core.motors.wire_formats import FORMATS, MIT, Frame, WireFormat
+from exo_gravity.core.numbers import one_float
 from exo_gravity.core.params import Param
 
 # In the format `mit` the first byte of a reply is the motor's ID. The first byte of our commands is 0x7f or 0x80,
@@ -49,9 +50,7 @@ class JointMotor:
         limit = self.spec.position_range - math.pi
         if not abs(self.zero) <= limit:
             raise ParameterError("zero", self.zero, f"from {-limit:.2f} to {limit:.2f} rad, or the angle would wrap")
-        low, high = TORQUE_SCALE_BOUNDS
-        if not low <= self.torque_scale <= high:
-            raise ParameterError("torque_scale", self.torque_scale, f"from {low:g} to {high:g}")
+        one_float("torque_scale", self.torque_scale, *TORQUE_SCALE_BOUNDS)
 
     @property
     def rated_effort(self) -> float:
@@ -86,8 +85,10 @@ class JointMotor:
         """The frames that switch the motor off."""
         return self.wire_format.exit(self.can_id)
 
-    def command(self, effort: float, damping: float) -> bytes:
+    def command(self, effort: float, damping: float, stiffness: float = 0.0, position: float = 0.0) -> bytes:
         """Return the data of a command: a joint `effort` in Nm and `damping` in Nm s/rad, clamped to the wire format.
+
+        With a `stiffness` in Nm/rad, the motor also pulls the joint to `position` in rad.
 
         Raises ParameterError on NaN or infinity.
         """
@@ -99,15 +100,16 @@ class JointMotor:
         most = spec.torque_range
         if not -most <= torque <= most and math.isfinite(torque):
             torque = math.copysign(most, torque)
-        return self.wire_format.pack_command(spec, 0.0, 0.0, 0.0, kd, torque)
+        kp = stiffness / self.torque_scale
+        return self.wire_format.pack_command(spec, self.motor_position(position) if kp else 0.0, 0.0, kp, kd, torque)
 
     def joint_reply(self, data: bytes | bytearray) -> MotorReply:
         """Return the content of a reply or status frame in the joint's rad, rad/s and Nm. Raises FrameError."""
         reply = self.wire_format.unpack_reply(self.spec, self.can_id, data)
-        motor_id, position, velocity, torque, temperature, error = reply
-        sign = self.direction
-        torque = sign * torque * self.torque_scale
-        return MotorReply(motor_id, sign * (position - self.zero), sign * velocity, torque, temperature, error)
+        sign, torque = self.direction, self.direction * reply.torque * self.torque_scale
+        return MotorReply(
+            reply.motor_id, sign * (reply.position - self.zero), sign * reply.velocity, torque, *reply[4:]
+        )
 
     def motor_position(self, joint_position: float) -> float:
         """Return the motor angle in rad for a joint angle in rad."""

@@ -20,6 +20,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 from exo_gravity.core.errors import FrameError, ParameterError
+from exo_gravity.core.numbers import one_float
 
 ENTER = b"\xff" * 7 + b"\xfc"
 EXIT = b"\xff" * 7 + b"\xfd"
@@ -63,18 +64,31 @@ class MotorSpec:
     kd_max: float = 5.0
 
     @cached_property
+    def fields(self) -> dict[str, tuple[float, float, int, float, float]]:
+        """Of each field on the wire: lowest and highest value, bits, codes per unit and units per code."""
+        position, velocity, torque = self.position_range, self.velocity_range, self.torque_range
+        table = {
+            "position": (-position, position, 16),
+            "velocity": (-velocity, velocity, 12),
+            "kp": (0.0, self.kp_max, 12),
+            "kd": (0.0, self.kd_max, 12),
+            "torque": (-torque, torque, 12),
+        }
+        spans = ((name, field, (1 << field[2]) - 1, field[1] - field[0]) for name, field in table.items())
+        return {name: (*field, codes / span, span / codes) for name, field, codes, span in spans}
+
+    @cached_property
     def standstill(self) -> float:
         """The velocity in rad/s that the motor decodes from a command of 0 rad/s."""
-        span = self.velocity_range
-        return from_code(to_code("velocity", 0.0, -span, span, 0xFFF), -span, span, 0xFFF)
+        return unpack_fields(self, pack_fields(self, velocity=0.0), "velocity")[0]
 
     def with_ranges(self, velocity_range: float, torque_range: float) -> MotorSpec:
         """Return this motor with another firmware's wire ranges in rad/s and Nm, which no CAN message reports."""
-        for name, value in (("velocity_range", velocity_range), ("torque_range", torque_range)):
-            low, high = WIRE_RANGE_BOUNDS
-            if not low <= value <= high:
-                raise ParameterError(name, value, f"from {low:g} to {high:g}, as in the firmware's manual")
-        return replace(self, velocity_range=velocity_range, torque_range=torque_range)
+        return replace(
+            self,
+            velocity_range=one_float("velocity_range", velocity_range, *WIRE_RANGE_BOUNDS),
+            torque_range=one_float("torque_range", torque_range, *WIRE_RANGE_BOUNDS),
+        )
 
 
 MOTORS = {
@@ -115,8 +129,8 @@ def pack_command(spec: MotorSpec, position: float, velocity: float, kp: float, k
     position rad, velocity rad/s, kp 0..500 Nm/rad, kd 0..5 Nm s/rad, torque Nm. Raises ParameterError on NaN, infinity
     or a value outside the spec's range.
     """
-    p, v, stiffness, damping, t = command_codes(spec, position, velocity, kp, kd, torque)
-    data = (p << 48 | v << 36 | stiffness << 24 | damping << 12 | t).to_bytes(8, "big")
+    word = pack_fields(spec, position=position, velocity=velocity, kp=kp, kd=kd, torque=torque)
+    data = word.to_bytes(8, "big")
     # With all other fields at their maximum, the top torque codes spell ENTER, EXIT or SET_ZERO. Send the code below.
     return data if data[0] != 0xFF or data not in SPECIAL_FRAMES else data[:7] + b"\xfb"
 
@@ -125,33 +139,7 @@ def unpack_command(spec: MotorSpec, data: bytes | bytearray) -> MotorCommand:
     """Return the content of a command frame. Raises FrameError unless it is 8 bytes and not a special frame."""
     if len(data) != 8 or bytes(data) in SPECIAL_FRAMES:
         raise FrameError(data, "8 bytes and not a special frame")
-    word = int.from_bytes(data, "big")
-    codes = word >> 48, word >> 36 & 0xFFF, word >> 24 & 0xFFF, word >> 12 & 0xFFF, word & 0xFFF
-    return command_of_codes(spec, *codes)
-
-
-def command_codes(
-    spec: MotorSpec, position: float, velocity: float, kp: float, kd: float, torque: float
-) -> tuple[int, int, int, int, int]:
-    """Return the codes of a command's fields, in the order of the arguments. Raises ParameterError."""
-    return (
-        to_code("position", position, -spec.position_range, spec.position_range, 0xFFFF),
-        to_code("velocity", velocity, -spec.velocity_range, spec.velocity_range, 0xFFF),
-        to_code("kp", kp, 0.0, spec.kp_max, 0xFFF),
-        to_code("kd", kd, 0.0, spec.kd_max, 0xFFF),
-        to_code("torque", torque, -spec.torque_range, spec.torque_range, 0xFFF),
-    )
-
-
-def command_of_codes(spec: MotorSpec, position: int, velocity: int, kp: int, kd: int, torque: int) -> MotorCommand:
-    """Return the command whose fields have these codes."""
-    return MotorCommand(
-        from_code(position, -spec.position_range, spec.position_range, 0xFFFF),
-        from_code(velocity, -spec.velocity_range, spec.velocity_range, 0xFFF),
-        from_code(kp, 0.0, spec.kp_max, 0xFFF),
-        from_code(kd, 0.0, spec.kd_max, 0xFFF),
-        from_code(torque, -spec.torque_range, spec.torque_range, 0xFFF),
-    )
+    return MotorCommand(*unpack_fields(spec, int.from_bytes(data, "big"), *MotorCommand._fields))
 
 
 def pack_reply(
@@ -167,13 +155,8 @@ def pack_reply(
 
     Raises ParameterError on NaN, infinity or a value outside the spec's range.
     """
-    word = (
-        _whole("motor_id", motor_id, 0, 255) << 40
-        | to_code("position", position, -spec.position_range, spec.position_range, 0xFFFF) << 24
-        | to_code("velocity", velocity, -spec.velocity_range, spec.velocity_range, 0xFFF) << 12
-        | to_code("torque", torque, -spec.torque_range, spec.torque_range, 0xFFF)
-    )
-    data = word.to_bytes(6, "big")
+    word = pack_fields(spec, position=position, velocity=velocity, torque=torque)
+    data = (_whole("motor_id", motor_id, 0, 255) << 40 | word).to_bytes(6, "big")
     if temperature is None:
         return data
     return data + bytes((_whole("temperature", temperature, -40, 215) + 40, _whole("error", error, 0, 255)))
@@ -183,27 +166,30 @@ def unpack_reply(spec: MotorSpec, data: bytes | bytearray) -> MotorReply:
     """Return the content of a reply. Raises FrameError unless it is 6 or 8 bytes."""
     if len(data) not in (6, 8):
         raise FrameError(data, "a reply of 6 or 8 bytes")
-    word = int.from_bytes(data[:6], "big")
-    return MotorReply(
-        word >> 40,
-        from_code(word >> 24 & 0xFFFF, -spec.position_range, spec.position_range, 0xFFFF),
-        from_code(word >> 12 & 0xFFF, -spec.velocity_range, spec.velocity_range, 0xFFF),
-        from_code(word & 0xFFF, -spec.torque_range, spec.torque_range, 0xFFF),
-        data[6] - 40 if len(data) == 8 else None,
-        data[7] if len(data) == 8 else None,
-    )
+    position, velocity, torque = unpack_fields(spec, int.from_bytes(data[:6], "big"), *MotorReply._fields[1:4])
+    temperature, error = (data[6] - 40, data[7]) if len(data) == 8 else (None, None)
+    return MotorReply(data[0], position, velocity, torque, temperature, error)
 
 
-def to_code(name: str, value: float, low: float, high: float, codes: int) -> int:
-    """Return the nearest of the codes 0..`codes` for a value in `low`..`high`. Raises ParameterError outside."""
-    if not low <= value <= high:  # rejects NaN too
-        raise ParameterError(name, value, f"from {low:g} to {high:g}")
-    return round((value - low) * (codes / (high - low)))
+def pack_fields(spec: MotorSpec, **values: float) -> int:
+    """Return the bit stream of these fields, in their order. Raises ParameterError for a value outside its range."""
+    word, fields = 0, spec.fields
+    for name, value in values.items():
+        low, high, bits, codes, _ = fields[name]
+        if not low <= value <= high:  # rejects NaN too
+            raise ParameterError(name, value, f"from {low:g} to {high:g}")
+        word = word << bits | round((value - low) * codes)
+    return word
 
 
-def from_code(code: int, low: float, high: float, codes: int) -> float:
-    """Return the value of a code: 0 is `low`, `codes` is `high`."""
-    return low + code * ((high - low) / codes)
+def unpack_fields(spec: MotorSpec, word: int, *names: str) -> list[float]:
+    """Return the values of the fields `names`, with which the bit stream `word` ends."""
+    values, fields = [], spec.fields
+    for name in reversed(names):
+        low, _, bits, _, unit = fields[name]
+        values.append(low + (word & (1 << bits) - 1) * unit)
+        word >>= bits
+    return values[::-1]
 
 
 def _whole(name: str, value: int | None, low: int, high: int) -> int:

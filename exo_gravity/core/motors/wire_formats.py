@@ -51,14 +51,28 @@ REPLY, COMMAND, OTHER = "reply", "command", "other"
 
 @dataclass(frozen=True)
 class WireFormat:
-    """The frames of one kind of board, as pure functions; here those of V1 and V2 boards."""
+    """The frames of one kind of board, as pure functions; here those of V1 and V2 boards.
+
+    The arbitration IDs of the fields are those of motor 0: a motor adds its own ID.
+    """
 
     #: the value of the parameter `wire_format`
     name: str = "mit"
     #: whether a motor replies to each command, and only then; if not, it sends its state on its own timer
     replies: bool = True
-    #: whether its IDs have 29 bits
-    is_extended: bool = False
+    #: of commands
+    first_id: int = 0
+    #: frames that switch a motor on, before its first command; none if the command itself does
+    on: tuple[Frame, ...] = ((0, ENTER),)
+    #: frames that switch a motor off
+    off: tuple[Frame, ...] = ((0, EXIT),)
+    #: frames that make the present angle zero; none if the board has no such frame
+    zero: tuple[Frame, ...] = ((0, SET_ZERO),)
+
+    @property
+    def is_extended(self) -> bool:
+        """Whether the arbitration IDs have 29 bits."""
+        return self.first_id >= EXTENDED
 
     def ranged(self, spec: MotorSpec) -> MotorSpec:
         """Return the motor with the usual ranges of this format."""
@@ -66,7 +80,19 @@ class WireFormat:
 
     def command_id(self, motor_id: int) -> int:
         """Return the arbitration ID of commands to a motor."""
-        return motor_id
+        return self.first_id + motor_id
+
+    def enter(self, motor_id: int) -> tuple[Frame, ...]:
+        """Return the frames that switch a motor on."""
+        return tuple((first + motor_id, data) for first, data in self.on)
+
+    def exit(self, motor_id: int) -> tuple[Frame, ...]:
+        """Return the frames that switch a motor off."""
+        return tuple((first + motor_id, data) for first, data in self.off)
+
+    def set_zero(self, motor_id: int) -> tuple[Frame, ...]:
+        """Return the frames that make the present angle zero."""
+        return tuple((first + motor_id, data) for first, data in self.zero)
 
     # Data of a command, as in `core.motors.specs`.
     pack_command = staticmethod(specs.pack_command)
@@ -79,18 +105,6 @@ class WireFormat:
     def unpack_reply(self, spec: MotorSpec, motor_id: int, data: bytes | bytearray) -> MotorReply:
         """Return the content of a reply or status frame of the motor `motor_id`. Raises FrameError."""
         return specs.unpack_reply(spec, data)
-
-    def enter(self, motor_id: int) -> tuple[Frame, ...]:
-        """Return the frames that switch a motor on, before its first command; none if the command itself does."""
-        return ((motor_id, ENTER),)
-
-    def exit(self, motor_id: int) -> tuple[Frame, ...]:
-        """Return the frames that switch a motor off."""
-        return ((motor_id, EXIT),)
-
-    def set_zero(self, motor_id: int) -> tuple[Frame, ...]:
-        """Return the frames that make the present angle zero; none if the board has no such frame."""
-        return ((motor_id, SET_ZERO),)
 
     def classify(self, frame_id: int, data: bytes | bytearray, motor_ids: frozenset[int]) -> tuple[str, int]:
         """Return what a frame is, REPLY, COMMAND or OTHER, and the ID of the motor in `motor_ids`, 0 for none.
@@ -105,47 +119,37 @@ class WireFormat:
         return OTHER, 0
 
 
-@dataclass(frozen=True)
 class V3Format(WireFormat):
     """The frames of V3 boards; the methods are those of `WireFormat`."""
-
-    name: str = "mit_v3"
-    replies: bool = False
-    is_extended: bool = True
 
     def ranged(self, spec: MotorSpec) -> MotorSpec:
         """Return the motor with the ranges of manual V3.0.0."""
         velocity_range, torque_range = V3_RANGES[spec.name]
         return replace(spec, position_range=V3_POSITION_RANGE, velocity_range=velocity_range, torque_range=torque_range)
 
-    def command_id(self, motor_id: int) -> int:
-        """Return the 29-bit ID of a command to a motor."""
-        return EXTENDED | MODE_MIT << 8 | motor_id
-
     def status_id(self, motor_id: int) -> int:
         """Return the 29-bit ID of a motor's status frames."""
         return EXTENDED | STATUS << 8 | motor_id
 
-    def pack_command(
-        self, spec: MotorSpec, position: float, velocity: float, kp: float, kd: float, torque: float
-    ) -> bytes:
+    @staticmethod
+    def pack_command(spec: MotorSpec, position: float, velocity: float, kp: float, kd: float, torque: float) -> bytes:
         """Return the 8 bytes of a command: kp, kd, position, velocity, torque."""
-        p, v, stiffness, damping, t = specs.command_codes(spec, position, velocity, kp, kd, torque)
-        return (stiffness << 52 | damping << 40 | p << 24 | v << 12 | t).to_bytes(8, "big")
+        word = specs.pack_fields(spec, kp=kp, kd=kd, position=position, velocity=velocity, torque=torque)
+        return word.to_bytes(8, "big")
 
-    def unpack_command(self, spec: MotorSpec, data: bytes | bytearray) -> MotorCommand:
+    @staticmethod
+    def unpack_command(spec: MotorSpec, data: bytes | bytearray) -> MotorCommand:
         """Return the content of a command. Raises FrameError."""
         if len(data) != 8:
             raise FrameError(data, "8 bytes")
-        word = int.from_bytes(data, "big")
-        codes = word >> 24 & 0xFFFF, word >> 12 & 0xFFF, word >> 52, word >> 40 & 0xFFF, word & 0xFFF
-        return specs.command_of_codes(spec, *codes)
+        order = "kp", "kd", "position", "velocity", "torque"
+        kp, kd, position, velocity, torque = specs.unpack_fields(spec, int.from_bytes(data, "big"), *order)
+        return MotorCommand(position, velocity, kp, kd, torque)
 
     def pack_reply(self, spec: MotorSpec, reply: MotorReply) -> bytes:
         """Return the 8 bytes of a status frame. Raises ParameterError for a value beyond its range."""
         numbers = []
-        steps = POSITION_STEP, _speed_step(spec), CURRENT_STEP * spec.torque_per_ampere
-        for name, value, step in zip(("position", "velocity", "torque"), reply[1:4], steps, strict=True):
+        for name, value, step in zip(MotorReply._fields[1:4], reply[1:4], _steps(spec), strict=True):
             limit = 0x7FFF * step
             if not abs(value) <= limit:
                 raise ParameterError(name, value, f"from {-limit:g} to {limit:g}")
@@ -157,20 +161,8 @@ class V3Format(WireFormat):
         if len(data) != 8:
             raise FrameError(data, "a status frame of 8 bytes")
         position, speed, current, temperature, error = _STATUS.unpack(data)
-        torque = current * (CURRENT_STEP * spec.torque_per_ampere)
-        return MotorReply(motor_id, position * POSITION_STEP, speed * _speed_step(spec), torque, temperature, error)
-
-    def enter(self, motor_id: int) -> tuple[Frame, ...]:
-        """Return no frames: a command switches the motor on."""
-        return ()
-
-    def exit(self, motor_id: int) -> tuple[Frame, ...]:
-        """Return the frame that ends MIT mode: a current of 0 A."""
-        return ((EXTENDED | MODE_CURRENT << 8 | motor_id, NO_CURRENT),)
-
-    def set_zero(self, motor_id: int) -> tuple[Frame, ...]:
-        """Return no frames: the board has none for it."""
-        return ()
+        steps = _steps(spec)
+        return MotorReply(motor_id, position * steps[0], speed * steps[1], current * steps[2], temperature, error)
 
     def classify(self, frame_id: int, data: bytes | bytearray, motor_ids: frozenset[int]) -> tuple[str, int]:
         """Return what a frame with a 29-bit ID is; a frame of any control mode is a command."""
@@ -182,10 +174,11 @@ class V3Format(WireFormat):
         return (COMMAND, motor_id) if kind <= LAST_MODE else (OTHER, 0)
 
 
-def _speed_step(spec: MotorSpec) -> float:
-    """Return the output's speed in rad/s that one step of a status frame means."""
-    return SPEED_STEP / (spec.pole_pairs * spec.gear_ratio)
+def _steps(spec: MotorSpec) -> tuple[float, float, float]:
+    """Return the output's rad, rad/s and Nm that one step of a status frame means."""
+    return POSITION_STEP, SPEED_STEP / (spec.pole_pairs * spec.gear_ratio), CURRENT_STEP * spec.torque_per_ampere
 
 
-MIT, MIT_V3 = WireFormat(), V3Format()
+MIT = WireFormat()
+MIT_V3 = V3Format("mit_v3", False, EXTENDED | MODE_MIT << 8, (), ((EXTENDED | MODE_CURRENT << 8, NO_CURRENT),), ())
 FORMATS: dict[str, WireFormat] = {MIT.name: MIT, MIT_V3.name: MIT_V3}

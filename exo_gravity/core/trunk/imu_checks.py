@@ -7,19 +7,21 @@ cannot be the reason. The limits were set on the trials of docs/imu.md.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from operator import eq
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.rotation import ZERO, Floats3, Quaternion, rotated
+from exo_gravity.core.model.rotation import ZERO, Floats3, Quaternion, dot, plus, rotated
 
 FROZEN_TIME, FROZEN_SAMPLES = 0.1, 10  # s of equal samples, and at least this many
-STUCK_SAMPLES = 5
+STUCK_SAMPLES, NO_REPEATS = 5, (0.0,) * 6  # that repeat the value of an axis; of each axis
 NEAR_GRAVITY = 0.15  # share of 1 g
 TURN = math.radians(3.0)
-STUCK_TURN = 0.1  # of gravity's unit vector along an axis
+STUCK_TURN = 0.09  # of gravity's unit vector along an axis
 
 CHECK_PERIOD = 0.0095  # s between two comparisons of gyroscope and accelerometer
-QUIET_TIME, QUIET = 0.15, 0.1  # s over which the acceleration must be near 1 g, by a share of 1 g
+QUIET_TIME, QUIET = 0.15, 0.1  # s over which the deviation from 1 g is averaged; share of 1 g
 MAX_CONTRADICTION = math.radians(20.0)
 CONTRADICTION_TIME = 0.5  # s; less than the time to settle, so that a wrong orientation is never used
 
@@ -53,61 +55,46 @@ class EqualValues:
     Gyroscope and accelerometer of a MEMS IMU have noise, so their values differ from sample to sample (measured: no two
     samples in a row were equal in 13,514). A vector of zeros is not judged: some drivers fill in zeros for what the IMU
     does not measure. At rest coarse steps can hide the noise of one axis; so an axis is stuck only if the trunk turned
-    meanwhile: gravity by the estimate along the accelerometer's axis, or the accelerometer away from the estimate.
+    meanwhile: if the accelerometer shows another direction of gravity than the estimate.
     """
 
-    def __init__(self) -> None:
-        self.duration = 0.0  #: s for which whole samples have been equal
-        self._since, self._count = math.inf, 0  # of equal samples
-        self._values: tuple[float, ...] = (math.nan,) * 6  # gyroscope and accelerometer
-        self._counts = [0.0] * 6  # of equal values; infinite for a stuck axis
-        self._ups = [0.0] * 6  # the estimate's vertical when the accelerometer's axis began to repeat its value
-        self._any_equal = False  # axes, by the last sample
+    duration = 0.0  #: s for which whole samples have been equal
+    _since = math.inf  # s, of the first of them
+    _values: tuple[float, ...] = (math.nan,) * 6  # gyroscope and accelerometer
+    _repeats: tuple[float, ...] = NO_REPEATS  # of each value
 
     def check(self, time: float, rate: Floats3, acceleration: Floats3 | None, up: Floats3 | None) -> None:
         """Raise ParameterError once the IMU is frozen, Contradiction once an axis is stuck, at the sample of `time` s.
 
         up: the vertical in the IMU's axes by an estimate from the samples before; None if there is none.
         """
-        last, values = self._values, rate + (acceleration or ZERO)
-        (a, b, c, d, e, f), (u, v, w, x, y, z) = last, values
-        self._values = values
-        if a != u and b != v and c != w and d != x and e != y and f != z and not self._any_equal:
-            self._since, self._count, self.duration = time, 1, 0.0
+        last, self._values = self._values, rate + (acceleration or ZERO)
+        if not any(map(eq, self._values, last)):
+            self._since, self.duration, self._repeats = time, 0.0, NO_REPEATS
             return
-        if values == last and time > self._since:
-            self._count += 1
-            self.duration = time - self._since
-            if self._count >= FROZEN_SAMPLES and self.duration >= FROZEN_TIME and any(values):
-                expected = "different from sample to sample, as noise makes them: the IMU or its driver is frozen"
-                raise ParameterError("angular_velocity and linear_acceleration", list(values), expected)
+        pairs = zip(self._repeats, self._values, last, strict=True)
+        repeats = self._repeats = tuple([count + 1.0 if value == before else 0.0 for count, value, before in pairs])
+        least, most = min(repeats), max(repeats)
+        self._since = min(self._since, time) if least else time
+        self.duration = time - self._since
+        if least + 1 >= FROZEN_SAMPLES and self.duration >= FROZEN_TIME and any(self._values):
+            expected = "different from sample to sample, as noise makes them: the IMU or its driver is frozen"
+            raise ParameterError("angular_velocity and linear_acceleration", list(self._values), expected)
+        axis = repeats.index(most)
+        if least or most < STUCK_SAMPLES or not up or not acceleration or not _should_change(axis, up, acceleration):
             return
-        self._since, self._count, self.duration = time, 1, 0.0
-        if up is None or acceleration is None:
-            return
-        for axis in range(6):
-            if values[axis] != last[axis]:
-                self._counts[axis] = 0
-            elif self._is_stuck(axis, acceleration, up):
-                self._counts[axis] = math.inf
-                name, shown = ("angular_velocity", rate) if axis < 3 else ("linear_acceleration", acceleration)
-                expected = f"different from sample to sample while the trunk turns: the {'xyz'[axis % 3]} axis is stuck"
-                raise Contradiction(name, shown, expected)
-        self._any_equal = any(self._counts)
+        name, shown = ("angular_velocity", rate) if axis < 3 else ("linear_acceleration", acceleration)
+        expected = f"different from sample to sample while the trunk turns: the {'xyz'[axis % 3]} axis is stuck"
+        raise Contradiction(name, shown, expected)
 
-    def _is_stuck(self, axis: int, acceleration: Floats3, up: Floats3) -> bool:
-        """Count an equal value; return whether it should have changed."""
-        if not self._counts[axis]:
-            self._ups[axis] = up[axis % 3]
-        self._counts[axis] += 1
-        if not STUCK_SAMPLES <= self._counts[axis] < math.inf:
-            return self._counts[axis] == math.inf
-        if axis >= 3:
-            return abs(up[axis - 3] - self._ups[axis]) > STUCK_TURN
-        norm = math.hypot(*acceleration)
-        x, y, z = acceleration
-        is_near = abs(norm / STANDARD_GRAVITY - 1.0) < NEAR_GRAVITY
-        return is_near and math.dist(up, (x / norm, y / norm, z / norm)) > TURN
+
+def _should_change(axis: int, up: Floats3, acceleration: Floats3) -> bool:
+    """Return whether gravity by the estimate is not what the accelerometer shows: for one of its axes, or at all."""
+    x, y, z = (component / STANDARD_GRAVITY for component in acceleration)
+    if axis >= 3:
+        return abs((x, y, z)[axis - 3] - up[axis - 3]) > STUCK_TURN
+    norm = math.hypot(x, y, z)
+    return abs(norm - 1.0) < NEAR_GRAVITY and math.dist(up, (x / norm, y / norm, z / norm)) > TURN
 
 
 class Agreement:
@@ -121,39 +108,27 @@ class Agreement:
     deviation of the acceleration from its mean times the time for which it keeps its direction.
     """
 
-    def __init__(self) -> None:
-        self.is_suspect = False  #: whether the two must agree on a turn, or the trunk rest, before the estimate is used
-        self._agreed = 0.0  # s
-        self.restart()
+    contradiction = 0.0  #: rad by which the two turns differ, while they clearly do
+    square = 0.0  #: of the acceleration's deviation from its mean, in shares of 1 g
+    _deviation = 0.0  # of the acceleration's length from 1 g, mean over QUIET_TIME, as a share
+    _means: Sequence[float] = ()  # over TURN_TIME, of gravity's direction by the estimate and of the acceleration's
+    _rate = ZERO  # rad/s, at the last comparison
+    _unlike = _agreed = _rest = _contradicted = _age = 0.0  # s
+    _mean = ZERO  # acceleration in the world, in 1 g
+    _since = ZERO, 0.0, 0  # the last comparison: sum of the accelerations, s, samples
 
-    def restart(self) -> None:
-        """Begin anew with the next sample. Whether the two have agreed before is kept."""
-        self.contradiction = 0.0  #: rad by which the two turns differ, while they clearly do
-        self.square = 0.0  #: of the acceleration's deviation from its mean, in shares of 1 g
-        self._deviation = 0.0  # of the acceleration's length from 1 g, mean over QUIET_TIME, as a share
-        self._up: Floats3 | None = None  # mean over TURN_TIME, like the next one
-        self._measured: Floats3 = ZERO
-        self._rate: Floats3 = ZERO  # rad/s, at the last comparison
-        self._unlike = self._rest = self._contradicted = 0.0  # s
-        self._age = 0.0  # s
-        self._mean: Floats3 = ZERO  # in 1 g
-        self._sum, self._span, self._count = ZERO, 0.0, 0  # of accelerations since the last comparison; s; samples
-
-    def suspect(self) -> None:
-        """Require that the two agree on a turn."""
-        self.is_suspect, self._agreed = True, 0.0
+    def __init__(self, is_suspect: bool = False) -> None:
+        #: whether the two must agree on a turn, or the trunk rest, before the estimate is used
+        self.is_suspect = is_suspect
 
     def check_reported(self, dt: float, up: Floats3, acceleration: Floats3) -> None:
         """Check a reported orientation: one that the driver does not have, or upside down.
 
         up: the world's z axis in the IMU's axes. Raises ParameterError.
         """
-        x, y, z = acceleration
-        norm = math.hypot(x, y, z)
-        now = abs(norm / STANDARD_GRAVITY - 1.0)
-        self._deviation += (now - self._deviation) * min(1.0, dt / QUIET_TIME)
-        if self._deviation < QUIET and now < QUIET:
-            contradicts = up[0] * x + up[1] * y + up[2] * z < norm * math.cos(MAX_CONTRADICTION)
+        norm = math.hypot(*acceleration)
+        if abs(norm / STANDARD_GRAVITY - 1.0) < QUIET:
+            contradicts = dot(up, acceleration) < norm * math.cos(MAX_CONTRADICTION)
             self._contradicted = self._contradicted + dt if contradicts else 0.0
         if self._contradicted > CONTRADICTION_TIME:
             limit = math.degrees(MAX_CONTRADICTION)
@@ -161,50 +136,41 @@ class Agreement:
             raise ParameterError("gravity_in_imu", [round(-component, 2) for component in up], expected)
 
     def check(self, dt: float, quaternion: Quaternion, up: Floats3, acceleration: Floats3, rate: Floats3) -> None:
-        """Compare a fused orientation, and its world z axis `up` in the IMU's axes, with the mean of the accelerations.
+        """Compare a fused orientation, and its world z axis `up` in the IMU's axes, with the acceleration.
 
-        The mean is that since the last comparison, CHECK_PERIOD before.
+        This is the mean since the last comparison, CHECK_PERIOD before.
         """
-        (x, y, z), (a, b, c) = self._sum, acceleration
-        total = x + a, y + b, z + c
-        span, count = self._span + dt, self._count + 1
-        if span < CHECK_PERIOD and self._up:
-            self._sum, self._span, self._count = total, span, count
+        total, span, count = self._since
+        total, dt, count = plus(acceleration, total), dt + span, count + 1
+        if dt < CHECK_PERIOD and self._means:
+            self._since = total, dt, count
             return
-        self._sum, self._span, self._count = ZERO, 0.0, 0
-        share = 1.0 / (count * STANDARD_GRAVITY)
-        mean = total[0] * share, total[1] * share, total[2] * share
-        spin_up = math.dist(rate, self._rate) / span if span else 0.0
+        self._since = ZERO, 0.0, 0
+        mean = plus(ZERO, total, 1.0 / (count * STANDARD_GRAVITY))
+        spin_up = math.dist(rate, self._rate) / dt if dt else 0.0
         self._rate = rate
-        explained = min(MOST, LEVER * (spin_up + rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2))
         # Before and just after the first tilt nothing is lost by a refusal.
-        self._check_turns(span, up, mean, explained if self._age > AVERAGE_TIME else 0.0)
-        self._check_mean(span, rotated(quaternion, mean))
+        explained = min(MOST, LEVER * (spin_up + dot(rate, rate))) if self._age > AVERAGE_TIME else 0.0
+        self._check_turns(dt, up, mean, explained)
+        self._check_mean(dt, rotated(quaternion, mean))
 
     def _check_turns(self, dt: float, up: Floats3, acceleration: Floats3, explained: float) -> None:
         """Compare the turns. acceleration: in 1 g; explained: the part of it that the rotation may cause."""
-        (a, b, c), (x, y, z) = up, acceleration
-        norm = math.sqrt(x * x + y * y + z * z)
-        x, y, z = x / norm, y / norm, z / norm
+        norm = math.hypot(*acceleration)
         self._deviation += (abs(norm - 1.0) - self._deviation) * min(1.0, dt / QUIET_TIME)
-        share = dt / TURN_TIME
-        (d, e, f), (u, v, w) = (self._up, self._measured) if self._up else (up, (x, y, z))
-        d, e, f = d + share * (a - d), e + share * (b - e), f + share * (c - f)
-        u, v, w = u + share * (x - u), v + share * (y - v), w + share * (z - w)
-        self._up, self._measured = (d, e, f), (u, v, w)
+        now = [*up, acceleration[0] / norm, acceleration[1] / norm, acceleration[2] / norm]
+        means = [mean + dt / TURN_TIME * (v - mean) for mean, v in zip(self._means or now, now, strict=True)]
+        turned = [v - mean for mean, v in zip(means, now, strict=True)]
+        size, difference = math.hypot(*turned[:3]), math.dist(turned[:3], turned[3:])
+        self._means, self.contradiction = means, 0.0
         self._unlike -= self._unlike * dt / FORGET_TIME
-        self.contradiction = 0.0
-        a, b, c = a - d, b - e, c - f
-        size = math.sqrt(a * a + b * b + c * c)
         if size <= CLEAR_TURN:
-            if self.is_suspect:
-                self._rest = self._rest + dt if self._deviation < AT_REST else 0.0
-                self.is_suspect = self._rest < REST_TIME
+            self._rest = self._rest + dt if self._deviation < AT_REST else 0.0
+            self.is_suspect = self.is_suspect and self._rest < REST_TIME
             return
         self._rest = 0.0
         if size <= CLEAR * self._deviation:
             return
-        difference = math.dist((x - u, y - v, z - w), (a, b, c))
         excess = difference - UNLIKE * size - explained
         if difference < ALIKE * size:
             self._agreed += dt
@@ -215,18 +181,17 @@ class Agreement:
             self.contradiction = difference * self._unlike / NOTICE
             if self._unlike > PATIENCE:
                 expected = "the turn that the accelerometer shows: check the gyroscope's unit, axes and signs"
-                raise Contradiction("turn by angular_velocity", [round(v, 3) for v in (a, b, c)], expected)
+                raise Contradiction("turn by angular_velocity", [round(v, 3) for v in turned[:3]], expected)
 
     def _check_mean(self, dt: float, acceleration: Floats3) -> None:
         """Compare the mean acceleration in the world, in 1 g, with gravity."""
         self._age += dt
-        span = self._age if self._age < AVERAGE_TIME else AVERAGE_TIME
+        span = min(self._age, AVERAGE_TIME)
         share = dt / span if dt else 1.0
-        (u, v, w), (x, y, z) = self._mean, acceleration
-        x, y, z = x - u, y - v, z - w
-        self._mean = u, v, w = u + share * x, v + share * y, w + share * z
-        self.square += share * ((1.0 - share) * (x * x + y * y + z * z) - self.square)
-        shift = math.sqrt(u * u + v * v + (w - 1.0) ** 2)
+        change = plus(acceleration, self._mean, -1.0)
+        self._mean = u, v, w = plus(self._mean, change, share)
+        self.square += share * ((1.0 - share) * dot(change, change) - self.square)
+        shift = math.hypot(u, v, w - 1.0)
         if shift < OFFSET or self._age < LEAST_TIME:
             return
         limit = OFFSET + (WALK + DIRECTION_TIME * math.sqrt(self.square)) / span
@@ -243,35 +208,33 @@ class ClockCheck:
     shortest time from stamp to arrival in each WINDOW must not grow, or fall below all before, from window to window.
     """
 
-    def __init__(self) -> None:
-        self.offset = 0.0  #: s by which the clock may have gone wrong by the last sample
-        self._end = math.inf  # s, of the present window
-        # s from stamp to arrival: shortest in this window and in the last one, before it began to drift, and ever
-        self._shortest = self._last = self._before = self._least = math.inf
-        self._drifts = 0  # windows in a row with a drift, < 0 for a fast clock
+    offset = 0.0  #: s by which the clock may have gone wrong by the last sample
+    _end = math.inf  # s, of the present window
+    _shortest = _last = _least = math.inf  # s from stamp to arrival: in this window, the last one, and all before that
+    _drift, _windows = 0.0, 0  # s in how many windows in a row
 
     def check(self, time: float, arrival: float) -> None:
         """Check the stamp `time` of a sample that arrived at `arrival`, both s. Raises Contradiction."""
         lag = arrival - time
-        if lag < self._shortest:
-            self._shortest = lag
+        self._shortest = min(self._shortest, lag)
         if self._end == math.inf:
-            self._end, self._last, self._before = arrival + WINDOW, lag, lag
+            self._end, self._last = arrival + WINDOW, lag
         if arrival >= self._end:
             self._close(MAX_DRIFT * (WINDOW + arrival - self._end))
             self._end = arrival + WINDOW
-        self.offset = abs(lag - self._before) if lag > self._before or self._before <= self._least else 0.0
-        if abs(self._drifts) >= DRIFTING_WINDOWS and abs(self._last - self._before) > MAX_OFFSET:
-            drifted = f"{1e3 * (self._before - self._last):+.0f} ms in {WINDOW * abs(self._drifts):.1f} s"
+        before = self._last - self._drift
+        self.offset = abs(lag - before) if lag > before or before <= self._least else 0.0
+        if self._windows >= DRIFTING_WINDOWS and abs(self._drift) > MAX_OFFSET:
+            drifted = f"{-1e3 * self._drift:+.0f} ms in {WINDOW * self._windows:.1f} s"
             expected = f"by a clock as fast as this computer's, not one that gains {drifted}"
             raise Contradiction("stamp", round(time, 4), expected)
 
     def _close(self, limit: float) -> None:
         """End the window, in which a drift by more than `limit` s is one."""
-        step, least = self._shortest - self._last, min(self._least, self._last)
-        is_slow, is_fast = step > limit, step < -limit and self._last <= least
-        direction = is_slow - is_fast
-        if self._drifts * direction <= 0:
-            self._drifts, self._before = 0, self._last if direction else self._shortest
-        self._drifts += direction
-        self._last, self._least, self._shortest = self._shortest, least, math.inf
+        step, self._least = self._shortest - self._last, min(self._least, self._last)
+        drifts = step > limit or (step < -limit and self._last <= self._least)
+        if not drifts or step * self._drift < 0.0:
+            self._drift, self._windows = 0.0, 0
+        if drifts:
+            self._drift, self._windows = self._drift + step, self._windows + 1
+        self._last, self._shortest = self._shortest, math.inf

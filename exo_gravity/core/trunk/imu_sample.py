@@ -13,7 +13,6 @@ from typing import NamedTuple
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.model.rotation import Floats3
-from exo_gravity.core.numbers import one_float
 
 # The usual widest ranges of a MEMS sensor, and those that any sensor may have.
 GYROSCOPE_RANGE, GYROSCOPE_RANGES = 34.9, (1.0, 200.0)  # rad/s; 2000 deg/s
@@ -41,47 +40,26 @@ class ImuSample(NamedTuple):
     orientation: Sequence[float] | None = None
 
 
-class Ranges:
-    """The sensor's ranges, each for one axis."""
+def check_living(acceleration: Floats3, last: Floats3 | None) -> None:
+    """Raise ParameterError for an accelerometer that is dead, or in g; last: the acceleration before, None at first."""
+    x, y, z = acceleration
+    if x * x + y * y + z * z > ALMOST_NOTHING**2:
+        return
+    if max(map(abs, acceleration)) < DEAD:
+        raise ParameterError("linear_acceleration", acceleration, "not zero, as a dead accelerometer reports")
+    if last and math.dist([STANDARD_GRAVITY * v for v in acceleration], last) < SAME * STANDARD_GRAVITY:
+        raise ParameterError("linear_acceleration", acceleration, "in m/s^2, not in g")
 
-    def __init__(self, gyroscope: float, accelerometer: float) -> None:
-        """Take the ranges in rad/s and m/s^2. Raises ParameterError for one that no IMU has."""
-        self.gyroscope = one_float("gyroscope_range", gyroscope, *GYROSCOPE_RANGES, "rad/s")
-        self.accelerometer = one_float("accelerometer_range", accelerometer, *ACCELEROMETER_RANGES, "m/s^2")
-        self._usual = SATURATED * self.gyroscope, SATURATED * self.accelerometer
 
-    def angular_velocity(self, values: Sequence[float] | None) -> tuple[Floats3, bool]:
-        """Return the rates, and whether one is saturated; raises ParameterError if one is impossible."""
-        rate = x, y, z = three_floats("angular_velocity", values)
-        usual = self._usual[0]
-        if -usual < x < usual and -usual < y < usual and -usual < z < usual:
-            return rate, False
-        if max(map(abs, rate)) > BEYOND * self.gyroscope:
-            expected = f"at most gyroscope_range = {self.gyroscope:.4g} rad/s about each axis (is it in deg/s?)"
-            raise ParameterError("angular_velocity", rate, expected)
-        return rate, True
-
-    def acceleration(self, values: Sequence[float] | None, last: Floats3 | None) -> Floats3 | None:
-        """Return the acceleration, None if an axis is saturated; raises ParameterError if it is impossible.
-
-        last: the acceleration before it, None at first.
-        """
-        acceleration = x, y, z = three_floats("linear_acceleration", values)
-        usual, square = self._usual[1], x * x + y * y + z * z
-        if square > ALMOST_NOTHING**2 and -usual < x < usual and -usual < y < usual and -usual < z < usual:
-            return acceleration
-        largest = max(map(abs, acceleration))
-        expected = ""
-        if largest > BEYOND * self.accelerometer:
-            expected = f"at most accelerometer_range = {self.accelerometer:.4g} m/s^2 along each axis"
-        elif largest < DEAD:
-            expected = "not zero, as a dead accelerometer reports"
-        elif last and square < ALMOST_NOTHING**2:
-            in_g = tuple(STANDARD_GRAVITY * component for component in acceleration)
-            expected = "in m/s^2, not in g" if math.dist(in_g, last) < SAME * STANDARD_GRAVITY else ""
-        if expected:
-            raise ParameterError("linear_acceleration", acceleration, expected)
-        return acceleration if largest < usual else None
+def in_range(values: Sequence[float] | None, name: str, limit: float, expected: str) -> tuple[Floats3, bool]:
+    """Return `values` as 3 floats, and whether one is saturated; raise ParameterError if one is beyond `limit`."""
+    vector = x, y, z = three_floats(name, values)
+    usual = SATURATED * limit
+    if -usual < x < usual and -usual < y < usual and -usual < z < usual:
+        return vector, False
+    if max(map(abs, vector)) > BEYOND * limit:
+        raise ParameterError(name, vector, f"at most {expected}")
+    return vector, True
 
 
 def three_floats(name: str, values: Sequence[float] | None) -> Floats3:

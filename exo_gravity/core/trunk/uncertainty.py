@@ -29,62 +29,54 @@ USUAL_SHARE = 0.02  # by which one interval changes the usual one
 
 
 class TiltUncertainty:
-    """Follows one estimate, whose samples are usually `period` s apart."""
+    """Follows one estimate from its start, when nothing is known but the accelerometer."""
+
+    variance = math.inf  #: of the tilt, rad^2
+    _square = 0.0  # of the angular acceleration, (rad/s^2)^2, mean over ACCELERATION_TIME
+    _lost = 0.0  # rad^2, of gaps and of runs of samples that did not show the rotation
+    _run = 0.0  # rad lost in the present run, whose angles have one direction
+    _start = math.pi  # rad, error of the start
+    _age = 0.0  # s since the start
 
     def __init__(self, period: float) -> None:
+        """Create it for samples that are usually `period` s apart."""
         self._period = period
-        self._square = 0.0  # of the angular acceleration, (rad/s^2)^2, mean over ACCELERATION_TIME
-        self.restart()
-
-    def restart(self) -> None:
-        """Begin anew: nothing is known but the accelerometer."""
-        self.variance = math.inf  #: of the tilt, rad^2
-        self._lost = 0.0  # rad^2, of gaps and saturation
-        self._run = 0.0  # rad lost in the present run of samples that do not show the rotation
-        self._is_losing = False  # whether the run goes on
-        self._start = math.pi  # rad, error of the start
-        self._age = 0.0  # s since the start
 
     @property
     def is_lost(self) -> bool:
         """Whether so much rotation was not measured that the estimate must begin anew."""
-        return SIGMAS * SIGMAS * self._lost > MAX_ERROR * MAX_ERROR
+        return SIGMAS * SIGMAS * (self._lost + self._run * self._run) > MAX_ERROR * MAX_ERROR
 
     @property
     def is_settled(self) -> bool:
         """Whether the tilt is off by no more than MAX_ERROR."""
         return self._age >= SETTLE_TIME and SIGMAS * SIGMAS * self.variance <= MAX_ERROR * MAX_ERROR
 
-    def advance(self, dt: float, rate: Floats3, last_rate: Floats3) -> None:
-        """Add the rotation that was not measured between the last sample and this one, `dt` s later."""
-        if not self._is_losing:
-            self._run = 0.0
-        self._is_losing = False
-        if dt <= 0.0:
-            return
+    def advance(
+        self, dt: float, rate: Floats3, last_rate: Floats3, unknown: float = 0.0, repeated: float = 0.0
+    ) -> None:
+        """Add the rotation that was not measured between the last sample and this one, `dt` s later.
+
+        unknown: rad/s by which the true rate may differ. repeated: s for which samples have been equal.
+        """
         self._age += dt
         self._lost *= 1.0 - 2.0 * dt / DECAY_TIME
-        period = self._period
+        period, lost = self._period, unknown * dt
+        if repeated:
+            lost = 0.5 * math.sqrt(self._square) * (2.0 * repeated - dt) * dt
         if dt > GAP * period:
             share = min(dt / period, LONG_GAP) / GAP_DIVISOR
             self._lost += max(LEAST_ACCELERATION**2, self._square) * (share * dt * dt) ** 2
-        else:
+        elif dt:
             change = math.dist(rate, last_rate)
-            acceleration = change / (dt if dt > 0.5 * period else 0.5 * period)
+            acceleration = change / max(dt, 0.5 * period)
             if change * dt > JUMP and acceleration > UNUSUAL * math.sqrt(self._square):
-                self.lose(change * dt)
+                lost += change * dt
             self._square += (acceleration * acceleration - self._square) * dt / ACCELERATION_TIME
-        self._period = period + USUAL_SHARE * (dt - period)
-
-    def repeat(self, dt: float, duration: float) -> None:
-        """Add a sample that repeats the last one, the `duration` s of equal ones having grown by `dt`."""
-        self.lose(0.5 * math.sqrt(self._square) * (2.0 * duration - dt) * dt)
-
-    def lose(self, angle: float) -> None:
-        """Add an angle in rad; the angles of one run have one direction, those of different runs do not."""
-        self._lost += angle * (angle + 2.0 * self._run)  # the difference of the squares
-        self._run += angle
-        self._is_losing = True
+        self._run += lost
+        if not lost:
+            self._lost, self._run = self._lost + self._run * self._run, 0.0
+        self._period = period + USUAL_SHARE * (dt - period) if dt else period
 
     def combine(self, bias_sigma: float, square: float, contradiction: float) -> None:
         """Add up the terms.
@@ -96,5 +88,5 @@ class TiltUncertainty:
             self._start = 0.0
         elif self._age >= SETTLE_TIME:  # a movement after a still start does not make it larger again
             self._start = min(self._start, math.sqrt(square) * CORRELATION_TIME / self._age)
-        bias, contradiction = BIAS_TIME * bias_sigma, contradiction / SIGMAS
-        self.variance = BASE * BASE + bias * bias + self._start**2 + contradiction * contradiction + self._lost
+        terms = BASE, BIAS_TIME * bias_sigma, self._start, contradiction / SIGMAS, self._run
+        self.variance = self._lost + sum([term * term for term in terms])

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.model.kinematics import frames
-from exo_gravity.core.numbers import JOINT_COUNT, Vector
+from exo_gravity.core.numbers import Vector
 from exo_gravity.core.safety.drive import CARRYING, State
 from exo_gravity.core.safety.limits import WALL_WIDTH
 from exo_gravity.core.view.urdf import ArmDescription
@@ -47,18 +47,6 @@ class Shape(NamedTuple):
     text: str = ""
 
 
-class ArmPose(NamedTuple):
-    """Where an arm is, in the trunk's axes.
-
-    origins: (5, 3) m, the four joints and the far end. axes: (4, 3), about which the joints turn. hanging: (4, 3), unit
-    vectors along the links at angle 0 of their joint.
-    """
-
-    origins: np.ndarray
-    axes: np.ndarray
-    hanging: np.ndarray
-
-
 class ArmView(NamedTuple):
     """What is known of one arm now."""
 
@@ -70,16 +58,18 @@ class ArmView(NamedTuple):
     message: str = ""  #: of its bridge
 
 
-def arm_pose(arm: ArmDescription, theta: Sequence[float]) -> ArmPose:
-    """Return where `arm` is at `theta` (4,) rad."""
+def arm_pose(arm: ArmDescription, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where `arm` is at `theta` (4,) rad, in the trunk's axes.
+
+    The origins (5, 3) in m of the four joints and the far end, the axes (4, 3) about which the joints turn, and unit
+    vectors (4, 3) along the links.
+    """
     length = arm.robot.length
     links = frames(length.tolist(), theta)
     along = _in_trunk(arm, [link.along for link in links])
-    turned = _in_trunk(arm, [link.axis for link in links]) * arm.outward  # a mirror reverses rotations
+    axes = _in_trunk(arm, [link.axis for link in links]) * arm.outward  # a mirror reverses rotations
     origins = _in_trunk(arm, [link.origin for link in links]) + arm.base
-    angle = np.array(theta)[:, None]
-    hanging = np.cos(angle) * along - np.sin(angle) * np.cross(turned, along)
-    return ArmPose(np.vstack((origins, origins[3] + length[3] * along[3])), turned, hanging)
+    return np.vstack((origins, origins[3] + length[3] * along[3])), axes, along
 
 
 def _in_trunk(arm: ArmDescription, points: Sequence[Sequence[float]]) -> np.ndarray:
@@ -98,22 +88,19 @@ def gravity_shapes(gravity: Vector | None) -> list[Shape]:
 
 def arm_shapes(view: ArmView) -> list[Shape]:
     """Return what is drawn around one arm: range and torque of each joint, and what the arm's bridge does."""
-    pose, limits = arm_pose(view.arm, view.theta), view.arm.limits
-    shapes = []
-    for n in range(JOINT_COUNT):
-        origin, axis, hanging = pose.origins[n], pose.axes[n], pose.hanging[n]
-        low, high, angle = limits.position_min[n], limits.position_max[n], view.theta[n]
-        near = not low + WALL_WIDTH <= angle <= high - WALL_WIDTH
-        colour = RED if near else GREY
-        shapes.append(Shape("limits", LINE, _arc(origin, axis, hanging, low, high), LIMIT_WIDTH, colour))
-        tip = _arc(origin, axis, hanging, angle, angle)[:1]
-        shapes.append(Shape("limits", LINE, np.vstack((origin, tip)), LIMIT_WIDTH, colour))
+    limits, shapes = view.arm.limits, []
+    for n, (origin, axis, along) in enumerate(zip(*arm_pose(view.arm, view.theta), strict=False)):
+        low, high = limits.position_min[n] - view.theta[n], limits.position_max[n] - view.theta[n]
+        colour = GREY if low + WALL_WIDTH <= 0.0 <= high - WALL_WIDTH else RED
+        tip = origin + RANGE_RADIUS * along
+        shapes.append(Shape("limits", LINE, _arc(origin, axis, along, low, high, RANGE_RADIUS), LIMIT_WIDTH, colour))
+        shapes.append(Shape("limits", LINE, np.array((origin, tip)), LIMIT_WIDTH, colour))
         effort, limit = view.effort[n], limits.max_effort[n]
         share = max(-1.0, min(1.0, effort / limit)) if limit > 0.0 else 0.0
-        arc = _arc(origin, axis, hanging, angle, angle + share * TORQUE_SPAN, TORQUE_RADIUS)
+        arc = _arc(origin, axis, along, 0.0, share * TORQUE_SPAN, TORQUE_RADIUS)
         strength = RED if abs(share) >= 1.0 else AMBER if abs(share) > 0.5 else GREEN
         shapes.append(Shape("torques", LINE, arc, TORQUE_WIDTH, strength))
-        shapes.append(Shape("torques", TEXT, tip, TEXT_HEIGHT, strength, f"{effort + 0.0:.2f} Nm"))
+        shapes.append(Shape("torques", TEXT, tip[None], TEXT_HEIGHT, strength, f"{effort + 0.0:.2f} Nm"))
     colour, state = state_of(view)
     above = np.add([view.arm.base], (0.0, 0.0, STATE_HEIGHT))
     shapes.append(Shape("states", SPHERE, above, SPHERE_SIZE, colour))
@@ -132,9 +119,8 @@ def state_of(view: ArmView) -> tuple[Colour, str]:
 
 
 def _arc(
-    origin: np.ndarray, axis: np.ndarray, zero: np.ndarray, start: float, end: float, radius: float = RANGE_RADIUS
+    origin: np.ndarray, axis: np.ndarray, along: np.ndarray, start: float, end: float, radius: float
 ) -> np.ndarray:
-    """Return points (n, 3) on the arc around `axis` from angle `start` to `end` rad; at angle 0 it is along `zero`."""
-    count = 2 + int(abs(end - start) / ARC_STEP)
-    angles = np.linspace(start, end, count)[:, None]
-    return np.asarray(origin + radius * (np.cos(angles) * zero + np.sin(angles) * np.cross(axis, zero)))
+    """Return points (n, 3) on the arc around `axis` from angle `start` to `end` in rad from the direction `along`."""
+    angles = np.linspace(start, end, 2 + int(abs(end - start) / ARC_STEP))[:, None]
+    return np.asarray(origin + radius * (np.cos(angles) * along + np.sin(angles) * np.cross(axis, along)))

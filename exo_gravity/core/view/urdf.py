@@ -16,31 +16,25 @@ are abduction and flexion on both sides. The gain c_n is no part of a descriptio
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 from xml.etree import ElementTree
-from xml.etree.ElementTree import Element, SubElement
+from xml.etree.ElementTree import Element
 
 from exo_gravity.core.compensation.params import robot_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import ZEROS, ArmModel
-from exo_gravity.core.model.tilt import SIDES
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.safety.params import LIMIT_PARAMETERS, limits_of
+from exo_gravity.core.safety.params import limits_of
 
 Point = tuple[float, float, float]
 
 ROOT = "trunk"
+NO_TURN = (0.0, 0.0, 0.0)  # rad
 HALF_BREADTH = 0.15  # m from the middle of the trunk to the axis of joint 1, if `shoulder` is not given
-# The parameters that `described` reads.
-OF_COMPENSATOR = (
-    "side", "link_length", "gain", "gravity", "robot.mass", "robot.cog", "robot.first_moment", "robot.off_axis",
-    "shoulder_from_imu", "friction.viscous", "friction.coulomb",
-)  # fmt: skip
-OF_BRIDGE = ("joint_names", *(param.name for param in LIMIT_PARAMETERS))
 # The parameters of `robot_model`.
 # fmt: off
 ROBOT_MODEL = (
@@ -73,10 +67,6 @@ class ArmDescription:
     damping: Vector = ZEROS  #: (4,) Nm s/rad, 0 for unknown
     friction: Vector = ZEROS  #: (4,) Nm, 0 for unknown
     shoulder: Vector = (0.0, 0.0, 0.0)  #: (3,) m, the arm's base in the trunk's axes; zeros for unknown
-
-    def __post_init__(self) -> None:
-        if self.side not in SIDES:
-            raise ParameterError("side", self.side, f"one of {', '.join(SIDES)}")
 
     @property
     def outward(self) -> float:
@@ -117,20 +107,15 @@ def urdf(arms: Sequence[ArmDescription], meshes: str = "") -> str:
     sides = [arm.side for arm in arms]
     if not arms or len(set(sides)) != len(sides):
         raise ParameterError("side", sides, "one arm for each side that is described")
-    robot = Element("robot", name="exo_gravity")
-    for name, colour in COLOURS.items():
-        _add(_add(robot, "material", name=name), "color", rgba=colour)
-    trunk = _add(robot, "link", name=ROOT)
-    if meshes:
-        _add_mesh(trunk, meshes)
-    else:
-        x, _, z = (sum(column) / len(arms) for column in zip(*(arm.base for arm in arms), strict=True))
-        _draw(trunk, "person", "box", (x, 0.0, z - CHEST[2] / 2), size=CHEST)
-        _draw(trunk, "person", "sphere", (x, 0.0, z + HEAD_HEIGHT), radius=HEAD_RADIUS)
-        for arm in arms:
-            _draw(trunk, "motor", "cylinder", arm.base, **MOTOR)
-    for arm, names in zip(arms, joint_names(arms), strict=True):
-        _add_arm(robot, arm, names, meshes)
+    x, _, z = (sum(column) / len(arms) for column in zip(*(arm.base for arm in arms), strict=True))
+    person = (
+        _visual("person", "box", (x, 0.0, z - CHEST[2] / 2), size=CHEST),
+        _visual("person", "sphere", (x, 0.0, z + HEAD_HEIGHT), radius=HEAD_RADIUS),
+    )
+    trunk = _link(ROOT, meshes, *person, *(_visual("motor", "cylinder", arm.base, **MOTOR) for arm in arms))
+    materials = (_element("material", _element("color", rgba=rgba), name=name) for name, rgba in COLOURS.items())
+    parts = (_arm(arm, names, meshes) for arm, names in zip(arms, joint_names(arms), strict=True))
+    robot = _element("robot", *materials, trunk, *(part for arm in parts for part in arm), name="exo_gravity")
     ElementTree.indent(robot)
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(robot, encoding="unicode") + "\n"
 
@@ -165,75 +150,68 @@ def _bodies(arm: ArmDescription) -> list[tuple[float, Point]]:
     return list(zip(mass, centres, strict=True))
 
 
-def _add_arm(robot: Element, arm: ArmDescription, names: Sequence[str], meshes: str) -> None:
+def _arm(arm: ArmDescription, names: Sequence[str], meshes: str) -> Iterator[Element]:
+    """Yield the joints and links of one arm."""
     out, limits, lengths = arm.outward, arm.limits, arm.robot.length.tolist()
     axes: list[Point] = [(0.0, 0.0, -out), (out, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, -1.0, 0.0)]
     ends: list[Point] = [(0.0, out * lengths[0], 0.0), *((0.0, 0.0, -length) for length in lengths[1:])]
     parent, origin = ROOT, arm.base
     for n, (mass, centre) in enumerate(_bodies(arm)):
-        joint = _add_joint(robot, names[n], "revolute", parent, arm.links[n], origin)
-        _add(joint, "axis", xyz=axes[n])
         lower, upper = limits.position_min[n], limits.position_max[n]
-        _add(joint, "limit", lower=lower, upper=upper, effort=limits.max_effort[n], velocity=limits.max_velocity[n])
+        largest = {"effort": limits.max_effort[n], "velocity": limits.max_velocity[n]}
+        moving = [_element("axis", xyz=axes[n]), _element("limit", lower=lower, upper=upper, **largest)]
         if arm.damping[n] or arm.friction[n]:
-            _add(joint, "dynamics", damping=arm.damping[n], friction=arm.friction[n])
-        link = _add(robot, "link", name=arm.links[n])
-        along = axes[3] if n == 0 else axes[0]  # of the link, but for its sign
-        _add_inertia(link, mass, centre, lengths[n], sideways=n == 0)
-        if meshes:
-            _add_mesh(link, meshes)
-        else:
-            if lengths[n]:
-                middle = ends[n][0] / 2, ends[n][1] / 2, ends[n][2] / 2
-                _draw(link, "tube", "cylinder", middle, along, radius=DRAWN_RADIUS, length=lengths[n])
-            if n + 1 < JOINT_COUNT:
-                _draw(link, "motor", "cylinder", ends[n], axes[n + 1], **MOTOR)
-            _draw(link, "centre_of_gravity", "sphere", centre, radius=COG_RADIUS)
+            moving.append(_element("dynamics", damping=arm.damping[n], friction=arm.friction[n]))
+        yield _joint(names[n], "revolute", parent, arm.links[n], origin, *moving)
+        drawn = []
+        if lengths[n]:
+            middle = ends[n][0] / 2, ends[n][1] / 2, ends[n][2] / 2
+            along = axes[3] if n == 0 else axes[0]  # of the link, but for its sign
+            drawn.append(_visual("tube", "cylinder", middle, along, radius=DRAWN_RADIUS, length=lengths[n]))
+        if n + 1 < JOINT_COUNT:
+            drawn.append(_visual("motor", "cylinder", ends[n], axes[n + 1], **MOTOR))
+        drawn.append(_visual("centre_of_gravity", "sphere", centre, radius=COG_RADIUS))
+        yield _link(arm.links[n], meshes, *drawn, inertial=_tube(mass, centre, lengths[n], sideways=n == 0))
         parent, origin = arm.links[n], ends[n]
-    _add_joint(robot, f"{arm.links[-1]}_joint", "fixed", parent, arm.links[-1], origin)
-    _add(robot, "link", name=arm.links[-1])
+    yield _joint(f"{arm.links[-1]}_joint", "fixed", parent, arm.links[-1], origin)
+    yield _element("link", name=arm.links[-1])
 
 
-def _add_joint(robot: Element, name: str, kind: str, parent: str, child: str, origin: Point) -> Element:
-    joint = _add(robot, "joint", name=name, type=kind)
-    _add(joint, "origin", xyz=origin, rpy=(0.0, 0.0, 0.0))
-    _add(joint, "parent", link=parent)
-    _add(joint, "child", link=child)
-    return joint
+def _joint(name: str, kind: str, parent: str, child: str, origin: Point, *moving: Element) -> Element:
+    ends = _element("parent", link=parent), _element("child", link=child)
+    return _element("joint", _element("origin", xyz=origin, rpy=NO_TURN), *ends, *moving, name=name, type=kind)
 
 
-def _add_inertia(link: Element, mass: float, centre: Point, length: float, sideways: bool) -> None:
-    """Add the inertial element of a thin tube along the link, which points along y if `sideways` and along z if not."""
+def _tube(mass: float, centre: Point, length: float, sideways: bool) -> Element:
+    """Return the inertial element of a thin tube, which points along y if `sideways` and along z if not."""
     along = mass * TUBE_RADIUS**2
     across = along / 2 + mass * length**2 / 12
     iyy, izz = (along, across) if sideways else (across, along)
-    inertial = _add(link, "inertial")
-    _add(inertial, "origin", xyz=centre, rpy=(0.0, 0.0, 0.0))
-    _add(inertial, "mass", value=mass)
-    _add(inertial, "inertia", ixx=across, iyy=iyy, izz=izz, ixy=0.0, ixz=0.0, iyz=0.0)
+    inertia = _element("inertia", ixx=across, iyy=iyy, izz=izz, ixy=0.0, ixz=0.0, iyz=0.0)
+    return _element("inertial", _element("origin", xyz=centre, rpy=NO_TURN), _element("mass", value=mass), inertia)
 
 
-def _add_mesh(link: Element, folder: str) -> None:
-    """Add the mesh LINK.stl in `folder`, an address, as the visual of `link`."""
-    geometry = _add(_add(link, "visual"), "geometry")
-    _add(geometry, "mesh", filename=f"{folder.rstrip('/')}/{link.get('name')}.stl")
+def _link(name: str, meshes: str, *drawn: Element, inertial: Element | None = None) -> Element:
+    """Return a link that shows the mesh NAME.stl in the folder `meshes`, an address, or without one what is `drawn`."""
+    if meshes:
+        mesh = _element("mesh", filename=f"{meshes.rstrip('/')}/{name}.stl")
+        drawn = (_element("visual", _element("geometry", mesh)),)
+    return _element("link", *([] if inertial is None else [inertial]), *drawn, name=name)
 
 
-def _draw(
-    link: Element, material: str, shape: str, centre: Point, axis: Point = (0.0, 0.0, 1.0), **size: float | Point
-) -> None:
-    """Add a shape; axis: one of the frame's axes, of a cylinder, which in URDF lies along z."""
-    visual = _add(link, "visual")
-    _add(visual, "origin", xyz=centre, rpy=(abs(axis[1]) * math.pi / 2, abs(axis[0]) * math.pi / 2, 0.0))
-    _add(_add(visual, "geometry"), shape, **size)
-    _add(visual, "material", name=material)
+def _visual(material: str, shape: str, centre: Point, axis: Point = (0.0, 0.0, 1.0), **size: float | Point) -> Element:
+    """Return a shape; axis: one of the frame's axes, of a cylinder, which in URDF lies along z."""
+    turn = (abs(axis[1]) * math.pi / 2, abs(axis[0]) * math.pi / 2, 0.0)
+    geometry = _element("geometry", _element(shape, **size))
+    return _element("visual", _element("origin", xyz=centre, rpy=turn), geometry, _element("material", name=material))
 
 
-def _add(parent: Element, tag: str, **attributes: str | float | Sequence[float]) -> Element:
-    """Add an element. Numbers are written with every digit, so that nothing is rounded."""
-    texts = {}
+def _element(tag: str, *children: Element, **attributes: str | float | Sequence[float]) -> Element:
+    """Return an element. Numbers are written with every digit, so that nothing is rounded."""
+    element = Element(tag)
     for name, value in attributes.items():
         numbers = (value,) if isinstance(value, float | int) else value
         # + 0.0: no negative zero
-        texts[name] = value if isinstance(value, str) else " ".join(repr(float(number) + 0.0) for number in numbers)
-    return SubElement(parent, tag, texts)
+        element.set(name, value if isinstance(value, str) else " ".join(repr(float(x) + 0.0) for x in numbers))
+    element.extend(children)
+    return element

@@ -12,17 +12,17 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import can
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID
-from exo_gravity.core.motors.specs import MOTORS, pack_command, unpack_reply
-from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, MASTER_ID, MIT, MIT_V3, REPLY, Frame
+from exo_gravity.core.motors.specs import MOTORS, pack_command
+from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, MIT, MIT_V3, REPLY, Frame
 from exo_gravity.hardware.can.can_port import CanPort, open_bus
-from exo_gravity.hardware.can.motor_bus import LISTEN_TIME, MAX_STALE_FRAMES
+from exo_gravity.hardware.can.motor_bus import LISTEN_TIME
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.ownership.bus_lock import Address, BusLock
 
@@ -32,7 +32,7 @@ ALL_IDS = range(1, MAX_CAN_ID + 1)
 REPLY_TIME = 0.01  # s: a motor replies within 0.4 ms; a USB adapter and a busy computer add some
 ATTEMPTS = 2  # for each ID, in case a frame is lost
 STATUS_TIME = 0.12  # s in which the next status frame of a V3 board is awaited
-V3_IDS = frozenset(range(1, 256))
+IDS = frozenset(range(1, 256))
 
 
 class MotorAnswer(NamedTuple):
@@ -47,14 +47,7 @@ class MotorAnswer(NamedTuple):
     wire_format: str = MIT.name  #: Name of the board's format.
 
 
-class Scan(NamedTuple):
-    """Who answered on a bus."""
-
-    answers: tuple[MotorAnswer, ...]  #: One per motor, by ID.
-    problems: tuple[str, ...]  #: Sentences on what is wrong with the bus or an ID.
-
-
-class BusScan:
+class BusScan(contextlib.ExitStack):
     """Owns the bus at `address` until `close`, so that no bridge can start meanwhile.
 
     open_bus: opens the bus. Raises BusError if a bridge holds the bus, with its name; if another host commands the
@@ -67,44 +60,37 @@ class BusScan:
         clock: Clock = COMPUTER_CLOCK,
         open_bus: Callable[[str, str, Mapping[str, Any]], can.BusABC] = open_bus,
     ) -> None:
+        super().__init__()
         self._now = clock.monotonic
         self.name = address[1]
         self._v3: dict[int, MotorAnswer] = {}  # the newest status of each V3 board
-        with contextlib.ExitStack() as held:
-            lock = BusLock(address, f"calibrate motors (PID {os.getpid()})", clock=clock)
-            held.callback(lock.release)
+        lock = BusLock(address, f"calibrate motors (PID {os.getpid()})", clock=clock)
+        self.callback(lock.release)
+        try:
             if lock.notes.drive.powered:
                 raise BusError(
                     f"CAN bus {self.name}: the last can_bridge died and may have left the motors on: start can_bridge, "
                     "which lets the arm down, and stop it"
                 )
             self._port = CanPort(open_bus(*address), clock)
-            held.callback(self._port.close)
+            self.callback(self._port.close)
             self._listen()
-            self._held = held.pop_all()
+        except BaseException:
+            self.close()
+            raise
 
-    def close(self) -> None:
-        """Release the bus."""
-        self._held.close()
-
-    def __enter__(self) -> BusScan:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
-    def scan(self, can_ids: Iterable[int] = ALL_IDS) -> Scan:
-        """Ask every ID; return who answers, and what is wrong. Raises BusError if the bus fails."""
+    def scan(self, can_ids: Iterable[int] = ALL_IDS) -> tuple[tuple[MotorAnswer, ...], tuple[str, ...]]:
+        """Ask every ID; return who answers, by ID, and what is wrong with the bus or an ID. Raises BusError."""
         found = {can_id: self._v3[can_id] for can_id in can_ids if can_id in self._v3}
         problems: dict[str, None] = {}
         for can_id in sorted(set(can_ids) - set(found)):
             for sent in range(1, ATTEMPTS + 1):
-                replies, others = self._ask(can_id)
+                answers, others = self._ask(can_id)
                 for reply_id, data in others:
-                    if problem := _problem(can_id, reply_id, data):
-                        problems[problem] = None
-                    elif data[0] < can_id:
-                        found.setdefault(data[0], _answer(reply_id, data))  # a late reply
+                    what = f"a frame with ID {reply_id} [{data.hex(' ')}]"
+                    problems[f"ID {can_id}: {what} follows a command, and is no motor's reply"] = None
+                replies = [answer for answer in answers if answer.can_id == can_id]
+                found = {answer.can_id: answer for answer in answers} | found  # also late replies
                 if len(replies) > sent:  # a late reply to the first command may arrive after the second
                     angles = " and ".join(sorted({f"{reply.position:.2f} rad" for reply in replies}))
                     problems[
@@ -112,95 +98,67 @@ class BusScan:
                         "them another ID with the vendor's tool, alone on the bus"
                     ] = None
                 if replies:
-                    found[can_id] = replies[0]
                     break
         for can_id in sorted(can_id for can_id in self._v3 if can_id > MAX_CAN_ID):
             problems[f"ID {can_id}: a V3 board; its ID must be from 1 to {MAX_CAN_ID}"] = None
-        return Scan(tuple(found[can_id] for can_id in sorted(found)), tuple(problems))
+        return tuple(found[can_id] for can_id in sorted(found)), tuple(problems)
 
     def poll(self, can_ids: Iterable[int]) -> dict[int, MotorAnswer]:
         """Return the newest answer of each of these motors; a silent one is missing. Raises BusError."""
         reporting = set(can_ids) & set(self._v3)
-        replies = {i: self._ask(i, is_alone=False)[0] for i in can_ids if i not in reporting}
-        return {i: found[-1] for i, found in replies.items() if found} | self._statuses(reporting)
+        asked = [self._ask(can_id, is_alone=False)[0] for can_id in can_ids if can_id not in reporting]
+        found = {answer.can_id: answer for answers in asked for answer in answers}
+        list(self._port.waiting())  # read: what came before is no answer
+        before = self._v3.copy()
+        for _ in self._frames(STATUS_TIME if reporting else 0.0):
+            if all(self._v3[can_id] is not before[can_id] for can_id in reporting):
+                break
+        return found | {can_id: self._v3[can_id] for can_id in reporting if self._v3[can_id] is not before[can_id]}
 
     def _listen(self) -> None:
-        end = self._now() + LISTEN_TIME
+        for message, kind, _ in self._frames(LISTEN_TIME):
+            heard = message.arbitration_id
+            if (kind == COMMAND) if message.is_extended_id else (heard <= MAX_CAN_ID):
+                raise BusError(
+                    f"CAN bus {self.name} is in use: a frame with ID {heard} was heard; stop the other host; if there "
+                    "is none, two motors with one ID answer each other: switch their power off"
+                )
+
+    def _ask(self, can_id: int, is_alone: bool = True) -> tuple[list[MotorAnswer], list[Frame]]:
+        """Send one command; return the replies of V1 and V2 boards, and other short frames.
+
+        is_alone: whether to wait for further replies after the first.
+        """
+        list(self._port.waiting())  # read: what came before is no answer
+        self._port.send((can_id, NOTHING))
+        answers: list[MotorAnswer] = []
+        others: list[Frame] = []
+        for message, _, answer in self._frames(REPLY_TIME):
+            if message.is_extended_id or message.data == NOTHING:
+                continue  # a V3 board; our own command, echoed by the bus
+            if answer is None:
+                others.append((message.arbitration_id, bytes(message.data)))
+                continue
+            answers.append(answer)
+            if answer.can_id == can_id and not is_alone:
+                break
+        self._port.confirm()
+        return answers, others
+
+    def _frames(self, duration: float) -> Iterator[tuple[can.Message, str, MotorAnswer | None]]:
+        """Yield the data frames that arrive within `duration` s, what each is, and the answer in it."""
+        end = self._now() + duration
         while (remaining := end - self._now()) > 0.0:
             message = self._port.receive(remaining)
             if message is None or message.is_error_frame or message.is_remote_frame:
                 continue
-            heard = message.arbitration_id
-            if (heard > MAX_CAN_ID) if not message.is_extended_id else self._note_status(message) != COMMAND:
-                continue
-            raise BusError(
-                f"CAN bus {self.name} is in use: a frame with ID {heard} was heard; stop the other host; if there is "
-                "none, two motors with one ID answer each other: switch their power off"
-            )
-
-    def _statuses(self, can_ids: set[int]) -> dict[int, MotorAnswer]:
-        """Return the next status of each of these V3 boards; a silent one is missing."""
-        self._drain()
-        before = dict(self._v3)
-        end = self._now() + STATUS_TIME
-        while (remaining := end - self._now()) > 0.0 and any(self._v3[i] is before[i] for i in can_ids):
-            message = self._port.receive(remaining)
-            if message is not None and message.is_extended_id:
-                self._note_status(message)
-        return {i: self._v3[i] for i in can_ids if self._v3[i] is not before[i]}
-
-    def _note_status(self, message: can.Message) -> str:
-        """Note the status in a frame with a 29-bit ID, if it is one; return what the frame is."""
-        frame_id = message.arbitration_id | EXTENDED
-        kind, can_id = MIT_V3.classify(frame_id, message.data, V3_IDS)
-        if kind == REPLY:
-            reply = MIT_V3.unpack_reply(SPEC, can_id, message.data)
-            state = reply.position, reply.temperature, reply.error
-            self._v3[can_id] = MotorAnswer(can_id, message.arbitration_id, 8, *state, MIT_V3.name)
-        return kind
-
-    def _drain(self) -> None:
-        """Read the frames that have arrived, but not forever: two motors with one ID may keep answering each other."""
-        for _ in range(MAX_STALE_FRAMES):
-            if self._port.waiting() is None:
-                break
-
-    def _ask(self, can_id: int, is_alone: bool = True) -> tuple[list[MotorAnswer], list[Frame]]:
-        """Send one command; return the replies of this motor, and other short frames.
-
-        is_alone: whether to wait for further replies after the first.
-        """
-        self._drain()
-        self._port.send((can_id, NOTHING))
-        replies: list[MotorAnswer] = []
-        others: list[Frame] = []
-        end = self._now() + REPLY_TIME
-        while (remaining := end - self._now()) > 0.0 and (is_alone or not replies):
-            message = self._port.receive(remaining)
-            if message is None or message.is_extended_id or message.is_error_frame or message.is_remote_frame:
-                continue
-            frame = message.arbitration_id, bytes(message.data)
-            if frame[1] == NOTHING:
-                continue  # our own command, echoed by the bus
-            if frame[1][:1] == bytes((can_id,)) and not _problem(can_id, *frame):
-                replies.append(_answer(*frame))
-            else:
-                others.append(frame)
-        self._port.confirm()
-        return replies, others
-
-
-def _problem(can_id: int, reply_id: int, data: bytes) -> str:
-    """Return what is wrong with a frame that came after a command to `can_id`; '' for a motor's reply."""
-    if len(data) not in (6, 8):
-        return f"ID {can_id}: a reply of {len(data)} bytes, must be 6 or 8"
-    if data[0] > can_id or (reply_id == can_id and data[0] != can_id):
-        return f"ID {can_id}: the reply says that it is from motor {data[0]}"
-    if reply_id not in (MASTER_ID, data[0]):
-        return f"ID {can_id}: a reply with ID {reply_id}, must be {can_id} or {MASTER_ID}"
-    return ""
-
-
-def _answer(reply_id: int, data: bytes) -> MotorAnswer:
-    reply = unpack_reply(SPEC, data)
-    return MotorAnswer(reply.motor_id, reply_id, len(data), reply.position, reply.temperature, reply.error)
+            board, flag = (MIT_V3, EXTENDED) if message.is_extended_id else (MIT, 0)
+            kind, can_id = board.classify(message.arbitration_id | flag, message.data, IDS)
+            answer = None
+            if kind == REPLY:
+                reply, length = board.unpack_reply(SPEC, can_id, message.data), len(message.data)
+                state = reply.position, reply.temperature, reply.error
+                answer = MotorAnswer(can_id, message.arbitration_id, length, *state, board.name)
+                if board is MIT_V3:
+                    self._v3[can_id] = answer
+            yield message, kind, answer

@@ -7,12 +7,13 @@ again is a new device, which only a newly opened bus can reach. Opening may bloc
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import can
 from can.interfaces.socketcan import SocketcanBus
+from can.interfaces.udp_multicast import UdpMulticastBus
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, Frame
@@ -20,6 +21,8 @@ from exo_gravity.hardware.clock import Clock
 
 REOPEN_AFTER = 0.02  # s of failures in a row after which the bus is opened again
 REOPEN_PERIOD = 0.1  # s between two attempts
+MAX_STALE_FRAMES = 256  # the capacity of udp_multicast, more than any cycle produces
+Result = TypeVar("Result")
 
 
 def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:
@@ -40,44 +43,38 @@ class CanPort:
     """
 
     def __init__(self, bus: can.BusABC, clock: Clock, reopen: Callable[[], can.BusABC] | None = None) -> None:
-        #: Name of the bus.
-        self.name = str(bus.channel_info)
+        self.name = str(bus.channel_info)  #: name of the bus
         #: Whether `is_rx` is false only for frames that this port sent.
         self.marks_echoes = not isinstance(bus, SocketcanBus)
-        self._bus = bus
+        #: Whether each frame that this port sends comes back to it, unmarked.
+        self.echoes = isinstance(bus, UdpMulticastBus)
+        self._bus: can.BusABC | None = bus  # None while a failed one is opened again
         self._clock = clock
         self._reopen = reopen
         self._failing_since: float | None = None
         self._error = ""
-        self._is_open = True
         self._is_closing = False
-        self._reopened: can.BusABC | None = None  # by the other thread, not yet in use
 
     def send(self, frame: Frame) -> None:
-        """Send one frame. Raises BusError."""
+        """Send a frame. Raises BusError."""
         frame_id, data = frame
-        bus = self._open_bus()
-        try:
-            bus.send(can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED))
-        except Exception as error:
-            raise self._failure(error) from error
+        message = can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED)
+        self._guarded(lambda bus: bus.send(message))
 
     def receive(self, timeout: float) -> can.Message | None:
         """Return the next frame, or None if there is none within `timeout` s. Raises BusError."""
-        bus = self._open_bus()
-        try:
-            return bus.recv(timeout)
-        except Exception as error:
-            raise self._failure(error) from error
+        return self._guarded(lambda bus: bus.recv(timeout))
 
-    def waiting(self) -> can.Message | None:
-        """Return the next frame that has already arrived, or None. Raises BusError.
+    def waiting(self) -> Iterator[can.Message]:
+        """Yield the frames that have already arrived, but not forever: others may keep sending. Raises BusError.
 
         An slcan adapter acknowledges each frame with a separate line, for which python-can returns None.
         """
-        while (message := self.receive(0.0)) is None and self._has_lines():
-            pass
-        return message
+        for _ in range(MAX_STALE_FRAMES):
+            while (message := self.receive(0.0)) is None:
+                if not self._guarded(_has_lines):
+                    return
+            yield message
 
     def confirm(self) -> None:
         """Note that the bus works: its last failure, if any, was not the first of a row."""
@@ -86,35 +83,25 @@ class CanPort:
     def close(self) -> None:
         """Close the bus. Never raises."""
         self._is_closing = True
-        if self._is_open:
+        if self._bus is not None:
             _close(self._bus)
 
-    def _has_lines(self) -> bool:
-        """Return whether the serial port of an slcan adapter has received more; False for every other bus."""
-        serial_port = getattr(self._bus, "serialPortOrig", None)
+    def _guarded(self, use: Callable[[can.BusABC], Result]) -> Result:
+        """Return what `use` returns. Raises BusError for every error, and while the bus is opened again."""
+        bus = self._bus
+        if bus is None:
+            raise BusError(f"CAN bus {self.name}: {self._error}; opening it again")
         try:
-            return serial_port is not None and serial_port.in_waiting > 0
-        except OSError as error:
-            raise self._failure(error) from error
-
-    def _open_bus(self) -> can.BusABC:
-        if not self._is_open:
-            if self._reopened is None:
-                raise BusError(f"CAN bus {self.name}: {self._error}; opening it again")
-            self._bus, self._reopened = self._reopened, None
-            self._is_open = True
-            self._failing_since = None
-        return self._bus
-
-    def _failure(self, error: Exception) -> BusError:
-        now = self._clock.monotonic()
-        self._error = f"{error}" if isinstance(error, (can.CanError, OSError)) else f"{type(error).__name__}: {error}"
-        if self._failing_since is None:
-            self._failing_since = now
-        elif self._reopen is not None and now - self._failing_since > REOPEN_AFTER:
-            self._is_open = False
-            self._clock.later(0.0, partial(self._open_again, self._reopen, self._bus))
-        return BusError(f"CAN bus {self.name}: {self._error}")
+            return use(bus)
+        except Exception as error:
+            now, is_plain = self._clock.monotonic(), isinstance(error, (can.CanError, OSError))
+            self._error = f"{error}" if is_plain else f"{type(error).__name__}: {error}"
+            if self._failing_since is None:
+                self._failing_since = now
+            elif self._reopen is not None and now - self._failing_since > REOPEN_AFTER:
+                self._bus = None
+                self._clock.later(0.0, partial(self._open_again, self._reopen, bus))
+            raise BusError(f"CAN bus {self.name}: {self._error}") from error
 
     def _open_again(self, reopen: Callable[[], can.BusABC], failed: can.BusABC | None = None) -> None:
         if failed is not None:
@@ -126,9 +113,15 @@ class CanPort:
         except BusError:
             self._clock.later(REOPEN_PERIOD, partial(self._open_again, reopen))
             return
+        self._failing_since, self._bus = None, bus
         if self._is_closing:
             _close(bus)
-        self._reopened = bus
+
+
+def _has_lines(bus: can.BusABC) -> bool:
+    """Return whether the serial port of an slcan adapter has received more; False for every other bus."""
+    serial_port = getattr(bus, "serialPortOrig", None)
+    return serial_port is not None and serial_port.in_waiting > 0
 
 
 def _close(bus: can.BusABC) -> None:

@@ -5,11 +5,11 @@ The wire formats of the boards (core/wire_formats) may differ. A motor of V1 and
 Frames of other devices are ignored and counted by kind.
 
 A motor obeys every sender. A command to one of our motors that we did not send is answered at once with our own, under
-full damping: until then the other sender's torque acts, and no damping. To know it, echoes of our own frames
-are set apart: most buses return none. Some return them and mark them (`is_rx` is false). udp_multicast returns them
-unmarked, in order. The first frames show whether a bus echoes. SocketCAN sets the same mark on every frame from this
-computer, also on those of another process (Documentation/networking/can.rst of Linux, MSG_DONTROUTE): there it does not
-show an echo.
+full damping: until then the other sender's torque acts, and no damping. What it moves the joint in between must not add
+up, so for a while all our commands to that motor also hold the joint. To know a foreign command, echoes of our own
+frames are set apart: most buses return none. Some return them and mark them (`is_rx` is false). udp_multicast returns
+them unmarked, in order. SocketCAN sets the same mark on every frame from this computer, also on those of another
+process (Documentation/networking/can.rst of Linux, MSG_DONTROUTE): there it does not show an echo.
 
 A zero command precedes the frames that switch a V1 or V2 board on or off: the motor remembers its last command, and
 ENTER would carry it out. A command switches a V3 board on, so it gets none while the arm is off.
@@ -23,7 +23,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from itertools import chain
 
 import can
@@ -37,7 +37,6 @@ from exo_gravity.core.safety.limits import DAMPING, UNKNOWN, JointSample
 from exo_gravity.hardware.can.can_port import CanPort
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
-MAX_STALE_FRAMES = 256  # frames read before each cycle: the capacity of udp_multicast, more than any cycle produces
 EXIT_PERIOD = 0.5  # s between two EXIT frames to motors that are off, in case one was lost,
 UNCONFIRMED_EXIT_PERIOD = 0.02  # s, and to motors that have not replied since the first EXIT
 OFF_EFFORT = 0.2  # Nm that a V3 board may report when it is off: it reports unasked, so a frame alone proves nothing
@@ -46,11 +45,11 @@ LISTEN_TIME = 0.12  # s before the first frame
 SETTLING_TIME = 0.02  # s of it in which late replies to the previous owner may still arrive
 CORRECTION_PERIOD = 0.001  # s between two corrections of a motor: two correcting hosts must not fill the bus
 CONTEST_TIME = 0.5  # s after a foreign command in which another one is expected
+HOLD_STIFFNESS = 60.0  # Nm/rad by which a contested motor holds its joint: the motor applies it without our delay,
+HOLD_REACH = 0.15  # rad at most from where the joint is,
+HOLD_SPEED = 0.3  # rad/s with which the held position follows the joint
 FOREIGN_COMMAND = "foreign command"
-TRIAL = 32  # frames sent until it is known whether the bus echoes
 MOST_AWAITED = 512  # twice the frames that a udp_multicast socket keeps unread
-
-Group = tuple[WireFormat, frozenset[int]]  # the motors of one format
 
 
 class MotorBus:
@@ -71,16 +70,13 @@ class MotorBus:
     ) -> None:
         #: The newest reading of each joint, UNKNOWN before the first reply.
         self.samples: list[JointSample] = [UNKNOWN] * JOINT_COUNT
-        #: Count of frames that were not replies of these motors, by kind.
-        self.ignored: Counter[str] = Counter()
-        #: Count of commands to these motors from another sender.
-        self.foreign_commands = 0
-        #: The last of them, in words.
-        self.foreign_command = ""
+        self.ignored: Counter[str] = Counter()  #: count of frames that were not replies of these motors, by kind
+        self.foreign_commands = 0  #: count of commands to these motors from another sender
+        self.foreign_command = ""  #: the last of them, in words
         self.clock = clock
         self._now = clock.monotonic
         self._port = CanPort(bus, clock, reopen)
-        self._filter = FrameFilter(motors, self._port.marks_echoes)
+        self._filter = FrameFilter(motors, self._port.marks_echoes, self._port.echoes)
         self._motors = tuple(motors)
         self._asked = frozenset(joint for joint, motor in enumerate(motors) if motor.wire_format.replies)
         self._joint_of = {motor.can_id: joint for joint, motor in enumerate(motors)}
@@ -90,7 +86,8 @@ class MotorBus:
         self._ids = tuple(motor.command_id for motor in motors)
         self._drive = OFF  # last sent
         self._corrected = [-math.inf] * JOINT_COUNT  # s
-        self._foreign_time = -math.inf
+        self._contested = [-math.inf] * JOINT_COUNT  # s of the last foreign command to the motor
+        self._held = [math.nan] * JOINT_COUNT  # rad
         self._note = note
         self._exit_sent = -math.inf
         self._is_confirming = False  # replies now follow an EXIT
@@ -104,7 +101,7 @@ class MotorBus:
     @property
     def is_contested(self) -> bool:
         """Whether another sender commands these motors."""
-        return self._now() - self._foreign_time < CONTEST_TIME
+        return self._now() - max(self._contested) < CONTEST_TIME
 
     def listen(self) -> None:
         """Listen before the first frame. Raises BusError if another host commands these motors."""
@@ -129,20 +126,19 @@ class MotorBus:
             self._unconfirmed.update(joint for joint, is_unsure in enumerate(drive.unsure) if not is_unsure)
         self._note(drive._replace(powered=self.may_be_powered))
         self._is_confirming = not self._powered and self._exit_sent > -math.inf
-        self._drain()
-        if drive.powered:
-            self._switch_on(drive)
+        for message in self._port.waiting():  # replies that arrived after their cycle are not replies to this one
+            self._take(message)
+        if drive.powered and not self._powered:
+            self._powered, self._exit_sent = True, -math.inf
+            if not any(drive.unsure):
+                self._send_commands(OFF)
+                for motor in self._motors:
+                    self._send(*motor.enter)
         self._send_commands(drive)
         if not drive.powered:
             self._switch_off()
         self._answered.clear()
-        while len(self._answered) < JOINT_COUNT:
-            remaining = deadline - self._now()
-            message = self._port.receive(max(0.0, remaining))
-            if message is not None:
-                self._take(message)
-            if remaining <= 0.0:
-                break
+        self.receive_until(deadline, lambda: len(self._answered) == JOINT_COUNT)
         self._port.confirm()
         return len(self._answered) == JOINT_COUNT
 
@@ -161,13 +157,13 @@ class MotorBus:
         if not all(frames):
             raise BusError(f"set_zero: motor {self._motors[frames.index(())].can_id} has a board without such a frame")
         self._send_commands(OFF)
-        self._send_each(frames)
+        self._send(*chain.from_iterable(frames))
 
-    def stop(self) -> bool:
+    def stop(self) -> None:
         """Send the last frames, a zero command and EXIT, twice; then close the bus. Never raises.
 
-        Returns whether the motors are off, as far as their replies show. If not, they stay noted as powered. Nothing is
-        sent to motors that were never switched on or off: another owner may have left them on.
+        Motors whose replies do not show that they are off stay noted as powered. Nothing is sent to motors that were
+        never switched on or off: another owner may have left them on.
         """
         for _ in range(2 if self.may_be_powered or self._exit_sent > -math.inf else 0):
             self._is_confirming = True
@@ -184,26 +180,16 @@ class MotorBus:
         if not self._unconfirmed:
             self._note(OFF)
         self._port.close()
-        return not self._unconfirmed
 
     def close(self) -> None:
         """Close the bus without any frame. Never raises."""
         self._port.close()
 
-    def _switch_on(self, drive: Drive) -> None:
-        if self._powered:
-            return
-        self._powered, self._exit_sent = True, -math.inf
-        if not any(drive.unsure):
-            self._send_commands(OFF)
-            self._send_each([motor.enter for motor in self._motors])
-
     def _switch_off(self) -> None:
         period = UNCONFIRMED_EXIT_PERIOD if self._unconfirmed else EXIT_PERIOD
         if self._powered or self._now() - self._exit_sent > period:
             for joint, motor in enumerate(self._motors):
-                zero = () if joint in self._asked else self._zero_command(joint)
-                self._send_each((zero, motor.exit))
+                self._send(*(() if joint in self._asked else self._zero_command(joint)), *motor.exit)
             self._exit_sent = self._now()
         self._powered = False
 
@@ -218,26 +204,15 @@ class MotorBus:
         for joint, motor in enumerate(self._motors):
             if joint not in self._asked and (drive.unsure[joint] or not drive.powered):
                 continue
-            command = self._ids[joint], motor.command(drive.effort[joint], drive.damping[joint])
+            command = self._command(joint)
             if drive.enter[joint]:
-                self._send_each([(command, *motor.enter)])
+                self._send(command, *motor.enter)
             self._send(command)
 
-    def _send_each(self, frames: Iterable[Sequence[Frame]]) -> None:
-        for frame in chain.from_iterable(frames):
-            self._send(frame)
-
-    def _send(self, frame: Frame) -> None:
-        self._filter.sent(frame)
-        self._port.send(frame)
-
-    def _drain(self) -> None:
-        """Read replies that arrived after their cycle, so that they are not taken for replies to this one."""
-        for _ in range(MAX_STALE_FRAMES):
-            message = self._port.waiting()
-            if message is None:
-                return
-            self._take(message)
+    def _send(self, *frames: Frame) -> None:
+        for frame in frames:
+            self._filter.awaited.append(frame)
+            self._port.send(frame)
 
     def _take(self, message: can.Message) -> None:
         kind, can_id = self._filter.sort(message)
@@ -251,51 +226,72 @@ class MotorBus:
         self._answered.add(joint)
         if self._is_confirming and (joint in self._asked or abs(reply.torque) < OFF_EFFORT):
             self._unconfirmed.discard(joint)
-        self.samples[joint] = JointSample(*reply[1:], self._now())
+        now = self._now()
+        self._follow(joint, reply.position, now)
+        self.samples[joint] = JointSample(*reply[1:], now)
+
+    def _follow(self, joint: int, position: float, now: float) -> None:
+        """Let the held position of a contested joint follow it slowly; that of any other joint at once."""
+        if self._is_opposed(joint):
+            away = position - self._held[joint]
+            step = max(HOLD_SPEED * (now - self.samples[joint].time), abs(away) - HOLD_REACH)
+            position = self._held[joint] + math.copysign(min(step, abs(away)), away)
+        self._held[joint] = position
+
+    def _is_opposed(self, joint: int) -> bool:
+        return self._drive.powered and self._now() - self._contested[joint] < CONTEST_TIME
+
+    def _command(self, joint: int) -> Frame:
+        """Return the last drive's command to a motor. If the motor is contested, it also holds the joint."""
+        motor, effort, damping = self._motors[joint], self._drive.effort[joint], self._drive.damping[joint]
+        if self._is_opposed(joint):
+            damping = max(DAMPING, damping)
+            if not math.isnan(self._held[joint]):
+                data = motor.command(effort, damping, HOLD_STIFFNESS, self._held[joint])
+                if data[0] not in self._joint_of:  # or its echo would look like a reply
+                    return self._ids[joint], data
+        return self._ids[joint], motor.command(effort, damping)
 
     def _oppose(self, joint: int, foreign: bytes) -> None:
-        """Answer a foreign command with our last one, under the motor's full damping until our next one."""
+        """Answer a foreign command with our last one, under the motor's full damping; hold the joint meanwhile."""
         now = self._now()
         motor = self._motors[joint]
         self.foreign_commands += 1
-        self._foreign_time = now
+        self._contested[joint] = now
         self.foreign_command = f"another sender commands motor {motor.can_id} (frame [{foreign.hex(' ')}])"
         if not (self._powered and self._drive.powered) or self._drive.unsure[joint]:
             return
-        effort, damping = self._drive.effort[joint], self._drive.damping[joint]
-        command = self._ids[joint], motor.command(effort, max(DAMPING, damping))
+        if foreign in [data for _, data in motor.wire_format.set_zero(motor.can_id)]:
+            self._held[joint] = math.nan  # not held in this contest: a reply may still count from the old zero
+        command = self._command(joint)
         is_exit = foreign in [data for _, data in motor.exit]
         if is_exit or now - self._corrected[joint] >= CORRECTION_PERIOD:
-            self._send_each([(command, *motor.enter) if is_exit else (), (command,)])
+            self._send(*((command, *motor.enter) if is_exit else ()), command)
             self._corrected[joint] = now
 
 
 class FrameFilter:
-    """Knows `motors` and which frames were sent. marks_echoes: whether `is_rx` is false for echoes only."""
+    """Knows `motors` and which frames were sent.
 
-    def __init__(self, motors: Sequence[JointMotor], marks_echoes: bool = True) -> None:
-        self._standard = _groups(motors, is_extended=False)
-        self._extended = _groups(motors, is_extended=True)
+    marks_echoes: whether `is_rx` is false for echoes only. echoes: whether sent frames come back unmarked.
+    """
+
+    def __init__(self, motors: Sequence[JointMotor], marks_echoes: bool = True, echoes: bool = False) -> None:
+        # The motors of each format, by whether its IDs have 29 bits.
+        self._groups: dict[bool, list[tuple[WireFormat, frozenset[int]]]] = {False: [], True: []}
+        for board in {motor.wire_format for motor in motors}:
+            can_ids = frozenset(motor.can_id for motor in motors if motor.wire_format == board)
+            self._groups[board.is_extended].append((board, can_ids))
         self._marks_echoes = marks_echoes
-        self._awaited: deque[Frame] = deque(maxlen=MOST_AWAITED)  # sent, their echoes not yet received
-        self._sent = self._returned = 0
-        self._is_echoing: bool | None = None  # None: not yet known
-
-    def sent(self, frame: Frame) -> None:
-        """Note a frame that is being sent."""
-        if self._is_echoing is False:
-            return
-        if self._is_echoing is None and self._sent >= TRIAL:
-            self._is_echoing = self._returned >= TRIAL // 2
-        self._sent += 1
-        self._awaited.append(frame)
+        #: Frames that were sent and whose echoes have not been received.
+        self.awaited: deque[Frame] = deque(maxlen=MOST_AWAITED if echoes else 0)
 
     def sort(self, message: can.Message) -> tuple[str, int]:
         """Return REPLY or FOREIGN_COMMAND with the motor's ID, or the kind of a frame that does not matter with 0."""
         if message.is_error_frame:
             return "error frame", 0
         is_extended = message.is_extended_id
-        groups = self._extended if is_extended else self._standard
+        groups = self._groups[is_extended]
         if message.is_remote_frame or message.is_fd or (is_extended and not groups):
             return "extended, remote or FD frame", 0
         frame_id = message.arbitration_id | EXTENDED if is_extended else message.arbitration_id
@@ -309,14 +305,8 @@ class FrameFilter:
         return "foreign frame", 0
 
     def _is_echo(self, frame: Frame) -> bool:
-        if self._is_echoing is False or frame not in self._awaited:
+        if frame not in self.awaited:
             return False
-        while self._awaited.popleft() != frame:
+        while self.awaited.popleft() != frame:
             pass  # echoes come in order, so those before it are lost
-        self._returned += 1
         return True
-
-
-def _groups(motors: Sequence[JointMotor], is_extended: bool) -> tuple[Group, ...]:
-    formats = {motor.wire_format for motor in motors if motor.wire_format.is_extended is is_extended}
-    return tuple((each, frozenset(m.can_id for m in motors if m.wire_format == each)) for each in formats)

@@ -12,6 +12,7 @@ killed, it tells the next owner what the motors still apply.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import math
 import mmap
@@ -36,59 +37,49 @@ ATTEMPT_PERIOD = 0.02  # s
 NAME = "\0exo_gravity/"  # the first character makes a socket's name abstract
 # The first that every user may write to; /dev/shm only after it, because logind empties it when a user logs out.
 FOLDERS = ("/run/lock", "/dev/shm", "/tmp")
+FLAGS = os.O_NOFOLLOW | os.O_NONBLOCK  # another user may have put a link or a pipe there
 SHARED = stat.S_ISVTX | stat.S_IWOTH | stat.S_IXOTH
-NOTE = struct.Struct("=10d")  # time, powered, effort (4,), damping (4,)
-HEARTBEAT = struct.Struct("=d")  # time
-HEARTBEAT_AT, OWNER_AT, OWNER_LENGTH = 128, 256, 512  # bytes
+NOTE = struct.Struct("=10d")  # the first fields of `DriveNotes`, written at once
 CREDENTIALS = struct.Struct("3i")  # PID, user and group of a socket's other end
 UNKNOWN_DRIVE = Drive(NOTHING, (DAMPING,) * JOINT_COUNT, True)  # of motors that may be on: the first frames hold
 
 Address = tuple[str, str, Mapping[str, Any]]  # interface, channel and options of a python-can bus
 
 
-class DriveNotes:
+class DriveNotes(ctypes.Structure):
     """One page of shared memory: what the motors of a bus receive, who owns the bus, and the watchdog's heartbeat.
 
     `MotorBus` notes each drive before its frames are sent. A process that outlives the writer thus knows the torque
-    that the motors still apply. An empty page means that the motors are off.
+    that the motors still apply. An empty page means that the motors are off. Create it by `from_buffer`.
     """
 
-    def __init__(self, page: mmap.mmap, clock: Clock) -> None:
-        self._page = page
-        self._clock = clock
+    _fields_ = (
+        ("time", ctypes.c_double),  #: s, of the last note
+        ("_powered", ctypes.c_double),
+        ("_applied", ctypes.c_double * (2 * JOINT_COUNT)),  # effort and damping
+        ("heartbeat", ctypes.c_double),  #: s, at which the watchdog last ran; 0 before it runs
+        ("_owner", ctypes.c_char * 512),
+    )
+    clock = COMPUTER_CLOCK
 
     def note(self, drive: Drive) -> None:
-        """Note the drive that the motors are about to receive."""
-        NOTE.pack_into(self._page, 0, self._clock.monotonic(), drive.powered, *drive.effort, *drive.damping)
-
-    @property
-    def time(self) -> float:
-        """Time in s of the last note."""
-        return float(NOTE.unpack_from(self._page)[0])
+        """Note what the motors are about to receive."""
+        NOTE.pack_into(self, 0, self.clock.monotonic(), drive.powered, *drive.effort, *drive.damping)
 
     @property
     def drive(self) -> Drive:
-        """The last noted drive."""
-        _, powered, *applied = NOTE.unpack_from(self._page)
-        return Drive(tuple(applied[:4]), tuple(applied[4:]), bool(powered))
-
-    def beat(self, now: float) -> None:
-        """Note that the watchdog runs at `now` (s); 0 before it runs."""
-        HEARTBEAT.pack_into(self._page, HEARTBEAT_AT, now)
-
-    @property
-    def heartbeat(self) -> float:
-        """Time in s at which the watchdog last ran, 0 before it runs."""
-        return float(HEARTBEAT.unpack_from(self._page, HEARTBEAT_AT)[0])
+        """What the motors received last."""
+        applied = tuple(self._applied)
+        return Drive(applied[:JOINT_COUNT], applied[JOINT_COUNT:], bool(self._powered))
 
     @property
     def owner(self) -> str:
         """Who owns the bus, for error messages."""
-        return self._page[OWNER_AT : OWNER_AT + OWNER_LENGTH].rstrip(b"\0").decode(errors="replace")
+        return str(self._owner, errors="replace")
 
     @owner.setter
     def owner(self, text: str) -> None:
-        self._page[OWNER_AT : OWNER_AT + OWNER_LENGTH] = text.encode()[:OWNER_LENGTH].ljust(OWNER_LENGTH, b"\0")
+        self._owner = text.encode()[:512]
 
 
 class BusLock:
@@ -106,33 +97,29 @@ class BusLock:
         clock: Clock = COMPUTER_CLOCK,
         asks: bool = False,
     ) -> None:
-        #: The lock, for the watchdog to inherit.
-        self.socket = _lock(address, patience, clock, asks)
+        self.socket = _lock(address, patience, clock, asks)  #: the lock, for the watchdog to inherit
         #: Why the notes of the last owner are not known, '' if they are. The motors count as powered then.
         self.problem = ""
         path = notes_file(address)
         try:
-            #: Of the notes, for the watchdog to inherit.
-            self.descriptor = _open_notes(path)
+            self.descriptor = _open_notes(path)  #: of the notes, for the watchdog to inherit
         except OSError as error:
             self.problem = f"{path}: {error.strerror}"
             self.descriptor = os.memfd_create("exo_gravity")
             os.ftruncate(self.descriptor, mmap.PAGESIZE)
-        self._page = mmap.mmap(self.descriptor, mmap.PAGESIZE)
-        #: The shared page.
-        self.notes = DriveNotes(self._page, clock)
+        self.notes = DriveNotes.from_buffer(mmap.mmap(self.descriptor, mmap.PAGESIZE))  #: the shared page
+        self.notes.clock = clock
         if not math.isfinite(sum(self.notes.drive.effort + self.notes.drive.damping)):
             self.problem = f"{path}: damaged"
         if self.problem:
             self.notes.note(UNKNOWN_DRIVE)
         self.notes.owner = owner
-        self.notes.beat(0.0)
+        self.notes.heartbeat = 0.0
 
     def release(self) -> None:
         """Give up the bus: it is free once the watchdog has ended, too."""
         if not self.notes.drive.powered:
             remove_notes(self.descriptor)
-        self._page.close()
         os.close(self.descriptor)
         self.socket.close()
 
@@ -165,12 +152,11 @@ def bus_name(address: Address) -> str:
     parts = [interface, channel, *([str(options["port"])] if "port" in options else [])]
     path = Path(channel.partition("@")[0])  # slcan: DEVICE@BITRATE
     with contextlib.suppress(OSError, ValueError):
-        if path.is_absolute() and path.is_char_device():
+        if interface == "socketcan":  # it may have alternative names
+            parts[1] = socket.if_indextoname(socket.if_nametoindex(channel))
+        elif path.is_absolute() and path.is_char_device():
             device = path.stat()
             parts = ["device", str(os.major(device.st_rdev)), str(os.minor(device.st_rdev))]
-    if interface == "socketcan":
-        with contextlib.suppress(OSError):  # it may have alternative names
-            parts[1] = socket.if_indextoname(socket.if_nametoindex(channel))
     return re.sub(r"[^\w.:-]", "_", "_".join(parts))[-80:]
 
 
@@ -182,11 +168,10 @@ def remove_notes(descriptor: int) -> None:
 
 def _open_notes(path: Path) -> int:
     """Return a descriptor of the notes, which any user may write. Raises OSError."""
-    flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     try:
-        descriptor = os.open(path, flags)
+        descriptor = os.open(path, os.O_RDWR | FLAGS)
     except FileNotFoundError:
-        descriptor = os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o666)
+        descriptor = os.open(path, os.O_RDWR | FLAGS | os.O_CREAT | os.O_EXCL, 0o666)
         os.fchmod(descriptor, 0o666)  # whatever the umask
     try:
         status = os.fstat(descriptor)
@@ -224,11 +209,11 @@ def _lock(address: Address, patience: float, clock: Clock, asks: bool) -> socket
 
 def _holder(address: Address, asking: socket.socket | None) -> str:
     """Return who holds the bus, as noted, or as the kernel tells who is connected to him by `asking`."""
-    with contextlib.suppress(OSError):
-        descriptor = os.open(notes_file(address), os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    with contextlib.suppress(OSError, ValueError):
+        descriptor = os.open(notes_file(address), os.O_RDONLY | FLAGS)
         with os.fdopen(descriptor, "rb"):
-            if noted := os.pread(descriptor, OWNER_LENGTH, OWNER_AT).rstrip(b"\0"):
-                return noted.decode(errors="replace")
+            if owner := DriveNotes.from_buffer_copy(os.pread(descriptor, mmap.PAGESIZE, 0)).owner:
+                return owner
     if asking:
         pid, user, _ = CREDENTIALS.unpack(asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size))
         if pid:

@@ -1,15 +1,184 @@
-"""A bus that this process owns: its lock, its watchdog, and what a previous owner left behind."""
+"""A bus that this process owns: its lock, its watchdog, and what a previous owner left behind.
+
+AK motors keep applying the last command: an arm that another process has left with its motors on is let down. The
+watchdog does it for a bridge that has died, and a new bridge does it if both had died.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from multiprocessing import Pipe
+
+import can
 
 from exo_gravity.core.errors import BusError
+from exo_gravity.core.motors.joint_motor import JointMotor, peaks_of
+from exo_gravity.core.safety.delivery import ABSOLUTE, RELATIVE
+from exo_gravity.core.safety.drive import Drive
+from exo_gravity.core.safety.limits import Limits
+from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
-from exo_gravity.hardware.ownership.bus_lock import ATTEMPT_TIME, BusLock
-from exo_gravity.hardware.ownership.handover import ArmOnBus, let_down
-from exo_gravity.hardware.ownership.watchdog import Watchdog
+from exo_gravity.hardware.control_loop import ControlLoop
+from exo_gravity.hardware.ownership.bus_lock import ATTEMPT_TIME, Address, BusLock, DriveNotes
+
+OPEN_PERIOD = 0.05  # s between two attempts to open the bus
+FIRST_REPLIES = 0.05  # s in which the motors must reply to the first commands
+START_TIME = 15.0  # s until the first heartbeat, before which no arm is enabled: imports on a busy machine take long
+HEARTBEAT_TIMEOUT = 0.3  # s without a heartbeat, while this process itself runs
+LONGEST_LOOK = 0.15  # s between two looks of a process that runs
+END_TIME = 2.0  # s for the watchdog to end after `close`
+
+
+@dataclass(frozen=True)
+class ArmOnBus:
+    """An arm that may have to be let down, and how to reach it."""
+
+    address: Address  #: Of its bus.
+    motors: Sequence[JointMotor]  #: From shoulder to elbow.
+    limits: Limits  #: That it must never exceed.
+    period: float  #: s of a control cycle.
+
+    def open(self) -> can.BusABC:
+        """Open the bus. Raises BusError."""
+        return open_bus(*self.address)
+
+
+def let_down(arm: ArmOnBus, notes: DriveNotes, log: Callable[[str], None], is_wanted: Callable[[], bool]) -> bool:
+    """Let down an arm whose motors apply what is noted; return whether its motors have confirmed that they are off.
+
+    log: called with each change worth knowing. is_wanted: whether to give up, because someone else waits for the bus,
+    while the bus or a motor cannot be reached.
+    """
+    bus, is_logged = None, False
+    while bus is None:
+        try:
+            bus = arm.open()
+        except BusError as error:
+            if not is_logged:
+                log(f"{error}; the motors may still be powered")
+            is_logged = True
+            if is_wanted():
+                return False
+            notes.clock.sleep(OPEN_PERIOD)
+    drive = notes.drive
+    motors = MotorBus(bus, arm.motors, powered=True, note=notes.note, reopen=arm.open, clock=notes.clock)
+    machine = SafetyMachine(arm.limits, arm.period, peaks_of(arm.motors))
+    machine.take_over(*_applied(motors, drive, arm.period), notes.clock.monotonic())
+    loop = ControlLoop(motors, machine, arm.period)
+    was_unreached = False
+    while not loop.is_off and loop.cycle():
+        if machine.is_unreached and not was_unreached:
+            log("a motor does not reply; it may still be powered; trying again")
+        was_unreached = machine.is_unreached
+        if was_unreached and is_wanted():
+            loop.abandon()
+            return False
+    loop.stop()
+    return not motors.may_be_powered
+
+
+def _applied(motors: MotorBus, drive: Drive, period: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the effort (4,) in Nm and damping (4,) in Nm s/rad that the motors apply, which received `drive`.
+
+    A motor that replies another torque has been switched off or obeyed another sender. Then its reply is used.
+    """
+    clock = motors.clock
+    end = clock.monotonic() + FIRST_REPLIES
+    first = drive._replace(powered=True, unsure=(True,) * len(drive.effort))
+    is_complete = False
+    while not is_complete and clock.monotonic() < end:
+        try:
+            is_complete = motors.exchange(first, clock.monotonic() + period)
+        except BusError:
+            clock.sleep(period)
+    effort, damping = list(drive.effort), list(drive.damping)
+    for i, joint in enumerate(motors.samples):
+        expected = effort[i] - damping[i] * joint.velocity
+        if abs(joint.effort - expected) > ABSOLUTE + RELATIVE * abs(expected):  # not without a reply: that is NaN
+            effort[i], damping[i] = joint.effort, 0.0
+    return tuple(effort), tuple(damping)
+
+
+class Silence:
+    """How long another process has given no sign of life, seen by a process that may have stood still itself.
+
+    now: s. longest_look: s between two looks of a process that runs. If more time has passed, the whole machine may
+    have stood still, and the other process gets another chance: only `longest_look` is added.
+    """
+
+    def __init__(self, now: float, longest_look: float) -> None:
+        self._last_look = now
+        self._longest_look = longest_look
+        self._sign = 0.0
+        self._duration = 0.0
+
+    def look(self, now: float, sign: float, is_due: bool = True) -> float:
+        """Return the silence in s at `now`, 0 if `sign` is new. is_due: whether the other process must give signs."""
+        is_silent = is_due and sign == self._sign
+        self._duration = self._duration + min(now - self._last_look, self._longest_look) if is_silent else 0.0
+        self._last_look, self._sign = now, sign
+        return self._duration
+
+
+class Watchdog:
+    """The bridge's end: the watchdog process of `arm`, on the bus that `lock` holds."""
+
+    def __init__(self, lock: BusLock, arm: ArmOnBus) -> None:
+        self._notes = lock.notes
+        self._now = lock.notes.clock.monotonic
+        self._start = self._now()
+        self._silence = Silence(self._start, LONGEST_LOOK)
+        receiver, self._sender = Pipe(duplex=False)
+        shared = (lock.descriptor, lock.socket.fileno(), receiver.fileno())
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "exo_gravity.hardware.ownership.watchdog", *map(str, (os.getpid(), *shared))],
+            pass_fds=shared,
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,  # keeps Ctrl-C and Ctrl-Z in the terminal away from it
+        )
+        receiver.close()
+        self._sender.send(arm)
+
+    @property
+    def is_starting(self) -> bool:
+        """Whether the watchdog does not watch yet: no motor may be switched on."""
+        return self._notes.heartbeat == 0.0
+
+    @property
+    def alive(self) -> bool:
+        """Whether the watchdog process runs. Read it several times a second: it must also notice a frozen process."""
+        if self.process.poll() is not None:
+            return False
+        now, heartbeat = self._now(), self._notes.heartbeat
+        if heartbeat == 0.0:
+            return now - self._start < START_TIME
+        return self._silence.look(now, heartbeat) < HEARTBEAT_TIMEOUT
+
+    def hand_over(self, reason: str) -> bool:
+        """Request the watchdog to kill this process and let the arm down; return whether it is alive."""
+        with contextlib.suppress(OSError):
+            if self.process.poll() is None:
+                self._sender.send(reason)
+                return True
+        return False
+
+    def close(self) -> None:
+        """End the watchdog and wait until it has ended. If the motors may be on, it stays and lets the arm down."""
+        self._sender.close()
+        if self._notes.drive.powered:
+            return
+        try:
+            self.process.wait(END_TIME)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
 
 
 class OwnedBus:
@@ -21,12 +190,10 @@ class OwnedBus:
 
     def __init__(self, arm: ArmOnBus, owner: str, log: Callable[[str], None], clock: Clock = COMPUTER_CLOCK) -> None:
         self._arm = arm
-        self._clock = clock
-        self._lock = _take(arm, owner, log, ATTEMPT_TIME, clock)
-        #: What the motors receive, for a process that outlives this one.
-        self.notes = self._lock.notes
+        self._lock = take_over(arm, owner, log, ATTEMPT_TIME, clock)
+        self.notes = self._lock.notes  #: what the motors receive, for a process that outlives this one
         try:
-            self.watchdog = Watchdog(self._lock, arm, clock)
+            self.watchdog = Watchdog(self._lock, arm)
         except BaseException:
             self._lock.release()
             raise
@@ -34,7 +201,7 @@ class OwnedBus:
     def open(self) -> MotorBus:
         """Open the bus. Raises BusError if it cannot be opened, or if another host commands the motors."""
         arm = self._arm
-        bus = MotorBus(arm.open(), arm.motors, note=self.notes.note, reopen=arm.open, clock=self._clock)
+        bus = MotorBus(arm.open(), arm.motors, note=self.notes.note, reopen=arm.open, clock=self.notes.clock)
         try:
             bus.listen()
         except BusError:
@@ -48,21 +215,13 @@ class OwnedBus:
         self._lock.release()
 
 
-def recover(
-    arm: ArmOnBus, owner: str, log: Callable[[str], None], patience: float, clock: Clock = COMPUTER_CLOCK
-) -> None:
-    """Let down an arm that a dead owner left with its motors on, and release the bus.
+def take_over(
+    arm: ArmOnBus, owner: str, log: Callable[[str], None], patience: float = ATTEMPT_TIME, clock: Clock = COMPUTER_CLOCK
+) -> BusLock:
+    """Lock the bus for `owner`, and let down the arm that its last owner left with its motors on.
 
-    patience: s for the dead owner's watchdog to do so first. Raises BusError if the bus is still held then or cannot be
-    opened, or if a motor does not reply.
-    """
-    _take(arm, owner, log, patience, clock).release()
-
-
-def _take(arm: ArmOnBus, owner: str, log: Callable[[str], None], patience: float, clock: Clock) -> BusLock:
-    """Lock the bus, and let down the arm that its last owner left with its motors on.
-
-    If it cannot be reached, a watchdog stays and keeps trying, until the next owner asks for the bus. Raises BusError.
+    patience: s for that owner's watchdog to do so first. If the arm cannot be reached, a watchdog stays and keeps
+    trying, until the next owner asks for the bus. Raises BusError.
     """
     lock = BusLock(arm.address, owner, patience, clock, asks=True)
     try:
@@ -72,8 +231,8 @@ def _take(arm: ArmOnBus, owner: str, log: Callable[[str], None], patience: float
         elif drive.powered:
             log("the last can_bridge on this bus and its watchdog ended with the motors on: letting the arm down")
         if drive.powered:
-            if not let_down(arm, drive, lock.notes.note, log, is_endless=False, clock=clock):
-                Watchdog(lock, arm, clock).close()
+            if not let_down(arm, lock.notes, log, lambda: True):
+                Watchdog(lock, arm).close()
                 raise BusError(f"CAN bus {arm.address[1]}: a motor that may be powered does not reply")
             log("the arm is down, its motors are off")
         return lock

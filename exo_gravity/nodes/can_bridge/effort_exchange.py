@@ -21,9 +21,8 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.drive import FaultCode
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.hardware.control_loop import NO_COMMAND, ControlLoop, EffortCommand
-from exo_gravity.nodes.ros.hot_path import HotPath
+from exo_gravity.nodes.ros.hot_path import HotPath, SolePublisher
 from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, to_nanoseconds
-from exo_gravity.nodes.ros.sole_publisher import SolePublisher
 
 # The control thread reads them once a cycle; the depth lets it notice a second commander. Not reliable: an old effort
 # sent again is useless, and acknowledging each one wakes a thread in both nodes (measured: 2 % of a core).
@@ -43,7 +42,7 @@ class EffortExchange:
         self._limits = limits
         self._get_loop = get_loop
         self._clock = node.get_clock()
-        self._command = NO_COMMAND  # the newest from the compensator
+        self.command = NO_COMMAND  #: the newest from the compensator
         self._measured = -math.inf  # monotonic s, when the last published joint state was measured
         self._published: OrderedDict[int, float] = OrderedDict()
         self._commander = SolePublisher(node, "effort_commands")
@@ -51,21 +50,12 @@ class EffortExchange:
         self._joint_states = JointState(name=list(limits.joint_names))  # one message, reused
         self._efforts = HotPath(node, JointState, "effort_commands", self._on_efforts, EFFORTS)
 
-    @property
-    def answered(self) -> float:
-        """Monotonic time in s at which the joint states were measured that the newest efforts answer."""
-        return self._command.answered
-
-    def forget(self) -> None:
-        """Forget the newest efforts, before a control loop starts."""
-        self._command = NO_COMMAND
-
     def get_efforts(self, latest: float) -> EffortCommand:
         """Return the newest efforts; wait until `latest` (monotonic s) for the answer to the last joint state."""
         self._efforts.poll()
-        if self._command.answered < self._measured:
+        if self.command.answered < self._measured:
             self._efforts.poll(latest - time.monotonic())
-        return self._command
+        return self.command
 
     def publish(self, now: float, joints: Sequence[JointSample]) -> None:
         """Publish a joint state if every motor has replied recently: an unknown angle is never sent as a number."""
@@ -88,7 +78,7 @@ class EffortExchange:
         answered = self._published.get(to_nanoseconds(message.header.stamp))
         if self._commander.is_another(info):
             self.refusal = "a second publisher of effort_commands"
-            self._command = EffortCommand(None, time.monotonic())  # fails the start gate
+            self.command = EffortCommand(None, time.monotonic())  # fails the start gate
             loop.trip_if_carried(FaultCode.SECOND_COMMANDER, "more than one publisher of effort_commands")
         elif answered is None:
             self.refusal = f"stamp {to_nanoseconds(message.header.stamp)} ns answers no joint state of this bridge"
@@ -101,4 +91,4 @@ class EffortExchange:
                 effort, self.refusal = None, str(error)
                 loop.trip(FaultCode.COMMAND_IMPOSSIBLE, f"effort_commands: {error.name} must be {error.expected}")
             is_late = message.header.frame_id == LATE_TILT
-            self._command = EffortCommand(effort, answered, bool(message.velocity), is_late)
+            self.command = EffortCommand(effort, answered, bool(message.velocity), is_late)

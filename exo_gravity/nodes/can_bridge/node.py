@@ -14,6 +14,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
 import rclpy
@@ -22,31 +23,21 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from exo_gravity.core.errors import BusError, ExoGravityError, ParameterError
-from exo_gravity.core.model.rotation import Floats3
-from exo_gravity.core.model.tilt import SIDES, Tilt
+from exo_gravity.core.model.tilt import SIDES
 from exo_gravity.core.motors.joint_motor import OPTIONS, motors_of, peaks_of, traffic_of
 from exo_gravity.core.safety.drive import FaultCode
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.params import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.trunk.tilt_input import TiltInput
 from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.hardware.ownership.handover import ArmOnBus
-from exo_gravity.hardware.ownership.owned_bus import OwnedBus, recover
-from exo_gravity.hardware.ownership.watchdog import Watchdog
+from exo_gravity.hardware.control_loop import NO_COMMAND, ControlLoop
+from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, OwnedBus, Watchdog, take_over
 from exo_gravity.hardware.scheduling import request_real_time
+from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
-from exo_gravity.nodes.can_bridge.operation import (
-    CALL_TIMEOUT,
-    BridgeReport,
-    BridgeServices,
-    Operator,
-    log_limits,
-    refuse_simulated_time,
-)
+from exo_gravity.nodes.ros.hot_path import TiltSubscription
 from exo_gravity.nodes.ros.parameters import bus_of, declare
 from exo_gravity.nodes.ros.run import keep_to_this_machine, run
-from exo_gravity.nodes.ros.tilt_subscription import TiltSubscription
 
 REPORT_PERIOD = 0.1  # s
 TILT_TIMEOUT = 0.08  # s for which /imu/data goes before /imu/pitch_yaw
@@ -56,25 +47,38 @@ REMINDER_PERIOD = 10.0  # s between two reminders that a motor cannot be reached
 RECOVER = "EXO_GRAVITY_RECOVER"
 
 
-class _GravityInput(TiltInput):
-    """Tells the loop's monitor where gravity points, as the trunk's tilt arrives; before that it is upright.
+def _follow_gravity(node: Node, get_loop: Callable[[], ControlLoop | None]) -> None:
+    """Tell the loop's monitor where gravity points, as the trunk's tilt arrives; before that it is upright.
 
     The side is that of the node's namespace: a compensator with the wrong `side` does not decide it.
     """
+    side = node.get_namespace().rpartition("/")[2]
+    if side not in SIDES:
+        expected = f"0, or the node in a namespace that ends with {' or '.join(SIDES)}"
+        raise ParameterError("largest_moment", "given", expected)
+    tilt = TiltInput(side, TILT_TIMEOUT)
 
-    def __init__(self, node: Node, get_loop: Callable[[], ControlLoop | None]) -> None:
-        side = node.get_namespace().rpartition("/")[2]
-        if side not in SIDES:
-            expected = f"0, or the node in a namespace that ends with {' or '.join(SIDES)}"
-            raise ParameterError("largest_moment", "given", expected)
-        super().__init__(side, TILT_TIMEOUT)
-        self._get_loop = get_loop
-        TiltSubscription(node, self, threading.Lock(), lambda topic, error: None, lambda topic: None)
+    def pass_on(now: float) -> None:
+        if loop := get_loop():
+            loop.safety.motion.gravity = tilt.at(now).direction
 
-    def _accept(self, now: float, tilt: Tilt, angular_velocity: Floats3, age: float) -> None:
-        super()._accept(now, tilt, angular_velocity, age)
-        if loop := self._get_loop():
-            loop.safety.motion.gravity = self.at(now).direction
+    TiltSubscription(node, tilt, threading.Lock(), on_tilt=pass_on)
+
+
+def _transition(function: Callable[[Any], None]) -> Callable[..., TransitionCallbackReturn]:
+    """Return a transition callback of a method; if that raises, it logs why, which rclpy does not."""
+
+    @wraps(function)
+    def callback(node: CanBridge, _state: LifecycleState) -> TransitionCallbackReturn:
+        try:
+            function(node)
+            return TransitionCallbackReturn.SUCCESS
+        except Exception as error:
+            node.error = str(error) if isinstance(error, BusError) else f"{type(error).__name__}: {error}"
+        node.get_logger().error(node.error)
+        return TransitionCallbackReturn.FAILURE
+
+    return callback
 
 
 class CanBridge(LifecycleNode):
@@ -87,7 +91,7 @@ class CanBridge(LifecycleNode):
     def __init__(self) -> None:
         super().__init__("can_bridge", automatically_declare_parameters_from_overrides=True)
         values, self._arm = _declared(self)
-        refuse_simulated_time(self, self._arm.address[0])
+        operation.refuse_simulated_time(self, self._arm.address[0])
         motors, limits = self._arm.motors, self._arm.limits
         traffic = traffic_of(values, self._arm.address[2])
         check_bridge(values["rate"], motors, limits, traffic.status_rate)
@@ -96,44 +100,71 @@ class CanBridge(LifecycleNode):
         self._thread_priority = values["thread_priority"]
         self._owned: OwnedBus | None = None  # while configured
         self._bus: MotorBus | None = None  # while inactive
-        self._error = ""  # why the last transition failed
+        self.error = ""  #: why the last transition failed
         self._exchange = EffortExchange(self, limits, lambda: self.loop)
-        lease = Operator(self, lambda: self.loop).lease
+        lease = operation.Operator(self, lambda: self.loop).lease
         rated = [motor.rated_effort for motor in motors]
-        self._report = BridgeReport(self, limits.joint_names, traffic, values["rate"], rated, lease)
-        BridgeServices(self, lambda: self.loop, motors)
+        self._report = operation.BridgeReport(self, limits.joint_names, traffic, values["rate"], rated, lease)
+        operation.BridgeServices(self, lambda: self.loop, motors)
         if any(limits.largest_moment):
-            _GravityInput(self, lambda: self.loop)
+            _follow_gravity(self, lambda: self.loop)
         self.create_timer(REPORT_PERIOD, self._on_report)
-        log_limits(self, limits, traffic, values["rate"])
+        operation.log_risks(self, traffic, values["rate"])
         if values["autostart"]:
             for trigger in (self.trigger_configure, self.trigger_activate):
                 if trigger() is not TransitionCallbackReturn.SUCCESS:
                     self.close()
-                    raise BusError(self._error)
+                    raise BusError(self.error)
 
     @property
     def failure(self) -> BaseException | None:
         """The exception that ended the control thread, if any."""
         return self.loop.failure if self.loop else None
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+    @_transition
+    def on_configure(self) -> None:
         """Take the bus, open it, and listen."""
-        return self._transition(self._configure)
+        self._owned = OwnedBus(self._arm, _owner(self), self.get_logger().error)
+        try:
+            self._bus = self._owned.open()
+        except BaseException:
+            self.close()
+            raise
 
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+    @_transition
+    def on_activate(self) -> None:
         """Start the control loop, and enable the arm once it passes the start gate."""
-        return self._transition(self._activate)
+        self._exchange.command = NO_COMMAND
+        assert self._owned, "the node is not configured"
+        bus, self._bus = self._bus or self._owned.open(), None
+        period = self._arm.period
+        safety = SafetyMachine(self._arm.limits, period, peaks_of(self._arm.motors))
+        hand_over = self._owned.watchdog.hand_over
+        loop = ControlLoop(bus, safety, period, self._exchange.publish, self._exchange.get_efforts, hand_over)
+        loop.start()
+        try:
+            request_real_time(self._thread_priority, self.get_logger().warning)
+        except BaseException:
+            loop.stop()
+            raise
+        self.loop = loop
+        self._look_at(self._owned.watchdog, loop)
+        loop.call(lambda: safety.enable(time.monotonic()))
 
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+    @_transition
+    def on_deactivate(self) -> None:
         """Let the arm down and wait until its motors are off; the bus stays ours for the next activation."""
-        return self._transition(self._deactivate)
-
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Let the arm down, close the bus and release it; also at a shutdown, and after an error in a transition."""
-        return self._transition(self.close)
-
-    on_shutdown = on_error = on_cleanup
+        loop, end = self.loop, time.monotonic() + DESCENT_TIMEOUT
+        assert loop, "the node is not active"
+        loop.call(lambda: loop.safety.disable(time.monotonic())).result(operation.CALL_TIMEOUT)
+        while not loop.is_off:
+            if loop.failure:
+                raise BusError(f"the control thread has ended: {loop.failure}")
+            if time.monotonic() > end:
+                raise BusError("a motor does not reply and may still be powered; the node stays active")
+            self._report_descent()
+            time.sleep(REPORT_PERIOD)
+        self._stop(loop)
 
     def close(self) -> None:
         """Let the arm down, send the last frames, close the bus and release it, in any state.
@@ -149,6 +180,9 @@ class CanBridge(LifecycleNode):
             self._owned.close()
             self._owned = None
 
+    # Also at a shutdown, and after an error in a transition.
+    on_cleanup = on_shutdown = on_error = _transition(close)
+
     def _stop(self, loop: ControlLoop) -> None:
         reminder = time.monotonic() + REMINDER_PERIOD
         while not loop.stop(REPORT_PERIOD):
@@ -159,64 +193,10 @@ class CanBridge(LifecycleNode):
         self._report_descent()
         self.loop = None
 
-    def _transition(self, function: Callable[[], None]) -> TransitionCallbackReturn:
-        """Run a transition; if it raises, log why, which rclpy does not."""
-        try:
-            function()
-            return TransitionCallbackReturn.SUCCESS
-        except BusError as error:
-            self._error = str(error)
-        except Exception as error:
-            self._error = f"{type(error).__name__}: {error}"
-        self.get_logger().error(self._error)
-        return TransitionCallbackReturn.FAILURE
-
-    def _configure(self) -> None:
-        self._owned = OwnedBus(self._arm, _owner(self), self.get_logger().error)
-        try:
-            self._bus = self._owned.open()
-        except BaseException:
-            self.close()
-            raise
-
-    def _activate(self) -> None:
-        self._exchange.forget()
-        if self._owned is None:
-            raise BusError("the node is not configured")
-        bus, self._bus = self._bus or self._owned.open(), None
-        period = self._arm.period
-        safety = SafetyMachine(self._arm.limits, period, peaks_of(self._arm.motors))
-        hand_over = self._owned.watchdog.hand_over
-        loop = ControlLoop(bus, safety, period, self._exchange.publish, self._exchange.get_efforts, hand_over)
-        loop.start()
-        try:
-            for refused in request_real_time(self._thread_priority):
-                self.get_logger().warning(refused)
-        except BaseException:
-            loop.stop()
-            raise
-        self.loop = loop
-        self._look_at(self._owned.watchdog, loop)
-        loop.call(lambda: safety.enable(time.monotonic()))
-
-    def _deactivate(self) -> None:
-        loop, end = self.loop, time.monotonic() + DESCENT_TIMEOUT
-        if loop is None:
-            raise BusError("the node is not active")
-        loop.call(lambda: loop.safety.disable(time.monotonic())).result(CALL_TIMEOUT)
-        while not loop.is_off:
-            if loop.failure:
-                raise BusError(f"the control thread has ended: {loop.failure}")
-            if time.monotonic() > end:
-                raise BusError("a motor does not reply and may still be powered; the node stays active")
-            self._report_descent()
-            time.sleep(REPORT_PERIOD)
-        self._stop(loop)
-
     def _on_report(self) -> None:
         if self.loop is not None and self._owned is not None:
             self._look_at(self._owned.watchdog, self.loop)
-        self._report.send(self.loop, self._exchange.refusal, self._exchange.answered)
+        self._report.send(self.loop, self._exchange.command, self._exchange.refusal)
 
     def _look_at(self, watchdog: Watchdog, loop: ControlLoop) -> None:
         """Let no motor be switched on before the watchdog watches, and none stay on without it."""
@@ -227,7 +207,7 @@ class CanBridge(LifecycleNode):
 
     def _report_descent(self) -> None:
         with contextlib.suppress(Exception):  # whatever the middleware does, the arm comes down
-            self._report.send(self.loop, self._exchange.refusal, self._exchange.answered)
+            self._report.send(self.loop, self._exchange.command, self._exchange.refusal)
 
 
 def _declared(node: Node) -> tuple[dict[str, Any], ArmOnBus]:
@@ -240,23 +220,15 @@ def _owner(node: Node) -> str:
     return f"{node.get_fully_qualified_name()} (PID {os.getpid()})"
 
 
-def run_recovery(patience: float) -> int:
-    """Let the arm down, if one was left behind; return the exit code, 0 if its motors are off.
-
-    patience: s for the watchdog to do so first.
-    """
+def main() -> None:
+    """Entry point of the executable `can_bridge`; with RECOVER, the exit code is 0 if no motor is on."""
+    if not (patience := os.environ.get(RECOVER)):
+        raise SystemExit(run(CanBridge, priority=20))
     keep_to_this_machine()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("can_bridge", automatically_declare_parameters_from_overrides=True)
     try:
-        recover(_declared(node)[1], _owner(node), node.get_logger().error, patience)
-        return 0
+        take_over(_declared(node)[1], _owner(node), node.get_logger().error, float(patience)).release()
     except ExoGravityError as error:
         node.get_logger().error(str(error))
-        return 1
-
-
-def main() -> None:
-    """Entry point of the executable `can_bridge`."""
-    patience = os.environ.get(RECOVER)
-    raise SystemExit(run_recovery(float(patience)) if patience else run(CanBridge, priority=20))
+        raise SystemExit(1) from None

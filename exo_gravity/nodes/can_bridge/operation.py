@@ -8,12 +8,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from concurrent import futures
-from typing import Any, TypeVar
+from functools import partial
+from typing import Any
 
 from diagnostic_msgs.msg import KeyValue
-from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.msg import ParameterDescriptor, ParameterType
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
@@ -24,9 +24,8 @@ from exo_gravity.core.numbers import Rate
 from exo_gravity.core.safety.delivery import MotorLoad
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.lease import Lease
-from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, MAX_TEMPERATURE, Limits
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
-from exo_gravity.hardware.control_loop import ControlLoop
+from exo_gravity.hardware.control_loop import ControlLoop, EffortCommand
 from exo_gravity.nodes.ros.hot_path import HotPath
 from exo_gravity.nodes.ros.messages import ERROR, HELD_BY, NOBODY, OK, WARN, Diagnostics, milliseconds, row
 from exo_gravity.nodes.ros.run import open_to_others
@@ -42,8 +41,6 @@ CALL_TIMEOUT = 2.0  # s that a service waits for the control thread
 
 UNREACHED = "a motor that was on does not reply and may still be powered, unless its supply is cut: cut it"
 
-Response = TypeVar("Response", SetBool.Response, Trigger.Response)
-
 
 def refuse_simulated_time(node: Node, interface: str) -> None:
     """Refuse `use_sim_time`, now and live, unless the python-can `interface` leads to a simulated device.
@@ -53,87 +50,52 @@ def refuse_simulated_time(node: Node, interface: str) -> None:
     """
     if interface in SIMULATED:
         return
-    expected = (
-        f"false with a real bus (can.interface {interface}): it stamps the joint states with a clock that can stop"
-    )
-
-    def check(changes: list[Parameter]) -> SetParametersResult:
-        is_asked = any(change.name == "use_sim_time" and change.value for change in changes)
-        return SetParametersResult(
-            successful=not is_asked, reason=f"use_sim_time must be {expected}" if is_asked else ""
-        )
-
+    why = f"with a real bus (can.interface {interface}): it stamps the joint states with a clock that can stop"
     if node.get_parameter("use_sim_time").value:
-        raise ParameterError("use_sim_time", True, expected)
-    node.add_on_set_parameters_callback(check)
+        raise ParameterError("use_sim_time", True, f"false {why}")
+    fixed = ParameterDescriptor(type=ParameterType.PARAMETER_BOOL, description=f"always false {why}", read_only=True)
+    node.set_descriptor("use_sim_time", fixed)
 
 
 class BridgeServices:
-    """Creates the services on `node`. get_loop returns the present control loop, None while the node is inactive."""
+    """Creates the services on `node`. get_loop returns the present control loop, None while the node is inactive.
+
+    Each method below, on the control thread, does what its service is for and returns why it is refused, or ''.
+    """
 
     def __init__(self, node: Node, get_loop: Callable[[], ControlLoop | None], motors: Sequence[JointMotor]) -> None:
         self._get_loop = get_loop
         self._zero = [motor.zero for motor in motors]
-        node.create_service(SetBool, "~/enable", self.enable)
-        node.create_service(Trigger, "~/clear_fault", self.clear_fault)
-        node.create_service(Trigger, "~/resume", self.resume)
-        node.create_service(Trigger, "~/set_zero", self.set_zero)
+        services = {self.enable: SetBool, self.clear_fault: Trigger, self.resume: Trigger, self.set_zero: Trigger}
+        for function, kind in services.items():
+            node.create_service(kind, f"~/{function.__name__}", partial(self.answer, function))
 
-    def enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    def enable(self, loop: ControlLoop, request: SetBool.Request) -> str:
         """Enable the arm, or let it down and disable it."""
-
-        def switch(loop: ControlLoop) -> str:
-            safety = loop.safety
-            if not request.data:
-                safety.disable(time.monotonic())
-            elif not safety.enable(time.monotonic()):
-                reason = f" ({safety.fault.reason})" if safety.fault else ""
-                return f"refused: the arm is {safety.state.value}{reason}"
-            return ""
-
-        return self._on_control_thread(switch, response)
-
-    def clear_fault(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Clear a latched fault."""
-
-        def clear(loop: ControlLoop) -> str:
-            safety = loop.safety
-            return "" if safety.clear(time.monotonic()) else f"no fault to clear: the arm is {safety.state.value}"
-
-        return self._on_control_thread(clear, response)
-
-    def resume(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Clear a fault that was no one's and enable the arm, where it is."""
-
-        def resume(loop: ControlLoop) -> str:
-            why_not = loop.safety.why_not_resumed
-            return "" if loop.safety.resume(time.monotonic()) else f"refused: {why_not}"
-
-        return self._on_control_thread(resume, response)
-
-    def set_zero(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Make the present pose the motors' zero, while they are off."""
-        since = time.monotonic()
-        self._on_control_thread(self._set_zero, response)
-        loop = self._get_loop()
-        if not response.success or loop is None:
-            return response
-        while not all(joint.time > since and abs(joint.position) <= ZERO_TOLERANCE for joint in loop.samples):
-            if time.monotonic() > since + ZERO_TIMEOUT:
-                columns = zip(loop.safety.limits.joint_names, loop.samples, strict=True)
-                positions = ", ".join(f"{name} at {joint.position:.3f} rad" for name, joint in columns)
-                response.success, response.message = False, f"the motors did not set their zero: {positions}"
-                break
-            time.sleep(0.005)
-        return response
-
-    def _set_zero(self, loop: ControlLoop) -> str:
         safety = loop.safety
+        if not request.data:
+            safety.disable(time.monotonic())
+        elif not safety.enable(time.monotonic()):
+            reason = f" ({safety.fault.reason})" if safety.fault else ""
+            return f"refused: the arm is {safety.state.value}{reason}"
+        return ""
+
+    def clear_fault(self, loop: ControlLoop, _request: Trigger.Request) -> str:
+        """Clear a latched fault."""
+        return "" if loop.safety.clear(time.monotonic()) else f"no fault to clear: the arm is {loop.safety.state.value}"
+
+    def resume(self, loop: ControlLoop, _request: Trigger.Request) -> str:
+        """Clear a fault that was no one's and enable the arm, where it is."""
+        why_not = loop.safety.why_not_resumed
+        return "" if loop.safety.resume(time.monotonic()) else f"refused: {why_not}"
+
+    def set_zero(self, loop: ControlLoop, _request: Trigger.Request) -> str:
+        """Make the present pose the motors' zero, while they are off."""
+        safety, now = loop.safety, time.monotonic()
         if any(self._zero):
             return f"zero = {self._zero}: must be all 0 when the motors store the zero"
         if safety.state is not State.DISABLED:
             return f"refused: the arm is {safety.state.value}, must be disabled"
-        now = time.monotonic()
         if any(safety.limits.is_silent(now, joint) for joint in loop.samples):
             return "refused: a motor does not reply"
         if not safety.settled(now):
@@ -141,18 +103,20 @@ class BridgeServices:
         loop.set_zero()
         return ""
 
-    def _on_control_thread(self, function: Callable[[ControlLoop], str], response: Response) -> Response:
-        """Run `function` on the control thread; it returns an error text, or ''.
+    def answer(self, function: Callable[[ControlLoop, Any], str], request: Any, response: Any) -> Any:
+        """Run `function` on the control thread, and wait for the motors' zeros if it has set them.
 
         A call that has timed out never runs later: an arm must not be enabled after its operator was refused.
         """
-        loop = self._get_loop()
+        loop, since = self._get_loop(), time.monotonic()
         if loop is None:
             response.success, response.message = False, "the node is not active"
             return response
-        future = loop.call(lambda: function(loop))
+        future = loop.call(lambda: function(loop, request))
         try:
             response.message = future.result(CALL_TIMEOUT)
+            if function == self.set_zero and not response.message:
+                response.message = _wait_for_zeros(loop, since)
         except BusError as error:
             response.message = str(error)
         except futures.TimeoutError:  # before Python 3.11 not the built-in one
@@ -160,6 +124,17 @@ class BridgeServices:
             response.message = "the control thread did not respond"
         response.success = not response.message
         return response
+
+
+def _wait_for_zeros(loop: ControlLoop, since: float) -> str:
+    """Wait for replies of all motors, later than `since` (monotonic s), at their zero; return who did not reply so."""
+    while not all(joint.time > since and abs(joint.position) <= ZERO_TOLERANCE for joint in loop.samples):
+        if time.monotonic() > since + ZERO_TIMEOUT:
+            columns = zip(loop.safety.limits.joint_names, loop.samples, strict=True)
+            positions = ", ".join(f"{name} at {joint.position:.3f} rad" for name, joint in columns)
+            return f"the motors did not set their zero: {positions}"
+        time.sleep(0.005)
+    return ""
 
 
 class Operator:
@@ -195,14 +170,9 @@ class Operator:
         self._news = self.lease.request(self._now(), message.key, message.value) or self._news
 
 
-def log_limits(node: Node, limits: Limits, traffic: Traffic, rate: float) -> None:
-    """Log the limits, the bus load at `rate` (Hz), and whether other hosts can command the arm."""
+def log_risks(node: Node, traffic: Traffic, rate: float) -> None:
+    """Log the bus load at `rate` (Hz), and whether other hosts can command the arm."""
     log = node.get_logger()
-    efforts = ", ".join(f"{effort:g}" for effort in limits.max_effort)
-    log.info(
-        f"limits: {efforts} Nm, {MAX_EFFORT_RATE:g} Nm/s, {max(limits.max_velocity):g} rad/s, "
-        f"{MAX_TEMPERATURE:g} degC, effort commands at most {limits.command_timeout * 1000:.0f} ms old"
-    )
     wire, worst = traffic.load(rate), traffic.load(rate, worst=True)
     log.info(
         f"bus load at {rate:g} Hz: {wire.bits_per_second / 1000:.0f} of {traffic.bitrate / 1000:g} kbit/s, "
@@ -231,12 +201,8 @@ class BridgeReport:
         self._slow = SLOW * rate  # Hz
         self._motors = MotorLoad(rated)
 
-    def send(self, loop: ControlLoop | None, refusal: str, answered: float) -> None:
-        """Report on `loop`, None while the node is inactive.
-
-        refusal: why the last message was refused. answered: monotonic s, when the joint states were measured that the
-        newest efforts answer.
-        """
+    def send(self, loop: ControlLoop | None, newest: EffortCommand, refusal: str) -> None:
+        """Report on `loop`, None while the node is inactive. refusal: why the last message was refused."""
         operator = {HELD_BY: self._lease.holder or NOBODY}
         if loop is None:
             self._diagnostics.report(WARN, "inactive", operator)
@@ -253,7 +219,7 @@ class BridgeReport:
             "limits acting": acting or "none",
             "rate (Hz)": f"{rate:.1f}",
             "bus load (%)": f"{100.0 * self._traffic.load(rate).share:.0f}" if rate else "0",
-            "age of efforts (ms)": milliseconds(now - answered),
+            "age of efforts (ms)": milliseconds(now - newest.answered),
             "rides": safety.ride.rides,
             "resume": safety.why_not_resumed or "possible",
             "cycles": loop.cycles,

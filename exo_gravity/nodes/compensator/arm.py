@@ -1,176 +1,110 @@
-"""The arm that `compensator` carries: its parameters, its compensator, and what is reported of it.
+"""The arm that `compensator` carries: its parameters, what is reported of it, and where its efforts go.
 
 The exoskeleton's own arm has its laws, a wearer, terms, an outer loop and a torque budget. With `law: urdf` it is any
 serial arm, whose URDF comes from a file or from `robot_description`, with gravity compensation alone.
+
+`can_bridge` watches the age of the efforts and lets the arm down. An effort controller of ros2_control keeps its last
+command for ever, so `MultiArrayInterface` watches the age of the joint states itself, on its own thread, and fades the
+torque (core/compensation/limiter.py).
 """
 
 from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from rclpy.node import Node
 from rclpy.wait_for_message import wait_for_message
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
+from std_msgs.msg import Float64MultiArray, String
+from std_srvs.srv import Trigger
 
+from exo_gravity.core.compensation import params
 from exo_gravity.core.compensation.compensator import Answer, Compensator
-from exo_gravity.core.compensation.params import (
-    COMPENSATOR,
-    MAX_JOINTS,
-    compensator_table,
-    settings_of,
-    urdf_settings_of,
-    urdf_table,
-)
+from exo_gravity.core.compensation.limiter import CommandFade, Output
 from exo_gravity.core.compensation.settings import URDF_LAW, Settings, UrdfSettings
-from exo_gravity.core.compensation.terms.assist import AssistInput
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.anfis import AnfisLaw
-from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.params import Param
+from exo_gravity.core.trunk.tilt_input import MAX_LEAD
 from exo_gravity.hardware.urdf_arm import UrdfArm
-from exo_gravity.nodes.compensator.budget_watch import BudgetWatch
-from exo_gravity.nodes.ros.hot_path import LATCHED, HotPath
-from exo_gravity.nodes.ros.messages import row, to_nanoseconds
+from exo_gravity.nodes.ros.hot_path import LATCHED, Repeated
+from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, row, to_nanoseconds, velocity_of
 from exo_gravity.nodes.ros.parameters import declare
-from exo_gravity.nodes.ros.sole_publisher import SolePublisher
 
-ASSIST_PAUSE = 0.002  # s
 DESCRIPTION_TIMEOUT = 10.0  # s in which robot_description must arrive
+TICK = 0.01  # s between two messages of a fade
+
+JointReading = tuple[Sequence[float], Sequence[float] | None]  # positions (n,) rad, velocities (n,) rad/s if known
+Read = Callable[[dict[str, Any]], Settings | UrdfSettings]
 
 
-class ControlledArm:
-    """Parameters, control and reports of the node's arm.
+def declared(node: Node) -> tuple[Sequence[Param], dict[str, Any], Read]:
+    """Declare the parameters of the node's arm. Raises ParameterError.
 
-    lock: guards `control`. threads: those that the node starts and stops.
+    Returns their table, their values, and a function that returns the settings that such values describe.
     """
+    given = node.get_parameters_by_prefix("")
+    if "law" not in given or given["law"].value != URDF_LAW:
+        table = params.compensator_table(given)
+        return table, declare(node, table), _settings
+    table = params.urdf_table(len(_joint_names(node)), given)
+    _forget_unused(node, {param.name for param in table})
+    values = declare(node, table)
+    model = UrdfArm(_description(node, values), values["joint_names"])
+    return table, values, lambda values: params.urdf_settings_of(values, model)
 
-    def __init__(self, node: Node, lock: threading.Lock) -> None:
-        given = node.get_parameters_by_prefix("")
-        self._model: UrdfArm | None = None
-        is_urdf = node.has_parameter("law") and node.get_parameter("law").value == URDF_LAW
-        self.table = urdf_table(len(_joint_names(node)), given) if is_urdf else compensator_table(given)
-        if is_urdf:
-            _forget_unused(node, {param.name for param in self.table})
-        self.values = declare(node, self.table)
-        names = self.values["joint_names"]
-        if is_urdf:
-            self._model = UrdfArm(_description(node, self.values), names)
-        self.control = Compensator(self.read(self.values), names)
-        terms = self.control.terms
-        self.threads = [AssistEfforts(node, terms.assist, lock)] if terms else []
-        self._budget = BudgetWatch(node, names) if terms else None
 
-    def read(self, values: dict[str, Any]) -> Settings | UrdfSettings:
-        """Return the settings that parameter values describe, with the file they name. Raises ParameterError."""
-        if self._model is not None:
-            return urdf_settings_of(values, self._model)
-        path = values["anfis_file"]
-        try:
-            anfis = AnfisLaw.load(Path(path).read_text(encoding="utf-8")) if path else None
-        except (OSError, UnicodeDecodeError, DataError) as error:
-            raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
-        return settings_of(values, anfis)
-
-    def update(self) -> None:
-        """Keep the torque budget up to date."""
-        if self._budget and isinstance(self.control.settings, Settings):
-            self._budget.update(self.control.settings)
-
-    def on_motion(self, *sample: Any) -> None:
-        """Use a sample of the trunk's motion."""
-        if self.control.settings.inertial:
-            self.control.set_motion(*sample)
-
-    def concern(self, answer: Answer) -> str:
-        """Return why the arm is not carried as set; '' if it is."""
-        if answer.fallback:
-            return f"the exact law replaces {self.control.settings.law}: {answer.fallback}"
-        problem = self.control.terms.problem if self.control.terms else ""
-        if problem:
-            return f"gravity compensation alone: {problem}"
-        return "changing load" if answer.remainder else ""
-
-    def _changing(self, answer: Answer) -> str:
-        """Return which joint has most to go until a change of load is done; 'none' if none is under way."""
-        if not answer.remainder:
-            return "none"
-        most, name = max(zip(map(abs, answer.remainder), self.values["joint_names"], strict=True))
-        return f"{name}, {most:.1f} Nm to go"
-
-    def report(self, answer: Answer) -> dict[str, object]:
-        """Return the current values for /diagnostics."""
-        s, terms = self.control.settings, self.control.terms
-        values: dict[str, object] = {"law": s.law, "changing load": self._changing(answer)}
-        if isinstance(s, UrdfSettings):
-            carried, limits = f"{s.arm.mass:.3f}", row(s.max_effort)
-            return {**values, "mass carried (kg)": carried, "gain": row(s.gain), "max effort (Nm)": limits}
-        values |= {
-            "law in use": "exact" if answer.fallback else s.law,
-            "mode": s.mode,
-            "support": s.support,
-            "robot mass (kg)": "not known" if s.robot.by_moments else row(s.robot.mass),
-            "robot cog (m)": "not known" if s.robot.by_moments else row(s.robot.cog),
-            "robot moments (kg m)": row((*s.robot.first_moment, *s.robot.off_axis)),
-            "wearer mass (kg)": row(s.wearer_mass),
-            "wearer cog (m)": row(s.wearer_cog),
-            "mass carried (kg)": f"{s.arm.total_mass:.3f}",
-            "max effort (Nm)": row(s.max_effort),
-        }
-        if terms and self._budget:
-            values["terms"] = ", ".join(terms.active) or "none"
-            values["assist"] = terms.assist.report
-            values["inertia tank (J)"] = f"{terms.energy:.2f}"
-            values["budget"] = self._budget.text
-            values["largest support"] = self._budget.largest_support
-        return values
+def _settings(values: dict[str, Any]) -> Settings:
+    """Return the settings of the exoskeleton's own arm, with the file that they name. Raises ParameterError."""
+    path = values["anfis_file"]
+    try:
+        anfis = AnfisLaw.load(Path(path).read_text(encoding="utf-8")) if path else None
+    except (OSError, UnicodeDecodeError, DataError) as error:
+        raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
+    return params.settings_of(values, anfis)
 
 
 def sentence(s: Settings | UrdfSettings) -> str:
-    """Return settings in a sentence for the log."""
+    """Return what is compensated, for the log."""
+    mode = f"{s.side} arm, mode {s.mode}, support {s.support:g}, " if isinstance(s, Settings) else ""
+    mass = s.arm.total_mass if isinstance(s, Settings) else s.arm.mass
+    return f"{mode}law {s.law}: compensates {mass:.2f} kg, at most {row(s.max_effort)} Nm"
+
+
+def report(control: Compensator, answer: Answer, names: Sequence[str]) -> dict[str, object]:
+    """Return what the arm's settings and terms are, for /diagnostics. names: of the joints."""
+    s, terms = control.settings, control.terms
+    most, name = max(zip(map(abs, answer.remainder), names, strict=False), default=(0.0, ""))
+    values: dict[str, object] = {"law": s.law, "changing load": f"{name}, {most:.1f} Nm to go" if name else "none"}
     if isinstance(s, UrdfSettings):
-        return f"law {s.law}, {len(s.gain)} joints: compensates {s.arm.mass:.2f} kg, at most {row(s.max_effort)} Nm"
-    of_wearer = f", wearer {row(s.wearer_mass)} kg at {row(s.wearer_cog)} m" if any(s.wearer_mass) else ""
-    return (
-        f"{s.side} arm, law {s.law}, mode {s.mode}, support {s.support:g}: compensates {s.arm.total_mass:.2f} kg, "
-        f"at most {row(s.max_effort)} Nm; robot {_of_robot(s.robot)}{of_wearer}"
-    )
-
-
-def _of_robot(robot: ArmModel) -> str:
-    along = f"{row(robot.mass)} kg at {row(robot.cog)} m"
-    if robot.by_moments:
-        along = f"moments {row(robot.first_moment)} kg m"
-    return f"{along}, across the links {row(robot.off_axis)} kg m" if any(robot.off_axis) else along
-
-
-class AssistEfforts(HotPath):
-    """Passes the newest message on the topic `assist_efforts` to `assist` on a thread, holding `lock`.
-
-    It looks 500 times a second at most, so that an outer loop that floods the topic does not slow the answers down.
-    """
-
-    def __init__(self, node: Node, assist: AssistInput, lock: threading.Lock) -> None:
-        super().__init__(node, JointState, "assist_efforts", self._on_efforts, pause=ASSIST_PAUSE)
-        self._clock = node.get_clock()
-        self._assist = assist
-        self._lock = lock
-        self._sole = SolePublisher(node, "assist_efforts")
-        self._sender = 0  # changes whenever a message comes from another publisher than the one before
-
-    def _on_efforts(self, message: JointState, info: dict[str, Any]) -> None:
-        now = time.monotonic()
-        age = (self._clock.now().nanoseconds - to_nanoseconds(message.header.stamp)) * 1e-9
-        self._sender += self._sole.is_another(info)
-        with self._lock:
-            self._assist.receive(now, message.name, message.effort, now - age, self._sender)
+        carried, limits = f"{s.arm.mass:.3f}", row(s.max_effort)
+        return {**values, "mass carried (kg)": carried, "gain": row(s.gain), "max effort (Nm)": limits}
+    values |= {
+        "law in use": "exact" if answer.fallback else s.law,
+        "mode": s.mode,
+        "support": s.support,
+        "robot mass (kg)": "not known" if s.robot.by_moments else row(s.robot.mass),
+        "robot cog (m)": "not known" if s.robot.by_moments else row(s.robot.cog),
+        "robot moments (kg m)": row((*s.robot.first_moment, *s.robot.off_axis)),
+        "wearer mass (kg)": row(s.wearer_mass),
+        "wearer cog (m)": row(s.wearer_cog),
+        "mass carried (kg)": f"{s.arm.total_mass:.3f}",
+        "max effort (Nm)": row(s.max_effort),
+    }
+    if terms:
+        values["terms"] = ", ".join(terms.active) or "none"
+        values["assist"] = terms.assist.report
+        values["inertia tank (J)"] = f"{terms.energy:.2f}"
+    return values
 
 
 def _forget_unused(node: Node, used: set[str]) -> None:
     """Undeclare the parameters of the exoskeleton's own arm, which a file may have, and log them."""
-    unused = [param.name for param in COMPENSATOR if param.name not in used and node.has_parameter(param.name)]
+    unused = [param.name for param in params.COMPENSATOR if param.name not in used and node.has_parameter(param.name)]
     for name in unused:
         node.undeclare_parameter(name)
     if unused:
@@ -179,8 +113,8 @@ def _forget_unused(node: Node, used: set[str]) -> None:
 
 def _joint_names(node: Node) -> list[str]:
     names = list(node.get_parameter("joint_names").value or ()) if node.has_parameter("joint_names") else []
-    if not 1 <= len(set(names)) == len(names) <= MAX_JOINTS:
-        raise ParameterError("joint_names", names, f"1 to {MAX_JOINTS} different joints of the URDF")
+    if not 1 <= len(set(names)) == len(names) <= params.MAX_JOINTS:
+        raise ParameterError("joint_names", names, f"1 to {params.MAX_JOINTS} different joints of the URDF")
     return names
 
 
@@ -196,3 +130,113 @@ def _description(node: Node, values: dict[str, Any]) -> str:
         return Path(path).expanduser().read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ParameterError("urdf.file", path, f"a URDF file ({error})") from None
+
+
+class JointStateInterface:
+    """Answers each joint state with `effort_commands` of the same stamp; without efforts: withdrawn.
+
+    The frame LATE_TILT says that they are computed from a late tilt: the bridge damps the motion meanwhile.
+    """
+
+    topic = "joint_states"
+    problem = ""
+
+    def __init__(self, node: Node, names: Sequence[str]) -> None:
+        self._names = names
+        self._publisher = node.create_publisher(JointState, "effort_commands", 1)
+        self._command = JointState(name=names)  # one message, reused
+        self._still = (0.0,) * len(names)
+        self.values: dict[str, object] = {}  # for /diagnostics
+
+    def read(self, message: JointState) -> JointReading:
+        """Return positions and velocities of exactly these joints. Raises ParameterError."""
+        return by_name(message, "position", self._names), velocity_of(message, self._names)
+
+    def send(self, now: float, message: JointState, answer: Answer) -> None:
+        """Publish the answer to the joint states of `message`."""
+        self._command.header.stamp = message.header.stamp
+        self._command.effort = answer.effort or ()
+        self._command.header.frame_id = LATE_TILT if answer.held else ""
+        self._command.velocity = self._still if answer.damped else ()  # asks for damping about standstill
+        self._publisher.publish(self._command)
+
+
+class MultiArrayInterface(Repeated):
+    """Sends Float64MultiArray in the order of `names`; fades to zero when there are no fresh, sound efforts.
+
+    values: the compensator's parameters. After a fade zeros follow, so that a controller that starts late has them too,
+    until the service `~/clear_fault` is called.
+    """
+
+    def __init__(self, node: Node, names: Sequence[str], values: Mapping[str, Any]) -> None:
+        super().__init__("fade", self._tick, TICK)
+        self.topic = values["multi_array.joint_states"]
+        self._names = names
+        self._clock = node.get_clock()
+        self._timeout = values["multi_array.timeout"]
+        self._fade = CommandFade(self._timeout)
+        self._lock = threading.Lock()  # guards the fade, and the order of its messages
+        self._publisher = node.create_publisher(Float64MultiArray, values["multi_array.topic"], 1)
+        self._message = Float64MultiArray()
+        self._is_late = False  # the last joint state, by its stamp
+        self._applied: Sequence[float] = ()  # Nm, what the joints applied before the first effort
+        node.create_service(Trigger, "~/clear_fault", self._clear)
+
+    @property
+    def problem(self) -> str:
+        """Why no efforts are sent; '' while they are."""
+        return self._fade.problem
+
+    @property
+    def values(self) -> dict[str, object]:
+        """What is known of the output, for /diagnostics."""
+        return {"output": self._fade.state.value, "output fault": self._fade.reason or "none"}
+
+    def read(self, message: JointState) -> JointReading:
+        """Return positions and velocities of these joints, which may be some of many.
+
+        Raises ParameterError if one is missing, and if the message is old by its stamp: a driver that lost its hardware
+        may go on publishing. Raises it, too, while nothing was sent and the message lacks the joints' efforts: the
+        controller may hold a torque, from which the next one must begin.
+        """
+        age = (self._clock.now().nanoseconds - to_nanoseconds(message.header.stamp)) * 1e-9
+        self._is_late = not -MAX_LEAD <= age <= self._timeout
+        if self._is_late:
+            raise ParameterError("age by its stamp", round(age, 3), f"from {-MAX_LEAD:g} to {self._timeout:g} s")
+        if self._fade.state is Output.WAITING:
+            self._applied = by_name(message, "effort", self._names, exact=False)
+        return by_name(message, "position", self._names, exact=False), velocity_of(message, self._names, exact=False)
+
+    def send(self, now: float, message: JointState, answer: Answer) -> None:
+        """Send the answer to a joint state, or begin the fade."""
+        with self._lock:
+            if self._is_late:
+                return  # one late message is not yet a reason to let the arm down
+            if answer.effort is None:
+                self._fade.withdraw(now, answer.reason)
+            elif effort := self._fade.take(now, answer.effort, self._applied):
+                self._publish(effort)
+
+    def stop(self) -> None:
+        """Fade to zero, and end the thread."""
+        with self._lock:
+            self._fade.withdraw(time.monotonic(), "the node stops")
+        while self._fade.state is Output.FADING and not self.failure:
+            time.sleep(TICK)
+        super().stop()
+
+    def _tick(self) -> None:
+        with self._lock:
+            effort = self._fade.tick(time.monotonic())
+            if effort is not None:
+                self._publish(effort)
+
+    def _publish(self, effort: Sequence[float]) -> None:
+        self._message.data = effort
+        self._publisher.publish(self._message)
+
+    def _clear(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        with self._lock:
+            response.success = self._fade.clear()
+        response.message = "cleared: the torque ramps in" if response.success else "nothing to clear, or still fading"
+        return response

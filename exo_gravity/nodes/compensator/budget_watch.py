@@ -7,9 +7,10 @@ two busy cores).
 
 from __future__ import annotations
 
+import math
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
@@ -17,14 +18,15 @@ from rclpy.node import Node
 
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.budget import BRIDGE_PARAMETERS, BudgetRequest, JointBudget, largest_support, overload
-from exo_gravity.core.params import values_of
-from exo_gravity.core.safety.params import CAN_BRIDGE
+from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.model.budget import USUAL_TILT, Workspace, budget, largest_support, motor_torques, overload
 from exo_gravity.nodes.ros.parameters import NodeParameters
 
 PAUSE = 0.005  # s, about 500 times per budget
 WITHIN = "within rated torque everywhere"
-Result = tuple[JointBudget, ...] | ParameterError
+BRIDGE_PARAMETERS = ("motor", "torque_scale", "position_min", "position_max")
+Load = tuple[tuple[float, ...], tuple[float, ...]]  # the wearer's mass (4,) kg and centre of gravity (4,) m
+Request = tuple[ArmModel, Load, float, float]  # robot, wearer, support 0..1, largest tilt in rad
 
 
 class BudgetWatch:
@@ -39,54 +41,42 @@ class BudgetWatch:
         self.largest_support = "unknown"
         self._logger = node.get_logger()
         self._names = tuple(joint_names)
-        self._bridge: dict[str, Any] = {}
-        self._parameters = NodeParameters(node, "can_bridge", self._on_bridge, BRIDGE_PARAMETERS)
-        self._request: BudgetRequest | None = None
-        self._job: Future[Result] | None = None
+        # Without its clients the executor then waits for two entities less.
+        self._bridge = NodeParameters(node, "can_bridge", lambda values: self._bridge.destroy(), BRIDGE_PARAMETERS)
+        self._request: Request | None = None
+        self._job: Future[tuple[str, str]] | None = None
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="budget")
 
     def update(self, settings: Settings) -> None:
         """Collect a finished budget, or start one for `settings` if they are new. Never blocks."""
-        self._parameters.update()
+        self._bridge.update()
         if self._job is not None:
             if self._job.done():
-                self._take(self._job.result())
-                self._job = None
-        elif self._bridge:
+                (self.text, self.largest_support), self._job = self._job.result(), None
+                if self.text != WITHIN:
+                    self._logger.warning(f"{self.text}; efforts stay clamped to max_effort")
+        elif self._bridge.values:
             s = settings
+            load = tuple(s.wearer_mass), tuple(s.wearer_cog)
             support = s.support if s.mode == "zero_g" else 0.0
-            request = BudgetRequest.of(s.robot, (s.wearer_mass, s.wearer_cog), support, self._bridge, s.use_imu)
+            request = s.robot, load, support, math.radians(USUAL_TILT) if s.use_imu else 0.0
             if request != self._request:
-                self._request, self._job = request, self._pool.submit(compute, request)
-
-    def _take(self, result: Result) -> None:
-        if isinstance(result, ParameterError):
-            self.largest_support = "unknown"
-            self._note(f"unknown: can_bridge has {result}")
-        else:
-            is_worn = self._request is not None and any(self._request.load[0])
-            self.largest_support = f"{largest_support(result) or 0.0:g}" if is_worn else "none"
-            self._note(overload(self._names, result) or WITHIN)
-
-    def _on_bridge(self, values: dict[str, Any]) -> None:
-        table = [param for param in CAN_BRIDGE if param.name in BRIDGE_PARAMETERS]
-        try:
-            self._bridge = values_of(table, values)
-        except ParameterError as error:
-            self._note(f"unknown: can_bridge has {error}")
-        self._parameters.destroy()  # the executor then waits for two entities less
-
-    def _note(self, text: str) -> None:
-        self.text = text
-        if text != WITHIN:
-            self._logger.warning(f"{text}; efforts stay clamped to max_effort")
+                self._request = request
+                self._job = self._pool.submit(compute, self._names, request, self._bridge.values)
 
 
-def compute(request: BudgetRequest) -> Result:
-    """Return the budget of `request`, or the error, with pauses and without real-time scheduling."""
+def compute(names: Sequence[str], request: Request, bridge: Mapping[str, Any]) -> tuple[str, str]:
+    """Return `text` and `largest_support` of `BudgetWatch`, with pauses and without real-time scheduling.
+
+    names: of the joints (4,). bridge: values of BRIDGE_PARAMETERS.
+    """
     # A thread inherits its creator's policy, and thread_priority sets that of all threads: never SCHED_FIFO here.
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    robot, load, support, tilt = request
     try:
-        return request.joints(lambda: time.sleep(PAUSE))
+        workspace = Workspace(bridge["position_min"], bridge["position_max"], tilt)
+        rated, peak = motor_torques(bridge["motor"], bridge["torque_scale"])
+        joints = budget(robot, load, support, workspace, rated, peak, lambda: time.sleep(PAUSE))
     except ParameterError as error:
-        return error
+        return f"unknown: can_bridge has {error}", "unknown"
+    return overload(names, joints) or WITHIN, f"{largest_support(joints) or 0.0:g}" if any(load[0]) else "none"

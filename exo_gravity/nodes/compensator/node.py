@@ -3,7 +3,7 @@
 It answers each joint state at once, with the joint state's stamp, so that `can_bridge` can tell how old the reading is.
 Where there is no safe answer it withdraws: it sends a command without efforts, and puts the reason on /diagnostics. To
 `can_bridge` silence means the same, a little later. An effort controller of ros2_control needs more
-(nodes/compensator/command_interface.py).
+(nodes/compensator/arm.py).
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
-from exo_gravity.core.compensation.compensator import Answer
+from exo_gravity.core.compensation.compensator import Answer, Compensator
+from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Rate
 from exo_gravity.hardware.scheduling import request_real_time
-from exo_gravity.nodes.compensator.arm import ControlledArm, sentence
-from exo_gravity.nodes.compensator.command_interface import JointStateInterface, MultiArrayInterface
-from exo_gravity.nodes.ros.hot_path import NEWEST, HotPath
-from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row
-from exo_gravity.nodes.ros.parameters import values_after, with_floats
+from exo_gravity.nodes.compensator.arm import JointStateInterface, MultiArrayInterface, declared, report, sentence
+from exo_gravity.nodes.compensator.budget_watch import BudgetWatch
+from exo_gravity.nodes.ros.hot_path import DISTRUST, NEWEST, HotPath, Repeated, SolePublisher, TiltSubscription
+from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row, to_nanoseconds
+from exo_gravity.nodes.ros.parameters import values_after
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.sole_publisher import DISTRUST, SolePublisher
-from exo_gravity.nodes.ros.tilt_subscription import TiltSubscription
 
 SILENCE = 0.5  # s without joint states until diagnostics report it
 REPORT_PERIOD = 0.5  # s
+ASSIST_PAUSE = 0.002  # s between two looks, so that an outer loop that floods its topic does not slow the answers down
 MAX_CHANGES = 16  # answers whose reason is new, waiting for the report
 
 
@@ -41,12 +41,24 @@ class CompensatorNode(Node):
     """The ROS shell around a compensator."""
 
     def __init__(self) -> None:
-        super().__init__("compensator", automatically_declare_parameters_from_overrides=True)
+        # A parameter that is not in the table is refused by `_check_parameters`, which names it: rclpy does not.
+        super().__init__(
+            "compensator", automatically_declare_parameters_from_overrides=True, allow_undeclared_parameters=True
+        )
         self._lock = threading.Lock()  # guards the control: joint states arrive on another thread
-        self._arm = ControlledArm(self, self._lock)
-        self._control, values = self._arm.control, self._arm.values
+        self._table, values, self._read = declared(self)
         self._names = values["joint_names"]
-        self._threads: list[HotPath | MultiArrayInterface] = [*self._arm.threads]
+        self._checked = self._read(values)  # the settings that the parameters describe
+        self._control = Compensator(self._checked, self._names)
+        self._budget: BudgetWatch | None = None
+        self._threads: list[Repeated] = []
+        if self._control.terms:
+            self._budget = BudgetWatch(self, self._names)
+            self._assist = self._control.terms.assist
+            self._assistant = SolePublisher(self, "assist_efforts")
+            self._assistants = 0  # changes whenever a message comes from another publisher than the one before
+            path = HotPath(self, JointState, "assist_efforts", self._on_assist_efforts, pause=ASSIST_PAUSE)
+            self._threads.append(path)
         self._interface: JointStateInterface | MultiArrayInterface
         if values.get("command_interface") == "multi_array":
             self._interface = MultiArrayInterface(self, self._names, values)
@@ -66,18 +78,16 @@ class CompensatorNode(Node):
         self._intruder, self._intruded = "", -math.inf
         self._threads.append(HotPath(self, JointState, topic, self._on_joint_states, NEWEST))
         if values["use_imu"]:
-            TiltSubscription(self, self._control, self._lock, self._refused, self._withdraw, self._arm.on_motion)
-        self.add_pre_set_parameters_callback(lambda changes: with_floats(self, changes))
+            TiltSubscription(self, self._control, self._lock, self._refused, self._withdraw, self._on_motion)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         # Only the executor's thread reports: diagnostics and budget are not for two threads.
         self._changed = self.create_guard_condition(self._report_changes)
         self.create_timer(REPORT_PERIOD, self._report_current)
-        self.get_logger().info(sentence(self._control.settings))
+        self.get_logger().info(sentence(self._checked))
         for thread in self._threads:
             thread.start()
-        for refused in request_real_time(values["thread_priority"]):
-            self.get_logger().warning(refused)
+        request_real_time(values["thread_priority"], self.get_logger().warning)
 
     @property
     def failure(self) -> Exception | None:
@@ -85,7 +95,7 @@ class CompensatorNode(Node):
         return next((thread.failure for thread in self._threads if thread.failure), None)
 
     def close(self) -> None:
-        """Stop answering joint states."""
+        """End the threads."""
         for thread in reversed(self._threads):
             thread.stop()
 
@@ -113,6 +123,17 @@ class CompensatorNode(Node):
             self._changes.append(answer)
             self._changed.trigger()
 
+    def _on_assist_efforts(self, message: JointState, info: dict[str, Any]) -> None:
+        now = time.monotonic()
+        age = (self.get_clock().now().nanoseconds - to_nanoseconds(message.header.stamp)) * 1e-9
+        self._assistants += self._assistant.is_another(info)
+        with self._lock:
+            self._assist.receive(now, message.name, message.effort, now - age, self._assistants)
+
+    def _on_motion(self, *sample: Any) -> None:
+        if self._control.settings.inertial:  # each sample takes a fit, under the lock
+            self._control.set_motion(*sample)
+
     def _withdraw(self, topic: str) -> None:
         """Withdraw for a while: a second publisher sends on `topic`."""
         self._intruder, self._intruded = f"more than one publisher of {topic}", time.monotonic()
@@ -124,23 +145,17 @@ class CompensatorNode(Node):
 
     def _check_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         try:
-            self._arm.read(values_after(self, self._arm.table, changes))
+            self._checked = self._read(values_after(self, self._table, changes))
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _apply_parameters(self, _changes: list[Parameter]) -> None:
-        try:
-            settings = self._arm.read(values_after(self, self._arm.table))
-        except ParameterError as error:  # checked just before: only a file can have changed since
-            self.get_logger().error(f"parameters not applied: {error}")
-            return
         with self._lock:
-            self._control.apply(settings)
-        self.get_logger().info(sentence(settings))
+            self._control.apply(self._checked)
+        self.get_logger().info(sentence(self._checked))
 
     def _values(self, now: float, answer: Answer) -> dict[str, object]:
-        """Return the current values for /diagnostics."""
         return {
             **self._interface.values,
             "limits acting": ", ".join(f"max_effort ({self._names[joint]})" for joint in answer.clamped) or "none",
@@ -151,7 +166,8 @@ class CompensatorNode(Node):
             "rides": self._rides,
             "joint states missed": self._source.missed,
             "effort (Nm)": row(answer.effort) if answer.effort else "none",
-            **self._arm.report(answer),
+            **report(self._control, answer, self._names),
+            **({"budget": self._budget.text, "largest support": self._budget.largest_support} if self._budget else {}),
             "last refused message": self._refusal,
         }
 
@@ -160,7 +176,9 @@ class CompensatorNode(Node):
             self._report(self._changes.popleft())
 
     def _report_current(self) -> None:
-        self._arm.update()
+        settings = self._control.settings
+        if self._budget and isinstance(settings, Settings):
+            self._budget.update(settings)
         self._report_changes()
         self._report(self._answer)
 
@@ -175,7 +193,14 @@ class CompensatorNode(Node):
             return STALE if self._answers else WARN, f"waiting for {self._interface.topic}"
         if answer.effort is None:
             return ERROR, f"withdrawn: {answer.reason}"
-        warnings = [warning for warning in (answer.held, self._arm.concern(answer)) if warning]
+        warnings = [answer.held] if answer.held else []
+        problem = self._control.terms.problem if self._control.terms else ""
+        if answer.fallback:
+            warnings.append(f"the exact law replaces {self._control.settings.law}: {answer.fallback}")
+        elif problem:
+            warnings.append(f"gravity compensation alone: {problem}")
+        elif answer.remainder:
+            warnings.append("changing load")
         if answer.clamped:
             warnings.append(f"gravity exceeds max_effort: {', '.join(self._names[joint] for joint in answer.clamped)}")
         return (WARN, "; ".join(warnings)) if warnings else (OK, "compensating")

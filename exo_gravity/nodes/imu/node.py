@@ -22,11 +22,10 @@ from exo_gravity.core.numbers import Rate
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator, TrunkOrientation
 from exo_gravity.nodes.imu.device import ImuDevice
-from exo_gravity.nodes.ros.hot_path import HotPath
+from exo_gravity.nodes.ros.hot_path import DISTRUST, HotPath, SolePublisher
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.sole_publisher import DISTRUST, SolePublisher
 
 PITCH_YAW, DATA = "/imu/pitch_yaw", "/imu/data"
 # The fusion integrates every sample. A queue of depth 1 would lose samples whenever the node is delayed.
@@ -108,7 +107,7 @@ class ImuNode(Node):
         self._pitch_yaw.publish(tilt)
         data = Imu(header=tilt.header)
         q, rate, acceleration = data.orientation, data.angular_velocity, data.linear_acceleration
-        q.x, q.y, q.z, q.w = orientation.orientation.tolist()
+        q.x, q.y, q.z, q.w = orientation.orientation
         variance = orientation.uncertainty**2
         data.orientation_covariance = np.diag((variance, variance, UNKNOWN_HEADING)).ravel()
         # In the trunk's axes. A covariance of zeros means unknown, one of -1 means not reported (REP-145).

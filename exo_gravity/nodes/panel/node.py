@@ -9,13 +9,13 @@ arrive hundreds of times a second: their subscription keeps the newest message o
 from __future__ import annotations
 
 import asyncio
-import concurrent.futures
 import math
 import os
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, KeyValue
@@ -25,48 +25,57 @@ from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
-from exo_gravity.core.errors import ExoGravityError
+from exo_gravity import packaged
+from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.nodes.ros.hot_path import HotPath
 from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.panel.control import Control
-from exo_gravity.panel.params import PANEL, scripts_folder
 from exo_gravity.panel.recordings import Recordings
-from exo_gravity.panel.view import Newest, Values, joint_rows, setup_of
+from exo_gravity.panel.view import PANEL, Newest, Values, joint_rows, setup_of
 
 STATE_PERIOD = 0.1  # s between two states that the pages get
 DISCOVERY_PERIOD = 0.5  # s between two searches for nodes
 CALL_TIMEOUT = 3.0  # s, longer than can_bridge itself waits
 ABSENT_TIMEOUT = 0.5  # s, where the service seems to be absent
+LOOK_PERIOD = 0.005  # s between two looks for an answer
 TILT = "/imu/pitch_yaw"
 BRIDGE, COMPENSATOR = "can_bridge", "compensator"
+SHOWN = {BRIDGE: "bridge", COMPENSATOR: "compensator"}  # what the page calls the status of each
+ASKED = {  # what a page may ask of an arm besides `set`: a service, and the request to it
+    "let_down": (SetBool, f"{BRIDGE}/enable", SetBool.Request(data=False)),
+    "enable": (SetBool, f"{BRIDGE}/enable", SetBool.Request(data=True)),
+    "clear_fault": (Trigger, f"{BRIDGE}/clear_fault", Trigger.Request()),
+    "resume": (Trigger, f"{BRIDGE}/resume", Trigger.Request()),
+}
 
 
 class ArmClient:
     """One arm, in the namespace `/name`."""
 
     def __init__(self, node: Node, name: str) -> None:
-        self.joints, self.bridge, self.compensator = Newest(), Newest(), Newest()
-        self.enable = node.create_client(SetBool, f"/{name}/{BRIDGE}/enable")
-        self.clear_fault = node.create_client(Trigger, f"/{name}/{BRIDGE}/clear_fault")
-        self.resume = node.create_client(Trigger, f"/{name}/{BRIDGE}/resume")
-        self.set = parameter_client(node, f"/{name}/{COMPENSATOR}")
+        self.newest = dict.fromkeys(("joints", *SHOWN.values()), Newest())  #: what the page shows of it
+        self.services = {kind: node.create_client(srv, f"/{name}/{leaf}") for kind, (srv, leaf, _) in ASKED.items()}
+        self.services["set"] = parameter_client(node, f"/{name}/{COMPENSATOR}")
         self.control = node.create_publisher(KeyValue, f"/{name}/{BRIDGE}/control", 10)
         self._states = HotPath(node, JointState, f"/{name}/joint_states", self._on_states)
 
     def state(self, now: float) -> dict[str, Any]:
         """Take the newest joint states, and return what the page shows; None in the place of what is old."""
         self._states.poll()
-        return {kind: getattr(self, kind).at(now) for kind in ("joints", "bridge", "compensator")}
+        return {kind: newest.at(now) for kind, newest in self.newest.items()}
+
+    def report(self) -> dict[str, str]:
+        """Return what the bridge reports; {} if it is silent."""
+        return self.newest["bridge"].at(time.monotonic()) or {}
 
     def _on_states(self, message: JointState, _info: dict[str, Any]) -> None:
         rows = joint_rows(message.name, message.position, message.velocity, message.effort)
-        self.joints = Newest(rows, time.monotonic())
+        self.newest["joints"] = Newest(rows, time.monotonic())
 
 
 class Arms:
@@ -127,8 +136,7 @@ class Arms:
 
     def states(self) -> dict[str, str | None]:
         """Return the state that each bridge reports; None if it is silent."""
-        now = time.monotonic()
-        return {name: (client.bridge.at(now) or {}).get("state") for name, client in self.clients.items()}
+        return {name: client.report().get("state") for name, client in self.clients.items()}
 
     async def perform(self, script: str) -> str:
         """Let the virtual wearers perform the script at this path; return '' or why not."""
@@ -149,41 +157,21 @@ class Arms:
 
     def other_holder(self, arm: str, page: str) -> str:
         """Return the name of another operator who holds control of the arm, as its bridge reports; '' for none."""
-        holder = (self.clients[arm].bridge.at(time.monotonic()) or {}).get(HELD_BY, NOBODY)
-        return "" if holder in (NOBODY, self._lessee + page) else str(holder)
+        holder = self.clients[arm].report().get(HELD_BY, NOBODY)
+        return "" if holder in (NOBODY, self._lessee + page) else holder
 
-    async def let_down(self, arm: str) -> str:
-        """Let one arm down. The request is sent even where the service seems to be absent."""
-        return await call(self.clients[arm].enable, SetBool.Request(data=False))
-
-    async def enable(self, arm: str) -> str:
-        """Enable one arm."""
-        return await call(self.clients[arm].enable, SetBool.Request(data=True))
-
-    async def clear_fault(self, arm: str) -> str:
-        """Clear the latched fault of one arm."""
-        return await call(self.clients[arm].clear_fault, Trigger.Request())
-
-    async def resume(self, arm: str) -> str:
-        """Clear the fault of one arm and enable it, where it is."""
-        return await call(self.clients[arm].resume, Trigger.Request())
-
-    async def set(self, arm: str, values: Mapping[str, Any]) -> str:
-        """Set parameters of the arm's compensator together."""
-        return await call(self.clients[arm].set, parameter_request(values))
+    async def ask(self, kind: str, arm: str, values: Mapping[str, Any]) -> str:
+        """Do what a page asks of one arm. The request is sent even where the service seems to be absent."""
+        request = parameter_request(values) if kind == "set" else ASKED[kind][-1]
+        return await call(self.clients[arm].services[kind], request)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             arm, _, leaf = status.name.strip("/").rpartition("/")
-            if arm not in self.clients:
-                continue
-            values = {pair.key: pair.value for pair in status.values}
-            level = int.from_bytes(status.level, "big")
-            newest = Newest({**values, "level": level, "message": status.message}, time.monotonic())
-            if leaf == BRIDGE:
-                self.clients[arm].bridge = newest
-            elif leaf == COMPENSATOR:
-                self.clients[arm].compensator = newest
+            if arm in self.clients and leaf in SHOWN:
+                values = {pair.key: pair.value for pair in status.values}
+                values |= {"level": int.from_bytes(status.level, "big"), "message": status.message}
+                self.clients[arm].newest[SHOWN[leaf]] = Newest(values, time.monotonic())
 
     def _on_parameter_event(self, event: ParameterEvent) -> None:
         if event.node in self._parameters:
@@ -203,20 +191,14 @@ def parameter_request(values: Mapping[str, Any]) -> SetParametersAtomically.Requ
 
 async def call(client: Client, request: Any) -> str:
     """Send `request` at once; return '' if it was carried out, else why not."""
-    done: concurrent.futures.Future[Any] = concurrent.futures.Future()
-
-    def answer(future: Future) -> None:
-        if done.set_running_or_notify_cancel():  # else it came too late
-            done.set_result(future.result())
-
     sent = client.call_async(request)
-    sent.add_done_callback(answer)
-    try:
-        timeout = CALL_TIMEOUT if client.service_is_ready() else ABSENT_TIMEOUT
-        response = await asyncio.wait_for(asyncio.wrap_future(done), timeout)
-    except asyncio.TimeoutError:
-        client.remove_pending_request(sent)
-        return f"{client.srv_name} does not answer"
+    deadline = time.monotonic() + (CALL_TIMEOUT if client.service_is_ready() else ABSENT_TIMEOUT)
+    while not sent.done():
+        if time.monotonic() > deadline:
+            client.remove_pending_request(sent)
+            return f"{client.srv_name} does not answer"
+        await asyncio.sleep(LOOK_PERIOD)
+    response: Any = sent.result()
     result = getattr(response, "result", response)
     if getattr(result, "successful", getattr(result, "success", False)):
         return ""
@@ -237,7 +219,9 @@ class Panel(Node):
         self._arms = Arms(self, values["dead_man"])
         self._tilt = Newest()
         self._tilts = HotPath(self, Vector3Stamped, TILT, self._on_tilt)
-        scripts = scripts_folder(values["trials"])
+        scripts = Path(values["trials"]) if values["trials"] else packaged("trials")
+        if values["trials"] and not os.path.isdir(values["trials"]):
+            raise ParameterError("trials", values["trials"], "a folder")
         self._recordings = Recordings(values["output"], scripts, self._arms, self._note, time.monotonic)
         own = {name: values[name] for name in ("language", "dead_man")}
         self._own_setup = {**own, "trials": list(self._recordings.trials)}
@@ -250,7 +234,6 @@ class Panel(Node):
             raise ExoGravityError(missing) from None
         address = (values["host"], values["port"], values["token"])
         self._server = PanelServer(*address, control, self._recordings.report, self._arms.parameters, time.monotonic)
-        self._server.start()
         self.create_timer(STATE_PERIOD, self._send_state)
         self.create_timer(DISCOVERY_PERIOD, self._arms.discover)
         self._log_address(values["host"], values["port"])

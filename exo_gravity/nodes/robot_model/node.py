@@ -2,7 +2,7 @@
 
 It looks for compensators, requests the parameters of each and of its bridge, and publishes
 
-    robot_description  std_msgs/String, latched: the URDF of all arms, again whenever an arm is added
+    robot_description  std_msgs/String, latched: the URDF of all arms, again whenever an arm is added or changed
     joint_states       sensor_msgs/JointState of all arms, unless this is the topic of one of them
     ~/markers          visualization_msgs/MarkerArray: gravity, torques, limits and the state of each arm
 
@@ -11,14 +11,12 @@ It only reads: nothing depends on it, and the arms run on if it ends.
 
 from __future__ import annotations
 
-import itertools
 import math
 import time
-from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from typing import Any
 
-from builtin_interfaces.msg import Duration, Time
+from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Point, Vector3Stamped
 from rclpy.node import Node
@@ -29,16 +27,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.tilt import gravity_in_trunk
 from exo_gravity.core.view.scene import ARROW, LINE, SPHERE, TEXT, ArmView, Shape, arm_shapes, gravity_shapes
-from exo_gravity.core.view.urdf import (
-    OF_BRIDGE,
-    OF_COMPENSATOR,
-    ROBOT_MODEL,
-    ROOT,
-    ArmDescription,
-    described,
-    joint_names,
-    urdf,
-)
+from exo_gravity.core.view.urdf import ROBOT_MODEL, ROOT, ArmDescription, described, joint_names, urdf
 from exo_gravity.nodes.ros.hot_path import LATCHED, NEWEST, HotPath
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics, by_name, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
@@ -48,7 +37,6 @@ DISCOVERY_PERIOD = 0.5  # s between two searches for arms
 MARKER_PERIOD = 0.1  # s
 STALE = 0.5  # s after which a reading or a state is no longer shown
 STALE_STATE = 2.0  # s; states come twice a second
-FIELDS = ("position", "velocity", "effort")
 KINDS = {ARROW: Marker.ARROW, LINE: Marker.LINE_STRIP, SPHERE: Marker.SPHERE, TEXT: Marker.TEXT_VIEW_FACING}
 LIFETIME = Duration(nanosec=500_000_000)  # a marker that is no longer sent disappears
 
@@ -62,7 +50,7 @@ class RobotModel(Node):
         self._meshes = values["meshes"]
         self._arms: dict[str, ViewedArm] = {}
         self._views: list[tuple[ViewedArm, ArmView]] = []
-        self._described: tuple[ViewedArm, ...] = ()
+        self._described: dict[ViewedArm, ArmDescription] = {}
         self._problem = ""  # of the description
         self._tilt, self._tilt_time = (0.0, 0.0), -math.inf
         self._diagnostics = Diagnostics(self)
@@ -79,42 +67,39 @@ class RobotModel(Node):
         for name, namespace in self.get_node_names_and_namespaces():
             if name == "compensator" and namespace not in self._arms:
                 self._arms[namespace] = ViewedArm(self, namespace.rstrip("/"))
-        for parameters in [parameters for arm in self._arms.values() for parameters in arm.parameters]:
-            parameters.update()
+        for arm in self._arms.values():
+            for parameters in arm.parameters:
+                parameters.update()
         self._describe()
-        problem = self._problem or next((arm.problem for arm in self._arms.values() if arm.problem), "")
-        if not self._arms:
-            problem = "waiting for a compensator"
+        problems = [self._problem, *(arm.problem for arm in self._arms.values())]
+        problem = next(filter(None, problems), "" if self._arms else "waiting for a compensator")
         level, message = (WARN, problem) if problem else (OK, f"publishing {', '.join(sorted(self._arms))}")
         self._diagnostics.report(level, message, {"arms": len(self._arms), "shown": len(self._views)})
 
     def _describe(self) -> None:
-        """Publish the description if the arms that are known have changed."""
-        known = tuple(arm for _, arm in sorted(self._arms.items()) if arm.description)
+        """Publish the description if what is known of the arms has changed."""
+        known = {arm: arm.description for _, arm in sorted(self._arms.items()) if arm.description}
         if known == self._described:
             return
         self._described, self._problem = known, ""
         try:
-            text = urdf([arm.description for arm in known if arm.description], self._meshes)
-            self._description.publish(String(data=text))
+            self._description.publish(String(data=urdf(list(known.values()), self._meshes)))
         except ParameterError as error:
             self._problem = str(error)
 
     def _publish_states(self) -> None:
-        self._views = [(arm, view) for arm in self._described if (view := arm.view())]
+        names = dict(zip(self._described, joint_names(list(self._described.values())), strict=True))
+        self._views = views = [(arm, view) for arm in self._described if (view := arm.view())]
         own_topic = self._joint_states.topic_name
-        if not self._views or self._problem or own_topic in {arm.states_topic for arm in self._arms.values()}:
+        if not views or self._problem or own_topic in {arm.states_topic for arm in self._arms.values()}:
             return
-        names = joint_names([arm.description for arm in self._described if arm.description])
-        by_arm = dict(zip(self._described, names, strict=True))
-        states = JointState()
-        stamps = (arm.states.header.stamp for arm, _ in self._views if arm.states)
-        states.header.stamp = max(stamps, key=to_nanoseconds)
-        for arm, view in self._views:
-            states.name = [*states.name, *by_arm[arm]]
-            states.position = [*states.position, *view.theta]
-            states.velocity = [*states.velocity, *view.velocity]
-            states.effort = [*states.effort, *view.effort]
+        states = JointState(
+            name=[name for arm, _ in views for name in names[arm]],
+            position=[theta for _, view in views for theta in view.theta],
+            velocity=[velocity for _, view in views for velocity in view.velocity],
+            effort=[effort for _, view in views for effort in view.effort],
+        )
+        states.header.stamp = max((arm.states.header.stamp for arm, _ in views), key=to_nanoseconds)
         self._joint_states.publish(states)
 
     def _publish_markers(self) -> None:
@@ -122,10 +107,13 @@ class RobotModel(Node):
         if not self._markers.get_subscription_count():
             return
         fresh = time.monotonic() - self._tilt_time < STALE
-        shapes = [("", shape) for shape in gravity_shapes(gravity_in_trunk(*self._tilt) if fresh else None)]
-        for _, view in self._views:
-            shapes += [(view.arm.side, shape) for shape in arm_shapes(view)]
-        self._markers.publish(marker_array(shapes, self.get_clock().now().to_msg()))
+        groups = [("", gravity_shapes(gravity_in_trunk(*self._tilt) if fresh else None))]
+        groups += [(f"{view.arm.side}/", arm_shapes(view)) for _, view in self._views]
+        markers = [marker(owner, n, shape) for owner, shapes in groups for n, shape in enumerate(shapes)]
+        stamp = self.get_clock().now().to_msg()
+        for each in markers:
+            each.header.stamp = stamp
+        self._markers.publish(MarkerArray(markers=markers))
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -144,14 +132,12 @@ class ViewedArm:
         #: Why there is no description or no reading, '' if nothing is wrong
         self.problem = f"waiting for the parameters of {namespace}/compensator and {namespace}/can_bridge"
         self.states_topic = f"{namespace}/joint_states"
-        self.states: JointState | None = None
-        self._node = node
+        self.states = JointState()
         self._bridge = f"{namespace}/can_bridge".lstrip("/")
         self._status, self._status_time = ("", ""), -math.inf
         self._time = -math.inf
         self.parameters = [
-            NodeParameters(node, f"{namespace}/{leaf}", self._on_values, names)
-            for leaf, names in (("compensator", OF_COMPENSATOR), ("can_bridge", OF_BRIDGE))
+            NodeParameters(node, f"{namespace}/{leaf}", self._on_values) for leaf in ("compensator", "can_bridge")
         ]
         self._subscription = HotPath(node, JointState, self.states_topic, self._on_states, NEWEST)
 
@@ -167,56 +153,45 @@ class ViewedArm:
         now = time.monotonic()
         if self.description is None:
             return None
-        if self.states is None or now - self._time > STALE:
-            self.problem = f"no messages on {self.states_topic}"
-            return None
-        names = self.description.limits.joint_names
+        self.problem = "" if now - self._time < STALE else f"no messages on {self.states_topic}"
         try:
-            theta, velocity, effort = (by_name(self.states, field, names) for field in FIELDS)
+            names = self.description.limits.joint_names
+            fields = ("position", "velocity", "effort")
+            theta, velocity, effort = (by_name(self.states, field, names) for field in fields)
         except ParameterError as error:
-            self.problem = f"{self.states_topic}: {error.name} must be {error.expected}"
+            self.problem = self.problem or f"{self.states_topic}: {error.name} must be {error.expected}"
+        if self.problem:
             return None
-        self.problem = ""
-        state, message = self._status if now - self._status_time < STALE_STATE else ("", "")
-        return ArmView(self.description, theta, velocity, effort, state, message)
+        status = self._status if now - self._status_time < STALE_STATE else ("", "")
+        return ArmView(self.description, theta, velocity, effort, *status)
 
     def _on_states(self, message: JointState, _info: dict[str, Any]) -> None:
         self.states, self._time = message, time.monotonic()
 
     def _on_values(self, _values: object) -> None:
-        if not all(parameters.values for parameters in self.parameters):
-            return
         try:
-            self.description = described(*(parameters.values for parameters in self.parameters))
+            with suppress(KeyError):  # one of them has not answered yet, or is of another kind of arm
+                self.description = described(*(parameters.values for parameters in self.parameters))
         except ParameterError as error:
             self.problem = f"{self._bridge.rpartition('/')[0] or 'arm'}: {error}"
-            self._node.get_logger().error(self.problem)
 
 
-def marker_array(shapes: Iterable[tuple[str, Shape]], stamp: Time) -> MarkerArray:
-    """Return the markers of (owner, shape): an owner is a side, or '' for what both arms share."""
-    markers, numbers = [], defaultdict[str, Iterator[int]](itertools.count)
-    for owner, shape in shapes:
-        group = f"{owner}/{shape.group}" if owner else shape.group
-        markers.append(_marker(group, next(numbers[group]), shape, stamp))
-    return MarkerArray(markers=markers)
-
-
-def _marker(group: str, number: int, shape: Shape, stamp: Time) -> Marker:
-    marker = Marker(ns=group, id=number, type=KINDS[shape.kind], action=Marker.ADD, lifetime=LIFETIME, text=shape.text)
-    marker.header.stamp, marker.header.frame_id = stamp, ROOT
+def marker(owner: str, number: int, shape: Shape) -> Marker:
+    """Return the marker of a shape; owner: 'left/' or 'right/', or '' for what both arms share."""
+    kind = KINDS[shape.kind]
+    marker = Marker(ns=f"{owner}{shape.group}", id=number, type=kind, lifetime=LIFETIME, text=shape.text)
+    marker.header.frame_id = ROOT
     marker.color = ColorRGBA(**dict(zip("rgba", shape.colour, strict=True)))
     marker.pose.orientation.w = 1.0
     points = [Point(x=x, y=y, z=z) for x, y, z in shape.points.tolist()]
     scale = marker.scale
+    scale.x = shape.size
     if shape.kind in (LINE, ARROW):
         marker.points = points
-        scale.x = shape.size
-        if shape.kind == ARROW:  # x: diameter of the shaft, y: of the head
-            scale.y = 2 * shape.size
+        scale.y = 2 * shape.size  # of an arrow's head
     else:
         marker.pose.position = points[0]
-        scale.x = scale.y = scale.z = shape.size
+        scale.y = scale.z = shape.size
     return marker
 
 

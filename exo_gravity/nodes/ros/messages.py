@@ -25,12 +25,12 @@ PERIOD = 0.45  # s; a little less than a multiple of the nodes' timer periods, w
 
 
 def to_time(nanoseconds: int) -> Time:
-    """Return a message stamp for nanoseconds."""
+    """Return the stamp of `nanoseconds`."""
     return Time(sec=nanoseconds // 1_000_000_000, nanosec=nanoseconds % 1_000_000_000)
 
 
 def to_nanoseconds(stamp: Time) -> int:
-    """Return the nanoseconds of a message stamp."""
+    """Return a stamp in ns."""
     return stamp.sec * 1_000_000_000 + stamp.nanosec
 
 

@@ -9,7 +9,6 @@ from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rcl_interfaces.srv import GetParameters, ListParameters
-from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.task import Future
@@ -43,19 +42,8 @@ def values_after(node: Node, table: Sequence[Param], changes: Sequence[Parameter
     return values_of(table, {name: plain(value) for name, value in values.items()})
 
 
-def with_floats(node: Node, changes: Sequence[Parameter]) -> list[Parameter]:
-    """Return `changes` with whole numbers converted to float where needed, as in `ros2 param set ... support 1`.
-
-    Raises ParameterNotDeclaredException with the unknown names, which rclpy itself leaves out.
-    """
-    unknown = [change.name for change in changes if not node.has_parameter(change.name)]
-    if unknown:
-        raise ParameterNotDeclaredException(unknown)
-    return [_with_floats(change, node.get_parameter(change.name).type_) for change in changes]
-
-
 def bus_of(node: Node, values: dict[str, Any]) -> tuple[str, str, dict[str, Any]]:
-    """Return interface, channel and options of the node's python-can bus."""
+    """Return python-can's interface and channel, and its options, that the node's parameters name."""
     options = {name: parameter.value for name, parameter in node.get_parameters_by_prefix(OPTIONS).items()}
     return values["can.interface"], values["can.channel"], options
 
@@ -63,24 +51,18 @@ def bus_of(node: Node, values: dict[str, Any]) -> tuple[str, str, dict[str, Any]
 def descriptor_of(param: Param) -> ParameterDescriptor:
     """Return the descriptor that `ros2 param describe` shows."""
     unit = f" [{param.unit}]" if param.unit else ""
-    descriptor = ParameterDescriptor(description=f"{param.description}{unit}", read_only=param.fixed)
-    if param.choices:
-        descriptor.additional_constraints = param.range
-    elif param.bounds and isinstance(param.default, list):
+    first = param.default[0] if isinstance(param.default, list) and param.default else param.default
+    # A whole number is accepted for a float, as in `ros2 param set ... support 1`; `values_after` checks the type.
+    descriptor = ParameterDescriptor(
+        description=f"{param.description}{unit}", read_only=param.fixed, dynamic_typing=isinstance(first, float)
+    )
+    if not param.bounds or isinstance(param.default, list):
         descriptor.additional_constraints = param.expected
-    elif param.bounds and isinstance(param.default, float):
+    elif isinstance(param.default, float):
         descriptor.floating_point_range = [FloatingPointRange(from_value=param.bounds[0], to_value=param.bounds[1])]
-    elif param.bounds:
+    else:
         descriptor.integer_range = [IntegerRange(from_value=int(param.bounds[0]), to_value=int(param.bounds[1]))]
     return descriptor
-
-
-def _with_floats(change: Parameter, declared: Parameter.Type) -> Parameter:
-    if (change.type_, declared) == (Parameter.Type.INTEGER, Parameter.Type.DOUBLE):
-        return Parameter(change.name, value=float(change.value))
-    if (change.type_, declared) == (Parameter.Type.INTEGER_ARRAY, Parameter.Type.DOUBLE_ARRAY):
-        return Parameter(change.name, value=[float(number) for number in change.value])
-    return change
 
 
 def plain(value: Any) -> Any:
@@ -154,5 +136,6 @@ class NodeParameters:
         if math.isfinite(self._due):  # else they have changed since
             self._due = math.inf
         values = map(parameter_value_to_python, future.result().values)
-        self.values = {name: plain(value) for name, value in zip(names, values, strict=False) if value is not None}
+        known = {name: plain(value) for name, value in zip(names, values, strict=False) if value is not None}
+        self.values = known if not self._names or len(known) == len(names) else {}
         self._on_change(self.values)

@@ -57,7 +57,7 @@ def open_to_others() -> str:
     return "" if reach == "LOCALHOST" else f"ROS_AUTOMATIC_DISCOVERY_RANGE={reach}"
 
 
-def run(make_node: Callable[[], Node], priority: int = 0, args: list[str] | None = None) -> int:
+def run(make_node: Callable[[], Node], priority: int = 0) -> int:
     """Run one node until a signal or an error; return the exit code (1 failed, 2 wrong parameters).
 
     priority: 1..20, requests nice value -priority, where permitted. Not SCHED_FIFO: four such nodes can fill a core,
@@ -73,7 +73,7 @@ def run(make_node: Callable[[], Node], priority: int = 0, args: list[str] | None
         favour(priority)
     executable = os.path.basename(sys.argv[0])
     try:
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
     except (ExoGravityError, RuntimeError) as error:  # RuntimeError: rcl could not read its own arguments
         get_logger(executable).fatal(str(error))

@@ -20,7 +20,7 @@ from rosbags.typesys import Stores, get_typestore
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.bag.storage import Storage
 from exo_gravity.core.calibration.identification import Observation
-from exo_gravity.core.calibration.motion import BINS, average
+from exo_gravity.core.calibration.motion import BINS, Average, average
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.trial.recording import Recording, in_blocks, still_spans
@@ -41,40 +41,37 @@ def observations_of(path: Path, arm: ConfiguredArm, with_held: bool = True) -> l
 
     with_held: False for sweeps alone, which show friction. Raises DataError if there are none.
     """
-    recording, tilts = _recorded(path, arm)
-    observations = list(_sweeps(recording, arm, tilts))
+    bag = read_bag(path)
+    found = {recording.name: recording for recording in bag.recordings}
+    if arm.name not in found:
+        raise DataError(f"{path}: no arm {arm.name}; it has {', '.join(found)}")
+    recording = found[arm.name]
+    if sorted(recording.joint_names) != sorted(arm.joint_names):
+        raise DataError(f"joints = {', '.join(recording.joint_names)}: must be {', '.join(arm.joint_names)}")
+    order = [recording.joint_names.index(name) for name in arm.joint_names]
+    effort = np.where(np.isfinite(recording.command), recording.command, recording.effort)  # as commanded, where known
+    position = recording.position[:, order].astype(float)
+    recording = replace(recording, joint_names=arm.joint_names, position=position, effort=effort[:, order])
+    down = _down(path, arm, recording.time + bag.start / 1e9)
+    observations = list(_sweeps(recording, down))
     if with_held:
-        observations += list(_held(recording, arm, tilts, observations))
+        observations += list(_held(recording, down, observations))
     if not observations:
         held = f", or held one for {HELD_TIME:g} s" if with_held else ""
         raise DataError(f"{path}: {arm.name} never passed a pose slowly there and back, all joints turning{held}")
     return observations
 
 
-def _recorded(path: Path, arm: ConfiguredArm) -> tuple[Recording, np.ndarray | None]:
-    """Return the recording of `arm`, and the trunk's tilts (n, 3), None where it uses none.
-
-    The columns are time in s, pitch and roll in rad.
-    """
-    bag = read_bag(path)
-    found = [recording for recording in bag.recordings if recording.name == arm.name]
-    if not found:
-        names = ", ".join(recording.name for recording in bag.recordings)
-        raise DataError(f"{path}: no arm {arm.name}; it has {names}")
-    tilts = None
-    if arm.compensator["use_imu"]:
-        vectors = ((stamp, message.vector) for stamp, message in messages_of(path, TILT_TOPIC, TILT_TYPE))
-        tilts = np.array([((stamp - bag.start) / 1e9, vector.y, vector.x) for stamp, vector in vectors])
-    return _in_order_of(found[0], arm), tilts
-
-
-def _in_order_of(recording: Recording, arm: ConfiguredArm) -> Recording:
-    order = [recording.joint_names.index(name) for name in arm.joint_names if name in recording.joint_names]
-    if len(order) != len(arm.joint_names):
-        raise DataError(f"joints = {', '.join(recording.joint_names)}: must be {', '.join(arm.joint_names)}")
-    fields = ("position", "velocity", "effort", "command")
-    columns = {name: getattr(recording, name)[:, order] for name in fields}
-    return replace(recording, joint_names=arm.joint_names, **columns)
+def _down(path: Path, arm: ConfiguredArm, times: np.ndarray) -> np.ndarray:
+    """Return gravity's direction (n, 3) in the base frame at `times` (n,) s, from the trunk's tilts if it uses any."""
+    if not arm.compensator["use_imu"]:
+        return np.tile(Tilt.of(arm.side).direction, (len(times), 1))
+    tilts = [
+        (stamp / 1e9, *Tilt.of(arm.side, message.vector.y, message.vector.x).direction)
+        for stamp, message in messages_of(path, TILT_TOPIC, TILT_TYPE)
+    ]
+    stamps, *components = np.array(tilts).T
+    return np.stack([np.interp(times, stamps, component) for component in components], axis=1)
 
 
 def messages_of(path: Path, topic: str, msgtype: str) -> Iterator[tuple[int, Any]]:
@@ -92,87 +89,71 @@ def messages_of(path: Path, topic: str, msgtype: str) -> Iterator[tuple[int, Any
         raise DataError(f"{path}: no samples of {topic} ({msgtype}); its topics: {topics}")
 
 
-def _direction(arm: ConfiguredArm, tilts: np.ndarray | None, start: float, end: float) -> np.ndarray:
-    """Return gravity's mean direction (3,) in the base frame between `start` and `end` s."""
-    if tilts is None:
-        return np.array(Tilt.of(arm.side).direction)
-    chosen = tilts[(tilts[:, 0] >= start) & (tilts[:, 0] <= end)]
-    nearest = chosen if len(chosen) else tilts[[np.argmin(np.abs(tilts[:, 0] - start))]]
-    return np.array(Tilt.of(arm.side, *nearest[:, 1:].mean(axis=0)).direction)
+def _mean_of(down: np.ndarray) -> np.ndarray:
+    """Return the mean (3,) of unit vectors (n, 3), of length 1."""
+    mean = down.mean(axis=0)
+    return np.asarray(mean / np.linalg.norm(mean))
 
 
-def _effort(recording: Recording, part: slice | np.ndarray) -> np.ndarray:
-    """Return the effort (n, 4) of a part: as commanded, where it is known, else as measured."""
-    commanded, measured = recording.command[part], recording.effort[part]
-    return np.where(np.isfinite(commanded), commanded, measured)
-
-
-def _sweeps(recording: Recording, arm: ConfiguredArm, tilts: np.ndarray | None) -> Iterator[Observation]:
+def _sweeps(recording: Recording, down: np.ndarray) -> Iterator[Observation]:
     """Yield an observation for every two runs one after the other in which all joints turn to and fro."""
+    time, position = recording.time, recording.position
     runs = [run for span in recording.while_carried(-math.inf, math.inf) for run in _runs(recording, *span)]
-    last_end = -math.inf
+    used = 0  # samples: each run is used once
     for there, back in pairwise(runs):
-        way = [recording.position[run.stop - 1] - recording.position[run.start] for run in (there, back)]
-        turn = recording.time[back.start] - recording.time[there.stop - 1]
-        if np.any(way[0] * way[1] >= 0.0) or turn > LONGEST_TURN:
+        ways = [position[run.stop - 1] - position[run.start] for run in (there, back)]
+        if np.any(ways[0] * ways[1] >= 0.0) or time[back.start] - time[there.stop - 1] > LONGEST_TURN:
             continue
-        if recording.time[there.start] < last_end:
-            continue  # each run is used once
-        direction = _direction(arm, tilts, *recording.time[[there.start, back.stop - 1]])
-        if observation := _there_and_back(recording, there, back, direction):
-            last_end = recording.time[back.stop - 1]
-            yield observation
+        if there.start >= used and (seen := _there_and_back(recording, there, back)):
+            used = back.stop
+            (theta, effort, friction, spread, _), speed = seen
+            direction = _mean_of(down[there.start : back.stop])
+            yield Observation(theta, direction, effort, np.sign(ways[0]) * friction, spread, speed=speed)
 
 
 def _runs(recording: Recording, start: float, end: float) -> Iterator[slice]:
     """Yield the runs between `start` and `end` s in which every joint turns slowly without turning round."""
-    inside = np.flatnonzero((recording.time >= start) & (recording.time <= end))
-    if len(inside) < 2:
-        return
-    first, beyond = int(inside[0]), int(inside[-1]) + 1
-    time, position = recording.time[first:beyond], recording.position[first:beyond].astype(float)
+    first, beyond = np.searchsorted(recording.time, start), np.searchsorted(recording.time, end, "right")
+    time, position = recording.time[first:beyond], recording.position[first:beyond]
     later = np.minimum(np.searchsorted(time, time + SMOOTHING), len(time) - 1)
     speed = (position[later] - position) / np.maximum(time[later] - time, 1e-3)[:, None]
     is_slow = np.all((np.abs(speed) >= SPEED[0]) & (np.abs(speed) <= SPEED[1]), axis=1)
     way = np.where(is_slow, np.sign(speed) @ (27, 9, 3, 1), 0.5)
     edges = np.flatnonzero(np.diff(way, prepend=np.nan, append=np.nan) != 0.0)
-    for low, high in pairwise(edges):
+    for low, high in pairwise(edges.tolist()):
         if is_slow[low] and high - low > 4 * BINS:
-            yield slice(first + int(low), first + int(high))
+            yield slice(int(first) + low, int(first) + high)
 
 
-def _there_and_back(recording: Recording, there: slice, back: slice, direction: np.ndarray) -> Observation | None:
-    """Return what is seen in the middle of the way that both runs have in common; None if that is short."""
-    position = recording.position.astype(float)
-    spans = [np.sort(position[[run.start, run.stop - 1]], axis=0) for run in (there, back)]
-    low, high = np.maximum(spans[0][0], spans[1][0]), np.minimum(spans[0][1], spans[1][1])
+def _there_and_back(recording: Recording, there: slice, back: slice) -> tuple[Average, np.ndarray] | None:
+    """Return what is seen in the middle of the way that both runs have in common, and the speed (4,) in rad/s.
+
+    None if that way is short.
+    """
+    time, position = recording.time, recording.position
+    low, high = np.sort([position[[run.start, run.stop - 1]] for run in (there, back)], axis=1).swapaxes(0, 1)
+    low, high = low.max(axis=0), high.min(axis=0)
     if np.any(high - low < LEAST_WAY):
         return None
-    middle, reach = (low + high) / 2.0, (high - low) * (0.5 - EDGE)
     sweeps, speeds = [], []
     for run in (there, back):
-        inside = np.flatnonzero(np.all(np.abs(position[run] - middle) <= reach, axis=1)) + run.start
+        is_inside = np.all(np.abs(position[run] - (low + high) / 2.0) <= (high - low) * (0.5 - EDGE), axis=1)
+        inside = np.flatnonzero(is_inside) + run.start
         if len(inside) < 2 * BINS:
             return None
         ends = inside[[0, -1]]
-        speeds.append(np.abs(np.diff(position[ends], axis=0)[0]) / np.diff(recording.time[ends]))
-        sweeps.append((position[inside], _effort(recording, inside).astype(float)))
-    result = average(sweeps, np.zeros((4, 4)))
-    sign = np.sign(position[there.stop - 1] - position[there.start])
-    speed = np.mean(speeds, axis=0)
-    return Observation(result.theta, direction, result.effort, sign * result.friction, result.spread, speed=speed)
+        speeds.append(np.abs(np.diff(position[ends], axis=0)[0]) / np.diff(time[ends]))
+        sweeps.append((position[inside], recording.effort[inside]))
+    return average(sweeps), np.mean(speeds, axis=0)
 
 
-def _held(
-    recording: Recording, arm: ConfiguredArm, tilts: np.ndarray | None, sweeps: list[Observation]
-) -> Iterator[Observation]:
+def _held(recording: Recording, down: np.ndarray, sweeps: list[Observation]) -> Iterator[Observation]:
     """Yield an observation for every pose that was held, as uncertain as the friction of `sweeps`."""
-    friction = np.median([s.friction for s in sweeps], axis=0) if sweeps else np.full(4, UNKNOWN_FRICTION)
+    friction = np.abs(np.median([s.friction for s in sweeps], axis=0)) if sweeps else np.full(4, UNKNOWN_FRICTION)
     for start, end in still_spans(recording, in_blocks(recording)):
-        if end - start < HELD_TIME:
-            continue
-        part = (recording.time >= start) & (recording.time <= end)
-        effort = _effort(recording, part)
-        spread = np.hypot(np.abs(friction) / math.sqrt(3.0), effort.std(axis=0))
-        theta = recording.position[part].mean(axis=0)
-        yield Observation(theta, _direction(arm, tilts, start, end), effort.mean(axis=0), np.abs(friction), spread)
+        if end - start >= HELD_TIME:
+            part = (recording.time >= start) & (recording.time <= end)
+            effort = recording.effort[part]
+            spread = np.hypot(friction / math.sqrt(3.0), effort.std(axis=0))
+            theta = recording.position[part].mean(axis=0)
+            yield Observation(theta, _mean_of(down[part]), effort.mean(axis=0), friction, spread)

@@ -14,8 +14,8 @@ wearer     the weight of the wearer's relaxed arm, from supported poses: what th
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -51,10 +51,17 @@ TABLE_RATIO = (0.6, 1.6)  # measured to tabled moments that are plausible
 
 def calibrate_gravity(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
     """Measure the poses, or take them from `options.bag`, and solve for the moments. Raises ParameterError."""
+    return moments_from(arm, _observations(options, arm, say, {"tour.poses": options.poses}))
+
+
+def _observations(
+    options: argparse.Namespace, arm: ConfiguredArm, say: Say, changes: Mapping[str, Any]
+) -> Sequence[Observation]:
+    """Return what a tour measures, or what `options.bag` shows; changes: as for `tour_parameters`."""
     if options.bag:
-        return moments_from(arm, observations_of(options.bag, arm))
-    nodes = tour_parameters(options.params, arm, {"tour.poses": options.poses})
-    return moments_from(arm, live.run_tour(options, nodes, say).complete(options.record))
+        return observations_of(options.bag, arm, with_held="tour.friction" not in changes)
+    nodes = tour_parameters(options.params, arm, changes)
+    return live.run_tour(options, nodes, say).complete(options.record)
 
 
 def calibrate_scale(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
@@ -147,10 +154,7 @@ def _row(values: np.ndarray) -> str:
 
 def calibrate_friction(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
     """Sweep all joints of the hanging arm, and fit the friction of each. Raises ParameterError."""
-    if options.bag:
-        return friction_from(arm, observations_of(options.bag, arm, with_held=False))
-    nodes = tour_parameters(options.params, arm, {"tour.friction": True})
-    return friction_from(arm, live.run_tour(options, nodes, say).complete(options.record))
+    return friction_from(arm, _observations(options, arm, say, {"tour.friction": True}))
 
 
 def friction_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:

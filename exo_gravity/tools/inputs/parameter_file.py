@@ -18,7 +18,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from fnmatch import fnmatchcase
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import yaml
 
@@ -39,6 +39,7 @@ SUPERVISED = {"EXO_GRAVITY_SUPERVISED": "1", "PYTHONUNBUFFERED": "1"}  # a node 
 # Starts can_bridge for one purpose: to let down an arm that was left behind, after that time for its watchdog.
 RECOVERY = {"EXO_GRAVITY_RECOVER": f"{WATCHDOG_TIMEOUT:g}"}
 ENDED_WELL = (0, 2)  # exit codes of a node that ended by itself: stopped, or with wrong parameters or no bus
+# A node that may end alone: the arm does not depend on it, and a full disk must not let the arm down.
 OBSERVERS = ("/recorder", "/robot_model", "/panel")
 ABSOLUTE_TOPICS = ("/imu/data", "/imu/data_raw", "/imu/pitch_yaw")  # those that a namespace must be added to
 
@@ -120,25 +121,12 @@ def executable(node: str) -> str:
     return found
 
 
-class Stages(NamedTuple):
-    """Names of nodes, in the order in which they stop."""
-
-    bridges: list[str]
-    others: list[str]
-    recorders: list[str]
-
-    @classmethod
-    def of(cls, nodes: Iterable[str]) -> Stages:
-        """Return the stages of `nodes`, full names."""
-        names = list(nodes)
-        bridges = [node for node in names if node.endswith("/can_bridge")]
-        recorders = [node for node in names if node.endswith("/recorder")]
-        return cls(bridges, [node for node in names if node not in (*bridges, *recorders)], recorders)
-
-
-def is_observer(node: str) -> bool:
-    """Return whether `node` may end alone: the arm does not depend on it, and a full disk must not let the arm down."""
-    return node.endswith(OBSERVERS)
+def stages(nodes: Iterable[str]) -> tuple[list[str], list[str], list[str]]:
+    """Return the full names `nodes` in the order in which they stop: bridges, others, recorders."""
+    found: tuple[list[str], list[str], list[str]] = [], [], []
+    for node in nodes:
+        found[0 if node.endswith("/can_bridge") else 2 if node.endswith("/recorder") else 1].append(node)
+    return found
 
 
 def chosen(nodes: Iterable[str], only: Sequence[str]) -> list[str]:
@@ -156,7 +144,7 @@ def chosen(nodes: Iterable[str], only: Sequence[str]) -> list[str]:
 def check_buses(nodes: Nodes) -> None:
     """Raise ParameterError if two bridges would command motors on the same bus, which has one owner."""
     owner: dict[tuple[tuple[str, str], ...], str] = {}
-    for node in Stages.of(nodes).bridges:
+    for node in stages(nodes)[0]:
         bus = tuple(sorted((k, str(v)) for k, v in nodes[node].items() if k.startswith("can.")))
         other = owner.setdefault(bus, node)
         if other != node:

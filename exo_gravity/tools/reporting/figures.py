@@ -63,7 +63,7 @@ def overview(recording: Recording, analysis: TrialAnalysis) -> Figure:
 def drift(recording: Recording, analysis: TrialAnalysis, criteria: HoldCriteria) -> Figure:
     """Return the deviation of each joint from the start of each hold, and the drift rate of each hold."""
     figure, blocks = Figure(figsize=(WIDTH, 6.6), layout="constrained"), in_blocks(recording)
-    upper, lower = figure.subfigures(2, 1, height_ratios=(1.0, 1.1))
+    upper, lower = np.ravel(figure.subfigures(2, 1, height_ratios=(1.0, 1.1)))
     axes = upper.subplots(1, 4, sharex=True, sharey=True)
     for joint, (axis, name) in enumerate(zip(axes, joint_labels(recording), strict=True)):
         for hold in analysis.holds:

@@ -188,10 +188,11 @@ def test_the_average_of_sweeps_separates_gravity_and_friction_at_different_angle
     for sign in (1.0, -1.0, 1.0, -1.0):
         offset = sign * np.linspace(-0.03, 0.03, 60)[:, None] - sign * 0.01  # behind the reference
         position = np.array((0.1, 0.2, 0.3, 0.4)) + offset
-        sweeps.append((position, 1.0 + position @ slope.T + sign * friction))
-    result = average(sweeps, slope)
+        effort = 1.0 + position @ slope.T + sign * friction
+        sweeps.append((position, effort - position @ slope.T))  # minus the expected one
+    result = average(sweeps)
     np.testing.assert_allclose(result.friction, friction, atol=1e-9)
-    np.testing.assert_allclose(result.effort, 1.0 + slope @ result.theta, atol=1e-9)
+    np.testing.assert_allclose(result.effort, 1.0, atol=1e-9)
 
 
 def test_the_expected_torque_learns_scale_and_moments_of_each_joint():
@@ -235,7 +236,7 @@ def test_the_sweeps_of_a_chosen_pose_and_the_way_home_with_a_weight_need_no_more
     itinerary, taken = BestPoses(LIMITS, 8, 160.0), np.empty((0, 4))
     itinerary.next(taken, np.zeros(4), 0.0, guess, (0.0,) * 4)  # the hanging arm
     while station := itinerary.next(taken, np.zeros(4), 15.0 * len(taken), guess, (0.2,) * 4):
-        ways = [station.low, station.high, *(share * np.array(station.theta) for share in np.linspace(0.0, 1.0, 20))]
+        ways = [*station.ends, *(share * np.array(station.theta) for share in np.linspace(0.0, 1.0, 20))]
         assert np.all(np.abs(guess.torques(np.array(ways))[0]) < 0.95 * np.array(LIMITS.max_effort))
         taken = np.vstack((taken, station.theta))
     assert len(taken) == 8

@@ -43,7 +43,7 @@ from exo_gravity.sim.arm import DEFAULT_LINKS
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")
 ZERO = (0.0,) * 4
-STATE = TermState(1.0, 0.002, (0.2, 0.7, 0.6, 0.5), ZERO, ZERO, ZERO, 0.0)
+STATE = TermState(0.002, (0.2, 0.7, 0.6, 0.5), ZERO, ZERO, 0.0)
 EDGES = (-1.5, 1.5, 0.0, 1.6, -0.6, 1.6, 0.0, 2.5)
 four = st.tuples(*[st.floats(-40.0, 40.0)] * 4)
 ALL = TermSettings(
@@ -139,7 +139,7 @@ class Driven:
     def run(self, seconds: float, position=STATE.position, velocity=ZERO, period: float = 0.002):
         for _ in range(max(1, round(seconds / period))):
             self.now += period
-            self.outputs.append(self.terms.torque(self.now, position, velocity, ZERO))
+            self.outputs.append(self.terms.torque(self.now, position, velocity))
         return self.outputs[-1]
 
 
@@ -155,7 +155,7 @@ def test_what_the_terms_before_a_change_would_give_stays_known():
     before = driven.terms.now
     driven.terms.apply(TermSettings(), DEFAULT_LINKS)
     assert driven.run(0.002) == ZERO
-    assert driven.terms.torque_of(before, ZERO) == pytest.approx(expected)
+    assert driven.terms.torque_of(before) == pytest.approx(expected)
 
 
 def test_after_a_pause_the_terms_begin_again_from_no_torque():
@@ -185,7 +185,7 @@ def test_whatever_the_terms_give_their_sum_is_bounded_and_rate_limited(sums):
     terms, now, before = Terms(NAMES, TermSettings(spring=Wild(given)), DEFAULT_LINKS), 1.0, ZERO
     for total, dt in sums:
         now, given[0] = now + dt, total
-        after = terms.torque(now, STATE.position, ZERO, ZERO)
+        after = terms.torque(now, STATE.position, ZERO)
         assert all(abs(tau) <= limit for tau, limit in zip(after, MAX_EFFORT, strict=True))
         steps = np.abs(np.subtract(after, before))
         assert steps.max() <= MAX_EFFORT_RATE * min(dt, LONGEST_STEP) + 1e-9
@@ -199,7 +199,7 @@ def test_all_terms_together_stay_bounded_in_any_state(states):
     terms, now = Terms(NAMES, ALL, DEFAULT_LINKS), 1.0
     for position, velocity, dt in states:
         now += dt
-        torque = terms.torque(now, position, velocity, ZERO)
+        torque = terms.torque(now, position, velocity)
         assert all(abs(tau) <= limit for tau, limit in zip(torque, MAX_EFFORT, strict=True))
 
 

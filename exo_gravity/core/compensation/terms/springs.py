@@ -6,12 +6,12 @@ without harm; the tests vary it from 0 to 10 ms. A stiffness or viscosity that t
 
 from __future__ import annotations
 
-import bisect
-import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
+
+import numpy as np
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.gravity import Torque
@@ -23,7 +23,6 @@ LATE = 2.0 * DELAY  # s: a spring of k Nm/rad needs the damping LATE k, in Nm s/
 SPRING_EFFORT = (1.0, 2.0, 1.0, 1.0)  # Nm that a spring may give: a hand overcomes it
 COUPLING_EFFORT = 1.0  # Nm on the joint that follows
 EDGE_STIFFNESS = (10.0,) * JOINT_COUNT  # Nm/rad: the whole torque 0.1 and 0.2 rad beyond the edge
-EDGE_SHARE = 0.8  # of the stiffness that the arm can bear, where that is less
 EDGE = 0.05  # rad beyond the edge over which the damping rises, so that it does not set in with a jolt
 FREE = 3.15  # rad: no edge
 MAX_PATH_SPEED = 2.0  # rad/s between two poses of a path
@@ -32,12 +31,10 @@ MAX_PATH_SPEED = 2.0  # rad/s between two poses of a path
 class TermState(NamedTuple):
     """The arm as the terms see it."""
 
-    time: float  #: s
     dt: float  #: s since the last state, 0 for the first
     position: Sequence[float]  #: (4,) rad
     velocity: Sequence[float]  #: (4,) rad/s
     acceleration: Sequence[float]  #: (4,) rad/s^2, low-passed
-    gravity: Sequence[float]  #: (4,) Nm of gravity compensation
     elapsed: float  #: s since the spring's settings
 
 
@@ -69,10 +66,6 @@ class Damping(TermParameters):
 
     viscosity: Sequence[float] = owned((0.0,) * 4, "virtual viscous friction; 0: off", (0.0, 5.0), "Nm s/rad")
 
-    def check(self, least_inertia: Sequence[float]) -> None:
-        """Raise ParameterError unless the viscosity damps these inertias (4,) kg m^2 although it acts late."""
-        _check_stable("damping.viscosity", self.viscosity, [i / (2.0 * DELAY) for i in least_inertia], "Nm s/rad")
-
     def torque(self, state: TermState) -> Torque:
         """Return the torque (4,) in Nm, against the motion."""
         b, v = self.viscosity, state.velocity
@@ -95,46 +88,37 @@ class Spring(TermParameters):
         any_length=True,
     )
     max_effort: Sequence[float] = SPRING_EFFORT  #: largest torque, (4,) Nm
-    #: rows of the path: (n,) s from 0 on, and (n, 4) rad
-    times: tuple[float, ...] = field(init=False, repr=False, compare=False)
-    poses: tuple[tuple[float, ...], ...] = field(init=False, repr=False, compare=False)
+    times: tuple[float, ...] = field(init=False, repr=False, compare=False)  #: (n,) s of the path's rows, from 0 on
+    ways: np.ndarray = field(init=False, repr=False, compare=False)  #: (4, n) rad, each joint's angles
 
     def __post_init__(self) -> None:
         super().__post_init__()
         numbers = tuple(self.pose)
         path = (0.0, *numbers) if len(numbers) == JOINT_COUNT else numbers
-        times = path[:: JOINT_COUNT + 1]
-        poses = tuple(path[i + 1 : i + JOINT_COUNT + 1] for i in range(0, len(path), JOINT_COUNT + 1))
-        if not (poses and all(map(_is_pose, poses))):
+        rows = np.reshape(path, (-1, 1 + JOINT_COUNT)) if len(path) % (1 + JOINT_COUNT) == 0 else np.empty((0, 1))
+        times, poses = rows[:, 0], rows[:, 1:]
+        if not (len(rows) and np.all(np.abs(poses) <= FREE)):
             raise ParameterError("spring.pose", list(numbers), f"4 angles within {FREE:g} rad, or a path of rows")
-        if times[0] != 0.0 or times[-1] == math.inf or not all(a < b for a, b in itertools.pairwise(times)):
-            raise ParameterError("times of the path in spring.pose", list(times[:3]), "rising from 0 s")
-        for (t, a), (u, b) in itertools.pairwise(zip(times, poses, strict=True)):
-            if math.dist(a, b) > MAX_PATH_SPEED * (u - t):
-                expected = f"at most {MAX_PATH_SPEED:g} rad/s"
-                raise ParameterError(f"speed of the path from {t:g} s on", math.dist(a, b) / (u - t), expected)
-        for name, value in (("pose", numbers), ("times", times), ("poses", poses)):
+        if times[0] != 0.0 or not (np.all(np.diff(times) > 0.0) and times[-1] < math.inf):
+            raise ParameterError("times of the path in spring.pose", times[:3].tolist(), "rising from 0 s")
+        speeds = np.linalg.norm(np.diff(poses, axis=0), axis=1) / np.diff(times)
+        if np.any(speeds > MAX_PATH_SPEED):
+            raise ParameterError(
+                "speed of the path in spring.pose", float(np.max(speeds)), f"at most {MAX_PATH_SPEED:g} rad/s"
+            )
+        for name, value in (("pose", numbers), ("times", tuple(times.tolist())), ("ways", poses.T)):
             object.__setattr__(self, name, value)
-
-    def check(self, least_inertia: Sequence[float]) -> None:
-        """Raise ParameterError unless the spring is stable on these inertias (4,) kg m^2."""
-        _check_stable("spring.stiffness", self.stiffness, stable_stiffness(least_inertia), "Nm/rad")
 
     def torque(self, state: TermState) -> Torque:
         """Return the torque (4,) in Nm."""
-        pose = self.poses[0] if len(self.times) == 1 else self._pose_at(state.elapsed)
+        pose = self.pose
+        if len(pose) != JOINT_COUNT:
+            pose = [float(np.interp(state.elapsed, self.times, way)) for way in self.ways]
         torque = []
         columns = zip(self.stiffness, pose, state.position, state.velocity, self.max_effort, strict=True)
         for k, to, q, v, most in columns:
             torque.append(clamp(k * (to - q), most) - LATE * k * v)
         return tuple(torque)
-
-    def _pose_at(self, elapsed: float) -> Sequence[float]:
-        i = bisect.bisect_right(self.times, elapsed)
-        if i == 0 or i == len(self.times):
-            return self.poses[max(0, i - 1)]
-        share = (elapsed - self.times[i - 1]) / (self.times[i] - self.times[i - 1])
-        return [a + share * (b - a) for a, b in zip(self.poses[i - 1], self.poses[i], strict=True)]
 
 
 @dataclass(frozen=True)
@@ -164,13 +148,10 @@ class Coupling(TermParameters):
         """Stiffness on the follower, Nm/rad."""
         return max(map(abs, self.stiffness))
 
-    def check(self, least_inertia: Sequence[float]) -> None:
-        """Raise ParameterError unless the spring is stable on these inertias (4,) kg m^2."""
+    def stable(self, least_inertia: Sequence[float]) -> float:
+        """Return the largest stiffness on the follower, Nm/rad, that is stable on these inertias (4,) kg m^2."""
         pairs = zip(self.stiffness, least_inertia, strict=True)
-        most = 1.0 / sum((k / self.largest) ** 2 / inertia for k, inertia in pairs) / (4.0 * DELAY**2)
-        if self.largest > most:
-            expected = f"at most {most:.2f} Nm/rad, which {1000 * DELAY:.0f} ms late is stable"
-            raise ParameterError("coupling.stiffness", self.largest, expected)
+        return 1.0 / sum((k / self.largest) ** 2 / inertia for k, inertia in pairs) / (4.0 * DELAY**2)
 
     def torque(self, state: TermState) -> Torque:
         """Return the torque (4,) in Nm on the follower and on the joints that it follows."""
@@ -199,11 +180,6 @@ class SoftLimits(TermParameters):
         if not all(low < high for low, high in zip(self.range[0::2], self.range[1::2], strict=True)):
             raise ParameterError("limits.range", list(self.range), "lower and upper edge of each joint, rising")
 
-    def on_arm(self, least_inertia: Sequence[float]) -> SoftLimits:
-        """Return these limits as stiff as an arm of these inertias (4,) kg m^2 can bear."""
-        most = [EDGE_SHARE * limit for limit in stable_stiffness(least_inertia)]
-        return replace(self, stiffness=tuple(map(min, self.stiffness, most)))
-
     def torque(self, state: TermState) -> Torque:
         """Return the torque (4,) in Nm: none inside, back towards the workspace outside."""
         torque = []
@@ -231,14 +207,3 @@ def stable_stiffness(least_inertia: Sequence[float]) -> list[float]:
     inertia / (2 DELAY) is the most that damps: twice what the spring needs.
     """
     return [inertia / (4.0 * DELAY**2) for inertia in least_inertia]
-
-
-def _check_stable(name: str, values: Sequence[float], most: Sequence[float], unit: str) -> None:
-    """Raise ParameterError that names `name` unless `values` (4,) are at most `most` (4,), both in `unit`."""
-    if any(value > limit for value, limit in zip(values, most, strict=True)):
-        shown = [round(limit, 3) for limit in most]
-        raise ParameterError(name, list(values), f"at most {shown} {unit}, which {1000 * DELAY:.0f} ms late is stable")
-
-
-def _is_pose(pose: Sequence[float]) -> bool:
-    return len(pose) == JOINT_COUNT and all(abs(angle) <= FREE for angle in pose)

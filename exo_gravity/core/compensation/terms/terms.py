@@ -21,7 +21,17 @@ from exo_gravity.core.compensation.terms.friction_inertia import (
     Inertia,
     InertiaTerm,
 )
-from exo_gravity.core.compensation.terms.springs import Coupling, Damping, SoftLimits, Spring, Term, TermState
+from exo_gravity.core.compensation.terms.springs import (
+    DELAY,
+    Coupling,
+    Damping,
+    SoftLimits,
+    Spring,
+    Term,
+    TermState,
+    clamp,
+    stable_stiffness,
+)
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import NO_TORQUE, Torque
@@ -31,6 +41,7 @@ from exo_gravity.core.params import Param, params_of
 MAX_GAP = 0.2  # s between two cycles, beyond which the terms begin again from no torque
 MAX_EFFORT = (2.0, 4.0, 2.0, 2.0)  # Nm of all terms: well below the motors' rated torque, which gravity needs
 MAX_EFFORT_RATE = 50.0  # Nm/s
+EDGE_SHARE = 0.8  # of the stiffness that the arm can bear, for `limits` where that is less
 
 
 @dataclass(frozen=True)
@@ -50,13 +61,22 @@ class TermSettings:
 
         Raises ParameterError unless every spring and damper is stable on `robot`, without a wearer in it.
         """
-        on = [term for term in (self.damping, self.spring, self.coupling) if term.on]
-        if not (on or self.limits.on or self.inertia.on):
+        if not any(getattr(self, name).on for name in ("damping", "spring", "coupling", "limits", "inertia")):
             return self
         least = least_inertia(LinkInertia.of(robot))
-        for term in on:
-            term.check(least)
-        return replace(self, limits=self.limits.on_arm(least))
+        springs = stable_stiffness(least)
+        bounds = [
+            ("damping.viscosity", self.damping.viscosity, [inertia / (2.0 * DELAY) for inertia in least], "Nm s/rad"),
+            ("spring.stiffness", self.spring.stiffness, springs, "Nm/rad"),
+        ]
+        if self.coupling.on:
+            bounds.append(("coupling.stiffness", [self.coupling.largest], [self.coupling.stable(least)], "Nm/rad"))
+        for name, values, most, unit in bounds:
+            if any(value > limit for value, limit in zip(values, most, strict=True)):
+                expected = f"at most {[round(limit, 3) for limit in most]} {unit}, which"
+                raise ParameterError(name, list(values), f"{expected} {1000 * DELAY:.0f} ms late is stable")
+        stiffness = tuple(min(k, EDGE_SHARE * most) for k, most in zip(self.limits.stiffness, springs, strict=True))
+        return replace(self, limits=replace(self.limits, stiffness=stiffness))
 
 
 #: the parameters of each term by the prefix of their names
@@ -72,14 +92,10 @@ def term_parameters() -> tuple[Param, ...]:
 
 def term_settings_of(values: Mapping[str, Any]) -> TermSettings:
     """Return the settings that parameter values describe, or raise ParameterError."""
-    groups: dict[str, Any] = {}
-    for prefix, owner in GROUPS.items():
-        try:
-            groups[prefix] = owner(**{param.name: values[f"{prefix}.{param.name}"] for param in params_of(owner)})
-        except ParameterError as error:
-            name = error.name if "." in error.name else f"{prefix}.{error.name}"
-            raise ParameterError(name, error.value, error.expected) from None
-    return TermSettings(**groups)
+    return TermSettings(**{
+        prefix: owner(**{param.name: values[f"{prefix}.{param.name}"] for param in params_of(owner)})
+        for prefix, owner in GROUPS.items()
+    })  # fmt: skip
 
 
 class Active(NamedTuple):
@@ -104,7 +120,7 @@ class Terms:
         self._tank = EnergyTank()
         self._acceleration = AccelerationFilter()
         self._time = -math.inf
-        self._state = TermState(self._time, 0.0, NO_TORQUE, NO_TORQUE, NO_TORQUE, NO_TORQUE, 0.0)
+        self._state = TermState(0.0, NO_TORQUE, NO_TORQUE, NO_TORQUE, 0.0)
         self._has_inertia = self._has_changed = False
         self.now = Active(self._built(settings, arm))
 
@@ -131,16 +147,16 @@ class Terms:
         self.settings, self.assist.assist, self._has_changed = settings, settings.assist, True
         self.now = Active(self._built(settings, arm), since)
 
-    def torque(self, now: float, theta: Sequence[float], velocity: Sequence[float], gravity: Sequence[float]) -> Torque:
+    def torque(self, now: float, theta: Sequence[float], velocity: Sequence[float]) -> Torque:
         """Return the torque (4,) in Nm on top of gravity compensation at `now` (s, monotonic).
 
-        theta, velocity: (4,) rad and rad/s. gravity: (4,) Nm of gravity compensation.
+        theta, velocity: (4,) rad and rad/s.
         """
         dt, self._time = now - self._time, now
         if not 0.0 <= dt <= MAX_GAP:
             self._output, self._has_changed, dt = NO_TORQUE, False, 0.0
         acceleration = self._acceleration.update(velocity, dt) if self._has_inertia else NO_TORQUE
-        self._state = TermState(now, dt, theta, velocity, acceleration, gravity, now - self.now.since)
+        self._state = TermState(dt, theta, velocity, acceleration, now - self.now.since)
         total = _sum(self.now.terms, self._state) if self.now.terms else NO_TORQUE
         self._refusal = "" if math.isfinite(sum(total)) else "torque of the terms is not finite"
         if self._refusal:
@@ -152,13 +168,13 @@ class Terms:
         self._assisted = NO_TORQUE if self.assist.idle else self.assist.torque(now)
         return self._with_assistance(self._output)
 
-    def torque_of(self, active: Active, gravity: Sequence[float]) -> Torque:
+    def torque_of(self, active: Active) -> Torque:
         """Return the torque (4,) in Nm that other terms would give in the state of the last `torque`."""
-        state = self._state._replace(dt=0.0, gravity=gravity, elapsed=self._time - active.since)
+        state = self._state._replace(dt=0.0, elapsed=self._time - active.since)
         total = _sum(active.terms, state)
         if not math.isfinite(sum(total)):
             total = NO_TORQUE
-        return self._with_assistance([max(-most, min(most, tau)) for tau, most in zip(total, MAX_EFFORT, strict=True)])
+        return self._with_assistance([clamp(tau, most) for tau, most in zip(total, MAX_EFFORT, strict=True)])
 
     def _with_assistance(self, torque: Sequence[float]) -> Torque:
         a, b, c, d = self._assisted
