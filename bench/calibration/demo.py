@@ -50,7 +50,7 @@ def held(params: Path) -> list[Recording]:
         little = FRICTION * trial.arm.device.arm.model.dof_frictionloss
 
         def on_second(now: float, trial: OfflineTrial = trial, little: np.ndarray = little) -> bool:
-            if trial.step is not None:
+            if trial.wearer.step is not None:
                 trial.arm.device.arm.model.dof_frictionloss[:] = little
             return False
 

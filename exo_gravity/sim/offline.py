@@ -92,12 +92,12 @@ class OfflineTrial:
         self.script = script
         self.events: list[tuple[float, str]] = []
         self.trouble = ""
-        self._wearer = wearer or VirtualWearer(script)
+        self.wearer = wearer or VirtualWearer(script)
         self._delay = delay
         self._start = math.inf  # s, of the script
         self._carried: tuple[Span, ...] = ()  # from the first to the last time at which the motors carried the arm
         self.safety = SafetyMachine(arm.limits, 1.0 / arm.rate, arm.motors)
-        self._compensator = compensator or Compensator(arm.settings)
+        self.compensator = compensator or Compensator(arm.settings)
         self._command = NO_COMMAND
         self._reason = ""  # why the compensator has withdrawn
         self._tilt_time = -math.inf  # of the compensator's newest tilt
@@ -108,15 +108,6 @@ class OfflineTrial:
         self._pack = [lru_cache(CACHED_FRAMES)(motor.command) for motor in arm.motors]
         self._unpack = [lru_cache(CACHED_FRAMES)(motor.joint_reply) for motor in arm.motors]
         self._rows = array("d")
-
-    @property
-    def step(self) -> int | None:
-        """Index of the wearer's current step, None before the first."""
-        return self._wearer.step
-
-    def apply(self, settings: Settings) -> None:
-        """Change the compensator's settings, as when its parameters are set live."""
-        self._compensator.apply(settings)
 
     def run(self, should_stop: Callable[[float], bool] = lambda now: False) -> Recording:
         """Run the script, let the arm down, and return what `recorder` would have recorded.
@@ -152,7 +143,7 @@ class OfflineTrial:
             velocity = [joint.velocity for joint in self._samples]
             for values in ((now,), position, velocity, [joint.effort for joint in self._samples], effort or NO_EFFORT):
                 self._rows.extend(values)
-            answer = self._compensator.step(now, position, velocity)
+            answer = self.compensator.step(now, position, velocity)
             answered = min(joint.time for joint in self._samples)
             self._command = EffortCommand(answer.effort, answered, answer.damped)
             if answer.reason and answer.reason != self._reason:
@@ -167,15 +158,15 @@ class OfflineTrial:
             return
         if arm.trunk is None:
             if arm.tilt and now - self._tilt_time >= TILT_PERIOD:
-                self._compensator.set_tilt(now, *arm.tilt)
+                self.compensator.set_tilt(now, *arm.tilt)
                 self.safety.motion.gravity = Tilt.of(arm.device.side, *arm.tilt).direction
                 self._tilt_time = now
             return
         if reading:
             age, turning = now - taken, reading.angular_velocity
-            self._compensator.set_gravity(now, reading.gravity, turning, age)
+            self.compensator.set_gravity(now, reading.gravity, turning, age)
             self.safety.motion.gravity = Tilt.of_gravity(arm.device.side, reading.gravity).direction
-            self._compensator.set_motion(now, reading.specific_force, turning, age)
+            self.compensator.set_motion(now, reading.specific_force, turning, age)
         due = cycle % arm.trunk.cycles == 0
         self._reading = (arm.trunk.measure(now, arm.device.trunk) if due else None), now
 
@@ -201,7 +192,7 @@ class OfflineTrial:
         """Start the wearer when the motors are on, and let the arm down after the script."""
         if self._start == math.inf:
             if self._powered:
-                self.arm.device.start(self._wearer, self._delay)
+                self.arm.device.start(self.wearer, self._delay)
                 self._start = now + self._delay
         elif now > self._start + self.script.duration + GRACE:
             self.safety.disable(now)
