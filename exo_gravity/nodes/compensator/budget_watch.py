@@ -75,8 +75,8 @@ def compute(names: Sequence[str], request: Request, bridge: Mapping[str, Any]) -
     robot, load, support, tilt = request
     try:
         workspace = Workspace(bridge["position_min"], bridge["position_max"], tilt)
-        torques = motor_torques(bridge["motor"], bridge["torque_scale"])
-        joints = budget(robot, load, support, workspace, *torques, lambda: time.sleep(PAUSE))
+        rated, peak = motor_torques(bridge["motor"], bridge["torque_scale"])
+        joints = budget(robot, load, support, workspace, rated, peak, lambda: time.sleep(PAUSE))
     except ParameterError as error:
         return f"unknown: can_bridge has {error}", "unknown"
     return overload(names, joints) or WITHIN, f"{largest_support(joints) or 0.0:g}" if any(load[0]) else "none"

@@ -101,9 +101,9 @@ class Spring(TermParameters):
             raise ParameterError("spring.pose", list(numbers), f"4 angles within {FREE:g} rad, or a path of rows")
         if times[0] != 0.0 or not (np.all(np.diff(times) > 0.0) and times[-1] < math.inf):
             raise ParameterError("times of the path in spring.pose", times[:3].tolist(), "rising from 0 s")
-        speeds = np.linalg.norm(np.diff(poses, axis=0), axis=1) / np.diff(times)
-        if np.any(speeds > MAX_PATH_SPEED):
-            raise ParameterError("speed of the path in spring.pose", speeds.max(), f"at most {MAX_PATH_SPEED:g} rad/s")
+        speed = max((np.linalg.norm(np.diff(poses, axis=0), axis=1) / np.diff(times)).tolist(), default=0.0)
+        if speed > MAX_PATH_SPEED:
+            raise ParameterError("speed of the path in spring.pose", speed, f"at most {MAX_PATH_SPEED:g} rad/s")
         for name, value in (("pose", numbers), ("times", tuple(times.tolist())), ("ways", poses.T)):
             object.__setattr__(self, name, value)
 
