@@ -59,11 +59,7 @@ def regressor(
     `regressor(...) @ moments`. Raises ParameterError as `gravity_torque` does.
     """
     poses = np.atleast_2d(np.asarray(theta, dtype=float))
-    return np.stack([gravity_torque(arm, poses, direction) for arm in _unit_arms(gravity)], axis=-1)
-
-
-def _unit_arms(gravity: float) -> list[ArmModel]:
-    """Return an arm for each moment, which has that moment of 1 kg m and no other."""
-    rows = np.eye(len(MOMENTS))
     no_length = (0.0,) * JOINT_COUNT  # the torque depends on the lengths through the moments only
-    return [ArmModel.from_moments(no_length, row[:JOINT_COUNT], row[JOINT_COUNT:], gravity=gravity) for row in rows]
+    rows = np.eye(len(MOMENTS))  # an arm for each moment, which has that moment of 1 kg m and no other
+    arms = [ArmModel.from_moments(no_length, row[:JOINT_COUNT], row[JOINT_COUNT:], gravity=gravity) for row in rows]
+    return np.stack([gravity_torque(arm, poses, direction) for arm in arms], axis=-1)

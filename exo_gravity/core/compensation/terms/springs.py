@@ -112,11 +112,8 @@ class Spring(TermParameters):
         pose = self.pose
         if len(pose) != JOINT_COUNT:
             pose = [float(np.interp(state.elapsed, self.times, way)) for way in self.ways]
-        torque = []
         columns = zip(self.stiffness, pose, state.position, state.velocity, self.max_effort, strict=True)
-        for k, to, q, v, most in columns:
-            torque.append(clamp(k * (to - q), most) - LATE * k * v)
-        return tuple(torque)
+        return tuple([clamp(k * (to - q), most) - LATE * k * v for k, to, q, v, most in columns])
 
 
 @dataclass(frozen=True)
