@@ -22,7 +22,7 @@ from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats, one_float
 
-Cost = Callable[[np.ndarray], np.ndarray]  # points (n, 6) -> (n,)
+Cost = Callable[[np.ndarray], np.ndarray]  # points (n, 6) -> (n, 4)
 
 USUAL_TILT = 20.0  # deg of trunk pitch and roll, in both directions, that a budget covers by default
 SAMPLES = 50_000  # random poses, which give shares to within 0.5 %
@@ -69,15 +69,14 @@ class Workspace:
         one_float("max_tilt", self.max_tilt, 0.0, np.pi / 2, "rad")
 
     @property
-    def bounds(self) -> np.ndarray:
-        """Lowest and highest point (2, 6): four joint angles, then pitch and roll of the trunk, in rad."""
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest point (6,): four joint angles, then pitch and roll of the trunk, in rad."""
         tilt = np.repeat(self.max_tilt, 2)
-        return np.array(((*self.position_min, *-tilt), (*self.position_max, *tilt)))
+        return np.append(self.position_min, -tilt), np.append(self.position_max, tilt)
 
     def points(self, count: int = SAMPLES) -> np.ndarray:
         """Return random points (count, 6), uniform over the workspace and the same in every call."""
-        low, high = self.bounds
-        return np.random.default_rng(0).uniform(low, high, (count, JOINT_COUNT + 2))
+        return np.random.default_rng(0).uniform(*self.bounds, (count, JOINT_COUNT + 2))
 
 
 @dataclass(frozen=True)
@@ -166,14 +165,16 @@ def budget(
 
     needs, shortages = need(starts), shortage(starts)
     joints = []
-    for joint in range(JOINT_COUNT):
-        worst, torque = _worst(lambda at: need(at)[:, joint], workspace, starts, needs[:, joint])  # noqa: B023
-        _, short = _worst(lambda at: shortage(at)[:, joint], workspace, starts, shortages[:, joint])  # noqa: B023
+    for joint, limits in enumerate(zip(rated, peak, strict=True)):
+        worst, torque = _worst(need, joint, workspace, starts, needs[:, joint])
+        _, short = _worst(shortage, joint, workspace, starts, shortages[:, joint])
         # The search can find an overloaded pose that no sample shows. Then the share must not be 1.
-        limits = float(rated[joint]), float(peak[joint])
-        sampled = needs[-len(points) :, joint]
-        within = [min(float(np.mean(sampled <= most)), 0.9999 if torque > most else 1.0) for most in limits]
-        joints.append(JointBudget(*limits, torque, worst, within[0], within[1], None if short > 0.0 else -short))
+        low, high = (
+            min(float(np.mean(needs[-len(points) :, joint] <= limit)), 0.9999 if torque > limit else 1.0)
+            for limit in limits
+        )
+        largest = None if short > 0.0 else -short
+        joints.append(JointBudget(float(limits[0]), float(limits[1]), torque, worst, low, high, largest))
     return tuple(joints)
 
 
@@ -184,8 +185,10 @@ def _support(own: np.ndarray, added: np.ndarray, limit: np.ndarray) -> np.ndarra
     return np.where(np.abs(own) > limit, -1.0, np.minimum(support, 1.0))
 
 
-def _worst(cost: Cost, workspace: Workspace, starts: np.ndarray, costs: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the point (6,) with the largest cost, and that cost.
+def _worst(
+    cost: Cost, joint: int, workspace: Workspace, starts: np.ndarray, costs: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Return the point (6,) with the largest cost of `joint`, and that cost.
 
     Among equal points it prefers upright ones and sets as many coordinates as possible to 0. costs: (m,), of `starts`
     (m, 6).
@@ -197,7 +200,7 @@ def _worst(cost: Cost, workspace: Workspace, starts: np.ndarray, costs: np.ndarr
         for axis in range(points.shape[1]):
             lines = np.repeat(points[:, None], len(STEPS), axis=1)
             lines[:, :, axis] = np.clip(lines[:, :, axis] + STEPS * width[axis], low[axis], high[axis])
-            found = cost(lines.reshape(-1, points.shape[1])).reshape(len(points), len(STEPS))
+            found = cost(lines.reshape(-1, points.shape[1]))[:, joint].reshape(len(points), len(STEPS))
             best_step = np.arange(len(points)), np.argmax(found, axis=1)
             points, values = lines[best_step], found[best_step]
         width = width / 4
@@ -205,6 +208,6 @@ def _worst(cost: Cost, workspace: Workspace, starts: np.ndarray, costs: np.ndarr
     for axis in range(len(best)):
         simpler = best.copy()
         simpler[axis] = np.clip(0.0, low[axis], high[axis])
-        if cost(simpler[None])[0] >= largest - TOLERANCE:
+        if cost(simpler[None])[0, joint] >= largest - TOLERANCE:
             best = simpler
     return best, largest
