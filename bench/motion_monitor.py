@@ -34,6 +34,7 @@ from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import NOTHING
 from exo_gravity.core.safety.limits import Limits
+from exo_gravity.core.safety.motion_monitor import PATIENCE
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, VirtualWearer, simulated_motor
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial, TrunkReading
@@ -290,7 +291,8 @@ def quiet(
 
     def is_over() -> bool:
         nonlocal share
-        share = max(share, *monitor.used)
+        columns = zip(monitor.impulse, monitor.full, strict=True)
+        share = max(share, *(impulse / (PATIENCE * full or 1.0) for impulse, full in columns))
         return trial.safety.fault is not None
 
     wearer.is_over = is_over

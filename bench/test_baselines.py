@@ -14,7 +14,6 @@ from bench.baselines.controllers import HELD, INTEGRAL, STIFFNESS, Burden, Contr
 from bench.baselines.growth import growth, sizes
 from bench.effort.exertion import REACH
 from exo_gravity.core import Tilt, gravity_torque
-from exo_gravity.core.motors.joint_motor import peaks_of
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.tools.inputs.arms import configured_arm
@@ -83,7 +82,7 @@ def test_a_pid_pulls_towards_where_it_began_with_an_integral_that_ends_at_the_pe
 
 
 def test_the_torque_is_limited_to_what_the_motors_give():
-    peaks = peaks_of(MOTORS_OF_ARM)[0]
+    peaks = tuple(motor.peak_effort for motor in MOTORS_OF_ARM)
     strong = Controlled(Feedforward(lambda *_: [99.0, -99.0, 1.0, 0.0], False), peaks)
     assert strong.torque(0.0, POSE, STILL) == (peaks[0], -peaks[1], 1.0, 0.0)
 

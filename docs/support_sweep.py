@@ -48,10 +48,10 @@ def sweep() -> tuple[Recording, np.ndarray]:
 
     def every_second(now: float) -> bool:
         nonlocal in_pose
-        in_pose += trial.step == 1
+        in_pose += trial.wearer.step == 1
         if in_pose > SETTLING + PAUSE and supports[-1][1] < 1.0:
             supports.append((now, round(supports[-1][1] + 0.05, 2)))
-            trial.apply(replace(settings, support=supports[-1][1]))
+            trial.compensator.apply(replace(settings, support=supports[-1][1]))
         return False
 
     return trial.run(every_second), np.array(supports)

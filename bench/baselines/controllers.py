@@ -14,7 +14,7 @@ import numpy as np
 
 from bench.effort.exertion import POSES, RATE, REACH, SETTLING, LettingGo, Task, measure, perform
 from exo_gravity.core.model.gravity import NO_TORQUE, Torque
-from exo_gravity.core.motors.joint_motor import JointMotor, peaks_of
+from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.sim import STEP, SimulatedDevice
 
@@ -83,7 +83,7 @@ def burden(
     task: Task = REACH,
 ) -> Burden:
     """Return what a controller costs the wearer. device(): a new one for each task, with an upright trunk."""
-    most = peaks_of(motors)[0]
+    most = tuple(motor.peak_effort for motor in motors)
 
     def sag(pose: tuple[float, ...], pitch: float) -> float:
         bowed = device()

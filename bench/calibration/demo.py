@@ -50,7 +50,7 @@ def held(params: Path) -> list[Recording]:
         little = FRICTION * trial.arm.device.arm.model.dof_frictionloss
 
         def on_second(now: float, trial: OfflineTrial = trial, little: np.ndarray = little) -> bool:
-            if trial.step is not None:
+            if trial.wearer.step is not None:
                 trial.arm.device.arm.model.dof_frictionloss[:] = little
             return False
 
@@ -112,10 +112,14 @@ def main(folder: Path | None = None) -> int:
     """Run the demo in a new folder; return the exit code of the calibration, 1 if the arm creeps afterwards."""
     folder = folder or Path("trials", f"calibrate_demo_{datetime.now():%Y%m%d_%H%M%S}")
     folder.mkdir(parents=True)
-    old, new = folder / "old.yaml", folder / "new.yaml"
+    old = folder / "old.yaml"
     write_changes(packaged_config("sim.yaml"), old, DEVICE, "make calibrate-demo")
-    code = calibrate.main(["gravity", "--params", str(old), "--output", str(new)])
-    if code:
+    for name in ("new.yaml", "second.yaml", "third.yaml"):  # a busy computer can be late, which ends a tour
+        new = folder / name
+        code = calibrate.main(["gravity", "--params", str(old), "--output", str(new)])
+        if not code:
+            break
+    else:
         return code
     recordings = [held(path) for path in (old, new)]
     picture(*recordings).savefig(folder / "before_and_after.png", dpi=150)

@@ -20,9 +20,9 @@ from exo_gravity.core.calibration.params import CALIBRATOR, tour_of
 from exo_gravity.core.calibration.tour import Tour
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.motors.joint_motor import JointMotor, motors_of, peaks_of
+from exo_gravity.core.motors.joint_motor import JointMotor, motors_of
 from exo_gravity.core.motors.specs import ENTER, EXIT
-from exo_gravity.core.safety.drive import Drive, State
+from exo_gravity.core.safety.drive import Drive, EffortCommand, State
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.params import CAN_BRIDGE, limits_of
@@ -57,13 +57,13 @@ class Player:
 
     def play(self) -> None:
         """Play until the motors are off."""
-        safety = SafetyMachine(self.limits, 1.0 / self.rate, peaks_of(self.motors))
+        safety = SafetyMachine(self.limits, 1.0 / self.rate, self.motors)
         safety.enable(0.0)
         effort: Torque | None = None
         answered, began = -math.inf, False
         for cycle in range(round(LONGEST * self.rate)):
             now = cycle / self.rate
-            self._exchange(safety.step(now, tuple(self._samples), effort, answered), now)
+            self._exchange(safety.step(now, tuple(self._samples), EffortCommand(effort, answered)), now)
             if not any(self.limits.is_silent(now, joint) for joint in self._samples):
                 began = began or safety.state is State.ACTIVE
                 effort = self._answer(now, began)

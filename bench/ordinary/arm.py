@@ -18,15 +18,14 @@ from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.motors.joint_motor import peaks_of
 from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.drive import EffortCommand, State
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import Clock
-from exo_gravity.hardware.control_loop import ControlLoop, EffortCommand
+from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedImu, VirtualWearer
 from exo_gravity.tools.inputs.arms import read_arm
@@ -117,7 +116,7 @@ class OrdinaryArm:
         self._answers: deque[tuple[float, EffortCommand]] = deque()  # on their way, by the time of their arrival
         self._efforts = EffortCommand(None, -np.inf)
         limits = Limits(("rotation", "abduction", "flexion", "elbow"))
-        self.safety = SafetyMachine(limits, 1.0 / rate, peaks_of(motors))
+        self.safety = SafetyMachine(limits, 1.0 / rate, motors)
         bus = MotorBus(wire.open(), motors, reopen=wire.open, clock=cast(Clock, self.clock))
         self.loop = ControlLoop(bus, self.safety, 1.0 / rate, self._on_cycle, self._get_efforts)
         self._begin = self._tilted = self.clock.monotonic()
@@ -130,7 +129,7 @@ class OrdinaryArm:
         while self.clock.monotonic() < end:
             self._start(carried)
         self.result.time = self.clock.monotonic() - self._begin
-        self.loop.abandon()
+        self.loop.bus.close()
         return self.result
 
     def _start(self, carried: float) -> None:

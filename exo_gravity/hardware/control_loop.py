@@ -11,16 +11,16 @@ last noted drive; without a watchdog, the loop lowers the arm without the state 
 from __future__ import annotations
 
 import contextlib
-import math
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from queue import Empty, SimpleQueue
-from typing import Any, NamedTuple
+from queue import SimpleQueue
+from typing import Any
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.bus_load import REPLY_SHARE
-from exo_gravity.core.safety.drive import CARRYING, OFF, Drive, FaultCode, State
+from exo_gravity.core.safety.descent import RestTracker
+from exo_gravity.core.safety.drive import NO_COMMAND, OFF, Drive, EffortCommand, FaultCode, State
 from exo_gravity.core.safety.limits import DAMPING, JointSample
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.supply import SupplyMonitor
@@ -34,21 +34,8 @@ HAND_OVER_TIME = 0.5  # s in which a watchdog that takes over has ended this pro
 
 # Lowering an arm without the state machine.
 LOWERING_FADE = 10.0  # s in which the torque fades
-REST_TIME = 10.0  # s for which the joints must be at rest,
-REST = 0.005  # rad that one may turn in that time
+REST_TIME = 10.0  # s for which the joints must be at rest
 REPLY_TIMEOUT = 0.1  # s without a reply after which a motor's position is not known
-
-
-class EffortCommand(NamedTuple):
-    """What the motors are to apply."""
-
-    effort: Sequence[float] | None  #: (4,) Nm, or None to withdraw.
-    answered: float  #: s, when the joint states that it answers were taken.
-    damped: bool = False  #: whether the load is changing, so that the motors are to damp the joints.
-    held: bool = False  #: Whether it is computed from a tilt that is late.
-
-
-NO_COMMAND = EffortCommand(None, -math.inf)
 
 
 class ControlLoop:
@@ -83,7 +70,8 @@ class ControlLoop:
         self.cycle_errors, self.cycle_error = 0, ""
         #: The exception that ended the control, if any.
         self.failure: BaseException | None = None
-        self._bus = bus
+        #: Its counts may be read, and it may be used within a `call`.
+        self.bus = bus
         self._clock = bus.clock
         self._now = bus.clock.monotonic
         self._on_cycle = on_cycle
@@ -98,7 +86,7 @@ class ControlLoop:
         self._suspended = bus.clock.suspended()  # s, so far
         self._work = period  # s per cycle, without waiting for efforts; smoothed
         self._calls: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
-        self._is_stopping = self._is_abandoned = self._has_ended = False
+        self._is_stopping = self._has_ended = False
         self._thread = threading.Thread(target=self._run, name="control", daemon=True)
 
     def start(self) -> None:
@@ -110,16 +98,25 @@ class ControlLoop:
         if self._has_ended:
             return False
         try:
-            if not self._is_abandoned and not (self._is_stopping and self.is_off):
-                self._try_cycle()
+            if not (self._is_stopping and self.is_off):
+                try:
+                    self._control(self._due)
+                    self._errors = 0
+                except Exception as error:
+                    self._errors += 1
+                    if self._errors == MAX_ERRORS:
+                        raise
+                    self.safety.trip(FaultCode.INTERNAL_ERROR, f"{type(error).__name__}: {error}", self._now())
+                self._due = self._wait(self._due + self.period)
                 return True
         except BaseException as error:  # whatever happened, the arm must come down
             self.failure = error
-            self._resign(f"{type(error).__name__}: {error}")
-        if self._is_abandoned:
-            self._bus.close()
-        else:
-            self._bus.stop()
+            if self.bus.may_be_powered:  # the watchdog ends this process; without one, the arm is lowered here
+                with contextlib.suppress(Exception):
+                    if self._hand_over(f"the control loop failed: {type(error).__name__}: {error}"):
+                        self._clock.sleep(HAND_OVER_TIME)
+                lower(self.bus, self._drive, self.period)
+        self.bus.stop()
         self._has_ended = True
         return False
 
@@ -132,37 +129,18 @@ class ControlLoop:
     @property
     def samples(self) -> Sequence[JointSample]:
         """The newest reading of each joint."""
-        return tuple(self._bus.samples)
-
-    @property
-    def ignored(self) -> dict[str, int]:
-        """Count of frames that were not replies of this arm's motors, by kind."""
-        return dict(self._bus.ignored)
+        return tuple(self.bus.samples)
 
     @property
     def is_off(self) -> bool:
         """Whether the arm is down and its motors have confirmed that they are off."""
         safety = self.safety
         is_down = safety.state in (State.DISABLED, State.FAULT) and not safety.is_unreached
-        return is_down and not self._bus.may_be_powered
-
-    def set_zero(self) -> None:
-        """Make the present pose the motors' zero. Use it within a `call`, and only while they are off."""
-        self._bus.set_zero()
+        return is_down and not self.bus.may_be_powered
 
     def trip(self, code: FaultCode, reason: str) -> None:
         """Let the arm down for a fault detected outside the loop."""
         self.call(lambda: self.safety.trip(code, reason, self._now()))
-
-    def trip_if_carried(self, code: FaultCode, reason: str) -> None:
-        """Let the arm down for something that is a fault only while torque is applied."""
-        if self.safety.state in CARRYING:
-            self.trip(code, reason)
-
-    def trip_unless_let_down(self, code: FaultCode, reason: str) -> None:
-        """Let the arm down, or refuse its start, for something that does not matter once it is being let down."""
-        if self.safety.state is not State.LETTING_DOWN:
-            self.trip(code, reason)
 
     def stop(self, timeout: float | None = None) -> bool:
         """Let the arm down, send the last frames, close the bus; return whether that was done within `timeout` s.
@@ -171,49 +149,20 @@ class ControlLoop:
         remaining cycles run here, whatever `timeout` is.
         """
         self._is_stopping = True
-        return self._join(timeout)
-
-    def abandon(self) -> None:
-        """End the loop and close the bus without any further frame: the motors keep what they apply."""
-        self._is_abandoned = True
-        self._join()
-
-    def _join(self, timeout: float | None = None) -> bool:
         if self._thread.ident is None:
-            while self.cycle():
-                pass
+            self._run()
         else:
             self._thread.join(timeout)
             if self._thread.is_alive():
                 return False
-        with contextlib.suppress(Empty):
-            while True:
-                self._calls.get_nowait()[1].cancel()
+        while not self._calls.empty():
+            self._calls.get()[1].cancel()
         return True
 
     def _run(self) -> None:
         self._due = self._now()
         while self.cycle():
             pass
-
-    def _try_cycle(self) -> None:
-        try:
-            self._control(self._due)
-            self._errors = 0
-        except Exception as error:
-            self._errors += 1
-            if self._errors == MAX_ERRORS:
-                raise
-            self.safety.trip(FaultCode.INTERNAL_ERROR, f"{type(error).__name__}: {error}", self._now())
-        self._due = self._wait(self._due + self.period)
-
-    def _resign(self, reason: str) -> None:
-        """Hand the arm over to the watchdog, which ends this process; without one, lower the arm."""
-        if self._bus.may_be_powered:
-            with contextlib.suppress(Exception):
-                if self._hand_over(f"the control loop failed: {reason}"):
-                    self._clock.sleep(HAND_OVER_TIME)
-            lower(self._bus, self._drive, self.period)
 
     def _control(self, due: float) -> None:
         efforts = self._efforts(due)
@@ -224,26 +173,26 @@ class ControlLoop:
             self.safety.trip(FaultCode.MOTOR_SILENT, f"the computer was suspended for {suspended:.0f} s", now)
         if self._is_stopping:
             self.safety.disable(now)
-        drive = self._drive = self.safety.step(now, tuple(self._bus.samples), *efforts)
+        drive = self._drive = self.safety.step(now, tuple(self.bus.samples), efforts)
         try:
-            complete = self._bus.exchange(drive, now + REPLY_SHARE * self.period)
+            complete = self.bus.exchange(drive, now + REPLY_SHARE * self.period)
         except BusError as error:
             self.safety.trip(FaultCode.BUS_ERROR, str(error), now)
             complete = False
-        if self._bus.foreign_commands > self._foreign_commands:
-            self._foreign_commands = self._bus.foreign_commands
-            self.safety.trip(FaultCode.FOREIGN_COMMAND, self._bus.foreign_command, self._now())
+        if self.bus.foreign_commands > self._foreign_commands:
+            self._foreign_commands = self.bus.foreign_commands
+            self.safety.trip(FaultCode.FOREIGN_COMMAND, self.bus.foreign_command, self._now())
         self.cycles += 1
         self.incomplete += not complete
         try:
-            self._on_cycle(self._now(), self._bus.samples)
+            self._on_cycle(self._now(), self.bus.samples)
         except Exception as error:
             self.cycle_errors += 1
             self.cycle_error = f"{type(error).__name__}: {error}"
         self._work += SMOOTHING * (self._now() - now - self._work)
 
     def _efforts(self, due: float) -> EffortCommand:
-        is_contested = self._bus.is_contested  # then receiving comes first
+        is_contested = self.bus.is_contested  # then receiving comes first
         latest = due if is_contested else due + EFFORT_WAIT * (self.period - self._work)
         try:
             return self._get_efforts(latest)
@@ -253,11 +202,8 @@ class ControlLoop:
             return NO_COMMAND
 
     def _run_calls(self) -> None:
-        while True:
-            try:
-                function, future = self._calls.get_nowait()
-            except Empty:
-                return
+        while not self._calls.empty():  # nobody else takes from it
+            function, future = self._calls.get()
             if not future.set_running_or_notify_cancel():
                 continue
             try:
@@ -270,9 +216,9 @@ class ControlLoop:
 
         While another sender commands the motors, this receives instead, to answer each foreign command at once.
         """
-        if self._bus.is_contested:
+        if self.bus.is_contested:
             with contextlib.suppress(BusError):
-                self._bus.receive_until(deadline)
+                self.bus.receive_until(deadline)
         remaining = deadline - self._now()
         if remaining > 0.0:
             self._clock.sleep(remaining)
@@ -289,30 +235,25 @@ def lower(bus: MotorBus, drive: Drive, period: float) -> None:
     joint under damping creeps, and would fall if it were switched off before it hangs. While no motor replies the
     torque is held, and one that then returns without torque stays off. No exception ends this.
     """
-    now = bus.clock.monotonic
-    rest_since, faded = now(), 0.0
-    rest: Sequence[JointSample] = tuple(bus.samples)
-    supply = SupplyMonitor()
+    now, faded = bus.clock.monotonic, 0.0
+    rest, supply = RestTracker(), SupplyMonitor()
     if any(drive.unsure):
         supply.doubt(drive.effort)
-    while (time := now()) - rest_since < REST_TIME or faded < LOWERING_FADE:
-        share = max(0.0, 1.0 - faded / LOWERING_FADE)
-        effort = tuple(share * effort for effort in drive.effort)
-        silent = [time - joint.time > REPLY_TIMEOUT for joint in bus.samples]
+    while True:
+        time, joints = now(), tuple(bus.samples)
+        silent = [time - joint.time > REPLY_TIMEOUT for joint in joints]
+        rest.step(time, joints, silent)
+        if faded >= LOWERING_FADE and not any(silent) and time - rest.since >= REST_TIME:
+            break
+        effort = tuple(max(0.0, 1.0 - faded / LOWERING_FADE) * effort for effort in drive.effort)
         if all(silent):
             supply.doubt(effort)
         else:
             faded += period
-        supply.step(period, bus.samples, silent)
+        supply.step(period, joints, silent)
         _exchange(bus, Drive(effort, (DAMPING,) * len(effort), True, unsure=supply.unsure), time + period)
-        if not all(_is_at_rest(time, joint, last) for joint, last in zip(bus.samples, rest, strict=True)):
-            rest_since, rest = time, tuple(bus.samples)
     while bus.may_be_powered:
         _exchange(bus, OFF, now() + period)
-
-
-def _is_at_rest(now: float, joint: JointSample, last: JointSample) -> bool:
-    return now - joint.time <= REPLY_TIMEOUT and abs(joint.position - last.position) <= REST
 
 
 def _exchange(bus: MotorBus, drive: Drive, deadline: float) -> None:

@@ -98,16 +98,12 @@ class CalibratorNode(Node):
         with self._lock:
             tilt, state = self._tilt.at(now), self._bridge_state
             problem = self._tilt.problem(now) if self._uses_imu else ""
-        if self._trouble:
+        if problem and self._began:
+            self._trouble = self._trouble or problem
+        if problem or self._trouble:
             return None
-        if problem:
-            if self._began:
-                self._trouble = problem
-            return None
-        if not self._began and state != State.ACTIVE.value:
-            return self._tour.wait(position, tilt)
-        self._began = True
-        return self._tour.step(now, position, velocity, tilt)
+        self._began = self._began or state == State.ACTIVE.value
+        return self._tour.step(now, position, velocity, tilt) if self._began else self._tour.wait(position, tilt)
 
     def _on_refused_tilt(self, topic: str, error: ParameterError) -> None:
         self.get_logger().error(f"{topic}: {error}", throttle_duration_sec=1.0)
@@ -118,10 +114,10 @@ class CalibratorNode(Node):
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name == self._bridge:
-                state = next((pair.value for pair in status.values if pair.key == "state"), "")
+                values = {pair.key: pair.value for pair in status.values}
+                state, has_fault = values.get("state", ""), values.get("fault", "none") != "none"
                 with self._lock:
                     self._bridge_state, self._bridge_message = state, status.message
-                has_fault = any(pair.key == "fault" and pair.value != "none" for pair in status.values)
                 has_left = self._began and not self._tour.done and state != State.ACTIVE.value
                 if (has_fault or has_left) and not self._trouble and not self._tour.trouble:
                     self._trouble = status.message if has_fault else f"the bridge stopped carrying: {state}"
@@ -137,10 +133,8 @@ class CalibratorNode(Node):
             if value != self._reported[key]:
                 self._reported[key] = value
                 _print({key: value})
-        if trouble:
-            self._diagnostics.report(ERROR, f"withdrawn: {trouble}")
-        else:
-            self._diagnostics.report(OK if self._began else WARN, progress)
+        level = ERROR if trouble else OK if self._began else WARN
+        self._diagnostics.report(level, f"withdrawn: {trouble}" if trouble else progress)
 
 
 def _print(event: dict[str, Any]) -> None:

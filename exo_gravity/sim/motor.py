@@ -30,7 +30,7 @@ _NO_COMMAND = MotorCommand(0.0, 0.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Firmware:
-    """Differences between firmwares, except the wire ranges (`MotorSpec.with_ranges`)."""
+    """Differences between firmwares, except the wire ranges (of `MotorSpec`)."""
 
     reply_to_master: bool = owned(False, "replies carry ID 0 instead of the motor's own")
     #: 6 without temperature and error.

@@ -22,9 +22,9 @@ from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.motors.joint_motor import JointMotor, peaks_of
+from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.safety.drive import Drive, State
+from exo_gravity.core.safety.drive import NO_COMMAND, Drive, EffortCommand, State
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trial.recording import Recording, ScriptedStep, Span
@@ -37,7 +37,7 @@ GRACE = 0.5  # s from the end of the script until the arm is let down
 TILT_PERIOD = 0.01  # s between two tilts for the compensator
 CACHED_FRAMES = 64
 COLUMNS = 1 + 4 * JOINT_COUNT  # of the recording: time, position, velocity, effort, command
-NO_COMMAND = (math.nan,) * JOINT_COUNT
+NO_EFFORT = (math.nan,) * JOINT_COUNT
 MOTORS_OFF = (State.DISABLED, State.FAULT)
 CARRIED = (State.RAMPING_IN, State.ACTIVE)
 
@@ -92,14 +92,13 @@ class OfflineTrial:
         self.script = script
         self.events: list[tuple[float, str]] = []
         self.trouble = ""
-        self._wearer = wearer or VirtualWearer(script)
+        self.wearer = wearer or VirtualWearer(script)
         self._delay = delay
         self._start = math.inf  # s, of the script
         self._carried: tuple[Span, ...] = ()  # from the first to the last time at which the motors carried the arm
-        self.safety = SafetyMachine(arm.limits, 1.0 / arm.rate, peaks_of(arm.motors))
-        self._compensator = compensator or Compensator(arm.settings)
-        # The newest efforts, when the readings that they answer were taken, and whether the joints are to be damped.
-        self._efforts: tuple[Sequence[float] | None, float, bool] = (None, -math.inf, False)
+        self.safety = SafetyMachine(arm.limits, 1.0 / arm.rate, arm.motors)
+        self.compensator = compensator or Compensator(arm.settings)
+        self._command = NO_COMMAND
         self._reason = ""  # why the compensator has withdrawn
         self._tilt_time = -math.inf  # of the compensator's newest tilt
         self._reading: tuple[TrunkReading | None, float] = (None, 0.0)  # on its way, and when it was taken
@@ -109,15 +108,6 @@ class OfflineTrial:
         self._pack = [lru_cache(CACHED_FRAMES)(motor.command) for motor in arm.motors]
         self._unpack = [lru_cache(CACHED_FRAMES)(motor.joint_reply) for motor in arm.motors]
         self._rows = array("d")
-
-    @property
-    def step(self) -> int | None:
-        """Index of the wearer's current step, None before the first."""
-        return self._wearer.step
-
-    def apply(self, settings: Settings) -> None:
-        """Change the compensator's settings, as when its parameters are set live."""
-        self._compensator.apply(settings)
 
     def run(self, should_stop: Callable[[float], bool] = lambda now: False) -> Recording:
         """Run the script, let the arm down, and return what `recorder` would have recorded.
@@ -144,17 +134,18 @@ class OfflineTrial:
         return self._recording()
 
     def _cycle(self, now: float) -> None:
-        arm, effort = self.arm, self._efforts[0]
-        self._exchange(self.safety.step(now, tuple(self._samples), *self._efforts), now)
+        arm, effort = self.arm, self._command.effort
+        self._exchange(self.safety.step(now, tuple(self._samples), self._command), now)
         if self.safety.state in CARRIED:
             self._carried = ((self._carried[0][0] if self._carried else now, now),)
         position = [joint.position for joint in self._samples]
         if not any(arm.limits.is_silent(now, joint) for joint in self._samples):
             velocity = [joint.velocity for joint in self._samples]
-            for values in ((now,), position, velocity, [joint.effort for joint in self._samples], effort or NO_COMMAND):
+            for values in ((now,), position, velocity, [joint.effort for joint in self._samples], effort or NO_EFFORT):
                 self._rows.extend(values)
-            answer = self._compensator.step(now, position, velocity)
-            self._efforts = answer.effort, min(joint.time for joint in self._samples), answer.damped
+            answer = self.compensator.step(now, position, velocity)
+            answered = min(joint.time for joint in self._samples)
+            self._command = EffortCommand(answer.effort, answered, answer.damped)
             if answer.reason and answer.reason != self._reason:
                 self._note(now, f"withdrawn: {answer.reason}")
             self._reason = answer.reason
@@ -167,15 +158,15 @@ class OfflineTrial:
             return
         if arm.trunk is None:
             if arm.tilt and now - self._tilt_time >= TILT_PERIOD:
-                self._compensator.set_tilt(now, *arm.tilt)
+                self.compensator.set_tilt(now, *arm.tilt)
                 self.safety.motion.gravity = Tilt.of(arm.device.side, *arm.tilt).direction
                 self._tilt_time = now
             return
         if reading:
             age, turning = now - taken, reading.angular_velocity
-            self._compensator.set_gravity(now, reading.gravity, turning, age)
+            self.compensator.set_gravity(now, reading.gravity, turning, age)
             self.safety.motion.gravity = Tilt.of_gravity(arm.device.side, reading.gravity).direction
-            self._compensator.set_motion(now, reading.specific_force, turning, age)
+            self.compensator.set_motion(now, reading.specific_force, turning, age)
         due = cycle % arm.trunk.cycles == 0
         self._reading = (arm.trunk.measure(now, arm.device.trunk) if due else None), now
 
@@ -201,7 +192,7 @@ class OfflineTrial:
         """Start the wearer when the motors are on, and let the arm down after the script."""
         if self._start == math.inf:
             if self._powered:
-                self.arm.device.start(self._wearer, self._delay)
+                self.arm.device.start(self.wearer, self._delay)
                 self._start = now + self._delay
         elif now > self._start + self.script.duration + GRACE:
             self.safety.disable(now)

@@ -113,8 +113,7 @@ def compare(case: Case, torque: dict[str, np.ndarray], reference: str, expected:
 
 def rms(values: np.ndarray) -> np.ndarray:
     """Return the root mean square of each column."""
-    result: np.ndarray = np.sqrt(np.mean(np.square(values), axis=0))
-    return result
+    return np.asarray(np.sqrt(np.mean(np.square(values), axis=0)))
 
 
 @dataclass(frozen=True)

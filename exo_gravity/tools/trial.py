@@ -100,31 +100,35 @@ def _hold_durations(script: TrialScript) -> list[float]:
 
 def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, console: Console) -> int:
     """Run and report a trial; return the exit code. Raises ExoGravityError."""
+    from exo_gravity.bag.reader import read_bag
     from exo_gravity.tools.reporting import trial_report
     from exo_gravity.tools.trials.run import ADVICE, BUSY_CODE, TrialEnd, is_guided, prepare, run_attempts
 
     path, script = read_script(options.name)
     stopped = stop_on_signals()
     folder = Path(options.output).resolve() / f"{script.name}_{datetime.now():%Y%m%d_%H%M%S}"
-    bag: Bag | None
+    guided = options.attach == "guided" if options.attach else is_guided(params)
+    bag: Bag | None = None
     if options.offline:
         if clip:
             os.environ["MUJOCO_GL"] = video.backend()  # before the simulated device imports MuJoCo
         with extras("trial", "sim"):
             from exo_gravity.tools.trials.offline import run_offline, simulated_trials
         trials = simulated_trials(params, script)
-        written = prepare(params, path, folder, recorded=False)
-        bag, trouble = run_offline(trials, written, console, stopped.is_set)
+        bag, trouble = run_offline(trials, prepare(params, path, folder, recorded=False), console, stopped.is_set)
         end = TrialEnd(trouble, int(bool(trouble)))
-    elif options.attach:
-        end = _attached(options.attach == "guided", path, script, folder, console, stopped)
-        bag = _recorded(folder, end)
     else:
-        end = run_attempts(params, path, script, folder, console, stopped)
-        bag = _recorded(folder, end)
+        if options.attach:
+            end = _attached(guided, path, script, folder, console, stopped)
+        else:
+            end = run_attempts(params, path, script, folder, console, stopped)
+        try:
+            bag = read_bag(folder / "bag")
+        except DataError:
+            if not end.trouble:
+                raise
     trouble, code = end.trouble, end.code
     if bag is not None:
-        guided = options.attach == "guided" if options.attach else is_guided(params)
         report = trial_report.analyse(bag, criteria_for(script), shortest_hold(script, guided))
         if guided and not trouble:
             trouble = missing_holds(script, report)
@@ -146,18 +150,6 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
     return code
 
 
-def _recorded(folder: Path, end: TrialEnd) -> Bag | None:
-    """Return the recording of a trial; None if there is none because of what ended the trial. Raises DataError."""
-    from exo_gravity.bag.reader import read_bag
-
-    try:
-        return read_bag(folder / "bag")
-    except DataError:
-        if not end.trouble:
-            raise
-        return None
-
-
 def _attached(
     guided: bool, path: Path, script: TrialScript, folder: Path, console: Console, stopped: Stopping
 ) -> TrialEnd:
@@ -168,14 +160,13 @@ def _attached(
     params = prepare(None, path, folder, recorded=True)
     _print_json(folder=str(folder))
     # The clock leads, because a simulator's newest step may be that of an earlier trial.
-    screen = TrialScreen(script, guided, console, lead=LEAD if guided else START_TIME, on_progress=_print_step)
+    screen = TrialScreen(
+        script, guided, console, lead=LEAD if guided else START_TIME,
+        on_progress=lambda step, left: _print_json(step=step, left=round(left, 1)),
+    )  # fmt: skip
     end = run_nodes(params, script, folder, screen, stopped)
     _print_json(phase="reporting")
     return TrialEnd(end.trouble, end.code)
-
-
-def _print_step(step: int, left: float) -> None:
-    _print_json(step=step, left=round(left, 1))
 
 
 def _print_json(**values: object) -> None:

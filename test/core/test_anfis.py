@@ -100,10 +100,6 @@ def test_the_file_has_one_line_per_rule():
     assert sum(line.strip().startswith("[") and line.count(",") >= 3 for line in lines) == 3 * 8
 
 
-def test_a_law_also_loads_from_a_mapping():
-    assert AnfisLaw.load(json.loads(law().dump())).gravity == 9.8
-
-
 @pytest.mark.parametrize(
     ("flaw", "named"),
     [
@@ -123,7 +119,7 @@ def test_an_error_in_a_file_is_rejected_and_named(flaw, named):
     content = json.loads(law().dump())
     flaw(content)
     with pytest.raises(DataError, match=named):
-        AnfisLaw.load(content)
+        AnfisLaw.load(json.dumps(content))
 
 
 @pytest.mark.parametrize("text", ["", "no JSON", "[1, 2]", "3"])

@@ -165,27 +165,25 @@ def sample(effort: float, velocity: float = 0.0) -> JointSample:
     return JointSample(0.0, velocity, effort, 30, 0, 0.0)
 
 
-def load_after(seconds: float, step: float, torque: float) -> MotorLoad:
+def load_after(seconds: float, step: float, torque: float) -> list[tuple[float, float, float]]:
+    """Return power, RMS torque and share of two motors; the second never replies."""
     load = MotorLoad((3.0, 9.0))
-    for number in range(round(seconds / step) + 1):
-        load.update(number * step, (sample(torque), UNKNOWN))
-    return load
+    return [load.update(number * step, (sample(torque), UNKNOWN)) for number in range(round(seconds / step) + 1)][-1]
 
 
 @pytest.mark.parametrize("step", [0.1, 0.5])
 def test_a_constant_torque_warms_a_cold_motor_exponentially_whatever_the_period(step):
-    rms, other = load_after(THERMAL_TIME, step, 6.0).rms
+    (_, rms, _), (_, other, _) = load_after(THERMAL_TIME, step, 6.0)
     assert rms == pytest.approx(6.0 * math.sqrt(1.0 - math.exp(-1.0)), rel=1e-9)
     assert other == 0.0
 
 
 def test_a_torque_above_rated_is_overload_only_when_it_lasts():
-    assert load_after(5.0, 0.1, 6.0).share[0] < 1.0
-    assert load_after(60.0, 0.1, 6.0).share[0] > 1.0
-    assert load_after(600.0, 0.1, 2.9).share[0] < 1.0
+    assert load_after(5.0, 0.1, 6.0)[0][2] < 1.0
+    assert load_after(60.0, 0.1, 6.0)[0][2] > 1.0
+    assert load_after(600.0, 0.1, 2.9)[0][2] < 1.0
 
 
 def test_power_is_torque_times_speed_and_negative_where_the_motor_brakes():
-    load = MotorLoad((3.0, 9.0, 3.0))
-    load.update(1.0, (sample(2.0, 3.0), sample(-2.0, 3.0), UNKNOWN))
-    assert load.power == (6.0, -6.0, 0.0)
+    loads = MotorLoad((3.0, 9.0, 3.0)).update(1.0, (sample(2.0, 3.0), sample(-2.0, 3.0), UNKNOWN))
+    assert [power for power, *_ in loads] == [6.0, -6.0, 0.0]

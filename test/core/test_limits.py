@@ -40,8 +40,7 @@ def test_the_soft_wall_never_throws_a_joint_back_faster_than_it_came(rate, inert
     position, velocity, torque = limit - 0.15, speed, 0.0
     for _ in range(int(4.0 * rate)):
         joints = [reading(position=position, velocity=round(velocity / 0.022) * 0.022, time=0.0)] * 4
-        (torque, *_), _ = LIMITS.shape((0.0,) * 4, 1.0, joints, (torque,) * 4, period)
-        damping = LIMITS.wall_damping(joints)[0]
+        (torque, *_), (damping, *_), _ = LIMITS.shape((0.0,) * 4, 1.0, joints, (torque,) * 4, period)
         end = torque / damping if damping else math.inf  # rad/s, where the damping balances the torque
         if damping:
             decay = math.exp(-damping / inertia * period)
@@ -58,9 +57,9 @@ def test_a_wall_pushes_back_before_a_joint_limit():
     low, high = LIMITS.position_min[3], LIMITS.position_max[3]
     for position, sign in ((low + 0.05, 1), (high - 0.05, -1)):
         joints = [reading(position=position, time=0.0)] * 4
-        shaped, acted = LIMITS.shape((0.0,) * 4, 1.0, joints, (0.0,) * 4, 1.0)
+        shaped, damping, acted = LIMITS.shape((0.0,) * 4, 1.0, joints, (0.0,) * 4, 1.0)
         assert shaped[3] == pytest.approx(sign * 1.25)
-        assert LIMITS.wall_damping(joints)[3] == 5.0
+        assert damping[3] == 5.0
         assert "soft wall (d)" in acted
 
 

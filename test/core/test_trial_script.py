@@ -14,7 +14,6 @@ GOOD = {
 def test_a_script_returns_the_active_step_and_the_time_since_its_start():
     script = TrialScript.parse(GOOD)
     assert script.duration == 12.5
-    assert script.pose_count == 1
     assert script.at(1.9)[0] == 0
     index, since = script.at(2.5)
     assert (script.steps[index].action, since) == ("hold", 0.5)

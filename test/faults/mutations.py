@@ -75,8 +75,8 @@ MUTATIONS = (
         (
             Edit(
                 DESCENT,
-                "self.effort = self._carried = effort",
-                "self.effort = self._carried = 0.0",
+                "self.restart(effort, damping)",
+                "self.restart(0.0, damping)",
             ),
         ),
     ),
@@ -101,7 +101,7 @@ MUTATIONS = (
     Mutation(
         "a soft wall without damping",
         ("elbow pushed into the soft wall",),
-        (Edit(LIMITS, "return tuple(WALL_DAMPING * min(", "return tuple(0.0 * min("),),
+        (Edit(LIMITS, "damping.append(WALL_DAMPING * min(", "damping.append(0.0 * min("),),
     ),
     Mutation(
         "torque delivery is not checked",
@@ -123,7 +123,7 @@ MUTATIONS = (
         ("joint 2 jumps by a motor turn, then clear and enable",),
         (Edit(SAFETY, "if readings.lost or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):",
               "if False:"),
-         Edit(SAFETY, "        if code in DOUBTFUL:\n", "        if False:\n")),
+         Edit(SAFETY, "        if code.casts_doubt:\n", "        if False:\n")),
     ),
     Mutation(
         "motors are switched off while damping still holds the arm",
@@ -201,7 +201,7 @@ MUTATIONS = (
     Mutation(
         "the brake of the descent grows without a bound",
         ("compensator frozen while the wearer pushes down",),
-        (Edit(DESCENT, "self._most = max(max_effort, abs(effort))", "self._most = 18.0"),
+        (Edit(DESCENT, "self._most = max(self._most, abs(effort))", "self._most = 18.0"),
          Edit(DESCENT, "rate = min(BRAKE_GROWTH, BRAKE_GAIN * excess)", "rate = BRAKE_GAIN * excess")),
     ),
     Mutation(
@@ -217,7 +217,7 @@ MUTATIONS = (
     Mutation(
         "an enable never expires",
         ("enabled, and the supply cut for 4 s while checking",),
-        (Edit(SAFETY, "elif now - self._since >= self.limits.enable_timeout:", "elif False:"),),
+        (Edit(SAFETY, "elif self._now - self._since >= limits.enable_timeout:", "elif False:"),),
     ),
     Mutation(
         "unexplained torque is never a fault",

@@ -9,15 +9,14 @@ from typing import Any
 from exo_gravity.core.compensation.compensator import JOINTS, Answer, Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.model.wearer import Wearer
-from exo_gravity.core.motors.joint_motor import peaks_of
 from exo_gravity.core.motors.wire_formats import MIT, WireFormat
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.drive import EffortCommand, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.control_loop import ControlLoop, EffortCommand
+from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.virtual_wearer import VirtualWearer
@@ -91,7 +90,7 @@ class CompensatedArm:
         low, high = (-1.65, -0.17, -0.78, -0.17), (1.65, 3.14, 2.53, 3.14)
         limits = Limits(JOINTS, low, high, (5.0, 5.0, 5.0, 6.0), limit, sign_check_torque=0.0)
         bus = MotorBus(self.wire.open(), motors, reopen=self.wire.open, clock=self.clock)
-        self.safety = SafetyMachine(limits, cycle, peaks_of(motors))
+        self.safety = SafetyMachine(limits, cycle, motors)
         self.loop = ControlLoop(bus, self.safety, cycle, get_efforts=self._get_efforts)
         self.person = Person(pose)
         self.device.start(self.person, 3.0)

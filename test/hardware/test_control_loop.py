@@ -38,15 +38,6 @@ def test_stopping_lets_the_arm_down_and_switches_the_motors_off():
     assert not arm.loop.cycle()
 
 
-def test_an_abandoned_arm_receives_no_further_frame():
-    arm = Carried()
-    listener = Responder(arm.wire)
-    arm.loop.abandon()
-    assert not listener.received
-    assert arm.rig.motors_on == [True] * 4
-    assert arm.drives[-1].powered
-
-
 def test_an_arm_is_let_down_after_its_computer_was_suspended():
     arm = Carried()
     arm.clock.slept += 0.9  # less may be a thread that was not run

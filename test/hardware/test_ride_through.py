@@ -3,71 +3,46 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from exo_gravity.core.model.gravity import gravity_torque
-from exo_gravity.core.model.wearer import Wearer
-from exo_gravity.core.motors.joint_motor import peaks_of
-from exo_gravity.core.safety.drive import FaultCode, State
-from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.core.safety.drive import NO_COMMAND, EffortCommand, FaultCode, State
 from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.control_loop import NO_COMMAND, ControlLoop, EffortCommand
-from exo_gravity.sim import ArmConfig, VirtualWearer
+from exo_gravity.sim import VirtualWearer
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
-from ..support.simulated_device import make_device
-from .simulated_rig import LIMITS, MOTORS_OF_ARM
-from .virtual_time import Wire
+from .compensated_arm import CYCLE, WEARER, CompensatedArm
 
-CYCLE = 0.004  # s
-MASS, COG = Wearer(75.0).on_links(DEFAULT_LINKS.length)
 RAISED, ZERO_G = (0.0, 1.3, 0.0, 0.3), (0.3, 0.45, 0.10, 0.4)  # rad
 SPEED = 0.6  # rad/s
 STEP = 0.35  # Nm within 2 ms: a frame may change the torque by 0.2, and the hand moves the damped joint
 
 
-class RidingArm:
-    """A simulated arm that the loop carries in `pose` by the efforts that gravity takes; `gap` makes them late.
+class RidingArm(CompensatedArm):
+    """An arm that the loop carries in `pose`; `gap` makes its efforts late.
 
     records: of each step of the device since the start: angle, speed and Nm of the motors, (4,) each.
     """
 
     def __init__(self, pose: Sequence[float] = RAISED, wearer: bool = False) -> None:
-        passive = {"wearer_mass": MASS, "wearer_cog": COG} if wearer else {}
-        self.device = make_device(config=ArmConfig(coulomb_friction=(0.1,) * 4, **passive))
-        self.links = DEFAULT_LINKS.with_wearer(MASS, COG) if wearer else DEFAULT_LINKS
-        self.wire = Wire()
-        self.clock = self.wire.clock
-        self.is_late = False
-        self.is_withdrawn = False
-        self.is_held = False
+        self.is_late = self.is_withdrawn = self.is_held = False
         self.records: list[tuple[list[float], ...]] = []
-        self.wire.play(self.device, self._look)
-        limits = replace(LIMITS, sign_check_torque=0.0, max_velocity=(6.0,) * 4)
-        self.safety = SafetyMachine(limits, CYCLE, peaks_of(MOTORS_OF_ARM))
-        bus = MotorBus(self.wire.open(), MOTORS_OF_ARM, clock=self.clock, reopen=self.wire.open)
-        self.loop = ControlLoop(bus, self.safety, CYCLE, get_efforts=self._efforts)
         self._command = NO_COMMAND
-        self.safety.enable(self.clock.monotonic())
-        self.run(2.6)
-        self.move(pose, 2.0)
-        self.run(2.5)
-        assert self.safety.state is State.ACTIVE, self.safety.fault
-        assert np.abs(np.subtract(self.device.arm.positions, pose)).max() < 0.1
+        self.links = DEFAULT_LINKS.with_wearer(*WEARER) if wearer else DEFAULT_LINKS
+        super().__init__(pose, has_wearer=wearer, mode="zero_g" if wearer else "one_g")
+        self.run(2.0)
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget what was seen."""
+        self.top_speed = 0.0
         self.records.clear()
 
     def move(self, pose: Sequence[float], duration: float) -> None:
         """Let the wearer's hand move the arm."""
         steps = [{"move": list(pose), "over": duration}]
         self.device.start(VirtualWearer(TrialScript.parse({"name": "move", "steps": steps})))
-
-    def run(self, duration: float) -> None:
-        end = self.clock.monotonic() + duration
-        while self.clock.monotonic() < end:
-            self.loop.cycle()
 
     def run_while(self, state: State) -> None:
         while self.safety.state is state:
@@ -78,23 +53,17 @@ class RidingArm:
         self.run(duration)
         self.is_late = False
 
-    def _efforts(self, latest: float) -> EffortCommand:
-        samples = self.loop.samples
-        if not self.is_late and min(joint.time for joint in samples) > 0.0:
-            effort = tuple(gravity_torque(self.links, [joint.position for joint in samples]))
-            self._command = EffortCommand(effort, min(joint.time for joint in samples), held=self.is_held)
+    def _get_efforts(self, latest: float) -> EffortCommand:
+        if not self.is_late:
+            self._command = super()._get_efforts(latest)._replace(held=self.is_held)
         return self._command._replace(effort=None) if self.is_withdrawn else self._command
 
     def _look(self) -> None:
+        super()._look()
         arm = self.device.arm
         position, velocity = arm.positions, arm.velocities
         joints = zip(self.device.motors, position, velocity, strict=True)
-        torque = [motor.torque(angle, speed) for motor, angle, speed in joints]
-        self.records.append((position, velocity, torque))
-
-    @property
-    def top_speed(self) -> float:
-        return float(np.abs([velocity for _, velocity, _ in self.records]).max())
+        self.records.append((position, velocity, [motor.torque(angle, speed) for motor, angle, speed in joints]))
 
     @property
     def largest_step(self) -> float:
@@ -119,7 +88,7 @@ def test_a_gap_while_the_arm_is_held_moves_nothing_and_one_too_long_lets_it_down
     arm.run_while(State.LETTING_DOWN)
     assert arm.safety.state is State.FAULT
     assert arm.top_speed < SPEED
-    arm.records.clear()
+    arm.forget()
     assert arm.safety.resume(arm.clock.monotonic())
     arm.run(2.4)
     assert arm.safety.state is State.ACTIVE
@@ -132,7 +101,7 @@ def test_a_wearer_who_moves_is_slowed_gently_while_efforts_are_late():
     arm.move(np.add(position, (0.0, -0.5, 0.0, 0.5)).tolist(), 1.25)
     arm.run(0.45)
     assert max(map(abs, arm.device.arm.velocities)) > 0.9
-    arm.records.clear()
+    arm.forget()
     arm.gap(0.1)
     arm.run(0.4)
     assert arm.safety.state is State.ACTIVE and arm.safety.ride.rides == 1

@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 import can
 
 from exo_gravity.core.model.gravity import gravity_torque
-from exo_gravity.core.motors.joint_motor import peaks_of
 from exo_gravity.core.motors.wire_formats import MIT, WireFormat
-from exo_gravity.core.safety.drive import NOTHING, Drive, State
+from exo_gravity.core.safety.drive import NOTHING, Drive, EffortCommand, State
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.control_loop import ControlLoop, EffortCommand
+from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.ownership.bus_lock import DriveNotes
 from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, let_down
 
@@ -96,7 +95,7 @@ class Carried:
         self.motors = MotorBus(
             self.wire.open(), self.rig.motors, note=self.drives.append, reopen=self.wire.open, clock=self.clock
         )
-        self.safety = SafetyMachine(QUICK, CYCLE, peaks_of(self.rig.motors))
+        self.safety = SafetyMachine(QUICK, CYCLE, self.rig.motors)
         self.failure_of_efforts: Exception | None = None
         self._is_raised = False
         self.loop = ControlLoop(self.motors, self.safety, CYCLE, get_efforts=self._get_efforts, **options)

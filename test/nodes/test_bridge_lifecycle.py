@@ -11,8 +11,7 @@ import rclpy
 from rclpy.lifecycle import TransitionCallbackReturn
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.safety.drive import NOTHING, State
-from exo_gravity.hardware.control_loop import EffortCommand
+from exo_gravity.core.safety.drive import NOTHING, EffortCommand, State
 from exo_gravity.hardware.ownership import bus_lock, owned_bus
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.nodes.can_bridge import node as can_bridge

@@ -17,11 +17,10 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.bus_load import Traffic
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS
-from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.safety.drive import NO_COMMAND, FaultCode, State
 from exo_gravity.core.safety.lease import LEASE_TIME, Lease
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.hardware.control_loop import NO_COMMAND
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.can_bridge.operation import WATCH_PERIOD, BridgeReport, BridgeServices, Operator
@@ -37,7 +36,8 @@ def carrying(effort, cycles=0):
     safety.state = State.ACTIVE
     samples = [JointSample(0.5, 2.0, torque, 40, 0, 0.0) for torque in (0.0, 0.0, 0.0, effort)]
     counts = dict.fromkeys(("late", "incomplete", "cycle_errors"), 0)
-    return SimpleNamespace(safety=safety, samples=samples, ignored={}, failure=None, cycles=cycles, **counts)
+    bus = SimpleNamespace(ignored={})
+    return SimpleNamespace(safety=safety, samples=samples, bus=bus, failure=None, cycles=cycles, **counts)
 
 
 @pytest.fixture
@@ -114,8 +114,8 @@ def standing():
     def set_zero():
         loop.zeroed += 1
 
-    loop.call, loop.set_zero = call, set_zero
-    loop.safety.step(0.0, loop.samples, None, 0.0)
+    loop.call, loop.bus = call, SimpleNamespace(set_zero=set_zero)
+    loop.safety.step(0.0, loop.samples, NO_COMMAND)
     return loop
 
 

@@ -1,6 +1,5 @@
 """The way down, judged by the simulated arm's true motion: slow, to the ground in time, and no drop at the end."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,9 +7,9 @@ import pytest
 
 from exo_gravity.core import Tilt, gravity_torque
 from exo_gravity.core.model.wearer import Wearer
-from exo_gravity.core.motors.joint_motor import JointMotor, peaks_of
+from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
-from exo_gravity.core.safety.drive import OFF, State
+from exo_gravity.core.safety.drive import NO_COMMAND, OFF, State
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
@@ -44,7 +43,7 @@ class Lowered:
         self.arm.reset(theta)
         links = config.links.with_wearer(mass, cog)
         self.holding = gravity_torque(links, theta, Tilt.of("right", pitch, roll).direction)
-        self.machine = SafetyMachine(LIMITS, 1.0 / RATE, peaks_of(self.motors))
+        self.machine = SafetyMachine(LIMITS, 1.0 / RATE, self.motors)
         self.top_speed = self.speed_after_exit = 0.0
         self.switched_on_again = False
         self._samples = [UNKNOWN] * 4
@@ -58,7 +57,7 @@ class Lowered:
             self._take(motor, self.device.exchange(motor.can_id, ENTER))
         self.machine.take_over(self.holding.tolist(), (0.0,) * 4, 0.0)
         while self._now < 60.0:
-            drive = self.machine.step(self._now, tuple(self._samples), None, -math.inf)
+            drive = self.machine.step(self._now, tuple(self._samples), NO_COMMAND)
             if drive == OFF:
                 break
             self.switched_on_again = self.switched_on_again or any(drive.enter)
@@ -111,7 +110,7 @@ def test_from_other_poses_and_on_a_tilted_trunk_it_comes_down_as_slowly(theta, p
 @pytest.mark.parametrize("theta", POSES[2:4])
 def test_a_passive_arm_of_75_kg_comes_down_as_slowly_wherever_the_motors_can_hold_it(theta):
     lowered = Lowered(theta, 0.05, 75.0)
-    assert np.all(np.abs(lowered.holding) <= peaks_of(MOTORS_OF_ARM).effort)
+    assert np.all(np.abs(lowered.holding) <= [motor.peak_effort for motor in MOTORS_OF_ARM])
     assert lowered.top_speed < TOP_SPEED
     assert lowered.speed_after_exit < TOP_SPEED / 4
 

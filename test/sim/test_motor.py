@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -122,7 +124,7 @@ def test_torque_is_limited_to_the_motors_peak(commanded):
 
 
 def test_a_wrong_firmware_range_scales_the_torque():
-    motor = entered(spec=SPEC.with_ranges(velocity_range=45.0, torque_range=9.0))
+    motor = entered(spec=replace(SPEC, velocity_range=45.0, torque_range=9.0))
     motor.receive(command(torque=5.0), 0.0, 0.0, 0.0)
     assert motor.torque(0.0, 0.0) == pytest.approx(3.0, abs=TORQUE_CODE)
 

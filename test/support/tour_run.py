@@ -17,9 +17,9 @@ from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.model.kinematics import LinkInertia
 from exo_gravity.core.model.moments import load_moments, moments_of
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.motors.joint_motor import JointMotor, peaks_of
+from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
-from exo_gravity.core.safety.drive import Drive, State
+from exo_gravity.core.safety.drive import Drive, EffortCommand, State
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trial.script import TrialScript
@@ -82,7 +82,7 @@ class TourRun:
         moments = moments_of(self.assumed) + load_moments(self.assumed.length.tolist(), *self.load)
         guess = TorqueGuess(self.assumed.length, moments, tilt, self.assumed.gravity)
         tour = Tour(self.limits, guess, itinerary or BestPoses(self.limits, 12, 230.0), self.rate, self.load)
-        safety = SafetyMachine(self.limits, 1.0 / self.rate, peaks_of(MOTORS_AS_MOUNTED))
+        safety = SafetyMachine(self.limits, 1.0 / self.rate, MOTORS_AS_MOUNTED)
         safety.enable(0.0)
         samples: list[JointSample] = [UNKNOWN] * 4
         effort: Torque | None = None
@@ -91,7 +91,7 @@ class TourRun:
         for cycle in range(round(LONGEST * self.rate)):
             now = cycle / self.rate
             queue = [*queue, effort][-1 - self.late :]
-            drive = safety.step(now, tuple(samples), queue[0], answered)
+            drive = safety.step(now, tuple(samples), EffortCommand(queue[0], answered))
             powered = self._exchange(device, drive, powered, samples, now)
             if not any(self.limits.is_silent(now, joint) for joint in samples):
                 position, velocity = [row.position for row in samples], [row.velocity for row in samples]

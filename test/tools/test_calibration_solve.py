@@ -95,7 +95,7 @@ def test_an_implausible_wearer_is_refused():
     with pytest.raises(DataError, match=r"is the arm relaxed|add a pose"):
         wearer_from(arm, observed(arm=ARM.robot, scales=np.ones(4), poses=POSES[:4]))
     with pytest.raises(DataError, match="at least 3"):
-        worn_arm(arm, observed(poses=POSES[:2]), np.array((0.16, 0.18)))
+        worn_arm(arm, observed(poses=POSES[:2]), np.array((0.0, 0.0, 0.16, 0.18)))
 
 
 def test_scale_needs_a_weight_that_shows():

@@ -22,7 +22,6 @@ from exo_gravity.core.calibration.pose_fit import (
     ANGLE,
     COUNT,
     DISTURBED,
-    FACTOR,
     MOMENT,
     OFFSET,
     SCALE,
@@ -54,6 +53,7 @@ LEAST_TILT = 1.0  # deg worth a sentence
 # Unknowns of joint 1, which carries nothing while its axis is vertical.
 FIRST_JOINT = (0, MOMENTS.index("W"), SCALE.start, OFFSET.start)
 PER_JOINT = tuple(f"{what} {n + 1}" for what in ("torque scale", "offset") for n in range(JOINT_COUNT))
+UNKNOWN = np.eye(COUNT)  # one row for each
 NAMES = (*MOMENTS, *PER_JOINT)
 LEAN = "lean the stand by 10 to 14 degrees to the arm's side, where the arm still hangs close to its home"
 
@@ -100,17 +100,22 @@ def identify(observations: Sequence[Observation], length: Vector, gravity: float
     rows = _rows(observations, length, gravity)
     keep, rejected = without_outliers(rows)
     used, solution = _bounded(rows.only(keep))
-    _check_fit(solution.residual, used.effort)
+    typical, peak = np.median(np.abs(solution.residual), axis=0), np.abs(used.effort).max(axis=0)
+    for joint in np.flatnonzero(typical > np.maximum(MISFIT * peak, LEAST_MISFIT)):
+        misfit = f"joint {joint + 1} is {typical[joint]:.2f} Nm off in half of the poses"
+        raise DataError(f"the poses do not fit one arm: {misfit}. {DISTURBED}")
     direction, hidden = np.asarray(observations[-1].direction, dtype=float), solution.hidden > HIDDEN
-    _check_known(hidden, len(observations), direction, gravity)
-    unknowns, covariance = _in_kilograms(solution, np.where(hidden, START, solution.unknowns))
+    is_relative = not np.any(used.load)
+    _check_known(hidden, len(observations), direction, gravity, is_relative)
+    unknowns = np.where(hidden, START, solution.unknowns)
+    # Student's distribution: for few poses two standard errors would cover less than 95 %.
+    covariance = solution.covariance * (1.0 + 1.25 / (solution.freedom.min() + 6.0)) ** 2
     error = np.where(hidden, np.inf, np.sqrt(np.diag(covariance)))
     moments, scale = unknowns[MOMENT], np.exp(unknowns[SCALE])
     check_physical(moments, error[MOMENT], scale, direction, gravity)
     residual = rows.effort - rows.predicted(solution.unknowns)
     held_out = residual.copy()
     held_out[keep], _ = without_each_pose(solution, used.sigma)
-    is_relative = not np.any(used.load)
     return Identified(
         moments,
         error[MOMENT],
@@ -133,25 +138,20 @@ def _rows(observations: Sequence[Observation], length: Vector, gravity: float) -
     """Return the observations as arrays, with what is held. Raises DataError that names the observation."""
     if not observations:
         raise DataError("no pose was observed")
-    theta, direction, effort, spread = columns(observations)
-    for name, values in (("theta", theta), ("direction", direction), ("effort", effort), ("spread", spread)):
+    theta, direction, effort, spread = found = columns(observations)
+    for name, values in zip(("theta", "direction", "effort", "spread"), found, strict=True):
         for index in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
             raise DataError(f"pose {index + 1}: {name} = {values[index].tolist()}: must be finite numbers")
     load = np.array([load_moments(length, one.load_mass, one.load_lever) for one in observations])
-    free = np.ones(COUNT, dtype=bool)
-    free[FACTOR] = free[ANGLE] = bool(np.any(load))
-    one = np.eye(COUNT)
-    product = one[SCALE][1:].sum(axis=0, keepdims=True)  # of the scales of joints 2 to 4: 1, the weight gives the rest
-    anchor = np.vstack((one[ANGLE] / BESIDE_ERROR, one[TILT] / TILT_ERROR, product / EXACT))
-    return Rows(along_axes(theta, gravity), direction, load, effort, np.hypot(spread, LEAST_SPREAD), free, anchor)
+    product = UNKNOWN[SCALE][1:].sum(axis=0, keepdims=True)  # of the scales of joints 2 to 4: 1 without a weight
+    product *= not np.any(load)
+    anchor = np.vstack((UNKNOWN[ANGLE] / BESIDE_ERROR, UNKNOWN[TILT] / TILT_ERROR, product / EXACT))
+    return Rows(along_axes(theta, gravity), direction, load, effort, np.hypot(spread, LEAST_SPREAD), anchor)
 
 
 def columns(observations: Sequence[Observation]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return theta (n, 4) rad, direction (n, 3), effort and spread (n, 4) Nm of the observations."""
-    theta, direction, effort, spread = (
-        np.array([getattr(one, name) for one in observations], dtype=float)
-        for name in ("theta", "direction", "effort", "spread")
-    )
+    theta, direction, effort, spread = (np.array([one[i] for one in observations], dtype=float) for i in (0, 1, 2, 4))
     return theta, direction, effort, spread
 
 
@@ -160,38 +160,17 @@ def _bounded(rows: Rows) -> tuple[Rows, Solution]:
     used, solution = final(rows)
     if solution.unknowns[0] >= 0.0:
         return used, solution
-    used, bounded = final(replace(rows, free=rows.free & (np.arange(COUNT) != 0)))
+    used, bounded = final(replace(rows, anchor=np.vstack((rows.anchor, UNKNOWN[:1] / EXACT))))
     covariance = bounded.covariance.copy()
     covariance[0, 0] = solution.covariance[0, 0]
-    return used, replace(bounded, covariance=covariance)
+    return used, replace(bounded, unknowns=bounded.unknowns * (np.arange(COUNT) > 0), covariance=covariance)
 
 
-def _in_kilograms(solution: Solution, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the unknowns (23,) and their covariance (23, 23) without the factor by which a weight seems too heavy."""
-    factor = unknowns[FACTOR]
-    change = np.eye(COUNT)
-    change[MOMENT, MOMENT] /= factor
-    change[MOMENT, FACTOR] = -unknowns[MOMENT] / factor**2
-    change[SCALE, FACTOR] = -1.0 / factor
-    unknowns[MOMENT] /= factor
-    unknowns[SCALE] -= math.log(factor)
-    # Student's distribution: for few poses two standard errors would cover less than 95 %.
-    return unknowns, (1.0 + 1.25 / (solution.freedom.min() + 6.0)) ** 2 * change @ solution.covariance @ change.T
-
-
-def _check_fit(residual: np.ndarray, effort: np.ndarray) -> None:
-    """Raise DataError if half of the residuals (n, 4) in Nm of a joint are large compared with its efforts (n, 4)."""
-    typical, peak = np.median(np.abs(residual), axis=0), np.abs(effort).max(axis=0)
-    for joint in np.flatnonzero(typical > np.maximum(MISFIT * peak, LEAST_MISFIT)):
-        misfit = f"joint {joint + 1} is {typical[joint]:.2f} Nm off in half of the poses"
-        raise DataError(f"the poses do not fit one arm: {misfit}. {DISTURBED}")
-
-
-def _check_known(hidden: np.ndarray, count: int, direction: np.ndarray, gravity: float) -> None:
-    """Raise DataError that names the missing pose if `count` poses do not show `hidden` (23,) of joints 2 to 4."""
+def _check_known(hidden: np.ndarray, count: int, direction: np.ndarray, gravity: float, is_relative: bool) -> None:
+    """Raise DataError that names what is missing if `count` poses do not show `hidden` (22,) of joints 2 to 4."""
     missing = hidden.copy()
     missing[list(FIRST_JOINT)] = False
-    if missing[FACTOR]:
+    if np.all(missing[SCALE][1:]) and not is_relative:
         raise DataError("the weight shows no common factor: hang a heavier one, or hold it with a horizontal forearm")
     if np.any(missing):
         names = ", ".join(NAMES[index] for index in np.flatnonzero(missing))
@@ -217,26 +196,22 @@ def check_physical(
     for across, along in ((6, 2), (7, 3)):
         if abs(moments[across]) > moments[along]:
             angle = math.degrees(math.atan2(moments[across], moments[along]))
-            raise DataError(
-                f"{MOMENTS[across]} = {moments[across]:.3f} kg m exceeds {MOMENTS[along]}: "
-                f"the zero of joint {along + 1} seems {angle:.0f} degrees off"
-            )
+            seems = f"the zero of joint {along + 1} seems {angle:.0f} degrees off"
+            raise DataError(f"{MOMENTS[across]} = {moments[across]:.3f} kg m exceeds {MOMENTS[along]}: {seems}")
 
 
 def _unknown(unknowns: np.ndarray, covariance: np.ndarray, hidden: np.ndarray, relative: bool) -> tuple[str, ...]:
-    """Return what the poses do not show, and what would, in sentences; unknowns and `hidden`: (23,)."""
+    """Return what the poses do not show, and what would, in sentences; unknowns and `hidden`: (22,)."""
     sentences = []
     if relative:
         sentences.append("A common factor of all torque scales and moments: hang a known weight on link 4.")
-    if np.any(hidden[:FACTOR]):
-        names = ", ".join(NAMES[index] for index in np.flatnonzero(hidden[:FACTOR]))
+    if np.any(hidden[: ANGLE.start]):
+        names = ", ".join(NAMES[index] for index in np.flatnonzero(hidden[: ANGLE.start]))
         sentences.append(f"{names}: joint 1 carries nothing while its axis is vertical: {LEAN}.")
     for joint, along, across in ((4, 3, 7), (3, 2, 6)):
         angle = math.degrees(math.atan2(unknowns[across], unknowns[along]))
-        sentences.append(
-            f"{MOMENTS[across]} of link {joint} from an error of joint {joint}'s zero: it looks like one of "
-            f"{angle:+.1f} degrees; check the zero with a level or at a stop."
-        )
+        looks = f"it looks like one of {angle:+.1f} degrees; check the zero with a level or at a stop."
+        sentences.append(f"{MOMENTS[across]} of link {joint} from an error of joint {joint}'s zero: {looks}")
     elbow, elbow_error = math.degrees(unknowns[ANGLE][0]), math.degrees(math.sqrt(covariance[ANGLE, ANGLE][0, 0]))
     if elbow and abs(elbow) > max(3.0 * elbow_error, LEAST_ZERO_ERROR):
         sentences.append(f"The weight shows joint 3's zero {elbow:+.1f} +- {elbow_error:.1f} degrees off.")

@@ -1,12 +1,11 @@
 """Weighted least squares for the unknowns of an arm in held poses.
 
-The unknowns are the eight moments in kg m, the logarithm of the four torque scales, the four offsets in Nm, the factor
-by which moments and scales are too large in common, by which a known weight seems too heavy, three angles by which the
-weight seems to lie off the links (a zero of joint 3 or 4 that is off by a degree moves a weight by more than a light
-forearm's own moment), and the rotation of gravity's direction from the measured to the true one: an IMU is mounted, and
-a stand placed, to no better than a degree. The commanded effort is `torque(moments + factor * load) / scale + offset`:
-nearly linear, so a few Gauss-Newton steps solve it. Each step leaves out the combinations of unknowns that the poses do
-not show: those whose standard error exceeds `NATURAL`.
+The unknowns are the eight moments in kg m, the logarithm of the four torque scales, the four offsets in Nm, three
+angles by which a known weight seems to lie off the links (a zero of joint 3 or 4 that is off by a degree moves a weight
+by more than a light forearm's own moment), and the rotation of gravity's direction from the measured to the true one:
+an IMU is mounted, and a stand placed, to no better than a degree. The commanded effort is `torque(moments + load) /
+scale + offset`: nearly linear, so a few Gauss-Newton steps solve it. Each step leaves out the combinations of unknowns
+that the poses do not show: those whose standard error exceeds `NATURAL`.
 
 Errors are larger in some joints than the observations state (gear friction is not the same in every pose), so each
 joint gets a factor of its own, estimated from its residuals and pooled with the others where poses are few.
@@ -25,17 +24,16 @@ from exo_gravity.core.numbers import JOINT_COUNT
 MOMENT = slice(0, 8)
 SCALE = slice(8, 12)
 OFFSET = slice(12, 16)
-FACTOR = 16
-ANGLE = slice(17, 20)  # of the load, from M3 to Y3, from M4 to Y4, and from M4 to Z
+ANGLE = slice(16, 19)  # of the load, from M3 to Y3, from M4 to Y4, and from M4 to Z
 ALONG, ACROSS = [2, 3, 3], [6, 7, 5]  # indices of these moments
-TILT = slice(20, 23)  # rotation vector of gravity in the base frame
+TILT = slice(19, 22)  # rotation vector of gravity in the base frame
 TURN = np.cross(np.eye(3), np.eye(3)[:, None])  # (3, 3, 3): v @ TURN has the rows v x X, v x Y and v x Z
-COUNT = 23
-# kg m, logarithm, Nm, 1, rad, rad: a combination of unknowns that may be wrong by this much is not known.
-NATURAL = np.repeat((0.1, 0.3, 0.3, 0.3, 0.3, 0.1), (len(MOMENTS), JOINT_COUNT, JOINT_COUNT, 1, 3, 3))
+COUNT = 22
+# kg m, logarithm, Nm, rad, rad: a combination of unknowns that may be wrong by this much is not known.
+NATURAL = np.repeat((0.1, 0.3, 0.3, 0.3, 0.1), (len(MOMENTS), JOINT_COUNT, JOINT_COUNT, 3, 3))
 # kg m, of a robot arm with the motors of this package; only the share of noise and scale in a pose depends on it.
 TYPICAL_MOMENTS = (0.08, 0.15, 0.2, 0.026, 0.0, 0.0, 0.0, 0.0)
-START = np.array((0.0, *TYPICAL_MOMENTS[1:4], *np.zeros(12), 1.0, *np.zeros(6)))  # of the search
+START = np.array((0.0, *TYPICAL_MOMENTS[1:4], *np.zeros(18)))  # of the search
 HUBER = 2.0  # standard errors beyond which a residual's weight falls
 POOLING = 6.0  # degrees of freedom with which all joints together inform the error of each
 STEPS = 40
@@ -58,8 +56,7 @@ class Rows:
     load: np.ndarray  #: (n, 8) kg m, moments of the weight
     effort: np.ndarray  #: (n, 4) Nm
     sigma: np.ndarray  #: (n, 4) Nm, standard error of `effort`
-    free: np.ndarray = field(default_factory=lambda: np.ones(COUNT, dtype=bool))  #: (23,), the unknowns to be solved
-    #: (k, 23), linear combinations of the unknowns that are 0, divided by their standard errors
+    #: (k, 22), linear combinations of the unknowns that are 0, divided by their standard errors
     anchor: np.ndarray = field(default_factory=lambda: np.zeros((0, COUNT)))
 
     def only(self, keep: np.ndarray) -> Rows:
@@ -71,13 +68,13 @@ class Rows:
         """Return the commanded effort (n, 4) in Nm."""
         turn = np.eye(len(MOMENTS), dtype=unknowns.dtype)
         turn[ALONG, ACROSS] = unknowns[ANGLE]
-        moments = unknowns[MOMENT] + unknowns[FACTOR] * (self.load @ turn)
+        moments = unknowns[MOMENT] + self.load @ turn
         direction = self.direction + self.direction @ (unknowns[TILT] @ TURN)
         torque = np.einsum("njka,nka->nj", self.along, moments[:, :, None] * direction[:, None, :])
         return np.asarray(torque * np.exp(-unknowns[SCALE]) + unknowns[OFFSET])
 
     def jacobian(self, unknowns: np.ndarray) -> np.ndarray:
-        """Return the derivative of `predicted` by the unknowns, (n, 4, 23), exact to rounding by complex steps."""
+        """Return the derivative of `predicted` by the unknowns, (n, 4, 22), exact to rounding by complex steps."""
         steps = (self.predicted(unknowns + 1j * TINY * one).imag for one in np.eye(COUNT))
         return np.stack(list(steps), axis=-1) / TINY
 
@@ -86,13 +83,13 @@ class Rows:
 class Solution:
     """The fit of `Rows`."""
 
-    unknowns: np.ndarray  #: (23,)
-    covariance: np.ndarray  #: (23, 23) of what is known
-    hidden: np.ndarray  #: (23,), share 0..1 of each unknown that is not known
+    unknowns: np.ndarray  #: (22,)
+    covariance: np.ndarray  #: (22, 22) of what is known
+    hidden: np.ndarray  #: (22,), share 0..1 of each unknown that is not known
     singular_values: np.ndarray  #: of the poses alone, in units of `NATURAL`, the largest first
     residual: np.ndarray  #: (n, 4) Nm
     hat: np.ndarray  #: (n, 4, n, 4), derivative of the predicted by the measured effort, both divided by sigma
-    inverse: np.ndarray  #: (23, 4 n + k), change of the unknowns with each effort and condition, divided by its error
+    inverse: np.ndarray  #: (22, 4 n + k), change of the unknowns with each effort and condition, divided by its error
 
     @property
     def left(self) -> np.ndarray:
@@ -111,26 +108,25 @@ def along_axes(theta: np.ndarray, gravity: float) -> np.ndarray:
 
 
 def solve(rows: Rows, start: np.ndarray = START, weight: np.ndarray | float = 1.0) -> Solution:
-    """Return the least-squares solution from `start` (23,); weight: (n, 4) of the squared residuals."""
+    """Return the least-squares solution from `start` (22,); weight: (n, 4) of the squared residuals."""
     root = np.sqrt(weight) / rows.sigma
     unknowns = start
     for _ in range(STEPS):
         poses = (rows.jacobian(unknowns) * root[..., None]).reshape(-1, COUNT)
         whitened = np.vstack((poses, rows.anchor))
-        natural = NATURAL * rows.free
-        left, size, right = np.linalg.svd(whitened * natural, full_matrices=False)
+        left, size, right = np.linalg.svd(whitened * NATURAL, full_matrices=False)
         known = size > 1.0
-        inverse = natural[:, None] * (right[known].T / size[known]) @ left[:, known].T
+        inverse = NATURAL[:, None] * (right[known].T / size[known]) @ left[:, known].T
         residual = rows.effort - rows.predicted(unknowns)
         step = inverse @ np.append(root * residual, -rows.anchor @ unknowns)
         if np.all(np.abs(step) < 1e-9 * NATURAL):
             break
         # A scale that jumps by more than a factor of 1.6 in one step has left the range of the linear model.
         unknowns = unknowns + step / max(1.0, 2.0 * float(np.abs(step[SCALE]).max()))
-    hidden = np.where(rows.free, 1.0 - np.diag(inverse @ whitened), 0.0)  # a projection, up to the units
-    free = rows.free & (np.arange(COUNT) < FACTOR)  # a weight that hangs is known, and so is the common factor
-    size = np.linalg.svd((poses * NATURAL)[:, free], compute_uv=False)
-    singular_values = np.append(size, np.zeros(int(free.sum()) - len(size)))
+    hidden = 1.0 - np.diag(inverse @ whitened)  # a projection, up to the units
+    singular_values = np.zeros(ANGLE.start)
+    size = np.linalg.svd((poses * NATURAL)[:, : ANGLE.start], compute_uv=False)
+    singular_values[: len(size)] = size
     hat = (poses @ inverse[:, : residual.size]).reshape(2 * residual.shape)
     return Solution(unknowns, inverse @ inverse.T, hidden, singular_values, residual, hat, inverse)
 
@@ -162,7 +158,7 @@ def final(rows: Rows) -> tuple[Rows, Solution]:
 
 
 def _common_error(rows: Rows, solution: Solution) -> np.ndarray:
-    """Return the covariance (23, 23) that the error `COMMON` of each joint and weight causes."""
+    """Return the covariance (22, 22) that the error `COMMON` of each joint and weight causes."""
     torque = (rows.predicted(solution.unknowns) - solution.unknowns[OFFSET]) / rows.sigma
     loads, group = np.unique(rows.load, axis=0, return_inverse=True)
     shared = np.arange(len(loads))[:, None, None, None] == group.reshape(-1, 1)

@@ -19,7 +19,8 @@ from exo_gravity.core.safety.limits import WALL_WIDTH, Limits
 CANDIDATES = 800
 MOST_UPWARDS = 0.3  # sine of the largest angle above the horizontal, of links 3 and 4
 SHARE = 0.85  # of max_effort that a pose may need
-DEVIATIONS = (2.0, 1.0, 0.0)  # of the expected torque, that a pose must leave room for; less where none does
+DEVIATIONS = 2.0  # of the expected torque, that a pose must leave room for; less where none does
+LEAST_DEVIATION = 1e-9  # Nm
 USUAL_FRICTION = 0.5  # Nm, until it is measured
 WAYPOINTS = 8  # of the way to a pose, at which the motors must hold the arm too
 FIRST_EDGE = 0.1  # rad in addition, at the first pose
@@ -72,12 +73,10 @@ class BestPoses:
             self._is_started = True
             return self._first
         in_time = np.flatnonzero(self._is_in_time(self.count - len(taken), position, elapsed))
-        for deviations in DEVIATIONS:
-            possible = in_time[self._is_holdable(self._candidates[in_time], position, guess, friction, deviations)]
-            if len(possible):
-                break
-        else:
+        room = self._room(self._candidates[in_time], position, guess, friction)
+        if room.max() < 0.0:
             raise DataError("no further pose can be held within max_effort: is it too small for the arm?")
+        possible = in_time[room >= min(DEVIATIONS, math.floor(room.max()))]
         seen, poses = list(taken) or [self._first.theta], self._candidates[possible]
         index = possible[next_pose(seen, poses, guess.tilt.direction, guess.common_moments, guess.gravity)]
         pose = self._candidates[index]
@@ -94,25 +93,20 @@ class BestPoses:
         fits = way + self._first.duration <= budget * (TIME_SHARE if left > 1 else 1.0)
         return np.asarray(fits if fits.any() else way + home <= (way + home).min() + 1.0)
 
-    def _is_holdable(
-        self, poses: np.ndarray, start: np.ndarray, guess: TorqueGuess, friction: Sequence[float], deviations: float
-    ) -> np.ndarray:
-        """Return which poses (n,) the motors can hold, reach from `start`, and leave for the hanging arm.
+    def _room(self, poses: np.ndarray, start: np.ndarray, guess: TorqueGuess, friction: Sequence[float]) -> np.ndarray:
+        """Return the room (n,) that the motors have to hold `poses`, reach them from `start`, and leave them for home.
 
-        friction: (4,) Nm, against which the arm is moved. deviations: standard deviations of the expected torque for
-        which there must be room.
+        It is in standard deviations of the expected torque, below 0 where they have none; on the way home the torque is
+        known. friction: (4,) Nm, against which the arm is moved.
         """
         shares = np.linspace(0.0, 1.0, WAYPOINTS + 1)[1:, None, None]
         sweep = AMPLITUDE * np.array((-1.0, 1.0))[:, None, None]
         start, home = start + shares * (poses - start), self._limits.home + shares * (poses - self._limits.home)
-        slide = [own or USUAL_FRICTION for own in friction]
-        result = np.ones(len(poses), dtype=bool)
-        for way, room in ((start, deviations), (poses + sweep, deviations), (home, 0.0)):
-            mean, deviation = guess.torques(way.reshape(-1, JOINT_COUNT))
-            needed = np.abs(mean) + room * deviation + slide
-            can = np.all(needed <= SHARE * np.array(self._limits.max_effort), axis=1)
-            result &= can.reshape(len(way), -1).all(axis=0)
-        return result
+        mean, deviation = guess.torques(np.vstack((start, poses + sweep, home)).reshape(-1, JOINT_COUNT))
+        most = SHARE * np.array(self._limits.max_effort) - [own or USUAL_FRICTION for own in friction]
+        room = ((most - np.abs(mean)) / np.maximum(deviation, LEAST_DEVIATION)).min(axis=1).reshape(-1, len(poses))
+        is_home = np.arange(len(room))[:, None] >= len(room) - len(home)
+        return np.asarray(np.where(is_home & (room >= 0.0), np.inf, room).min(axis=0))
 
 
 Itinerary = FixedStations | BestPoses
@@ -164,7 +158,7 @@ def next_pose(
 
 
 def missing_pose(hidden: np.ndarray, direction: Vector, gravity: float) -> str:
-    """Return, in words, the pose of `GRID` that shows most of the unknowns of which `hidden` (23,) are not known."""
+    """Return, in words, the pose of `GRID` that shows most of the unknowns of which `hidden` (22,) are not known."""
     poses = np.radians(list(itertools.product(*GRID)))
     shown = _sensitivity(poses, direction, TYPICAL_MOMENTS, gravity) * NATURAL * hidden
     best = poses[int(np.argmax((shown**2).sum(axis=(1, 2))))]
@@ -172,7 +166,7 @@ def missing_pose(hidden: np.ndarray, direction: Vector, gravity: float) -> str:
 
 
 def _sensitivity(theta: np.ndarray, direction: Vector, moments: Vector, gravity: float) -> np.ndarray:
-    """Return the derivative of the efforts in the poses (n, 4) by the unknowns, divided by their noise: (n, 4, 23)."""
+    """Return the derivative of the efforts in the poses (n, 4) by the unknowns, divided by their noise: (n, 4, 22)."""
     nothing = np.zeros((len(theta), JOINT_COUNT))
     down, no_load = np.broadcast_to(direction, (len(theta), 3)), np.zeros((len(theta), len(moments)))
     rows = Rows(along_axes(theta, gravity), down, no_load, nothing, nothing)

@@ -138,7 +138,13 @@ class Tracker:
         push = stiff + matrix @ speed_error * 2.0 * frequency
         weakest = float(np.linalg.eigvalsh(matrix)[0])
         integral = self._integral + INTEGRAL_SHARE * frequency * dt * (stiff + FLOOR * weakest * error * frequency**2)
-        self._compensate_friction(dt, error, speed_error, heading)
+        # Friction is compensated by and by, and no further in a joint that is ahead.
+        most = FRICTION_RATE * self.friction * dt
+        wanted = self.friction * np.clip(heading / FULL_FRICTION_SPEED, -1.0, 1.0)
+        change = np.clip(wanted - self._slide, -most, most)
+        way = np.sign(heading)
+        is_ahead = (error * way < -AHEAD) | (speed_error * way < -FASTER)
+        self._slide += np.where(is_ahead & (change * way > 0.0), 0.0, change)
         torque = expected + self._slide + push + integral
         is_saturated = np.abs(torque) > self._max_effort
         self.saturated = np.where(is_saturated, self.saturated + dt, 0.0)
@@ -146,11 +152,3 @@ class Tracker:
         self._integral = np.where(is_saturated & (torque * error > 0.0), self._integral, integral)
         self.correction = push + self._integral
         return tuple(np.clip(torque, -self._max_effort, self._max_effort).tolist())
-
-    def _compensate_friction(self, dt: float, error: np.ndarray, speed_error: np.ndarray, heading: np.ndarray) -> None:
-        step = FRICTION_RATE * self.friction * dt
-        wanted = self.friction * np.clip(heading / FULL_FRICTION_SPEED, -1.0, 1.0)
-        change = np.clip(wanted - self._slide, -step, step)
-        way = np.sign(heading)
-        is_ahead = (error * way < -AHEAD) | (speed_error * way < -FASTER)
-        self._slide += np.where(is_ahead & (change * way > 0.0), 0.0, change)

@@ -146,9 +146,7 @@ def robot_of(values: Mapping[str, Any]) -> ArmModel:
             return ArmModel.from_moments(length, values["robot.first_moment"], off_axis, *rest)
         return ArmModel(length, values["robot.cog"], values["robot.mass"], *rest, off_axis)
     except ParameterError as error:
-        if error.name in ("mass", "cog", "first_moment", "off_axis"):
-            raise ParameterError(f"robot.{error.name}", error.value, error.expected) from None
-        raise
+        raise ParameterError(f"robot.{error.name}", error.value, error.expected) from None
 
 
 def wearer_of(values: Mapping[str, Any]) -> tuple[Sequence[float], Sequence[float]]:

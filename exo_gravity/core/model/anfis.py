@@ -86,10 +86,8 @@ class Anfis:
         share = grades(self.centre, self.sigma, inputs)
         models, count, dimension, functions = share.shape
         for axis in reversed(range(dimension)):
-            value = value.reshape(models, count, -1, functions) @ share[:, :, axis, :, None]
-            value = value[..., 0]
-        output: np.ndarray = value[..., 0].T
-        return output
+            value = (value.reshape(models, count, -1, functions) @ share[:, :, axis, :, None])[..., 0]
+        return np.asarray(value[..., 0].T)
 
 
 def grades(centre: np.ndarray, sigma: np.ndarray, inputs: np.ndarray) -> np.ndarray:
@@ -99,8 +97,7 @@ def grades(centre: np.ndarray, sigma: np.ndarray, inputs: np.ndarray) -> np.ndar
     """
     exponent = -0.5 * np.square((inputs[:, :, None] - centre[:, None]) / sigma[:, None])
     membership = np.exp(exponent - exponent.max(axis=-1, keepdims=True))
-    normalised: np.ndarray = membership / membership.sum(axis=-1, keepdims=True)
-    return normalised
+    return np.asarray(membership / membership.sum(axis=-1, keepdims=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,10 +126,10 @@ class AnfisLaw:
             raise DataError(f"ANFIS file: gravity = {self.gravity}: must be greater than 0 m/s^2")
 
     @classmethod
-    def load(cls, content: str | Mapping[str, Any]) -> AnfisLaw:
-        """Return the law from JSON text or its parsed mapping. Raises DataError that names what is wrong."""
+    def load(cls, text: str) -> AnfisLaw:
+        """Return the law from JSON text. Raises DataError that names what is wrong."""
         try:
-            content = json.loads(content) if isinstance(content, str) else content
+            content = json.loads(text)
             if content["format"] != FORMAT:
                 raise DataError(f"ANFIS file: format = {content['format']!r}: must be {FORMAT!r}")
             joints = [content["joints"][joint] for joint in JOINTS]
@@ -199,5 +196,4 @@ class AnfisLaw:
 
 def scaled(theta: np.ndarray, low: Vector, high: Vector) -> np.ndarray:
     """Return angles (n, d) in rad, scaled to -1..1 over the box from `low` to `high` (d,)."""
-    fraction: np.ndarray = (2.0 * theta - low - high) / np.subtract(high, low)
-    return fraction
+    return np.asarray((2.0 * theta - low - high) / np.subtract(high, low))

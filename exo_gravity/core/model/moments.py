@@ -13,6 +13,8 @@ their y. What lies along a joint's own axis (link 1 along y_1) needs no torque.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -62,6 +64,7 @@ def regressor(
     return np.stack([gravity_torque(arm, poses, direction) for arm in _unit_arms(gravity)], axis=-1)
 
 
+@lru_cache(4)
 def _unit_arms(gravity: float) -> list[ArmModel]:
     """Return an arm for each moment, which has that moment of 1 kg m and no other."""
     rows = np.eye(len(MOMENTS))

@@ -16,7 +16,6 @@ actual number depends on the bytes (test/core/test_bus_load.py).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from exo_gravity.core.errors import ParameterError
 
@@ -30,26 +29,13 @@ SLOW_BITRATE = 500_000  # bit/s, below which a bus is slow
 REPLY_SHARE = 0.8  # of a cycle in which replies are awaited
 
 
-class Load(NamedTuple):
-    """The load on one bus."""
-
-    bits_per_second: float
-    #: of the bit rate, 1 when the bus is full
-    share: float
-    #: cycles/s that fill the bus
-    largest_rate: float
-
-
 @dataclass(frozen=True)
 class Traffic:
     """The motors on one bus, and its bit rate. Raises ParameterError."""
 
-    #: motors of V1 and V2 boards
-    replying: int
-    #: motors of V3 boards
-    reporting: int = 0
-    #: bit/s
-    bitrate: int = BITRATE
+    replying: int  #: motors of V1 and V2 boards
+    reporting: int = 0  #: motors of V3 boards
+    bitrate: int = BITRATE  #: bit/s
 
     def __post_init__(self) -> None:
         if not isinstance(self.bitrate, int) or not 10_000 <= self.bitrate <= 1_000_000:
@@ -60,31 +46,27 @@ class Traffic:
         """Status frames a second of each V3 board on this bus."""
         return MAX_STATUS_RATE if self.bitrate >= SLOW_BITRATE else SLOW_STATUS_RATE
 
-    def load(self, rate: float, worst: bool = False) -> Load:
-        """Return the bus load of `rate` (> 0) cycles a second, for typical or for `worst` stuffing."""
+    def load(self, rate: float, worst: bool = False) -> float:
+        """Return the share of the bus that `rate` cycles a second take, for typical or for `worst` stuffing."""
         command, reply, v3_command, status = (bits[worst] for bits in (COMMAND, REPLY, V3_COMMAND, STATUS))
         cycle = self.replying * (command + reply) + self.reporting * v3_command
-        unasked = self.reporting * self.status_rate * status  # bit/s
-        used = rate * cycle + unasked
-        return Load(used, used / self.bitrate, max(0.0, self.bitrate - unasked) / cycle)
+        return (rate * cycle + self.reporting * self.status_rate * status) / self.bitrate
 
-    def check(self, rate: float) -> Load:
-        """Return the typical load of `rate`. Raises ParameterError if it exceeds the capacity of the bus."""
-        typical = self.load(rate)
-        if typical.share > 1.0:
-            motors, needed = self.replying + self.reporting, typical.bits_per_second / 1000.0
-            fits = f"at most {int(typical.largest_rate)} Hz, the capacity of the CAN bus"
+    @property
+    def largest_rate(self) -> float:
+        """Cycles/s that fill the bus, for typical stuffing."""
+        unasked = self.load(0.0)
+        return max(0.0, 1.0 - unasked) / (self.load(1.0) - unasked)
+
+    def is_crowded(self, rate: float) -> bool:
+        """Return whether replies may be late at `rate` although they fit on the bus."""
+        return self.load(rate) > REPLY_SHARE or self.load(rate, worst=True) > 1.0
+
+    def check(self, rate: float) -> None:
+        """Raise ParameterError if the typical load of `rate` exceeds the capacity of the bus."""
+        if (share := self.load(rate)) > 1.0:
+            motors, capacity = self.replying + self.reporting, self.bitrate / 1000.0
+            fits = f"at most {int(self.largest_rate)} Hz, the capacity of the CAN bus"
             raise ParameterError(
-                "rate", rate, f"{fits}: {motors} motors need {needed:.0f} kbit/s of its {self.bitrate / 1000.0:g}"
+                "rate", rate, f"{fits}: {motors} motors need {share * capacity:.0f} kbit/s of its {capacity:g}"
             )
-        return typical
-
-    def warning(self, rate: float) -> str:
-        """Return why replies may be late at `rate` although they fit on the bus, or ''."""
-        typical, worst = self.load(rate), self.load(rate, worst=True)
-        if typical.share <= REPLY_SHARE and worst.share <= 1.0:
-            return ""
-        return (
-            f"bus load {typical.share:.0%}, {worst.share:.0%} at worst: replies may be late; at most "
-            f"{int(REPLY_SHARE * typical.largest_rate)} Hz leave them time"
-        )

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.bus_load import BITRATE, Traffic
@@ -31,16 +31,11 @@ class JointMotor:
     """One motor on one joint. Raises ParameterError."""
 
     spec: MotorSpec
-    #: 1 to MAX_CAN_ID
-    can_id: int
-    #: 1 or -1: joint angle = direction * (motor angle - zero)
-    direction: int = 1
-    #: motor angle in rad at which the joint angle is 0
-    zero: float = 0.0
-    #: real output torque per commanded Nm (users report 0.75 for one AK80-9)
-    torque_scale: float = 1.0
-    #: of the motor's board
-    wire_format: WireFormat = MIT
+    can_id: int  #: 1 to MAX_CAN_ID
+    direction: int = 1  #: 1 or -1: joint angle = direction * (motor angle - zero)
+    zero: float = 0.0  #: motor angle in rad at which the joint angle is 0
+    torque_scale: float = 1.0  #: real output torque per commanded Nm (users report 0.75 for one AK80-9)
+    wire_format: WireFormat = MIT  #: of the motor's board
 
     def __post_init__(self) -> None:
         if not isinstance(self.can_id, int) or not 1 <= self.can_id <= MAX_CAN_ID:
@@ -73,17 +68,25 @@ class JointMotor:
     @property
     def command_id(self) -> int:
         """The arbitration ID of commands to this motor."""
-        return self.wire_format.command_id(self.can_id)
+        return self.wire_format.first_id + self.can_id
 
     @property
     def enter(self) -> tuple[Frame, ...]:
         """The frames that switch the motor on, before its next command."""
-        return self.wire_format.enter(self.can_id)
+        return self._own(self.wire_format.on)
 
     @property
     def exit(self) -> tuple[Frame, ...]:
         """The frames that switch the motor off."""
-        return self.wire_format.exit(self.can_id)
+        return self._own(self.wire_format.off)
+
+    @property
+    def set_zero(self) -> tuple[Frame, ...]:
+        """The frames that make the motor's present angle zero; none if its board has no such frame."""
+        return self._own(self.wire_format.zero)
+
+    def _own(self, frames: Sequence[Frame]) -> tuple[Frame, ...]:
+        return tuple((first + self.can_id, data) for first, data in frames)
 
     def command(self, effort: float, damping: float, stiffness: float = 0.0, position: float = 0.0) -> bytes:
         """Return the data of a command: a joint `effort` in Nm and `damping` in Nm s/rad, clamped to the wire format.
@@ -114,20 +117,6 @@ class JointMotor:
     def motor_position(self, joint_position: float) -> float:
         """Return the motor angle in rad for a joint angle in rad."""
         return self.direction * joint_position + self.zero
-
-
-class Peaks(NamedTuple):
-    """The most that the motors of an arm apply at its joints."""
-
-    #: (4,) Nm
-    effort: tuple[float, ...]
-    #: (4,) Nm s/rad
-    damping: tuple[float, ...] = (math.inf,) * 4
-
-
-def peaks_of(motors: Sequence[JointMotor]) -> Peaks:
-    """Return what `motors` apply at most."""
-    return Peaks(tuple(motor.peak_effort for motor in motors), tuple(motor.peak_damping for motor in motors))
 
 
 # fmt: off
@@ -172,9 +161,8 @@ def _motor_of(given: Mapping[str, Any]) -> JointMotor:
         own = getattr(usual, name)
         if given[name] == getattr(plain, name) != own:
             raise ParameterError(name, given[name], f"{own:g} or 0 for an {plain.name} with wire_format = {board.name}")
-    ranges = (given[name] or getattr(usual, name) for name in ("velocity_range", "torque_range"))
-    per_ampere = given["torque_per_ampere"] or usual.torque_per_ampere
-    spec = replace(usual.with_ranges(*ranges), torque_per_ampere=per_ampere)
+    own_ranges = ("velocity_range", "torque_range", "torque_per_ampere")
+    spec = replace(usual, **{name: given[name] for name in own_ranges if given[name]})
     return JointMotor(spec, given["can_id"], given["direction"], given["zero"], given["torque_scale"], board)
 
 

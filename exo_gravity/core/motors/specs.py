@@ -15,7 +15,7 @@ code is exactly 0 Nm.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -42,7 +42,10 @@ MOTOR_ERRORS = {
 
 @dataclass(frozen=True)
 class MotorSpec:
-    """A motor type: the ranges of its wire format, which are not physical limits, and its physical limits."""
+    """A motor type: the ranges of its wire format, which are not physical limits, and its physical limits.
+
+    No CAN message reports the ranges; some firmware has others. Raises ParameterError.
+    """
 
     name: str
     #: rad/s, Nm: the wire range is +- this value
@@ -51,17 +54,17 @@ class MotorSpec:
     #: Nm at the output
     rated_torque: float
     peak_torque: float
-    #: turns of the motor per turn of the output
-    gear_ratio: int
-    #: of the motor
-    pole_pairs: int
-    #: Nm at the output, rated torque by rated current; only V3 boards report a current
-    torque_per_ampere: float
-    #: rad: the wire range is +- this value
-    position_range: float = 12.5
+    gear_ratio: int  #: turns of the motor per turn of the output
+    pole_pairs: int  #: of the motor
+    torque_per_ampere: float  #: Nm at the output, rated torque by rated current; only V3 boards report a current
+    position_range: float = 12.5  #: rad: the wire range is +- this value
     #: Nm/rad, Nm s/rad: the wire range starts at 0
     kp_max: float = 500.0
     kd_max: float = 5.0
+
+    def __post_init__(self) -> None:
+        for name in ("velocity_range", "torque_range"):
+            one_float(name, getattr(self, name), *WIRE_RANGE_BOUNDS)
 
     @cached_property
     def fields(self) -> dict[str, tuple[float, float, int, float, float]]:
@@ -81,14 +84,6 @@ class MotorSpec:
     def standstill(self) -> float:
         """The velocity in rad/s that the motor decodes from a command of 0 rad/s."""
         return unpack_fields(self, pack_fields(self, velocity=0.0), "velocity")[0]
-
-    def with_ranges(self, velocity_range: float, torque_range: float) -> MotorSpec:
-        """Return this motor with another firmware's wire ranges in rad/s and Nm, which no CAN message reports."""
-        return replace(
-            self,
-            velocity_range=one_float("velocity_range", velocity_range, *WIRE_RANGE_BOUNDS),
-            torque_range=one_float("torque_range", torque_range, *WIRE_RANGE_BOUNDS),
-        )
 
 
 MOTORS = {
@@ -111,16 +106,11 @@ class MotorReply(NamedTuple):
     """The content of a reply."""
 
     motor_id: int
-    #: rad
-    position: float
-    #: rad/s
-    velocity: float
-    #: Nm
-    torque: float
-    #: degC, None from firmware that replies with 6 bytes
-    temperature: int | None
-    #: a code of MOTOR_ERRORS, None from firmware that replies with 6 bytes
-    error: int | None
+    position: float  #: rad
+    velocity: float  #: rad/s
+    torque: float  #: Nm
+    temperature: int | None  #: degC, None from firmware that replies with 6 bytes
+    error: int | None  #: a code of MOTOR_ERRORS, None from firmware that replies with 6 bytes
 
 
 def pack_command(spec: MotorSpec, position: float, velocity: float, kp: float, kd: float, torque: float) -> bytes:

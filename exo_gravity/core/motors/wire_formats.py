@@ -56,43 +56,19 @@ class WireFormat:
     The arbitration IDs of the fields are those of motor 0: a motor adds its own ID.
     """
 
-    #: the value of the parameter `wire_format`
-    name: str = "mit"
+    name: str = "mit"  #: the value of the parameter `wire_format`
     #: whether a motor replies to each command, and only then; if not, it sends its state on its own timer
     replies: bool = True
-    #: of commands
-    first_id: int = 0
+    first_id: int = 0  #: of commands
     #: frames that switch a motor on, before its first command; none if the command itself does
     on: tuple[Frame, ...] = ((0, ENTER),)
-    #: frames that switch a motor off
-    off: tuple[Frame, ...] = ((0, EXIT),)
+    off: tuple[Frame, ...] = ((0, EXIT),)  #: frames that switch a motor off
     #: frames that make the present angle zero; none if the board has no such frame
     zero: tuple[Frame, ...] = ((0, SET_ZERO),)
-
-    @property
-    def is_extended(self) -> bool:
-        """Whether the arbitration IDs have 29 bits."""
-        return self.first_id >= EXTENDED
 
     def ranged(self, spec: MotorSpec) -> MotorSpec:
         """Return the motor with the usual ranges of this format."""
         return spec
-
-    def command_id(self, motor_id: int) -> int:
-        """Return the arbitration ID of commands to a motor."""
-        return self.first_id + motor_id
-
-    def enter(self, motor_id: int) -> tuple[Frame, ...]:
-        """Return the frames that switch a motor on."""
-        return tuple((first + motor_id, data) for first, data in self.on)
-
-    def exit(self, motor_id: int) -> tuple[Frame, ...]:
-        """Return the frames that switch a motor off."""
-        return tuple((first + motor_id, data) for first, data in self.off)
-
-    def set_zero(self, motor_id: int) -> tuple[Frame, ...]:
-        """Return the frames that make the present angle zero."""
-        return tuple((first + motor_id, data) for first, data in self.zero)
 
     # Data of a command, as in `core.motors.specs`.
     pack_command = staticmethod(specs.pack_command)
@@ -109,7 +85,7 @@ class WireFormat:
     def classify(self, frame_id: int, data: bytes | bytearray, motor_ids: frozenset[int]) -> tuple[str, int]:
         """Return what a frame is, REPLY, COMMAND or OTHER, and the ID of the motor in `motor_ids`, 0 for none.
 
-        The frame's ID has `is_extended` bits. The first byte of a command is never its motor's ID.
+        The first byte of a command is never its motor's ID.
         """
         length = len(data)
         if length in (6, 8) and data[0] in motor_ids and frame_id in (MASTER_ID, data[0]):
@@ -133,7 +109,7 @@ class V3Format(WireFormat):
 
     @staticmethod
     def pack_command(spec: MotorSpec, position: float, velocity: float, kp: float, kd: float, torque: float) -> bytes:
-        """Return the 8 bytes of a command: kp, kd, position, velocity, torque."""
+        """Return the data of a command."""
         word = specs.pack_fields(spec, kp=kp, kd=kd, position=position, velocity=velocity, torque=torque)
         return word.to_bytes(8, "big")
 
@@ -147,7 +123,7 @@ class V3Format(WireFormat):
         return MotorCommand(position, velocity, kp, kd, torque)
 
     def pack_reply(self, spec: MotorSpec, reply: MotorReply) -> bytes:
-        """Return the 8 bytes of a status frame. Raises ParameterError for a value beyond its range."""
+        """Return the data of a status frame. Raises ParameterError."""
         numbers = []
         for name, value, step in zip(MotorReply._fields[1:4], reply[1:4], _steps(spec), strict=True):
             limit = 0x7FFF * step
@@ -165,7 +141,7 @@ class V3Format(WireFormat):
         return MotorReply(motor_id, position * steps[0], speed * steps[1], current * steps[2], temperature, error)
 
     def classify(self, frame_id: int, data: bytes | bytearray, motor_ids: frozenset[int]) -> tuple[str, int]:
-        """Return what a frame with a 29-bit ID is; a frame of any control mode is a command."""
+        """Return what a frame is: one of any control mode is a command."""
         motor_id, kind = frame_id & 0xFF, (frame_id & ID_BITS) >> 8
         if motor_id not in motor_ids:
             return OTHER, 0

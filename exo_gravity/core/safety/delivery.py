@@ -99,27 +99,21 @@ class MotorLoad:
     def __init__(self, rated: Sequence[float]) -> None:
         self._rated = tuple(rated)
         self._mean_square = [0.0] * len(self._rated)  # Nm^2
-        self._time: float | None = None
-        self.power: tuple[float, ...] = (0.0,) * len(self._rated)
+        self._time = math.inf
 
-    def update(self, now: float, joints: Sequence[JointSample]) -> None:
-        """Add the readings `joints` (n,), the newest at `now` s. Ten a second are enough.
+    def update(self, now: float, joints: Sequence[JointSample]) -> list[tuple[float, float, float]]:
+        """Add the readings `joints` (n,), the newest at `now` s, and return three figures of each motor.
 
-        A motor that never replied adds nothing. `power` is then torque times speed in W, > 0 where the motor drives.
+        They are power (W, > 0 where the motor drives), RMS torque (Nm), and its share of rated torque: above 1 the
+        motor overheats if the load stays. Ten a second are enough. A motor that never replied adds nothing.
         """
-        share = 0.0 if self._time is None else -math.expm1(-max(0.0, now - self._time) / THERMAL_TIME)
+        share = -math.expm1(-max(0.0, now - self._time) / THERMAL_TIME)
         self._time = now
-        self.power = tuple(0.0 if joint.time == -math.inf else joint.effort * joint.velocity for joint in joints)
+        loads = []
         for i, joint in enumerate(joints):
             if joint.time > -math.inf:
                 self._mean_square[i] += share * (joint.effort**2 - self._mean_square[i])
-
-    @property
-    def rms(self) -> tuple[float, ...]:
-        """RMS torque (n,) in Nm."""
-        return tuple(map(math.sqrt, self._mean_square))
-
-    @property
-    def share(self) -> tuple[float, ...]:
-        """RMS torque (n,) as a share of rated torque; above 1 the motor overheats if the load stays."""
-        return tuple(rms / rated for rms, rated in zip(self.rms, self._rated, strict=True))
+            power = joint.effort * joint.velocity if joint.time > -math.inf else 0.0
+            rms = math.sqrt(self._mean_square[i])
+            loads.append((power, rms, rms / self._rated[i]))
+        return loads

@@ -62,61 +62,49 @@ class JointDescent:
     """
 
     def __init__(self, effort: float, damping: float, max_effort: float) -> None:
-        self.effort = self._carried = effort
-        self.damping = damping
-        self._most = max(max_effort, abs(effort))
-        self._fade_rate = _rate_to_fade(effort)
-        self._is_rising = True  # the damping has not yet reached DAMPING
-        self._speed = DESCENT_SPEED
-        self._direction = 0.0
+        self._carried, self._most = 0.0, max_effort
+        self._speed, self._direction = DESCENT_SPEED, 0.0
+        self.restart(effort, damping)
 
     @property
     def is_down(self) -> bool:
         """Whether neither torque nor damping holds the joint."""
         return self.effort == 0.0 and self.damping <= FREE_DAMPING
 
-    def restart(self, effort: float) -> None:
+    def restart(self, effort: float, damping: float = 0.0) -> None:
         """Continue from `effort` (Nm), which the motor is found to apply after a silence, without damping."""
-        self.effort = effort
+        self.effort, self.damping = effort, damping
         self._carried = max(self._carried, effort, key=abs)
         self._most = max(self._most, abs(effort))
-        self.damping = 0.0
-        self._fade_rate = _rate_to_fade(effort)
-        self._is_rising = True
+        self._fade_rate = min(MAX_EFFORT_RATE, max(MIN_FADE_RATE, abs(effort) / FADE_TIME))
+        self._is_rising = True  # the damping has not yet reached DAMPING
 
     def step(self, dt: float, velocity: float) -> None:
         """Advance by `dt` s with the joint's `velocity` in rad/s; NaN is taken as 0."""
         if not math.isfinite(velocity):
             velocity = 0.0
-        self._limit_swing(dt, velocity)
-        speed, excess = abs(velocity), max(0.0, abs(velocity) - self._speed)
-        if self.effort * velocity > 0.0 and speed > DRIVEN_SPEED:
-            self._approach(0.0, RELEASE_GAIN * (speed - DRIVEN_SPEED), dt)
-        elif excess and self._carried * velocity < 0.0:
-            self._brake(excess, dt)
-        else:
-            self._approach(0.0, self._fade_rate, dt)
-        self._step_damping(dt, excess)
-
-    def _brake(self, excess: float, dt: float) -> None:
-        """Let the torque grow against a joint that sinks by `excess` rad/s too fast."""
-        if abs(self.effort) < abs(self._carried):
-            self._approach(self._carried, BRAKE_GAIN * excess, dt)
-        elif abs(self.effort) < self._most:
-            rate = min(BRAKE_GROWTH, BRAKE_GAIN * excess)
-            self._approach(math.copysign(self._most, self._carried), rate, dt)
-
-    def _approach(self, effort: float, rate: float, dt: float) -> None:
-        """Bring the torque nearer to `effort` (Nm), by at most `rate` (Nm/s)."""
-        most = min(MAX_EFFORT_RATE, rate) * dt
-        self.effort += max(-most, min(most, effort - self.effort))
-
-    def _limit_swing(self, dt: float, velocity: float) -> None:
         self._speed += (DESCENT_SPEED - self._speed) * dt / SPEED_RECOVERY
         if abs(velocity) > SWING_SPEED:
             if velocity * self._direction < 0.0:
                 self._speed = max(MIN_SPEED, 0.5 * self._speed)
             self._direction = math.copysign(1.0, velocity)
+        speed, excess = abs(velocity), max(0.0, abs(velocity) - self._speed)
+        if self.effort * velocity > 0.0 and speed > DRIVEN_SPEED:
+            self._approach(0.0, RELEASE_GAIN * (speed - DRIVEN_SPEED), dt)
+        elif excess and self._carried * velocity < 0.0:
+            if abs(self.effort) < abs(self._carried):
+                self._approach(self._carried, BRAKE_GAIN * excess, dt)
+            elif abs(self.effort) < self._most:
+                rate = min(BRAKE_GROWTH, BRAKE_GAIN * excess)
+                self._approach(math.copysign(self._most, self._carried), rate, dt)
+        else:
+            self._approach(0.0, self._fade_rate, dt)
+        self._step_damping(dt, excess)
+
+    def _approach(self, effort: float, rate: float, dt: float) -> None:
+        """Bring the torque nearer to `effort` (Nm), by at most `rate` (Nm/s)."""
+        most = min(MAX_EFFORT_RATE, rate) * dt
+        self.effort += max(-most, min(most, effort - self.effort))
 
     def _step_damping(self, dt: float, excess: float) -> None:
         if self._is_rising:
@@ -129,10 +117,6 @@ class JointDescent:
             self.damping *= math.exp(-dt / DAMPING_FADE)
             if self.damping < MIN_DAMPING:
                 self.damping = 0.0
-
-
-def _rate_to_fade(effort: float) -> float:
-    return min(MAX_EFFORT_RATE, max(MIN_FADE_RATE, abs(effort) / FADE_TIME))
 
 
 class ArmDescent:
@@ -189,19 +173,11 @@ class RestTracker:
 
     def step(self, now: float, joints: Sequence[JointSample], silent: Sequence[bool]) -> None:
         """Take the newest readings at `now` (s); silent: (4,) whose motor does not reply."""
-        moved = (
-            not is_silent and not abs(joint.position - reference.position) <= SETTLED
-            for joint, reference, is_silent in zip(joints, self._reference, silent, strict=True)
-        )
-        if any(moved):
+        columns = zip(joints, self._reference, silent, strict=True)
+        if any(
+            not is_silent and not abs(joint.position - last.position) <= SETTLED for joint, last, is_silent in columns
+        ):
             self.since, self._reference = now, joints
-        if not any(silent):
-            return
-        # A silent joint may have moved by the time it replies again.
-        self._reference = [
-            UNKNOWN if is_silent else reference for reference, is_silent in zip(self._reference, silent, strict=True)
-        ]
-
-    def is_settled(self, now: float) -> bool:
-        """Return whether no replying joint has moved for SETTLING_TIME."""
-        return now - self.since >= SETTLING_TIME
+        if any(silent):  # a silent joint may have moved by the time it replies again
+            known = zip(self._reference, silent, strict=True)
+            self._reference = [UNKNOWN if is_silent else last for last, is_silent in known]

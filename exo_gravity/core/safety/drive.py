@@ -5,7 +5,8 @@ Every fault has a code for programs and a sentence for people.
 
 from __future__ import annotations
 
-import operator
+import math
+from collections.abc import Sequence
 from enum import Enum
 from typing import NamedTuple
 
@@ -28,28 +29,37 @@ class State(str, Enum):
 CARRYING = (State.PROVING, State.RAMPING_IN, State.ACTIVE)
 
 
+class EffortCommand(NamedTuple):
+    """What the motors are asked to apply."""
+
+    effort: Sequence[float] | None  #: (4,) Nm, or None to withdraw.
+    answered: float  #: s, when the joint states that it answers were taken.
+    damped: bool = False  #: whether the load is changing, so that the motors are to damp the joints.
+    held: bool = False  #: Whether it is computed from a tilt that is late.
+
+
+NO_COMMAND = EffortCommand(None, -math.inf)
+
+
 class Drive(NamedTuple):
     """What the motors receive in one cycle."""
 
-    #: (4,) Nm
-    effort: tuple[float, ...]
-    #: (4,) Nm s/rad
-    damping: tuple[float, ...]
-    #: whether the motors are to be on
-    powered: bool
+    effort: tuple[float, ...]  #: (4,) Nm
+    damping: tuple[float, ...]  #: (4,) Nm s/rad
+    powered: bool  #: whether the motors are to be on
     #: (4,) which motors must be switched on again, because they are found off
     enter: tuple[bool, ...] = (False, False, False, False)
     #: (4,) which motors may be on or off: they are sent nothing that could switch them on
     unsure: tuple[bool, ...] = (False, False, False, False)
 
-    def within(self, peak_damping: tuple[float, ...]) -> Drive:
-        """Return the drive with no more damping than `peak_damping` (4,) Nm s/rad."""
-        if not any(map(operator.gt, self.damping, peak_damping)):
-            return self
-        return self._replace(damping=tuple(map(min, self.damping, peak_damping)))
-
 
 OFF = Drive(NOTHING, NOTHING, False)
+
+
+# After a fault, zeros and signs are checked again: an encoder may have lost its turn count, or a motor its power.
+RECHECK = "recheck"
+# After a fault, the operator may carry on at once: a computer, bus or network was late; nothing needs mending.
+RESUME = "resume"
 
 
 class FaultCode(str, Enum):
@@ -59,33 +69,35 @@ class FaultCode(str, Enum):
     """
 
     meaning: str
+    casts_doubt: bool
+    is_no_ones: bool
 
-    def __new__(cls, value: str, meaning: str) -> FaultCode:
-        """Create a code from its text and its meaning."""
+    def __new__(cls, value: str, meaning: str, then: str = "") -> FaultCode:
+        """Create a code from its text, its meaning and what follows."""
         code = str.__new__(cls, value)
-        code._value_ = value
-        code.meaning = meaning
+        code._value_, code.meaning = value, meaning
+        code.casts_doubt, code.is_no_ones = then == RECHECK, then == RESUME
         return code
 
     def __str__(self) -> str:
         return str(self.value)
 
     # The motors
-    MOTOR_SILENT = "motor_silent", "a motor has not replied within `reply_timeout`, nor in 7 cycles"
-    MOTOR_ERROR = "motor_error", "a motor reports an error"
+    MOTOR_SILENT = "motor_silent", "a motor has not replied within `reply_timeout`, nor in 7 cycles", RESUME
+    MOTOR_ERROR = "motor_error", "a motor reports an error", RECHECK
     OVER_TEMPERATURE = "over_temperature", "a motor is hotter than 80 degC"
-    TORQUE_NOT_DELIVERED = "torque_not_delivered", "a motor's reply shows another torque than the commanded one"
+    TORQUE_NOT_DELIVERED = "torque_not_delivered", "a motor's reply shows another torque than commanded", RECHECK
     # The motion
     OVER_SPEED = "over_speed", "a joint turns faster than `max_velocity`"
     OUTSIDE_LIMITS = "outside_limits", "a joint is more than 0.1 rad beyond `position_min` or `position_max`"
-    POSITION_JUMP = "position_jump", "an angle changed by 0.05 rad more than `max_velocity` allows"
+    POSITION_JUMP = "position_jump", "an angle changed by 0.05 rad more than `max_velocity` allows", RECHECK
     # The start gate
-    IMPLAUSIBLE_ZERO = "implausible_zero", "a joint is over 0.5 rad (AK80-9: 0.34 rad) from 0 at the first start"
+    IMPLAUSIBLE_ZERO = "implausible_zero", "a joint is over 0.5 rad (AK80-9: 0.34) from 0 at the first start", RECHECK
     WRONG_SIGN = "wrong_sign", "a joint moved against a small test torque at the first start"
     SIGN_UNPROVEN = "sign_unproven", "a joint did not move under a small test torque at the first start"
     # The efforts
-    COMMAND_STALE = "command_stale", "no effort command answers a joint state younger than `command_timeout`"
-    COMMAND_WITHDRAWN = "command_withdrawn", "the compensator withdrew its efforts; its diagnostics give the reason"
+    COMMAND_STALE = "command_stale", "no effort command answers a joint state younger than `command_timeout`", RESUME
+    COMMAND_WITHDRAWN = "command_withdrawn", "the compensator withdrew its efforts; its diagnostics say why", RESUME
     COMMAND_IMPOSSIBLE = "command_impossible", "an effort is NaN, beyond 40 Nm, misnamed or missing"
     UNEXPLAINED_TORQUE = (
         "unexplained_torque",
@@ -93,35 +105,12 @@ class FaultCode(str, Enum):
     )
     SECOND_COMMANDER = "second_commander", "two publishers send effort commands"
     # The operator
-    CONTROL_LOST = "control_lost", "who held control of the arm has not renewed it for 1 s"
+    CONTROL_LOST = "control_lost", "who held control of the arm has not renewed it for 1 s", RESUME
     # The bus and the computer
-    FOREIGN_COMMAND = "foreign_command", "another sender commands a motor of this arm"
-    BUS_ERROR = "bus_error", "the CAN bus cannot be opened, or sending or receiving failed"
+    FOREIGN_COMMAND = "foreign_command", "another sender commands a motor of this arm", RECHECK
+    BUS_ERROR = "bus_error", "the CAN bus cannot be opened, or sending or receiving failed", RESUME
     WATCHDOG_DEAD = "watchdog_dead", "the watchdog process has died"
     INTERNAL_ERROR = "internal_error", "the control loop raised an unexpected exception"
-
-
-# After these faults zeros and signs are checked again: an encoder may have lost its turn count, or a motor its power.
-DOUBTFUL = frozenset(
-    {
-        FaultCode.MOTOR_ERROR,
-        FaultCode.TORQUE_NOT_DELIVERED,
-        FaultCode.POSITION_JUMP,
-        FaultCode.IMPLAUSIBLE_ZERO,
-        FaultCode.FOREIGN_COMMAND,
-    }
-)
-
-# After these the operator may carry on at once (`resume`): a computer, bus or network was late; nothing needs mending.
-NO_ONES = frozenset(
-    {
-        FaultCode.COMMAND_STALE,
-        FaultCode.COMMAND_WITHDRAWN,
-        FaultCode.MOTOR_SILENT,
-        FaultCode.BUS_ERROR,
-        FaultCode.CONTROL_LOST,
-    }
-)
 
 
 class Fault(NamedTuple):

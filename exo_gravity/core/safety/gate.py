@@ -1,16 +1,17 @@
 """The start gate: what must hold before the motors of an arm are switched on, and before they carry it.
 
-`StartGate` waits until, for CALM seconds, every motor has replied without a fault, at rest and within its limits, and
-fresh efforts have arrived. `SwitchOnCheck` then checks that the motors are on, and `SignCheck` that their signs are
-right.
+The machine waits until, for CALM seconds, every motor has replied without a fault, at rest and within its limits
+(`missing_for_a_start`), and fresh efforts have arrived. `SwitchOnCheck` then checks that the motors are on, and
+`SignCheck` that their signs are right.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Generator, Iterator, Sequence
 
-from exo_gravity.core.safety.drive import Fault, FaultCode
+from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.safety.drive import NOTHING, Fault, FaultCode
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, JointSample, Limits
 
 AT_REST = 0.1  # rad/s; two to four codes of the 12-bit velocity
@@ -35,58 +36,28 @@ REST_TIMEOUT = 5.0  # s for the joint to come to rest
 MAX_DISTURBED = 5  # times that a joint may move without a push
 
 
-class StartGate:
-    """Waits for the conditions of a start. waiting_for: the condition that is not met; passed: whether all were.
+def missing_for_a_start(
+    limits: Limits, joints: Sequence[JointSample], fault: Fault | None, zeros_are_trusted: bool
+) -> Fault | str:
+    """Return the fault that refuses a start, or what the motors' readings `joints` lack for it, '' for nothing.
 
-    hindrance: what else must end first, set by the caller; '' for nothing.
+    fault: what the readings show.
     """
-
-    def __init__(self, limits: Limits, now: float) -> None:
-        self.waiting_for = "the first replies of the motors"
-        self.hindrance = ""
-        self.passed = False
-        self._limits = limits
-        self._calm_since = now
-
-    def step(
-        self,
-        now: float,
-        joints: Sequence[JointSample],
-        fault: Fault | None,
-        efforts_are_fresh: bool,
-        zeros_are_trusted: bool,
-    ) -> Fault | None:
-        """Check the newest readings at `now` (s), and the `fault` that they show; return one that refuses the start."""
-        outside = self._outside(joints)
-        if not fault and not outside and not zeros_are_trusted:
-            fault = self._limits.find_wrong_zero(joints)
-        if fault and fault.code not in WAITED_OUT:
-            return fault
-        if fault and fault.code is not FaultCode.OUTSIDE_LIMITS:
-            self.waiting_for = fault.reason
-        elif outside:
-            self.waiting_for = outside
-        elif any(abs(joint.velocity) > AT_REST for joint in joints):
-            self.waiting_for = "the arm to be at rest"
-        elif self.hindrance:
-            self.waiting_for = self.hindrance
-        elif not efforts_are_fresh:
-            self.waiting_for = "effort commands"
-        else:
-            self.waiting_for = f"{CALM:g} s without a fault"
-            self.passed = now - self._calm_since >= CALM
-            return None
-        self._calm_since = now
-        return None
-
-    def _outside(self, joints: Sequence[JointSample]) -> str:
-        """Return which joint must be moved, how far and which way to be within its limits, or ''."""
-        limits = self._limits
-        columns = (limits.joint_names, joints, limits.position_min, limits.position_max)
-        for name, joint, low, high in zip(*columns, strict=True):
-            if excess := joint.position - max(low, min(high, joint.position)):
-                return f"{name} to be moved by {-excess:+.2f} rad, within its limits {low:g} to {high:g}"
-        return ""
+    columns = zip(limits.joint_names, joints, limits.position_min, limits.position_max, strict=True)
+    outside = [
+        f"{name} to be moved by {-excess:+.2f} rad, within its limits {low:g} to {high:g}"
+        for name, joint, low, high in columns
+        if (excess := joint.position - max(low, min(high, joint.position)))
+    ]
+    if not fault and not outside and not zeros_are_trusted:
+        fault = limits.find_wrong_zero(joints)
+    if fault and fault.code not in WAITED_OUT:
+        return fault
+    if fault and fault.code is not FaultCode.OUTSIDE_LIMITS:
+        return fault.reason
+    if outside:
+        return outside[0]
+    return "the arm to be at rest" if any(abs(joint.velocity) > AT_REST for joint in joints) else ""
 
 
 class SwitchOnCheck:
@@ -103,17 +74,13 @@ class SwitchOnCheck:
         self.done = False
         self._names = limits.joint_names
         self._torque = [min(TEST_TORQUE, most) for most in limits.max_effort]
-        count = len(self._torque)
-        self.effort, self.enter = [0.0] * count, [False] * count
-        self._last_time = [-math.inf] * count
-        self._commanded = [0.0] * count  # Nm, as the replies show it
-        self._is_on = [False] * count
+        self.effort, self.enter = list(NOTHING), [False] * JOINT_COUNT
+        self._last_time = [-math.inf] * JOINT_COUNT
+        self._commanded = list(NOTHING)  # Nm, as the replies show it
+        self._products = list(NOTHING)  # of replied and commanded torque, summed since the last pair of pushes
+        self._squares = list(NOTHING)  # of commanded torque
+        self._is_on = [False] * JOINT_COUNT
         self._elapsed, self._pushes = 0.0, 0
-        self._begin()
-
-    def _begin(self) -> None:
-        self._products = [0.0] * len(self._torque)  # of replied and commanded torque, summed
-        self._squares = [0.0] * len(self._torque)  # of commanded torque
 
     def step(self, dt: float, joints: Sequence[JointSample], damping: Sequence[float]) -> Fault | None:
         """Advance by `dt` s with the replies to the last commands; return the fault that they show, if any.
@@ -149,7 +116,7 @@ class SwitchOnCheck:
             if self.enter[i] and self._elapsed >= TEST_TIMEOUT - 1e-9:
                 reason = f"{name}: the motor did not switch on: {share * 100:.0f} % of the commanded torque replied"
                 return Fault(FaultCode.TORQUE_NOT_DELIVERED, reason)
-        self._begin()
+        self._products, self._squares = list(NOTHING), list(NOTHING)
         return None
 
 
@@ -168,85 +135,72 @@ class SignCheck:
 
     def __init__(self, names: Sequence[str], torque: Sequence[float]) -> None:
         self.effort = [0.0] * len(names)
-        self.done = False
+        self.done = not any(torque)
         self.hint = ""
         self._names = names
-        self._torque = torque
-        self._joint = -1
-        self._sign = 1  # of the push; 0 once both pushes have passed
-        self._start = math.inf  # where the joint was before the push, rad
-        self._next_joint()
+        self._dt = 0.0
+        self._position = [math.nan] * len(names)  # rad
+        self._course = self._check_all(torque)
 
     def step(self, dt: float, joints: Sequence[JointSample]) -> Fault | None:
         """Advance by `dt` s with the joints' readings, until `done`; return the fault that they show, if any."""
-        position = joints[self._joint].position
-        if self._still_time < STILL_TIME:
-            self._release(dt)
-            return self._wait_for_rest(dt, position)
-        if self._sign == 0:  # both pushes have passed
-            if self._release(dt):
-                self._next_joint()
-            return None
-        return self._push(dt, position)
+        self._dt, self._position = dt, [joint.position for joint in joints]
+        return next(self._course, None)
 
-    def _push(self, dt: float, position: float) -> Fault | None:
-        push, most = self.effort[self._joint], self._torque[self._joint]
-        moved = self._sign * (position - self._start)
-        if moved >= MOVED or moved <= -MOVED:
-            if self._sign * push < MIN_PUSH:
-                return self._restart()
+    # Each of these yields once a step: a fault, or None.
+
+    def _check_all(self, torque: Sequence[float]) -> Iterator[Fault | None]:
+        for i, most in enumerate(torque):
+            if not most:
+                continue
+            for _ in range(MAX_DISTURBED + 1):
+                yield from self._wait_for_rest(i)
+                if (yield from self._push_both_ways(i, most)):
+                    break
+                self.hint = f"{self._names[i]} moves without being pushed: hold still"
+            else:
+                yield self._fault(i, "it moves without being pushed: hold still and let it hang")
+            while self.effort[i]:
+                self._approach(i, 0.0, FALL)
+                yield None
+            self.hint = ""
+        self.done = True
+
+    def _wait_for_rest(self, i: int) -> Iterator[Fault | None]:
+        start, still, waited = math.inf, 0.0, 0.0
+        while still < STILL_TIME:
+            self._approach(i, 0.0, FALL)
+            still, waited = still + self._dt, waited + self._dt
+            if not abs(self._position[i] - start) <= STILL or self.effort[i] != 0.0:
+                start, still = self._position[i], 0.0
+            is_late = waited > REST_TIMEOUT and still < STILL_TIME
+            yield self._fault(i, "it does not come to rest: hold still and let it hang") if is_late else None
+
+    def _push_both_ways(self, i: int, most: float) -> Generator[Fault | None, None, bool]:
+        """Return whether the joint moved under a push each way, False if it moved without one."""
+        for sign in (1.0, -1.0):
+            start, waited = self._position[i], 0.0
+            while not abs(moved := sign * (self._position[i] - start)) >= MOVED:
+                push = self.effort[i]
+                if abs(push) >= most and waited > PUSH_TIMEOUT:
+                    yield self._fault(i, f"{push:.2f} Nm did not move it: let it hang freely")
+                waited += self._dt if abs(push) >= most else 0.0
+                start = self._position[i] if push * sign <= 0.0 else start
+                # A push in the old direction is released faster than a new one is built up.
+                self._approach(i, sign * most, FALL if push * sign < 0.0 else RISE)
+                yield None
+            push = self.effort[i]
+            if sign * push < MIN_PUSH:
+                return False
             if moved < 0.0:
                 reason = f"{push:.2f} Nm moved it backwards: torque or encoder is reversed"
-                return self._fault(FaultCode.WRONG_SIGN, reason)
-            self._sign = {1: -1, -1: 0}[self._sign]  # the push the other way, or the end of this joint
-            self._start, self._waited = position, 0.0
-        elif abs(push) >= most and self._waited > PUSH_TIMEOUT:
-            return self._fault(FaultCode.SIGN_UNPROVEN, f"{push:.2f} Nm did not move it: let it hang freely")
-        else:
-            self._waited += dt if abs(push) >= most else 0.0
-            # A push in the old direction is released faster than a new one is built up.
-            step = (FALL if push * self._sign < 0.0 else RISE) * dt
-            self.effort[self._joint] = max(-most, min(most, push + self._sign * step))
-            if push * self._sign <= 0.0:
-                self._start = position
-        return None
+                yield self._fault(i, reason, FaultCode.WRONG_SIGN)
+        return True
 
-    def _restart(self) -> Fault | None:
-        self._disturbed += 1
-        if self._disturbed > MAX_DISTURBED:
-            return self._fault(FaultCode.SIGN_UNPROVEN, "it moves without being pushed: hold still and let it hang")
-        self.hint = f"{self._names[self._joint]} moves without being pushed: hold still"
-        self._start_joint()
-        return None
+    def _approach(self, i: int, effort: float, rate: float) -> None:
+        """Bring the push on joint `i` nearer to `effort` (Nm), by at most `rate` (Nm/s)."""
+        step = rate * self._dt
+        self.effort[i] += max(-step, min(step, effort - self.effort[i]))
 
-    def _next_joint(self) -> None:
-        self._joint += 1
-        while self._joint < len(self._names) and not self._torque[self._joint]:
-            self._joint += 1
-        self.done = self._joint == len(self._names)
-        self._disturbed, self.hint = 0, ""
-        self._start_joint()
-
-    def _start_joint(self) -> None:
-        self._start, self._sign = math.inf, 1
-        self._still_time = self._waited = 0.0
-
-    def _release(self, dt: float) -> bool:
-        """Take back the push on the present joint; return whether it is gone."""
-        push, step = self.effort[self._joint], FALL * dt
-        self.effort[self._joint] = push - max(-step, min(step, push))
-        return push == 0.0
-
-    def _wait_for_rest(self, dt: float, position: float) -> Fault | None:
-        self._still_time += dt
-        self._waited += dt
-        if not abs(position - self._start) <= STILL or self.effort[self._joint] != 0.0:
-            self._start, self._still_time = position, 0.0
-        if self._still_time >= STILL_TIME:
-            self._waited = 0.0
-        elif self._waited > REST_TIMEOUT:
-            return self._fault(FaultCode.SIGN_UNPROVEN, "it does not come to rest: hold still and let it hang")
-        return None
-
-    def _fault(self, code: FaultCode, reason: str) -> Fault:
-        return Fault(code, f"{self._names[self._joint]}: {reason}")
+    def _fault(self, i: int, reason: str, code: FaultCode = FaultCode.SIGN_UNPROVEN) -> Fault:
+        return Fault(code, f"{self._names[i]}: {reason}")

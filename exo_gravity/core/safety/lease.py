@@ -29,18 +29,20 @@ class Lease:
     def request(self, now: float, name: str, kind: str) -> str:
         """Do what `name` asks for: `kind` is hold, take or release. Return a sentence for the log if it is news."""
         if not (name.isprintable() and 0 < len(name) <= LONGEST_NAME) or kind not in ("hold", "take", "release"):
-            return self._refusal("?", f"control: needs a name of 1 to {LONGEST_NAME} letters and hold, take or release")
-        if kind == "release":
+            name, refusal = "?", f"control: needs a name of 1 to {LONGEST_NAME} letters and hold, take or release"
+        elif kind == "release":
             if name != self.holder:
                 return ""
             self.holder = ""
             return f"{name} has released control"
-        before = self.holder
-        if before == name or not before or kind == "take":
-            self.holder, self._renewed, self._refused = name, now, ""
+        elif self.holder in ("", name) or kind == "take":
+            before, self.holder, self._renewed, self._refused = self.holder, name, now, ""
             taken = f"{name} has taken control from {before}" if before else f"{name} holds control"
             return "" if before == name else taken
-        return self._refusal(name, f"{name} may not hold control: {before} does")
+        else:
+            refusal = f"{name} may not hold control: {self.holder} does"
+        is_news, self._refused = name != self._refused, name
+        return refusal if is_news else ""
 
     def lost(self, now: float) -> str:
         """Return who has lost control and why if the lease has run out, after which it is free; else ''."""
@@ -48,7 +50,3 @@ class Lease:
             return ""
         reason, self.holder = f"{self.holder} held control and has not renewed it for {LEASE_TIME:g} s", ""
         return reason
-
-    def _refusal(self, name: str, sentence: str) -> str:
-        is_news, self._refused = name != self._refused, name
-        return sentence if is_news else ""

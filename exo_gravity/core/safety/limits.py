@@ -17,7 +17,7 @@ from exo_gravity.core.model.arm import MAX_MOMENT
 from exo_gravity.core.motors.specs import MOTOR_ERRORS, MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import check_owned, owned
-from exo_gravity.core.safety.drive import NOTHING, Fault, FaultCode
+from exo_gravity.core.safety.drive import Fault, FaultCode
 
 MAX_COMMAND = 40.0  # Nm: no arm needs half of it, so a larger effort command is wrong
 PEAK_TORQUE = max(spec.peak_torque for spec in MOTORS.values())  # Nm
@@ -47,18 +47,12 @@ HOME_TOLERANCE = {"AK60-6": 0.5, "AK80-9": 0.34}
 class JointSample(NamedTuple):
     """The newest reading of one joint."""
 
-    #: rad
-    position: float
-    #: rad/s
-    velocity: float
-    #: Nm
-    effort: float
-    #: degC, None if the firmware reports none
-    temperature: int | None
-    #: a code of MOTOR_ERRORS, None if the firmware reports none
-    error: int | None
-    #: s on the caller's clock
-    time: float
+    position: float  #: rad
+    velocity: float  #: rad/s
+    effort: float  #: Nm
+    temperature: int | None  #: degC, None if the firmware reports none
+    error: int | None  #: a code of MOTOR_ERRORS, None if the firmware reports none
+    time: float  #: s on the caller's clock
 
 
 UNKNOWN = JointSample(math.nan, math.nan, math.nan, None, None, -math.inf)
@@ -153,24 +147,27 @@ class Limits:
 
     def shape(
         self, effort: Sequence[float], share: float, joints: Sequence[JointSample], before: Sequence[float], dt: float
-    ) -> tuple[tuple[float, ...], set[str]]:
-        """Return the limited torque (4,) in Nm, and the names of the limits that acted.
+    ) -> tuple[tuple[float, ...], tuple[float, ...], set[str]]:
+        """Return the limited torque (4,) in Nm, the soft walls' damping (4,) in Nm s/rad, and which limits acted.
 
         effort: (4,) Nm, requested. share: 0..1, the ramp's factor on effort and soft wall. before: (4,) Nm, applied
         `dt` s ago. Raises ParameterError if an effort is NaN or beyond MAX_COMMAND.
         """
         step = MAX_EFFORT_RATE * dt
-        shaped, acted = [], set()
+        shaped, damping, acted = [], [], set()
         for i, (name, joint) in enumerate(zip(self.joint_names, joints, strict=True)):
             if not abs(effort[i]) <= MAX_COMMAND:
                 raise ParameterError(f"effort of {name}", effort[i], f"from -{MAX_COMMAND:g} to {MAX_COMMAND:g} Nm")
-            depth = self._depth(i, joint.position)
+            above = joint.position - self.position_max[i] + WALL_WIDTH
+            below = self.position_min[i] + WALL_WIDTH - joint.position
+            depth = above if above > 0.0 else -max(0.0, below)  # rad in a wall, > 0 in the upper one
             permitted = self.max_effort[i] * _derating(joint.temperature)
             wall = _wall_torque(depth, joint.velocity) if depth else 0.0
             wanted = share * (effort[i] + wall)
             clamped = max(-permitted, min(permitted, wanted))
             limited = max(before[i] - step, min(before[i] + step, clamped))
             shaped.append(limited)
+            damping.append(WALL_DAMPING * min(1.0, abs(depth) / WALL_EDGE))
             if depth != 0.0:
                 acted.add(f"soft wall ({name})")
             if permitted < self.max_effort[i]:
@@ -179,35 +176,19 @@ class Limits:
                 acted.add(f"max_effort ({name})")
             if limited != clamped:
                 acted.add(f"max_effort_rate ({name})")
-        return tuple(shaped), acted
-
-    def wall_damping(self, joints: Sequence[JointSample]) -> tuple[float, ...]:
-        """Return the damping (4,) in Nm s/rad of the soft walls at the joints' positions."""
-        depths = [self._depth(i, joint.position) for i, joint in enumerate(joints)]
-        if not any(depths):  # as in nearly every cycle
-            return NOTHING
-        return tuple(WALL_DAMPING * min(1.0, abs(depth) / WALL_EDGE) for depth in depths)
-
-    def _depth(self, i: int, position: float) -> float:
-        """Return how deep joint `i` is in a soft wall, in rad: > 0 beyond the upper edge, < 0 beyond the lower one."""
-        above = position - self.position_max[i] + WALL_WIDTH
-        below = self.position_min[i] + WALL_WIDTH - position
-        return above if above > 0.0 else -max(0.0, below)
+        return tuple(shaped), tuple(damping), acted
 
 
 def guide_damping(velocity: float) -> float:
     """Return the damping in Nm s/rad of a joint at `velocity` rad/s while its load changes."""
-    speed = abs(velocity)
-    if not speed > GUIDE_SPEED:
-        return 0.0
+    speed = max(GUIDE_SPEED, abs(velocity))
     return min(DAMPING * (speed - GUIDE_SPEED), GUIDE_BRAKE) / speed
 
 
 def _derating(temperature: int | None) -> float:
     """Return the share of torque that a motor of `temperature` (degC) is permitted."""
-    if temperature is None or temperature <= MAX_TEMPERATURE - DERATING:
-        return 1.0
-    return max(0.5, 0.5 + 0.5 * (MAX_TEMPERATURE - temperature) / DERATING)
+    colder = DERATING if temperature is None else MAX_TEMPERATURE - temperature
+    return 0.5 + 0.5 * max(0.0, min(1.0, colder / DERATING))
 
 
 def _wall_torque(depth: float, velocity: float) -> float:

@@ -21,8 +21,7 @@
 A compensator that is late for a moment is waited for (ride.py): the last torque stays, and damping rises.
 
 Zeros and signs are trusted once they were checked, until a motor may have lost its turn count (readings.py), or a fault
-casts doubt on them (`DOUBTFUL`). Until then `resume` carries an arm on from any pose after a fault that was no one's
-(`NO_ONES`).
+casts doubt on them. Until then `resume` carries an arm on from any pose after a fault that was no one's.
 """
 
 from __future__ import annotations
@@ -32,12 +31,12 @@ import operator
 from collections.abc import Sequence
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.joint_motor import Peaks
+from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.delivery import DeliveryMonitor
-from exo_gravity.core.safety.descent import DAMPING_RISE, ArmDescent, RestTracker
-from exo_gravity.core.safety.drive import CARRYING, DOUBTFUL, NO_ONES, NOTHING, OFF, Drive, Fault, FaultCode, State
-from exo_gravity.core.safety.gate import SignCheck, StartGate, SwitchOnCheck
+from exo_gravity.core.safety.descent import DAMPING_RISE, SETTLING_TIME, ArmDescent, RestTracker
+from exo_gravity.core.safety.drive import CARRYING, NOTHING, OFF, Drive, EffortCommand, Fault, FaultCode, State
+from exo_gravity.core.safety.gate import CALM, SignCheck, SwitchOnCheck, missing_for_a_start
 from exo_gravity.core.safety.limits import DAMPING, JointSample, Limits, guide_damping
 from exo_gravity.core.safety.motion_monitor import MotionMonitor
 from exo_gravity.core.safety.readings import Readings
@@ -51,7 +50,7 @@ class SafetyMachine:
     """Decides, cycle by cycle, what the motors of one arm receive. Not thread-safe: one thread owns it.
 
     period: s of a cycle. After a pause the torque continues as if only one period had passed: it never catches up.
-    peaks: the most that the motors apply; by default `max_effort`, and any damping.
+    motors: of the arm, which bound its torque and damping; by default `max_effort` does, and nothing.
 
     state: the State. fault: the latched Fault or None. waiting_for: what CHECKING or PROVING waits for. refusal: why
     the last enable was refused without a fault, or "". acted: for each limit that has acted, by name, the last time.
@@ -59,7 +58,7 @@ class SafetyMachine:
     motion: judges the efforts by gravity alone.
     """
 
-    def __init__(self, limits: Limits, period: float, peaks: Peaks | None = None) -> None:
+    def __init__(self, limits: Limits, period: float, motors: Sequence[JointMotor] = ()) -> None:
         self.limits = limits
         self.state = State.DISABLED
         self.fault: Fault | None = None
@@ -68,19 +67,18 @@ class SafetyMachine:
         self.is_unreached = False
         self.ride = RideThrough(limits.command_timeout)
         self._period = period
-        self._peaks = peaks or Peaks(tuple(limits.max_effort))
-        self._since = 0.0
-        self._now = -math.inf
+        self._peak_damping = [motor.peak_damping for motor in motors] or [math.inf] * JOINT_COUNT
+        self._since = self._calm_since = 0.0
+        self._now, self._dt = -math.inf, 0.0  # of the present cycle
         self._sent = OFF  # last sent to the motors
         self._descent = ArmDescent(0.0, NOTHING, NOTHING, NOTHING)
         self._rest = RestTracker()
         self._readings = Readings(limits)
         self._is_found_on = False  # by this cycle's replies
         self._is_trusted = False  # zeros and signs
-        self._delivery = DeliveryMonitor(limits, self._peaks.effort)
+        self._delivery = DeliveryMonitor(limits, [motor.peak_effort for motor in motors] or limits.max_effort)
         self.motion = MotionMonitor(limits)
         self._supply = SupplyMonitor()
-        self._gate = StartGate(limits, 0.0)
         self._switch_on = SwitchOnCheck(limits)
         self._signs = SignCheck(limits.joint_names, NOTHING)
         #: What else CHECKING waits for, set from outside; '' for nothing.
@@ -90,8 +88,8 @@ class SafetyMachine:
         """Start the checks, after which torque ramps in. Return False, and do nothing, unless DISABLED."""
         if self.state is not State.DISABLED:
             return False
-        self._gate = StartGate(self.limits, now)
-        self.waiting_for, self.refusal = self._gate.waiting_for, ""
+        self.waiting_for, self.refusal = "the first replies of the motors", ""
+        self._calm_since = now
         self._enter(State.CHECKING, now)
         return True
 
@@ -115,7 +113,7 @@ class SafetyMachine:
         """Why `resume` would be refused; '' if it would not."""
         if self.state is not State.FAULT or self.fault is None:
             return f"the arm is {self.state.value}, must be in fault"
-        if self.fault.code not in NO_ONES:
+        if not self.fault.code.is_no_ones:
             return f"{self.fault.code} has a cause to look for: then clear the fault and enable the arm"
         return "" if self._is_trusted else "zeros are no longer sure: let the arm hang, clear the fault, enable the arm"
 
@@ -128,7 +126,7 @@ class SafetyMachine:
 
         While the arm is off only a foreign command is a fault: it may have switched a motor on.
         """
-        if code in DOUBTFUL:
+        if code.casts_doubt:
             self._is_trusted = False
         if self.state is State.FAULT or (self.state is State.DISABLED and code is not FaultCode.FOREIGN_COMMAND):
             return
@@ -151,140 +149,115 @@ class SafetyMachine:
 
     def settled(self, now: float) -> bool:
         """Return whether no replying joint has moved for a while."""
-        return self._rest.is_settled(now)
+        return now - self._rest.since >= SETTLING_TIME
 
-    def step(
-        self,
-        now: float,
-        joints: Sequence[JointSample],
-        effort: Sequence[float] | None,
-        effort_time: float,
-        damped: bool = False,
-        held: bool = False,
-    ) -> Drive:
-        """Return what the motors receive in the cycle at `now` s.
-
-        joints: the 4 newest readings. effort: (4,) Nm requested, None if withdrawn or never requested; effort_time:
-        when the joint readings that it answers were taken. damped: whether the joints are to be damped too, because the
-        load changes; held: whether the efforts are computed from a tilt that is late. All times are on one clock.
-        """
+    def step(self, now: float, joints: Sequence[JointSample], command: EffortCommand) -> Drive:
+        """Return what the motors receive in the cycle at `now` s; joints: the 4 newest readings."""
+        effort, effort_time, damped, held = command
         now = max(now, self._now)  # a call may carry a slightly later time than the cycle that follows it
-        dt = min(now - self._now, self._period)
-        self._now = now
-        joints = self._track(now, joints, dt)
+        age = now - effort_time
+        self._now, self._dt = now, min(now - self._now, self._period)
+        self._track(joints)
         if self.state is State.CHECKING:
-            self._check(now, joints, effort, effort_time)
+            self._check(effort is not None and age <= self.limits.command_timeout)
         if self._sent.powered:
-            self._check_delivery(now, joints, dt)
+            fault = self._delivery.step(self._dt, self._readings.joints, self._sent.effort, self._sent.damping)
+            is_proven = self.state in (State.RAMPING_IN, State.ACTIVE) or self._switch_on.done
+            if fault and self.state in CARRYING and is_proven:
+                self._trip(fault)
         if self.state in CARRYING:
-            self._watch(now, dt, effort, now - effort_time, held)
+            self._watch(effort is not None, age, held)
         if effort is not None and self.state in (State.RAMPING_IN, State.ACTIVE):
-            effort, fault = self.motion.step(dt, joints, effort, now - effort_time)
-            if fault:
-                self.trip(*fault, now)
-        drive = self._drive(now, joints, effort, damped, dt).within(self._peaks.damping)
-        self._sent = drive
-        return drive
-
-    def _drive(
-        self, now: float, joints: Sequence[JointSample], effort: Sequence[float] | None, damped: bool, dt: float
-    ) -> Drive:
+            effort, fault = self.motion.step(self._dt, self._readings.joints, effort, age)
+            self._trip(fault)
         if self.state is State.PROVING:
-            self._prove(now, joints, dt)
+            self._prove()
+        drive = self._drive(effort or NOTHING, damped)
+        self._sent = drive._replace(damping=tuple(map(min, drive.damping, self._peak_damping)))
+        return self._sent
+
+    def _drive(self, effort: Sequence[float], damped: bool) -> Drive:
         if self.state in (State.RAMPING_IN, State.ACTIVE):
             try:
-                return self._carry(now, joints, effort or NOTHING, damped, dt)
+                return self._carry(effort, damped)
             except ParameterError as error:
-                self.trip(FaultCode.COMMAND_IMPOSSIBLE, str(error), now)
+                self.trip(FaultCode.COMMAND_IMPOSSIBLE, str(error), self._now)
         if self.state is State.PROVING:
-            damping = DAMPING * min(1.0, (now - self._since) / DAMPING_RISE)
-            if self._switch_on.done:
-                return Drive(tuple(self._signs.effort), (damping,) * 4, True)
-            return Drive(tuple(self._switch_on.effort), (damping,) * 4, True, tuple(self._switch_on.enter))
-        if self.state is State.LETTING_DOWN:
-            return self._descend(now, joints, dt)
-        return self._stand(now, joints, dt)
+            damping = DAMPING * min(1.0, (self._now - self._since) / DAMPING_RISE)
+            pushed = (self._signs if self._switch_on.done else self._switch_on).effort
+            return Drive(tuple(pushed), (damping,) * 4, True, tuple(self._switch_on.enter))
+        return self._descend() if self.state is State.LETTING_DOWN else self._stand()
 
-    def _check(
-        self, now: float, joints: Sequence[JointSample], effort: Sequence[float] | None, effort_time: float
-    ) -> None:
-        """Continue to PROVING once the start gate has passed, or trip on a fault that refuses the start."""
-        self._gate.hindrance = self.hindrance
-        are_fresh = effort is not None and now - effort_time <= self.limits.command_timeout
-        fault = self._gate.step(now, joints, self._readings.fault, are_fresh, self._is_trusted)
-        self.waiting_for = self._gate.waiting_for
-        if fault:
-            self.trip(*fault, now)
-        elif self._gate.passed:
+    def _check(self, efforts_are_fresh: bool) -> None:
+        """Continue to PROVING once all has been well for CALM s, or trip on a fault that refuses the start."""
+        readings, limits = self._readings, self.limits
+        missing = missing_for_a_start(limits, readings.joints, readings.fault, self._is_trusted)
+        if isinstance(missing, Fault):
+            self._trip(missing)
+            return
+        missing = missing or self.hindrance or ("" if efforts_are_fresh else "effort commands")
+        self.waiting_for = missing or f"{CALM:g} s without a fault"
+        if missing:
+            self._calm_since = self._now
+        if self._now - self._calm_since >= CALM:
             self.waiting_for = ""
-            largest = 0.0 if self._is_trusted else self.limits.sign_check_torque
-            self._switch_on = SwitchOnCheck(self.limits)
-            self._signs = SignCheck(self.limits.joint_names, [min(largest, most) for most in self.limits.max_effort])
+            largest = 0.0 if self._is_trusted else limits.sign_check_torque
+            self._switch_on = SwitchOnCheck(limits)
+            self._signs = SignCheck(limits.joint_names, [min(largest, most) for most in limits.max_effort])
             self._delivery.reset()
-            self._enter(State.PROVING, now)
-        elif now - self._since >= self.limits.enable_timeout:
-            self._refuse(f"not enabled within {self.limits.enable_timeout:g} s: waited for {self.waiting_for}", now)
+            self._enter(State.PROVING)
+        elif self._now - self._since >= limits.enable_timeout:
+            self._refuse(f"not enabled within {limits.enable_timeout:g} s: waited for {self.waiting_for}")
 
-    def _check_delivery(self, now: float, joints: Sequence[JointSample], dt: float) -> None:
-        fault = self._delivery.step(dt, joints, self._sent.effort, self._sent.damping)
-        is_proven = self.state in (State.RAMPING_IN, State.ACTIVE) or self._switch_on.done
-        if fault and self.state in CARRYING and is_proven:
-            self.trip(*fault, now)
-
-    def _watch(self, now: float, dt: float, effort: Sequence[float] | None, age: float, held: bool) -> None:
+    def _watch(self, is_requested: bool, age: float, held: bool) -> None:
         fault = self._readings.fault
-        if fault is None and effort is None:
+        if fault is None and not is_requested:
             fault = Fault(FaultCode.COMMAND_WITHDRAWN, "the compensator withdrew its efforts; see its diagnostics")
         elif fault is None:
-            fault = self.ride.step(now, dt, age, held)
-        if fault:
-            self.trip(*fault, now)
+            fault = self.ride.step(self._now, self._dt, age, held)
+        self._trip(fault)
 
-    def _prove(self, now: float, joints: Sequence[JointSample], dt: float) -> None:
+    def _prove(self) -> None:
         if self._switch_on.done:
-            fault = self._signs.step(dt, joints)
+            fault = self._signs.step(self._dt, self._readings.joints)
         else:
-            fault = self._switch_on.step(dt, joints, self._sent.damping)
+            fault = self._switch_on.step(self._dt, self._readings.joints, self._sent.damping)
             self._delivery.reset()
         self.waiting_for = self._signs.hint
-        if fault:
-            self.trip(*fault, now)
-        elif self._switch_on.done and self._signs.done:
+        self._trip(fault)
+        if not fault and self._switch_on.done and self._signs.done:
             self._is_trusted = True
             self.motion.reset()
-            self._enter(State.RAMPING_IN, now)
+            self._enter(State.RAMPING_IN)
 
-    def _carry(
-        self, now: float, joints: Sequence[JointSample], effort: Sequence[float], damped: bool, dt: float
-    ) -> Drive:
-        ramp = 1.0
+    def _carry(self, effort: Sequence[float], damped: bool) -> Drive:
+        joints, ramp = self._readings.joints, 1.0
         if self.state is State.RAMPING_IN:
-            ramp = (now - self._since) / RAMP_TIME
-            if ramp >= 1.0:
-                ramp = 1.0
-                self._enter(State.ACTIVE, now)
-        shaped, acted = self.limits.shape(effort, ramp, joints, self._sent.effort, dt)
-        self.acted.update(dict.fromkeys(acted, now))
+            ramp = min(1.0, (self._now - self._since) / RAMP_TIME)
+            if ramp == 1.0:
+                self._enter(State.ACTIVE)
+        shaped, walls, acted = self.limits.shape(effort, ramp, joints, self._sent.effort, self._dt)
+        self.acted.update(dict.fromkeys(acted, self._now))
         # A wall's damping rises at once, since it already rises with the position. That of a ride or a changing load
         # rises over DAMPING_RISE, and any damping falls so.
-        step = DAMPING / DAMPING_RISE * dt
+        step = DAMPING / DAMPING_RISE * self._dt
         guided = [guide_damping(joint.velocity) if damped else 0.0 for joint in joints]
         wanted = (DAMPING,) * len(guided) if self.ride.is_riding else guided
-        columns = zip(self.limits.wall_damping(joints), wanted, self._sent.damping, strict=True)
+        columns = zip(walls, wanted, self._sent.damping, strict=True)
         damping = tuple(max(wall, last - step, min(last + step, most)) for wall, most, last in columns)
         return Drive(shaped, damping, True)
 
-    def _descend(self, now: float, joints: Sequence[JointSample], dt: float) -> Drive:
+    def _descend(self) -> Drive:
         descent, supply, silent = self._descent, self._supply, self._readings.silent
-        descent.step(now, dt, joints, tuple(map(operator.or_, silent, supply.returning)))
+        may_differ = tuple(map(operator.or_, silent, supply.returning))
+        descent.step(self._now, self._dt, self._readings.joints, may_differ)
         if self.state is not State.LETTING_DOWN:  # a motor that could not be reached replies again
-            self._enter(State.LETTING_DOWN, now)
-        are_off = supply.all_unsure and supply.are_off
-        if are_off or descent.is_down(now, self._rest.since):
+            self._enter(State.LETTING_DOWN)
+        if (all(supply.unsure) and supply.are_off) or descent.is_down(self._now, self._rest.since):
             self.is_unreached = any(silent)
             supply.settle(silent)
-            self._enter(State.FAULT if self.fault else State.DISABLED, now)
-            return self._stand(now, joints, dt)
+            self._enter(State.FAULT if self.fault else State.DISABLED)
+            return self._stand()
         columns = zip(self._delivery.missing, silent, supply.unsure, strict=True)
         enter = tuple(missing and not is_silent and not is_unsure for missing, is_silent, is_unsure in columns)
         if any(enter):
@@ -292,13 +265,13 @@ class SafetyMachine:
             self._delivery.reset()
         return Drive(descent.effort, descent.damping, True, enter, supply.unsure)
 
-    def _stand(self, now: float, joints: Sequence[JointSample], dt: float) -> Drive:
+    def _stand(self) -> Drive:
         """Return what the motors receive while the arm is off: nothing, unless one of them may be on."""
         supply = self._supply
         if supply.are_off:
             supply.settle()
             if self.is_unreached and self.state is State.CHECKING:
-                self._refuse("the motors have just returned, switched off: enable them again", now)
+                self._refuse("the motors have just returned, switched off: enable them again")
             self.is_unreached = False
         is_doubtful = any(supply.unsure)
         if not (self.is_unreached or is_doubtful or self._is_found_on):
@@ -306,31 +279,34 @@ class SafetyMachine:
         if not self._is_found_on and (is_doubtful or any(self._readings.silent)):
             return Drive(self._descent.effort, self._descent.damping, True, unsure=supply.unsure)
         if self.state is State.CHECKING:
-            self._refuse("a motor was still on: it is let down", now)
+            self._refuse("a motor was still on: it is let down")
         self.is_unreached = False
-        return self._descend(now, joints, dt)
+        return self._descend()
 
-    def _refuse(self, reason: str, now: float) -> None:
+    def _refuse(self, reason: str) -> None:
         self.refusal = reason
-        self._enter(State.DISABLED, now)
+        self._enter(State.DISABLED)
 
-    def _track(self, now: float, joints: Sequence[JointSample], dt: float) -> Sequence[JointSample]:
-        """Follow the readings: who is silent, who applies torque, whether the arm rests; return those that count."""
+    def _track(self, joints: Sequence[JointSample]) -> None:
+        """Follow the readings: who is silent, who applies torque, whether the arm rests."""
         readings = self._readings
-        readings.step(now, joints, self._sent.powered)
+        readings.step(self._now, joints, self._sent.powered)
         if readings.lost or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):
             self._is_trusted = False
-        self._rest.step(now, readings.joints, readings.silent)
+        self._rest.step(self._now, readings.joints, readings.silent)
         if all(readings.silent) and self._sent.powered:
             self._supply.doubt(self._sent.effort)
-        self._is_found_on = self._supply.step(dt, readings.joints, readings.silent)
-        return readings.joints
+        self._is_found_on = self._supply.step(self._dt, readings.joints, readings.silent)
 
     def _let_down(self, now: float) -> None:
         applied = self._delivery.applied(self._sent, self._readings.silent)
         self._descent = ArmDescent(now, *applied, self.limits.max_effort)
         self._enter(State.LETTING_DOWN, now)
 
-    def _enter(self, state: State, now: float) -> None:
+    def _trip(self, fault: Fault | None) -> None:
+        if fault:
+            self.trip(*fault, self._now)
+
+    def _enter(self, state: State, now: float = -math.inf) -> None:
         self.state = state
         self._since = self._now = max(now, self._now)

@@ -34,7 +34,7 @@ MEMORY = 1.0  # s, time constant
 class MotionMonitor:
     """The unexplained impulse of each joint. gravity: (3,) unit vector in the arm's base frame; may be set anytime.
 
-    limits.largest_moment: (4,) kg m; zeros switch the monitor off. impulse: (4,) Nm s.
+    limits.largest_moment: (4,) kg m; zeros switch the monitor off. impulse: (4,) Nm s. full: (4,) Nm, the largest load.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -43,18 +43,13 @@ class MotionMonitor:
         self._load = tuple(GRAVITY * moment for moment in limits.largest_moment)  # Nm
         one, two, three, four = self._load
         full = two + three + four
-        self._full = (one + full, full, three + four, four)
+        self.full = (one + full, full, three + four, four)
         self.reset()
 
     def reset(self) -> None:
         """Forget the past."""
         self.impulse = list(NOTHING)
         self._slow: list[float] = []  # the torque, low-passed, (4,) Nm
-
-    @property
-    def used(self) -> tuple[float, ...]:
-        """The share (4,) of the permitted impulse."""
-        return tuple(sum_ / (PATIENCE * full or 1.0) for sum_, full in zip(self.impulse, self._full, strict=True))
 
     def step(
         self, dt: float, joints: Sequence[JointSample], effort: Sequence[float], age: float = 0.0
@@ -63,14 +58,14 @@ class MotionMonitor:
 
         age: s since the pose that the effort answers. An impossible effort is returned as it is.
         """
-        if not self._full[1] or not all(abs(torque) <= MAX_COMMAND for torque in effort):
+        if not self.full[1] or not all(abs(torque) <= MAX_COMMAND for torque in effort):
             return effort, None
         fastest = max([abs(joint.velocity) for joint in joints])
         lowest, highest = self.explained([joint.position for joint in joints])
         self._slow = self._slow or list(effort)
         passed: list[float] = []
         fault: Fault | None = None
-        for i, full in enumerate(self._full):
+        for i, full in enumerate(self.full):
             most = self._limits.max_effort[i]
             torque = max(-most, min(most, effort[i]))
             margin = ABSOLUTE + self._limits.largest_addition[i] + (RELATIVE + max(LATE, age) * fastest) * full
@@ -107,9 +102,6 @@ class MotionMonitor:
             (turn3, turn4),
             (turn4,),
         )
-        lowest, highest = [], []
-        for torques in parts:
-            up = sum([torque for torque in torques if torque > 0.0])
-            lowest.append(SURPLUS * (sum(torques) - up))
-            highest.append(SURPLUS * up)
-        return tuple(lowest), tuple(highest)
+        lowest = tuple([SURPLUS * sum([min(0.0, torque) for torque in torques]) for torques in parts])
+        highest = tuple([SURPLUS * sum([max(0.0, torque) for torque in torques]) for torques in parts])
+        return lowest, highest

@@ -46,8 +46,8 @@ class Readings:
         """Take the newest readings `joints` (4,) in the cycle at `now` s; powered: whether the motors are on."""
         limits = self._limits
         longest = TRUSTED_SILENCE if powered else TRUSTED_SILENCE_OFF
-        faults, counting = list[Fault | None](), list(self.joints)
-        self.lost = False
+        counting = list(self.joints)
+        self.fault, self.lost = None, False
         for i, joint in enumerate(joints):
             if joint.time > self._newest[i]:
                 gap = joint.time - self._newest[i]
@@ -55,7 +55,7 @@ class Readings:
                 self.lost |= gap > limits.reply_timeout and moved > limits.home_tolerance[i]
                 self._newest[i], self._missed[i] = joint.time, 0
                 counting[i], fault = self._taken(i, joint)
-                faults.append(fault)
+                self.fault = self.fault or fault
             else:
                 self._missed[i] += 1
                 self.lost |= self._missed[i] >= MISSED and now - joint.time > longest
@@ -65,8 +65,7 @@ class Readings:
         if any(self.silent):
             name = limits.joint_names[self.silent.index(True)]
             reason = f"{name}: no reply for more than {limits.reply_timeout * 1000:.0f} ms"
-            faults.insert(0, Fault(FaultCode.MOTOR_SILENT, reason))
-        self.fault = next(filter(None, faults), None)
+            self.fault = Fault(FaultCode.MOTOR_SILENT, reason)
         self._now = now
 
     def _taken(self, i: int, joint: JointSample) -> tuple[JointSample, Fault | None]:

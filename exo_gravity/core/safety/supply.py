@@ -25,22 +25,14 @@ class SupplyMonitor:
     """Reads from the replies which motors are on. unsure: (4,) those of which it is not known."""
 
     def __init__(self) -> None:
-        self.unsure = (False,) * len(NOTHING)
-        self._held: Sequence[float] = NOTHING
-        self._torque = list(NOTHING)  # smoothed, since the motor replies again
-        self._heard = list(NOTHING)  # s for which it has replied again
-        self._times = list(NOTHING)  # s, of its last reply
-        self._were_silent = [False] * len(NOTHING)
+        self._times = list(NOTHING)  # s, of each motor's last reply
+        self.doubt(NOTHING)
+        self.settle()
 
     @property
     def returning(self) -> tuple[bool, ...]:
         """Those (4,) in doubt that were silent: they may apply another torque than the last one sent."""
         return tuple(map(operator.and_, self.unsure, self._were_silent))
-
-    @property
-    def all_unsure(self) -> bool:
-        """Whether no motor is known to be on."""
-        return all(self.unsure)
 
     @property
     def are_off(self) -> bool:
@@ -51,8 +43,9 @@ class SupplyMonitor:
     def doubt(self, held: Sequence[float]) -> None:
         """Doubt every motor; they apply `held` (4,) Nm if they are on."""
         self._held = held
-        self.unsure = (True,) * len(held)
-        self._torque, self._heard = list(NOTHING), list(NOTHING)
+        self.unsure: tuple[bool, ...] = (True,) * len(held)
+        self._torque = list(NOTHING)  # smoothed, since the motor replies again
+        self._heard = list(NOTHING)  # s for which it has replied again
         self._were_silent = [False] * len(held)
 
     def settle(self, silent: Sequence[bool] = (False,) * len(NOTHING)) -> None:

@@ -208,11 +208,8 @@ def _releases(recording: Recording, blocks: Blocks) -> Iterator[Release]:
 
 def _rms(values: np.ndarray) -> np.ndarray:
     """Return the root mean square (4,) of the finite values among (n, 4); NaN for a joint that has none."""
-    known = np.isfinite(values)
-    squares = np.square(values, where=known, out=np.zeros(values.shape))
-    with np.errstate(invalid="ignore"):
-        rms: np.ndarray = np.sqrt(squares.sum(axis=0) / known.sum(axis=0))
-    return rms
+    mean: np.ndarray = np.ma.masked_invalid(np.square(values, dtype=float)).mean(axis=0).filled(math.nan)
+    return np.sqrt(mean)
 
 
 @dataclass(frozen=True)

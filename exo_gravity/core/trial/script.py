@@ -88,11 +88,6 @@ class TrialScript:
         """Total length of all steps in s."""
         return sum(step.duration for step in self.steps)
 
-    @property
-    def pose_count(self) -> int:
-        """Number of poses to which the arm is moved."""
-        return sum(step.action == "move" for step in self.steps)
-
     def at(self, elapsed: float) -> tuple[int, float]:
         """Return the index of the active step `elapsed` s after the start, and the time since that step began.
 

@@ -153,7 +153,7 @@ class MotorBus:
         """Make the present pose every motor's zero; only while they are off. They are silent for up to 1.5 s."""
         if self._powered:
             raise BusError("set_zero: refused while the motors are on")
-        frames = [motor.wire_format.set_zero(motor.can_id) for motor in self._motors]
+        frames = [motor.set_zero for motor in self._motors]
         if not all(frames):
             raise BusError(f"set_zero: motor {self._motors[frames.index(())].can_id} has a board without such a frame")
         self._send_commands(OFF)
@@ -263,7 +263,7 @@ class MotorBus:
         self.foreign_command = f"another sender commands motor {motor.can_id} (frame [{foreign.hex(' ')}])"
         if not (self._powered and self._drive.powered) or self._drive.unsure[joint]:
             return
-        if foreign in [data for _, data in motor.wire_format.set_zero(motor.can_id)]:
+        if foreign in [data for _, data in motor.set_zero]:
             self._held[joint] = math.nan  # not held in this contest: a reply may still count from the old zero
         command = self._command(joint, now)
         is_exit = foreign in [data for _, data in motor.exit]
@@ -283,7 +283,7 @@ class FrameFilter:
         self._groups: dict[bool, list[tuple[WireFormat, frozenset[int]]]] = {False: [], True: []}
         for board in {motor.wire_format for motor in motors}:
             can_ids = frozenset(motor.can_id for motor in motors if motor.wire_format == board)
-            self._groups[board.is_extended].append((board, can_ids))
+            self._groups[board.first_id >= EXTENDED].append((board, can_ids))
         self._marks_echoes = marks_echoes
         #: Frames that were sent and whose echoes have not been received.
         self.awaited: deque[Frame] = deque(maxlen=MOST_AWAITED if echoes else 0)

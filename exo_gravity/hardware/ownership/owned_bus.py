@@ -17,7 +17,7 @@ from multiprocessing import Pipe
 import can
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.joint_motor import JointMotor, peaks_of
+from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.delivery import ABSOLUTE, RELATIVE
 from exo_gravity.core.safety.drive import Drive
 from exo_gravity.core.safety.limits import Limits
@@ -69,7 +69,7 @@ def let_down(arm: ArmOnBus, notes: DriveNotes, log: Callable[[str], None], is_wa
             notes.clock.sleep(OPEN_PERIOD)
     drive = notes.drive
     motors = MotorBus(bus, arm.motors, powered=True, note=notes.note, reopen=arm.open, clock=notes.clock)
-    machine = SafetyMachine(arm.limits, arm.period, peaks_of(arm.motors))
+    machine = SafetyMachine(arm.limits, arm.period, arm.motors)
     machine.take_over(*_applied(motors, drive, arm.period), notes.clock.monotonic())
     loop = ControlLoop(motors, machine, arm.period)
     was_unreached = False
@@ -78,7 +78,7 @@ def let_down(arm: ArmOnBus, notes: DriveNotes, log: Callable[[str], None], is_wa
             log("a motor does not reply; it may still be powered; trying again")
         was_unreached = machine.is_unreached
         if was_unreached and is_wanted():
-            loop.abandon()
+            motors.close()
             return False
     loop.stop()
     return not motors.may_be_powered

@@ -18,9 +18,9 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.safety.drive import FaultCode
+from exo_gravity.core.safety.drive import CARRYING, NO_COMMAND, EffortCommand, FaultCode
 from exo_gravity.core.safety.limits import JointSample, Limits
-from exo_gravity.hardware.control_loop import NO_COMMAND, ControlLoop, EffortCommand
+from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.nodes.ros.hot_path import HotPath, SolePublisher
 from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, to_nanoseconds
 
@@ -79,7 +79,8 @@ class EffortExchange:
         if self._commander.is_another(info):
             self.refusal = "a second publisher of effort_commands"
             self.command = EffortCommand(None, time.monotonic())  # fails the start gate
-            loop.trip_if_carried(FaultCode.SECOND_COMMANDER, "more than one publisher of effort_commands")
+            if loop.safety.state in CARRYING:
+                loop.trip(FaultCode.SECOND_COMMANDER, "more than one publisher of effort_commands")
         elif answered is None:
             self.refusal = f"stamp {to_nanoseconds(message.header.stamp)} ns answers no joint state of this bridge"
         else:

@@ -24,13 +24,13 @@ from rclpy.signals import SignalHandlerOptions
 
 from exo_gravity.core.errors import BusError, ExoGravityError, ParameterError
 from exo_gravity.core.model.tilt import SIDES
-from exo_gravity.core.motors.joint_motor import OPTIONS, motors_of, peaks_of, traffic_of
-from exo_gravity.core.safety.drive import FaultCode
+from exo_gravity.core.motors.joint_motor import OPTIONS, motors_of, traffic_of
+from exo_gravity.core.safety.drive import NO_COMMAND, FaultCode, State
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.params import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.trunk.tilt_input import TiltInput
 from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.control_loop import NO_COMMAND, ControlLoop
+from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, OwnedBus, Watchdog, take_over
 from exo_gravity.hardware.scheduling import request_real_time
 from exo_gravity.nodes.can_bridge import operation
@@ -138,7 +138,7 @@ class CanBridge(LifecycleNode):
         assert self._owned, "the node is not configured"
         bus, self._bus = self._bus or self._owned.open(), None
         period = self._arm.period
-        safety = SafetyMachine(self._arm.limits, period, peaks_of(self._arm.motors))
+        safety = SafetyMachine(self._arm.limits, period, self._arm.motors)
         hand_over = self._owned.watchdog.hand_over
         loop = ControlLoop(bus, safety, period, self._exchange.publish, self._exchange.get_efforts, hand_over)
         loop.start()
@@ -201,9 +201,8 @@ class CanBridge(LifecycleNode):
     def _look_at(self, watchdog: Watchdog, loop: ControlLoop) -> None:
         """Let no motor be switched on before the watchdog watches, and none stay on without it."""
         loop.safety.hindrance = "the watchdog to start" if watchdog.is_starting else ""
-        if not watchdog.alive:
-            reason = "the watchdog process has died, is frozen, or did not start"
-            loop.trip_unless_let_down(FaultCode.WATCHDOG_DEAD, reason)
+        if not watchdog.alive and loop.safety.state is not State.LETTING_DOWN:
+            loop.trip(FaultCode.WATCHDOG_DEAD, "the watchdog process has died, is frozen, or did not start")
 
     def _report_descent(self) -> None:
         with contextlib.suppress(Exception):  # whatever the middleware does, the arm comes down

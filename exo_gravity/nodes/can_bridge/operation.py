@@ -18,14 +18,14 @@ from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity.core.errors import BusError, ParameterError
-from exo_gravity.core.motors.bus_load import Traffic
+from exo_gravity.core.motors.bus_load import REPLY_SHARE, Traffic
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import Rate
 from exo_gravity.core.safety.delivery import MotorLoad
-from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.safety.drive import EffortCommand, FaultCode, State
 from exo_gravity.core.safety.lease import Lease
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
-from exo_gravity.hardware.control_loop import ControlLoop, EffortCommand
+from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.nodes.ros.hot_path import HotPath
 from exo_gravity.nodes.ros.messages import ERROR, HELD_BY, NOBODY, OK, WARN, Diagnostics, milliseconds, row
 from exo_gravity.nodes.ros.run import open_to_others
@@ -100,7 +100,7 @@ class BridgeServices:
             return "refused: a motor does not reply"
         if not safety.settled(now):
             return "refused: the arm is not at rest"
-        loop.set_zero()
+        loop.bus.set_zero()
         return ""
 
     def answer(self, function: Callable[[ControlLoop, Any], str], request: Any, response: Any) -> Any:
@@ -163,8 +163,8 @@ class Operator:
         reason, loop = self.lease.lost(self._now()), self._get_loop()
         if reason:
             self._log.warning(reason)
-        if reason and loop is not None:
-            loop.trip_unless_let_down(FaultCode.CONTROL_LOST, reason)
+        if reason and loop is not None and loop.safety.state is not State.LETTING_DOWN:
+            loop.trip(FaultCode.CONTROL_LOST, reason)
 
     def _on_request(self, message: KeyValue, _info: dict[str, Any]) -> None:
         self._news = self.lease.request(self._now(), message.key, message.value) or self._news
@@ -173,13 +173,13 @@ class Operator:
 def log_risks(node: Node, traffic: Traffic, rate: float) -> None:
     """Log the bus load at `rate` (Hz), and whether other hosts can command the arm."""
     log = node.get_logger()
-    wire, worst = traffic.load(rate), traffic.load(rate, worst=True)
     log.info(
-        f"bus load at {rate:g} Hz: {wire.bits_per_second / 1000:.0f} of {traffic.bitrate / 1000:g} kbit/s, "
-        f"{wire.share:.0%} of the bus, {worst.share:.0%} at worst; the bus is full at {int(wire.largest_rate)} Hz"
+        f"bus load at {rate:g} Hz: {traffic.load(rate):.0%} of {traffic.bitrate / 1000:g} kbit/s, "
+        f"{traffic.load(rate, worst=True):.0%} at worst; the bus is full at {int(traffic.largest_rate)} Hz"
     )
-    if warning := traffic.warning(rate):
-        log.warning(warning)
+    if traffic.is_crowded(rate):
+        fitting = int(REPLY_SHARE * traffic.largest_rate)
+        log.warning(f"replies may be late at {rate:g} Hz: at most {fitting} Hz leave them time")
     if opening := open_to_others():
         log.warning(f"{opening}: other hosts can command this arm; unset it, or enforce SROS2")
 
@@ -210,7 +210,8 @@ class BridgeReport:
         now, safety = time.monotonic(), loop.safety
         acting = ", ".join(sorted(limit for limit, acted in tuple(safety.acted.items()) if acted > now - RECENT))
         rate = self._rate.update(now, loop.cycles)
-        self._motors.update(now, loop.samples)
+        samples = loop.samples
+        loads = self._motors.update(now, samples)
         values: dict[str, object] = {
             "state": safety.state.value,
             "fault": safety.fault.code if safety.fault else "none",
@@ -218,19 +219,18 @@ class BridgeReport:
             "refusal": safety.refusal or "none",
             "limits acting": acting or "none",
             "rate (Hz)": f"{rate:.1f}",
-            "bus load (%)": f"{100.0 * self._traffic.load(rate).share:.0f}" if rate else "0",
+            "bus load (%)": f"{100.0 * self._traffic.load(rate):.0f}" if rate else "0",
             "age of efforts (ms)": milliseconds(now - newest.answered),
             "rides": safety.ride.rides,
             "resume": safety.why_not_resumed or "possible",
             "cycles": loop.cycles,
             "late cycles": loop.late,
             "incomplete cycles": loop.incomplete,
-            "frames ignored": ", ".join(f"{kind}: {n}" for kind, n in sorted(loop.ignored.items())) or "none",
+            "frames ignored": ", ".join(f"{kind}: {n}" for kind, n in sorted(dict(loop.bus.ignored).items())) or "none",
             "publishing errors": f"{loop.cycle_errors}, last: {loop.cycle_error}" if loop.cycle_errors else "none",
             "last refused message": refusal,
         }
-        columns = self._names, loop.samples, self._motors.power, self._motors.rms, self._motors.share
-        for name, joint, power, rms, share in zip(*columns, strict=True):
+        for name, joint, (power, rms, share) in zip(self._names, samples, loads, strict=True):
             values[f"{name} temperature (degC)"] = joint.temperature
             values[f"{name} torque (Nm)"] = row([joint.effort], 2)
             values[f"{name} power (W)"] = row([power], 1)
@@ -239,7 +239,7 @@ class BridgeReport:
         warnings = [f"limited by {acting}"] if acting else []
         if now - safety.ride.ended < RECENT:
             warnings.append(f"riding through: {safety.ride.why}")
-        hot = [name for name, share in zip(self._names, self._motors.share, strict=True) if share > 1.0]
+        hot = [name for name, (_, _, share) in zip(self._names, loads, strict=True) if share > 1.0]
         if hot:
             warnings.append(f"above rated torque for too long: {', '.join(hot)}")
         if 0.0 < rate < self._slow:

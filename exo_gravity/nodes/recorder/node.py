@@ -83,7 +83,8 @@ class Recorder(Node):
         """Write what has arrived, and close the recording."""
         try:
             self._drain()
-            if any(self._report_losses()):
+            self._report_losses()
+            if any(self._reported):
                 missed, unwritten = self._reported
                 self._writer.add_topic(content.LOSSES, "std_msgs/msg/String", offered_qos(True, True, 1))
                 self._write_text(content.LOSSES, f"{missed} did not arrive, {unwritten} were not written")
@@ -148,12 +149,10 @@ class Recorder(Node):
         """Return how many messages of joints and IMU did not arrive, and how many were not written."""
         return sum(drain.lost for drain in self._drains), self._writer.lost
 
-    def _report_losses(self) -> tuple[int, int]:
-        lost = self._losses()
-        if lost != self._reported:
+    def _report_losses(self) -> None:
+        if (lost := self._losses()) != self._reported:
             self._reported = lost
             self.get_logger().warning(f"messages lost so far: {lost[0]} did not arrive, {lost[1]} were not written")
-        return lost
 
     def _subscribe(self, topic: str, msgtype: type) -> None:
         publishers = self.get_publishers_info_by_topic(topic)
@@ -231,9 +230,8 @@ class LiveLine:
             else:
                 arm["names"] = list(message.name)
                 arm |= {field: list(getattr(message, field)) for field in ("position", "velocity", "effort")}
-        line["recorder"] = recorder
-        line["status"] = self._status
-        line["faults"] = [f"{name}: {status['message']}" for name, status in self._status.items() if status["level"]]
+        faults = [f"{name}: {status['message']}" for name, status in self._status.items() if status["level"]]
+        line |= {"recorder": recorder, "status": self._status, "faults": faults}
         sys.stdout.write(json.dumps(line) + "\n")
         sys.stdout.flush()
 

@@ -10,9 +10,9 @@ import argparse
 import contextlib
 import json
 import select
+import signal
 import sys
 import tempfile
-import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -30,15 +30,11 @@ from exo_gravity.core.calibration.params import ARM, BRIDGE
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.moments import moments_of
 from exo_gravity.tools.inputs.arms import ConfiguredArm
-from exo_gravity.tools.launcher import Launcher, Stopping, stop_on_signals
+from exo_gravity.tools.launcher import Launcher, stop_on_signals
 
 KEPT = ("can_bridge", "simulator")  # the arm's nodes that run during a calibration, with the shared /imu
 REFRESH_PERIOD = 0.1  # s, of what the person is shown
-POLL_PERIOD = 0.05  # s
 STOPPED = "stopped by Ctrl-C"
-ATTEMPTS = 3  # of a tour on the simulated device
-# Parts of the lines of nodes on a busy computer: the simulated device itself is never late.
-LATE = ("command_stale", "motor_silent", "no joint states for", "trunk tilt older", "was frozen for", "stalled for")
 
 Say = Callable[[Any], None]
 
@@ -75,7 +71,6 @@ class LiveTour:
     measured: list[Observation] = field(default_factory=list)
     trouble: str = ""  #: why it ended early, or ''
     done: bool = False  #: whether it is complete
-    was_late: bool = False  #: whether this computer did not run the nodes in time
 
     def follow(self, line: str, record: Path, say: Say) -> None:
         """Take one line of `calibrator`; ignore half a line, which a killed node leaves."""
@@ -121,55 +116,46 @@ def tour_parameters(
         "first_moment": expected[:4],
         "off_axis": expected[4:],
     }
+    simulator = nodes.get(f"{arm.namespace}/simulator")
+    if simulator and (mass := changes.get("tour.load_mass")):
+        # The simulated device cannot be reached by hand: it carries the weight as a wearer's forearm would.
+        wearer = {"mass": [0.0, 0.0, 0.0, mass], "cog": [0.0, 0.0, 0.0, changes["tour.load_lever"]]}
+        simulator["ros__parameters"]["wearer"] = wearer
     nodes[f"{arm.namespace}/calibrator"] = {"ros__parameters": {**values, **changes}}
     return nodes
 
 
-def run_tour(
-    options: argparse.Namespace, nodes: Mapping[str, Any], say: Say, stopping: Stopping | None = None
-) -> LiveTour:
+def run_tour(options: argparse.Namespace, nodes: Mapping[str, Any], say: Say) -> LiveTour:
     """Run `nodes`, the content of a parameter file, until the tour is done or has failed; the arm is then down.
 
-    options: output (the log goes into the same folder) and record. A tour of the simulated device for which this
-    computer was too busy is repeated. Raises ParameterError for a wrong file.
+    options: output (the log goes into the same folder) and record. Raises ParameterError for a wrong file.
     """
-    stopping = stopping or stop_on_signals()
-    is_simulated = any(node.endswith("/simulator") for node in nodes)
-    for attempt in range(1, ATTEMPTS + 1):
-        tour = _run_once(options, nodes, say, stopping)
-        if not (is_simulated and tour.trouble and tour.was_late) or stopping.is_set() or attempt == ATTEMPTS:
-            break
-        say(f"this computer was too busy ({tour.trouble}): attempt {attempt + 1} of {ATTEMPTS}")
-    return tour
-
-
-def _run_once(options: argparse.Namespace, nodes: Mapping[str, Any], say: Say, stopping: Stopping) -> LiveTour:
     tour, last_errors = LiveTour(), dict[str, str]()
-    ending, dead = threading.Event(), list[tuple[str, int] | None]()
+    handlers = [(number, signal.getsignal(number)) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
+    ending = stop_on_signals()
+
+    def on_line(node: str, line: str) -> None:
+        if node.endswith("/calibrator") and line.startswith("{"):
+            tour.follow(line, options.record, say)
+            if tour.done or tour.trouble:
+                ending.set()
+            return
+        log.write(f"{datetime.now():%H:%M:%S.%f} {node.lstrip('/')} {line}\n")
+        if line.startswith(("FATAL ", "ERROR ")):
+            last_errors[node] = line.partition(" ")[2]
+
     with tempfile.TemporaryDirectory() as folder, options.output.with_suffix(".log").open("a", 1) as log:
         path = Path(folder, "params.yaml")
         path.write_text(yaml.safe_dump(dict(nodes), sort_keys=False), encoding="utf-8")
-
-        def on_line(node: str, line: str) -> None:
-            tour.was_late = tour.was_late or any(sign in line for sign in LATE)
-            if node.endswith("/calibrator") and line.startswith("{"):
-                tour.follow(line, options.record, say)
-                return
-            log.write(f"{datetime.now():%H:%M:%S.%f} {node.lstrip('/')} {line}\n")
-            if line.startswith(("FATAL ", "ERROR ")):
-                last_errors[node] = line.partition(" ")[2]
-
         launcher = Launcher(path, on_line)
-        running = threading.Thread(target=lambda: dead.append(launcher.run(ending)))
-        running.start()
-        while running.is_alive() and not (tour.done or tour.trouble) and not stopping.wait(POLL_PERIOD):
-            pass
-        if stopping.is_set() and not tour.done:
-            tour.trouble = tour.trouble or STOPPED
-        ending.set()
-        running.join()
-    for node, code in filter(None, dead):
+        dead = launcher.run(ending)
+    for number, handler in handlers:
+        signal.signal(number, handler)
+    if dead:
+        node, code = dead
         tour.trouble = f"{node.lstrip('/')} ended with exit code {code}: {last_errors.get(node, 'see the log')}"
+    elif not (tour.done or tour.trouble):
+        tour.trouble = STOPPED
     if launcher.maybe_powered:
         powered = f"the motors of {', '.join(launcher.maybe_powered)} may still be powered: cut their supply"
         tour.trouble = f"{tour.trouble}; {powered}" if tour.trouble else powered

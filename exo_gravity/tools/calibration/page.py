@@ -15,8 +15,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from exo_gravity.core.calibration.identification import Identified, Observation, columns
-from exo_gravity.core.model.gravity import gravity_torque
-from exo_gravity.core.model.moments import load_moments, regressor
+from exo_gravity.core.model.moments import load_moments, moments_of, regressor
+from exo_gravity.core.numbers import Vector
 from exo_gravity.tools.calibration.result import CalibrationResult, Curve, plain, value_text
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.reporting import html
@@ -45,11 +45,10 @@ class TorqueTable(NamedTuple):
         """Return the table of what was identified of `arm` from `poses`."""
         theta, direction, measured, spread = columns(poses)
         loads = np.array([load_moments(arm.robot.length, pose.load_mass, pose.load_lever) for pose in poses])
-        weight = np.einsum("ijk,ik->ij", regressor(theta, direction, arm.robot.gravity), loads)
-        used = np.ones(len(poses), dtype=bool)
-        used[[index for index, _ in found.rejected]] = False
-        before = gravity_torque(arm.robot, theta, direction) + weight
+        moments = moments_of(arm.robot) + loads
+        before = np.einsum("njk,nk->nj", regressor(theta, direction, arm.robot.gravity), moments)
         after, held_out = measured - found.residual - found.offset, found.held_out + found.offset
+        used = ~np.isin(np.arange(len(poses)), [index for index, _ in found.rejected])
         return cls(theta, measured, spread, before, after, held_out, found.friction, used)
 
 
@@ -62,10 +61,8 @@ def page_of(result: CalibrationResult, command: str, params: str, today: datetim
 
 def _sections(result: CalibrationResult) -> Iterator[str]:
     labels = result.arm.joint_names if result.arm else tuple(f"joint {n}" for n in (1, 2, 3, 4))
-    if result.refusals:
-        yield html.verdict("Not calibrated; no file was written.", result.refusals, good=False)
-    else:
-        yield html.verdict("Calibrated.")
+    refused = "Not calibrated; no file was written."
+    yield html.verdict(refused if result.refusals else "Calibrated.", result.refusals, good=not result.refusals)
     found = result.identified
     unknown = found.unknown if found else ()
     yield html.bullets("Result", [line for line in result.lines if line not in unknown])
@@ -76,9 +73,9 @@ def _sections(result: CalibrationResult) -> Iterator[str]:
     if found and result.arm:
         table = TorqueTable.of(found, result.arm, result.observations)
         caption = "Predicted against measured torque: on the line, the file is right."
-        yield _figure(prediction_figure(table, labels), caption)
+        yield html.picture(html.png_of(prediction_figure(table, labels), DPI), caption)
         caption = "The torque that remains in each pose. Inside the band, friction holds the arm; outside, it creeps."
-        yield _figure(remainder_figure(table, labels), caption)
+        yield html.picture(html.png_of(remainder_figure(table, labels), DPI), caption)
         yield html.bullets("Drift to expect", _drift(table))
         values = " ".join(f"{value:.3g}" for value in found.singular_values)
         yield html.bullets("What these poses do not show", [*unknown, f"Singular values of the information: {values}"])
@@ -86,11 +83,7 @@ def _sections(result: CalibrationResult) -> Iterator[str]:
         yield html.bullets("Next best pose, if more is wanted", [f"{_degrees(result.suggestion)} degrees"])
     if result.curves:
         caption = "Friction over speed, half the difference between both directions."
-        yield _figure(friction_figure(result.curves, labels), caption)
-
-
-def _figure(figure: Figure, caption: str) -> str:
-    return html.picture(html.png_of(figure, DPI), caption)
+        yield html.picture(html.png_of(friction_figure(result.curves, labels), DPI), caption)
 
 
 def _drift(table: TorqueTable) -> Iterator[str]:
@@ -102,7 +95,7 @@ def _drift(table: TorqueTable) -> Iterator[str]:
         yield f"With {friction} the arm creeps {count}."
 
 
-def _degrees(theta: Sequence[float]) -> str:
+def _degrees(theta: Vector) -> str:
     return " ".join(f"{angle:.0f}" for angle in np.degrees(theta))
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import datetime
 import math
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +20,7 @@ import yaml
 
 from exo_gravity.core.calibration.identification import Identified, Observation
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.numbers import Vector
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.inputs.parameter_file import load
 
@@ -59,7 +60,7 @@ class CalibrationResult:
     arm: ConfiguredArm | None = None  #: as configured before
     observations: tuple[Observation, ...] = ()
     identified: Identified | None = None
-    suggestion: tuple[float, ...] | None = None  #: the next best pose, (4,) rad, None if none is wanted
+    suggestion: Vector | None = None  #: the next best pose, (4,) rad, None if none is wanted
     curves: tuple[Curve, ...] = ()  #: of each joint
 
 
@@ -112,36 +113,32 @@ def value_text(value: Value) -> str:
 
 def _changed(text: str, change: Change) -> str:
     """Return the text with one change, in the node's mapping of parameters or in a mapping inside it."""
-    node: Any = yaml.compose(text, yaml.SafeLoader)
-    path = [change.node, PARAMETERS, *filter(None, change.name.split("."))]
-    while found := _entry(node, path):
-        key, node, path = found
-        if not path:
-            edits = _replacing(key, node, change.value) if change.name else []
-            return _edited(text, [_above(text, key, change.note), *edits])
-        if not isinstance(node, yaml.MappingNode) or not node.value:
-            raise ParameterError(f"{change.node} {change.name}", node.value, "a mapping, to add a value to it")
-    if PARAMETERS in path:
+    root: Any = yaml.compose(text, yaml.SafeLoader)
+    entries = dict(_entries("", root))
+    target = ".".join(filter(None, (change.node, PARAMETERS, change.name)))
+    if target in entries:
+        key, old = entries[target]
+        nodes = old.value if isinstance(old, yaml.SequenceNode) else [old]
+        items = change.value if isinstance(change.value, list) else [change.value]
+        # Of a list, entry by entry: the comments between them stay.
+        pairs = zip(nodes, items, strict=False) if change.name else ()
+        edits = [(node.start_mark.index, node.end_mark.index, value_text(item)) for node, item in pairs]
+        return _edited(text, [_above(text, key, change.note), *edits])
+    parent = max((name for name in entries if target.startswith(f"{name}.")), key=len, default="")
+    if PARAMETERS not in parent:
         raise ParameterError("params", change.node, "a node of the file that has parameters")
-    return _added(text, node, ".".join(path), change)
+    mapping = entries[parent][1]
+    if not isinstance(mapping, yaml.MappingNode) or not mapping.value:
+        raise ParameterError(f"{change.node} {change.name}", mapping.value, "a mapping, to add a value to it")
+    return _added(text, mapping, target.removeprefix(f"{parent}."), change)
 
 
-def _entry(mapping: yaml.MappingNode, path: list[str]) -> tuple[yaml.Node, yaml.Node, list[str]] | None:
-    """Return key and value of the entry that begins the dotted `path`, and the rest of the path."""
-    for length in range(len(path), 0, -1):
-        for key, value in mapping.value:
-            if key.value == ".".join(path[:length]):
-                return key, value, path[length:]
-    return None
-
-
-def _replacing(key: yaml.Node, old: yaml.Node, value: Value) -> list[Edit]:
-    """Return the edits that replace a value; a list of the same length by entries, with the comments between them."""
-    nodes = old.value if isinstance(old, yaml.SequenceNode) else [old]
-    items = value if isinstance(value, list) else [value]
-    if len(nodes) != len(items):
-        return [(key.end_mark.index, _end(old), f": {value_text(value)}")]
-    return [(n.start_mark.index, n.end_mark.index, value_text(item)) for n, item in zip(nodes, items, strict=True)]
+def _entries(prefix: str, mapping: yaml.MappingNode) -> Iterator[tuple[str, tuple[yaml.Node, yaml.Node]]]:
+    """Yield the dotted name of each entry, also of those in mappings inside, with its key and value."""
+    for key, value in mapping.value:
+        yield prefix + key.value, (key, value)
+        if isinstance(value, yaml.MappingNode):
+            yield from _entries(f"{prefix}{key.value}.", value)
 
 
 def _added(text: str, mapping: yaml.MappingNode, name: str, change: Change) -> str:

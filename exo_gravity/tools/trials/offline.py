@@ -12,12 +12,11 @@ from pathlib import Path
 
 import yaml
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import Progress, TaskID
 
 from exo_gravity.bag.content import Bag, Event
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.tilt import rotation_matrix
-from exo_gravity.core.trial.recording import Recording
 from exo_gravity.core.trial.script import TRUNK_ACTIONS, TrialScript
 from exo_gravity.hardware.trunk_estimator import VQF, ImuSample, TrunkEstimator
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu, measured_tilt
@@ -66,33 +65,29 @@ def run_offline(
     params: parameter file in the folder of the trial. Raises DataError if nothing was recorded.
     """
     start = time.time_ns()
-    recordings = tuple(_run_one(trial, console, should_stop) for trial in trials)
+    recordings = []
+    for trial in trials:
+        name = trial.arm.name
+        with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+            task = progress.add_task(name, total=trial.script.duration)
+
+            def on_second(now: float, progress: Progress = progress, task: TaskID = task) -> bool:
+                progress.update(task, completed=now)
+                return should_stop()
+
+            begin = time.perf_counter()
+            recordings.append(trial.run(on_second))
+            taken = time.perf_counter() - begin
+        length = float(recordings[-1].time[-1])
+        console.print(f"{name}: {length:.0f} s simulated in {taken:.1f} s, {length / taken:.0f} times real time")
     events = sorted(Event(*event) for trial in trials for event in trial.events)
     texts = {
         node: yaml.safe_dump({node: {"ros__parameters": values}}, default_flow_style=None, width=120)
         for node, values in load(params).items()
     }
     notes = ("simulated offline: this report has no recording",)
-    troubles = (trial.trouble for trial in trials if trial.trouble)
-    return Bag(params.parent, start, recordings, tuple(events), texts, notes, ()), next(troubles, "")
-
-
-def _run_one(trial: OfflineTrial, console: Console, should_stop: Callable[[], bool]) -> Recording:
-    name, script = trial.arm.name, trial.script
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task(name, total=script.duration)
-
-        def on_second(now: float) -> bool:
-            pose = sum(step.action == "move" for step in script.steps[: (trial.step or 0) + 1])
-            progress.update(task, completed=now, description=f"{name}: pose {pose} of {script.pose_count}")
-            return should_stop()
-
-        begin = time.perf_counter()
-        recording = trial.run(on_second)
-        taken = time.perf_counter() - begin
-    length = float(recording.time[-1])
-    console.print(f"{name}: {length:.0f} s simulated in {taken:.1f} s, {length / taken:.0f} times real time")
-    return recording
+    trouble = next((trial.trouble for trial in trials if trial.trouble), "")
+    return Bag(params.parent, start, tuple(recordings), tuple(events), texts, notes, ()), trouble
 
 
 class TrunkImu:

@@ -95,11 +95,19 @@ class TrialScreen:
         return self._start < math.inf and not self._all_active
 
     @property
+    def _step(self) -> Step | None:
+        return self._script.steps[self._index] if 0 <= self._index < len(self._script.steps) else None
+
+    @property
     def _left(self) -> float:
         """Time in s until the next step."""
-        if 0 <= self._index < len(self._script.steps):
-            return max(0.0, self._script.steps[self._index].duration - self._clock() + self._step_start)
-        return max(0.0, self._start - self._clock())
+        due = self._step_start + self._step.duration if self._step else self._start
+        return max(0.0, due - self._clock())
+
+    @property
+    def _all_active(self) -> bool:
+        states = {name: values.get("state") for name, values in self.status.items() if name.endswith("can_bridge")}
+        return bool(states) and set(self._bridges) <= set(states) and set(states.values()) == {State.ACTIVE.value}
 
     def _follow(self, simulated_steps: list[int]) -> None:
         index, now = self._index, self._clock()
@@ -111,27 +119,15 @@ class TrialScreen:
         elif now >= self._start:
             index = self._script.at(now - self._start)[0]
         if index != self._index:
-            self._begin(index)
-        elif not self._origin and now - self._step_start > SETTLING and self._holding:
+            if self._origin:
+                self._console.print(f"     drifted {self._drift():.2f} deg")
+            self._index, self._step_start, self._origin = index, now, {}
+            if self._step:
+                number = f"{index + 1}/{len(self._script.steps)}"
+                self._console.print(f"{number:<5}{describe(self._step, self._guided)}", soft_wrap=True)
+        elif not self._origin and now - self._step_start > SETTLING and self._step and self._step.action == "hold":
             self._origin = {name: arm["position"] for name, arm in self._arms.items()}
         self.done = index >= len(self._script.steps)
-
-    @property
-    def _all_active(self) -> bool:
-        states = {name: values.get("state") for name, values in self.status.items() if name.endswith("can_bridge")}
-        return bool(states) and set(self._bridges) <= set(states) and set(states.values()) == {State.ACTIVE.value}
-
-    def _begin(self, index: int) -> None:
-        if self._origin:
-            self._console.print(f"     drifted {self._drift():.2f} deg")
-        self._index, self._step_start, self._origin = index, self._clock(), {}
-        if index < len(self._script.steps):
-            number = f"{index + 1}/{len(self._script.steps)}"
-            self._console.print(f"{number:<5}{describe(self._script.steps[index], self._guided)}", soft_wrap=True)
-
-    @property
-    def _holding(self) -> bool:
-        return 0 <= self._index < len(self._script.steps) and self._script.steps[self._index].action == "hold"
 
     def _drift(self) -> float:
         """Return the largest drift of any joint since it was let go, in degrees."""
@@ -168,19 +164,15 @@ class TrialScreen:
 
 def describe(step: Step, guided: bool) -> str:
     """Return a step as a sentence: an instruction for the person at the arm, or what the virtual wearer does."""
-    if step.action == "hold":
-        return f"hands off for {step.duration:g} s"
-    if step.action == "move":
-        pose = " ".join(f"{math.degrees(angle):.0f}" for angle in step.value)
-        return f"bring the arm to {pose} deg, then let go" if guided else f"the wearer brings the arm to {pose} deg"
-    if step.action == "push":
-        pushed = "once, briefly" if step.duration < 1.0 else f"for {step.duration:g} s, then let go"
-        return f"push the arm {pushed}" if guided else "the wearer pushes the arm"
-    if step.action == "walk":
-        what = f"walk for {step.duration:g} s"
-    elif step.action == "sit":
-        what = "sit down hard"
-    else:
-        way = "forward" if step.action == "bow" else "to the right"
-        what = f"{step.action} to {math.degrees(step.value[0]):.0f} deg {way} in {step.duration:g} s"
-    return f"{'' if guided else 'the wearer: '}{what}, and leave the arm alone"
+    angles, time = " ".join(f"{math.degrees(angle):.0f}" for angle in step.value), f"for {step.duration:g} s"
+    pushed = "once, briefly" if step.duration < 1.0 else f"{time}, then let go"
+    over = f"{angles} deg {'forward' if step.action == 'bow' else 'to the right'} in {step.duration:g} s"
+    arm = {
+        "hold": (f"hands off {time}",) * 2,
+        "move": (f"bring the arm to {angles} deg, then let go", f"the wearer brings the arm to {angles} deg"),
+        "push": (f"push the arm {pushed}", "the wearer pushes the arm"),
+    }
+    trunk = {"walk": f"walk {time}", "sit": "sit down hard", "bow": f"bow to {over}", "lean": f"lean to {over}"}
+    if step.action in trunk:
+        return f"{'' if guided else 'the wearer: '}{trunk[step.action]}, and leave the arm alone"
+    return arm[step.action][0 if guided else 1]

@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from exo_gravity.core.compensation.terms.springs import DELAY, TermParameters, TermState
 from exo_gravity.core.model.gravity import Torque
@@ -107,27 +108,26 @@ class EnergyTank:
         return torque
 
 
-class InertiaTerm:
-    """The term: a share of the inertia of `links`. coulomb: (4,) Nm of friction that is left to fill the tank."""
+class InertiaTerm(NamedTuple):
+    """The term: a share of the inertia of `links`."""
 
-    def __init__(self, share: float, links: LinkInertia, coulomb: Sequence[float], tank: EnergyTank) -> None:
-        self._share = share
-        self._tank = tank
-        self._links = links
-        self._coulomb = tuple(coulomb)
+    share: float
+    links: LinkInertia
+    coulomb: Sequence[float]  #: (4,) Nm of friction that is left to fill the tank
+    tank: EnergyTank
 
     def torque(self, state: TermState) -> Torque:
         """Return the torque (4,) in Nm: a share of what accelerates the arm as it is accelerated now."""
         velocity = state.velocity
         fastest = max(map(abs, velocity))
         fading = min((fastest - STANDSTILL) / (MOVING - STANDSTILL), (TOO_FAST - fastest) / (TOO_FAST - FAST))
-        share = self._share * max(0.0, min(1.0, fading))
-        whole = self._links.torque(state.position, velocity, state.acceleration)
+        share = self.share * max(0.0, min(1.0, fading))
+        whole = self.links.torque(state.position, velocity, state.acceleration)
         v1, v2, v3, v4 = velocity
-        c1, c2, c3, c4 = self._coulomb
+        c1, c2, c3, c4 = self.coulomb
         income = c1 * abs(v1) + c2 * abs(v2) + c3 * abs(v3) + c4 * abs(v4)
         a, b, c, d = whole
-        return self._tank.pass_on((share * a, share * b, share * c, share * d), velocity, state.dt, income)
+        return self.tank.pass_on((share * a, share * b, share * c, share * d), velocity, state.dt, income)
 
 
 class AccelerationFilter:

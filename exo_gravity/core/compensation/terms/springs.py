@@ -101,11 +101,9 @@ class Spring(TermParameters):
             raise ParameterError("spring.pose", list(numbers), f"4 angles within {FREE:g} rad, or a path of rows")
         if times[0] != 0.0 or not (np.all(np.diff(times) > 0.0) and times[-1] < math.inf):
             raise ParameterError("times of the path in spring.pose", times[:3].tolist(), "rising from 0 s")
-        speeds = np.linalg.norm(np.diff(poses, axis=0), axis=1) / np.diff(times)
-        if np.any(speeds > MAX_PATH_SPEED):
-            raise ParameterError(
-                "speed of the path in spring.pose", float(np.max(speeds)), f"at most {MAX_PATH_SPEED:g} rad/s"
-            )
+        speed = max((np.linalg.norm(np.diff(poses, axis=0), axis=1) / np.diff(times)).tolist(), default=0.0)
+        if speed > MAX_PATH_SPEED:
+            raise ParameterError("speed of the path in spring.pose", speed, f"at most {MAX_PATH_SPEED:g} rad/s")
         for name, value in (("pose", numbers), ("times", tuple(times.tolist())), ("ways", poses.T)):
             object.__setattr__(self, name, value)
 
@@ -114,11 +112,8 @@ class Spring(TermParameters):
         pose = self.pose
         if len(pose) != JOINT_COUNT:
             pose = [float(np.interp(state.elapsed, self.times, way)) for way in self.ways]
-        torque = []
         columns = zip(self.stiffness, pose, state.position, state.velocity, self.max_effort, strict=True)
-        for k, to, q, v, most in columns:
-            torque.append(clamp(k * (to - q), most) - LATE * k * v)
-        return tuple(torque)
+        return tuple([clamp(k * (to - q), most) - LATE * k * v for k, to, q, v, most in columns])
 
 
 @dataclass(frozen=True)

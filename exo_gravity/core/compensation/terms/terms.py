@@ -7,6 +7,7 @@ gravity compensation goes on beneath it. A new term is a field of `TermSettings`
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
@@ -177,8 +178,7 @@ class Terms:
         return self._with_assistance([clamp(tau, most) for tau, most in zip(total, MAX_EFFORT, strict=True)])
 
     def _with_assistance(self, torque: Sequence[float]) -> Torque:
-        a, b, c, d = self._assisted
-        return a + torque[0], b + torque[1], c + torque[2], d + torque[3]
+        return tuple(map(operator.add, self._assisted, torque))
 
     def _built(self, s: TermSettings, arm: ArmModel) -> Sequence[Term]:
         """Return the terms that are on."""
