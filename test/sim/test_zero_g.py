@@ -78,7 +78,7 @@ def test_a_sweep_of_the_support_changes_the_torque_smoothly_until_it_holds_the_a
 
     def every_second(now):
         if now > 5.0:
-            trial.apply(replace(CONTROLLER, support=next(support, 1.0)))
+            trial.compensator.apply(replace(CONTROLLER, support=next(support, 1.0)))
         return False
 
     recording = trial.run(every_second)
