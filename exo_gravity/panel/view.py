@@ -20,7 +20,8 @@ PANEL = (
     Param("token", "", "secret that opens the page; empty: none on loopback, elsewhere a random one in the log",
           fixed=True),
     Param("dead_man", False, "let the arms down when the page that holds control has been gone for 1 s", fixed=True),
-    Param("language", "en", "language of the page until its user chooses another", choices=("en", "de"), fixed=True),
+    Param("language", "auto", "language of the page until its user chooses another; auto: the browser's",
+          choices=("auto", "en", "de"), fixed=True),
     Param("trials", "", "folder with trial scripts; empty: those of the package", fixed=True),
     Param("output", "recordings", "folder for recordings, trials and saved parameters", fixed=True),
 )
@@ -31,6 +32,9 @@ SETTABLE = {
     for param in COMPENSATOR
     if param.name in ("support", "mode", "wearer.body_mass", "wearer.sex", "wearer.segment_length")
 }
+
+# Buses of python-can that lead to no motor.
+SIMULATED = ("udp_multicast", "virtual")
 
 Values = Mapping[str, Any]
 NUMBERS = ("position", "velocity", "effort")
@@ -75,4 +79,5 @@ def _arm_setup(bridge: Values, compensator: Values) -> dict[str, Any]:
     return {
         "max_effort": [min(column) for column in zip(*efforts, strict=True)] if efforts else None,
         "settings": {name: compensator.get(name) for name in SETTABLE},
+        "simulated": bridge.get("can.interface") in SIMULATED,
     }

@@ -152,7 +152,7 @@ def test_every_page_gets_setup_and_state_and_a_reloaded_page_stays_the_same(stag
         page = first(connection, "page")
         setup = first(connection, "setup")
         assert set(setup["arms"]) == {"right", "left"}
-        assert setup["language"] == "en"
+        assert setup["language"] == "auto"
         assert setup["urdf"].count('type="revolute"') == 8
         state = first(connection, "state")
         assert len(state["arms"]["right"]["joints"]) == 4

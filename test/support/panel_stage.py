@@ -137,7 +137,7 @@ class Stage:
         self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}/"
         self.server = PanelServer(host, self.port, token, self.control, self.reports.get, dict, time.monotonic)
-        self._own_setup = {"language": "en", "dead_man": False, "trials": list(self.files.trials)}
+        self._own_setup = {"language": "auto", "dead_man": False, "trials": list(self.files.trials)}
         self._bridge = values_of(CAN_BRIDGE, BUS, "can.options")
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._play, daemon=True)
