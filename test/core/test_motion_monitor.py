@@ -117,5 +117,5 @@ def test_a_wrong_compensator_is_let_down_before_an_arm_that_no_one_holds_is_fast
 
 def test_a_fast_wearer_is_not_let_down() -> None:
     settings = settings_of(75.0)
-    seen = quiet(Compensator(settings), 7.0, 3, settings.arm.first_moment)
+    seen = quiet(Compensator(settings), 4.0, 3, settings.arm.first_moment)
     assert not seen.trouble and seen.speed > 3.0 and seen.share < 0.5

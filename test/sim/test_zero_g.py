@@ -23,7 +23,9 @@ from exo_gravity.sim.offline import ArmSetup, OfflineTrial
 
 RATED = (3.0, 9.0, 3.0, 3.0)
 NAMES = ("rotation", "abduction", "flexion", "elbow")
-LIMITS = Limits(NAMES, (-1.65, -0.17, -0.78, -0.17), (1.65, 3.14, 2.53, 3.14), (5.0, 5.0, 5.0, 6.0), RATED)
+LIMITS = Limits(
+    NAMES, (-1.65, -0.17, -0.78, -0.17), (1.65, 3.14, 2.53, 3.14), (5.0, 5.0, 5.0, 6.0), RATED, sign_check_torque=0.0
+)
 MOTORS_OF_ARM = [JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1)]
 ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
 MASS, COG = Wearer(75.0).on_links(ROBOT.length)
@@ -41,7 +43,7 @@ def carried(settings, pose, tilt=UPRIGHT, seconds=10.0, after=()):
     device.pitch, device.roll = tilt
     steps = [{"move": pose, "over": 3.0}, *after, {"hold": seconds}]
     script = TrialScript.parse({"name": "release", "steps": steps})
-    return OfflineTrial(ArmSetup("right", device, MOTORS_OF_ARM, LIMITS, settings, 250.0, tilt), script, 8.0)
+    return OfflineTrial(ArmSetup("right", device, MOTORS_OF_ARM, LIMITS, settings, 250.0, tilt), script, 3.0)
 
 
 def moved(trial):
