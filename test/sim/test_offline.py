@@ -104,9 +104,9 @@ def test_the_recorded_command_is_the_torque_that_the_motors_report(done):
 
 
 def test_the_same_trial_gives_the_same_recording(done):
-    again = make().run(lambda now: now >= 8.0).position
-    same = np.all(again[: 8 * 250] == done[1].position[: 8 * 250])
-    assert same and len(again) > 8 * 250
+    again = make().run(lambda now: now >= 4.0).position
+    same = np.all(again[: 4 * 250] == done[1].position[: 4 * 250])
+    assert same and len(again) > 4 * 250
 
 
 def test_after_a_motor_failure_the_arm_is_let_down_and_the_joint_named():
@@ -129,14 +129,6 @@ def test_a_stop_lets_the_arm_down_and_keeps_the_recording():
     assert 2.0 < start < 8.0  # the checks take a second without trouble, then the sign check of four joints
     assert end == pytest.approx(10.0, abs=0.01)
     assert end + 2.0 < recording.time[-1] < 36.0  # of letting down
-    assert not any(motor.entered for motor in trial.arm.device.motors)
-
-
-def test_a_stop_before_the_arm_is_carried_ends_the_trial_with_the_motors_off_and_keeps_the_recording():
-    trial = make()
-    recording = trial.run(lambda now: now >= 4.0)
-    assert trial.trouble == "right: stopped by the operator"
-    assert 6.0 < recording.time[-1] < 30.0  # of letting down
     assert not any(motor.entered for motor in trial.arm.device.motors)
 
 
