@@ -135,7 +135,8 @@ def test_a_refusal_is_on_the_page_without_new_values() -> None:
 def test_friction_is_drawn_over_speed() -> None:
     speed = np.array((0.3, 0.05, 0.1))
     curves = [Curve(speed, 0.1 + 0.02 * speed, 0.1 + 0.02 * speed) for _ in range(4)]
-    page = page_of(CalibrationResult((), ("friction found",), curves=tuple(curves)), "friction", "old.yaml", DAY)
+    comment = Change("/right/can_bridge", "", 0, "friction of the elbow")  # in the file alone
+    page = page_of(CalibrationResult((comment,), ("friction found",), curves=tuple(curves)), "friction", "old.yaml", DAY)
     assert page.count("<img") == 1 and "Friction over speed" in page
 
 

@@ -66,9 +66,9 @@ def _sections(result: CalibrationResult) -> Iterator[str]:
     found = result.identified
     unknown = found.unknown if found else ()
     yield html.bullets("Result", [line for line in result.lines if line not in unknown])
-    if result.changes and not result.refusals:
+    rows = [(c.node, c.name, value_text(plain(c.value)), c.note) for c in result.changes if c.name]
+    if rows and not result.refusals:
         yield html.heading("New values")
-        rows = ((c.node, c.name, value_text(plain(c.value)), c.note) for c in result.changes if c.name)
         yield html.table(("node", "parameter", "value", "note"), [((), rows)])
     if found and result.arm:
         table = TorqueTable.of(found, result.arm, result.observations)
