@@ -136,7 +136,9 @@ def test_friction_is_drawn_over_speed() -> None:
     speed = np.array((0.3, 0.05, 0.1))
     curves = [Curve(speed, 0.1 + 0.02 * speed, 0.1 + 0.02 * speed) for _ in range(4)]
     comment = Change("/right/can_bridge", "", 0, "friction of the elbow")  # in the file alone
-    page = page_of(CalibrationResult((comment,), ("friction found",), curves=tuple(curves)), "friction", "old.yaml", DAY)
+    page = page_of(
+        CalibrationResult((comment,), ("friction found",), curves=tuple(curves)), "friction", "old.yaml", DAY
+    )
     assert page.count("<img") == 1 and "Friction over speed" in page
 
 
