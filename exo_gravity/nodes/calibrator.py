@@ -26,7 +26,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.tilt_input import TiltInput
-from exo_gravity.nodes.ros.hot_path import NEWEST, HotPath, SolePublisher, TiltSubscription
+from exo_gravity.nodes.ros.hot_path import NEWEST, HotPath, Repeated, SolePublisher, TiltSubscription
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, by_name
 from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
@@ -61,25 +61,21 @@ class CalibratorNode(Node):
             TiltSubscription(self, self._tilt, self._lock, self._on_refused_tilt, self._on_intruder)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self.create_timer(REPORT_PERIOD, self._report)
+        # Poses are chosen on a thread of their own: neither joint states nor tilts may wait for it.
+        self._planner = Repeated("plan", self._tour.plan, PLAN_PERIOD)
         self._joint_states.start()
-        self._stopping = threading.Event()
-        threading.Thread(target=self._plan, daemon=True).start()
+        self._planner.start()
 
     @property
     def failure(self) -> Exception | None:
-        """The exception that ended the thread of the joint states."""
-        return self._joint_states.failure
+        """The exception that ended the thread of the joint states, or that of the poses."""
+        return self._joint_states.failure or self._planner.failure
 
     def close(self) -> None:
         """Stop answering joint states, and report what is still unreported."""
-        self._stopping.set()
         self._joint_states.stop()
+        self._planner.stop()
         self._report()
-
-    def _plan(self) -> None:
-        """Choose poses on a thread of its own: neither joint states nor tilts may wait for it."""
-        while not self._stopping.wait(PLAN_PERIOD):
-            self._tour.plan()
 
     def _on_joint_states(self, message: JointState, info: dict[str, Any]) -> None:
         self._command.header.stamp = message.header.stamp
