@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.calibration.identification import Observation, identify
+from exo_gravity.core.calibration.motion import fit_friction
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.model.moments import load_moments, regressor
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.tools.calibration.page import TorqueTable, page_of
-from exo_gravity.tools.calibration.result import CalibrationResult, Change, Curve
+from exo_gravity.tools.calibration.result import CalibrationResult, Change
 from exo_gravity.tools.inputs.arms import configured_arm
 
 DAY = datetime.date(2026, 11, 22)
@@ -109,7 +110,7 @@ def test_the_page_says_what_was_found_and_what_does_not_show() -> None:
     assert "<b>Calibrated.</b>" in page
     assert "robot.first_moment" in page and "kg m, &lt;±0.001&gt;" in page
     assert "M4 is 20 % larger than in the file." in page
-    assert page.count("data:image/png;base64,") == 2
+    assert page.count("data:image/png;base64,") == 1
     assert found.identified is not None
     for sentence in found.identified.unknown:
         assert escape(sentence) in page
@@ -134,7 +135,7 @@ def test_a_refusal_is_on_the_page_without_new_values() -> None:
 
 def test_friction_is_drawn_over_speed() -> None:
     speed = np.array((0.3, 0.05, 0.1))
-    curves = [Curve(speed, 0.1 + 0.02 * speed, 0.1 + 0.02 * speed) for _ in range(4)]
+    curves = [fit_friction(speed, 0.1 + 0.02 * speed) for _ in range(4)]
     comment = Change("/right/can_bridge", "", 0, "friction of the elbow")  # in the file alone
     page = page_of(
         CalibrationResult((comment,), ("friction found",), curves=tuple(curves)), "friction", "old.yaml", DAY

@@ -15,16 +15,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from exo_gravity.core.calibration.identification import Identified, Observation, columns
+from exo_gravity.core.calibration.motion import FrictionCurve
 from exo_gravity.core.model.moments import load_moments, moments_of, regressor
 from exo_gravity.core.numbers import Vector
-from exo_gravity.tools.calibration.result import CalibrationResult, Curve, plain, value_text
+from exo_gravity.tools.calibration.result import CalibrationResult, plain, value_text
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.reporting import html
 from exo_gravity.tools.reporting.html import FAINT, HOLD_COLOUR, INK, JOINT_COLOURS, make_plain
 
 DPI = 130
 FIGURE_WIDTH = 11.0  # inches
-ROOM = 0.08  # of the data's range, around it
 SMALL_FRICTION = 0.2  # of the friction that was measured: a well-run-in gear
 
 
@@ -72,10 +72,9 @@ def _sections(result: CalibrationResult) -> Iterator[str]:
         yield html.table(("node", "parameter", "value", "note"), [((), rows)])
     if found and result.arm:
         table = TorqueTable.of(found, result.arm, result.observations)
-        caption = "Predicted against measured torque: on the line, the file is right."
-        yield html.picture(html.png_of(prediction_figure(table, labels), DPI), caption)
-        caption = "The torque that remains in each pose. Inside the band, friction holds the arm; outside, it creeps."
-        yield html.picture(html.png_of(remainder_figure(table, labels), DPI), caption)
+        line = "Predicted against measured torque: on the line, the file is right"
+        caption = f"{line}. What remains in each pose: inside the band, friction holds the arm; outside, it creeps."
+        yield html.picture(html.png_of(torque_figure(table, labels), DPI), caption)
         yield html.bullets("Drift to expect", _drift(table))
         values = " ".join(f"{value:.3g}" for value in found.singular_values)
         yield html.bullets("What these poses do not show", [*unknown, f"Singular values of the information: {values}"])
@@ -99,70 +98,54 @@ def _degrees(theta: Vector) -> str:
     return " ".join(f"{angle:.0f}" for angle in np.degrees(theta))
 
 
-def prediction_figure(table: TorqueTable, labels: Sequence[str]) -> Figure:
-    """Return predicted against measured torque, a panel per joint, with the old file's predictions behind."""
-    figure = Figure(figsize=(FIGURE_WIDTH, 3.4), layout="constrained")
-    for joint, axis in enumerate(figure.subplots(1, 4)):
-        measured, before, after = (column[:, joint] for column in (table.measured, table.before, table.after))
-        everything = np.concatenate((measured, before, after))
-        room = max(ROOM * np.ptp(everything), 0.05)
-        limits = everything.min() - room, everything.max() + room
-        axis.plot(limits, limits, color=FAINT, lw=0.8, zorder=0)
-        axis.plot(measured, before, "o", ms=4.5, mfc="none", color=FAINT, label="old file")
-        axis.plot(measured[table.used], after[table.used], "o", ms=4.5, color=JOINT_COLOURS[joint], label="new file")
-        if not table.used.all():
-            axis.plot(measured[~table.used], after[~table.used], "x", ms=6, color=INK, label="left out")
-        axis.set(xlim=limits, ylim=limits, aspect="equal", xlabel="Measured (Nm)")
-        axis.legend(frameon=False, fontsize=8, loc="upper left", handletextpad=0.1)
-        _finish(axis, joint, labels)
-    figure.axes[0].set_ylabel("Predicted (Nm)")
-    return figure
-
-
-def remainder_figure(table: TorqueTable, labels: Sequence[str]) -> Figure:
-    """Return the torque that remains unbalanced in each pose, with the friction that holds it, a panel per joint."""
-    figure = Figure(figsize=(FIGURE_WIDTH, 6.2), layout="constrained")
-    axes = figure.subplots(4, 1, sharex=True)
+def torque_figure(table: TorqueTable, labels: Sequence[str]) -> Figure:
+    """Return a row per joint: predicted against measured torque, and what remains in each pose, with the friction."""
+    figure = Figure(figsize=(FIGURE_WIDTH, 10.0), layout="constrained")
     numbers, used = np.arange(1, len(table.theta) + 1), table.used
-    for joint, axis in enumerate(axes):
-        friction = table.friction[joint]
-        axis.axhspan(-friction, friction, color=HOLD_COLOUR, lw=0, zorder=0, label="friction holds")
-        axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
-        before = table.measured[:, joint] - table.before[:, joint]
-        axis.plot(numbers[used] - 0.12, before[used], "o", ms=5, mfc="none", color=INK, label="old file")
-        axis.errorbar(
+    for joint, (left, right) in enumerate(figure.subplots(4, 2, width_ratios=(1.0, 3.0))):
+        colour, friction = JOINT_COLOURS[joint], table.friction[joint]
+        measured, before, after = (column[:, joint] for column in (table.measured, table.before, table.after))
+        left.axline((0.0, 0.0), slope=1.0, color=FAINT, lw=0.8, zorder=0)
+        left.plot(measured, before, "o", ms=4.5, mfc="none", color=INK)
+        left.plot(measured[used], after[used], "o", ms=4.5, color=colour)
+        left.plot(measured[~used], after[~used], "x", ms=6, color=INK)
+        left.set(aspect="equal", adjustable="datalim", ylabel="Predicted (Nm)")
+        right.axhspan(-friction, friction, color=HOLD_COLOUR, lw=0, zorder=0, label="friction holds")
+        right.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
+        wrong = (measured - before)[used]
+        right.plot(numbers[used] - 0.12, wrong, "o", ms=5, mfc="none", color=INK, label="old file")
+        right.errorbar(
             numbers[used] + 0.12, table.held_out[used, joint], 2.0 * table.spread[used, joint], fmt="o", ms=4.5, lw=1.2,
-            color=JOINT_COLOURS[joint], label="new file, this pose held out, ± 2 standard errors",
+            color=colour, label="new file; right: this pose held out, ± 2 standard errors",
         )  # fmt: skip
-        _finish(axis, joint, labels)
-    axes[1].set_ylabel("Measured minus predicted torque (Nm)", y=0.0)
-    axes[-1].set_xlabel("Pose, with its four angles in degrees")
+        right.set(xlim=(0.4, len(numbers) + 0.6), ylabel="Remainder (Nm)")
+        right.set_xticks(numbers, [])
+        _finish(left, joint, labels[joint])
+        _finish(right, joint)
+    left.set_xlabel("Measured (Nm)")
     poses = [[str(n), *_degrees(theta).split()] for n, theta in zip(numbers, table.theta, strict=True)]
     ticks = ["\n".join(pose if kept else [*pose, "left out"]) for pose, kept in zip(poses, used, strict=True)]
-    axes[-1].set_xticks(numbers, ticks, fontsize=8)
-    axes[-1].set_xlim(0.4, len(numbers) + 0.6)
-    handles, names = axes[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside upper center", ncols=3, frameon=False, fontsize=9)
+    right.set_xticks(numbers, ticks, fontsize=8)
+    right.set_xlabel("Pose, with its four angles in degrees")
+    figure.legend(*right.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False, fontsize=9)
     return figure
 
 
-def friction_figure(curves: Sequence[Curve], labels: Sequence[str]) -> Figure:
+def friction_figure(curves: Sequence[FrictionCurve], labels: Sequence[str]) -> Figure:
     """Return the friction of each joint over its speed, as measured and as fitted."""
     figure = Figure(figsize=(FIGURE_WIDTH, 3.2), layout="constrained")
-    axes = figure.subplots(1, len(curves), sharey=True, squeeze=False)[0]
-    for joint, (axis, curve) in enumerate(zip(axes, curves, strict=True)):
-        order = np.argsort(curve.speed)
+    for joint, axis in enumerate(figure.subplots(1, 4, sharey=True)):
+        curve, order = curves[joint], np.argsort(curves[joint].speed)
         axis.plot(curve.speed, curve.torque, "o", ms=4.5, color=JOINT_COLOURS[joint], label="measured")
-        axis.plot(curve.speed[order], curve.fit[order], color=INK, lw=1.0, label="fitted")
+        axis.plot(curve.speed[order], curve.fitted[order], color=INK, lw=1.0, label="fitted")
         axis.set_xlabel("Speed (rad/s)")
         axis.legend(frameon=False, fontsize=8)
-        _finish(axis, joint, labels)
-    axes[0].set_ylabel("Friction (Nm)")
-    axes[0].set_ylim(bottom=0.0)
+        _finish(axis, joint, labels[joint])
+    figure.axes[0].set(ylabel="Friction (Nm)", ylim=(0.0, None))
     return figure
 
 
-def _finish(axis: Axes, joint: int, labels: Sequence[str]) -> None:
-    axis.set_title(labels[joint], fontsize=10, color=JOINT_COLOURS[joint], loc="left", weight="bold")
+def _finish(axis: Axes, joint: int, title: str = "") -> None:
+    axis.set_title(title, fontsize=10, color=JOINT_COLOURS[joint], loc="left", weight="bold")
     make_plain(axis)
     axis.margins(y=0.12)

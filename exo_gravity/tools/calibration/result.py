@@ -19,6 +19,7 @@ import numpy as np
 import yaml
 
 from exo_gravity.core.calibration.identification import Identified, Observation
+from exo_gravity.core.calibration.motion import FrictionCurve
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Vector
 from exo_gravity.tools.inputs.arms import ConfiguredArm
@@ -40,14 +41,6 @@ class Change(NamedTuple):
     note: str = ""  #: uncertainty and unit, for a comment in the file
 
 
-class Curve(NamedTuple):
-    """Friction of one joint."""
-
-    speed: np.ndarray  #: (n,) rad/s
-    torque: np.ndarray  #: (n,) Nm, measured
-    fit: np.ndarray  #: (n,) Nm
-
-
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
     """The result of one subcommand of `calibrate`."""
@@ -59,7 +52,7 @@ class CalibrationResult:
     observations: tuple[Observation, ...] = ()
     identified: Identified | None = None
     suggestion: Vector | None = None  #: the next best pose, (4,) rad, None if none is wanted
-    curves: tuple[Curve, ...] = ()  #: of each joint
+    curves: tuple[FrictionCurve, ...] = ()  #: of each joint
 
 
 def check_output(path: Path) -> None:

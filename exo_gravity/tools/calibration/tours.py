@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.calibration.friction import FrictionCurve, fit_friction
 from exo_gravity.core.calibration.identification import Identified, Observation, columns, identify
+from exo_gravity.core.calibration.motion import FrictionCurve, fit_friction
 from exo_gravity.core.calibration.poses import candidates, next_pose
 from exo_gravity.core.compensation.params import wearer_of
 from exo_gravity.core.errors import DataError, ParameterError
@@ -33,7 +33,7 @@ from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.tools.calibration import live
 from exo_gravity.tools.calibration.live import Say, tour_parameters
 from exo_gravity.tools.calibration.recorded import observations_of
-from exo_gravity.tools.calibration.result import CalibrationResult, Change, Curve
+from exo_gravity.tools.calibration.result import CalibrationResult, Change
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 
 SCALE_POSES = 8  # of each tour of `calibrate scale`
@@ -160,7 +160,7 @@ def friction_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Ca
         fit = fit_friction(speed, torque)
         lines.append(f"{name}: {_sentence(fit)}")
         changes.append(Change(f"{arm.namespace}/can_bridge", "", 0, f"friction of {lines[-1]}"))
-        curves.append(Curve(speed, torque, fit.at(speed)))
+        curves.append(fit)
         if fit.coulomb <= 0.0:
             negative.append(f"{name}: friction of {fit.coulomb:.3f} Nm: must be above 0: was the arm touched?")
     observed = tuple(observations)

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.calibration.friction import fit_friction
-from exo_gravity.core.calibration.motion import ACCELERATION, MAX_SPEED, Line, Station, average
+from exo_gravity.core.calibration.motion import ACCELERATION, MAX_SPEED, Line, Station, average, fit_friction
 from exo_gravity.core.calibration.poses import BestPoses, FixedStations, candidates, measurable
 from exo_gravity.core.calibration.tour import Tour
 from exo_gravity.core.calibration.tracking import TorqueGuess, inertia_of
@@ -255,7 +254,7 @@ def test_friction_over_speed_is_fitted_with_and_without_stribeck():
     assert plain.stribeck == 0.0
     np.testing.assert_allclose((plain.coulomb, plain.viscous), (0.2, 0.05), atol=1e-9)
     fit = fit_friction(speed, 0.2 + 0.05 * speed + 0.1 * np.exp(-((speed / 0.05) ** 2)))
-    np.testing.assert_allclose(fit.at(speed), 0.2 + 0.05 * speed + 0.1 * np.exp(-((speed / 0.05) ** 2)), atol=0.005)
+    np.testing.assert_allclose(fit.fitted, 0.2 + 0.05 * speed + 0.1 * np.exp(-((speed / 0.05) ** 2)), atol=0.005)
     assert fit.coulomb == pytest.approx(0.2, abs=0.01)
     with pytest.raises(DataError, match="at 1 speeds"):
         fit_friction(speed[:1], speed[:1])
