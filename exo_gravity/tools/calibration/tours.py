@@ -153,18 +153,17 @@ def calibrate_friction(options: argparse.Namespace, arm: ConfiguredArm, say: Say
 
 def friction_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
     """Return the friction of each joint that `observations` show. Raises DataError as `fit_friction` does."""
-    changes, lines, negative, curves = [], [], [], []
-    for joint, name in enumerate(arm.joint_names):
-        speed = np.array([np.broadcast_to(one.speed, JOINT_COUNT)[joint] for one in observations])
-        torque = np.array([one.friction[joint] for one in observations])
-        fit = fit_friction(speed, torque)
-        lines.append(f"{name}: {_sentence(fit)}")
-        changes.append(Change(f"{arm.namespace}/can_bridge", "", 0, f"friction of {lines[-1]}"))
-        curves.append(fit)
-        if fit.coulomb <= 0.0:
-            negative.append(f"{name}: friction of {fit.coulomb:.3f} Nm: must be above 0: was the arm touched?")
-    observed = tuple(observations)
-    return CalibrationResult(tuple(changes), tuple(lines), tuple(negative), arm, observed, curves=tuple(curves))
+    speed = np.array([np.broadcast_to(one.speed, JOINT_COUNT) for one in observations])
+    curves = tuple(map(fit_friction, speed.T, np.array([one.friction for one in observations]).T))
+    named = list(zip(arm.joint_names, curves, strict=True))
+    lines = tuple(f"{name}: {_sentence(fit)}" for name, fit in named)
+    changes = tuple(Change(f"{arm.namespace}/can_bridge", "", 0, f"friction of {line}") for line in lines)
+    negative = tuple(
+        f"{name}: friction of {fit.coulomb:.3f} Nm: must be above 0: was the arm touched?"
+        for name, fit in named
+        if fit.coulomb <= 0.0
+    )
+    return CalibrationResult(changes, lines, negative, arm, tuple(observations), curves=curves)
 
 
 def _sentence(fit: FrictionCurve) -> str:
@@ -179,14 +178,14 @@ def calibrate_wearer(options: argparse.Namespace, arm: ConfiguredArm, say: Say) 
     # Few poses, in a comfortable range, with the weight that the table expects.
     low, high = np.maximum(arm.low, COMFORTABLE[0]), np.minimum(arm.high, COMFORTABLE[1])
     changes = {"tour.poses": WEARER_POSES, "position_min": low.tolist(), "position_max": high.tolist()}
-    expected = moments_of(arm.robot.with_wearer(*_expected_wearer(arm)))
+    expected = moments_of(arm.robot.with_wearer(*_wearer(arm)))
     request = "Wear the arm, sit upright and relax: it will be moved slowly. Pull to stop it"
     return wearer_from(arm, _observations(options, arm, say, changes, request, expected))
 
 
 def wearer_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
     """Return the wearer's masses that `observations` show. Raises DataError as `worn_arm` does."""
-    cog = np.array(_expected_wearer(arm)[1])
+    cog = np.array(_wearer(arm)[1])
     mass, error, remainder = worn_arm(arm, observations, cog)
     node, note = f"{arm.namespace}/compensator", f"kg, +-{error[0]:.2f} and {error[1]:.2f}"
     changes = (
@@ -199,7 +198,7 @@ def wearer_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Cali
     lines = [f"{part}: {own:.2f} +- {e:.2f} kg, {name} {moment:.3f} kg m" for part, own, e, name, moment in rows]
     lines.append(f"largest remainder of a pose: {np.abs(remainder).max():.2f} Nm")
     body_mass, (low, high) = arm.compensator["wearer.body_mass"], TABLE_RATIO
-    tabled_mass, tabled_cog = map(np.array, _tabled_wearer(arm))
+    tabled_mass, tabled_cog = map(np.array, _wearer(arm, tabled=True))
     ratio = moments / moments_along(length, tabled_cog, tabled_mass)[2:]
     refusals: tuple[str, ...] = ()
     if not body_mass:
@@ -243,13 +242,10 @@ def worn_arm(
     return np.append((0.0, 0.0), mass), error, remainder
 
 
-def _tabled_wearer(arm: ConfiguredArm) -> tuple[Sequence[float], Sequence[float]]:
-    """Return mass (4,) in kg and cog (4,) in m on each link, by the body-mass table."""
-    body_mass = arm.compensator["wearer.body_mass"] or TYPICAL_BODY_MASS
-    return wearer_of({**arm.compensator, "wearer.mass": (0.0,) * 4, "wearer.body_mass": body_mass})
-
-
-def _expected_wearer(arm: ConfiguredArm) -> tuple[Sequence[float], Sequence[float]]:
-    """Return the same of the file's wearer, if it gives both masses."""
-    mass = arm.compensator["wearer.mass"]
-    return (mass, arm.compensator["wearer.cog"]) if mass[2] and mass[3] else _tabled_wearer(arm)
+def _wearer(arm: ConfiguredArm, tabled: bool = False) -> tuple[Sequence[float], Sequence[float]]:
+    """Return mass (4,) in kg and cog (4,) in m on each link: the file's if it gives both masses, else the table's."""
+    values = arm.compensator
+    if not tabled and all(values["wearer.mass"][2:]):
+        return values["wearer.mass"], values["wearer.cog"]
+    body_mass = values["wearer.body_mass"] or TYPICAL_BODY_MASS
+    return wearer_of({**values, "wearer.mass": (0.0,) * JOINT_COUNT, "wearer.body_mass": body_mass})
