@@ -79,21 +79,13 @@ class Line:
         return is_steady and abs(time - self.duration / 2.0) * self._speed <= WINDOW * self._length / 2.0
 
 
-class Average(NamedTuple):
-    """What sweeps show at a pose."""
+def average(sweeps: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, ...]:
+    """Return what `sweeps` show at a pose, which alternate between there and back.
 
-    theta: np.ndarray  #: (4,) rad
-    effort: np.ndarray  #: (4,) Nm
-    friction: np.ndarray  #: (4,) Nm
-    spread: np.ndarray  #: (4,) Nm, standard error of `effort`
-    unrest: np.ndarray  #: (4,) Nm, largest change of the effort from one cycle to another
-
-
-def average(sweeps: Sequence[tuple[np.ndarray, np.ndarray]]) -> Average:
-    """Return the average of `sweeps`, which alternate between there and back.
-
-    Each is the position (n, 4) rad and effort (n, 4) Nm of its samples. The effort minus that expected at its angle can
-    be given in its place: it does not change along a sweep (gravity does, and by up to 0.3 % more than in proportion).
+    These are the angles in rad, and in Nm: the effort, the friction, the standard error of the effort, and its largest
+    change from one cycle to another; (4,) each. A sweep is the position (n, 4) rad and effort (n, 4) Nm of its samples.
+    The effort minus that expected at its angle can be given in its place: it does not change along a sweep (gravity
+    does, and by up to 0.3 % more than in proportion).
     """
     bins = np.zeros((len(sweeps), BINS, JOINT_COUNT))  # mean effort in order of the angle
     for number, (_, effort) in enumerate(sweeps):
@@ -104,7 +96,7 @@ def average(sweeps: Sequence[tuple[np.ndarray, np.ndarray]]) -> Average:
     friction = (there - back).mean(axis=(0, 1)) / 2.0
     scatter = gravity.reshape(-1, JOINT_COUNT).std(axis=0, ddof=1) / np.sqrt(max(1.0, gravity[..., 0].size / 2.0))
     theta = np.mean([position.mean(axis=0) for position, _ in sweeps], axis=0)
-    return Average(theta, cycles.mean(axis=0), friction, np.hypot(scatter, RESOLUTION), np.ptp(cycles, axis=0))
+    return theta, cycles.mean(axis=0), friction, np.hypot(scatter, RESOLUTION), np.ptp(cycles, axis=0)
 
 
 class FrictionCurve(NamedTuple):

@@ -206,23 +206,19 @@ class Tour:
             followed = ways / (2.0 * WINDOW * station.amplitude)
             was_known, sticks = any(self._friction), bool(np.min(followed) < FOLLOWED)
             if station.speed >= STEADY_SPEED:
-                friction = np.maximum(average(sweeps[-2:]).friction, self._friction if sticks else 0.0)
+                friction = np.maximum(average(sweeps[-2:])[2], self._friction if sticks else 0.0)
                 self._friction, self._tracker.friction = friction.tolist(), friction
             # Sweep again what passed without friction, or what a joint did not follow.
             if sticks or not was_known:
                 sweeps, directions = [], []
             failures += sticks
             if failures > MAX_FAILURES:
-                self._skip(followed)
+                self._skipped += 1
+                if self._skipped > MAX_SKIPPED:
+                    name, share = self._limits.joint_names[int(np.argmin(followed))], float(np.min(followed))
+                    self.trouble = f"{name}: it sticks: it follows {share:.0%} of a slow motion, must be {FOLLOWED:.0%}"
                 return
         self._keep(station, sweeps, np.mean(directions, axis=0))
-
-    def _skip(self, followed: np.ndarray) -> None:
-        """Leave out a pose in which a joint sticks; the tour ends if that happens often."""
-        self._skipped += 1
-        if self._skipped > MAX_SKIPPED:
-            name, share = self._limits.joint_names[int(np.argmin(followed))], followed.min()
-            self.trouble = f"{name}: it sticks: it follows {share:.0%} of a slow motion, must be {FOLLOWED:.0%}"
 
     def _keep(self, station: Station, sweeps: list[tuple[np.ndarray, np.ndarray]], direction: np.ndarray) -> None:
         """Keep what the `sweeps` show, and improve the expected torque with it, unless the passes differ."""
@@ -232,10 +228,8 @@ class Tour:
         allowed = np.dot(MAX_UNREST, (np.ones(JOINT_COUNT), np.abs(friction), np.abs(effort)))
         for name, change, limit in zip(self._limits.joint_names, unrest, allowed, strict=True):
             if change > limit:
-                reason = "the arm was touched, or the joint slips"
-                self.trouble = (
-                    f"{name}: {change:.2f} Nm between two passes of a pose, the limit is {limit:.2f}: {reason}"
-                )
+                what = f"{change:.2f} Nm between two passes of a pose, the limit is {limit:.2f}"
+                self.trouble = f"{name}: {what}: the arm was touched, or the joint slips"
                 return
         self.measured.append(Observation(theta, direction, effort, friction, spread, *self._load, station.speed))
         before = self._guess.torque(theta.tolist())

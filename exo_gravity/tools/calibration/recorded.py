@@ -119,9 +119,9 @@ def _sweeps(recording: Recording, down: np.ndarray) -> Iterator[Observation]:
             continue
         used, first_last = back.stop, np.array([middle[[0, -1]] for middle in middles])
         speed = np.mean(np.abs(np.diff(position[first_last], axis=1)[:, 0]) / np.diff(time[first_last]), axis=0)
-        seen = average([(position[middle], recording.effort[middle]) for middle in middles])
+        theta, effort, friction, spread, _ = average([(position[part], recording.effort[part]) for part in middles])
         direction = _mean_of(down[there.start : back.stop])
-        yield Observation(seen.theta, direction, seen.effort, np.sign(way) * seen.friction, seen.spread, speed=speed)
+        yield Observation(theta, direction, effort, np.sign(way) * friction, spread, speed=speed)
 
 
 def _runs(recording: Recording, start: float, end: float) -> Iterator[slice]:
