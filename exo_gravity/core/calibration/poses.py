@@ -62,7 +62,7 @@ class BestPoses:
         self._candidates = candidates(limits)
 
     def next(
-        self, taken: np.ndarray, position: np.ndarray, elapsed: float, guess: TorqueGuess, friction: Sequence[float]
+        self, taken: np.ndarray, position: np.ndarray, elapsed: float, guess: TorqueGuess, friction: Vector
     ) -> Station | None:
         """Return the best of the candidates that can be held and reached; the first is the hanging arm.
 
@@ -96,7 +96,7 @@ class BestPoses:
         fits = way + self._first.duration <= budget * (TIME_SHARE if left > 1 else 1.0)
         return np.asarray(fits if fits.any() else way + home <= (way + home).min() + 1.0)
 
-    def _room(self, poses: np.ndarray, start: np.ndarray, guess: TorqueGuess, friction: Sequence[float]) -> np.ndarray:
+    def _room(self, poses: np.ndarray, start: np.ndarray, guess: TorqueGuess, friction: Vector) -> np.ndarray:
         """Return the room (n,) that the motors have to hold `poses`, reach them from `start`, and leave them for home.
 
         It is in standard deviations of the expected torque, below 0 where they have none; on the way home the torque is
@@ -158,10 +158,8 @@ def next_pose(
     """
     if len(candidates) == 0:
         raise ParameterError("candidates", [], "at least one pose")
-    information = np.diag(NATURAL**-2.0)
-    if len(taken):
-        rows = _sensitivity(np.asarray(taken, dtype=float), direction, moments, gravity).reshape(-1, COUNT)
-        information += rows.T @ rows
+    seen = _sensitivity(np.reshape(taken, (-1, JOINT_COUNT)), direction, moments, gravity).reshape(-1, COUNT)
+    information = np.diag(NATURAL**-2.0) + seen.T @ seen
     rows = _sensitivity(candidates, direction, moments, gravity)
     added = np.eye(JOINT_COUNT) + rows @ np.linalg.inv(information) @ rows.transpose(0, 2, 1)
     return int(np.argmax(np.linalg.slogdet(added)[1]))

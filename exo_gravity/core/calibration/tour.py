@@ -73,10 +73,10 @@ class Tour:
         self._awaits_plan = False
         self._plan: tuple[Station | None, str] = (None, "")  # the next pose, or None to go home, and the trouble
         self._sweep: list[tuple[Sequence[float], np.ndarray, Sequence[float]]] | None = None  # its samples
-        self._friction = [0.0] * JOINT_COUNT  # Nm, 0 until it is measured
-        self._unexplained = [0.0] * JOINT_COUNT  # s
+        self._friction = np.zeros(JOINT_COUNT)  # Nm, 0 until it is measured
+        self._unexplained = np.zeros(JOINT_COUNT)  # s
         self._refreshed = -math.inf
-        self._matrix, self._uncertain = np.eye(JOINT_COUNT), [0.0] * JOINT_COUNT
+        self._matrix, self._uncertain = np.eye(JOINT_COUNT), np.zeros(JOINT_COUNT)
         self._effort: Torque = (0.0,) * JOINT_COUNT
 
     def wait(self, position: Sequence[float], tilt: Tilt) -> Torque:
@@ -124,7 +124,7 @@ class Tour:
         self._refreshed = self._now
         moments = self._guess.common_moments[:JOINT_COUNT]
         self._matrix = inertia_of(self._guess.length, moments, self._load).matrix(position)
-        self._uncertain = self._guess.torques(np.array([position]))[1][0].tolist()
+        self._uncertain = self._guess.torques(np.array([position]))[1][0]
 
     def _wrong_motion(self, dt: float, error: Sequence[float], velocity: Sequence[float], tilt: Tilt) -> str:
         """Return what is wrong after `dt` s with the motion, or ''; error: (4,) rad, velocity: (4,) rad/s."""
@@ -142,16 +142,15 @@ class Tour:
 
     def _wrong_torque(self, dt: float) -> str:
         """Return which joint is saturated, or needs a torque that neither weight nor friction explains, or ''."""
-        for i, name in enumerate(self._limits.joint_names):
-            if self._tracker.saturated[i] > SATURATION:
-                return f"{name}: saturated: the pose needs more than max_effort = {self._most[i]:g} Nm"
-        for i, name in enumerate(self._limits.joint_names):
-            friction, torque = self._friction[i], self._tracker.correction[i]
-            limit = MAX_CORRECTION + DEVIATIONS * self._uncertain[i] + (0.5 * friction or UNKNOWN_FRICTION)
-            self._unexplained[i] = self._unexplained[i] + dt if abs(torque) > limit else 0.0
-            if self._unexplained[i] > PERSISTENCE:
-                reason = "is a hand on the arm?"
-                return f"{name}: {torque:.2f} Nm beyond its weight and friction, the limit is {limit:.2f}: {reason}"
+        for i in np.flatnonzero(self._tracker.saturated > SATURATION):
+            most = f"max_effort = {self._most[i]:g} Nm"
+            return f"{self._limits.joint_names[i]}: saturated: the pose needs more than {most}"
+        torque, slide = self._tracker.correction, np.where(self._friction, 0.5 * self._friction, UNKNOWN_FRICTION)
+        limit = MAX_CORRECTION + DEVIATIONS * self._uncertain + slide
+        self._unexplained = np.where(np.abs(torque) > limit, self._unexplained + dt, 0.0)
+        for i in np.flatnonzero(self._unexplained > PERSISTENCE):
+            beyond = f"{torque[i]:.2f} Nm beyond its weight and friction, the limit is {limit[i]:.2f}"
+            return f"{self._limits.joint_names[i]}: {beyond}: is a hand on the arm?"
         return ""
 
     def plan(self) -> None:
@@ -204,10 +203,10 @@ class Tour:
                 directions += direction
             ways = np.min([np.abs(position[-1] - position[0]) for position, _ in sweeps[-2:]], axis=0)
             followed = ways / (2.0 * WINDOW * station.amplitude)
-            was_known, sticks = any(self._friction), bool(np.min(followed) < FOLLOWED)
+            was_known, sticks = bool(np.any(self._friction)), bool(np.min(followed) < FOLLOWED)
             if station.speed >= STEADY_SPEED:
-                friction = np.maximum(average(sweeps[-2:])[2], self._friction if sticks else 0.0)
-                self._friction, self._tracker.friction = friction.tolist(), friction
+                self._friction = np.maximum(average(sweeps[-2:])[2], self._friction if sticks else 0.0)
+                self._tracker.friction = self._friction
             # Sweep again what passed without friction, or what a joint did not follow.
             if sticks or not was_known:
                 sweeps, directions = [], []

@@ -184,19 +184,34 @@ def calibrate_wearer(options: argparse.Namespace, arm: ConfiguredArm, say: Say) 
 
 
 def wearer_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
-    """Return the wearer's masses that `observations` show. Raises DataError as `worn_arm` does."""
-    cog = np.array(_wearer(arm)[1])
-    mass, error, remainder = worn_arm(arm, observations, cog)
+    """Return the masses on links 3 and 4 that explain what the robot alone does not. Raises DataError if none do."""
+    if len(observations) < 3:
+        raise DataError(f"{len(observations)} poses were measured, must be at least 3")
+    theta, direction, effort, spread = columns(observations)
+    cog, length, rows = np.array(_wearer(arm)[1]), arm.robot.length, regressor(theta, direction, arm.robot.gravity)
+    per_mass = np.stack([moments_along(length, cog, one) for one in np.eye(JOINT_COUNT)[2:]], axis=1)
+    weight = 1.0 / np.hypot(spread, BREATHING).ravel()
+    matrix = (rows[..., :JOINT_COUNT] @ per_mass).reshape(-1, 2) * weight[:, None]
+    extra = (effort - rows @ moments_of(arm.robot)).ravel() * weight
+    covariance = np.linalg.pinv(matrix.T @ matrix)
+    mass = covariance @ matrix.T @ extra
+    remainder = extra - matrix @ mass
+    error = np.sqrt(np.diag(covariance) * max(1.0, float(remainder @ remainder) / (remainder.size - 2)))
+    moments = (per_mass @ mass)[2:]
+    lines = []
+    for part, own, e, name, moment in zip(WORN, mass, error, ("M3", "M4"), moments, strict=True):
+        if not 0.0 < own < MOST:
+            relaxed = "is the arm relaxed, the robot calibrated?"
+            raise DataError(f"{part}: {own:.2f} kg: must be from 0 to {MOST:g}: {relaxed}")
+        if e > LARGEST_ERROR * own:
+            raise DataError(f"{part}: {own:.2f} +- {e:.2f} kg: add a pose with the arm further forward")
+        lines.append(f"{part}: {own:.2f} +- {e:.2f} kg, {name} {moment:.3f} kg m")
+    lines.append(f"largest remainder of a pose: {np.abs(remainder / weight).max():.2f} Nm")
     node, note = f"{arm.namespace}/compensator", f"kg, +-{error[0]:.2f} and {error[1]:.2f}"
     changes = (
-        Change(node, "wearer.mass", np.round(mass, 3).tolist(), note),
-        Change(node, "wearer.cog", np.round(cog, 4).tolist(), "m, of the body-mass table"),
+        Change(node, "wearer.mass", [0.0, 0.0, *mass.round(3).tolist()], note),
+        Change(node, "wearer.cog", cog.round(4).tolist(), "m, of the body-mass table"),
     )
-    length = arm.robot.length
-    moments = moments_along(length, cog, mass)[2:]
-    rows = zip(WORN, mass[2:], error, ("M3", "M4"), moments, strict=True)
-    lines = [f"{part}: {own:.2f} +- {e:.2f} kg, {name} {moment:.3f} kg m" for part, own, e, name, moment in rows]
-    lines.append(f"largest remainder of a pose: {np.abs(remainder).max():.2f} Nm")
     body_mass, (low, high) = arm.compensator["wearer.body_mass"], TABLE_RATIO
     tabled_mass, tabled_cog = map(np.array, _wearer(arm, tabled=True))
     ratio = moments / moments_along(length, tabled_cog, tabled_mass)[2:]
@@ -204,42 +219,10 @@ def wearer_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Cali
     if not body_mass:
         lines.append(f"a person of {TYPICAL_BODY_MASS * ratio[0]:.0f} kg has this M3 by the table {Wearer.table}")
     else:
-        shares = f"{ratio[0]:.0%} of M3 and {ratio[1]:.0%} of M4 by the table {Wearer.table} for {body_mass:g} kg"
-        lines.append(shares)
+        lines.append(f"{ratio[0]:.0%} of M3 and {ratio[1]:.0%} of M4 by the table {Wearer.table} for {body_mass:g} kg")
         if not np.all((ratio >= low) & (ratio <= high)):
-            refusals = (f"implausible: {shares}: must be from {low:.0%} to {high:.0%}",)
+            refusals = (f"implausible: {lines[-1]}: must be from {low:.0%} to {high:.0%}",)
     return CalibrationResult(changes, tuple(lines), refusals, arm, tuple(observations))
-
-
-def worn_arm(
-    arm: ConfiguredArm, observations: Sequence[Observation], cog: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the masses (4,) kg, at `cog` (4,) m, that explain what the robot alone does not, on links 3 and 4.
-
-    Also the standard errors (2,) kg of these two, and the torque (n, 4) Nm that remains in each pose. Raises DataError
-    if the poses do not show the masses.
-    """
-    if len(observations) < 3:
-        raise DataError(f"{len(observations)} poses were measured, must be at least 3")
-    theta, direction, effort, spread = columns(observations)
-    rows = regressor(theta, direction, arm.robot.gravity)
-    moments = np.stack([moments_along(arm.robot.length, cog, one) for one in np.eye(JOINT_COUNT)[2:]], axis=1)
-    per_mass = rows[..., :JOINT_COUNT] @ moments
-    extra = effort - rows @ moments_of(arm.robot)
-    weight = 1.0 / np.hypot(spread, BREATHING).ravel()
-    matrix = per_mass.reshape(-1, 2) * weight[:, None]
-    covariance = np.linalg.pinv(matrix.T @ matrix)
-    mass = covariance @ matrix.T @ (extra.ravel() * weight)
-    remainder = extra - per_mass @ mass
-    chi = float(np.sum((remainder.ravel() * weight) ** 2)) / (remainder.size - 2)
-    error = np.sqrt(np.diag(covariance) * max(1.0, chi))
-    for name, own, deviation in zip(WORN, mass, error, strict=True):
-        if not 0.0 < own < MOST:
-            relaxed = "is the arm relaxed, the robot calibrated?"
-            raise DataError(f"{name}: {own:.2f} kg: must be from 0 to {MOST:g}: {relaxed}")
-        if deviation > LARGEST_ERROR * own:
-            raise DataError(f"{name}: {own:.2f} +- {deviation:.2f} kg: add a pose with the arm further forward")
-    return np.append((0.0, 0.0), mass), error, remainder
 
 
 def _wearer(arm: ConfiguredArm, tabled: bool = False) -> tuple[Sequence[float], Sequence[float]]:
