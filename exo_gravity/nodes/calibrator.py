@@ -119,23 +119,19 @@ class CalibratorNode(Node):
                     self._trouble = status.message if has_fault else f"the bridge stopped carrying: {state}"
 
     def _report(self) -> None:
-        tour = self._tour
+        tour, events = self._tour, list[dict[str, Any]]()
         while self._printed < len(tour.measured):
-            _print({"observation": tour.measured[self._printed]._asdict()})
+            events.append({"observation": tour.measured[self._printed]._asdict()})
             self._printed += 1
         trouble = tour.trouble or self._trouble
         progress = tour.progress if self._began else f"waiting for the arm to be carried: {self._bridge_message}"
-        for key, value in (("progress", progress), ("trouble", trouble), ("done", tour.done)):
-            if value != self._reported[key]:
-                self._reported[key] = value
-                _print({key: value})
+        reported = {"progress": progress, "trouble": trouble, "done": tour.done}
+        events += [{key: value} for key, value in reported.items() if value != self._reported[key]]
+        self._reported = reported
+        sys.stdout.writelines(json.dumps(event, default=np.ndarray.tolist) + "\n" for event in events)
+        sys.stdout.flush()
         level = ERROR if trouble else OK if self._began else WARN
         self._diagnostics.report(level, f"withdrawn: {trouble}" if trouble else progress)
-
-
-def _print(event: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(event, default=np.ndarray.tolist) + "\n")
-    sys.stdout.flush()
 
 
 def main() -> None:
