@@ -26,7 +26,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.tilt_input import TiltInput
-from exo_gravity.nodes.ros.hot_path import NEWEST, HotPath, SolePublisher, TiltSubscription
+from exo_gravity.nodes.ros.hot_path import NEWEST, HotPath, Repeated, SolePublisher, TiltSubscription
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, by_name
 from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
@@ -61,25 +61,21 @@ class CalibratorNode(Node):
             TiltSubscription(self, self._tilt, self._lock, self._on_refused_tilt, self._on_intruder)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self.create_timer(REPORT_PERIOD, self._report)
+        # Poses are chosen on a thread of their own: neither joint states nor tilts may wait for it.
+        self._planner = Repeated("plan", self._tour.plan, PLAN_PERIOD)
         self._joint_states.start()
-        self._stopping = threading.Event()
-        threading.Thread(target=self._plan, daemon=True).start()
+        self._planner.start()
 
     @property
     def failure(self) -> Exception | None:
-        """The exception that ended the thread of the joint states."""
-        return self._joint_states.failure
+        """The exception that ended the thread of the joint states, or that of the poses."""
+        return self._joint_states.failure or self._planner.failure
 
     def close(self) -> None:
         """Stop answering joint states, and report what is still unreported."""
-        self._stopping.set()
         self._joint_states.stop()
+        self._planner.stop()
         self._report()
-
-    def _plan(self) -> None:
-        """Choose poses on a thread of its own: neither joint states nor tilts may wait for it."""
-        while not self._stopping.wait(PLAN_PERIOD):
-            self._tour.plan()
 
     def _on_joint_states(self, message: JointState, info: dict[str, Any]) -> None:
         self._command.header.stamp = message.header.stamp
@@ -123,23 +119,19 @@ class CalibratorNode(Node):
                     self._trouble = status.message if has_fault else f"the bridge stopped carrying: {state}"
 
     def _report(self) -> None:
-        tour = self._tour
+        tour, events = self._tour, list[dict[str, Any]]()
         while self._printed < len(tour.measured):
-            _print({"observation": tour.measured[self._printed]._asdict()})
+            events.append({"observation": tour.measured[self._printed]._asdict()})
             self._printed += 1
         trouble = tour.trouble or self._trouble
         progress = tour.progress if self._began else f"waiting for the arm to be carried: {self._bridge_message}"
-        for key, value in (("progress", progress), ("trouble", trouble), ("done", tour.done)):
-            if value != self._reported[key]:
-                self._reported[key] = value
-                _print({key: value})
+        reported = {"progress": progress, "trouble": trouble, "done": tour.done}
+        events += [{key: value} for key, value in reported.items() if value != self._reported[key]]
+        self._reported = reported
+        sys.stdout.writelines(json.dumps(event, default=np.ndarray.tolist) + "\n" for event in events)
+        sys.stdout.flush()
         level = ERROR if trouble else OK if self._began else WARN
         self._diagnostics.report(level, f"withdrawn: {trouble}" if trouble else progress)
-
-
-def _print(event: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(event, default=np.ndarray.tolist) + "\n")
-    sys.stdout.flush()
 
 
 def main() -> None:
