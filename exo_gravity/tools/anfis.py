@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_typestore
 from scipy.linalg import qr, solve_triangular
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
+from exo_gravity.bag.joints import TYPES
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.bag.storage import Storage
 from exo_gravity.core.errors import DataError
@@ -84,21 +84,18 @@ def from_bag(path: str | Path, configured: ConfiguredArm, functions: int) -> Sam
     `functions` membership functions per input.
     """
     bag = read_bag(path)
-    names = {recording.name: recording for recording in bag.recordings}
-    recording = names.get(configured.side) or (next(iter(names.values())) if len(names) == 1 else None)
+    joints = sorted(configured.joint_names)
+    recording = next((r for r in bag.recordings if sorted(r.joint_names) == joints), None)
     if recording is None:
-        raise DataError(f"{path}: the arms are {', '.join(names)}: must include {configured.side}")
-    if sorted(recording.joint_names) != sorted(configured.joint_names):
-        expected = ", ".join(configured.joint_names)
-        raise DataError(f"{path}: the joints are {', '.join(recording.joint_names)}: must be {expected}")
+        found = "; ".join(", ".join(r.joint_names) for r in bag.recordings)
+        raise DataError(f"{path}: the joints are {found}: must include {', '.join(joints)}")
     order = [recording.joint_names.index(name) for name in configured.joint_names]
     tilted = _tilted(path, configured.side, bag.start)
     holds = [h for h in analyse(recording).holds if not np.any((tilted >= h.start) & (tilted <= h.end))]
     spans = [(recording.time >= hold.start) & (recording.time <= hold.end) for hold in holds]
     angle = np.array([hold.pose for hold in holds]).reshape(-1, JOINT_COUNT)[:, order]
     torque = np.array([recording.effort[span].mean(axis=0) for span in spans]).reshape(-1, JOINT_COUNT)[:, order]
-    known = np.isfinite(torque) & (angle >= configured.low) & (angle <= configured.high)
-    kept = np.all(known, axis=1)
+    kept = np.all(np.isfinite(torque) & (angle >= configured.low) & (angle <= configured.high), axis=1)
     angle, torque = angle[kept, 1:], torque[kept, 1:]
     checked = np.arange(len(angle)) % HELD_OUT == HELD_OUT - 1
     if len(angle) < HELD_OUT:
@@ -111,11 +108,10 @@ def from_bag(path: str | Path, configured: ConfiguredArm, functions: int) -> Sam
 
 def _tilted(path: str | Path, side: str, start: int) -> np.ndarray:
     """Return the times in s at which the trunk was not upright; without an IMU it is taken as upright."""
-    types = get_typestore(Stores.ROS2_JAZZY)
     times = []
     for *_, stamp, data in Storage(path).messages(lambda topic, msgtype: (topic, msgtype) == (TILT_TOPIC, TILT_TYPE)):
         try:
-            message: Any = types.deserialize_cdr(data, TILT_TYPE)
+            message: Any = TYPES.deserialize_cdr(data, TILT_TYPE)
         except (SerdeError, ValueError) as error:
             raise DataError(f"{path}: cannot read {TILT_TOPIC} ({error})") from None
         if not Tilt.of(side, pitch=message.vector.y, roll=message.vector.x).axis_angle <= UPRIGHT:
