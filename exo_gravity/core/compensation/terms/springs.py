@@ -181,10 +181,7 @@ class SoftLimits(TermParameters):
         edges = self.range[0::2], self.range[1::2]
         columns = zip(self.stiffness, *edges, state.position, state.velocity, self.max_effort, strict=True)
         for k, low, high, q, v, most in columns:
-            if low <= q <= high:
-                torque.append(0.0)
-                continue
-            depth = q - high if q > high else q - low
+            depth = max(q - high, 0.0) + min(q - low, 0.0)
             damping = LATE * k * min(1.0, abs(depth) / EDGE)
             torque.append(clamp(-k * depth, most) - damping * v)
         return tuple(torque)

@@ -158,7 +158,7 @@ class Terms:
             self._output, self._has_changed, dt = NO_TORQUE, False, 0.0
         acceleration = self._acceleration.update(velocity, dt) if self._has_inertia else NO_TORQUE
         self._state = TermState(dt, theta, velocity, acceleration, now - self.now.since)
-        total = _sum(self.now.terms, self._state) if self.now.terms else NO_TORQUE
+        total = _sum(self.now.terms, self._state)
         self._refusal = "" if math.isfinite(sum(total)) else "torque of the terms is not finite"
         if self._refusal:
             total, self._acceleration = NO_TORQUE, AccelerationFilter()  # it may have kept what is not finite
@@ -191,8 +191,4 @@ class Terms:
 
 
 def _sum(terms: Sequence[Term], state: TermState) -> Torque:
-    a = b = c = d = 0.0
-    for term in terms:
-        e, f, g, h = term.torque(state)
-        a, b, c, d = a + e, b + f, c + g, d + h
-    return a, b, c, d
+    return tuple(map(sum, zip(NO_TORQUE, *(term.torque(state) for term in terms), strict=True)))
