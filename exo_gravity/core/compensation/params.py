@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from exo_gravity.core.compensation.settings import URDF_LAW, GravityModel, Settings, UrdfSettings
 from exo_gravity.core.compensation.terms.terms import term_parameters, term_settings_of
-from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.anfis import AnfisLaw
 from exo_gravity.core.model.arm import (
     MAX_GAIN,
@@ -107,11 +107,16 @@ def urdf_table(count: int, given: Collection[str]) -> tuple[Param, ...]:
     return compensator_table(given, (*shared, *URDF))
 
 
-def settings_of(values: Mapping[str, Any], anfis: AnfisLaw | None = None) -> Settings:
+def settings_of(values: Mapping[str, Any], read: Callable[[str], str] | None = None) -> Settings:
     """Return the settings that `compensator`'s parameter values describe, or raise ParameterError.
 
-    anfis: the model in `anfis_file`; None if no file is given.
+    read: returns the text of the file `anfis_file`; without it the file is left out.
     """
+    path = values["anfis_file"]
+    try:
+        anfis = AnfisLaw.load(read(path)) if path and read else None
+    except (OSError, UnicodeDecodeError, DataError) as error:
+        raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
     mass, cog = wearer_of(values)
     return Settings(
         side=values["side"],

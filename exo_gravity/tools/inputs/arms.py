@@ -16,8 +16,7 @@ import numpy as np
 
 from exo_gravity.core.compensation.params import compensator_table, settings_of
 from exo_gravity.core.compensation.settings import URDF_LAW, Settings
-from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.model.anfis import AnfisLaw
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.motors.joint_motor import OPTIONS, JointMotor, motors_of
 from exo_gravity.core.params import Param, values_of
@@ -65,7 +64,7 @@ class ConfiguredArm:
     def settings(self) -> Settings:
         """Return the compensator's settings, with the model in `anfis_file`. Raises ParameterError."""
         with named(f"{self.namespace}/compensator"):
-            return settings_of(self.compensator, _anfis_model(self.compensator["anfis_file"]))
+            return settings_of(self.compensator, lambda path: Path(path).read_text(encoding="utf-8"))
 
 
 def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:
@@ -134,11 +133,3 @@ def named(node: str) -> Iterator[None]:
     except ParameterError as error:
         name = error.name if error.name.startswith(node) else f"{node} {error.name}"
         raise ParameterError(name, error.value, error.expected) from None
-
-
-def _anfis_model(path: str) -> AnfisLaw | None:
-    """Return the model of a file, None for no file."""
-    try:
-        return AnfisLaw.load(Path(path).read_text(encoding="utf-8")) if path else None
-    except (OSError, DataError) as error:
-        raise ParameterError("anfis_file", path, f"a file written by train_anfis ({error})") from None
