@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from exo_gravity.core.errors import ExoGravityError, ParameterError
+from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.model.tilt import SIDES
 from exo_gravity.core.view.urdf import described, urdf
 from exo_gravity.tools.inputs.arms import configured_arm, configured_arms, named
@@ -41,14 +41,11 @@ def main(args: Sequence[str] | None = None) -> int:
     options = _arguments(args)
     try:
         text = urdf_of(options.params, options.side, options.meshes)
-        if not options.output:
-            print(text, end="")
-            return 0
-        try:
+        if options.output:
             Path(options.output).write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise ParameterError("output", options.output, f"a file to write to ({error.strerror})") from None
-    except ExoGravityError as error:
+        else:
+            print(text, end="")
+    except (ExoGravityError, OSError) as error:
         print(f"urdf: {error}", file=sys.stderr)
         return 2
     return 0

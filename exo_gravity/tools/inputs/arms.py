@@ -74,23 +74,17 @@ def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:
     """
     can_bridge = node_values(nodes, f"{namespace}/can_bridge", CAN_BRIDGE)
     node = f"{namespace}/compensator"
-    nodes = _with_own_law(nodes, node)
-    compensator = node_values(nodes, node, compensator_table(nodes.get(node, ())))
+    given = nodes.get(node, {})
+    if given.get("law") == URDF_LAW:  # the law `exact` gives the torques of a URDF of this arm
+        kept = {name: value for name, value in given.items() if not name.startswith(f"{URDF_LAW}.")}
+        nodes = {**nodes, node: {**kept, "law": "exact"}}
+    compensator = node_values(nodes, node, compensator_table(given))
     with named(f"{namespace}/can_bridge"):
         motors, limits = motors_of(can_bridge), limits_of(can_bridge)
     with named(f"{namespace}/compensator"):
         # The robot does not depend on the law, and the model of `law: anfis` may not be trained yet.
         robot = settings_of({**compensator, "law": "exact"}).robot
     return ConfiguredArm(namespace, can_bridge, compensator, motors, limits, robot)
-
-
-def _with_own_law(nodes: Nodes, node: str) -> Nodes:
-    """Return the nodes with the law `exact` in place of `urdf`, whose torques a URDF of this arm shares."""
-    given = nodes.get(node, {})
-    if given.get("law") != URDF_LAW:
-        return nodes
-    own = {name: value for name, value in given.items() if not name.startswith(f"{URDF_LAW}.")}
-    return {**nodes, node: {**own, "law": "exact"}}
 
 
 def configured_arms(params: str | Path) -> list[ConfiguredArm]:
