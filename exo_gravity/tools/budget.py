@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from exo_gravity.core.errors import ExoGravityError, ParameterError
+from exo_gravity.core.errors import ExoGravityError, ParameterError, named
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.budget import (
     USUAL_TILT,
@@ -36,7 +36,7 @@ from exo_gravity.core.model.budget import (
 from exo_gravity.core.model.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
 from exo_gravity.core.numbers import one_float
 from exo_gravity.tools.cli import missing
-from exo_gravity.tools.inputs.arms import ConfiguredArm, configured_arms, named
+from exo_gravity.tools.inputs.arms import ConfiguredArm, configured_arms
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -77,7 +77,7 @@ def arm_budget(configured: ConfiguredArm, wearer: Wearer, support: float, max_ti
     """
     motors, robot = configured.can_bridge["motor"], configured.robot
     bounds = workspace(configured.low, configured.high, max_tilt)
-    with named(f"{configured.namespace}/compensator"):
+    with named(f"{configured.namespace}/compensator "):
         load = wearer.on_links(robot.length)
         torques = motor_torques(motors, configured.can_bridge["torque_scale"])
         joints = budget(robot, load, support, bounds, *torques)

@@ -13,16 +13,16 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from exo_gravity.core.errors import ExoGravityError
+from exo_gravity.core.errors import ExoGravityError, named
 from exo_gravity.core.model.tilt import SIDES
 from exo_gravity.core.view.urdf import described, urdf
-from exo_gravity.tools.inputs.arms import configured_arm, configured_arms, named
+from exo_gravity.tools.inputs.arms import configured_arm, configured_arms
 
 
 def urdf_of(params: str | Path, side: str = "", meshes: str = "") -> str:
     """Return the URDF of the arms in a parameter file, or of the arm on one `side`. Raises ParameterError."""
     arms = [configured_arm(params, side)] if side else configured_arms(params)
-    with named(f"{arms[0].namespace}/compensator" if len(arms) == 1 else str(params)):
+    with named(f"{arms[0].namespace}/compensator " if len(arms) == 1 else f"{params} "):
         return urdf([described(arm.compensator, arm.can_bridge) for arm in arms], meshes)
 
 

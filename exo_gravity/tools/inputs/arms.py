@@ -6,8 +6,7 @@ unknown parameter is an error here too. Errors name node and parameter: `/right/
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ import numpy as np
 
 from exo_gravity.core.compensation.params import compensator_table, settings_of
 from exo_gravity.core.compensation.settings import URDF_LAW, Settings
-from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.errors import ParameterError, named
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.motors.joint_motor import OPTIONS, JointMotor, motors_of
 from exo_gravity.core.params import Param, values_of
@@ -63,7 +62,7 @@ class ConfiguredArm:
 
     def settings(self) -> Settings:
         """Return the compensator's settings, with the model in `anfis_file`. Raises ParameterError."""
-        with named(f"{self.namespace}/compensator"):
+        with named(f"{self.namespace}/compensator "):
             return settings_of(self.compensator, lambda path: Path(path).read_text(encoding="utf-8"))
 
 
@@ -79,9 +78,9 @@ def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:
         kept = {name: value for name, value in given.items() if not name.startswith(f"{URDF_LAW}.")}
         nodes = {**nodes, node: {**kept, "law": "exact"}}
     compensator = node_values(nodes, node, compensator_table(given))
-    with named(f"{namespace}/can_bridge"):
+    with named(f"{namespace}/can_bridge "):
         motors, limits = motors_of(can_bridge), limits_of(can_bridge)
-    with named(f"{namespace}/compensator"):
+    with named(f"{namespace}/compensator "):
         # The robot does not depend on the law, and the model of `law: anfis` may not be trained yet.
         robot = settings_of({**compensator, "law": "exact"}).robot
     return ConfiguredArm(namespace, can_bridge, compensator, motors, limits, robot)
@@ -115,15 +114,5 @@ def node_values(nodes: Nodes, node: str, table: tuple[Param, ...]) -> dict[str, 
     """Return every parameter of `node` by name, checked against its `table`. Raises ParameterError."""
     if node not in nodes:
         raise ParameterError("params", sorted(nodes), f"a file with {node}")
-    with named(node):
+    with named(f"{node} "):
         return values_of(table, nodes[node], OPTIONS)
-
-
-@contextmanager
-def named(node: str) -> Iterator[None]:
-    """Add the name of `node` to any ParameterError raised inside the context."""
-    try:
-        yield
-    except ParameterError as error:
-        name = error.name if error.name.startswith(node) else f"{node} {error.name}"
-        raise ParameterError(name, error.value, error.expected) from None

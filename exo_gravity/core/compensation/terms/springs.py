@@ -190,12 +190,3 @@ class SoftLimits(TermParameters):
 def clamp(value: float, limit: float) -> float:
     """Return `value` limited to -limit..limit."""
     return max(-limit, min(limit, value))
-
-
-def stable_stiffness(least_inertia: Sequence[float]) -> list[float]:
-    """Return the stiffness (4,) in Nm/rad that can be damped on these inertias (4,) kg m^2.
-
-    A spring that acts DELAY late gives the energy of a damping of -stiffness * DELAY. Virtual damping acts as late, so
-    inertia / (2 DELAY) is the most that damps: twice what the spring needs.
-    """
-    return [inertia / (4.0 * DELAY**2) for inertia in least_inertia]

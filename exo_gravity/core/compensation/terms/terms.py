@@ -31,7 +31,6 @@ from exo_gravity.core.compensation.terms.springs import (
     Term,
     TermState,
     clamp,
-    stable_stiffness,
 )
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import ArmModel
@@ -65,9 +64,12 @@ class TermSettings:
         if not any(getattr(self, name).on for name in ("damping", "spring", "coupling", "limits", "inertia")):
             return self
         least = least_inertia(LinkInertia.of(robot))
-        springs = stable_stiffness(least)
+        # A spring that acts DELAY late gives the energy of a damping of -stiffness * DELAY. Virtual damping acts as
+        # late, so inertia / (2 DELAY) is the most that damps: twice what the spring needs.
+        dampers = [inertia / (2.0 * DELAY) for inertia in least]
+        springs = [most / (2.0 * DELAY) for most in dampers]
         bounds = [
-            ("damping.viscosity", self.damping.viscosity, [inertia / (2.0 * DELAY) for inertia in least], "Nm s/rad"),
+            ("damping.viscosity", self.damping.viscosity, dampers, "Nm s/rad"),
             ("spring.stiffness", self.spring.stiffness, springs, "Nm/rad"),
         ]
         if self.coupling.on:
