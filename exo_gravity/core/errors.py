@@ -5,6 +5,9 @@ Each message names the item, its value and what would be valid.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class ExoGravityError(Exception):
     """Base class of all errors below."""
@@ -21,6 +24,16 @@ class ParameterError(ExoGravityError, ValueError):
         self.name = name
         self.value = value
         self.expected = expected
+
+
+@contextmanager
+def named(owner: str) -> Iterator[None]:
+    """Put `owner`, with what separates it, before the name in any ParameterError raised inside the context."""
+    try:
+        yield
+    except ParameterError as error:
+        name = error.name if error.name.startswith(owner) else f"{owner}{error.name}"
+        raise ParameterError(name, error.value, error.expected) from None
 
 
 class FrameError(ExoGravityError, ValueError):

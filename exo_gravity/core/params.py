@@ -11,8 +11,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
+import numpy as np
+
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.numbers import floats, one_float
 
 # ROS declares these on every node, and `ros2 param dump` writes them to files.
 ROS_PARAMETERS = ("use_sim_time", "start_type_description_service")
@@ -71,7 +72,7 @@ class Param:
     any_length: bool = False
 
     def check(self, value: Any) -> Any:
-        """Return `value` in this parameter's type; an integer is converted if the type is float.
+        """Return `value` in this parameter's type; other numbers are converted if the type is float.
 
         Raises ParameterError if the type, the length of a list or a value is wrong.
         """
@@ -79,7 +80,7 @@ class Param:
         items: list[Any] = list(value) if is_list else [value]
         kind, count = self._kind_and_count
         if kind is float:
-            items = [float(item) if type(item) is int else item for item in items]
+            items = [float(x) if isinstance(x, int | float) and type(x) is not bool else x for x in items]
         if self.required and (not items or "" in items):
             raise ParameterError(self.name, value, f"set to {self.expected}")
         fits = is_list == isinstance(self.default, list) and count in (None, len(items))
@@ -138,20 +139,15 @@ def params_of(owner: type, fixed: bool = False) -> tuple[Param, ...]:
 
 
 def check_owned(instance: Any) -> None:
-    """Check every owned field of a frozen dataclass instance, and convert numbers to a float or a tuple of floats.
+    """Check every owned field of a frozen dataclass instance, and convert its numbers; a list becomes a tuple.
 
     Raises ParameterError that names the field.
     """
     for param in params_of(type(instance)):
         value = getattr(instance, param.name)
-        if param.choices:
-            if value not in param.choices:
-                raise ParameterError(param.name, value, param.range)
-        elif param.bounds and isinstance(param.default, list):
-            checked = tuple(floats(param.name, value, len(param.default), *param.bounds, param.unit).tolist())
-            object.__setattr__(instance, param.name, checked)
-        elif param.bounds:
-            object.__setattr__(instance, param.name, one_float(param.name, value, *param.bounds, param.unit))
+        plain = value.tolist() if isinstance(value, np.ndarray) else value
+        checked = param.check(plain)
+        object.__setattr__(instance, param.name, tuple(checked) if isinstance(checked, list) else checked)
 
 
 def values_of(table: Sequence[Param], given: Mapping[str, Any], free_prefix: str = "") -> dict[str, Any]:

@@ -17,29 +17,25 @@ import time
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_typestore
 from scipy.linalg import qr, solve_triangular
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
 from exo_gravity.bag.reader import read_bag
-from exo_gravity.bag.storage import Storage
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.anfis import INPUTS, UPRIGHT, Anfis, AnfisLaw, grades, scaled
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.trial.analysis import analyse
+from exo_gravity.tools.calibration.recorded import TILT_TOPIC, TILT_TYPE, messages_of
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.inputs.references import gravload
 
 GRID = (13, 9, 9)  # positions of joints 2, 3, 4: 1,053 as in the paper
 HELD_OUT = 5  # every fifth hold
-TILT_TOPIC, TILT_TYPE = "/imu/pitch_yaw", "geometry_msgs/msg/Vector3Stamped"
 RIDGE = 1e-6  # keeps consequents that the data do not determine near 0; noisy data need more
 # In units of half the training box. Narrow functions overfit the sampled positions: at a width of 0.4 the held-out
 # error is up to ten times that at 0.8.
@@ -84,21 +80,25 @@ def from_bag(path: str | Path, configured: ConfiguredArm, functions: int) -> Sam
     `functions` membership functions per input.
     """
     bag = read_bag(path)
-    names = {recording.name: recording for recording in bag.recordings}
-    recording = names.get(configured.side) or (next(iter(names.values())) if len(names) == 1 else None)
+    joints = sorted(configured.joint_names)
+    recording = next((r for r in bag.recordings if sorted(r.joint_names) == joints), None)
     if recording is None:
-        raise DataError(f"{path}: the arms are {', '.join(names)}: must include {configured.side}")
-    if sorted(recording.joint_names) != sorted(configured.joint_names):
-        expected = ", ".join(configured.joint_names)
-        raise DataError(f"{path}: the joints are {', '.join(recording.joint_names)}: must be {expected}")
+        found = "; ".join(", ".join(r.joint_names) for r in bag.recordings)
+        raise DataError(f"{path}: the joints are {found}: must include {', '.join(joints)}")
     order = [recording.joint_names.index(name) for name in configured.joint_names]
-    tilted = _tilted(path, configured.side, bag.start)
+    tilts = messages_of(Path(path), TILT_TOPIC, TILT_TYPE, required=False)
+    tilted = np.array(
+        [
+            (stamp - bag.start) / 1e9
+            for stamp, message in tilts
+            if not Tilt.of(configured.side, message.vector.y, message.vector.x).axis_angle <= UPRIGHT
+        ]
+    )
     holds = [h for h in analyse(recording).holds if not np.any((tilted >= h.start) & (tilted <= h.end))]
     spans = [(recording.time >= hold.start) & (recording.time <= hold.end) for hold in holds]
     angle = np.array([hold.pose for hold in holds]).reshape(-1, JOINT_COUNT)[:, order]
     torque = np.array([recording.effort[span].mean(axis=0) for span in spans]).reshape(-1, JOINT_COUNT)[:, order]
-    known = np.isfinite(torque) & (angle >= configured.low) & (angle <= configured.high)
-    kept = np.all(known, axis=1)
+    kept = np.all(np.isfinite(torque) & (angle >= configured.low) & (angle <= configured.high), axis=1)
     angle, torque = angle[kept, 1:], torque[kept, 1:]
     checked = np.arange(len(angle)) % HELD_OUT == HELD_OUT - 1
     if len(angle) < HELD_OUT:
@@ -107,20 +107,6 @@ def from_bag(path: str | Path, configured: ConfiguredArm, functions: int) -> Sam
     _check_coverage(scaled(angle[~checked], low, high), functions)
     source = f"recording {Path(path).name}, {len(angle)} holds"
     return Samples(angle[~checked], torque[~checked], angle[checked], torque[checked], low, high, source)
-
-
-def _tilted(path: str | Path, side: str, start: int) -> np.ndarray:
-    """Return the times in s at which the trunk was not upright; without an IMU it is taken as upright."""
-    types = get_typestore(Stores.ROS2_JAZZY)
-    times = []
-    for *_, stamp, data in Storage(path).messages(lambda topic, msgtype: (topic, msgtype) == (TILT_TOPIC, TILT_TYPE)):
-        try:
-            message: Any = types.deserialize_cdr(data, TILT_TYPE)
-        except (SerdeError, ValueError) as error:
-            raise DataError(f"{path}: cannot read {TILT_TOPIC} ({error})") from None
-        if not Tilt.of(side, pitch=message.vector.y, roll=message.vector.x).axis_angle <= UPRIGHT:
-            times.append((stamp - start) / 1e9)
-    return np.array(times)
 
 
 def _check_coverage(inputs: np.ndarray, functions: int) -> None:

@@ -16,29 +16,27 @@ from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from exo_gravity.core.errors import ExoGravityError, ParameterError
+from exo_gravity.core.errors import ExoGravityError, ParameterError, named
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.budget import (
-    FAMILY,
     USUAL_TILT,
     JointBudget,
-    Workspace,
     budget,
     largest_support,
     motor_for,
     motor_torques,
     rounded_down,
     torque_at,
+    workspace,
 )
 from exo_gravity.core.model.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
 from exo_gravity.core.numbers import one_float
 from exo_gravity.tools.cli import missing
-from exo_gravity.tools.inputs.arms import ConfiguredArm, configured_arms, named
-from exo_gravity.tools.reporting.html import INK
+from exo_gravity.tools.inputs.arms import ConfiguredArm, configured_arms
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,12 +44,12 @@ if TYPE_CHECKING:
 DPI = 150
 JOINTS = ("shoulder rotation", "shoulder abduction", "shoulder flexion", "elbow flexion")
 HEADINGS = (
-    ("", "", "rated", "peak", "needs", "within", "within", "", "support"),
-    ("joint", "motor", "Nm", "Nm", "Nm", "rated", "peak", "worst pose; pitch, roll (deg)", "within rated"),
+    ("", "", "rated", "peak", "needs", "within", "within", "", "support", "motor that"),
+    ("joint", "motor", "Nm", "Nm", "Nm", "rated", "peak", "worst pose; pitch, roll (deg)", "within rated", "would do"),
 )
-LINE = "  {:<22}{:<8}{:>7}{:>7}{:>8}{:>10}{:>10}   {:<32}{:>12}"
+LINE = "  {:<22}{:<8}{:>7}{:>7}{:>8}{:>10}{:>10}   {:<32}{:>12}{:>12}"
 CELLS = 31  # of a map, along each axis
-REST = 60  # random settings of the angles that a map does not show, the same for each cell
+REST = 5  # values of each angle that a map does not show
 OTHER = (1, 2, 3, 2)  # the second axis of each joint's map: the angle that affects it most
 
 
@@ -63,13 +61,13 @@ class ArmBudget:
     carrying: ArmModel  #: with its share of the wearer's arm
     support: float  #: 0..1, that share
     motors: Sequence[str]
-    workspace: Workspace
+    bounds: np.ndarray  #: of its workspace, (2, 6) rad
     joints: tuple[JointBudget, ...]
 
     @property
-    def beyond(self) -> list[int]:
-        """Indices of the joints that need more than rated torque somewhere."""
-        return [number for number, joint in enumerate(self.joints) if joint.torque > joint.rated]
+    def is_beyond(self) -> bool:
+        """Whether a joint needs more than rated torque somewhere."""
+        return any(joint.torque > joint.rated for joint in self.joints)
 
 
 def arm_budget(configured: ConfiguredArm, wearer: Wearer, support: float, max_tilt: float) -> ArmBudget:
@@ -78,18 +76,18 @@ def arm_budget(configured: ConfiguredArm, wearer: Wearer, support: float, max_ti
     Raises ParameterError if the wearer does not fit the robot.
     """
     motors, robot = configured.can_bridge["motor"], configured.robot
-    workspace = Workspace(configured.low, configured.high, max_tilt)
-    with named(f"{configured.namespace}/compensator"):
+    bounds = workspace(configured.low, configured.high, max_tilt)
+    with named(f"{configured.namespace}/compensator "):
         load = wearer.on_links(robot.length)
         torques = motor_torques(motors, configured.can_bridge["torque_scale"])
-        joints = budget(robot, load, support, workspace, *torques)
+        joints = budget(robot, load, support, bounds, *torques)
         carrying = robot.with_wearer(*load, support)
-    return ArmBudget(configured.namespace, carrying, support, motors, workspace, joints)
+    return ArmBudget(configured.namespace, carrying, support, motors, bounds, joints)
 
 
 def table_lines(arm: ArmBudget) -> Iterator[str]:
     """Yield the lines of a table with one row per joint."""
-    yield f"{arm.name} at support {arm.support:g}, trunk tilt up to {math.degrees(arm.workspace.max_tilt):g} deg"
+    yield f"{arm.name} at support {arm.support:g}, trunk tilt up to {math.degrees(arm.bounds[1, 4]):g} deg"
     yield from (LINE.format(*heading).rstrip() for heading in HEADINGS)
     for number, joint in enumerate(arm.joints):
         *pose, pitch, roll = (f"{angle:.0f}" for angle in np.degrees(joint.worst) + 0.0)  # + 0.0: no minus zero
@@ -103,6 +101,7 @@ def table_lines(arm: ArmBudget) -> Iterator[str]:
             f"{100 * rounded_down(joint.within_peak):.1f} %",
             f"{', '.join(pose)}; {pitch}, {roll}",
             "none" if joint.support is None else f"{rounded_down(joint.support):.3f}",
+            motor_for(joint.torque) or "none",
         )
 
 
@@ -115,40 +114,23 @@ def _mirrored(arms: Sequence[ArmBudget]) -> list[ArmBudget]:
     return list(tables.values())
 
 
-def verdict(arm: ArmBudget, wearer: Wearer) -> list[str]:
-    """Return the conclusion in sentences: what is beyond the motors, which motor would do, which support fits."""
+def verdict(arm: ArmBudget, wearer: Wearer) -> Iterator[str]:
+    """Yield the conclusion: whether it is beyond the motors, which support fits, and can_bridge's parameter for it."""
     support = "Full Zero-G" if arm.support == 1.0 else f"Support {arm.support:g}"
     what = f"{support} of a wearer of {wearer.body_mass:g} kg"
-    sentences = [f"{what} is within rated torque everywhere on {arm.name}."]
-    if arm.beyond:
-        sentences = [f"{what} is beyond the motors of {arm.name}."]
-        sentences += [_shortage(arm, number) for number in arm.beyond]
-        sentences.append(
-            "A larger motor is heavier and loads the joints before it: change the masses and run this again."
-        )
-        if any(motor_for(arm.joints[number].torque) == "AK80-64" for number in arm.beyond):
-            sentences.append("AK80-64 has a 64:1 gear: the wearer can hardly move it by hand.")
+    if arm.is_beyond:
+        yield f"{what} is beyond the motors of {arm.name}."
+        yield "A larger motor is heavier and loads the joints before it: change the masses and run this again."
+        yield "The wearer can hardly move an AK80-64 by hand: its gear is 64:1."
+    else:
+        yield f"{what} is within rated torque everywhere on {arm.name}."
     fits = largest_support(arm.joints)
     if fits is None:
-        return [*sentences, "The robot alone needs more than rated torque somewhere: no support stays within it."]
-    return [*sentences, f"The largest support within rated torque everywhere is {fits:g}."]
-
-
-def largest_moment(arm: ArmBudget) -> str:
-    """Return the parameter of `can_bridge` for this load, rounded up."""
-    shown = ", ".join(f"{math.ceil(1000.0 * moment) / 1000.0:g}" for moment in arm.carrying.first_moment)
-    return f"For the can_bridge of {arm.name}, if it never carries more: largest_moment: [{shown}]  # kg m"
-
-
-def _shortage(arm: ArmBudget, number: int) -> str:
-    joint, needs = arm.joints[number], arm.joints[number].torque
-    motor = motor_for(needs)
-    remedy = f"{motor} would do ({FAMILY[motor][0]:g} Nm rated)" if motor else "No motor of its family would do"
-    return (
-        f"Joint {number + 1}, {JOINTS[number]}: {needs:.1f} Nm, {needs / joint.rated:.1f} times the rated torque of "
-        f"its {arm.motors[number]} ({joint.rated:.3g} Nm), {'beyond' if needs > joint.peak else 'within'} its peak "
-        f"({joint.peak:.3g} Nm). {remedy}."
-    )
+        yield "The robot alone needs more than rated torque somewhere: no support stays within it."
+    else:
+        yield f"The largest support within rated torque everywhere is {fits:g}."
+    moments = ", ".join(f"{math.ceil(1000.0 * moment) / 1000.0:g}" for moment in arm.carrying.first_moment)
+    yield f"For the can_bridge of {arm.name}, if it never carries more: largest_moment: [{moments}]  # kg m"
 
 
 def _write_figures(arms: Sequence[ArmBudget], folder: Path) -> str:
@@ -170,14 +152,12 @@ def _write_figures(arms: Sequence[ArmBudget], folder: Path) -> str:
 def _joint_figure(arm: ArmBudget, joint: int) -> Figure:
     """Map the largest torque of a joint (0..3) over two angles: the maximum over the others and the trunk's tilt."""
     from matplotlib.figure import Figure
-    from matplotlib.patheffects import withStroke
 
     other = OTHER[joint]
-    low, high = arm.workspace.bounds
-    across, up = (np.linspace(low[n], high[n], CELLS) for n in (joint, other))
-    ends = np.array(list(product(*(sorted({a, min(max(0.0, a), b), b}) for a, b in zip(low, high, strict=True)))))
-    ends = ends[(ends[:, joint] == low[joint]) & (ends[:, other] == low[other])]
-    rest = np.vstack((arm.workspace.points(REST), ends, arm.joints[joint].worst))
+    axes = [np.linspace(low, high, REST) for low, high in arm.bounds.T]
+    axes[joint] = axes[other] = np.zeros(1)
+    rest = np.vstack((list(product(*axes)), arm.joints[joint].worst))
+    across, up = (np.linspace(*arm.bounds[:, axis], CELLS) for axis in (joint, other))
     points = np.tile(rest, (CELLS * CELLS, 1))
     grid = np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2)
     points[:, [joint, other]] = np.repeat(grid, len(rest), axis=0)
@@ -190,10 +170,7 @@ def _joint_figure(arm: ArmBudget, joint: int) -> Figure:
     figure.colorbar(mesh, ax=axis, label=f"Largest torque at support {arm.support:g} (Nm)")
     for limit, style in ((arm.joints[joint].rated, "-"), (arm.joints[joint].peak, ":")):
         if largest.min() < limit < largest.max():
-            lines = axis.contour(*angles, largest, [limit], colors="white", linestyles=style)
-            outline: list[Any] = [withStroke(linewidth=2.5, foreground=INK)]
-            for artist in (lines, *axis.clabel(lines, fmt=f"{limit:g} Nm")):
-                artist.set_path_effects(outline)
+            axis.clabel(axis.contour(*angles, largest, [limit], colors="red", linestyles=style), fmt=f"{limit:g} Nm")
     axis.set_title(f"{arm.name} joint {joint + 1}, {JOINTS[joint]}: {arm.motors[joint]}", loc="left", weight="bold")
     axis.set_xlabel(f"Joint {joint + 1} (deg)")
     axis.set_ylabel(f"Joint {other + 1} (deg); maximum over the other joints and the trunk's tilt")
@@ -234,6 +211,6 @@ def main(args: Sequence[str] | None = None) -> int:
     segments = ", ".join(f"{name} {mass:.2f} kg at {cog:.3f} m" for name, (mass, cog) in masses)
     print(f"Wearer: {wearer.body_mass:g} kg, {wearer.sex}, table {wearer.table}: {segments}")
     for alike in _mirrored(arms):
-        print("", *table_lines(alike), "", *verdict(alike, wearer), largest_moment(alike), sep="\n")
+        print("", *table_lines(alike), "", *verdict(alike, wearer), sep="\n")
     print(f"\n{written}")
-    return int(any(arm.beyond for arm in arms))
+    return int(any(arm.is_beyond for arm in arms))

@@ -13,14 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 
-# Ubuntu 24.04 has these; all others come from PyPI only.
-APT = {
-    "matplotlib": "python3-matplotlib",
-    "rich": "python3-rich",
-    "scipy": "python3-scipy",
-    "sklearn": "python3-sklearn",
-    "threadpoolctl": "python3-threadpoolctl",
-}
+# Ubuntu 24.04 has these as python3-NAME; all others come from PyPI only.
+APT = ("matplotlib", "rich", "scipy", "sklearn", "threadpoolctl")
 
 
 def non_negative(text: str) -> float:
@@ -37,7 +31,7 @@ def non_negative(text: str) -> float:
 def missing(module: str, extra: str) -> str:
     """Return a sentence that names the missing `module` and how to install it; extra: e.g. 'report'."""
     module = module.partition(".")[0]
-    apt = f"apt install {APT[module]}, or " if module in APT else ""
+    apt = f"apt install python3-{module}, or " if module in APT else ""
     return f"the Python package {module} is not installed: {apt}pip install 'exo_gravity[{extra}]'"
 
 

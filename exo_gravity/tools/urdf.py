@@ -13,16 +13,16 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from exo_gravity.core.errors import ExoGravityError, ParameterError
+from exo_gravity.core.errors import ExoGravityError, named
 from exo_gravity.core.model.tilt import SIDES
 from exo_gravity.core.view.urdf import described, urdf
-from exo_gravity.tools.inputs.arms import configured_arm, configured_arms, named
+from exo_gravity.tools.inputs.arms import configured_arm, configured_arms
 
 
 def urdf_of(params: str | Path, side: str = "", meshes: str = "") -> str:
     """Return the URDF of the arms in a parameter file, or of the arm on one `side`. Raises ParameterError."""
     arms = [configured_arm(params, side)] if side else configured_arms(params)
-    with named(f"{arms[0].namespace}/compensator" if len(arms) == 1 else str(params)):
+    with named(f"{arms[0].namespace}/compensator " if len(arms) == 1 else f"{params} "):
         return urdf([described(arm.compensator, arm.can_bridge) for arm in arms], meshes)
 
 
@@ -41,14 +41,11 @@ def main(args: Sequence[str] | None = None) -> int:
     options = _arguments(args)
     try:
         text = urdf_of(options.params, options.side, options.meshes)
-        if not options.output:
-            print(text, end="")
-            return 0
-        try:
+        if options.output:
             Path(options.output).write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise ParameterError("output", options.output, f"a file to write to ({error.strerror})") from None
-    except ExoGravityError as error:
+        else:
+            print(text, end="")
+    except (ExoGravityError, OSError) as error:
         print(f"urdf: {error}", file=sys.stderr)
         return 2
     return 0

@@ -7,8 +7,10 @@ import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.moments import MOMENTS, load_moments, moments_of, off_axis_of, regressor
+from exo_gravity.core.model.moments import MOMENTS, load_moments, moments_of, regressor
 from exo_gravity.tools.inputs.references import ALPHA, OFFSET
+
+from ..support.random_device import off_axis_of
 
 ROUNDING = 1e-12  # Nm
 LENGTH = (0.05, 0.13, 0.30, 0.30)

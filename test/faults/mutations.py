@@ -166,8 +166,8 @@ MUTATIONS = (
     Mutation(
         "a clamp outside the guided change",
         ("max_effort 9 to 0.5 Nm, Zero-G, 75 kg",),
-        (Edit("exo_gravity/core/compensation/compensator.py", "self._limiter.limit(now, torque, s.max_effort_rate)",
-              "self._limiter.limit(now, clamped(torque, s.max_effort), s.max_effort_rate)"),),
+        (Edit("exo_gravity/core/compensation/compensator.py", "zip(torque, self._effort, strict=True)",
+              "zip(clamped(torque, s.max_effort), self._effort, strict=True)"),),
     ),
     Mutation(
         "the torque of an outer loop that has ended is remembered",

@@ -11,7 +11,7 @@ from exo_gravity.core import ArmModel, Tilt
 from exo_gravity.core.calibration.identification import Observation
 from exo_gravity.core.calibration.pose_fit import TYPICAL_MOMENTS
 from exo_gravity.core.calibration.poses import next_pose
-from exo_gravity.core.model.moments import load_moments, moments_of, off_axis_of, regressor
+from exo_gravity.core.model.moments import load_moments, moments_of, regressor
 from exo_gravity.core.numbers import Vector
 
 LENGTH = (0.05, 0.13, 0.30, 0.30)
@@ -26,6 +26,11 @@ SAMPLES = 50  # of the effort in each direction
 CANDIDATES = np.radians(
     list(itertools.product((-60, -30, 0, 30, 60), (10, 40, 70, 100, 130), (-30, 0, 30, 60, 90), (0, 30, 60, 90, 120)))
 )
+
+
+def off_axis_of(mass: Vector, cog_y: Vector, cog_z: Vector) -> Vector:
+    """Return (W, Z, Y3, Y4) in kg m of links with centres of gravity (4,) m beside them, along y_n and z_n."""
+    return mass[0] * cog_z[0] + mass[1] * cog_y[1], np.dot(mass[1:], cog_z[1:]), mass[2] * cog_y[2], mass[3] * cog_y[3]
 
 
 class Device:

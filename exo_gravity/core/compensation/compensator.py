@@ -17,7 +17,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from exo_gravity.core.compensation.guidance import GuidedChange
-from exo_gravity.core.compensation.limiter import BREAK, EffortLimiter
+from exo_gravity.core.compensation.limiter import BREAK, LONGEST_STEP, RAMP_TIME, limited
 from exo_gravity.core.compensation.settings import Settings, UrdfSettings
 from exo_gravity.core.compensation.terms.terms import Active, Terms
 from exo_gravity.core.errors import ParameterError
@@ -25,7 +25,7 @@ from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.model.kinematics import turning_torque
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.trunk.felt_motion import Felt, FeltMotion
+from exo_gravity.core.trunk.felt_motion import FeltMotion
 from exo_gravity.core.trunk.tilt_input import MAX_TURN, Tilted
 
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
@@ -45,6 +45,7 @@ class Answer(NamedTuple):
     held: str = ""  #: why the last tilt is held on, and the bound of the error in Nm; or ''
 
 
+State = tuple[float, Sequence[float], Sequence[float] | None]  # time in s, joint angles and velocities as in `step`
 Load = tuple[Settings | UrdfSettings, Active]  # what the compensator carries, and the terms on top of it
 
 
@@ -61,7 +62,8 @@ class Compensator(Tilted):
         super().__init__(settings.side, settings.tilt_timeout)
         self._motion = FeltMotion()
         self._nothing = (0.0,) * len(settings.max_effort)
-        self._limiter = EffortLimiter(len(settings.max_effort))
+        self._effort = self._nothing  # the last answer's,
+        self._last_answer = self._ramp_start = -math.inf  # its time, and that of the first one after a break
         self._change = GuidedChange(len(settings.max_effort))
         self._origin: Load | None = None  # where the change began; None where no settings say
         self._torque: Torque = self._nothing  # the last, before ramp and rate limit
@@ -109,22 +111,23 @@ class Compensator(Tilted):
         added = self.terms.torque(now, theta, velocity) if velocity and self.terms else self._nothing
         s = self.settings
         torque = clamped(map(operator.add, gravity, added), s.max_effort)
-        dt = now - self._limiter.last_answer
-        if not 0.0 <= dt <= BREAK:
-            self._change.stop()  # the torque ramps in from zero
+        dt = now - self._last_answer
+        if not 0.0 <= dt <= BREAK:  # the torque ramps in from zero
+            self._change.stop()
+            self._effort, self._ramp_start, dt = self._nothing, now, 0.0
         elif before is not None or bool(self._fallback) != replaced:
-            self._begin(now, theta, velocity, torque, before)  # without `before`: a replaced law may not apply here
+            self._begin(before, torque, (now, theta, velocity))  # without `before`: a replaced law may not apply here
         if not self._change.is_over:
-            start = torque
-            if self._origin is not None:
-                start = self._torque_of(self._origin, now, theta, velocity)
+            start = self._torque_of(self._origin, (now, theta, velocity)) if self._origin else torque
             torque = self._change.step(dt, velocity, start, torque)
-        self._torque = torque
-        effort = self._limiter.limit(now, torque, s.max_effort_rate)
+        self._torque, self._last_answer = torque, now
+        ramp, step = min(1.0, (now - self._ramp_start) / RAMP_TIME), s.max_effort_rate * min(dt, LONGEST_STEP)
+        pairs = zip(torque, self._effort, strict=True)
+        self._effort = tuple([limited(ramp * wanted, last, math.inf, step) for wanted, last in pairs])
         over = [joint for joint, most in enumerate(s.max_effort) if not -most <= gravity[joint] <= most]
         change = self._change
         remainder = () if change.is_over else change.remainder
-        return Answer(effort, "", tuple(over), self._fallback, remainder, change.is_large, held)
+        return Answer(self._effort, "", tuple(over), self._fallback, remainder, change.is_large, held)
 
     def _largest_torque(self, theta: Sequence[float]) -> float:
         """Return the most in Nm that gravity takes of any joint at `theta` (n,) rad, whatever its direction."""
@@ -141,67 +144,55 @@ class Compensator(Tilted):
         if self.terms is not None and isinstance(settings, Settings):
             self.terms.apply(settings.terms, settings.moving)
 
-    def _begin(
-        self,
-        now: float,
-        theta: Sequence[float],
-        velocity: Sequence[float] | None,
-        torque: Torque,
-        before: Load | None,
-    ) -> None:
+    def _begin(self, before: Load | None, torque: Torque, state: State) -> None:
         """Begin a change to `torque` (n,) Nm, from `before` or from where an unfinished change began.
 
         Of the two, the one is chosen that explains the present torque better.
         """
-        origins = [before] if self._change.is_over else [self._origin, before]
         ways = []
-        for origin in origins:
-            start = torque if origin is None else self._torque_of(origin, now, theta, velocity)
+        for origin in [before] if self._change.is_over else [self._origin, before]:
             change = GuidedChange(len(torque))
-            change.begin(self._torque, start, torque)
+            change.begin(self._torque, self._torque_of(origin, state) if origin else torque, torque)
             ways.append((change.unexplained, origin, change))
         _, self._origin, self._change = min(ways, key=operator.itemgetter(0))
 
-    def _torque_of(self, load: Load, now: float, theta: Sequence[float], velocity: Sequence[float] | None) -> Torque:
+    def _torque_of(self, load: Load, state: State) -> Torque:
         """Return the torque (n,) in Nm that `load` would need here, clamped as it was."""
+        now, theta, velocity = state
         settings, active = load
-        felt = self._felt(settings, now)
-        gravity = self._gravity(settings, theta, felt, bool(settings.outside(theta, felt[0])))
+        gravity, _ = self._gravity(settings, now, theta)
         if not velocity or self.terms is None:
             return clamped(gravity, settings.max_effort)
         return clamped(map(operator.add, gravity, self.terms.torque_of(active)), settings.max_effort)
 
     def _law(self, now: float, theta: Sequence[float]) -> Torque:
         """Return the torque of the chosen law, or of the exact law while the chosen one does not apply."""
-        felt = self._felt(self.settings, now)
-        reason = self.settings.outside(theta, felt[0])
+        torque, reason = self._gravity(self.settings, now, theta, exact=now < self._fallback_until)
         if reason:
             self._fallback, self._fallback_until = reason, now + FALLBACK_TIME
         elif now >= self._fallback_until:
             self._fallback = ""
-        return self._gravity(self.settings, theta, felt, bool(self._fallback))
+        return torque
 
-    def _felt(self, settings: Settings | UrdfSettings, now: float) -> tuple[Tilt, Felt | None]:
-        """Return the tilt of what the trunk feels as gravity, and its motion if that is compensated, too."""
-        tilt = self._tilt.at(now)
-        if not (isinstance(settings, Settings) and settings.inertial and settings.use_imu):
-            return tilt, None
-        felt = self._motion.at(now, settings.shoulder_from_imu)
+    def _gravity(
+        self, settings: Settings | UrdfSettings, now: float, theta: Sequence[float], exact: bool = False
+    ) -> tuple[Torque, str]:
+        """Return the torque (n,) in Nm by the law of `settings`, or by the exact law and why the law does not apply.
+
+        The tilt is that of what the trunk feels as gravity. exact: by the exact law in any case.
+        """
+        tilt, felt = self._tilt.at(now), None
+        if isinstance(settings, Settings) and settings.inertial and settings.use_imu:
+            felt = self._motion.at(now, settings.shoulder_from_imu)
         if felt:
             magnitude = math.hypot(*felt.gravity) / STANDARD_GRAVITY
             tilt = Tilt.of_gravity(settings.side, felt.gravity)._replace(magnitude=magnitude)
-        return tilt, felt
-
-    def _gravity(
-        self, settings: Settings | UrdfSettings, theta: Sequence[float], felt: tuple[Tilt, Felt | None], exact: bool
-    ) -> Torque:
-        """Return the torque (n,) in Nm of the law of `settings`, or of the exact law."""
-        tilt, motion = felt
-        torque = settings.torque(theta, tilt, exact)
-        if motion is None or not isinstance(settings, Settings):
-            return torque
-        turning = turning_torque(settings.arm, settings.side, theta, motion.angular_acceleration)
-        return tuple(map(operator.add, torque, turning))
+        reason = settings.outside(theta, tilt)
+        torque = settings.torque(theta, tilt, exact or bool(reason))
+        if felt and isinstance(settings, Settings):
+            turning = turning_torque(settings.arm, settings.side, theta, felt.angular_acceleration)
+            torque = tuple(map(operator.add, torque, turning))
+        return torque, reason
 
 
 def clamped(torque: Iterable[float], limit: Sequence[float]) -> Torque:

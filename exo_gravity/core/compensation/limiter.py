@@ -1,4 +1,4 @@
-"""What keeps torques from stepping, for any number of joints: ramp, rate limit, and a last fade."""
+"""What keeps torques from stepping, for any number of joints: the limits of ramp and rate, and a last fade."""
 
 from __future__ import annotations
 
@@ -18,27 +18,6 @@ def limited(wanted: float, last: float, limit: float, step: float) -> float:
     """Return `wanted` within -limit..limit and within `step` of `last`."""
     target = limit if wanted > limit else -limit if wanted < -limit else wanted
     return last + step if target > last + step else last - step if target < last - step else target
-
-
-class EffortLimiter:
-    """Ramp and rate limit of the torques of `count` joints. last_answer: s, when the last torque was limited."""
-
-    def __init__(self, count: int) -> None:
-        self.last_answer = -math.inf
-        self._zero = self._effort = (0.0,) * count
-        self._ramp_start = -math.inf
-
-    def limit(self, now: float, torque: Sequence[float], max_effort_rate: float) -> tuple[float, ...]:
-        """Return the effort (n,) in Nm at `now` s for the `torque` (n,) in Nm. max_effort_rate: Nm/s."""
-        dt = now - self.last_answer
-        if not 0.0 <= dt <= BREAK:
-            self._ramp_start, self._effort, dt = now, self._zero, 0.0
-        self.last_answer = now
-        ramp = min(1.0, (now - self._ramp_start) / RAMP_TIME)
-        step = max_effort_rate * min(dt, LONGEST_STEP)
-        pairs = zip(torque, self._effort, strict=True)
-        self._effort = tuple([limited(ramp * wanted, last, math.inf, step) for wanted, last in pairs])
-        return self._effort
 
 
 class Output(Enum):

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from exo_gravity.core.compensation.settings import URDF_LAW, GravityModel, Settings, UrdfSettings
 from exo_gravity.core.compensation.terms.terms import term_parameters, term_settings_of
-from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.errors import DataError, ParameterError, named
 from exo_gravity.core.model.anfis import AnfisLaw
 from exo_gravity.core.model.arm import (
     MAX_GAIN,
@@ -107,11 +107,16 @@ def urdf_table(count: int, given: Collection[str]) -> tuple[Param, ...]:
     return compensator_table(given, (*shared, *URDF))
 
 
-def settings_of(values: Mapping[str, Any], anfis: AnfisLaw | None = None) -> Settings:
+def settings_of(values: Mapping[str, Any], read: Callable[[str], str] | None = None) -> Settings:
     """Return the settings that `compensator`'s parameter values describe, or raise ParameterError.
 
-    anfis: the model in `anfis_file`; None if no file is given.
+    read: returns the text of the file `anfis_file`; without it the file is left out.
     """
+    path = values["anfis_file"]
+    try:
+        anfis = AnfisLaw.load(read(path)) if path and read else None
+    except (OSError, UnicodeDecodeError, DataError) as error:
+        raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
     mass, cog = wearer_of(values)
     return Settings(
         side=values["side"],
@@ -141,12 +146,10 @@ def urdf_settings_of(values: Mapping[str, Any], model: GravityModel) -> UrdfSett
 def robot_of(values: Mapping[str, Any]) -> ArmModel:
     """Return the robot's arm, by its moments if robot.first_moment is given, or raise ParameterError."""
     length, off_axis, rest = values["link_length"], values["robot.off_axis"], (values["gain"], values["gravity"])
-    try:
+    with named("robot."):
         if any(values["robot.first_moment"]):
             return ArmModel.from_moments(length, values["robot.first_moment"], off_axis, *rest)
         return ArmModel(length, values["robot.cog"], values["robot.mass"], *rest, off_axis)
-    except ParameterError as error:
-        raise ParameterError(f"robot.{error.name}", error.value, error.expected) from None
 
 
 def wearer_of(values: Mapping[str, Any]) -> tuple[Sequence[float], Sequence[float]]:
@@ -154,8 +157,6 @@ def wearer_of(values: Mapping[str, Any]) -> tuple[Sequence[float], Sequence[floa
     if any(values["wearer.mass"]) or not values["wearer.body_mass"]:
         return values["wearer.mass"], values["wearer.cog"]
     person = {name: values[f"wearer.{name}"] for name in ("body_mass", "sex", "segment_length")}
-    try:
+    with named("wearer."):
         load = Wearer(**person).on_links(values["link_length"])
-    except ParameterError as error:
-        raise ParameterError(f"wearer.{error.name}", error.value, error.expected) from None
     return load.mass.tolist(), load.cog.tolist()

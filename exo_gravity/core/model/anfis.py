@@ -19,17 +19,17 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.model.arm import MAX_GRAVITY, ArmModel
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.numbers import Vector
+from exo_gravity.core.numbers import Vector, floats, one_float
 
 MAX_RULES = 10_000  # 6 inputs of 4 functions give 4,096; more is probably a mistake, and would exhaust the memory
+PARTS = ("centre", "sigma", "consequent")
 INPUTS = ("theta_2", "theta_3", "theta_4")
 JOINTS = ("2", "3", "4")
 # Largest angle in rad between joint 1's axis and gravity of an upright trunk. A trunk tilt of 0.5 degrees changes
@@ -50,25 +50,23 @@ class Anfis:
     consequent: np.ndarray  #: (m, k^d, d + 1), p_0..p_d of each rule; the function of the last input varies fastest
 
     def __post_init__(self) -> None:
-        for name in ("centre", "sigma", "consequent"):
-            try:
-                array = np.array(getattr(self, name), dtype=float)
-            except (TypeError, ValueError):
-                array = np.array(())
-            if array.ndim != 3 or not np.all(np.isfinite(array)):
-                raise DataError(f"ANFIS: {name}: must be an array of finite numbers with 3 axes")
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
-        models, inputs, functions = self.centre.shape
+        try:
+            parts = [np.array(getattr(self, name), dtype=float) for name in PARTS]
+        except (TypeError, ValueError):
+            parts = [np.empty(0)] * len(PARTS)
+        models, inputs, functions = parts[0].shape if parts[0].ndim == 3 else (0, 0, 0)
         rules = functions**inputs
-        if not 0 < rules <= MAX_RULES:
-            given = f"{inputs} inputs with {functions} functions each"
-            raise DataError(f"ANFIS: {given}: must make 1 to {MAX_RULES} rules")
-        for name, expected in (("sigma", self.centre.shape), ("consequent", (models, rules, inputs + 1))):
-            if getattr(self, name).shape != expected:
-                raise DataError(f"ANFIS: shape of {name} = {getattr(self, name).shape}: must be {expected}")
-        if np.any(self.sigma <= 0):
-            raise DataError(f"ANFIS: sigma = {self.sigma.min():g}: must be greater than 0")
+        expected = [(models, inputs, functions)] * 2 + [(models, rules, inputs + 1)]
+        fits = [part.shape for part in parts] == expected and 0 < rules <= MAX_RULES
+        if not (fits and all(np.all(np.isfinite(part)) for part in parts) and np.all(parts[1] > 0)):
+            shapes = ", ".join(f"{name} {part.shape}" for name, part in zip(PARTS, parts, strict=True))
+            bounds = (
+                f"finite numbers, sigma > 0, of shapes (m, d, k), (m, d, k), (m, k^d, d + 1), k^d <= {MAX_RULES} rules"
+            )
+            raise DataError(f"ANFIS: {shapes}: must be {bounds}")
+        for name, part in zip(PARTS, parts, strict=True):
+            part.setflags(write=False)
+            object.__setattr__(self, name, part)
 
     @property
     def rules(self) -> int:
@@ -78,7 +76,7 @@ class Anfis:
     @property
     def parameters(self) -> int:
         """Parameters per model: premises and consequents."""
-        return sum(a[0].size for a in (self.centre, self.sigma, self.consequent))
+        return sum(getattr(self, part)[0].size for part in PARTS)
 
     def output(self, inputs: np.ndarray) -> np.ndarray:
         """Return the outputs (n, m) for inputs (n, d)."""
@@ -102,7 +100,7 @@ def grades(centre: np.ndarray, sigma: np.ndarray, inputs: np.ndarray) -> np.ndar
 
 @dataclass(frozen=True, eq=False)
 class AnfisLaw:
-    """Torques of an arm on an upright trunk, learned over a box of joint angles. Raises DataError."""
+    """Torques of an arm on an upright trunk, learned over a box of joint angles. Raises DataError, ParameterError."""
 
     #: one output in Nm for each of joints 2, 3 and 4 at gain 1; its inputs are theta_2..theta_4, -1..1 over the box
     model: Anfis
@@ -120,10 +118,8 @@ class AnfisLaw:
         for name, low, high in zip(INPUTS, self.low, self.high, strict=True):
             if not -2 * math.pi <= low < high <= 2 * math.pi:
                 raise DataError(f"ANFIS file: box of {name} = {[low, high]}: must be [low, high] in rad")
-        if len(self.first_moment) != len(JOINTS) or not all(0 <= moment < math.inf for moment in self.first_moment):
-            raise DataError(f"ANFIS file: first_moment = {list(self.first_moment)}: must be M2, M3, M4 in kg m")
-        if not 0 < self.gravity < math.inf:
-            raise DataError(f"ANFIS file: gravity = {self.gravity}: must be greater than 0 m/s^2")
+        floats("first_moment", self.first_moment, len(JOINTS), 0.0, 1e3, "kg m")
+        one_float("gravity", self.gravity, 0.1, MAX_GRAVITY, "m/s^2")
 
     @classmethod
     def load(cls, text: str) -> AnfisLaw:
@@ -135,16 +131,10 @@ class AnfisLaw:
             joints = [content["joints"][joint] for joint in JOINTS]
             box = [tuple(float(bound) for bound in content["box"][name]) for name in INPUTS]
             low, high = zip(*box, strict=True)
-            parts: Any = ([joint[part] for joint in joints] for part in ("centre", "sigma", "consequent"))
-            return cls(
-                Anfis(*parts),
-                low,
-                high,
-                tuple(float(moment) for moment in content["arm"]["first_moment"]),
-                float(content["arm"]["gravity"]),
-                str(content["source"]),
-                {kind: [float(joint[f"{kind}_rmse"]) for joint in joints] for kind in ("training", "held_out")},
-            )
+            model = Anfis(*([joint[part] for joint in joints] for part in PARTS))
+            error = {kind: [float(joint[f"{kind}_rmse"]) for joint in joints] for kind in ("training", "held_out")}
+            moment, gravity = tuple(map(float, content["arm"]["first_moment"])), float(content["arm"]["gravity"])
+            return cls(model, low, high, moment, gravity, str(content["source"]), error)
         except KeyError as error:
             raise DataError(f"ANFIS file: the key {error.args[0]} is missing") from None
         except (TypeError, ValueError) as error:
@@ -152,11 +142,10 @@ class AnfisLaw:
 
     def dump(self) -> str:
         """Return the JSON text that `load` reads, one line per rule."""
-        parts = (self.model.centre, self.model.sigma, self.model.consequent)
         joints = {}
         for i, joint in enumerate(JOINTS):
             joints[joint] = {f"{kind}_rmse": float(values[i]) for kind, values in self.error.items()}
-            joints[joint] |= dict(zip(("centre", "sigma", "consequent"), (p[i].tolist() for p in parts), strict=True))
+            joints[joint] |= {part: getattr(self.model, part)[i].tolist() for part in PARTS}
         content = {
             "format": FORMAT,
             "about": "Takagi-Sugeno models (Jang 1993) of the holding torque in Nm of joints 2 to 4, trunk upright. "

@@ -16,11 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.motors.specs import MOTORS
-from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats, one_float
+from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats
 
 Cost = Callable[[np.ndarray], np.ndarray]  # points (n, 6) -> (n, 4)
 
@@ -53,30 +52,18 @@ def motor_torques(motors: Sequence[str], torque_scale: Vector) -> np.ndarray:
     return np.asarray(scale * np.transpose([FAMILY[motor] for motor in motors]))
 
 
-@dataclass(frozen=True)
-class Workspace:
-    """Every pose within the joint limits at every trunk tilt up to a bound."""
+def workspace(position_min: Vector, position_max: Vector, max_tilt: float) -> np.ndarray:
+    """Return the lowest and the highest point (2, 6): four joint angles, then pitch and roll of the trunk, in rad.
 
-    position_min: Vector  #: (4,) rad
-    position_max: Vector  #: (4,) rad
-    max_tilt: float  #: largest trunk pitch and roll in either direction, rad (up to pi/2)
+    position_min, position_max: the joint limits, (4,) rad. max_tilt: of the trunk, in either direction, rad.
+    """
+    tilt = np.repeat(max_tilt, 2)
+    return np.array((np.append(position_min, -tilt), np.append(position_max, tilt)))
 
-    def __post_init__(self) -> None:
-        low = four_floats("position_min", self.position_min, -3.15, 3.15, "rad")
-        high = four_floats("position_max", self.position_max, -3.15, 3.15, "rad")
-        if np.any(low >= high):
-            raise ParameterError("position_max", self.position_max, f"above position_min = {low.tolist()} rad")
-        one_float("max_tilt", self.max_tilt, 0.0, np.pi / 2, "rad")
 
-    @property
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest point (6,): four joint angles, then pitch and roll of the trunk, in rad."""
-        tilt = np.repeat(self.max_tilt, 2)
-        return np.append(self.position_min, -tilt), np.append(self.position_max, tilt)
-
-    def points(self, count: int = SAMPLES) -> np.ndarray:
-        """Return random points (count, 6), uniform over the workspace and the same in every call."""
-        return np.random.default_rng(0).uniform(*self.bounds, (count, JOINT_COUNT + 2))
+def random_points(bounds: np.ndarray, count: int = SAMPLES) -> np.ndarray:
+    """Return points (count, 6), uniform over the workspace `bounds` (2, 6) and the same in every call."""
+    return np.random.default_rng(0).uniform(*bounds, (count, JOINT_COUNT + 2))
 
 
 @dataclass(frozen=True)
@@ -131,7 +118,7 @@ def budget(
     robot: ArmModel,
     load: tuple[Vector, Vector],
     support: float,
-    workspace: Workspace,
+    bounds: np.ndarray,
     rated: Vector,
     peak: Vector,
     pause: Callable[[], None] = lambda: None,
@@ -139,6 +126,7 @@ def budget(
     """Return the budget of each joint of `robot` when it carries a share `support` (0..1) of a wearer's arm.
 
     load: mass (4,) in kg and centre of gravity (4,) in m of the wearer's arm on each link, e.g. a `LinkLoad`.
+    bounds: of the workspace, (2, 6) rad.
     rated, peak: (4,) Nm at the joints. pause: called about 500 times, before each chunk of about a millisecond of
     computation. Raises ParameterError if the load does not fit the robot.
     """
@@ -153,7 +141,7 @@ def budget(
         own, with_all = map(np.concatenate, zip(*chunks, strict=True))
         return own, with_all - own
 
-    points = workspace.points()
+    points = random_points(bounds)
     starts = np.vstack((points[: SAMPLES // 5] * (1, 1, 1, 1, 0, 0), points))  # those with an upright trunk first
 
     def need(at: np.ndarray) -> np.ndarray:
@@ -161,13 +149,17 @@ def budget(
         return np.asarray(np.abs(own + support * added))
 
     def shortage(at: np.ndarray) -> np.ndarray:
-        return -_support(*torques(at), np.asarray(rated))
+        """Return the negative of the largest support, at most 1, within rated torque; 1 where none fits."""
+        own, added = torques(at)
+        room = rated - np.sign(added) * own  # in the direction of the wearer's torque
+        most = np.divide(room, np.abs(added), out=np.ones_like(room), where=np.abs(added) > 1e-9)
+        return np.where(np.abs(own) > rated, 1.0, -np.minimum(most, 1.0))
 
     needs, shortages = need(starts), shortage(starts)
     joints = []
     for joint, limits in enumerate(zip(rated, peak, strict=True)):
-        worst, torque = _worst(need, joint, workspace, starts, needs[:, joint])
-        _, short = _worst(shortage, joint, workspace, starts, shortages[:, joint])
+        worst, torque = _worst(need, joint, bounds, starts, needs[:, joint])
+        _, short = _worst(shortage, joint, bounds, starts, shortages[:, joint])
         # The search can find an overloaded pose that no sample shows. Then the share must not be 1.
         low, high = (
             min(float(np.mean(needs[-len(points) :, joint] <= limit)), 0.9999 if torque > limit else 1.0)
@@ -178,22 +170,15 @@ def budget(
     return tuple(joints)
 
 
-def _support(own: np.ndarray, added: np.ndarray, limit: np.ndarray) -> np.ndarray:
-    """Return the largest support (n, 4), at most 1, for |own + support added| <= limit; negative where none fits."""
-    room = limit - np.sign(added) * own  # in the direction of the wearer's torque
-    support = np.divide(room, np.abs(added), out=np.ones_like(room), where=np.abs(added) > 1e-9)
-    return np.where(np.abs(own) > limit, -1.0, np.minimum(support, 1.0))
-
-
 def _worst(
-    cost: Cost, joint: int, workspace: Workspace, starts: np.ndarray, costs: np.ndarray
+    cost: Cost, joint: int, bounds: np.ndarray, starts: np.ndarray, costs: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Return the point (6,) with the largest cost of `joint`, and that cost.
 
     Among equal points it prefers upright ones and sets as many coordinates as possible to 0. costs: (m,), of `starts`
     (m, 6).
     """
-    low, high = workspace.bounds
+    low, high = bounds
     chosen = sorted({*np.argsort(costs)[-STARTS:].tolist(), int(np.argmax(costs[: SAMPLES // 5]))})
     points, values, width = starts[chosen], costs[chosen], (high - low) / 8
     while np.any(width > 1e-4):  # climb from each of the points along one coordinate at a time

@@ -28,7 +28,6 @@ Torque = tuple[float, ...]  # (4,) Nm in joint order
 NO_TORQUE: Torque = (0.0, 0.0, 0.0, 0.0)
 Law = Callable[[ArmModel, Sequence[float], Tilt], Torque]  # arm, theta (4,) rad, tilt -> the torque that holds the arm
 Values = Iterable[Any]  # plain floats if xp is `math`, arrays (n,) if it is `numpy`
-BLOCK = 4096  # poses computed at once, so that intermediate arrays fit the processor's cache
 
 
 def _exact(xp: ModuleType, arm: ArmModel, theta: Values, direction: Values) -> tuple[Any, ...]:
@@ -91,7 +90,7 @@ def gravity_torque(arm: ArmModel, theta: ArrayLike, direction: ArrayLike = (0.0,
         raise ParameterError("direction", down, f"of shape (3,) or {(*poses.shape[:-1], 3)}")
     if not np.allclose(np.linalg.norm(down, axis=-1), 1.0, atol=1e-6, rtol=0):
         raise ParameterError("direction", down, "a unit vector")
-    return _in_blocks(_exact, arm, poses, down)
+    return _torque(_exact, arm, poses, down)
 
 
 def paper_static_torque(arm: ArmModel, theta: ArrayLike) -> np.ndarray:
@@ -102,7 +101,7 @@ def paper_static_torque(arm: ArmModel, theta: ArrayLike) -> np.ndarray:
     given by its moments or has moments across its links.
     """
     arm.check_masses("paper_static")
-    return _in_blocks(_paper_static, arm, _poses(theta))
+    return _torque(_paper_static, arm, _poses(theta))
 
 
 def paper_mobile_torque(arm: ArmModel, theta: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> np.ndarray:
@@ -118,7 +117,7 @@ def paper_mobile_torque(arm: ArmModel, theta: ArrayLike, pitch: ArrayLike, yaw: 
         if angle.shape not in ((), poses.shape[:-1]) or not np.all(np.isfinite(angle)):
             raise ParameterError(name, angle, f"a finite number or an array of shape {poses.shape[:-1]}")
     tilt = np.stack(np.broadcast_arrays(beta, phi), axis=-1)
-    return _in_blocks(lambda xp, arm, angles, tilt: _paper_mobile(xp, arm, angles, *tilt), arm, poses, tilt)
+    return _torque(lambda xp, arm, angles, tilt: _paper_mobile(xp, arm, angles, *tilt), arm, poses, tilt)
 
 
 def _poses(theta: ArrayLike) -> np.ndarray:
@@ -130,20 +129,11 @@ def _poses(theta: ArrayLike) -> np.ndarray:
     return poses
 
 
-def _in_blocks(
-    formula: Callable[..., tuple[Any, ...]], arm: ArmModel, theta: np.ndarray, *inputs: np.ndarray
-) -> np.ndarray:
-    """Return the scaled torque by `formula` in the shape of `theta`; inputs: (k,) for all poses, or (n, k)."""
-    scale = arm.gain * arm.gravity
-    poses = np.atleast_2d(theta)
-    rows = [np.atleast_2d(values) for values in inputs]
-    torque = np.empty_like(poses)
-    for begin in range(0, len(poses), BLOCK):
-        part = slice(begin, begin + BLOCK)
-        columns = [(row if len(row) == 1 else row[part]).T for row in rows]
-        for joint, tau in enumerate(formula(np, arm, poses[part].T.copy(), *columns)):
-            np.multiply(tau, scale[joint], out=torque[part, joint])
-    return torque.reshape(theta.shape)
+def _torque(formula: Callable[..., tuple[Any, ...]], arm: ArmModel, *inputs: np.ndarray) -> np.ndarray:
+    """Return the scaled torque (4,) or (n, 4) by `formula`; inputs: (k,) for all poses, or (n, k), the angles first."""
+    columns = (np.moveaxis(values, -1, 0).copy() for values in inputs)  # contiguous: twice as fast
+    unscaled = np.broadcast_arrays(*formula(np, arm, *columns))
+    return np.asarray(np.stack(unscaled, axis=-1) * (arm.gain * arm.gravity))
 
 
 def _law(formula: Callable[..., Torque]) -> Law:

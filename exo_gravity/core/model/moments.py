@@ -42,16 +42,6 @@ def load_moments(length: Vector, mass: float, lever: float) -> np.ndarray:
     return np.array((*(mass * lengths[:3]).tolist(), mass * lever, 0.0, 0.0, 0.0, 0.0))
 
 
-def off_axis_of(mass: Vector, cog_y: Vector, cog_z: Vector) -> np.ndarray:
-    """Return (W, Z, Y3, Y4) in kg m of links whose centres of gravity lie beside the link.
-
-    mass: (4,) kg. cog_y, cog_z: (4,) m along y_n and z_n of Table 1. Raises ParameterError.
-    """
-    m = four_floats("mass", mass, 0.0, MAX_MASS, "kg")
-    y, z = (four_floats(name, v, -MAX_OFFSET, MAX_OFFSET, "m") for name, v in (("cog_y", cog_y), ("cog_z", cog_z)))
-    return np.array((m[0] * z[0] + m[1] * y[1], m[1:] @ z[1:], m[2] * y[2], m[3] * y[3]))
-
-
 def regressor(
     theta: ArrayLike, direction: ArrayLike = (0.0, 0.0, 1.0), gravity: float = STANDARD_GRAVITY
 ) -> np.ndarray:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.rotation import unit_quaternion
+from exo_gravity.core.model.rotation import rotated, unit_quaternion
 from exo_gravity.core.numbers import Vector, one_float
 
 SIDES = ("left", "right")
@@ -92,11 +92,5 @@ def rotation_matrix(quaternion: Vector | None, name: str = "quaternion") -> np.n
 
     Raises ParameterError that names `name` unless its norm is within 1 % of 1, which allows for rounding in drivers.
     """
-    x, y, z, w = unit_quaternion(name, quaternion)
-    return np.array(
-        (
-            (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-            (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-            (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-        )
-    )
+    unit = unit_quaternion(name, quaternion)
+    return np.column_stack([rotated(unit, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))])

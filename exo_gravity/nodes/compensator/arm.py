@@ -26,8 +26,7 @@ from exo_gravity.core.compensation import params
 from exo_gravity.core.compensation.compensator import Answer, Compensator
 from exo_gravity.core.compensation.limiter import CommandFade, Output
 from exo_gravity.core.compensation.settings import URDF_LAW, Settings, UrdfSettings
-from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.model.anfis import AnfisLaw
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import Param
 from exo_gravity.core.trunk.tilt_input import MAX_LEAD
 from exo_gravity.hardware.urdf_arm import UrdfArm
@@ -50,22 +49,12 @@ def declared(node: Node) -> tuple[Sequence[Param], dict[str, Any], Read]:
     given = node.get_parameters_by_prefix("")
     if "law" not in given or given["law"].value != URDF_LAW:
         table = params.compensator_table(given)
-        return table, declare(node, table), _settings
+        return table, declare(node, table), lambda values: params.settings_of(values, _text)
     table = params.urdf_table(len(_joint_names(node)), given)
     _forget_unused(node, {param.name for param in table})
     values = declare(node, table)
     model = UrdfArm(_description(node, values), values["joint_names"])
     return table, values, lambda values: params.urdf_settings_of(values, model)
-
-
-def _settings(values: dict[str, Any]) -> Settings:
-    """Return the settings of the exoskeleton's own arm, with the file that they name. Raises ParameterError."""
-    path = values["anfis_file"]
-    try:
-        anfis = AnfisLaw.load(Path(path).read_text(encoding="utf-8")) if path else None
-    except (OSError, UnicodeDecodeError, DataError) as error:
-        raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
-    return params.settings_of(values, anfis)
 
 
 def sentence(s: Settings | UrdfSettings) -> str:
@@ -127,9 +116,13 @@ def _description(node: Node, values: dict[str, Any]) -> str:
             raise ParameterError("urdf.topic", topic, f"published, latched, within {DESCRIPTION_TIMEOUT:g} s")
         return str(message.data)
     try:
-        return Path(path).expanduser().read_text(encoding="utf-8")
+        return _text(path)
     except (OSError, UnicodeDecodeError) as error:
         raise ParameterError("urdf.file", path, f"a URDF file ({error})") from None
+
+
+def _text(path: str) -> str:
+    return Path(path).expanduser().read_text(encoding="utf-8")
 
 
 class JointStateInterface:

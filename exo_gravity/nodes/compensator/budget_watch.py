@@ -19,7 +19,7 @@ from rclpy.node import Node
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.model.budget import USUAL_TILT, Workspace, budget, largest_support, motor_torques, overload
+from exo_gravity.core.model.budget import USUAL_TILT, budget, largest_support, motor_torques, overload, workspace
 from exo_gravity.nodes.ros.parameters import NodeParameters
 
 PAUSE = 0.005  # s, about 500 times per budget
@@ -74,9 +74,9 @@ def compute(names: Sequence[str], request: Request, bridge: Mapping[str, Any]) -
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     robot, load, support, tilt = request
     try:
-        workspace = Workspace(bridge["position_min"], bridge["position_max"], tilt)
+        bounds = workspace(bridge["position_min"], bridge["position_max"], tilt)
         rated, peak = motor_torques(bridge["motor"], bridge["torque_scale"])
-        joints = budget(robot, load, support, workspace, rated, peak, lambda: time.sleep(PAUSE))
+        joints = budget(robot, load, support, bounds, rated, peak, lambda: time.sleep(PAUSE))
     except ParameterError as error:
         return f"unknown: can_bridge has {error}", "unknown"
     return overload(names, joints) or WITHIN, f"{largest_support(joints) or 0.0:g}" if any(load[0]) else "none"

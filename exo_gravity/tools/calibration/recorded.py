@@ -74,8 +74,11 @@ def _down(path: Path, arm: ConfiguredArm, times: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(times, stamps, component) for component in components], axis=1)
 
 
-def messages_of(path: Path, topic: str, msgtype: str) -> Iterator[tuple[int, Any]]:
-    """Yield stamp in ns and message of each message of `topic` in a recording. Raises DataError if there are none."""
+def messages_of(path: Path, topic: str, msgtype: str, required: bool = True) -> Iterator[tuple[int, Any]]:
+    """Yield stamp in ns and message of each message of `topic` in a recording.
+
+    Raises DataError for one that cannot be read, and if there are none although they are `required`.
+    """
     storage, types = Storage(path), get_typestore(Stores.ROS2_JAZZY)
     found = False
     for *_, stamp, data in storage.messages(lambda name, kind: (name, kind) == (topic, msgtype)):
@@ -84,7 +87,7 @@ def messages_of(path: Path, topic: str, msgtype: str) -> Iterator[tuple[int, Any
         except (SerdeError, ValueError) as error:
             raise DataError(f"{path}: {topic}: {error}") from None
         found = True
-    if not found:
+    if required and not found:
         topics = ", ".join(sorted(storage.topics)) or "none"
         raise DataError(f"{path}: no samples of {topic} ({msgtype}); its topics: {topics}")
 

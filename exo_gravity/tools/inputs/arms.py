@@ -6,8 +6,7 @@ unknown parameter is an error here too. Errors name node and parameter: `/right/
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,7 @@ import numpy as np
 
 from exo_gravity.core.compensation.params import compensator_table, settings_of
 from exo_gravity.core.compensation.settings import URDF_LAW, Settings
-from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.model.anfis import AnfisLaw
+from exo_gravity.core.errors import ParameterError, named
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.motors.joint_motor import OPTIONS, JointMotor, motors_of
 from exo_gravity.core.params import Param, values_of
@@ -64,8 +62,8 @@ class ConfiguredArm:
 
     def settings(self) -> Settings:
         """Return the compensator's settings, with the model in `anfis_file`. Raises ParameterError."""
-        with named(f"{self.namespace}/compensator"):
-            return settings_of(self.compensator, _anfis_model(self.compensator["anfis_file"]))
+        with named(f"{self.namespace}/compensator "):
+            return settings_of(self.compensator, lambda path: Path(path).read_text(encoding="utf-8"))
 
 
 def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:
@@ -75,23 +73,17 @@ def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:
     """
     can_bridge = node_values(nodes, f"{namespace}/can_bridge", CAN_BRIDGE)
     node = f"{namespace}/compensator"
-    nodes = _with_own_law(nodes, node)
-    compensator = node_values(nodes, node, compensator_table(nodes.get(node, ())))
-    with named(f"{namespace}/can_bridge"):
+    given = nodes.get(node, {})
+    if given.get("law") == URDF_LAW:  # the law `exact` gives the torques of a URDF of this arm
+        kept = {name: value for name, value in given.items() if not name.startswith(f"{URDF_LAW}.")}
+        nodes = {**nodes, node: {**kept, "law": "exact"}}
+    compensator = node_values(nodes, node, compensator_table(given))
+    with named(f"{namespace}/can_bridge "):
         motors, limits = motors_of(can_bridge), limits_of(can_bridge)
-    with named(f"{namespace}/compensator"):
+    with named(f"{namespace}/compensator "):
         # The robot does not depend on the law, and the model of `law: anfis` may not be trained yet.
         robot = settings_of({**compensator, "law": "exact"}).robot
     return ConfiguredArm(namespace, can_bridge, compensator, motors, limits, robot)
-
-
-def _with_own_law(nodes: Nodes, node: str) -> Nodes:
-    """Return the nodes with the law `exact` in place of `urdf`, whose torques a URDF of this arm shares."""
-    given = nodes.get(node, {})
-    if given.get("law") != URDF_LAW:
-        return nodes
-    own = {name: value for name, value in given.items() if not name.startswith(f"{URDF_LAW}.")}
-    return {**nodes, node: {**own, "law": "exact"}}
 
 
 def configured_arms(params: str | Path) -> list[ConfiguredArm]:
@@ -122,23 +114,5 @@ def node_values(nodes: Nodes, node: str, table: tuple[Param, ...]) -> dict[str, 
     """Return every parameter of `node` by name, checked against its `table`. Raises ParameterError."""
     if node not in nodes:
         raise ParameterError("params", sorted(nodes), f"a file with {node}")
-    with named(node):
+    with named(f"{node} "):
         return values_of(table, nodes[node], OPTIONS)
-
-
-@contextmanager
-def named(node: str) -> Iterator[None]:
-    """Add the name of `node` to any ParameterError raised inside the context."""
-    try:
-        yield
-    except ParameterError as error:
-        name = error.name if error.name.startswith(node) else f"{node} {error.name}"
-        raise ParameterError(name, error.value, error.expected) from None
-
-
-def _anfis_model(path: str) -> AnfisLaw | None:
-    """Return the model of a file, None for no file."""
-    try:
-        return AnfisLaw.load(Path(path).read_text(encoding="utf-8")) if path else None
-    except (OSError, DataError) as error:
-        raise ParameterError("anfis_file", path, f"a file written by train_anfis ({error})") from None

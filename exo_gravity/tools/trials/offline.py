@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import Progress, TaskID
 
 from exo_gravity.bag.content import Bag, Event
-from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.errors import ParameterError, named
 from exo_gravity.core.model.tilt import rotation_matrix
 from exo_gravity.core.trial.script import TRUNK_ACTIONS, TrialScript
 from exo_gravity.hardware.trunk_estimator import VQF, ImuSample, TrunkEstimator
@@ -23,7 +23,7 @@ from exo_gravity.sim.imu import ImuConfig, SimulatedImu, measured_tilt
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial, TrunkReading
 from exo_gravity.sim.params import SIMULATOR, device_of, imu_of, set_faults
 from exo_gravity.sim.trunk_motion import TrunkState
-from exo_gravity.tools.inputs.arms import named, node_values, read_arm
+from exo_gravity.tools.inputs.arms import node_values, read_arm
 from exo_gravity.tools.inputs.parameter_file import load
 
 
@@ -42,12 +42,12 @@ def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
     moves = any(step.action in TRUNK_ACTIONS for step in script.steps)
     tilt, trials = None, []
     if with_imu and not moves:
-        with named("/imu"):
+        with named("/imu "):
             trunk = with_imu["trunk.pitch"], with_imu["trunk.roll"]
             tilt = measured_tilt(*trunk, SimulatedImu(imu_of(with_imu)), rotation)
     for namespace, simulator in simulators.items():
         arm = read_arm(nodes, namespace)
-        with named(f"{namespace}/simulator"):
+        with named(f"{namespace}/simulator "):
             device = device_of(simulator)
             set_faults(device, simulator)
         rate = arm.can_bridge["rate"]

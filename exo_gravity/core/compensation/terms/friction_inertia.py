@@ -18,8 +18,10 @@ moved the shoulder's rotation against its friction, by up to 1 degree a minute.
 
 from __future__ import annotations
 
+import math
+import operator
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -55,16 +57,12 @@ class Friction(TermParameters):
 
     def torque(self, state: TermState) -> Torque:
         """Return the torque (4,) in Nm, along the motion."""
-        share, torque = self.share, []
+        torque = []
         for v, coulomb, viscous in zip(state.velocity, self.coulomb, self.viscous, strict=True):
-            speed = -v if v < 0.0 else v
-            if speed <= STANDSTILL:
-                torque.append(0.0)
-                continue
-            whole = share * (coulomb + viscous * (speed if speed < MAX_SPEED else MAX_SPEED))
-            if speed < SLIDING:
-                whole *= (speed - STANDSTILL) / (SLIDING - STANDSTILL)
-            torque.append(whole if v > 0.0 else -whole)
+            speed = abs(v)
+            moving = max(0.0, min(1.0, (speed - STANDSTILL) / (SLIDING - STANDSTILL)))
+            whole = self.share * (coulomb + viscous * min(speed, MAX_SPEED))
+            torque.append(math.copysign(moving * whole, v))
         return tuple(torque)
 
 
@@ -91,9 +89,7 @@ class EnergyTank:
 
         velocity: (4,) rad/s. income: W that flows into the tank, from the joints' friction.
         """
-        v1, v2, v3, v4 = velocity
-        a, b, c, d = torque
-        power = a * v1 + b * v2 + c * v3 + d * v4
+        power = _dot(torque, velocity)
         if power > 0.0 and self.level < FADING * TANK:
             share = max(0.0, self.level) / (FADING * TANK)
             torque, power = tuple([share * tau for tau in torque]), share * power
@@ -102,9 +98,7 @@ class EnergyTank:
         given.append((self._time, torque))
         while given[0][0] < self._time - DELAY:
             given.popleft()
-        a, b, c, d = given[0][1]
-        late = a * v1 + b * v2 + c * v3 + d * v4
-        self.level = min(TANK, self.level + (income - (power if power > late else late)) * dt)
+        self.level = min(TANK, self.level + (income - max(power, _dot(given[0][1], velocity))) * dt)
         return torque
 
 
@@ -123,11 +117,12 @@ class InertiaTerm(NamedTuple):
         fading = min((fastest - STANDSTILL) / (MOVING - STANDSTILL), (TOO_FAST - fastest) / (TOO_FAST - FAST))
         share = self.share * max(0.0, min(1.0, fading))
         whole = self.links.torque(state.position, velocity, state.acceleration)
-        v1, v2, v3, v4 = velocity
-        c1, c2, c3, c4 = self.coulomb
-        income = c1 * abs(v1) + c2 * abs(v2) + c3 * abs(v3) + c4 * abs(v4)
-        a, b, c, d = whole
-        return self.tank.pass_on((share * a, share * b, share * c, share * d), velocity, state.dt, income)
+        income = _dot(self.coulomb, map(abs, velocity))
+        return self.tank.pass_on(tuple([share * tau for tau in whole]), velocity, state.dt, income)
+
+
+def _dot(a: Iterable[float], b: Iterable[float]) -> float:
+    return sum(map(operator.mul, a, b))
 
 
 class AccelerationFilter:

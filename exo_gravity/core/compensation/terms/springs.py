@@ -181,10 +181,7 @@ class SoftLimits(TermParameters):
         edges = self.range[0::2], self.range[1::2]
         columns = zip(self.stiffness, *edges, state.position, state.velocity, self.max_effort, strict=True)
         for k, low, high, q, v, most in columns:
-            if low <= q <= high:
-                torque.append(0.0)
-                continue
-            depth = q - high if q > high else q - low
+            depth = max(q - high, 0.0) + min(q - low, 0.0)
             damping = LATE * k * min(1.0, abs(depth) / EDGE)
             torque.append(clamp(-k * depth, most) - damping * v)
         return tuple(torque)
@@ -193,12 +190,3 @@ class SoftLimits(TermParameters):
 def clamp(value: float, limit: float) -> float:
     """Return `value` limited to -limit..limit."""
     return max(-limit, min(limit, value))
-
-
-def stable_stiffness(least_inertia: Sequence[float]) -> list[float]:
-    """Return the stiffness (4,) in Nm/rad that can be damped on these inertias (4,) kg m^2.
-
-    A spring that acts DELAY late gives the energy of a damping of -stiffness * DELAY. Virtual damping acts as late, so
-    inertia / (2 DELAY) is the most that damps: twice what the spring needs.
-    """
-    return [inertia / (4.0 * DELAY**2) for inertia in least_inertia]

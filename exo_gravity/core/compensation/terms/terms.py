@@ -31,7 +31,6 @@ from exo_gravity.core.compensation.terms.springs import (
     Term,
     TermState,
     clamp,
-    stable_stiffness,
 )
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import ArmModel
@@ -65,9 +64,12 @@ class TermSettings:
         if not any(getattr(self, name).on for name in ("damping", "spring", "coupling", "limits", "inertia")):
             return self
         least = least_inertia(LinkInertia.of(robot))
-        springs = stable_stiffness(least)
+        # A spring that acts DELAY late gives the energy of a damping of -stiffness * DELAY. Virtual damping acts as
+        # late, so inertia / (2 DELAY) is the most that damps: twice what the spring needs.
+        dampers = [inertia / (2.0 * DELAY) for inertia in least]
+        springs = [most / (2.0 * DELAY) for most in dampers]
         bounds = [
-            ("damping.viscosity", self.damping.viscosity, [inertia / (2.0 * DELAY) for inertia in least], "Nm s/rad"),
+            ("damping.viscosity", self.damping.viscosity, dampers, "Nm s/rad"),
             ("spring.stiffness", self.spring.stiffness, springs, "Nm/rad"),
         ]
         if self.coupling.on:
@@ -158,7 +160,7 @@ class Terms:
             self._output, self._has_changed, dt = NO_TORQUE, False, 0.0
         acceleration = self._acceleration.update(velocity, dt) if self._has_inertia else NO_TORQUE
         self._state = TermState(dt, theta, velocity, acceleration, now - self.now.since)
-        total = _sum(self.now.terms, self._state) if self.now.terms else NO_TORQUE
+        total = _sum(self.now.terms, self._state)
         self._refusal = "" if math.isfinite(sum(total)) else "torque of the terms is not finite"
         if self._refusal:
             total, self._acceleration = NO_TORQUE, AccelerationFilter()  # it may have kept what is not finite
@@ -191,8 +193,4 @@ class Terms:
 
 
 def _sum(terms: Sequence[Term], state: TermState) -> Torque:
-    a = b = c = d = 0.0
-    for term in terms:
-        e, f, g, h = term.torque(state)
-        a, b, c, d = a + e, b + f, c + g, d + h
-    return a, b, c, d
+    return tuple(map(sum, zip(NO_TORQUE, *(term.torque(state) for term in terms), strict=True)))
