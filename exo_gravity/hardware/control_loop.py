@@ -19,11 +19,10 @@ from typing import Any
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.bus_load import REPLY_SHARE
-from exo_gravity.core.safety.descent import RestTracker
 from exo_gravity.core.safety.drive import NO_COMMAND, OFF, Drive, EffortCommand, FaultCode, State
 from exo_gravity.core.safety.limits import DAMPING, JointSample
 from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.core.safety.supply import SupplyMonitor
+from exo_gravity.core.safety.monitors import RestTracker, SupplyMonitor
 from exo_gravity.hardware.can.motor_bus import MotorBus
 
 EFFORT_WAIT = 0.5  # share of a cycle's idle time for which the loop may wait for late efforts

@@ -145,7 +145,7 @@ MUTATIONS = (
     Mutation(
         "a ride that never ends",
         ("compensator frozen, the rest runs on",),
-        (Edit("exo_gravity/core/safety/ride.py", "if self._left >= 0.0 and age <= LONGEST_AGE:", "if True:"),),
+        (Edit("exo_gravity/core/safety/monitors.py", "if self._left >= 0.0 and age <= LONGEST_AGE:", "if True:"),),
     ),
     Mutation(
         "a ride without damping",

@@ -6,8 +6,8 @@ A `JointMotor` translates joint angle, effort and damping to the frames of its w
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from exo_gravity.core.errors import ParameterError
@@ -36,6 +36,12 @@ class JointMotor:
     zero: float = 0.0  #: motor angle in rad at which the joint angle is 0
     torque_scale: float = 1.0  #: real output torque per commanded Nm (users report 0.75 for one AK80-9)
     wire_format: WireFormat = MIT  #: of the motor's board
+    command_id: int = field(init=False)  #: the arbitration ID of commands
+    #: the frames that switch the motor on, before its next command; that switch it off; and that make its present angle
+    #: zero, none if its board has no such frame
+    enter: tuple[Frame, ...] = field(init=False)
+    exit: tuple[Frame, ...] = field(init=False)
+    set_zero: tuple[Frame, ...] = field(init=False)
 
     def __post_init__(self) -> None:
         if not isinstance(self.can_id, int) or not 1 <= self.can_id <= MAX_CAN_ID:
@@ -46,6 +52,10 @@ class JointMotor:
         if not abs(self.zero) <= limit:
             raise ParameterError("zero", self.zero, f"from {-limit:.2f} to {limit:.2f} rad, or the angle would wrap")
         one_float("torque_scale", self.torque_scale, *TORQUE_SCALE_BOUNDS)
+        board = self.wire_format
+        object.__setattr__(self, "command_id", board.first_id + self.can_id)
+        for name, frames in (("enter", board.on), ("exit", board.off), ("set_zero", board.zero)):
+            object.__setattr__(self, name, tuple((first + self.can_id, data) for first, data in frames))
 
     @property
     def rated_effort(self) -> float:
@@ -64,29 +74,6 @@ class JointMotor:
     def peak_damping(self) -> float:
         """The largest damping in Nm s/rad at the joint that a command can ask for."""
         return self.spec.kd_max * self.torque_scale
-
-    @property
-    def command_id(self) -> int:
-        """The arbitration ID of commands to this motor."""
-        return self.wire_format.first_id + self.can_id
-
-    @property
-    def enter(self) -> tuple[Frame, ...]:
-        """The frames that switch the motor on, before its next command."""
-        return self._own(self.wire_format.on)
-
-    @property
-    def exit(self) -> tuple[Frame, ...]:
-        """The frames that switch the motor off."""
-        return self._own(self.wire_format.off)
-
-    @property
-    def set_zero(self) -> tuple[Frame, ...]:
-        """The frames that make the motor's present angle zero; none if its board has no such frame."""
-        return self._own(self.wire_format.zero)
-
-    def _own(self, frames: Sequence[Frame]) -> tuple[Frame, ...]:
-        return tuple((first + self.can_id, data) for first, data in frames)
 
     def command(self, effort: float, damping: float, stiffness: float = 0.0, position: float = 0.0) -> bytes:
         """Return the data of a command: a joint `effort` in Nm and `damping` in Nm s/rad, clamped to the wire format.

@@ -27,14 +27,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE, UNKNOWN, JointSample
+from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE, JointSample
 
 REST_TIME = 2.0  # s at rest with nothing holding the arm, until it is down
 LONGEST_REST = 7.5  # s with nothing holding the arm, after which it is down even if the wearer moves it
 DESCENT_TIMEOUT = 40.0  # s for a bridge to let its arm down before its launcher kills it
 LONGEST_SILENCE = 5.0  # s for which the way down waits for a silent motor
 
-SETTLED = 0.005  # rad that a joint at rest may turn
 SETTLING_TIME = 0.5  # s
 
 DESCENT_SPEED = 0.35  # rad/s; a horizontal arm is down within 10 s
@@ -159,25 +158,3 @@ class ArmDescent:
         free = now - self._held
         is_down = free >= LONGEST_REST or (free >= REST_TIME and now - rest_since >= REST_TIME)
         return is_down and (not any(self._silent) or now - self._start >= LONGEST_SILENCE)
-
-
-class RestTracker:
-    """Whether an arm is at rest, judged by position: a damped arm can creep at less than one code of the velocity.
-
-    since: s, the time since which no replying joint has turned by more than SETTLED.
-    """
-
-    def __init__(self) -> None:
-        self.since = -math.inf
-        self._reference: Sequence[JointSample] = (UNKNOWN,) * 4
-
-    def step(self, now: float, joints: Sequence[JointSample], silent: Sequence[bool]) -> None:
-        """Take the newest readings at `now` (s); silent: (4,) whose motor does not reply."""
-        columns = zip(joints, self._reference, silent, strict=True)
-        if any(
-            not is_silent and not abs(joint.position - last.position) <= SETTLED for joint, last, is_silent in columns
-        ):
-            self.since, self._reference = now, joints
-        if any(silent):  # a silent joint may have moved by the time it replies again
-            known = zip(self._reference, silent, strict=True)
-            self._reference = [UNKNOWN if is_silent else last for last, is_silent in known]

@@ -1,6 +1,6 @@
 """The limits of a worn arm: which motor readings are a fault, and how an effort is limited before it reaches a motor.
 
-`find_fault` checks a motor's reading; readings.py confirms what it finds. `shape` limits the requested efforts, in this
+`find_fault` checks a motor's reading; monitors.py confirms what it finds. `shape` limits the requested efforts, in this
 order: soft wall before a joint limit, clamp to the permitted torque (derated when hot), rate limit. docs/safety.md
 compares the defaults with those of other systems.
 """

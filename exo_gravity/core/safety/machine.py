@@ -14,13 +14,13 @@
 - LETTING_DOWN lowers each joint at a bounded speed (descent.py). The motors are switched off once nothing holds
   the arm and nothing moves it. A motor that cannot be reached stays in this state's care: if it replies again, however
   late, its joint is lowered from the torque that it then applies. If all were silent at once, their supply may have
-  been cut: a motor that returns without torque stays off (supply.py).
+  been cut: a motor that returns without torque stays off (`SupplyMonitor`).
 - FAULT latches the code and reason of the first fault. Only `clear` leaves it, and only to DISABLED: clearing a fault
   never enables the arm.
 
-A compensator that is late for a moment is waited for (ride.py): the last torque stays, and damping rises.
+A compensator that is late for a moment is waited for (`RideThrough`): the last torque stays, and damping rises.
 
-Zeros and signs are trusted once they were checked, until a motor may have lost its turn count (readings.py), or a fault
+Zeros and signs are trusted once they were checked, until a motor may have lost its turn count (`Readings`), or a fault
 casts doubt on them. Until then `resume` carries an arm on from any pose after a fault that was no one's.
 """
 
@@ -34,14 +34,12 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.delivery import DeliveryMonitor
-from exo_gravity.core.safety.descent import DAMPING_RISE, SETTLING_TIME, ArmDescent, RestTracker
+from exo_gravity.core.safety.descent import DAMPING_RISE, SETTLING_TIME, ArmDescent
 from exo_gravity.core.safety.drive import CARRYING, NOTHING, OFF, Drive, EffortCommand, Fault, FaultCode, State
 from exo_gravity.core.safety.gate import CALM, SignCheck, SwitchOnCheck, missing_for_a_start
 from exo_gravity.core.safety.limits import DAMPING, JointSample, Limits, guide_damping
+from exo_gravity.core.safety.monitors import Readings, RestTracker, RideThrough, SupplyMonitor
 from exo_gravity.core.safety.motion_monitor import MotionMonitor
-from exo_gravity.core.safety.readings import Readings
-from exo_gravity.core.safety.ride import RideThrough
-from exo_gravity.core.safety.supply import SupplyMonitor
 
 RAMP_TIME = 1.0  # s from no torque to full torque: the arm becomes light without a jolt
 
