@@ -21,7 +21,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
-from exo_gravity.core.motors.bus_load import REPLY_SHARE
+from exo_gravity.core.motors.joint_motor import REPLY_SHARE
 from exo_gravity.core.safety.drive import NOTHING, Drive
 from exo_gravity.core.safety.limits import UNKNOWN
 from exo_gravity.hardware.scheduling import favour

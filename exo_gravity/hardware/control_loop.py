@@ -18,7 +18,7 @@ from queue import SimpleQueue
 from typing import Any
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.bus_load import REPLY_SHARE
+from exo_gravity.core.motors.joint_motor import REPLY_SHARE
 from exo_gravity.core.safety.drive import NO_COMMAND, OFF, Drive, EffortCommand, FaultCode, State
 from exo_gravity.core.safety.limits import DAMPING, JointSample
 from exo_gravity.core.safety.machine import SafetyMachine
