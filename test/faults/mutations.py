@@ -212,7 +212,7 @@ MUTATIONS = (
     Mutation(
         "powered frames are sent while the supply is cut",
         ("V3 boards: supply cut for 2 s", "supply cut for 2 s"),
-        (Edit(SAFETY, "if all(readings.silent) and self._sent.powered:", "if False:"),),
+        (Edit(SAFETY, "if all(readings.silent) and sent.powered:", "if False:"),),
     ),
     Mutation(
         "an enable never expires",

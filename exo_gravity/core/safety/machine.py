@@ -151,22 +151,34 @@ class SafetyMachine:
 
     def step(self, now: float, joints: Sequence[JointSample], command: EffortCommand) -> Drive:
         """Return what the motors receive in the cycle at `now` s; joints: the 4 newest readings."""
-        effort, effort_time, damped, held = command
+        effort, answered, damped, held = command
         now = max(now, self._now)  # a call may carry a slightly later time than the cycle that follows it
-        age = now - effort_time
+        age = now - answered
         self._now, self._dt = now, min(now - self._now, self._period)
-        self._track(joints)
+        readings, supply, sent = self._readings, self._supply, self._sent
+        readings.step(now, joints, sent.powered)
+        if readings.lost or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):
+            self._is_trusted = False
+        self._rest.step(now, readings.joints, readings.silent)
+        if all(readings.silent) and sent.powered:
+            supply.doubt(sent.effort)
+        self._is_found_on = supply.step(self._dt, readings.joints, readings.silent)
         if self.state is State.CHECKING:
             self._check(effort is not None and age <= self.limits.command_timeout)
-        if self._sent.powered:
-            fault = self._delivery.step(self._dt, self._readings.joints, self._sent.effort, self._sent.damping)
+        if sent.powered:
+            fault = self._delivery.step(self._dt, readings.joints, sent.effort, sent.damping)
             is_proven = self.state in (State.RAMPING_IN, State.ACTIVE) or self._switch_on.done
             if fault and self.state in CARRYING and is_proven:
                 self._trip(fault)
         if self.state in CARRYING:
-            self._watch(effort is not None, age, held)
+            fault = readings.fault
+            if fault is None and effort is None:
+                fault = Fault(FaultCode.COMMAND_WITHDRAWN, "the compensator withdrew its efforts; see its diagnostics")
+            elif fault is None:
+                fault = self.ride.step(now, self._dt, age, held)
+            self._trip(fault)
         if effort is not None and self.state in (State.RAMPING_IN, State.ACTIVE):
-            effort, fault = self.motion.step(self._dt, self._readings.joints, effort, age)
+            effort, fault = self.motion.step(self._dt, readings.joints, effort, age)
             self._trip(fault)
         if self.state is State.PROVING:
             self._prove()
@@ -206,14 +218,6 @@ class SafetyMachine:
             self._enter(State.PROVING)
         elif self._now - self._since >= limits.enable_timeout:
             self._refuse(f"not enabled within {limits.enable_timeout:g} s: waited for {self.waiting_for}")
-
-    def _watch(self, is_requested: bool, age: float, held: bool) -> None:
-        fault = self._readings.fault
-        if fault is None and not is_requested:
-            fault = Fault(FaultCode.COMMAND_WITHDRAWN, "the compensator withdrew its efforts; see its diagnostics")
-        elif fault is None:
-            fault = self.ride.step(self._now, self._dt, age, held)
-        self._trip(fault)
 
     def _prove(self) -> None:
         if self._switch_on.done:
@@ -284,17 +288,6 @@ class SafetyMachine:
     def _refuse(self, reason: str) -> None:
         self.refusal = reason
         self._enter(State.DISABLED)
-
-    def _track(self, joints: Sequence[JointSample]) -> None:
-        """Follow the readings: who is silent, who applies torque, whether the arm rests."""
-        readings = self._readings
-        readings.step(self._now, joints, self._sent.powered)
-        if readings.lost or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):
-            self._is_trusted = False
-        self._rest.step(self._now, readings.joints, readings.silent)
-        if all(readings.silent) and self._sent.powered:
-            self._supply.doubt(self._sent.effort)
-        self._is_found_on = self._supply.step(self._dt, readings.joints, readings.silent)
 
     def _let_down(self, now: float) -> None:
         applied = self._delivery.applied(self._sent, self._readings.silent)
