@@ -53,8 +53,8 @@ MUTATIONS = (
         (
             Edit(
                 DESCENT,
-                "return tuple(joint.damping for joint in self._joints)",
-                "return (self._joints[0].damping, 0.0, 0.0, 0.0)",
+                "tuple(joint.damping for joint in self._joints)",
+                "(self._joints[0].damping, 0.0, 0.0, 0.0)",
             ),
         ),
     ),

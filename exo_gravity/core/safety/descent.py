@@ -133,14 +133,9 @@ class ArmDescent:
         self._held = now  # when something last held the arm, s
 
     @property
-    def effort(self) -> tuple[float, ...]:
-        """Torque (4,) in Nm to apply now."""
-        return tuple(joint.effort for joint in self._joints)
-
-    @property
-    def damping(self) -> tuple[float, ...]:
-        """Damping (4,) in Nm s/rad to apply now."""
-        return tuple(joint.damping for joint in self._joints)
+    def applied(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Torque (4,) in Nm and damping (4,) in Nm s/rad to apply now."""
+        return tuple(joint.effort for joint in self._joints), tuple(joint.damping for joint in self._joints)
 
     def step(self, now: float, dt: float, samples: Sequence[JointSample], silent: Sequence[bool]) -> None:
         """Advance by `dt` s to `now` (s) with the newest readings; silent: (4,) whose motor does not reply."""

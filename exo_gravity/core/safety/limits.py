@@ -134,17 +134,6 @@ class Limits:
             return Fault(FaultCode.OUTSIDE_LIMITS, reason)
         return None
 
-    def find_wrong_zero(self, joints: Sequence[JointSample]) -> Fault | None:
-        """Return the fault of the first joint that is not near `home`, or None."""
-        for name, joint, home, tolerance in zip(self.joint_names, joints, self.home, self.home_tolerance, strict=True):
-            if not abs(joint.position - home) <= tolerance:
-                reason = (
-                    f"{name}: {joint.position:.3f} rad at the start, must be within {tolerance:g} of {home:g}: "
-                    "let the arm hang, or correct the parameter zero"
-                )
-                return Fault(FaultCode.IMPLAUSIBLE_ZERO, reason)
-        return None
-
     def shape(
         self, effort: Sequence[float], share: float, joints: Sequence[JointSample], before: Sequence[float], dt: float
     ) -> tuple[tuple[float, ...], tuple[float, ...], set[str]]:

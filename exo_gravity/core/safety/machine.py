@@ -265,7 +265,7 @@ class SafetyMachine:
         if any(enter):
             self._is_trusted = False
             self._delivery.reset()
-        return Drive(descent.effort, descent.damping, True, enter, supply.unsure)
+        return Drive(*descent.applied, True, enter, supply.unsure)
 
     def _stand(self) -> Drive:
         """Return what the motors receive while the arm is off: nothing, unless one of them may be on."""
@@ -279,7 +279,7 @@ class SafetyMachine:
         if not (self.is_unreached or is_doubtful or self._is_found_on):
             return OFF
         if not self._is_found_on and (is_doubtful or any(self._readings.silent)):
-            return Drive(self._descent.effort, self._descent.damping, True, unsure=supply.unsure)
+            return Drive(*self._descent.applied, True, unsure=supply.unsure)
         if self.state is State.CHECKING:
             self._refuse("a motor was still on: it is let down")
         self.is_unreached = False

@@ -64,8 +64,11 @@ class Readings:
                 moved = abs(joint.position - self.joints[i].position)
                 self.lost |= gap > limits.reply_timeout and moved > limits.home_tolerance[i]
                 self._newest[i], self._missed[i] = joint.time, 0
-                counting[i], fault = self._taken(i, joint)
-                self.fault = self.fault or fault
+                fault = limits.find_fault(i, joint, self.joints[i], self._asked[i])
+                is_confirmed, self._is_doubted[i] = self._is_doubted[i], fault is not None
+                if is_confirmed or not fault or self.joints[i] is UNKNOWN:
+                    counting[i], self._asked[i] = joint, self._now
+                    self.fault = self.fault or (fault if is_confirmed else None)
             else:
                 self._missed[i] += 1
                 self.lost |= self._missed[i] >= MISSED and now - joint.time > longest
@@ -77,16 +80,6 @@ class Readings:
             reason = f"{name}: no reply for more than {limits.reply_timeout * 1000:.0f} ms"
             self.fault = Fault(FaultCode.MOTOR_SILENT, reason)
         self._now = now
-
-    def _taken(self, i: int, joint: JointSample) -> tuple[JointSample, Fault | None]:
-        """Return the reading that counts now, and the fault of `joint` if the reading before it showed one, too."""
-        fault = self._limits.find_fault(i, joint, self.joints[i], self._asked[i])
-        is_confirmed = self._is_doubted[i]
-        self._is_doubted[i] = fault is not None
-        if fault and not is_confirmed and self.joints[i] is not UNKNOWN:
-            return self.joints[i], None
-        self._asked[i] = self._now
-        return joint, fault if is_confirmed else None
 
 
 class RestTracker:

@@ -14,6 +14,7 @@ import contextlib
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from operator import methodcaller
 from typing import Any, TypeVar
 
 import can
@@ -60,12 +61,13 @@ class CanPort:
         self._error = ""
         self._is_closing = False
 
-    def send(self, frame: Frame) -> None:
-        """Send a frame. Raises BusError."""
-        self._awaited.append(frame)
-        frame_id, data = frame
-        message = can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED)
-        self._guarded(lambda bus: bus.send(message))
+    def send(self, *frames: Frame) -> None:
+        """Send frames. Raises BusError."""
+        for frame in frames:
+            self._awaited.append(frame)
+            frame_id, data = frame
+            message = can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED)
+            self._guarded(methodcaller("send", message))
 
     def receive(self, timeout: float) -> can.Message | None:
         """Return the next frame, or None if there is none within `timeout` s. Raises BusError."""

@@ -129,7 +129,7 @@ class MotorBus:
             if not any(drive.unsure):
                 self._send_commands(OFF)
                 for motor in self._motors:
-                    self._send(*motor.enter)
+                    self._port.send(*motor.enter)
         self._send_commands(drive)
         if not drive.powered:
             self._switch_off()
@@ -153,7 +153,7 @@ class MotorBus:
         if not all(frames):
             raise BusError(f"set_zero: motor {self._motors[frames.index(())].can_id} has a board without such a frame")
         self._send_commands(OFF)
-        self._send(*chain.from_iterable(frames))
+        self._port.send(*chain.from_iterable(frames))
 
     def stop(self) -> None:
         """Send the last frames, a zero command and EXIT, twice; then close the bus. Never raises.
@@ -165,10 +165,8 @@ class MotorBus:
             self._is_confirming = True
             for joint, motor in enumerate(self._motors):
                 for frame in (*self._zero_command(joint), *motor.exit):
-                    try:
-                        self._send(frame)
-                    except BusError:
-                        self.ignored["unsent"] += 1
+                    with contextlib.suppress(BusError):
+                        self._port.send(frame)
             self._powered, self._exit_sent = False, self._now()
             end = self._exit_sent + LAST_REPLIES
             with contextlib.suppress(BusError):
@@ -185,7 +183,7 @@ class MotorBus:
         period = UNCONFIRMED_EXIT_PERIOD if self._unconfirmed else EXIT_PERIOD
         if self._powered or self._now() - self._exit_sent > period:
             for joint, motor in enumerate(self._motors):
-                self._send(*(() if joint in self._asked else self._zero_command(joint)), *motor.exit)
+                self._port.send(*(() if joint in self._asked else self._zero_command(joint)), *motor.exit)
             self._exit_sent = self._now()
         self._powered = False
 
@@ -203,12 +201,8 @@ class MotorBus:
                 continue
             command = self._command(joint, now)
             if drive.enter[joint]:
-                self._send(command, *motor.enter)
-            self._send(command)
-
-    def _send(self, *frames: Frame) -> None:
-        for frame in frames:
-            self._port.send(frame)
+                self._port.send(command, *motor.enter)
+            self._port.send(command)
 
     def _sort(self, message: can.Message) -> tuple[str, int]:
         """Return REPLY or FOREIGN_COMMAND with the motor's ID, or the kind of a frame that does not matter with 0."""
@@ -278,5 +272,5 @@ class MotorBus:
         command = self._command(joint, now)
         is_exit = foreign in [data for _, data in motor.exit]
         if is_exit or now - self._corrected[joint] >= CORRECTION_PERIOD:
-            self._send(*((command, *motor.enter) if is_exit else ()), command)
+            self._port.send(*((command, *motor.enter) if is_exit else ()), command)
             self._corrected[joint] = now
