@@ -14,8 +14,7 @@ from sensor_msgs.msg import JointState
 
 from exo_gravity.core.compensation.compensator import Answer
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.bus_load import Traffic
-from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.joint_motor import JointMotor, Traffic
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.safety.drive import NO_COMMAND, FaultCode, State
 from exo_gravity.core.safety.lease import LEASE_TIME, Lease

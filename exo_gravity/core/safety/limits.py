@@ -1,6 +1,6 @@
 """The limits of a worn arm: which motor readings are a fault, and how an effort is limited before it reaches a motor.
 
-`find_fault` checks a motor's reading; readings.py confirms what it finds. `shape` limits the requested efforts, in this
+`find_fault` checks a motor's reading; monitors.py confirms what it finds. `shape` limits the requested efforts, in this
 order: soft wall before a joint limit, clamp to the permitted torque (derated when hot), rate limit. docs/safety.md
 compares the defaults with those of other systems.
 """
@@ -132,17 +132,6 @@ class Limits:
         if not low - OVERSHOOT <= joint.position <= high + OVERSHOOT:
             reason = f"{name}: {joint.position:.3f} rad, the limits are {low:g} to {high:g}"
             return Fault(FaultCode.OUTSIDE_LIMITS, reason)
-        return None
-
-    def find_wrong_zero(self, joints: Sequence[JointSample]) -> Fault | None:
-        """Return the fault of the first joint that is not near `home`, or None."""
-        for name, joint, home, tolerance in zip(self.joint_names, joints, self.home, self.home_tolerance, strict=True):
-            if not abs(joint.position - home) <= tolerance:
-                reason = (
-                    f"{name}: {joint.position:.3f} rad at the start, must be within {tolerance:g} of {home:g}: "
-                    "let the arm hang, or correct the parameter zero"
-                )
-                return Fault(FaultCode.IMPLAUSIBLE_ZERO, reason)
         return None
 
     def shape(

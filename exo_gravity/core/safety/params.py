@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.bus_load import MAX_STATUS_RATE, REPLY_SHARE
-from exo_gravity.core.motors.joint_motor import MOTOR_PARAMETERS, JointMotor
+from exo_gravity.core.motors.joint_motor import MAX_STATUS_RATE, MOTOR_PARAMETERS, REPLY_SHARE, JointMotor
 from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, params_of
 from exo_gravity.core.safety.limits import HOME_TOLERANCE, Limits
 

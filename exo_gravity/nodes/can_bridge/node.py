@@ -30,9 +30,9 @@ from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.params import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.trunk.tilt_input import TiltInput
 from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.clock import request_real_time
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, OwnedBus, Watchdog, take_over
-from exo_gravity.hardware.scheduling import request_real_time
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.ros.hot_path import TiltSubscription

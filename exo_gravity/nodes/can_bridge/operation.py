@@ -18,8 +18,7 @@ from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity.core.errors import BusError, ParameterError
-from exo_gravity.core.motors.bus_load import REPLY_SHARE, Traffic
-from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.joint_motor import REPLY_SHARE, JointMotor, Traffic
 from exo_gravity.core.numbers import Rate
 from exo_gravity.core.safety.delivery import MotorLoad
 from exo_gravity.core.safety.drive import EffortCommand, FaultCode, State

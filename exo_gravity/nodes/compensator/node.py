@@ -23,7 +23,7 @@ from exo_gravity.core.compensation.compensator import Answer, Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Rate
-from exo_gravity.hardware.scheduling import request_real_time
+from exo_gravity.hardware.clock import request_real_time
 from exo_gravity.nodes.compensator.arm import JointStateInterface, MultiArrayInterface, declared, report, sentence
 from exo_gravity.nodes.compensator.budget_watch import BudgetWatch
 from exo_gravity.nodes.ros.hot_path import DISTRUST, NEWEST, HotPath, Repeated, SolePublisher, TiltSubscription

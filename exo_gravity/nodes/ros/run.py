@@ -22,7 +22,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from exo_gravity.core.errors import ExoGravityError
-from exo_gravity.hardware.scheduling import favour
+from exo_gravity.hardware.clock import favour
 
 NEEDED_CHECK_PERIOD = 0.1  # s
 CLOSE_TIMEOUT = 5  # s for the middleware to close
