@@ -30,11 +30,11 @@ NO_IMU: Parameters = {"use_imu": False}  # for the compensator, which then start
 FAST: Parameters = {"sign_check_torque": 0.0}
 # Rate and time-outs of config/sim.yaml, which suit a busy machine, and those of a real device.
 SIMULATED: dict[str, Parameters] = {
-    "can_bridge": {"rate": 100.0, "command_timeout": 0.1, "reply_timeout": 0.1},
+    "can_bridge": {"rate": 100.0, "command_timeout": 0.1},
     "compensator": {"tilt_timeout": 0.5},
 }
 REAL: dict[str, Parameters] = {
-    "can_bridge": {"rate": 250.0, "command_timeout": 0.05, "reply_timeout": 0.05},
+    "can_bridge": {"rate": 250.0, "command_timeout": 0.05},
     "compensator": {"tilt_timeout": 0.08},
 }
 
