@@ -26,10 +26,10 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.tilt_input import TiltInput
-from exo_gravity.nodes.ros.hot_path import NEWEST, HotPath, SolePublisher, TiltSubscription
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, by_name
 from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
+from exo_gravity.nodes.ros.subscriptions import NEWEST, HotPath, Publishers, TiltSubscription
 
 REPORT_PERIOD = 0.1  # s
 PLAN_PERIOD = 0.05  # s
@@ -52,7 +52,7 @@ class CalibratorNode(Node):
         self._printed = 0  # observations
         self._trouble = ""  # outside the tour
         self._diagnostics = Diagnostics(self)
-        self._source = SolePublisher(self, "joint_states")
+        self._source = Publishers()
         self._publisher = self.create_publisher(JointState, "effort_commands", 1)
         self._command = JointState(name=self._names)  # one message, reused
         self._lock = threading.Lock()  # guards tilt and state: joint states arrive on another thread

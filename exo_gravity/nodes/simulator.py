@@ -24,10 +24,10 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS
 from exo_gravity.core.trial.script import Step, TrialScript
 from exo_gravity.hardware.can.can_port import open_bus
-from exo_gravity.nodes.ros.hot_path import LATCHED
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
 from exo_gravity.nodes.ros.parameters import bus_of, declare, values_after
 from exo_gravity.nodes.ros.run import run
+from exo_gravity.nodes.ros.subscriptions import LATCHED
 from exo_gravity.sim import SimulatedImu, VirtualWearer
 from exo_gravity.sim.device import MAX_CATCH_UP
 from exo_gravity.sim.params import SIMULATOR, device_of, imu_of, set_faults

@@ -24,9 +24,9 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.nodes.compensator import arm
 from exo_gravity.nodes.compensator.node import CompensatorNode
-from exo_gravity.nodes.ros.hot_path import LATCHED
 from exo_gravity.nodes.ros.messages import to_time
 from exo_gravity.nodes.ros.run import keep_to_this_machine
+from exo_gravity.nodes.ros.subscriptions import LATCHED
 
 keep_to_this_machine()
 URDF = Path(rtbdata.__path__[0], "xacro/kuka_description/kuka_kr16/urdf/kr16_2.urdf")

@@ -90,7 +90,7 @@ class FaultCode(str, Enum):
     # The motion
     OVER_SPEED = "over_speed", "a joint turns faster than 5 rad/s, the elbow 6"
     OUTSIDE_LIMITS = "outside_limits", "a joint is more than 0.1 rad beyond `position_min` or `position_max`"
-    POSITION_JUMP = "position_jump", "an angle changed by 0.05 rad more than that allows", RECHECK
+    POSITION_JUMP = "position_jump", "an angle changed by 0.05 rad more than the speed of `over_speed` allows", RECHECK
     # The start gate
     IMPLAUSIBLE_ZERO = "implausible_zero", "a joint is over 0.5 rad (AK80-9: 0.34) from 0 at the first start", RECHECK
     WRONG_SIGN = "wrong_sign", "a joint moved against a small test torque at the first start"

@@ -35,9 +35,9 @@ from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, OwnedBus, Watchdo
 from exo_gravity.hardware.scheduling import request_real_time
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
-from exo_gravity.nodes.ros.hot_path import TiltSubscription
 from exo_gravity.nodes.ros.parameters import bus_of, declare
 from exo_gravity.nodes.ros.run import keep_to_this_machine, run
+from exo_gravity.nodes.ros.subscriptions import TiltSubscription
 
 REPORT_PERIOD = 0.1  # s
 TILT_TIMEOUT = 0.08  # s for which /imu/data goes before /imu/pitch_yaw

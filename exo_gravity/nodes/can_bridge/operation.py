@@ -26,9 +26,9 @@ from exo_gravity.core.safety.drive import EffortCommand, FaultCode, State
 from exo_gravity.core.safety.lease import Lease
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.nodes.ros.hot_path import HotPath
 from exo_gravity.nodes.ros.messages import ERROR, HELD_BY, NOBODY, OK, WARN, Diagnostics, milliseconds, row
 from exo_gravity.nodes.ros.run import open_to_others
+from exo_gravity.nodes.ros.subscriptions import HotPath
 
 RECENT = 2.0  # s for which a limit that acted is still shown
 SLOW = 0.9  # share of the set rate below which the loop is slow

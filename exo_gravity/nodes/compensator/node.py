@@ -26,10 +26,10 @@ from exo_gravity.core.numbers import Rate
 from exo_gravity.hardware.scheduling import request_real_time
 from exo_gravity.nodes.compensator.arm import JointStateInterface, MultiArrayInterface, declared, report, sentence
 from exo_gravity.nodes.compensator.budget_watch import BudgetWatch
-from exo_gravity.nodes.ros.hot_path import DISTRUST, NEWEST, HotPath, Repeated, SolePublisher, TiltSubscription
 from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import values_after
 from exo_gravity.nodes.ros.run import run
+from exo_gravity.nodes.ros.subscriptions import DISTRUST, NEWEST, HotPath, Publishers, Repeated, TiltSubscription
 
 SILENCE = 0.5  # s without joint states until diagnostics report it
 REPORT_PERIOD = 0.5  # s
@@ -55,7 +55,7 @@ class CompensatorNode(Node):
         if self._control.terms:
             self._budget = BudgetWatch(self, self._names)
             self._assist = self._control.terms.assist
-            self._assistant = SolePublisher(self, "assist_efforts")
+            self._assistant = Publishers()
             self._assistants = 0  # changes whenever a message comes from another publisher than the one before
             path = HotPath(self, JointState, "assist_efforts", self._on_assist_efforts, pause=ASSIST_PAUSE)
             self._threads.append(path)
@@ -73,7 +73,7 @@ class CompensatorNode(Node):
         self._rate = Rate()
         self._refusal = "none"
         topic = self._interface.topic
-        self._source = SolePublisher(self, topic)
+        self._source = Publishers()
         # Which input had a second publisher, as a sentence, and when (monotonic s).
         self._intruder, self._intruded = "", -math.inf
         self._threads.append(HotPath(self, JointState, topic, self._on_joint_states, NEWEST))

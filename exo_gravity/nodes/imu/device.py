@@ -16,8 +16,8 @@ from sensor_msgs.msg import Imu
 from exo_gravity.core.trunk.imu_sample import ImuSample
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.imu_sources import Reopening, open_source
-from exo_gravity.nodes.ros.hot_path import Callback
 from exo_gravity.nodes.ros.messages import to_time
+from exo_gravity.nodes.ros.subscriptions import Callback
 
 POLLS_A_SAMPLE = 2.0
 MIN_PERIOD = 0.002  # s between two polls

@@ -22,10 +22,10 @@ from exo_gravity.core.numbers import Rate
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator, TrunkOrientation
 from exo_gravity.nodes.imu.device import ImuDevice
-from exo_gravity.nodes.ros.hot_path import DISTRUST, HotPath, SolePublisher
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
+from exo_gravity.nodes.ros.subscriptions import DISTRUST, HotPath, Publishers
 
 PITCH_YAW, DATA = "/imu/pitch_yaw", "/imu/data"
 # The fusion integrates every sample. A queue of depth 1 would lose samples whenever the node is delayed.
@@ -52,7 +52,7 @@ class ImuNode(Node):
         )
         self._timeout = values["timeout"]
         self._arrived = time.monotonic()
-        self._driver = SolePublisher(self, self._topic)
+        self._driver = Publishers()
         self._intruded = -math.inf  # monotonic s, when a second publisher was seen
         self._received = self._published = self._refused = 0
         self._rate = Rate()

@@ -3,7 +3,7 @@
 It is a ROS client like any other: it uses the topics, services and parameters that `ros2` can use, and nothing depends
 on it. The web server (exo_gravity/panel/server.py) runs on a separate thread, which calls the services; this node's
 executor receives the answers, collects the state of the arms and sends it to the pages ten times a second. Joint states
-arrive hundreds of times a second: their subscription keeps the newest message outside the executor (`hot_path`).
+arrive hundreds of times a second: their subscription keeps the newest message outside the executor (`HotPath`).
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity import packaged
 from exo_gravity.core.errors import ExoGravityError, ParameterError
-from exo_gravity.nodes.ros.hot_path import HotPath
-from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics
+from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics, status_values
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
+from exo_gravity.nodes.ros.subscriptions import HotPath
 from exo_gravity.panel.control import Control
 from exo_gravity.panel.recordings import Recordings
 from exo_gravity.panel.view import PANEL, Newest, Values, joint_rows, setup_of
@@ -169,9 +169,7 @@ class Arms:
         for status in message.status:
             arm, _, leaf = status.name.strip("/").rpartition("/")
             if arm in self.clients and leaf in SHOWN:
-                values = {pair.key: pair.value for pair in status.values}
-                values |= {"level": int.from_bytes(status.level, "big"), "message": status.message}
-                self.clients[arm].newest[SHOWN[leaf]] = Newest(values, time.monotonic())
+                self.clients[arm].newest[SHOWN[leaf]] = Newest(status_values(status), time.monotonic())
 
     def _on_parameter_event(self, event: ParameterEvent) -> None:
         if event.node in self._parameters:

@@ -28,10 +28,10 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.tilt import gravity_in_trunk
 from exo_gravity.core.view.scene import ARROW, LINE, SPHERE, TEXT, ArmView, Shape, arm_shapes, gravity_shapes
 from exo_gravity.core.view.urdf import ROBOT_MODEL, ROOT, ArmDescription, described, joint_names, urdf
-from exo_gravity.nodes.ros.hot_path import LATCHED, NEWEST, HotPath
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics, by_name, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
+from exo_gravity.nodes.ros.subscriptions import LATCHED, NEWEST, HotPath
 
 DISCOVERY_PERIOD = 0.5  # s between two searches for arms
 MARKER_PERIOD = 0.1  # s

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -97,6 +98,12 @@ class Diagnostics:
                 logger.warning(message)
             else:
                 logger.error(message)
+
+
+def status_values(status: DiagnosticStatus) -> dict[str, Any]:
+    """Return the values of a status by key, with its `level` as a number and its `message`."""
+    values = {pair.key: pair.value for pair in status.values}
+    return values | {"level": int.from_bytes(status.level, "big"), "message": status.message}
 
 
 def row(values: Iterable[float], digits: int = 3) -> str:
