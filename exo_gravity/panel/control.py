@@ -108,16 +108,17 @@ class Control:
     arms: has their `names`; a coroutine function `ask(kind, arm, values)` for each request with the key "arm";
     `lease(page, kind)`, which sends a page's request for control to all arms, and `other_holder(arm, page)`, the name
     of who else holds control of an arm. files: has the names of the `trials` and a coroutine function for each other
-    request, of which `trial` takes a name. Each returns '' or why it failed. note: called with a sentence for the log
-    and the recording. clock: monotonic s.
+    request, of which `trial` takes a name. Each returns '' or why it failed. `arms.parameters()`, those in force by
+    node, and `files.report(name)`, the path of a trial's report or None, are for the server. note: called with a
+    sentence for the log and the recording. clock: monotonic s.
     """
 
     def __init__(self, arms: Any, files: Any, note: Callable[[str], object], clock: Callable[[], float]) -> None:
         self.holder: Page | None = None  #: the page that holds control
-        self._arms = arms
-        self._files = files
+        self.arms = arms
+        self.files = files
         self._note = note
-        self._clock = clock
+        self.clock = clock
         self._pages: dict[str, Page] = {}  # by secret
         self._numbers = 0
 
@@ -128,7 +129,7 @@ class Control:
         is gone.
         """
         page = self._pages.get(secret)
-        now = self._clock()
+        now = self.clock()
         if page is None:
             if len(self._pages) >= MAX_PAGES:  # those that are closed lose their numbers
                 self._pages = {known.secret: known for known in self._pages.values() if known.connected}
@@ -145,25 +146,25 @@ class Control:
 
     def confirm(self, page: Page) -> None:
         """Note that the page shows the present state, and renew its lease."""
-        page.seen = self._clock()
+        page.seen = self.clock()
         if page is self.holder:
-            self._arms.lease(str(page), "hold")
+            self.arms.lease(str(page), "hold")
 
     def is_gone(self) -> bool:
         """Return whether a page holds control that is gone."""
-        return self.holder is not None and self._clock() - self.holder.seen > GONE
+        return self.holder is not None and self.clock() - self.holder.seen > GONE
 
     @property
     def elsewhere(self) -> str:
         """The name of another operator who holds control of an arm, instead of this panel's page; '' for none."""
-        others = [self._arms.other_holder(arm, str(self.holder)) for arm in self._arms.names]
+        others = [self.arms.other_holder(arm, str(self.holder)) for arm in self.arms.names]
         return next(filter(None, others), "")
 
     async def perform(self, body: Any, secret: str, address: str) -> Reply:
         """Do what the JSON value `body` asks for, sent by the page with `secret`, at `address`."""
         page = self._pages.get(secret)
         try:
-            action = parse(body, self._arms.names, self._files.trials)
+            action = parse(body, self.arms.names, self.files.trials)
         except ExoGravityError as error:
             return self._refused(page, 400, str(error))
         if action.kind != "let_down":
@@ -173,10 +174,10 @@ class Control:
                 return Reply(429, "too many requests: wait a moment")
             if action.kind != "take" and page is not self.holder:
                 return self._refused(page, 403, f"{action}: another page holds control")
-            if action.arm and (other := self._arms.other_holder(action.arm, str(page))):
+            if action.arm and (other := self.arms.other_holder(action.arm, str(page))):
                 return self._refused(page, 403, f"{action}: {other} holds control of this arm")
         if action.kind in ("enable", "resume"):  # by a page that confirms nothing, the arm is not carried for long
-            self._arms.lease(str(page), "hold")
+            self.arms.lease(str(page), "hold")
         problem = await self._carry_out(action, page)
         self._log(f"{page or f'{address} unknown page'}: {action}: {problem or 'done'}")
         return Reply(409 if problem else 200, problem)
@@ -189,14 +190,14 @@ class Control:
     async def _carry_out(self, action: Action, page: Page | None) -> str:
         if action.kind in ("take", "release"):
             self.holder = page if action.kind == "take" else None
-            self._arms.lease(str(page), action.kind)
+            self.arms.lease(str(page), action.kind)
             return ""
         if action.kind != "let_down":
             if action.arm:
-                return str(await self._arms.ask(action.kind, action.arm, action.values))
-            return str(await getattr(self._files, action.kind)(*filter(None, (action.name,))))
-        arms = [action.arm] if action.arm else self._arms.names  # all at once, and none waits for another
-        asked = (self._arms.ask("let_down", arm, {}) for arm in arms)
+                return str(await self.arms.ask(action.kind, action.arm, action.values))
+            return str(await getattr(self.files, action.kind)(*filter(None, (action.name,))))
+        arms = [action.arm] if action.arm else self.arms.names  # all at once, and none waits for another
+        asked = (self.arms.ask("let_down", arm, {}) for arm in arms)
         results = await asyncio.gather(*asked, return_exceptions=True)
         problems = [f"{type(r).__name__}: {r}" if isinstance(r, BaseException) else r for r in results]
         failed = [f"{arm}: {problem}" for arm, problem in zip(arms, problems, strict=True) if problem]
@@ -210,7 +211,7 @@ class Control:
 
     def _spend(self, page: Page) -> bool:
         """Return whether the page may send one more request now."""
-        now = self._clock()
+        now = self.clock()
         page.credit = min(BURST, page.credit + REFILL * (now - page.credited))
         page.credited = now
         if page.credit < 1.0:

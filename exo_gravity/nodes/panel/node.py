@@ -14,7 +14,6 @@ import os
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -87,10 +86,9 @@ class Arms:
 
     def __init__(self, node: Node, has_lease: bool) -> None:
         self.clients: dict[str, ArmClient] = {}
-        self.known: dict[str, dict[str, Any]] = {}  #: the newest parameters of each node by full name, also if it ended
         self._node = node
         self._lessee = f"panel {os.getpid()}, " if has_lease else ""
-        self._parameters: dict[str, NodeParameters] = {}
+        self._parameters: dict[str, NodeParameters] = {}  # by full name, also of nodes that ended
         self._wearers: dict[str, Client] = {}  # the virtual ones, by their simulator's name
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
         node.create_subscription(ParameterEvent, "/parameter_events", self._on_parameter_event, 50)
@@ -106,14 +104,12 @@ class Arms:
         nodes = {f"{space.rstrip('/')}/{name}" for name, space in found if not name.startswith("_")}
         nodes.discard(self._node.get_fully_qualified_name())
         for name in nodes - set(self._parameters):
-            self._parameters[name] = NodeParameters(self._node, name, partial(self.known.__setitem__, name))
+            self._parameters[name] = NodeParameters(self._node, name)
             arm, _, leaf = name.strip("/").rpartition("/")
             if leaf == BRIDGE and arm and arm not in self.clients:
                 self.clients[arm] = ArmClient(self._node, arm)
             if leaf == "simulator" and name not in self._wearers:
                 self._wearers[name] = parameter_client(self._node, name)
-        for name in set(self._parameters) - nodes:
-            self._parameters.pop(name).destroy()
         for parameters in self._parameters.values():
             parameters.update()
 
@@ -124,8 +120,8 @@ class Arms:
 
     def nodes(self) -> dict[str, tuple[Values, Values]]:
         """Return the newest parameters of bridge and compensator by arm, {} while they are not known."""
-        get = self.known.get
-        return {arm: (get(f"/{arm}/{BRIDGE}", {}), get(f"/{arm}/{COMPENSATOR}", {})) for arm in self.names}
+        known = {name: parameters.values for name, parameters in self._parameters.items()}
+        return {arm: (known[f"/{arm}/{BRIDGE}"], known.get(f"/{arm}/{COMPENSATOR}", {})) for arm in self.names}
 
     # For a trial (`Device` of exo_gravity.panel.recordings); called on the web server's thread
 
@@ -230,8 +226,7 @@ class Panel(Node):
         except ModuleNotFoundError as error:
             missing = f"the Python package {error.name} is not installed: pip install 'exo_gravity[panel]'"
             raise ExoGravityError(missing) from None
-        address = (values["host"], values["port"], values["token"])
-        self._server = PanelServer(*address, control, self._recordings.report, self._arms.parameters, time.monotonic)
+        self._server = PanelServer(values["host"], values["port"], values["token"], control)
         self.create_timer(STATE_PERIOD, self._send_state)
         self.create_timer(DISCOVERY_PERIOD, self._arms.discover)
         self._log_address(values["host"], values["port"])
