@@ -9,13 +9,11 @@ from __future__ import annotations
 import json
 import threading
 from collections import deque
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import yaml
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Imu
 from std_msgs.msg import String
@@ -25,7 +23,7 @@ from exo_gravity.core.motors.joint_motor import OPTIONS
 from exo_gravity.core.trial.script import Step, TrialScript
 from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
-from exo_gravity.nodes.ros.parameters import bus_of, declare, values_after
+from exo_gravity.nodes.ros.parameters import accept_changes, bus_of, declare
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 from exo_gravity.sim import SimulatedImu, VirtualWearer
@@ -36,10 +34,10 @@ from exo_gravity.sim.trunk_motion import TrunkState
 TRUNK_SPEED = 0.5  # rad/s at which the trunk moves to a new tilt
 
 
-def script_of(path: str) -> TrialScript:
-    """Return the script in a YAML file. Raises ParameterError."""
+def script_of(path: str) -> TrialScript | None:
+    """Return the script in a YAML file, None if `path` is empty. Raises ParameterError."""
     try:
-        return TrialScript.parse(yaml.safe_load(Path(path).read_text(encoding="utf-8")))
+        return TrialScript.parse(yaml.safe_load(Path(path).read_text(encoding="utf-8"))) if path else None
     except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
         raise ParameterError("trial", path, f"a readable script file ({error})") from None
 
@@ -56,7 +54,8 @@ class Simulator(Node):
         values = declare(self, SIMULATOR, free_prefix=OPTIONS)
         self._device = device_of(values)
         set_faults(self._device, values)
-        self._script = script_of(values["trial"]) if values["trial"] else None
+        self._trial = values["trial"]
+        self._script = script_of(self._trial)
         self._delay = values["trial_delay"]
         self._trunk_target = (values["trunk.pitch"], values["trunk.roll"])
         self._wearer: VirtualWearer | None = None
@@ -69,8 +68,7 @@ class Simulator(Node):
         self._imu_publisher = self.create_publisher(Imu, topic, qos_profile_sensor_data) if topic else None
         self._trunk_period = 1.0 / self._imu.config.rate
         self._trunk_due = 0.0  # monotonic s
-        self.add_on_set_parameters_callback(self._check_parameters)
-        self.add_post_set_parameters_callback(self._apply_parameters)
+        accept_changes(self, SIMULATOR, lambda values: (values, script_of(values["trial"])), self._apply)
         self.failure: Exception | None = None  # ends the node, see run()
         self._stopping = threading.Event()
         self._bus = open_bus(*bus_of(self, values))
@@ -88,8 +86,6 @@ class Simulator(Node):
         self._stopping.set()
         self._thread.join()
         self._bus.shutdown()
-
-    # Device thread
 
     def _play(self) -> None:
         try:
@@ -165,22 +161,13 @@ class Simulator(Node):
             level, message = WARN, "a simulated fault disconnects a motor"
         self._diagnostics.report(level, message, values)
 
-    # ROS callbacks
-
-    def _check_parameters(self, changes: Sequence[Parameter]) -> SetParametersResult:
-        try:
-            if path := values_after(self, SIMULATOR, changes)["trial"]:
-                script_of(path)
-        except ParameterError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
-
-    def _apply_parameters(self, changes: Sequence[Parameter]) -> None:
-        values = values_after(self, SIMULATOR)
+    def _apply(self, changed: tuple[dict[str, Any], TrialScript | None]) -> None:
+        values, script = changed
         self._trunk_target = (values["trunk.pitch"], values["trunk.roll"])
         set_faults(self._device, values)
-        if any(change.name == "trial" for change in changes) and values["trial"]:
-            self._new_scripts.append(script_of(values["trial"]))
+        if script and values["trial"] != self._trial:
+            self._new_scripts.append(script)
+        self._trial = values["trial"]
 
 
 def main() -> None:

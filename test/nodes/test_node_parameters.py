@@ -69,28 +69,6 @@ def test_a_node_that_has_gone_and_returned_is_read_anew(node, executor):
     parameters.destroy()
 
 
-def test_named_parameters_are_read_alone_and_all_or_none(node, executor):
-    other = other_node(node)
-    executor.add_node(other)
-    answers: dict[str, dict[str, object]] = {}
-    readers = {
-        names: NodeParameters(node, "other", lambda values, names=names: answers.update({names: values}), names)
-        for names in (("gain",), ("gain", "unknown"))
-    }
-
-    def spin() -> None:
-        executor.spin_once(timeout_sec=0.05)
-        for parameters in readers.values():
-            parameters.update()
-
-    wait_until(lambda: len(answers) == 2, spin)
-    assert answers == {("gain",): {"gain": 1.0}, ("gain", "unknown"): {}}
-    for parameters in readers.values():
-        parameters.destroy()
-    executor.remove_node(other)
-    other.destroy_node()
-
-
 def test_a_name_without_services_is_not_present(node):
     ghost = rclpy.create_node("ghost", context=node.context, start_parameter_services=False)
     parameters = NodeParameters(node, "/ghost")
