@@ -19,13 +19,13 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.serialization import serialize_message
+from rclpy.time import Time
 from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.nodes.recorder.node import LiveLine
-from exo_gravity.nodes.ros.messages import to_time
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 
 NODE = [sys.executable, "-c", "from exo_gravity.nodes.recorder.node import main; main()", "--ros-args"]
@@ -77,7 +77,7 @@ class PublishingArm:
         return all(publisher.get_subscription_count() for publisher in publishers)
 
     def publish(self, k):
-        stamp = to_time(time.time_ns())
+        stamp = Time(nanoseconds=time.time_ns()).to_msg()
         state = JointState(name=NAMES, position=[float(k)] * 4, velocity=[0.0] * 4, effort=[1.0] * 4)
         effort = JointState(name=NAMES, effort=[float(k)] * 4)
         image = Imu()

@@ -29,16 +29,17 @@ from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity import packaged
 from exo_gravity.core.errors import ExoGravityError, ParameterError
-from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics, status_values
+from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics, Newest, status_values
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import HotPath
 from exo_gravity.panel.control import Control
 from exo_gravity.panel.recordings import Recordings
-from exo_gravity.panel.view import PANEL, Newest, Values, joint_rows, setup_of
+from exo_gravity.panel.view import PANEL, Values, joint_rows, setup_of
 
 STATE_PERIOD = 0.1  # s between two states that the pages get
 DISCOVERY_PERIOD = 0.5  # s between two searches for nodes
+SILENT = 1.5  # s without diagnostics or joint states after which the last ones are not shown any more
 CALL_TIMEOUT = 3.0  # s, longer than can_bridge itself waits
 ABSENT_TIMEOUT = 0.5  # s, where the service seems to be absent
 LOOK_PERIOD = 0.005  # s between two looks for an answer
@@ -63,14 +64,14 @@ class ArmClient:
         self.control = node.create_publisher(KeyValue, f"/{name}/{BRIDGE}/control", 10)
         self._states = HotPath(node, JointState, f"/{name}/joint_states", self._on_states)
 
-    def state(self, now: float) -> dict[str, Any]:
+    def state(self) -> dict[str, Any]:
         """Take the newest joint states, and return what the page shows; None in the place of what is old."""
         self._states.poll()
-        return {kind: newest.at(now) for kind, newest in self.newest.items()}
+        return {kind: newest.within(SILENT) for kind, newest in self.newest.items()}
 
     def report(self) -> dict[str, str]:
         """Return what the bridge reports; {} if it is silent."""
-        return self.newest["bridge"].at(time.monotonic()) or {}
+        return self.newest["bridge"].within(SILENT) or {}
 
     def _on_states(self, message: JointState, _info: dict[str, Any]) -> None:
         rows = joint_rows(message.name, message.position, message.velocity, message.effort)
@@ -115,8 +116,7 @@ class Arms:
 
     def state(self) -> dict[str, Any]:
         """Return what the page shows of each arm."""
-        now = time.monotonic()
-        return {name: client.state(now) for name, client in sorted(self.clients.items(), reverse=True)}
+        return {name: client.state() for name, client in sorted(self.clients.items(), reverse=True)}
 
     def nodes(self) -> dict[str, tuple[Values, Values]]:
         """Return the newest parameters of bridge and compensator by arm, {} while they are not known."""
@@ -260,7 +260,7 @@ class Panel(Node):
         if nodes != self._shown:
             self._shown = nodes
             self._server.setup = {**self._own_setup, **setup_of(nodes)}
-        tilt = self._tilt.at(time.monotonic())
+        tilt = self._tilt.within(SILENT)
         self._server.state = {"arms": self._arms.state(), "tilt": tilt, **self._recordings.state()}
 
     def _on_tilt(self, message: Vector3Stamped, _info: dict[str, Any]) -> None:

@@ -11,7 +11,6 @@ It only reads: nothing depends on it, and the arms run on if it ends.
 
 from __future__ import annotations
 
-import math
 import time
 from contextlib import suppress
 from typing import Any
@@ -28,7 +27,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.tilt import gravity_in_trunk
 from exo_gravity.core.view.scene import ARROW, LINE, SPHERE, TEXT, ArmView, Shape, arm_shapes, gravity_shapes
 from exo_gravity.core.view.urdf import ROBOT_MODEL, ROOT, ArmDescription, described, joint_names, urdf
-from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics, by_name, to_nanoseconds
+from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics, Newest, by_name, status_values, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import LATCHED, NEWEST, HotPath
@@ -52,7 +51,7 @@ class RobotModel(Node):
         self._views: list[tuple[ViewedArm, ArmView]] = []
         self._described: dict[ViewedArm, ArmDescription] = {}
         self._problem = ""  # of the description
-        self._tilt, self._tilt_time = (0.0, 0.0), -math.inf
+        self._tilt = Newest()  # gravity in the trunk's axes
         self._diagnostics = Diagnostics(self)
         self._description = self.create_publisher(String, "robot_description", LATCHED)
         self._joint_states = self.create_publisher(JointState, "joint_states", 1)
@@ -106,8 +105,7 @@ class RobotModel(Node):
         self._tilts.poll()
         if not self._markers.get_subscription_count():
             return
-        fresh = time.monotonic() - self._tilt_time < STALE
-        groups = [("", gravity_shapes(gravity_in_trunk(*self._tilt) if fresh else None))]
+        groups = [("", gravity_shapes(self._tilt.within(STALE)))]
         groups += [(f"{view.arm.side}/", arm_shapes(view)) for _, view in self._views]
         markers = [marker(owner, n, shape) for owner, shapes in groups for n, shape in enumerate(shapes)]
         stamp = self.get_clock().now().to_msg()
@@ -121,7 +119,7 @@ class RobotModel(Node):
                 arm.note(status)
 
     def _on_tilt(self, message: Vector3Stamped, _info: dict[str, Any]) -> None:
-        self._tilt, self._tilt_time = (message.vector.y, message.vector.x), time.monotonic()
+        self._tilt = Newest(gravity_in_trunk(message.vector.y, message.vector.x), time.monotonic())
 
 
 class ViewedArm:
@@ -134,8 +132,7 @@ class ViewedArm:
         self.states_topic = f"{namespace}/joint_states"
         self.states = JointState()
         self._bridge = f"{namespace}/can_bridge".lstrip("/")
-        self._status, self._status_time = ("", ""), -math.inf
-        self._time = -math.inf
+        self._status = self._arrived = Newest()
         self.parameters = [
             NodeParameters(node, f"{namespace}/{leaf}", self._on_values) for leaf in ("compensator", "can_bridge")
         ]
@@ -144,16 +141,15 @@ class ViewedArm:
     def note(self, status: DiagnosticStatus) -> None:
         """Keep the status of this arm's bridge; ignore any other."""
         if status.name == self._bridge:
-            state = next((pair.value for pair in status.values if pair.key == "state"), "")
-            self._status, self._status_time = (state, status.message), time.monotonic()
+            values = status_values(status)
+            self._status = Newest((values.get("state", ""), values["message"]), time.monotonic())
 
     def view(self) -> ArmView | None:
         """Return what is known of the arm now; None without a description or a fresh reading."""
         self._subscription.poll()
-        now = time.monotonic()
         if self.description is None:
             return None
-        self.problem = "" if now - self._time < STALE else f"no messages on {self.states_topic}"
+        self.problem = "" if self._arrived.within(STALE) else f"no messages on {self.states_topic}"
         try:
             names = self.description.limits.joint_names
             fields = ("position", "velocity", "effort")
@@ -162,11 +158,10 @@ class ViewedArm:
             self.problem = self.problem or f"{self.states_topic}: {error.name} must be {error.expected}"
         if self.problem:
             return None
-        status = self._status if now - self._status_time < STALE_STATE else ("", "")
-        return ArmView(self.description, theta, velocity, effort, *status)
+        return ArmView(self.description, theta, velocity, effort, *(self._status.within(STALE_STATE) or ("", "")))
 
     def _on_states(self, message: JointState, _info: dict[str, Any]) -> None:
-        self.states, self._time = message, time.monotonic()
+        self.states, self._arrived = message, Newest(True, time.monotonic())
 
     def _on_values(self, _values: object) -> None:
         try:
