@@ -55,11 +55,10 @@ class Simulator(Node):
         self._device = device_of(values)
         set_faults(self._device, values)
         self._trial = values["trial"]
-        self._script = script_of(self._trial)
-        self._delay = values["trial_delay"]
+        # Scripts, and when they start, in s after the motors are on.
+        self._scripts = deque([(script, values["trial_delay"])] if (script := script_of(self._trial)) else [])
         self._trunk_target = (values["trunk.pitch"], values["trunk.roll"])
         self._wearer: VirtualWearer | None = None
-        self._new_scripts: deque[TrialScript] = deque()  # set by a parameter, started by the device's thread
         self._published_step: int | None = None
         self._diagnostics = Diagnostics(self)
         self._step_publisher = self.create_publisher(String, "wearer_step", LATCHED)
@@ -127,10 +126,10 @@ class Simulator(Node):
     def _follow_wearer(self) -> None:
         """Start the wearer when the motors are on, and publish each new step."""
         device = self._device
-        while self._new_scripts:
-            self._start_wearer(self._new_scripts.popleft(), 0.0)
-        if self._script and self._wearer is None and all(motor.entered for motor in device.motors):
-            self._start_wearer(self._script, self._delay)
+        while self._scripts and all(motor.entered for motor in device.motors):
+            script, delay = self._scripts.popleft()
+            self._wearer, self._published_step = VirtualWearer(script), None
+            device.start(self._wearer, delay)
         if self._wearer is None or self._wearer.step is None or self._wearer.step == self._published_step:
             return
         number, steps = self._wearer.step, self._wearer.script.steps
@@ -139,11 +138,6 @@ class Simulator(Node):
         content = {"step": number, "of": len(steps), "action": step.action, "duration": step.duration}
         self._step_publisher.publish(String(data=json.dumps(content)))
         self.get_logger().info(f"wearer: {step.action} ({number} of {len(steps)})")
-
-    def _start_wearer(self, script: TrialScript, delay: float) -> None:
-        self._script, self._published_step = script, None
-        self._wearer = VirtualWearer(script)
-        self._device.start(self._wearer, delay)
 
     def _report(self) -> None:
         device = self._device
@@ -166,7 +160,7 @@ class Simulator(Node):
         self._trunk_target = (values["trunk.pitch"], values["trunk.roll"])
         set_faults(self._device, values)
         if script and values["trial"] != self._trial:
-            self._new_scripts.append(script)
+            self._scripts.append((script, 0.0))
         self._trial = values["trial"]
 
 

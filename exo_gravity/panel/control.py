@@ -24,7 +24,7 @@ import asyncio
 import logging
 import secrets
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from exo_gravity.core.errors import ExoGravityError, ParameterError
@@ -42,23 +42,8 @@ MAX_PAGES = 32
 BURST, REFILL = 20.0, 10.0  # requests that a page may send at once, and per second
 
 
-@dataclass(frozen=True)
-class Action:
-    """What one request asks for."""
-
-    kind: str
-    arm: str = ""  #: '' for all arms or none
-    values: Mapping[str, Any] = field(default_factory=dict)  #: parameters of the arm's compensator
-    name: str = ""  #: of the trial
-
-    def __str__(self) -> str:
-        """Describe the action for the log, without the wearer's data."""
-        shown = [key if key.startswith("wearer.") else f"{key} = {value}" for key, value in self.values.items()]
-        return " ".join(filter(None, (self.kind.replace("_", " "), self.arm, ", ".join(shown), self.name)))
-
-
-def parse(body: Any, arms: Collection[str], trials: Collection[str]) -> Action:
-    """Return the action that the JSON value `body` describes. Raises ParameterError."""
+def parse(body: Any, arms: Collection[str], trials: Collection[str]) -> dict[str, Any]:
+    """Return the request that the JSON value `body` is, with its values in their types. Raises ParameterError."""
     kind = body.get("do") if isinstance(body, dict) else None
     if not isinstance(kind, str) or kind not in KEYS:
         raise ParameterError("do", kind, f"one of {', '.join(KEYS)}")
@@ -71,11 +56,19 @@ def parse(body: Any, arms: Collection[str], trials: Collection[str]) -> Action:
     if kind == "trial" and name not in trials:
         raise ParameterError("trial", name, f"one of {', '.join(sorted(trials))}")
     if kind != "set":
-        return Action(kind, arm, name=name)
+        return dict(body)
     values = body.get("values") if isinstance(body.get("values"), dict) else {}
     if not values or not values.keys() <= SETTABLE.keys():  # the error has no values: they may be the wearer's
         raise ParameterError("values", list(values), f"an object with some of {', '.join(SETTABLE)}")
-    return Action(kind, arm, {key: SETTABLE[key].check(value) for key, value in values.items()})
+    return {**body, "values": {key: SETTABLE[key].check(value) for key, value in values.items()}}
+
+
+def sentence(request: Mapping[str, Any]) -> str:
+    """Describe a request for the log, without the wearer's data."""
+    values = request.get("values", {}).items()
+    shown = ", ".join(key if key.startswith("wearer.") else f"{key} = {value}" for key, value in values)
+    words = (request["do"].replace("_", " "), request.get("arm"), shown, request.get("name"))
+    return " ".join(filter(None, words))
 
 
 @dataclass
@@ -164,22 +157,23 @@ class Control:
         """Do what the JSON value `body` asks for, sent by the page with `secret`, at `address`."""
         page = self._pages.get(secret)
         try:
-            action = parse(body, self.arms.names, self.files.trials)
+            request = parse(body, self.arms.names, self.files.trials)
         except ExoGravityError as error:
             return self._refused(page, 400, str(error))
-        if action.kind != "let_down":
+        kind, arm, text = request["do"], request.get("arm", ""), sentence(request)
+        if kind != "let_down":
             if page is None:
                 return Reply(403, "unknown page: reload it")
             if not self._spend(page):
                 return Reply(429, "too many requests: wait a moment")
-            if action.kind != "take" and page is not self.holder:
-                return self._refused(page, 403, f"{action}: another page holds control")
-            if action.arm and (other := self.arms.other_holder(action.arm, str(page))):
-                return self._refused(page, 403, f"{action}: {other} holds control of this arm")
-        if action.kind in ("enable", "resume"):  # by a page that confirms nothing, the arm is not carried for long
+            if kind != "take" and page is not self.holder:
+                return self._refused(page, 403, f"{text}: another page holds control")
+            if arm and (other := self.arms.other_holder(arm, str(page))):
+                return self._refused(page, 403, f"{text}: {other} holds control of this arm")
+        if kind in ("enable", "resume"):  # by a page that confirms nothing, the arm is not carried for long
             self.arms.lease(str(page), "hold")
-        problem = await self._carry_out(action, page)
-        self._log(f"{page or f'{address} unknown page'}: {action}: {problem or 'done'}")
+        problem = await self._carry_out(request, kind, arm, page)
+        self._log(f"{page or f'{address} unknown page'}: {text}: {problem or 'done'}")
         return Reply(409 if problem else 200, problem)
 
     def _refused(self, page: Page | None, status: int, text: str) -> Reply:
@@ -187,16 +181,19 @@ class Control:
             self._log(f"{page}: refused: {text}")
         return Reply(status, text)
 
-    async def _carry_out(self, action: Action, page: Page | None) -> str:
-        if action.kind in ("take", "release"):
-            self.holder = page if action.kind == "take" else None
-            self.arms.lease(str(page), action.kind)
+    async def _carry_out(self, request: Mapping[str, Any], kind: str, arm: str, page: Page | None) -> str:
+        if kind == "let_down":
+            return await self._let_down([arm] if arm else self.arms.names)
+        if kind in ("take", "release"):
+            self.holder = page if kind == "take" else None
+            self.arms.lease(str(page), kind)
             return ""
-        if action.kind != "let_down":
-            if action.arm:
-                return str(await self.arms.ask(action.kind, action.arm, action.values))
-            return str(await getattr(self.files, action.kind)(*filter(None, (action.name,))))
-        arms = [action.arm] if action.arm else self.arms.names  # all at once, and none waits for another
+        if arm:
+            return str(await self.arms.ask(kind, arm, request.get("values", {})))
+        return str(await getattr(self.files, kind)(*filter(None, (request.get("name"),))))
+
+    async def _let_down(self, arms: Collection[str]) -> str:
+        """Let the arms down all at once: none waits for another."""
         asked = (self.arms.ask("let_down", arm, {}) for arm in arms)
         results = await asyncio.gather(*asked, return_exceptions=True)
         problems = [f"{type(r).__name__}: {r}" if isinstance(r, BaseException) else r for r in results]

@@ -13,11 +13,11 @@ from exo_gravity.panel.control import (
     GONE,
     MAX_PAGES,
     REFILL,
-    Action,
     Control,
     Page,
     Reply,
     parse,
+    sentence,
 )
 
 from ..support.panel_stage import PlayedArms, PlayedFiles
@@ -60,18 +60,23 @@ def panel() -> Panel:
 
 
 @pytest.mark.parametrize(
-    ("body", "action"),
+    "body",
     [
-        ({"do": "let_down"}, Action("let_down")),
-        ({"do": "let_down", "arm": "left"}, Action("let_down", "left")),
-        ({"do": "enable", "arm": "right"}, Action("enable", "right")),
-        ({"do": "set", "arm": "right", "values": {"support": 1}}, Action("set", "right", {"support": 1.0})),
-        ({"do": "trial", "name": "demo"}, Action("trial", name="demo")),
-        ({"do": "take"}, Action("take")),
+        {"do": "let_down"},
+        {"do": "let_down", "arm": "left"},
+        {"do": "enable", "arm": "right"},
+        {"do": "set", "arm": "right", "values": {"support": 1}},
+        {"do": "trial", "name": "demo"},
+        {"do": "take"},
     ],
 )
-def test_a_right_request_is_understood(body, action):
-    assert parse(body, ("right", "left"), ("demo",)) == action
+def test_a_right_request_is_understood(body):
+    assert parse(body, ("right", "left"), ("demo",)) == body
+
+
+def test_a_whole_number_is_sent_as_the_parameters_type():
+    body = {"do": "set", "arm": "right", "values": {"support": 1}}
+    assert isinstance(parse(body, ("right",), ())["values"]["support"], float)
 
 
 @pytest.mark.parametrize(
@@ -114,7 +119,7 @@ def test_a_wrong_request_is_refused(body):
 
 def test_the_log_shows_the_support_but_not_the_wearers_data():
     values = {"support": 0.3, "wearer.body_mass": 81.5, "wearer.sex": "female"}
-    text = str(Action("set", "right", values))
+    text = sentence({"do": "set", "arm": "right", "values": values})
     assert text == "set right support = 0.3, wearer.body_mass, wearer.sex"
 
 

@@ -65,8 +65,7 @@ class Recorder(Node):
         self._topics: dict[str, HotPath] = {}
         self._counted: list[Publishers] = []  # of joints and IMU; other topics have several
         self._taken: list[tuple[str, int, bytes]] = []  # topic, time of arrival in ns since 1970, serialised
-        self._nodes: set[str] = set()
-        self._unwritten: dict[str, NodeParameters] = {}  # of nodes whose parameters are not in the recording yet
+        self._nodes: dict[str, NodeParameters] = {}  # until their parameters are in the recording
         self._live = LiveLine() if values["live"] else None
         self.create_timer(DRAIN_PERIOD, self._drain)
         self.create_timer(DISCOVERY_PERIOD, self._discover)
@@ -114,16 +113,12 @@ class Recorder(Node):
         for name, namespace in self.get_node_names_and_namespaces():
             node = f"{namespace.rstrip('/')}/{name}"
             if node not in self._nodes and node != self.get_fully_qualified_name() and not name.startswith("_"):
-                self._nodes.add(node)
-                self._guarded(node, self._add_node, node)
-
-    def _add_node(self, node: str) -> None:
-        write = partial(self._guarded, node, self._write_parameters, node)
-        self._unwritten[node] = NodeParameters(self, node, write)
+                write = partial(self._guarded, node, self._write_parameters, node)
+                self._nodes[node] = NodeParameters(self, node, write)
 
     def _look(self) -> None:
         """Ask the nodes whose parameters are not known, and print the live line."""
-        for node, parameters in list(self._unwritten.items()):
+        for node, parameters in self._nodes.items():
             self._guarded(node, parameters.update)
         if self._live:
             counts = {"messages": self._writer.count, "lost": sum(self._losses())}
@@ -180,7 +175,7 @@ class Recorder(Node):
         given = {name: value for name, value in values.items() if value != []}
         text = yaml.safe_dump({node: {"ros__parameters": given}}, default_flow_style=None, width=120)
         self._write_text(PARAMETERS, text)
-        self._unwritten.pop(node).destroy()
+        self._nodes[node].destroy()
 
     def _write_text(self, topic: str, text: str) -> None:
         now = self.get_clock().now().nanoseconds
