@@ -52,13 +52,13 @@ class CalibratorNode(Node):
         self._printed = 0  # observations
         self._trouble = ""  # outside the tour
         self._diagnostics = Diagnostics(self)
-        self._source = Publishers()
+        self._sources = {"joint_states": Publishers()}  # of what the torque depends on
         self._publisher = self.create_publisher(JointState, "effort_commands", 1)
         self._command = JointState(name=self._names)  # one message, reused
         self._lock = threading.Lock()  # guards tilt and state: joint states arrive on another thread
         self._joint_states = HotPath(self, JointState, "joint_states", self._on_joint_states, NEWEST)
         if values["use_imu"]:
-            TiltSubscription(self, self._tilt, self._lock, self._on_refused_tilt, self._on_intruder)
+            self._sources |= TiltSubscription(self, self._tilt, self._lock, self._on_refused_tilt).senders
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self.create_timer(REPORT_PERIOD, self._report)
         self._joint_states.start()
@@ -84,8 +84,10 @@ class CalibratorNode(Node):
     def _on_joint_states(self, message: JointState, info: dict[str, Any]) -> None:
         self._command.header.stamp = message.header.stamp
         try:
-            if self._source.is_another(info):
-                self._on_intruder("joint_states")
+            self._sources["joint_states"].is_another(info)
+            for topic, publishers in self._sources.items():
+                if publishers.are_several:
+                    self._trouble = f"more than one publisher of {topic}"
             effort = self._effort(by_name(message, "position", self._names), by_name(message, "velocity", self._names))
         except ParameterError as error:
             self._trouble, effort = f"joint_states: {error}", None
@@ -107,9 +109,6 @@ class CalibratorNode(Node):
 
     def _on_refused_tilt(self, topic: str, error: ParameterError) -> None:
         self.get_logger().error(f"{topic}: {error}", throttle_duration_sec=1.0)
-
-    def _on_intruder(self, topic: str) -> None:
-        self._trouble = f"more than one publisher of {topic}"
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:

@@ -202,8 +202,13 @@ def stop_on_signals() -> Stopping:
         if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
             # On a thread, which waits where the handler interrupts a holder of the event's lock.
             signal.signal(number, lambda *_: _thread.start_new_thread(stopping.set, ()))
-    if os.environ.get("EXO_GRAVITY_SUPERVISED"):  # by `ros2 launch`, which holds our standard input open
-        threading.Thread(target=lambda: (sys.stdin.read(), stopping.set()), daemon=True).start()
+
+    def follow_owner() -> None:  # `ros2 launch`, which holds our standard input open
+        sys.stdin.read()
+        stopping.set()
+
+    if os.environ.get("EXO_GRAVITY_SUPERVISED"):
+        threading.Thread(target=follow_owner, daemon=True).start()
     return stopping
 
 

@@ -21,6 +21,7 @@ from exo_gravity.core.safety.drive import NO_COMMAND, FaultCode, State
 from exo_gravity.core.safety.lease import LEASE_TIME, Lease
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.hardware.ownership.owned_bus import ArmOnBus
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.can_bridge.operation import WATCH_PERIOD, BridgeReport, BridgeServices, Operator
@@ -51,7 +52,9 @@ def sent(node, monkeypatch):
     monkeypatch.setattr(operation, "time", SimpleNamespace(monotonic=lambda: clock.now))
 
     def sent(loop, count, answered=None):
-        report = BridgeReport(node, ("a", "b", "c", "elbow"), Traffic(4), 250.0, (3.0, 9.0, 3.0, 3.0), Lease())
+        motors = tuple(JointMotor(MOTORS["AK60-6"], can_id) for can_id in (1, 2, 3, 4))
+        arm = ArmOnBus(("virtual", "arm", {}), motors, Limits(("a", "b", "c", "elbow")), 0.004)
+        report = BridgeReport(node, arm, Traffic(4), Lease())
         for n in range(count):
             report.send(loop(n), NO_COMMAND._replace(answered=clock.now if answered is None else answered), "none")
             clock.now += 0.1

@@ -103,8 +103,7 @@ class CanBridge(LifecycleNode):
         self.error = ""  #: why the last transition failed
         self._exchange = EffortExchange(self, limits, lambda: self.loop)
         lease = operation.Operator(self, lambda: self.loop).lease
-        rated = [motor.rated_effort for motor in motors]
-        self._report = operation.BridgeReport(self, limits.joint_names, traffic, values["rate"], rated, lease)
+        self._report = operation.BridgeReport(self, self._arm, traffic, lease)
         operation.BridgeServices(self, lambda: self.loop, motors)
         if any(limits.largest_moment):
             _follow_gravity(self, lambda: self.loop)

@@ -26,6 +26,7 @@ from exo_gravity.core.safety.drive import EffortCommand, FaultCode, State
 from exo_gravity.core.safety.lease import Lease
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
+from exo_gravity.hardware.ownership.owned_bus import ArmOnBus
 from exo_gravity.nodes.ros.messages import ERROR, HELD_BY, NOBODY, OK, WARN, Diagnostics, milliseconds, row
 from exo_gravity.nodes.ros.run import open_to_others
 from exo_gravity.nodes.ros.subscriptions import HotPath
@@ -185,21 +186,16 @@ def log_risks(node: Node, traffic: Traffic, rate: float) -> None:
 
 
 class BridgeReport:
-    """The status of one bridge.
+    """The status of one bridge. lease: of control."""
 
-    rate: Hz, as set. rated: (4,) Nm, the motors' rated torque at the joints. lease: of control.
-    """
-
-    def __init__(
-        self, node: Node, names: Sequence[str], traffic: Traffic, rate: float, rated: Sequence[float], lease: Lease
-    ) -> None:
+    def __init__(self, node: Node, arm: ArmOnBus, traffic: Traffic, lease: Lease) -> None:
         self._diagnostics = Diagnostics(node)
-        self._names = names
+        self._names = arm.limits.joint_names
         self._lease = lease
         self._traffic = traffic
         self._rate = Rate()
-        self._slow = SLOW * rate  # Hz
-        self._motors = MotorLoad(rated)
+        self._slow = SLOW / arm.period  # Hz
+        self._motors = MotorLoad([motor.rated_effort for motor in arm.motors])
 
     def send(self, loop: ControlLoop | None, newest: EffortCommand, refusal: str) -> None:
         """Report on `loop`, None while the node is inactive. refusal: why the last message was refused."""

@@ -27,7 +27,7 @@ from exo_gravity.nodes.compensator.budget_watch import BudgetWatch
 from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import accept_changes
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import DISTRUST, NEWEST, HotPath, Publishers, Repeated, TiltSubscription
+from exo_gravity.nodes.ros.subscriptions import NEWEST, HotPath, Publishers, Repeated, TiltSubscription
 
 SILENCE = 0.5  # s without joint states until diagnostics report it
 REPORT_PERIOD = 0.5  # s
@@ -72,11 +72,11 @@ class CompensatorNode(Node):
         self._refusal = "none"
         topic = self._interface.topic
         self._source = Publishers()
-        # Which input had a second publisher, as a sentence, and when (monotonic s).
-        self._intruder, self._intruded = "", -math.inf
+        self._sources = {topic: self._source}  # of what the torque depends on
         self._threads.append(HotPath(self, JointState, topic, self._on_joint_states, NEWEST))
         if values["use_imu"]:
-            TiltSubscription(self, self._control, self._lock, self._refused, self._withdraw, self._on_motion)
+            tilt = TiltSubscription(self, self._control, self._lock, self._refused, self._on_motion)
+            self._sources |= tilt.senders
         accept_changes(self, table, read, self._apply)
         # Only the executor's thread reports: diagnostics and budget are not for two threads.
         self._changed = self.create_guard_condition(self._report_changes)
@@ -99,8 +99,7 @@ class CompensatorNode(Node):
     def _on_joint_states(self, message: JointState, info: dict[str, Any]) -> None:
         now = time.monotonic()
         try:
-            if self._source.is_another(info):
-                self._withdraw(self._interface.topic)
+            self._source.is_another(info)
             theta, velocity = self._interface.read(message)
             if self._interface.problem:  # no step: the torque must ramp in from zero
                 answer = Answer(None, self._interface.problem)
@@ -109,8 +108,9 @@ class CompensatorNode(Node):
                     answer = self._control.step(now, theta, velocity)
         except ParameterError as error:
             answer = Answer(None, self._refused(self._interface.topic, error))
-        if now - self._intruded < DISTRUST:
-            answer = Answer(None, self._intruder)
+        for topic, publishers in self._sources.items():
+            if publishers.are_several:
+                answer = Answer(None, f"more than one publisher of {topic}")
         self._interface.send(now, message, answer)
         self._answers += answer.effort is not None
         self._rides += bool(answer.held and not self._answer.held)
@@ -130,10 +130,6 @@ class CompensatorNode(Node):
     def _on_motion(self, *sample: Any) -> None:
         if self._control.settings.inertial:  # each sample takes a fit, under the lock
             self._control.set_motion(*sample)
-
-    def _withdraw(self, topic: str) -> None:
-        """Withdraw for a while: a second publisher sends on `topic`."""
-        self._intruder, self._intruded = f"more than one publisher of {topic}", time.monotonic()
 
     def _refused(self, topic: str, error: ParameterError) -> str:
         """Note an impossible message. Its value goes to /diagnostics only: a hostile sender could fill the log."""

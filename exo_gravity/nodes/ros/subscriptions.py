@@ -8,6 +8,7 @@ of a core). A flood is shed before Python sees it: the middleware keeps `qos.dep
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -129,6 +130,7 @@ class Publishers:
     def __init__(self) -> None:
         self.missed = 0
         self._newest: deque[int] = deque(maxlen=MAX_PUBLISHERS)  # number of each publisher's last message
+        self._changed = -math.inf  # monotonic s
 
     def is_another(self, info: dict[str, Any]) -> bool:
         """Return whether this message comes from a different publisher than the previous one: its number is no higher.
@@ -143,15 +145,22 @@ class Publishers:
             self.missed += number - previous - 1
             self._newest.remove(previous)
         self._newest.append(number)
-        return bool(number <= last)
+        if is_another := bool(number <= last):
+            self._changed = time.monotonic()
+        return is_another
+
+    @property
+    def are_several(self) -> bool:
+        """Whether a message came from another publisher than the one before, within DISTRUST s."""
+        return time.monotonic() - self._changed < DISTRUST
 
 
 class TiltSubscription:
     """Passes the trunk's tilt on to `target`, under `lock`: `/imu/data`, and `/imu/pitch_yaw` of who sends that alone.
 
-    on_refusal(topic, error): a message is impossible; the last tilt then grows old. on_intruder(topic): a second
-    publisher sends on it. on_motion(now, specific force (3,) m/s^2, angular velocity (3,) rad/s, age in s): a sample
-    of the trunk's motion, in its axes, under `lock` too. on_tilt(now): `target` has a message of `now`, in s.
+    on_refusal(topic, error): a message is impossible; the last tilt then grows old. on_motion(now, specific force (3,)
+    m/s^2, angular velocity (3,) rad/s, age in s): a sample of the trunk's motion, in its axes, under `lock` too.
+    on_tilt(now): `target` has a message of `now`, in s. senders: the publishers by topic.
     """
 
     def __init__(
@@ -160,14 +169,12 @@ class TiltSubscription:
         target: TiltInput | Tilted,
         lock: threading.Lock,
         on_refusal: Callable[[str, ParameterError], object] = lambda topic, error: None,
-        on_intruder: Callable[[str], object] = lambda topic: None,
         on_motion: Callable[..., object] = lambda *sample: None,
         on_tilt: Callable[[float], object] = lambda now: None,
     ) -> None:
         self._node, self._target, self._lock = node, target, lock
-        self._on_refusal, self._on_intruder, self._on_motion = on_refusal, on_intruder, on_motion
-        self._on_tilt = on_tilt
-        self._senders = {topic: Publishers() for topic in (DATA, PITCH_YAW)}
+        self._on_refusal, self._on_motion, self._on_tilt = on_refusal, on_motion, on_tilt
+        self.senders = {topic: Publishers() for topic in (DATA, PITCH_YAW)}
         node.create_subscription(Imu, DATA, self._on_data, NEWEST)
         node.create_subscription(Vector3Stamped, PITCH_YAW, self._on_pitch_yaw, NEWEST)
 
@@ -193,8 +200,7 @@ class TiltSubscription:
 
     def _pass_on(self, topic: str, stamp: Time, info: dict[str, Any], use: Callable[[float, float], None]) -> None:
         """Call `use` with the present monotonic time in s, and the age of the stamp in s by the node's clock."""
-        if self._senders[topic].is_another(info):
-            self._on_intruder(topic)
+        self.senders[topic].is_another(info)
         age = (self._node.get_clock().now().nanoseconds - to_nanoseconds(stamp)) * 1e-9
         try:
             with self._lock:
