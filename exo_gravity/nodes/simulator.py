@@ -21,7 +21,9 @@ from std_msgs.msg import String
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS
 from exo_gravity.core.trial.script import Step, TrialScript
+from exo_gravity.core.trunk.imu_sample import ImuSample
 from exo_gravity.hardware.can.can_port import open_bus
+from exo_gravity.nodes.imu.device import message_of
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
 from exo_gravity.nodes.ros.parameters import accept_changes, bus_of, declare
 from exo_gravity.nodes.ros.run import run
@@ -114,14 +116,9 @@ class Simulator(Node):
             rates = pitch_step / self._trunk_period, roll_step / self._trunk_period
             state = TrunkState(device.pitch, device.roll, *rates)
         if self._imu_publisher:
-            message = Imu()
-            message.header.stamp = self.get_clock().now().to_msg()
-            message.header.frame_id = "imu"
-            message.orientation_covariance[0] = -1.0  # REP-145: no orientation
-            readings = self._imu.sample_of(state)
-            for vector, value in zip((message.angular_velocity, message.linear_acceleration), readings, strict=True):
-                vector.x, vector.y, vector.z = value.tolist()
-            self._imu_publisher.publish(message)
+            time = self.get_clock().now().nanoseconds * 1e-9
+            sample = ImuSample(time, *(vector.tolist() for vector in self._imu.sample_of(state)))
+            self._imu_publisher.publish(message_of(sample))
 
     def _follow_wearer(self) -> None:
         """Start the wearer when the motors are on, and publish each new step."""

@@ -16,7 +16,7 @@ from contextlib import suppress
 from typing import Any
 
 from builtin_interfaces.msg import Duration
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Point, Vector3Stamped
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -52,6 +52,7 @@ class RobotModel(Node):
         self._described: dict[ViewedArm, ArmDescription] = {}
         self._problem = ""  # of the description
         self._tilt = Newest()  # gravity in the trunk's axes
+        self._status: dict[str, Newest] = {}  # of each node
         self._diagnostics = Diagnostics(self)
         self._description = self.create_publisher(String, "robot_description", LATCHED)
         self._joint_states = self.create_publisher(JointState, "joint_states", 1)
@@ -88,7 +89,8 @@ class RobotModel(Node):
 
     def _publish_states(self) -> None:
         names = dict(zip(self._described, joint_names(list(self._described.values())), strict=True))
-        self._views = views = [(arm, view) for arm in self._described if (view := arm.view())]
+        found = ((arm, arm.view(self._status.get(arm.bridge, Newest()))) for arm in self._described)
+        self._views = views = [(arm, view) for arm, view in found if view]
         own_topic = self._joint_states.topic_name
         if not views or self._problem or own_topic in {arm.states_topic for arm in self._arms.values()}:
             return
@@ -114,9 +116,8 @@ class RobotModel(Node):
         self._markers.publish(MarkerArray(markers=markers))
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            for arm in self._arms.values():
-                arm.note(status)
+        now = time.monotonic()
+        self._status.update({status.name: Newest(status_values(status), now) for status in message.status})
 
     def _on_tilt(self, message: Vector3Stamped, _info: dict[str, Any]) -> None:
         self._tilt = Newest(gravity_in_trunk(message.vector.y, message.vector.x), time.monotonic())
@@ -131,21 +132,15 @@ class ViewedArm:
         self.problem = f"waiting for the parameters of {namespace}/compensator and {namespace}/can_bridge"
         self.states_topic = f"{namespace}/joint_states"
         self.states = JointState()
-        self._bridge = f"{namespace}/can_bridge".lstrip("/")
-        self._status = self._arrived = Newest()
+        self.bridge = f"{namespace}/can_bridge".lstrip("/")
+        self._arrived = Newest()
         self.parameters = [
             NodeParameters(node, f"{namespace}/{leaf}", self._on_values) for leaf in ("compensator", "can_bridge")
         ]
         self._subscription = HotPath(node, JointState, self.states_topic, self._on_states, NEWEST)
 
-    def note(self, status: DiagnosticStatus) -> None:
-        """Keep the status of this arm's bridge; ignore any other."""
-        if status.name == self._bridge:
-            values = status_values(status)
-            self._status = Newest((values.get("state", ""), values["message"]), time.monotonic())
-
-    def view(self) -> ArmView | None:
-        """Return what is known of the arm now; None without a description or a fresh reading."""
+    def view(self, status: Newest) -> ArmView | None:
+        """Return what is known of the arm now; None without a description or a fresh reading. status: its bridge's."""
         self._subscription.poll()
         if self.description is None:
             return None
@@ -158,7 +153,8 @@ class ViewedArm:
             self.problem = self.problem or f"{self.states_topic}: {error.name} must be {error.expected}"
         if self.problem:
             return None
-        return ArmView(self.description, theta, velocity, effort, *(self._status.within(STALE_STATE) or ("", "")))
+        values = status.within(STALE_STATE) or {}
+        return ArmView(self.description, theta, velocity, effort, values.get("state", ""), values.get("message", ""))
 
     def _on_states(self, message: JointState, _info: dict[str, Any]) -> None:
         self.states, self._arrived = message, Newest(True, time.monotonic())
@@ -168,7 +164,7 @@ class ViewedArm:
             with suppress(KeyError):  # one of them has not answered yet, or is of another kind of arm
                 self.description = described(*(parameters.values for parameters in self.parameters))
         except ParameterError as error:
-            self.problem = f"{self._bridge.rpartition('/')[0] or 'arm'}: {error}"
+            self.problem = f"{self.bridge.rpartition('/')[0] or 'arm'}: {error}"
 
 
 def marker(owner: str, number: int, shape: Shape) -> Marker:
