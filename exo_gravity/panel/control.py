@@ -25,7 +25,7 @@ import logging
 import secrets
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.panel.view import SETTABLE
@@ -81,18 +81,11 @@ class Page:
     seen: float  #: monotonic s of its last confirmation
     credited: float  #: monotonic s of its last request
     credit: float = BURST  #: requests that it may send
-    connected: bool = True
+    connection: Any = None  #: its open live connection
 
     def __str__(self) -> str:
         """Name the page in log lines."""
         return f"{self.address} page {self.number}"
-
-
-class Reply(NamedTuple):
-    """The answer to a request: an HTTP status and '' or what is wrong."""
-
-    status: int
-    text: str
 
 
 class Control:
@@ -125,7 +118,7 @@ class Control:
         now = self.clock()
         if page is None:
             if len(self._pages) >= MAX_PAGES:  # those that are closed lose their numbers
-                self._pages = {known.secret: known for known in self._pages.values() if known.connected}
+                self._pages = {known.secret: known for known in self._pages.values() if known.connection}
             if len(self._pages) >= MAX_PAGES:
                 return None
             self._numbers += 1
@@ -133,7 +126,6 @@ class Control:
             self._pages[page.secret] = page
         if self.holder is None or self.is_gone():
             self.holder = page
-        page.connected = True
         self.confirm(page)
         return page
 
@@ -153,8 +145,11 @@ class Control:
         others = [self.arms.other_holder(arm, str(self.holder)) for arm in self.arms.names]
         return next(filter(None, others), "")
 
-    async def perform(self, body: Any, secret: str, address: str) -> Reply:
-        """Do what the JSON value `body` asks for, sent by the page with `secret`, at `address`."""
+    async def perform(self, body: Any, secret: str, address: str) -> tuple[int, str]:
+        """Do what the JSON value `body` asks for, sent by the page with `secret`, at `address`.
+
+        Returns an HTTP status, and '' or what is wrong.
+        """
         page = self._pages.get(secret)
         try:
             request = parse(body, self.arms.names, self.files.trials)
@@ -163,9 +158,9 @@ class Control:
         kind, arm, text = request["do"], request.get("arm", ""), sentence(request)
         if kind != "let_down":
             if page is None:
-                return Reply(403, "unknown page: reload it")
+                return (403, "unknown page: reload it")
             if not self._spend(page):
-                return Reply(429, "too many requests: wait a moment")
+                return (429, "too many requests: wait a moment")
             if kind != "take" and page is not self.holder:
                 return self._refused(page, 403, f"{text}: another page holds control")
             if arm and (other := self.arms.other_holder(arm, str(page))):
@@ -174,12 +169,12 @@ class Control:
             self.arms.lease(str(page), "hold")
         problem = await self._carry_out(request, kind, arm, page)
         self._log(f"{page or f'{address} unknown page'}: {text}: {problem or 'done'}")
-        return Reply(409 if problem else 200, problem)
+        return (409 if problem else 200, problem)
 
-    def _refused(self, page: Page | None, status: int, text: str) -> Reply:
+    def _refused(self, page: Page | None, status: int, text: str) -> tuple[int, str]:
         if page and self._spend(page):  # a flood of wrong requests must not fill the log
             self._log(f"{page}: refused: {text}")
-        return Reply(status, text)
+        return (status, text)
 
     async def _carry_out(self, request: Mapping[str, Any], kind: str, arm: str, page: Page | None) -> str:
         if kind == "let_down":

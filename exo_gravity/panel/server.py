@@ -47,7 +47,6 @@ class PanelServer:
         self.state = NONE_YET  #: what the pages show, replaced by a new object in any thread
         self.setup = NONE_YET  #: what changes rarely, replaced likewise
         self._control = control
-        self._connections: dict[str, WebSocket] = {}  # by the page's secret
         routes = [
             Route("/", lambda request: FileResponse(FOLDER / "static" / "index.html")),
             Route("/strings", lambda request: FileResponse(FOLDER / "strings.json")),
@@ -94,9 +93,9 @@ class PanelServer:
             if page is None:
                 await connection.close(FULL)
                 return
-            if page.secret in self._connections:
-                await self._connections[page.secret].close(REPLACED)
-            self._connections[page.secret] = connection
+            replaced, page.connection = page.connection, connection
+            if replaced:
+                await replaced.close(REPLACED)
             sender = asyncio.create_task(self._send(connection, page))
             try:
                 while True:
@@ -104,9 +103,8 @@ class PanelServer:
                     self._control.confirm(page)
             finally:
                 sender.cancel()
-                if self._connections.get(page.secret) is connection:
-                    del self._connections[page.secret]
-                    page.connected = False
+                if page.connection is connection:
+                    page.connection = None
 
     async def _send(self, connection: WebSocket, page: Page) -> None:
         """Send the page's number, then setup and state whenever they are new, until it is cancelled."""

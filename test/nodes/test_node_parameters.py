@@ -5,12 +5,14 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 
 import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
+from exo_gravity.nodes.ros import parameters as parameters_module
 from exo_gravity.nodes.ros.parameters import ANSWER_TIMEOUT, NodeParameters
 from exo_gravity.nodes.ros.run import keep_to_this_machine
 
@@ -77,16 +79,17 @@ def test_a_name_without_services_is_not_present(node):
     ghost.destroy_node()
 
 
-def test_answers_after_the_first_are_ignored_once_it_is_destroyed(node, executor):
+def test_answers_after_the_first_are_ignored_once_it_is_destroyed(node, executor, monkeypatch):
     other = other_node(node)
     clock = itertools.count(0.0, ANSWER_TIMEOUT).__next__  # every update asks again
+    monkeypatch.setattr(parameters_module, "time", SimpleNamespace(monotonic=clock))
     answers: list[object] = []
 
     def destroy(values: dict[str, object]) -> None:
         answers.append(values)
         parameters.destroy()
 
-    parameters = NodeParameters(node, "/right/other", destroy, clock=clock)
+    parameters = NodeParameters(node, "/right/other", destroy)
     wait_until(lambda: parameters.is_present, parameters.update)
     for _ in range(5):
         parameters.update()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from typing import NamedTuple
 
 import pytest
 
@@ -15,12 +16,19 @@ from exo_gravity.panel.control import (
     REFILL,
     Control,
     Page,
-    Reply,
     parse,
     sentence,
 )
 
 from ..support.panel_stage import PlayedArms, PlayedFiles
+
+
+class Reply(NamedTuple):
+    """The answer to a request."""
+
+    status: int
+    text: str
+
 
 DOWN = [("let_down", "right"), ("let_down", "left")]
 
@@ -43,11 +51,12 @@ class Panel(Control):
     def opened(self, address: str = "10.0.0.3", secret: str = "") -> Page:
         page = self.open(secret, address)
         assert page is not None
+        page.connection = "open"
         return page
 
     def ask(self, page: Page | str, **body: object) -> Reply:
         secret = page if isinstance(page, str) else page.secret
-        return asyncio.run(self.perform(body, secret, "10.0.0.9"))
+        return Reply(*asyncio.run(self.perform(body, secret, "10.0.0.9")))
 
 
 @pytest.fixture
@@ -212,7 +221,7 @@ def test_control_is_taken_and_given_up(panel):
 
 
 def test_a_reloaded_page_keeps_its_number_and_control(panel):
-    panel.first.connected = False
+    panel.first.connection = None
     assert panel.opened(secret=panel.first.secret) is panel.first
     assert panel.holder is panel.first
     assert panel.first.number == 1
@@ -242,10 +251,10 @@ def test_a_new_page_holds_control_if_the_operators_page_is_gone(panel):
 def test_the_number_of_pages_is_limited(panel):
     pages = [panel.first, panel.second, *(panel.opened() for _ in range(MAX_PAGES - 2))]
     assert panel.open("", "10.0.0.1") is None
-    pages[5].connected = False
+    pages[5].connection = None
     panel.opened()
     assert panel.open(pages[5].secret, "10.0.0.1") is None
-    pages[6].connected = False
+    pages[6].connection = None
     assert panel.opened(secret=pages[6].secret) is pages[6]
 
 

@@ -106,9 +106,9 @@ class Recorder(Node):
 
     def _discover(self) -> None:
         """Subscribe to new topics, and note new nodes."""
-        for topic, types in self.get_topic_names_and_types():
+        for topic, _types in self.get_topic_names_and_types():
             msgtype = SHARED_TOPICS.get(topic) or OF_ARMS.get(leaf(topic))
-            if msgtype and topic not in self._topics and type_name(msgtype) in types:
+            if msgtype and topic not in self._topics:
                 self._guarded(topic, self._subscribe, topic, msgtype)
         for name, namespace in self.get_node_names_and_namespaces():
             node = f"{namespace.rstrip('/')}/{name}"
@@ -144,10 +144,12 @@ class Recorder(Node):
             self.get_logger().warning(f"messages lost so far: {lost[0]} did not arrive, {lost[1]} were not written")
 
     def _subscribe(self, topic: str, msgtype: type) -> None:
-        publishers = self.get_publishers_info_by_topic(topic)
-        offered = [publisher.qos_profile for publisher in publishers if publisher.node_name != REPEATER]
+        found = self.get_publishers_info_by_topic(topic)
+        others = [publisher for publisher in found if publisher.node_name != REPEATER]
+        named = [publisher for publisher in others if leaf(publisher.topic_type) == msgtype.__name__]
+        offered = [publisher.qos_profile for publisher in named]
         if not offered:
-            return  # a subscriber without a publisher; try again later
+            return  # a subscriber without a publisher, or a topic of another type; try again later
         reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
         latched = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
         # A recorder must not make the control loops' publishers wait for acknowledgements.
@@ -157,7 +159,7 @@ class Recorder(Node):
             reliability=ReliabilityPolicy.RELIABLE if acknowledged else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
-        self._writer.add_topic(topic, type_name(msgtype), offered_qos(reliable, latched, offered[0].depth or 1))
+        self._writer.add_topic(topic, named[0].topic_type, offered_qos(reliable, latched, offered[0].depth or 1))
         publishers = Publishers()
         self._counted += [publishers] if msgtype in (JointState, Imu, Vector3Stamped) else []
         self._topics[topic] = HotPath(self, msgtype, topic, partial(self._on_message, topic, publishers), qos, raw=True)
@@ -180,12 +182,6 @@ class Recorder(Node):
     def _write_text(self, topic: str, text: str) -> None:
         now = self.get_clock().now().nanoseconds
         self._writer.write([(topic, now, serialize_message(String(data=text)))])
-
-
-def type_name(msgtype: type) -> str:
-    """Return 'sensor_msgs/msg/JointState' for that class."""
-    package, kind, *_ = msgtype.__module__.split(".")
-    return f"{package}/{kind}/{msgtype.__name__}"
 
 
 class LiveLine:

@@ -89,21 +89,16 @@ class NodeParameters:
     """The parameters of another node, in `values` once they are known.
 
     name: its full name, or its name in `node`'s namespace. on_change: called with `values` on the executor's thread
-    each time that they were read. clock: monotonic s.
+    each time that they were read.
     """
 
     def __init__(
-        self,
-        node: Node,
-        name: str,
-        on_change: Callable[[dict[str, Any]], object] = lambda values: None,
-        clock: Callable[[], float] = time.monotonic,
+        self, node: Node, name: str, on_change: Callable[[dict[str, Any]], object] = lambda values: None
     ) -> None:
         self.values: dict[str, Any] = {}
         self.is_present = False  #: whether it has its services; a node that has died can stay in ROS's list of names
         self._node = node
         self._on_change = on_change
-        self._clock = clock
         self._get = node.create_client(GetParameters, f"{name}/get_parameters")
         self._list = node.create_client(ListParameters, f"{name}/list_parameters")
         self._due = -math.inf  # s, when to ask; infinite while the values are known
@@ -118,7 +113,7 @@ class NodeParameters:
         if self._is_destroyed:
             return
         self.is_present = self._get.service_is_ready() and self._list.service_is_ready()
-        now = self._clock()
+        now = time.monotonic()
         if not self.is_present:
             self._due = -math.inf  # it may return with other values
         elif now >= self._due:
