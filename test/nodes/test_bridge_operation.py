@@ -156,10 +156,11 @@ def test_the_zero_is_set_only_for_an_arm_that_is_off_at_rest_and_replies(ask, mo
     )
     assert ask("set_zero", loop) == ""
     loop.safety.enable(0.0)
-    assert ask("set_zero", loop) == "refused: the arm is checking, must be disabled"
+    refusal = "refused: the arm is {}; must be disabled and at rest, and all motors reply"
+    assert ask("set_zero", loop) == refusal.format("checking")
     loop.safety.disable(0.0)
     loop.samples = (*loop.samples[:3], loop.samples[3]._replace(time=-math.inf))
-    assert ask("set_zero", loop) == "refused: a motor does not reply"
+    assert ask("set_zero", loop) == refusal.format("disabled")
     assert loop.zeroed == 1
     monkeypatch.setattr(operation, "ZERO_TIMEOUT", 0.0)
     loop.samples = (*loop.samples[:3], JointSample(0.5, 0.0, 0.0, 40, 0, math.inf))

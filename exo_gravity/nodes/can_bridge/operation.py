@@ -95,12 +95,9 @@ class BridgeServices:
         safety, now = loop.safety, time.monotonic()
         if any(self._zero):
             return f"zero = {self._zero}: must be all 0 when the motors store the zero"
-        if safety.state is not State.DISABLED:
-            return f"refused: the arm is {safety.state.value}, must be disabled"
-        if any(safety.limits.is_silent(now, joint) for joint in loop.samples):
-            return "refused: a motor does not reply"
-        if not safety.settled(now):
-            return "refused: the arm is not at rest"
+        is_silent = any(safety.limits.is_silent(now, joint) for joint in loop.samples)
+        if safety.state is not State.DISABLED or is_silent or not safety.settled(now):
+            return f"refused: the arm is {safety.state.value}; must be disabled and at rest, and all motors reply"
         loop.bus.set_zero()
         return ""
 

@@ -113,8 +113,11 @@ class Recorder(Node):
         for name, namespace in self.get_node_names_and_namespaces():
             node = f"{namespace.rstrip('/')}/{name}"
             if node not in self._nodes and node != self.get_fully_qualified_name() and not name.startswith("_"):
-                write = partial(self._guarded, node, self._write_parameters, node)
-                self._nodes[node] = NodeParameters(self, node, write)
+                self._guarded(node, self._add_node, node)
+
+    def _add_node(self, node: str) -> None:
+        write = partial(self._guarded, node, self._write_parameters, node)
+        self._nodes[node] = NodeParameters(self, node, write)
 
     def _look(self) -> None:
         """Ask the nodes whose parameters are not known, and print the live line."""

@@ -17,7 +17,7 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Vector3Stamped
-from rclpy.callback_groups import CallbackGroup
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -40,14 +40,12 @@ NOT_REPORTED = -1.0  # first entry of a covariance (REP-145)
 Callback = Callable[[Any, dict[str, Any]], None]
 
 
-class Unexecuted(CallbackGroup):
+class Unexecuted(ReentrantCallbackGroup):
     """Keeps its subscriptions out of the executor's wait set."""
 
     def can_execute(self, entity: Any) -> bool:
         """Return that no entity may be executed."""
         return False
-
-    beginning_execution = ending_execution = can_execute
 
 
 class Repeated:
