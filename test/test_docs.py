@@ -48,7 +48,7 @@ def test_every_table_has_its_place_in_a_document() -> None:
 @pytest.mark.parametrize(
     ("document", "table", "declared", "changed"),
     [
-        ("parameters.md", "can_bridge", "| `reply_timeout` | 0.05 |", "| `reply_timeout` | 0.06 |"),
+        ("parameters.md", "can_bridge", "| `command_timeout` | 0.05 |", "| `command_timeout` | 0.06 |"),
         ("safety.md", "faults", f"| {FaultCode.MOTOR_SILENT.meaning} |", "| a motor is quiet |"),
     ],
 )

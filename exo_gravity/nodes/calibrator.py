@@ -26,10 +26,10 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.tilt_input import TiltInput
-from exo_gravity.nodes.ros.hot_path import NEWEST, HotPath, Repeated, SolePublisher, TiltSubscription
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, by_name
 from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
+from exo_gravity.nodes.ros.subscriptions import NEWEST, HotPath, Publishers, Repeated, TiltSubscription
 
 REPORT_PERIOD = 0.1  # s
 PLAN_PERIOD = 0.05  # s
@@ -52,13 +52,13 @@ class CalibratorNode(Node):
         self._printed = 0  # observations
         self._trouble = ""  # outside the tour
         self._diagnostics = Diagnostics(self)
-        self._source = SolePublisher(self, "joint_states")
+        self._sources = {"joint_states": Publishers()}  # of what the torque depends on
         self._publisher = self.create_publisher(JointState, "effort_commands", 1)
         self._command = JointState(name=self._names)  # one message, reused
         self._lock = threading.Lock()  # guards tilt and state: joint states arrive on another thread
         self._joint_states = HotPath(self, JointState, "joint_states", self._on_joint_states, NEWEST)
         if values["use_imu"]:
-            TiltSubscription(self, self._tilt, self._lock, self._on_refused_tilt, self._on_intruder)
+            self._sources |= TiltSubscription(self, self._tilt, self._lock, self._on_refused_tilt).senders
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self.create_timer(REPORT_PERIOD, self._report)
         # Poses are chosen on a thread of their own: neither joint states nor tilts may wait for it.
@@ -80,8 +80,10 @@ class CalibratorNode(Node):
     def _on_joint_states(self, message: JointState, info: dict[str, Any]) -> None:
         self._command.header.stamp = message.header.stamp
         try:
-            if self._source.is_another(info):
-                self._on_intruder("joint_states")
+            self._sources["joint_states"].is_another(info)
+            for topic, publishers in self._sources.items():
+                if publishers.are_several:
+                    self._trouble = f"more than one publisher of {topic}"
             effort = self._effort(by_name(message, "position", self._names), by_name(message, "velocity", self._names))
         except ParameterError as error:
             self._trouble, effort = f"joint_states: {error}", None
@@ -103,9 +105,6 @@ class CalibratorNode(Node):
 
     def _on_refused_tilt(self, topic: str, error: ParameterError) -> None:
         self.get_logger().error(f"{topic}: {error}", throttle_duration_sec=1.0)
-
-    def _on_intruder(self, topic: str) -> None:
-        self._trouble = f"more than one publisher of {topic}"
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:

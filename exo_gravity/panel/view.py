@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import chain, repeat, zip_longest
 from typing import Any
 
@@ -38,19 +37,6 @@ SIMULATED = ("udp_multicast", "virtual")
 
 Values = Mapping[str, Any]
 NUMBERS = ("position", "velocity", "effort")
-SILENT = 1.5  # s without diagnostics or joint states after which the last ones are not shown any more
-
-
-@dataclass(frozen=True)
-class Newest:
-    """The newest message of one kind, as the page gets it."""
-
-    content: Any = None
-    time: float = -math.inf  #: monotonic s of its arrival
-
-    def at(self, now: float) -> Any:
-        """Return the content; None if it is old."""
-        return self.content if now - self.time < SILENT else None
 
 
 def joint_rows(

@@ -67,7 +67,6 @@ def test_a_wall_pushes_back_before_a_joint_limit():
     ("field", "value"),
     [
         ("max_effort", (3.0, 9.0, 3.0)),
-        ("max_velocity", (0.0,) * 4),
         ("position_max", (0.0,) * 4),
         ("command_timeout", 5.0),
         ("sign_check_torque", math.nan),

@@ -339,7 +339,6 @@ def test_each_joint_has_the_ranges_of_its_own_wire_format():
     assert [motor.wire_format.name for motor in motors] == ["mit", "mit_v3", "mit_v3", "mit"]
     assert [motor.spec.torque_range for motor in motors] == [15.0, 18.0, 12.0, 15.0]
     assert [motor.spec.velocity_range for motor in motors] == [45.0, 65.0, 60.0, 45.0]
-    assert motors_of(parameters(torque_per_ampere=[0.5, 0.0, 0.0, 0.0]))[0].spec.torque_per_ampere == 0.5
 
 
 def test_the_torque_range_of_a_v1_board_is_refused_for_a_v3_board():

@@ -15,6 +15,7 @@ import rclpy
 import yaml
 from geometry_msgs.msg import Vector3Stamped
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.time import Time
 from sensor_msgs.msg import Imu, JointState
 
 from exo_gravity.core import ArmModel, gravity_torque
@@ -22,7 +23,7 @@ from exo_gravity.core.compensation.limiter import LONGEST_STEP
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.safety.params import CAN_BRIDGE
-from exo_gravity.nodes.ros.messages import to_nanoseconds, to_time
+from exo_gravity.nodes.ros.messages import to_nanoseconds
 
 from ..support.joint_state_feeder import PARTS, POSE, JointStateFeeder
 from ..support.launched_nodes import NO_IMU
@@ -109,7 +110,8 @@ class TiltFeeder:
         angles, vector = Vector3Stamped(), Imu()
         angles.vector.y = 0.3
         while not self._stopping.wait(0.01):
-            angles.header.stamp = vector.header.stamp = to_time(time.time_ns() - round(self.lag * 1e9))
+            stamp = Time(nanoseconds=time.time_ns() - round(self.lag * 1e9)).to_msg()
+            angles.header.stamp = vector.header.stamp = stamp
             self._publisher.publish(angles)
             if (bow := self.vector_bow) is not None:
                 vector.orientation.y, vector.orientation.w = math.sin(bow / 2.0), math.cos(bow / 2.0)

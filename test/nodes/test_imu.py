@@ -13,13 +13,14 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3, Vector3Stamped
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.time import Time
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 from exo_gravity.nodes.imu.node import ImuNode as ImuShell
-from exo_gravity.nodes.ros.messages import to_nanoseconds, to_time
+from exo_gravity.nodes.ros.messages import to_nanoseconds
 
 from ..support.handheld_imu import read_recording
 
@@ -88,7 +89,7 @@ class ImuNode:
     def send(self, stamp, rate=(0.0, 0.0, 0.0), acceleration=(0.0, 0.0, G), orientation=None, noise=1e-9):
         """Publish the sample of `stamp` s; wait while too many are in flight."""
         message = Imu()
-        message.header.stamp = to_time(round(stamp * 1e9))
+        message.header.stamp = Time(nanoseconds=round(stamp * 1e9)).to_msg()
         for vector, values in ((message.angular_velocity, rate), (message.linear_acceleration, acceleration)):
             vector.x, vector.y, vector.z = map(float, values)
         q = message.orientation

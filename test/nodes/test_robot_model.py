@@ -18,7 +18,7 @@ from std_msgs.msg import String
 from visualization_msgs.msg import Marker, MarkerArray
 
 from exo_gravity.core.view.urdf import ROOT
-from exo_gravity.nodes.ros.hot_path import LATCHED
+from exo_gravity.nodes.ros.subscriptions import LATCHED
 from exo_gravity.tools.urdf import urdf_of
 
 from ..support import CONFIG

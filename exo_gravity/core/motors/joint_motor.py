@@ -123,8 +123,6 @@ MOTOR_PARAMETERS = (
           (0.0, WIRE_RANGE_BOUNDS[1]), "rad/s", fixed=True),
     Param("torque_range", [0.0] * 4, "torque range of the firmware's wire format; 0: the usual one of the motor",
           (0.0, WIRE_RANGE_BOUNDS[1]), "Nm", fixed=True),
-    Param("torque_per_ampere", [0.0] * 4, "V3: output torque by the current in status frames; 0: rated torque by "
-          "rated current", (0.0, 10.0), "Nm/A", fixed=True, expert=True),
 )
 # fmt: on
 _OF_A_MOTOR = tuple(param.name for param in MOTOR_PARAMETERS if isinstance(param.default, list))
@@ -149,8 +147,7 @@ def _motor_of(given: Mapping[str, Any]) -> JointMotor:
         own = getattr(usual, name)
         if given[name] == getattr(plain, name) != own:
             raise ParameterError(name, given[name], f"{own:g} or 0 for an {plain.name} with wire_format = {board.name}")
-    own_ranges = ("velocity_range", "torque_range", "torque_per_ampere")
-    spec = replace(usual, **{name: given[name] for name in own_ranges if given[name]})
+    spec = replace(usual, **{name: given[name] for name in ("velocity_range", "torque_range") if given[name]})
     return JointMotor(spec, given["can_id"], given["direction"], given["zero"], given["torque_scale"], board)
 
 
