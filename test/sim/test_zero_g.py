@@ -19,7 +19,7 @@ from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
-from exo_gravity.sim.offline import ArmSetup, OfflineTrial
+from exo_gravity.sim.offline import ArmSetup, OfflineTrial, resting
 
 RATED = (3.0, 9.0, 3.0, 3.0)
 NAMES = ("rotation", "abduction", "flexion", "elbow")
@@ -46,7 +46,7 @@ def carried(settings, pose, tilt=UPRIGHT, seconds=10.0, after=()):
     device.pitch, device.roll = tilt
     steps = [{"move": pose, "over": 3.0}, *after, {"hold": seconds}]
     script = TrialScript.parse({"name": "release", "steps": steps})
-    return OfflineTrial(ArmSetup("right", device, MOTORS_OF_ARM, LIMITS, settings, 250.0, tilt), script, 8.0)
+    return OfflineTrial(ArmSetup("right", device, MOTORS_OF_ARM, LIMITS, settings, 250.0, resting(*tilt)), script, 8.0)
 
 
 def moved(trial):
@@ -78,7 +78,7 @@ def test_a_sweep_of_the_support_changes_the_torque_smoothly_until_it_holds_the_a
 
     def every_second(now):
         if now > 5.0:
-            trial.apply(replace(CONTROLLER, support=next(support, 1.0)))
+            trial.compensator.apply(replace(CONTROLLER, support=next(support, 1.0)))
         return False
 
     recording = trial.run(every_second)
