@@ -24,12 +24,11 @@ from exo_gravity.bag.joints import FIELDS, TYPES, JointArrays
 from exo_gravity.bag.storage import Storage
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.safety.drive import State
-from exo_gravity.core.trial.recording import Recording, ScriptedStep, Span
+from exo_gravity.core.trial.recording import CARRIED, Recording, ScriptedStep, Span
 
 BATCH_SIZE = 5_000  # messages that are decoded at once
 MAX_COMMAND_AGE = 200_000_000  # ns; an older command is no longer in force
 MAX_CLOCK_OFFSET = 1_000_000_000  # ns between stamp and arrival
-CARRIED = (State.RAMPING_IN.value, State.ACTIVE.value)
 STATE_GAP = 1.0  # s; can_bridge reports its state twice a second, except while it ends
 TOPIC = itemgetter(0)
 

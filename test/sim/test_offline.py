@@ -17,7 +17,7 @@ from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import ArmConfig, ImuConfig, SimulatedArm, SimulatedDevice, SimulatedImu, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.imu import measured_tilt
-from exo_gravity.sim.offline import ArmSetup, OfflineTrial
+from exo_gravity.sim.offline import ArmSetup, OfflineTrial, resting
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")
 POSE = [0.1, 0.6, 0.7, 0.5]
@@ -48,7 +48,7 @@ def make(links=DEFAULT_LINKS, tilt=(0.1, -0.06), ids=(1, 2, 3, 4)):
     device = SimulatedDevice(SimulatedArm(ArmConfig()), [SimulatedMotor(motor) for motor in MOTORS_AS_MOUNTED])
     device.pitch, device.roll = 0.1, -0.06
     assumed = [replace(motor, can_id=can_id) for motor, can_id in zip(MOTORS_AS_MOUNTED, ids, strict=True)]
-    arm = ArmSetup("right", device, assumed, LIMITS, Settings("right", links), 250.0, tilt)
+    arm = ArmSetup("right", device, assumed, LIMITS, Settings("right", links), 250.0, tilt and resting(*tilt))
     return OfflineTrial(arm, SCRIPT, 6.0)
 
 

@@ -19,7 +19,7 @@ from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
-from exo_gravity.sim.offline import ArmSetup, OfflineTrial
+from exo_gravity.sim.offline import ArmSetup, OfflineTrial, resting
 
 RATED = (3.0, 9.0, 3.0, 3.0)
 NAMES = ("rotation", "abduction", "flexion", "elbow")
@@ -43,7 +43,7 @@ def carried(settings, pose, tilt=UPRIGHT, seconds=10.0, after=()):
     device.pitch, device.roll = tilt
     steps = [{"move": pose, "over": 3.0}, *after, {"hold": seconds}]
     script = TrialScript.parse({"name": "release", "steps": steps})
-    return OfflineTrial(ArmSetup("right", device, MOTORS_OF_ARM, LIMITS, settings, 250.0, tilt), script, 3.0)
+    return OfflineTrial(ArmSetup("right", device, MOTORS_OF_ARM, LIMITS, settings, 250.0, resting(*tilt)), script, 3.0)
 
 
 def moved(trial):

@@ -16,7 +16,7 @@ from exo_gravity.core.trial.recording import Recording
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import ArmConfig, ImuConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial
-from exo_gravity.tools.trials.offline import TrunkImu
+from exo_gravity.tools.trials.offline import trunk_imu
 
 FRICTION = 0.03  # Nm in each joint
 POSE = (0.0, 0.4, 0.5, 1.0)  # rad
@@ -42,9 +42,9 @@ def trunk_trial(*steps: dict[str, Any], seed: int = 0, **settings: Any) -> Offli
     )
     arm = SimulatedArm(ArmConfig(TRUE, coulomb_friction=(FRICTION,) * 4))
     device = SimulatedDevice(arm, [SimulatedMotor(motor) for motor in motors])
-    trunk = TrunkImu(ImuConfig(MOUNTING, seed=seed), MOUNTING, RATE)
+    trunk = trunk_imu(ImuConfig(MOUNTING, seed=seed), MOUNTING, RATE)
     script = TrialScript.parse({"name": "trunk", "steps": [{"move": list(POSE), "over": 2.0}, {"hold": 1.0}, *steps]})
-    setup = ArmSetup("right", device, motors, limits, Settings("right", ROBOT, **settings), RATE, None, trunk)
+    setup = ArmSetup("right", device, motors, limits, Settings("right", ROBOT, **settings), RATE, trunk)
     return OfflineTrial(setup, script, 3.0)
 
 
