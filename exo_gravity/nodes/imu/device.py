@@ -13,7 +13,7 @@ from geometry_msgs.msg import Vector3
 from rclpy.node import Node
 from sensor_msgs.msg import Imu
 
-from exo_gravity.core.trunk.imu_sample import ImuSample
+from exo_gravity.core.trunk.imu_checks import ImuSample
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.imu_sources import Reopening, open_source
 from exo_gravity.nodes.ros.hot_path import Callback
