@@ -146,10 +146,10 @@ class TrunkEstimator:
         imu_checks.check_living(force, self._forces[-1] if self._forces else None)
         dt = self._step(sample, rate + force, None if is_saturated or is_cut else self._quaternion)
         last = self._rates[-1] if self._rates else rate
-        change, repeated = math.dist(rate, last), self._equal.duration
-        if is_saturated or repeated or change * dt > JUMP or dt > GAP * self._uncertainty.period:
+        change, repeated, uncertainty = math.dist(rate, last), self._equal.duration, self._uncertainty
+        if is_saturated or repeated or change * dt > JUMP or uncertainty.run or dt > GAP * uncertainty.period:
             unknown = OVERSHOOT * self._fastest if is_saturated else 0.0
-            if self._uncertainty.miss(dt, change, unknown, repeated):
+            if uncertainty.miss(dt, change, unknown, repeated):
                 self._restart("too much rotation was not measured")
         quaternion = self._fusion.advance(dt, rate, last, None if is_cut else force)
         self._rates.append(rate)

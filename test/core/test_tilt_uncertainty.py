@@ -62,6 +62,7 @@ def test_what_was_lost_decays_and_too_much_makes_the_estimate_begin_anew():
     uncertainty = settled()
     assert not uncertainty.miss(0.002, 0.0, OVERSHOOT * RANGE, 0.0)
     before = added(uncertainty)
+    uncertainty.miss(0.01, 0.0, 0.0, 0.0)  # a good sample ends the run
     for _ in range(round(50 * DECAY_TIME)):
         go_on(uncertainty)
     assert added(uncertainty) == pytest.approx(before / math.e, rel=0.02)

@@ -36,7 +36,7 @@ class TiltUncertainty:
         self._rest = math.inf  # rad^2, of what does not add up
         self._square = 0.0  # of the angular acceleration, (rad/s^2)^2, mean over ACCELERATION_TIME
         self._lost = 0.0  # rad^2, of gaps and of runs of samples that did not show the rotation
-        self._run, self._runs = 0.0, False  # rad of the present run, whose angles have one direction; if it goes on
+        self.run = 0.0  #: rad lost in the present run, whose angles have one direction
 
     def miss(self, dt: float, change: float, unknown: float, repeated: float) -> bool:
         """Add the rotation that was not measured in `dt` s; return whether the estimate must begin anew.
@@ -50,7 +50,9 @@ class TiltUncertainty:
             self._lost += (GAP_SHARE * max(LEAST_ACCELERATION, usual) * (dt - self.period) ** 2) ** 2
         elif change * dt > JUMP and change > UNUSUAL * usual * max(dt, 0.5 * self.period):
             lost += change * dt
-        self._run, self._runs = self._run + lost, self._runs or lost > 0.0
+        self.run += lost
+        if not lost:
+            self._lost, self.run = self._lost + self.run * self.run, 0.0
         return self._add_up() > MAX_SIGMA * MAX_SIGMA
 
     def advance(
@@ -65,9 +67,6 @@ class TiltUncertainty:
         self._square += (spin_up * spin_up - self._square) * dt / ACCELERATION_TIME
         self.period += USUAL_SHARE * (dt - count * self.period)
         self._lost *= 1.0 - 2.0 * dt / DECAY_TIME
-        if not self._runs:
-            self._lost, self._run = self._lost + self._run * self._run, 0.0
-        self._runs = False
         if self._age >= START_TIME:
             self._start = 0.0
         elif self._age >= SETTLE_TIME:  # a movement after a still start does not make it larger again
@@ -83,6 +82,6 @@ class TiltUncertainty:
 
     def _add_up(self) -> float:
         """Return the rad^2 that were not measured."""
-        lost = self._lost + self._run * self._run
+        lost = self._lost + self.run * self.run
         self.sigma = math.sqrt(self._rest + lost) if self._age >= SETTLE_TIME else math.inf
         return lost

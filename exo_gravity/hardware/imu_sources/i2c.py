@@ -20,6 +20,7 @@ TEMPERATURE_PERIOD = 1.0  # s
 BANK_SELECT = 0x7F  # of a chip whose registers lie in banks
 
 Bus = Any  # a `smbus2.SMBus`
+Limits = tuple[float, float]
 Wait = Callable[[float], Any]  # s, e.g. time.sleep
 
 
@@ -162,15 +163,16 @@ class FifoSource(ImuSource):
             means.append([sum(axis) / count for axis in zip(*readings, strict=True)])
         return [on - off for off, on in zip(*means, strict=True)]
 
-    def _judge(self, sensor: str, response: Sequence[float], limits: Sequence[tuple[float, float]], unit: str) -> None:
-        """Raise DeviceError unless the response of each axis lies within its limits."""
-        for axis, value, (low, high) in zip("xyz", response, limits, strict=True):
-            if not low <= value <= high:
-                raise DeviceError(
-                    self._registers.name,
-                    f"self-test failed: {sensor} {axis} responds by {value:.0f} {unit}, must be {low:.0f} to "
-                    f"{high:.0f}: keep it still and try again, or replace it",
-                )
+    def _judge(self, axis: int, response: float, limits: Sequence[float], unit: str) -> None:
+        """Raise DeviceError unless the response lies within its limits; axis: 0 to 2 of the gyroscope, 3 to 5."""
+        low, high = limits
+        if not low <= response <= high:
+            sensor = f"{('gyroscope', 'accelerometer')[axis // 3]} {'xyz'[axis % 3]}"
+            raise DeviceError(
+                self._registers.name,
+                f"self-test failed: {sensor} responds by {response:.0f} {unit}, must be {low:.0f} to {high:.0f}: "
+                "keep it still and try again, or replace it",
+            )
 
     def _axes(self, data: bytes, scale: float) -> Axes:
         """Return three 16-bit numbers times `scale`."""

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.hardware.imu_sources.i2c import FifoSource, Registers
+from exo_gravity.hardware.imu_sources.i2c import FifoSource, Limits, Registers
 from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Measurement
 
 SAMPLE = 12  # bytes in the FIFO
@@ -25,23 +25,22 @@ READINGS = 200  # of each mean of the self-test
 START_UP = 0.1  # s after a reset, and after waking
 RESET, BEST_CLOCK = 0x80, 0x01  # PWR_MGMT_1
 
-# MPU
-SMPLRT_DIV, CONFIG, GYRO_CONFIG, ACCEL_CONFIG, ACCEL_CONFIG_2, FIFO_EN, USER_CTRL = (
-    0x19, 0x1A, 0x1B, 0x1C, 0x1D, 0x23, 0x6A,
-)  # fmt: skip
-EMPTIED = (USER_CTRL, 0x00), (USER_CTRL, 0x04), (USER_CTRL, 0x40)  # off, FIFO_RESET, FIFO_EN
-BOTH_TO_FIFO = 0x78
-SELECT_2000_DPS = SELECT_16_G = 0x18
-SELECT_8_G, ALL_AXES = 0x10, 0xE0  # ALL_AXES: self-test
-
-# ICM-20948
-ICM_USER_CTRL, FIFO_EN_2, FIFO_RST, FIFO_MODE = 0x003, 0x067, 0x068, 0x069
-GYRO_SMPLRT_DIV, GYRO_CONFIG_1, GYRO_CONFIG_2, ODR_ALIGN_EN = 0x200, 0x201, 0x202, 0x209
-ACCEL_SMPLRT_DIV_1, ACCEL_SMPLRT_DIV_2, ICM_ACCEL_CONFIG, ICM_ACCEL_CONFIG_2 = 0x210, 0x211, 0x214, 0x215
-USE_FILTER, ICM_SELECT_2000_DPS, ICM_SELECT_16_G = 0x01, 0x06, 0x06  # GYRO_CONFIG_1, ACCEL_CONFIG
-GYROSCOPE_ACTUATORS, ACCELEROMETER_ACTUATORS = 0x38, 0x1C  # GYRO_CONFIG_2, ACCEL_CONFIG_2
-
 Values = dict[int, int]  # of registers, in the order in which they are written
+
+
+def _factory_6500(registers: Registers, firsts: tuple[int, int]) -> list[float]:
+    """Return the factory's responses, angular velocity first, in LSB at 250 deg/s and 2 g; 0: it stored none."""
+    codes = [code for first in firsts for code in registers.read_block(first, 3)]
+    return [2620.0 * 1.01 ** (code - 1) if code else 0.0 for code in codes]
+
+
+def _factory_6050(registers: Registers, firsts: tuple[int, int]) -> list[float]:
+    """Return the same of an MPU-6050, at 250 deg/s and 8 g (RM-MPU-6000A 4.1)."""
+    *codes, low_bits = registers.read_block(firsts[0], 4)
+    rates = [25.0 * 131.0 * 1.046 ** ((code & 0x1F) - 1) if code & 0x1F else 0.0 for code in codes]
+    codes = [code >> 5 << 2 | low_bits >> (4 - 2 * axis) & 3 for axis, code in enumerate(codes)]
+    forces = [4096.0 * 0.34 * (0.92 / 0.34) ** ((code - 1) / 30.0) if code else 0.0 for code in codes]
+    return [rates[0], -rates[1], rates[2], *forces]
 
 
 class Map(NamedTuple):
@@ -57,7 +56,11 @@ class Map(NamedTuple):
     tested: Values  #: of the self-test, for 250 deg/s, 1 kHz
     off: Values  #: without the self-test's actuators
     on: Values  #: with them
-    factory: tuple[int, int]  #: first registers of the response, of angular velocity and of acceleration
+    firsts: tuple[int, int]  #: registers of the factory's response, of angular velocity and of acceleration
+    #: The response that these say, and its limits: shares of it, or in LSB of either sign without one.
+    factory: Callable[[Registers, tuple[int, int]], list[float]] = _factory_6500
+    shares: tuple[Limits, Limits] = (0.5, math.inf), (0.5, 1.5)
+    without: tuple[Limits, Limits] = (60.0 * 131.0, math.inf), (225.0 * 16.384, 675.0 * 16.384)  # 60 deg/s, 225 mg
 
 
 MPU_6500 = Map(
@@ -67,26 +70,29 @@ MPU_6500 = Map(
     bandwidths={1: 184.0, 2: 94.0, 3: 44.0, 4: 21.0, 5: 10.0, 6: 5.0},
     base_rate=1000.0,
     set_up=lambda divider, low_pass: {
-        CONFIG: low_pass,
-        ACCEL_CONFIG_2: low_pass,
-        SMPLRT_DIV: divider,
-        GYRO_CONFIG: SELECT_2000_DPS,
-        ACCEL_CONFIG: SELECT_16_G,
-        FIFO_EN: BOTH_TO_FIFO,
+        0x1A: low_pass,  # CONFIG
+        0x1D: low_pass,  # ACCEL_CONFIG_2
+        0x19: divider,  # SMPLRT_DIV
+        0x1B: 0x18,  # GYRO_CONFIG: 2000 deg/s
+        0x1C: 0x18,  # ACCEL_CONFIG: 16 g
+        0x23: 0x78,  # FIFO_EN: both
     },
-    emptied=EMPTIED,
-    tested={CONFIG: 2, ACCEL_CONFIG_2: 2, SMPLRT_DIV: 0},
-    off={GYRO_CONFIG: 0, ACCEL_CONFIG: 0},
-    on={GYRO_CONFIG: ALL_AXES, ACCEL_CONFIG: ALL_AXES},
-    factory=(0x00, 0x0D),
+    emptied=((0x6A, 0x00), (0x6A, 0x04), (0x6A, 0x40)),  # USER_CTRL: off, FIFO_RESET, FIFO_EN
+    tested={0x1A: 2, 0x1D: 2, 0x19: 0},
+    off={0x1B: 0, 0x1C: 0},
+    on={0x1B: 0xE0, 0x1C: 0xE0},
+    firsts=(0x00, 0x0D),
 )
-# Its CONFIG filters both sensors, and its test is at 8 g.
+# Its CONFIG filters both sensors, and its test is at 8 g. Limits: 14 % (PS-MPU-6000A 6.1), or none.
 MPU_6050 = MPU_6500._replace(
-    set_up=lambda *values: {key: v for key, v in MPU_6500.set_up(*values).items() if key != ACCEL_CONFIG_2},
-    tested={CONFIG: 2, SMPLRT_DIV: 0},
-    off={GYRO_CONFIG: 0, ACCEL_CONFIG: SELECT_8_G},
-    on={GYRO_CONFIG: ALL_AXES, ACCEL_CONFIG: ALL_AXES | SELECT_8_G},
-    factory=(0x0D, 0x0D),
+    set_up=lambda *values: {key: value for key, value in MPU_6500.set_up(*values).items() if key != 0x1D},
+    tested={0x1A: 2, 0x19: 0},
+    off={0x1B: 0, 0x1C: 0x10},
+    on={0x1B: 0xE0, 0x1C: 0xF0},
+    firsts=(0x0D, 0x0D),
+    factory=_factory_6050,
+    shares=((0.86, 1.14), (0.86, 1.14)),
+    without=((0.0, math.inf), (0.0, math.inf)),
 )
 ICM_20948 = Map(
     power=(0x006, 0x007),
@@ -95,23 +101,23 @@ ICM_20948 = Map(
     bandwidths={2: 119.5, 3: 51.2, 4: 23.9, 5: 11.6, 6: 5.7},  # the accelerometer's: at most 8 Hz narrower
     base_rate=1125.0,
     set_up=lambda divider, low_pass: {
-        ODR_ALIGN_EN: 1,  # both sensors sample at the same time
-        GYRO_SMPLRT_DIV: divider,
-        ACCEL_SMPLRT_DIV_1: 0,
-        ACCEL_SMPLRT_DIV_2: divider,
-        GYRO_CONFIG_1: USE_FILTER | ICM_SELECT_2000_DPS | low_pass << 3,
-        GYRO_CONFIG_2: 0,
-        ICM_ACCEL_CONFIG: USE_FILTER | ICM_SELECT_16_G | low_pass << 3,
-        ICM_ACCEL_CONFIG_2: 0,
-        FIFO_MODE: 0,  # the newest samples replace the oldest
-        FIFO_EN_2: 0x1E,  # accelerometer, gyroscope z, y, x
-        ICM_USER_CTRL: 0x40,  # FIFO_EN
+        0x209: 1,  # ODR_ALIGN_EN: both sensors sample at the same time
+        0x200: divider,  # GYRO_SMPLRT_DIV
+        0x210: 0,  # ACCEL_SMPLRT_DIV_1
+        0x211: divider,  # ACCEL_SMPLRT_DIV_2
+        0x201: 0x07 | low_pass << 3,  # GYRO_CONFIG_1: filter, 2000 deg/s
+        0x202: 0,  # GYRO_CONFIG_2
+        0x214: 0x07 | low_pass << 3,  # ACCEL_CONFIG: filter, 16 g
+        0x215: 0,  # ACCEL_CONFIG_2
+        0x069: 0,  # FIFO_MODE: the newest samples replace the oldest
+        0x067: 0x1E,  # FIFO_EN_2: accelerometer, gyroscope z, y, x
+        0x003: 0x40,  # USER_CTRL: FIFO_EN
     },
-    emptied=((FIFO_RST, 0x1F), (FIFO_RST, 0x00)),
-    tested={GYRO_SMPLRT_DIV: 0, ACCEL_SMPLRT_DIV_2: 0, GYRO_CONFIG_1: 0x11, ICM_ACCEL_CONFIG: 0x11},  # filter 2, 2 g
-    off={GYRO_CONFIG_2: 0, ICM_ACCEL_CONFIG_2: 0},
-    on={GYRO_CONFIG_2: GYROSCOPE_ACTUATORS, ICM_ACCEL_CONFIG_2: ACCELEROMETER_ACTUATORS},
-    factory=(0x102, 0x10E),
+    emptied=((0x068, 0x1F), (0x068, 0x00)),  # FIFO_RST
+    tested={0x200: 0, 0x211: 0, 0x201: 0x11, 0x214: 0x11},  # filter 2, 250 deg/s, 2 g
+    off={0x202: 0, 0x215: 0},
+    on={0x202: 0x38, 0x215: 0x1C},
+    firsts=(0x102, 0x10E),
 )
 
 
@@ -138,6 +144,13 @@ class InvenSense(FifoSource):
         self._empty_fifo()
         return rate
 
+    def _test(self, response: Sequence[float]) -> None:
+        factory = self.map.factory(self._registers, self.map.firsts)
+        for axis, (value, expected) in enumerate(zip(response, factory, strict=True)):
+            low, high = self.map.shares[axis // 3]
+            limits = sorted((low * expected, high * expected)) if expected else self.map.without[axis // 3]
+            self._judge(axis, value if expected else abs(value), limits, "LSB")
+
     def _empty_fifo(self) -> None:
         for register, value in self.map.emptied:
             self._registers.write(register, value)
@@ -154,22 +167,6 @@ class InvenSense(FifoSource):
             for sample in samples
         ]
 
-    def _test(self, response: Sequence[float]) -> None:
-        """Judge a chip since the MPU-6500, angular velocity first.
-
-        A response, at 250 deg/s (131 LSB each) and 2 g, must be over half the factory's, an accelerometer's at most 1.5
-        times. Without one it must be at least 60 deg/s, and 225 to 675 mg (16.384 LSB each), of either sign.
-        """
-        for sensor, values, register, shares, without in (
-            ("gyroscope", response[:3], self.map.factory[0], (0.5, math.inf), (60.0 * 131.0, math.inf)),
-            ("accelerometer", response[3:], self.map.factory[1], (0.5, 1.5), (225.0 * 16.384, 675.0 * 16.384)),
-        ):
-            codes = self._registers.read_block(register, 3)
-            low, high = (2620.0 * share for share in shares)
-            limits = [(low * 1.01 ** (code - 1), high * 1.01 ** (code - 1)) if code else without for code in codes]
-            judged = [value if code else abs(value) for value, code in zip(values, codes, strict=True)]
-            self._judge(sensor, judged, limits, "LSB")
-
 
 class Mpu6050(InvenSense):
     """An MPU-6050 or one of its successors."""
@@ -182,14 +179,6 @@ class Mpu6050(InvenSense):
             self.map, self.capacity, self.thermometer = MPU_6050, 1024, (340.0, 36.53)
         return super()._set_up(rate, self_test)
 
-    def _test(self, response: Sequence[float]) -> None:
-        if self.chip != "MPU-6050":
-            super()._test(response)
-            return
-        limits = _limits_6050(self._registers.read_block(MPU_6050.factory[0], 4))
-        self._judge("gyroscope", response[:3], limits[:3], "LSB")
-        self._judge("accelerometer", response[3:], limits[3:], "LSB")
-
 
 class Icm20948(InvenSense):
     """An ICM-20948, whose registers lie in four banks. Its magnetometer is not used."""
@@ -201,20 +190,3 @@ class Icm20948(InvenSense):
         """Set up the chip; see `FifoSource`."""
         registers.is_banked = True
         super().__init__(registers, *arguments, **options)
-
-
-def _limits_6050(codes: bytes) -> list[tuple[float, float]]:
-    """Return the limits of the responses, gyroscope first, in LSB at 250 deg/s and 8 g.
-
-    They lie 14 % (PS-MPU-6000A 6.1) about the factory's response (RM-MPU-6000A 4.1); a chip without one has no limits.
-    """
-    gyroscope, accelerometer = [], []
-    for axis, sign in enumerate((1.0, -1.0, 1.0)):
-        code = codes[axis] & 0x1F
-        gyroscope.append(sign * 25.0 * 131.0 * 1.046 ** (code - 1) if code else math.inf)
-        code = codes[axis] >> 5 << 2 | codes[3] >> (4 - 2 * axis) & 3
-        accelerometer.append(4096.0 * 0.34 * (0.92 / 0.34) ** ((code - 1) / 30.0) if code else math.inf)
-    return [
-        (factory - 0.14 * abs(factory), factory + 0.14 * abs(factory)) if factory < math.inf else (-math.inf, math.inf)
-        for factory in gyroscope + accelerometer
-    ]

@@ -30,7 +30,7 @@ GYROSCOPE, ACCELEROMETER = 1, 2  # tags
 RADIANS_PER_LSB = 0.070 * RADIANS_PER_DEGREE  # at 2000 deg/s
 ACCELERATION_PER_LSB = 0.488e-3 * STANDARD_GRAVITY  # at 16 g
 # In the self-test, at 4 g and 2000 deg/s: what an LSB is, and the limits.
-RESPONSES = {"accelerometer": (0.122, (50.0, 1700.0), "mg"), "gyroscope": (0.070, (150.0, 700.0), "deg/s")}
+RESPONSES = (0.070, (150.0, 700.0), "deg/s"), (0.122, (50.0, 1700.0), "mg")  # gyroscope, accelerometer
 
 
 class Lsm6dsox(FifoSource):
@@ -51,8 +51,8 @@ class Lsm6dsox(FifoSource):
             raise DeviceError(self._registers.name, "does not finish its reset", CTRL3_C)
         self._registers.set({CTRL9_XL: NO_I3C, CTRL3_C: WHOLE_SAMPLES})
         if self_test:
-            self._test("accelerometer", CTRL1_XL, SELECT_4_G, 52.0, OUTX_L_A, 0x01)
-            self._test("gyroscope", CTRL2_G, SELECT_2000_DPS, 208.0, OUTX_L_G, 0x04)
+            self._test(1, CTRL1_XL, SELECT_4_G, 52.0, OUTX_L_A, 0x01)
+            self._test(0, CTRL2_G, SELECT_2000_DPS, 208.0, OUTX_L_G, 0x04)
         rate = min(RATES, key=lambda candidate: abs(candidate - rate))
         code = RATES[rate]
         rates = {FIFO_CTRL3: code << 4 | code, CTRL1_XL: code << 4 | SELECT_16_G, CTRL2_G: code << 4 | SELECT_2000_DPS}
@@ -60,14 +60,15 @@ class Lsm6dsox(FifoSource):
         self._empty_fifo()
         return rate
 
-    def _test(self, sensor: str, control: int, scale: int, rate: float, data: int, actuators: int) -> None:
+    def _test(self, sensor: int, control: int, scale: int, rate: float, data: int, actuators: int) -> None:
         """Compare means of 5 samples with the actuators off and on, as the manufacturer's example does."""
         self._registers.set({control: RATES[rate] << 4 | scale})
         # The chip's clock may be slow.
         response = self._responses({CTRL5_C: 0}, {CTRL5_C: actuators}, [data], 5, 1.1 / rate)
         self._registers.set({CTRL5_C: 0, control: OFF})
         lsb, limits, unit = RESPONSES[sensor]
-        self._judge(sensor, [abs(lsb * value) for value in response], [limits] * 3, unit)
+        for axis, value in enumerate(response):
+            self._judge(3 * sensor + axis, abs(lsb * value), limits, unit)
 
     def _empty_fifo(self) -> None:
         self._half = None
