@@ -49,6 +49,7 @@ class SerialSource(ImuSource):
 
     HEADER: ClassVar[bytes]
     LENGTH: ClassVar[int]  # bytes of a packet
+    SUMMED: ClassVar[int]  # the first byte that counts into the sum in its last one
 
     def __init__(self, device: str, port: str, baud: int, rate: float, clock: Clock) -> None:
         """Open `port`. Raises DeviceError, and ParameterError without pyserial."""
@@ -98,8 +99,8 @@ class SerialSource(ImuSource):
         return packets
 
     def _is_whole(self, packet: bytes) -> bool:
-        """Return whether the packet's sum is right."""
-        raise NotImplementedError
+        """Return whether the sum of the packet's content is right."""
+        return sum(packet[self.SUMMED : -1]) & 0xFF == packet[-1]
 
     def _decode(self, packet: bytes) -> Measurement | None:
         """Return the measurement that a packet completes."""
@@ -109,7 +110,7 @@ class SerialSource(ImuSource):
 class WitMotion(SerialSource):
     """A WitMotion sensor. A sample is complete with its orientation: a quaternion, or angles if it sends none."""
 
-    HEADER, LENGTH = b"\x55", 11
+    HEADER, LENGTH, SUMMED = b"\x55", 11, 0
 
     def __init__(self, port: str, baud: int, rate: float, clock: Clock) -> None:
         """Open the port and set the sensor's rate. Raises DeviceError, ParameterError."""
@@ -129,7 +130,7 @@ class WitMotion(SerialSource):
             raise DeviceError(self.name, f"cannot be written: {error}") from None
 
     def _is_whole(self, packet: bytes) -> bool:
-        return 0x50 <= packet[1] <= 0x5F and sum(packet[:10]) & 0xFF == packet[10]
+        return 0x50 <= packet[1] <= 0x5F and super()._is_whole(packet)
 
     def _decode(self, packet: bytes) -> Measurement | None:
         kind, numbers = packet[1], struct.unpack_from("<4h", packet, 2)
@@ -175,15 +176,12 @@ def _axes(numbers: Numbers, scale: float) -> Axes:
 class Bno085(SerialSource):
     """A BNO085 with PS0 high and PS1 low, which selects UART-RVC."""
 
-    HEADER, LENGTH = b"\xaa\xaa", 19
+    HEADER, LENGTH, SUMMED = b"\xaa\xaa", 19, 2
 
     def __init__(self, port: str, baud: int, clock: Clock) -> None:
         """Open the port. Raises DeviceError, ParameterError."""
         super().__init__("BNO085", port, baud, RVC_RATE, clock)
         self._counter: int | None = None
-
-    def _is_whole(self, packet: bytes) -> bool:
-        return sum(packet[2:18]) & 0xFF == packet[18]
 
     def _decode(self, packet: bytes) -> Measurement:
         counter, yaw, pitch, roll, x, y, z = struct.unpack_from("<B6h", packet, 2)

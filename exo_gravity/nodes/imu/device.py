@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import Imu
 
-from exo_gravity.core.trunk.imu_sample import ImuSample
+from exo_gravity.core.trunk.imu_checks import ImuSample
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.imu_sources import Reopening, open_source
 from exo_gravity.nodes.ros.subscriptions import Callback
