@@ -18,6 +18,7 @@ import struct
 import tempfile
 from collections.abc import Callable, Generator, Iterator
 from io import BytesIO
+from itertools import chain
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 
@@ -69,9 +70,10 @@ class Storage:
             yield from self._by_rosbags(wanted)
             return
         for file in self.files:
-            yield from self._mcap(file, wanted) if file.suffix == ".mcap" else self._sqlite(file, wanted)
+            parts = self._mcap(file, wanted) if file.suffix == ".mcap" else (self._sqlite(file, wanted),)
+            yield from chain.from_iterable(parts)
 
-    def _mcap(self, file: Path, wanted: Wanted) -> Iterator[Message]:
+    def _mcap(self, file: Path, wanted: Wanted) -> Iterator[list[Message]]:
         with file.open("rb") as stream:
             if stream.read(len(MAGIC)) != MAGIC:
                 raise DataError(f"{file}: not an MCAP file, or empty")
@@ -84,46 +86,47 @@ class Storage:
 
     def _records(
         self, data: bytes | mmap, at: int, wanted: Wanted, schemas: dict[int, Schema], chosen: dict[int, Topic]
-    ) -> Generator[Message, None, bool]:
+    ) -> Generator[list[Message], None, bool]:
         """Yield the messages among the records from `at` on, also those in chunks; return whether all data were read.
 
         schemas: read so far. chosen: the wanted topics by channel. Raises an error at a cut or damage.
         """
+        found: list[Message] = []
         end = len(data)
-        while at < end:
-            if data[at] == MESSAGE_OPCODE:
+        while at + RECORD.size <= end:
+            if data[at] == MESSAGE_OPCODE and at + MESSAGE.size <= end:
                 _, length, number, _, stamp, _ = MESSAGE.unpack_from(data, at)
                 start, at = at + MESSAGE.size, at + RECORD.size + length
-                if at > end:
-                    raise EOFError
-                if number in chosen:
-                    yield *chosen[number], stamp, data[start:at]
+                if number in chosen and at <= end:
+                    found.append((*chosen[number], stamp, data[start:at]))
                 continue
             opcode, length = RECORD.unpack_from(data, at)
             at += RECORD.size + length
             body = ReadDataStream(BytesIO(data[at - length : at]))
+            yield found
+            found = []
             if opcode == Opcode.CHUNK:
                 chunk, size = get_chunk_data_stream(Chunk.read(body))
                 yield from self._records(chunk.read(size), 0, wanted, schemas, chosen)
-            if at > end:
-                raise EOFError
-            if opcode == Opcode.SCHEMA:
-                schema = Schema.read(body)
-                schemas[schema.id] = schema
+            elif at > end:
+                break
+            elif opcode == Opcode.SCHEMA:
+                described = Schema.read(body)
+                schemas[described.id] = described
             elif opcode == Opcode.CHANNEL:
                 channel = Channel.read(body)
-                topic = self._announce(channel, schemas.get(channel.schema_id))
-                if wanted(*topic):
-                    chosen[channel.id] = topic
+                schema = schemas.get(channel.schema_id)
+                msgtype, definition = (schema.name, schema.data.decode(errors="replace")) if schema else ("", "")
+                self.topics[channel.topic] = msgtype
+                self.announced[channel.topic] = definition, channel.metadata.get("offered_qos_profiles", "")
+                if wanted(channel.topic, msgtype):
+                    chosen[channel.id] = channel.topic, msgtype
             elif opcode == Opcode.DATA_END:
                 return True
+        yield found
+        if at != end:
+            raise EOFError
         return False
-
-    def _announce(self, channel: Channel, schema: Schema | None) -> Topic:
-        msgtype, definition = (schema.name, schema.data.decode(errors="replace")) if schema else ("", "")
-        self.topics[channel.topic] = msgtype
-        self.announced[channel.topic] = definition, channel.metadata.get("offered_qos_profiles", "")
-        return channel.topic, msgtype
 
     def _sqlite(self, file: Path, wanted: Wanted) -> Iterator[Message]:
         try:
