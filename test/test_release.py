@@ -22,7 +22,7 @@ ROSDEP = {
     "serial": "python3-serial",
     "yaml": "python3-yaml",
 }
-# Needed although no module imports them: by a lifecycle node's services, by python-can's udp_multicast, by the launch files.
+# Needed although no module imports them: by a lifecycle node's services, python-can's udp_multicast, the launch files.
 INDIRECT = {"lifecycle_msgs", "python3-msgpack", "robot_state_publisher", "ros2launch", "rviz2"}
 PYTEST_TIMEOUT = "python3-pytest-timeout"
 # From PyPI alone, by an extra of setup.py; a tool that misses one names it.

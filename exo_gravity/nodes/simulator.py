@@ -21,7 +21,7 @@ from std_msgs.msg import String
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS
 from exo_gravity.core.trial.script import Step, TrialScript
-from exo_gravity.core.trunk.imu_sample import ImuSample
+from exo_gravity.core.trunk.imu_checks import ImuSample
 from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.nodes.imu.device import message_of
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics

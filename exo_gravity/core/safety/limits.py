@@ -39,7 +39,7 @@ GUIDE_BRAKE = 1.5  # Nm
 MAX_TEMPERATURE = 80.0  # degC, an assumption: a motor whose own protection switches it off would drop the arm
 DERATING = 10.0  # degC below MAX_TEMPERATURE over which the permitted torque falls to half
 MAX_VELOCITY = (5.0, 5.0, 5.0, 6.0)  # rad/s; a reach stays below, a throw does not
-REPLY_TIMEOUT = 0.05  # s, and MISSED cycles (readings.py) at least; an ordinary computer is late by 0.02 s
+REPLY_TIMEOUT = 0.05  # s, and MISSED cycles (monitors.py) at least; an ordinary computer is late by 0.02 s
 JUMP = 0.05  # rad that two readings may differ by in addition to what MAX_VELOCITY allows
 # rad from the hanging arm at the first start. The zero of a motor with a single encoder may be off by whole turns of
 # the rotor (60 degrees of an AK60-6's output, 40 of an AK80-9's): less than half of that shows it.

@@ -9,7 +9,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import MAX_STATUS_RATE, MOTOR_PARAMETERS, REPLY_SHARE, JointMotor
 from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, params_of
 from exo_gravity.core.safety.limits import HOME_TOLERANCE, REPLY_TIMEOUT, Limits
-from exo_gravity.core.safety.readings import MISSED
+from exo_gravity.core.safety.monitors import MISSED
 
 FROZEN = 0.08  # s without a drive from the control loop while the watchdog itself runs, after which it takes over
 PERIODS = 2  # control periods that must fit into each time-out, so that one late cycle is not a fault
