@@ -91,12 +91,8 @@ class Page:
 class Control:
     """The pages, which of them holds control, and what is done for them.
 
-    arms: has their `names`; a coroutine function `ask(kind, arm, values)` for each request with the key "arm";
-    `lease(page, kind)`, which sends a page's request for control to all arms, and `other_holder(arm, page)`, the name
-    of who else holds control of an arm. files: has the names of the `trials` and a coroutine function for each other
-    request, of which `trial` takes a name. Each returns '' or why it failed. `arms.parameters()`, those in force by
-    node, and `files.report(name)`, the path of a trial's report or None, are for the server. note: called with a
-    sentence for the log and the recording. clock: monotonic s.
+    arms: `Arms` of nodes/panel/node.py. files: `Recordings`. note: called with a sentence for the log and the
+    recording. clock: monotonic s.
     """
 
     def __init__(self, arms: Any, files: Any, note: Callable[[str], object], clock: Callable[[], float]) -> None:

@@ -32,7 +32,7 @@ def limits_of(values: Mapping[str, Any]) -> Limits:
     """Return the limits that `can_bridge`'s parameter values describe, or raise ParameterError."""
     given = {param.name: values[param.name] for param in LIMIT_PARAMETERS}
     given["home_tolerance"] = tuple(HOME_TOLERANCE[name] for name in values["motor"])
-    given["reply_timeout"] = max(REPLY_TIMEOUT, MISSED / values["rate"])
+    given["reply_timeout"] = min(2.0 * REPLY_TIMEOUT, max(REPLY_TIMEOUT, MISSED / values["rate"]))
     return Limits(tuple(values["joint_names"]), **given)
 
 

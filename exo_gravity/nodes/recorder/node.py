@@ -127,15 +127,14 @@ class Recorder(Node):
             counts = {"messages": self._writer.count, "lost": sum(self._losses())}
             self._guarded("live state", self._live.write, counts)
 
-    def _guarded(self, name: str, function: Callable[..., Any], *args: Any) -> Any:
-        """Return the function's result; None after an exception, which is logged once for each `name`."""
+    def _guarded(self, name: str, function: Callable[..., object], *args: Any) -> None:
+        """Call the function; an exception is logged, once for each `name`."""
         try:
-            return function(*args)
+            function(*args)
         except Exception as error:
             if name not in self._failed:
                 self._failed.add(name)
                 self.get_logger().error(f"{name}: {type(error).__name__}: {error}; the rest is recorded")
-            return None
 
     def _losses(self) -> tuple[int, int]:
         """Return how many messages of joints and IMU did not arrive, and how many were not written."""

@@ -70,22 +70,17 @@ class RobotModel(Node):
         for arm in self._arms.values():
             for parameters in arm.parameters:
                 parameters.update()
-        self._describe()
+        known = {arm: arm.description for _, arm in sorted(self._arms.items()) if arm.description}
+        if known != self._described:
+            self._described, self._problem = known, ""
+            try:
+                self._description.publish(String(data=urdf(list(known.values()), self._meshes)))
+            except ParameterError as error:
+                self._problem = str(error)
         problems = [self._problem, *(arm.problem for arm in self._arms.values())]
         problem = next(filter(None, problems), "" if self._arms else "waiting for a compensator")
         level, message = (WARN, problem) if problem else (OK, f"publishing {', '.join(sorted(self._arms))}")
         self._diagnostics.report(level, message, {"arms": len(self._arms), "shown": len(self._views)})
-
-    def _describe(self) -> None:
-        """Publish the description if what is known of the arms has changed."""
-        known = {arm: arm.description for _, arm in sorted(self._arms.items()) if arm.description}
-        if known == self._described:
-            return
-        self._described, self._problem = known, ""
-        try:
-            self._description.publish(String(data=urdf(list(known.values()), self._meshes)))
-        except ParameterError as error:
-            self._problem = str(error)
 
     def _publish_states(self) -> None:
         names = dict(zip(self._described, joint_names(list(self._described.values())), strict=True))
