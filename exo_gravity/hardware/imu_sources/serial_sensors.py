@@ -21,8 +21,8 @@ from typing import ClassVar
 
 from exo_gravity.core.errors import DeviceError, ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.rotation import Quaternion, product
-from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Axes, Clock, ImuSource, Measurement
+from exo_gravity.core.model.rotation import ZERO, Quaternion, plus, product
+from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Clock, ImuSource, Measurement
 
 ACCELERATION, ANGULAR_VELOCITY, ANGLES, QUATERNION = 0x51, 0x52, 0x53, 0x59
 UNLOCK = b"\xff\xaa\x69\x88\xb5"
@@ -150,27 +150,15 @@ class WitMotion(SerialSource):
             self._skipped += 1
             return None
         skipped, self._skipped = self._skipped, 0
-        return Measurement(
-            _axes(parts[ANGULAR_VELOCITY], RATE_PER_LSB),
-            _axes(parts[ACCELERATION], WITMOTION_ACCELERATION),
-            _orientation(parts),
-            skipped,
-        )
-
-
-def _orientation(parts: dict[int, Numbers]) -> Quaternion | None:
-    if QUATERNION in parts:
-        w, x, y, z = (number / 32768 for number in parts[QUATERNION])
-        return x, y, z, w
-    if ANGLES in parts:
-        roll, pitch, yaw, _ = (number * WITMOTION_ANGLE for number in parts[ANGLES])
-        return from_angles(("z", yaw), ("y", pitch), ("x", roll))
-    return None
-
-
-def _axes(numbers: Numbers, scale: float) -> Axes:
-    x, y, z, _ = numbers
-    return x * scale, y * scale, z * scale
+        orientation: Quaternion | None = None
+        if QUATERNION in parts:
+            w, x, y, z = (number / 32768 for number in parts[QUATERNION])
+            orientation = x, y, z, w
+        elif ANGLES in parts:
+            roll, pitch, yaw, _ = (number * WITMOTION_ANGLE for number in parts[ANGLES])
+            orientation = from_angles(("z", yaw), ("y", pitch), ("x", roll))
+        rate = plus(ZERO, parts[ANGULAR_VELOCITY][:3], RATE_PER_LSB)
+        return Measurement(rate, plus(ZERO, parts[ACCELERATION][:3], WITMOTION_ACCELERATION), orientation, skipped)
 
 
 class Bno085(SerialSource):
@@ -188,8 +176,7 @@ class Bno085(SerialSource):
         skipped = 0 if self._counter is None else (counter - self._counter - 1) & 0xFF
         self._counter = counter
         orientation = from_angles(("z", yaw * RVC_ANGLE), ("x", pitch * RVC_ANGLE), ("y", roll * RVC_ANGLE))
-        acceleration = (x * RVC_ACCELERATION, y * RVC_ACCELERATION, z * RVC_ACCELERATION)
-        return Measurement(None, acceleration, orientation, skipped)
+        return Measurement(None, plus(ZERO, (x, y, z), RVC_ACCELERATION), orientation, skipped)
 
 
 def from_angles(*turns: tuple[str, float]) -> Quaternion:

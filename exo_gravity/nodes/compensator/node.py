@@ -75,7 +75,7 @@ class CompensatorNode(Node):
         self._sources = {topic: self._source}  # of what the torque depends on
         self._threads.append(HotPath(self, JointState, topic, self._on_joint_states, NEWEST))
         if values["use_imu"]:
-            tilt = TiltSubscription(self, self._control, self._lock, self._refused, self._on_motion)
+            tilt = TiltSubscription(self, self._control.tilt, self._lock, self._refused, self._on_motion)
             self._sources |= tilt.senders
         accept_changes(self, table, read, self._apply)
         # Only the executor's thread reports: diagnostics and budget are not for two threads.
@@ -147,7 +147,7 @@ class CompensatorNode(Node):
             "limits acting": ", ".join(f"max_effort ({self._names[joint]})" for joint in answer.clamped) or "none",
             "rate (Hz)": row([self._rate.update(now, self._answers)], 1),
             "age of joint states (ms)": milliseconds(now - self._last_answer),
-            "age of tilt (ms)": milliseconds(self._control.tilt_age(now)),
+            "age of tilt (ms)": milliseconds(self._control.tilt.age(now)),
             "answers": self._answers,
             "rides": self._rides,
             "joint states missed": self._source.missed,
