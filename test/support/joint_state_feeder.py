@@ -11,7 +11,7 @@ from exo_gravity.nodes.ros.messages import to_time
 
 PARTS = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
 POSE = (0.2, 0.9, 0.7, 0.6)  # rad
-PERIOD = 0.01  # s
+PERIOD = 0.02  # s
 
 
 class JointStateFeeder:
