@@ -78,11 +78,8 @@ def test_an_arm_whose_bus_was_cut_is_let_down_by_its_motors_that_kept_their_powe
     assert arm.rig.top_speed < CAUSED_SPEED
 
 
-@FORMATS
-def test_a_single_motor_that_restarts_is_switched_on_again_and_let_down_with_the_others(
-    wire_format: WireFormat,
-) -> None:
-    arm = Carried(wire_format=wire_format)
+def test_a_single_motor_that_restarts_is_switched_on_again_and_let_down_with_the_others() -> None:
+    arm = Carried()
     motor = arm.rig.device.motors[2]
     motor.unplugged = True
     arm.run(0.1)

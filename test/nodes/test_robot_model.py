@@ -54,7 +54,7 @@ class Viewer:
         self.node.create_subscription(MarkerArray, "/robot_model/markers", self._on_markers, 1)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self.sides = set(READINGS)
-        self.node.create_timer(0.02, self._send)
+        self.node.create_timer(0.05, self._send)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
         self._closing = threading.Event()
@@ -112,7 +112,7 @@ def nodes(folder):
     """Both arms without simulators; the bridges stay inactive, so that the only joint states are those of the test."""
     content = yaml.safe_load((CONFIG / "sim_both.yaml").read_text(encoding="utf-8"))
     base = folder / "both.yaml"
-    content["/robot_model"] = {"ros__parameters": {"rate": 50.0}}
+    content["/robot_model"] = {"ros__parameters": {"rate": 20.0}}
     content["/recorder"] = {"ros__parameters": {"output": str(folder / "bag")}}
     base.write_text(yaml.safe_dump(content), encoding="utf-8")
     nodes = LaunchedNodes(folder, base=base, without=("simulator", "imu"), can_bridge={"autostart": False}).start()

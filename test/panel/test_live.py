@@ -66,10 +66,10 @@ def panel_diagnostics(bag: Path) -> list[str]:
 
 
 @pytest.fixture
-def clinic(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Clinic]:
-    """The right arm, carried, and the open page. Its parameter, if any: the panel's parameters."""
+def clinic(tmp_path: Path) -> Iterator[Clinic]:
+    """The right arm, carried, and the open page."""
     nodes = LaunchedNodes(tmp_path, compensator={"wearer": {"body_mass": 60.0}, "support": 0.0})
-    url = with_panel(nodes, **getattr(request, "param", {}))
+    url = with_panel(nodes)
     nodes.start()
     probe = RosProbe()
     try:

@@ -10,7 +10,7 @@ from sensor_msgs.msg import JointState
 
 PARTS = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
 POSE = (0.2, 0.9, 0.7, 0.6)  # rad
-PERIOD = 0.01  # s
+PERIOD = 0.02  # s
 
 
 class JointStateFeeder:

@@ -62,7 +62,7 @@ class TourRun:
     truth: ArmConfig = field(default_factory=ArmConfig)
     assumed: ArmModel = DEFAULT_LINKS
     motors: Sequence[JointMotor] = MOTORS_AS_MOUNTED
-    limits: Limits = field(default_factory=lambda: Limits(NAMES))
+    limits: Limits = field(default_factory=lambda: Limits(NAMES, sign_check_torque=0.0))
     tilt: tuple[float, float] = (0.1, -0.06)
     rate: float = 100.0
     load: tuple[float, float] = (0.0, 0.0)
