@@ -94,7 +94,7 @@ def _run(options: argparse.Namespace) -> int:
         if path is not None and not path.exists():
             raise ParameterError("bag", str(path), "a recording that exists")
     person = Person()
-    options.wait, options.ask = person.wait, person.ask
+    options.wait = person.wait
     arm = None if command == "imu" else configured_arm(options.params, options.side)
     if bag is None and command != "motors":
         require_ros("calibrate")

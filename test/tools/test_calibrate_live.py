@@ -44,7 +44,7 @@ def test_the_motors_are_watched_until_enter_is_pressed(keys: tuple[IO[str], IO[s
 def test_a_program_without_a_person_ends_with_the_reason(keys: tuple[IO[str], IO[str]]) -> None:
     keys[1].close()
     with pytest.raises(DataError, match="standard input has ended"):
-        Person(Console(file=io.StringIO()), keys[0]).ask("bow")
+        Person(Console(file=io.StringIO()), keys[0]).wait("bow")
 
 
 def test_lines_are_printed_as_they_are(keys: tuple[IO[str], IO[str]]) -> None:

@@ -94,7 +94,7 @@ class Mounting(NamedTuple):
 def calibrate_imu(options: argparse.Namespace, arm: ConfiguredArm | None, say: Say) -> CalibrationResult:
     """Calibrate the IMU of the file options.params from options.bag, or live.
 
-    options.rests: a recording of six rests, None for none. options.ask: waits for the person. Raises DataError.
+    options.rests: a recording of six rests, None for none. options.wait: waits for the person. Raises DataError.
     """
     topic = node_values(load(options.params), NODE, IMU)["input_topic"]
     found = mounting(read_imu(options.bag or _record(options, say), topic))
@@ -135,7 +135,7 @@ def _record(options: argparse.Namespace, say: Say) -> Path:
         launcher = Launcher(params, lambda node, line: None)
         launcher.start()
         try:
-            options.ask(REQUEST)
+            options.wait(REQUEST)
         finally:
             launcher.stop()
     say(f"Recorded: {bag}")

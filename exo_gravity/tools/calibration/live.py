@@ -50,12 +50,11 @@ class Person:
         """Print a line or a table."""
         self._console.print(what, markup=False, soft_wrap=isinstance(what, str))
 
-    def ask(self, request: str) -> None:
-        """Print `request` and wait for Enter. Raises DataError if standard input has ended."""
-        self.wait(request, lambda: "")
+    def wait(self, request: str, watch: Callable[[], RenderableType] = str) -> None:
+        """Print `request`, and show what `watch()` returns until Enter is pressed.
 
-    def wait(self, request: str, watch: Callable[[], RenderableType]) -> None:
-        """Print `request`, and show what `watch()` returns until Enter is pressed. Raises DataError as `ask` does."""
+        Raises DataError if standard input has ended.
+        """
         self._console.print(Text(f"{request}; then press Enter", style="bold"))
         with Live(console=self._console, auto_refresh=False, transient=True) as live:
             while not select.select([self._keys], [], [], REFRESH_PERIOD)[0]:

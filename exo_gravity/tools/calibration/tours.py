@@ -67,7 +67,7 @@ def _observations(
         return observations_of(options.bag, arm, with_held="tour.friction" not in changes)
     nodes = tour_parameters(options.params, arm, changes, moments)
     if request and f"{arm.namespace}/simulator" not in nodes:
-        options.ask(request)
+        options.wait(request)
     return live.run_tour(options, nodes, say).complete(options.record)
 
 
