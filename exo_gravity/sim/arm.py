@@ -139,7 +139,7 @@ class SimulatedArm:
         self._coulomb, self._stribeck, self._speed = map(
             np.array, (self.config.coulomb_friction, self.config.stribeck_friction, self.config.stribeck_speed)
         )
-        self.set_gravity((0.0, 0.0, 1.0))
+        self.move_base((0.0, 0.0, self.config.links.gravity))
         self.reset((0.0,) * JOINT_COUNT)
 
     @property
@@ -157,10 +157,6 @@ class SimulatedArm:
         mujoco.mj_resetData(self.model, self.data)
         self._theta[:] = four_floats("theta", theta, -math.pi, math.pi, "rad")
         mujoco.mj_forward(self.model, self.data)
-
-    def set_gravity(self, direction: Sequence[float]) -> None:
-        """Set the direction of gravity on a base at rest: (3,) unit vector in its frame, as in `Tilt.direction`."""
-        self.move_base([self.config.links.gravity * component for component in direction])
 
     def move_base(
         self,

@@ -86,7 +86,6 @@ def _run(options: argparse.Namespace) -> int:
     except (ExoGravityError, OSError) as error:
         print(f"report: {error}", file=sys.stderr)
         return 2
-    console = trial_report.report_console()
-    trial_report.print_report(report, console)
-    console.print(f"Written: {', '.join(path.name for path in written)} in {written[0].parent}", soft_wrap=True)
+    trial_report.print_report(report)
+    print(f"Written: {', '.join(path.name for path in written)} in {written[0].parent}")
     return report.exit_code

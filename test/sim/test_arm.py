@@ -8,6 +8,7 @@ import pytest
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.sim import STEP, ArmConfig, SimulatedArm
 
 from ..support.random_device import off_axis_of
@@ -36,7 +37,7 @@ def test_the_static_torque_agrees_with_the_exact_law_in_any_pose_and_tilt(side):
         arm = SimulatedArm(ArmConfig(links))
         direction = Tilt.of(side, *random.uniform(-np.pi, np.pi, 2)).direction
         theta = random.uniform(-np.pi, np.pi, 4)
-        arm.set_gravity(direction)
+        arm.move_base(np.multiply(STANDARD_GRAVITY, direction))
         arm.reset(theta)
         np.testing.assert_allclose(arm.data.qfrc_bias, gravity_torque(links, theta, direction), atol=1e-12)
 
@@ -56,7 +57,7 @@ def test_centres_of_gravity_beside_the_links_add_the_torques_of_their_moments():
         cog_y, cog_z = rng.uniform(-0.015, 0.015, (2, 4))
         arm = SimulatedArm(ArmConfig(links, cog_y=cog_y, cog_z=cog_z))
         theta, direction = rng.uniform(-3.0, 3.0, 4), Tilt.of("right", *rng.uniform(-1.0, 1.0, 2)).direction
-        arm.set_gravity(direction)
+        arm.move_base(np.multiply(STANDARD_GRAVITY, direction))
         arm.reset(theta)
         expected = ArmModel(links.length, links.cog, links.mass, off_axis=off_axis_of(links.mass, cog_y, cog_z))
         np.testing.assert_allclose(arm.data.qfrc_bias, gravity_torque(expected, theta, direction), atol=1e-12)
@@ -68,7 +69,7 @@ def test_stribeck_friction_holds_at_standstill_and_is_gone_in_motion():
     arms = SimulatedArm(ArmConfig(**config)), SimulatedArm(ArmConfig(**config))
     for arm, speed in zip(arms, (0.0, 0.5), strict=True):
         arm.reset(RAISED)
-        arm.set_gravity((0.0, 0.0, 0.0))
+        arm.move_base((0.0, 0.0, 0.0))
         arm.data.qvel[3] = speed
         simulate(arm, push, 0.2)
     assert moved(arms[0], RAISED) < 0.01
@@ -139,7 +140,7 @@ def test_joint_stops_hold_against_the_motors_peak_torque(joint, side):
     stop = getattr(arm.config, side)[joint]
     theta = np.clip(np.zeros(4), arm.config.position_min, arm.config.position_max)
     theta[joint] = stop
-    arm.set_gravity((0.0, 0.0, 0.0))
+    arm.move_base((0.0, 0.0, 0.0))
     arm.reset(theta)
     torque = np.zeros(4)
     torque[joint] = (9.0, 18.0, 9.0, 9.0)[joint] * (-1 if side == "position_min" else 1)
@@ -164,7 +165,7 @@ def test_a_change_of_gravitys_direction_moves_the_arm():
     arm.reset((0.0,) * 4)
     simulate(arm, (0.0,) * 4, 0.5)
     assert moved(arm, (0.0,) * 4) < 1e-6
-    arm.set_gravity(Tilt.of("right", pitch=0.6).direction)
+    arm.move_base(np.multiply(STANDARD_GRAVITY, Tilt.of("right", pitch=0.6).direction))
     simulate(arm, (0.0,) * 4, 2.0)
     assert moved(arm, (0.0,) * 4) > 10
 

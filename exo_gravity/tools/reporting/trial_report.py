@@ -118,8 +118,8 @@ def write(report: Report, folder: str | Path) -> list[Path]:
 
 
 def print_report(report: Report, console: Console | None = None) -> None:
-    """Print the tables, the notes and the verdict."""
-    console = console or report_console()
+    """Print the tables, the notes and the verdict; in a log or a pipe, wide enough for the tables."""
+    console = console or Console(highlight=False, width=None if Console().is_terminal else 140)
     for recording, analysis in report.arms:
         table.print_tables(console, recording, analysis)
     for note in report.notes:
@@ -129,12 +129,6 @@ def print_report(report: Report, console: Console | None = None) -> None:
     for sentence in report.failures:
         console.print(f"[red]{marked(sentence)}.[/]")
     console.print("[red bold]It did not hold.[/]" if report.failures else f"[green bold]{report.held}[/]")
-
-
-def report_console() -> Console:
-    """Return a console for standard output; in a log or a pipe it is wide enough for the tables."""
-    console = Console(highlight=False)
-    return console if console.is_terminal else Console(highlight=False, width=140)
 
 
 def _page(report: Report, sections: Sequence[str]) -> str:

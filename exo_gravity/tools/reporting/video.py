@@ -31,15 +31,11 @@ NO_GRAPHICS = (
 
 
 class Clip(NamedTuple):
-    """A clip to write. speed: how many seconds of the recording one second of the clip shows."""
+    """A clip to write."""
 
     path: Path
-    speed: float = 1.0
-
-    @property
-    def frame_rate(self) -> int:
-        """Frames per second."""
-        return FRAME_RATE[self.path.suffix.lower()]
+    speed: float  #: how many seconds of the recording one second of the clip shows
+    frame_rate: int  #: frames per second
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -61,7 +57,7 @@ def requested(video: str | None, speed: float) -> Clip | None:
         raise ParameterError("video", video, f"a file that ends with {' or '.join(FRAME_RATE)}")
     if not path.absolute().parent.is_dir():
         raise ParameterError("video", video, "a file in a folder that exists")
-    clip = Clip(path, one_float("video_speed", speed, 0.1, MAX_SPEED))
+    clip = Clip(path, one_float("video_speed", speed, 0.1, MAX_SPEED), FRAME_RATE[path.suffix.lower()])
     for module in NEEDED:
         if not find_spec(module):
             raise ParameterError("video", video, f"left out: {missing(module, 'video')}")

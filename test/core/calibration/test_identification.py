@@ -10,6 +10,7 @@ import pytest
 from exo_gravity.core import ArmModel, Tilt
 from exo_gravity.core.calibration.identification import Observation, identify
 from exo_gravity.core.calibration.pose_fit import COMMON, TYPICAL_MOMENTS
+from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.model.moments import MOMENTS, load_moments, moments_of, regressor
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
 
@@ -159,7 +160,7 @@ def test_the_next_pose_tells_more_than_a_repeated_or_a_random_one():
 def held(arm, theta, moments, weight=(0.0, 0.0)):
     """Move the simulated arm slowly through the pose in both directions; return what holds it, as commanded."""
     passes = []
-    arm.set_gravity(LEANING)
+    arm.move_base(np.multiply(STANDARD_GRAVITY, LEANING))
     for way in (1.0, -1.0):
         arm.reset(theta - way * 0.1)
         guess, summed, efforts = regressor([theta], LEANING)[0] @ moments, np.zeros(4), []
