@@ -158,15 +158,15 @@ class OfflineTrial:
             return
         if arm.trunk is None:
             if arm.tilt and now - self._tilt_time >= TILT_PERIOD:
-                self.compensator.set_tilt(now, *arm.tilt)
+                self.compensator.tilt.set_tilt(now, *arm.tilt)
                 self.safety.motion.gravity = Tilt.of(arm.device.side, *arm.tilt).direction
                 self._tilt_time = now
             return
         if reading:
             age, turning = now - taken, reading.angular_velocity
-            self.compensator.set_gravity(now, reading.gravity, turning, age)
+            self.compensator.tilt.set_gravity(now, reading.gravity, turning, age)
             self.safety.motion.gravity = Tilt.of_gravity(arm.device.side, reading.gravity).direction
-            self.compensator.set_motion(now, reading.specific_force, turning, age)
+            self.compensator.motion.add(now, reading.specific_force, turning, age)
         due = cycle % arm.trunk.cycles == 0
         self._reading = (arm.trunk.measure(now, arm.device.trunk) if due else None), now
 

@@ -26,7 +26,7 @@ from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.model.kinematics import turning_torque
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.trunk.felt_motion import FeltMotion
-from exo_gravity.core.trunk.tilt_input import MAX_TURN, Tilted
+from exo_gravity.core.trunk.tilt_input import MAX_TURN, TiltInput
 
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
 JOINTS = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
@@ -49,7 +49,7 @@ State = tuple[float, Sequence[float], Sequence[float] | None]  # time in s, join
 Load = tuple[Settings | UrdfSettings, Active]  # what the compensator carries, and the terms on top of it
 
 
-class Compensator(Tilted):
+class Compensator:
     """The control law and its state: ramp, rate limit, and the change of load that is under way.
 
     names: of the joints (4,), for the outer loop's input.
@@ -59,8 +59,9 @@ class Compensator(Tilted):
         self.settings = settings
         #: what is added to gravity compensation; None if `settings` have no terms
         self.terms = Terms(names, settings.terms, settings.moving) if isinstance(settings, Settings) else None
-        super().__init__(settings.side, settings.tilt_timeout)
-        self._motion = FeltMotion()
+        #: of the trunk, or of the root link of another arm
+        self.tilt = TiltInput(settings.side, settings.tilt_timeout)
+        self.motion = FeltMotion()  #: of the trunk, used with `inertial` while the tilt is fresh
         self._nothing = (0.0,) * len(settings.max_effort)
         self._effort = self._nothing  # the last answer's,
         self._last_answer = self._ramp_start = -math.inf  # its time, and that of the first one after a break
@@ -77,15 +78,6 @@ class Compensator(Tilted):
             raise ParameterError("side", settings.side, f"{self.settings.side}, because the side cannot change")
         self._pending = settings
 
-    def set_motion(
-        self, now: float, specific_force: Sequence[float], angular_velocity: Sequence[float], age: float = 0.0
-    ) -> None:
-        """Set what the trunk's IMU measured `age` s before `now`; used with `inertial`, while the tilt is fresh.
-
-        specific_force m/s^2, angular_velocity rad/s: (3,) in the trunk's axes. Raises ParameterError.
-        """
-        self._motion.add(now - max(0.0, age), specific_force, angular_velocity)
-
     def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Answer:
         """Return the torque for joint angles `theta` (n,) rad at `now` s on a monotonic clock.
 
@@ -94,9 +86,9 @@ class Compensator(Tilted):
         count = len(self._nothing)
         if len(theta) != count or not all(-MAX_ANGLE <= angle <= MAX_ANGLE for angle in theta):
             return Answer(None, f"joint angles {list(theta)} are not {count} numbers within {MAX_ANGLE:g} rad")
-        held = self._tilt.problem(now) if self.settings.use_imu else ""
+        held = self.tilt.problem(now) if self.settings.use_imu else ""
         if held:
-            turn = self._tilt.unknown_turn(now)
+            turn = self.tilt.unknown_turn(now)
             if not turn <= MAX_TURN:
                 return Answer(None, held)
             held = f"{held}: held on, torque off by at most {turn * self._largest_torque(theta):.2f} Nm"
@@ -140,7 +132,7 @@ class Compensator(Tilted):
         if settings.law != self.settings.law:
             self._fallback, self._fallback_until = "", -math.inf
         self.settings, self._pending = settings, None
-        self._tilt.timeout = settings.tilt_timeout
+        self.tilt.timeout = settings.tilt_timeout
         if self.terms is not None and isinstance(settings, Settings):
             self.terms.apply(settings.terms, settings.moving)
 
@@ -152,8 +144,8 @@ class Compensator(Tilted):
         ways = []
         for origin in [before] if self._change.is_over else [self._origin, before]:
             change = GuidedChange(len(torque))
-            change.begin(self._torque, self._torque_of(origin, state) if origin else torque, torque)
-            ways.append((change.unexplained, origin, change))
+            start = self._torque_of(origin, state) if origin else torque
+            ways.append((change.begin(self._torque, start, torque), origin, change))
         _, self._origin, self._change = min(ways, key=operator.itemgetter(0))
 
     def _torque_of(self, load: Load, state: State) -> Torque:
@@ -181,9 +173,9 @@ class Compensator(Tilted):
 
         The tilt is that of what the trunk feels as gravity. exact: by the exact law in any case.
         """
-        tilt, felt = self._tilt.at(now), None
+        tilt, felt = self.tilt.at(now), None
         if isinstance(settings, Settings) and settings.inertial and settings.use_imu:
-            felt = self._motion.at(now, settings.shoulder_from_imu)
+            felt = self.motion.at(now, settings.shoulder_from_imu)
         if felt:
             magnitude = math.hypot(*felt.gravity) / STANDARD_GRAVITY
             tilt = Tilt.of_gravity(settings.side, felt.gravity)._replace(magnitude=magnitude)

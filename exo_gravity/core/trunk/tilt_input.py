@@ -122,24 +122,3 @@ class TiltInput:
         self._time, self._arrival, self._refusal = measured, now, ""
         if now - measured <= self.timeout:
             self._in_time = measured
-
-
-class Tilted:
-    """What the controls of all arms share: the tilt of the trunk, or of the root link of another arm."""
-
-    def __init__(self, side: str, timeout: float) -> None:
-        self._tilt = TiltInput(side, timeout)
-
-    def set_tilt(self, now: float, pitch: float, roll: float, age: float = 0.0) -> None:
-        """Set pitch and roll; see `TiltInput.set_tilt`."""
-        self._tilt.set_tilt(now, pitch, roll, age)
-
-    def set_gravity(
-        self, now: float, gravity: Sequence[float], angular_velocity: Sequence[float] = STILL, age: float = 0.0
-    ) -> None:
-        """Set gravity's direction; see `TiltInput.set_gravity`."""
-        self._tilt.set_gravity(now, gravity, angular_velocity, age)
-
-    def tilt_age(self, now: float) -> float:
-        """Return the age of the newest tilt in s."""
-        return self._tilt.age(now)

@@ -78,7 +78,7 @@ class CompensatorNode(Node):
         self._intruder, self._intruded = "", -math.inf
         self._threads.append(HotPath(self, JointState, topic, self._on_joint_states, NEWEST))
         if values["use_imu"]:
-            TiltSubscription(self, self._control, self._lock, self._refused, self._withdraw, self._on_motion)
+            TiltSubscription(self, self._control.tilt, self._lock, self._refused, self._withdraw, self._on_motion)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         # Only the executor's thread reports: diagnostics and budget are not for two threads.
@@ -132,7 +132,7 @@ class CompensatorNode(Node):
 
     def _on_motion(self, *sample: Any) -> None:
         if self._control.settings.inertial:  # each sample takes a fit, under the lock
-            self._control.set_motion(*sample)
+            self._control.motion.add(*sample)
 
     def _withdraw(self, topic: str) -> None:
         """Withdraw for a while: a second publisher sends on `topic`."""
@@ -161,7 +161,7 @@ class CompensatorNode(Node):
             "limits acting": ", ".join(f"max_effort ({self._names[joint]})" for joint in answer.clamped) or "none",
             "rate (Hz)": row([self._rate.update(now, self._answers)], 1),
             "age of joint states (ms)": milliseconds(now - self._last_answer),
-            "age of tilt (ms)": milliseconds(self._control.tilt_age(now)),
+            "age of tilt (ms)": milliseconds(self._control.tilt.age(now)),
             "answers": self._answers,
             "rides": self._rides,
             "joint states missed": self._source.missed,

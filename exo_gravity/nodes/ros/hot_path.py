@@ -25,7 +25,7 @@ from sensor_msgs.msg import Imu
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.rotation import unit_quaternion, up_in_body
-from exo_gravity.core.trunk.tilt_input import STILL, Tilted, TiltInput
+from exo_gravity.core.trunk.tilt_input import STILL, TiltInput
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 
@@ -210,7 +210,7 @@ class TiltSubscription:
     def __init__(
         self,
         node: Node,
-        target: TiltInput | Tilted,
+        target: TiltInput,
         lock: threading.Lock,
         on_refusal: Callable[[str, ParameterError], object] = lambda topic, error: None,
         on_intruder: Callable[[str], object] = lambda topic: None,
