@@ -10,9 +10,10 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import groupby, product
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.colors import LogNorm
@@ -24,7 +25,7 @@ from exo_gravity.core.model.anfis import AnfisLaw
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import gravity_torque, paper_mobile_torque, paper_static_torque
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.tools.anfis import GRID, Trained, from_gravload, train_law
+from exo_gravity.tools.anfis import GRID, Trained, from_gravload, rms, train_law
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.inputs.references import PAPER_ANALYTICAL, PAPER_ANFIS, PAPER_SECONDS, REFERENCES, gravload
 
@@ -65,8 +66,7 @@ class Case:
         }
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """The error in Nm of `law` against `reference` on one joint (1..4) over the `count` poses of a case."""
 
     cog: str
@@ -109,11 +109,6 @@ def compare(case: Case, torque: dict[str, np.ndarray], reference: str, expected:
             head = case.cog, case.positions, case.limit, len(case.theta), law, reference, joint
             rows.append(Row(*head, *map(float, numbers)))
     return rows
-
-
-def rms(values: np.ndarray) -> np.ndarray:
-    """Return the root mean square of each column."""
-    return np.asarray(np.sqrt(np.mean(np.square(values), axis=0)))
 
 
 @dataclass(frozen=True)
@@ -192,9 +187,7 @@ def write(link_ends: Part, as_configured: Part, output: Path) -> list[str]:
     """Write the rows as CSV, one column per field in Nm (`limit` in degrees), and the figures; return the names."""
     rows = link_ends.rows + as_configured.rows
     with (output / "laws.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=list(asdict(rows[0])))
-        writer.writeheader()
-        writer.writerows(map(asdict, rows))
+        csv.writer(file).writerows([Row._fields, *rows])
     _workspace_figure(as_configured).savefig(output / "workspace.png", dpi=130)
     _tilt_figure(rows).savefig(output / "tilt.png", dpi=130)
     return ["laws.csv", "workspace.png", "tilt.png"]
