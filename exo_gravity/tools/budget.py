@@ -154,7 +154,7 @@ def _joint_figure(arm: ArmBudget, joint: int) -> Figure:
     axes = [np.linspace(low, high, REST) for low, high in arm.bounds.T]
     axes[joint] = axes[other] = np.zeros(1)
     rest = np.vstack((list(product(*axes)), arm.joints[joint].worst))
-    across, up = (np.linspace(*arm.bounds[:, axis], CELLS) for axis in (joint, other))
+    across, up = (np.linspace(low, high, CELLS) for low, high in arm.bounds.T[[joint, other]])
     points = np.tile(rest, (CELLS * CELLS, 1))
     grid = np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2)
     points[:, [joint, other]] = np.repeat(grid, len(rest), axis=0)
