@@ -10,10 +10,9 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, fields
 from itertools import groupby, product
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.colors import LogNorm
@@ -66,7 +65,8 @@ class Case:
         }
 
 
-class Row(NamedTuple):
+@dataclass(frozen=True)
+class Row:
     """The error in Nm of `law` against `reference` on one joint (1..4) over the `count` poses of a case."""
 
     cog: str
@@ -187,7 +187,7 @@ def write(link_ends: Part, as_configured: Part, output: Path) -> list[str]:
     """Write the rows as CSV, one column per field in Nm (`limit` in degrees), and the figures; return the names."""
     rows = link_ends.rows + as_configured.rows
     with (output / "laws.csv").open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([Row._fields, *rows])
+        csv.writer(file).writerows([[field.name for field in fields(Row)], *map(astuple, rows)])
     _workspace_figure(as_configured).savefig(output / "workspace.png", dpi=130)
     _tilt_figure(rows).savefig(output / "tilt.png", dpi=130)
     return ["laws.csv", "workspace.png", "tilt.png"]

@@ -173,7 +173,7 @@ def failed(parts):
 
 def test_an_exact_law_that_is_off_by_a_billionth_of_a_newton_metre_fails_its_check(quick):
     ends, part = quick[3]
-    rows = [row._replace(largest=1e-9) if (row.law, row.joint) == ("exact", 3) else row for row in part.rows]
+    rows = [replace(row, largest=1e-9) if (row.law, row.joint) == ("exact", 3) else row for row in part.rows]
     (sentence,) = failed((ends, replace(part, rows=rows)))
     assert sentence.startswith("exact law")
 
