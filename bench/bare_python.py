@@ -11,10 +11,10 @@ import signal
 import sys
 import time
 
-from exo_gravity.core.motors.bus_load import REPLY_SHARE
+from exo_gravity.core.motors.joint_motor import REPLY_SHARE
 from exo_gravity.core.safety.drive import NOTHING, Drive
 from exo_gravity.core.safety.limits import UNKNOWN
-from exo_gravity.hardware.scheduling import favour
+from exo_gravity.hardware.clock import favour
 
 from .direct_arm import DirectArm, run_paced
 

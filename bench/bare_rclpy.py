@@ -21,10 +21,10 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
-from exo_gravity.core.motors.bus_load import REPLY_SHARE
+from exo_gravity.core.motors.joint_motor import REPLY_SHARE
 from exo_gravity.core.safety.drive import NOTHING, Drive
 from exo_gravity.core.safety.limits import UNKNOWN
-from exo_gravity.hardware.scheduling import favour
+from exo_gravity.hardware.clock import favour
 from exo_gravity.nodes.ros.run import keep_to_this_machine
 
 from .direct_arm import DirectArm, run_paced

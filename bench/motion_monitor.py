@@ -66,9 +66,7 @@ Change = Callable[[float, Sequence[float], Sequence[float], Torque], Torque]
 class TrueTrunk:
     """An IMU that is right, one cycle late."""
 
-    cycles = 1
-
-    def measure(self, now: float, state: TrunkState) -> TrunkReading:
+    def __call__(self, now: float, state: TrunkState) -> TrunkReading:
         """Return the truth."""
         gravity = gravity_in_trunk(state.pitch, state.roll)
         force = state.acceleration - STANDARD_GRAVITY * gravity
@@ -263,7 +261,7 @@ def arm_of(settings: Any, worn: bool, moment: Sequence[float], addition: Sequenc
     limits = Limits(
         JOINTS, max_velocity=(20.0,) * 4, sign_check_torque=0.0, largest_moment=moment, largest_addition=addition
     )
-    return ArmSetup("right", device, motors, limits, settings, RATE, (0.0, 0.0), TrueTrunk())
+    return ArmSetup("right", device, motors, limits, settings, RATE, TrueTrunk())
 
 
 class Quiet(NamedTuple):

@@ -30,7 +30,7 @@ SPECS = [MOTORS[name] for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6")]
 COMMANDS = (0x7F, 0x80, 0xFF)  # first byte: commands hold the position 0; see hardware/can/motor_bus.py
 # The real device's rate, with time-outs that leave room for simulators and browser on the same computer.
 TIMING = {
-    "can_bridge": {"rate": 250.0, "command_timeout": 0.1, "reply_timeout": 0.1},
+    "can_bridge": {"rate": 250.0, "command_timeout": 0.1},
     "compensator": {"tilt_timeout": 0.5},
 }
 SLOW = {**TIMING, "can_bridge": {**TIMING["can_bridge"], "rate": 50.0}}

@@ -19,7 +19,7 @@ from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.trial.recording import Recording
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
-from exo_gravity.sim.offline import ArmSetup, OfflineTrial
+from exo_gravity.sim.offline import ArmSetup, OfflineTrial, resting
 
 POSE = [0.3, 0.45, 0.10, 0.4]  # rad; carrying the whole arm of the wearer takes less than rated torque here
 HELD, RELEASED = 30.0, 10.0  # s, how long the hand holds the arm in the pose, and how long the arm is alone
@@ -42,7 +42,7 @@ def sweep() -> tuple[Recording, np.ndarray]:
     device = SimulatedDevice(true_arm, [SimulatedMotor(motor) for motor in motors])
     steps = [{"move": POSE, "over": 3.0}, {"move": POSE, "over": HELD}, {"hold": RELEASED}]
     script = TrialScript.parse({"name": "support sweep", "steps": steps})
-    trial = OfflineTrial(ArmSetup("right", device, motors, limits, settings, 250.0, (0.0, 0.0)), script, 8.0)
+    trial = OfflineTrial(ArmSetup("right", device, motors, limits, settings, 250.0, resting(0.0, 0.0)), script, 8.0)
     supports = [(0.0, 0.0)]
     in_pose = 0  # s
 

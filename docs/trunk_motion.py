@@ -24,7 +24,7 @@ from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import ArmConfig, ImuConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial
-from exo_gravity.tools.trials.offline import TrunkImu
+from exo_gravity.tools.trials.offline import trunk_imu
 
 LENGTH = (0.05, 0.13, 0.30, 0.30)
 ASSUMED = ArmModel(LENGTH, (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))  # of config/exo.yaml
@@ -91,9 +91,9 @@ def simulate(
     limits = Limits(JOINTS, (-1.65, -0.17, -0.78, -0.17), (1.65, 3.14, 2.53, 3.14), (5.0, 5.0, 5.0, 6.0), rated)
     arm = SimulatedArm(ArmConfig(true, coulomb_friction=friction))
     device = SimulatedDevice(arm, [SimulatedMotor(motor) for motor in motors])
-    trunk = TrunkImu(imu or ImuConfig(MOUNTING), MOUNTING, RATE)
+    trunk = trunk_imu(imu or ImuConfig(MOUNTING), MOUNTING, RATE)
     steps = [{"move": pose, "over": 3.0}, {"hold": 2.0}, step, REST]
-    setup = ArmSetup("right", device, motors, limits, Settings("right", assumed, **law.settings), RATE, None, trunk)
+    setup = ArmSetup("right", device, motors, limits, Settings("right", assumed, **law.settings), RATE, trunk)
     trial = OfflineTrial(setup, TrialScript.parse({"name": "trunk", "steps": steps}), 8.0)
     recording = trial.run()
     start, end = recording.steps[2].start, min(recording.steps[-1].end, (recording.carried or ((0.0, 0.0),))[-1][1])

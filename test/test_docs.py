@@ -45,23 +45,15 @@ def test_every_table_has_its_place_in_a_document() -> None:
     assert places == {*NODES, "urdf_arm", "faults", "topics"}
 
 
-@pytest.mark.parametrize(
-    ("document", "table", "declared", "changed"),
-    [
-        ("parameters.md", "can_bridge", "| `reply_timeout` | 0.05 |", "| `reply_timeout` | 0.06 |"),
-        ("safety.md", "faults", f"| {FaultCode.MOTOR_SILENT.meaning} |", "| a motor is quiet |"),
-    ],
-)
-def test_a_document_that_differs_from_the_code_is_reported_with_the_command_that_renews_it(
-    tmp_path: Path, document: str, table: str, declared: str, changed: str
-) -> None:
-    copy = Path(shutil.copy(TABLES.with_name(document), tmp_path))
+def test_a_document_that_differs_from_the_code_is_reported_with_the_command_that_renews_it(tmp_path: Path) -> None:
+    copy = Path(shutil.copy(TABLES.with_name("safety.md"), tmp_path))
     text = copy.read_text(encoding="utf-8")
+    declared = f"| {FaultCode.MOTOR_SILENT.meaning} |"
     assert declared in text
-    copy.write_text(text.replace(declared, changed), encoding="utf-8")
+    copy.write_text(text.replace(declared, "| a motor is quiet |"), encoding="utf-8")
     checked = run_tables("--check", copy)
     assert checked.returncode == 1
-    assert f"table {table} differs from the code; run python docs/tables.py" in checked.stdout
+    assert "table faults differs from the code; run python docs/tables.py" in checked.stdout
     run_tables(copy)
     assert copy.read_text(encoding="utf-8") == text
 

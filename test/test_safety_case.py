@@ -5,7 +5,7 @@ from pathlib import Path
 
 from .faults.cases import CASES
 
-TEXT = (Path(__file__).parents[1] / "docs" / "safety_case.md").read_text(encoding="utf-8")
+TEXT = (Path(__file__).parents[1] / "docs" / "safety.md").read_text(encoding="utf-8")
 
 
 def rows_named() -> list[str]:

@@ -17,7 +17,10 @@ STATES, COMMANDS, STEPS, ASSIST = "joint_states", "effort_commands", "wearer_ste
 DIAGNOSTICS, PARAMETER_EVENTS = "/diagnostics", "/parameter_events"
 # Of the recorder, in the recording alone
 PARAMETERS, LOSSES = "/recorder/parameters", "/recorder/losses"
-OTHERS = {
+READ = {  # type of each topic, or last part of its name, that the reader decodes
+    STATES: JOINT_STATE,
+    COMMANDS: JOINT_STATE,
+    STEPS: STRING,
     DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
     PARAMETER_EVENTS: "rcl_interfaces/msg/ParameterEvent",
     PARAMETERS: STRING,
@@ -37,9 +40,7 @@ def arm_of(name: str) -> str:
 
 def is_wanted(topic: str, msgtype: str) -> bool:
     """Return whether the reader decodes this topic."""
-    if leaf(topic) in (STATES, COMMANDS):
-        return msgtype == JOINT_STATE
-    return OTHERS.get(topic) == msgtype or (leaf(topic) == STEPS and msgtype == STRING)
+    return msgtype in (READ.get(topic), READ.get(leaf(topic)))
 
 
 class Event(NamedTuple):

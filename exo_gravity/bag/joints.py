@@ -23,18 +23,17 @@ TYPES = get_typestore(Stores.ROS2_JAZZY)
 
 
 class JointArrays:
-    """Collects `fields` of the joint states of one topic. The first message gives the order of the joints, `names`."""
+    """Collects the joint states of one topic. The first message gives the order of the joints, `names`."""
 
-    def __init__(self, topic: str, fields: Sequence[str] = FIELDS) -> None:
+    def __init__(self, topic: str) -> None:
         self.topic = topic
-        self.fields = tuple(fields)
         self.names: tuple[str, ...] = ()
         self._parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
     def add(self, arrivals: Sequence[int], messages: Sequence[bytes]) -> None:
         """Decode messages that arrived at `arrivals` ns. Raises DataError if joints change or a message is damaged."""
+        arrived = np.array(arrivals, np.int64)
         lengths = np.fromiter(map(len, messages), np.int64, len(messages))
-        parts = []
         for length in dict.fromkeys(lengths.tolist()):  # in order of appearance
             chosen = np.flatnonzero(lengths == length)
             rows = np.frombuffer(b"".join([messages[i] for i in chosen.tolist()]), np.uint8).reshape(-1, length)
@@ -45,17 +44,14 @@ class JointArrays:
                     differing, expected = ", ".join(names), ", ".join(self.names)
                     raise DataError(f"{self.topic}: joint names differ: {differing}; must be {expected}")
                 same = np.all(rows[:, fixed] == rows[0, fixed], axis=1)
-                parts.append((chosen[same], *self._decoded(rows[same].view(numbers)[:, 0], names)))
+                self._parts.append((arrived[chosen[same]], *self._decoded(rows[same].view(numbers)[:, 0], names)))
                 chosen, rows = chosen[~same], rows[~same]
-        index, stamp, values = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-        order = np.argsort(index)
-        self._parts.append((np.array(arrivals, np.int64), stamp[order], values[order]))
 
     def _decoded(self, numbers: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-        """Return stamps (n,) in ns and values (n, fields, joints); float32 is 1000 times finer than a position code."""
-        values = np.full((len(numbers), len(self.fields), len(self.names)), np.nan, np.float32)
+        """Return stamps (n,) in ns and values (n, 3, joints); float32 is 1000 times finer than a position code."""
+        values = np.full((len(numbers), len(FIELDS), len(self.names)), np.nan, np.float32)
         order = [names.index(name) for name in self.names]
-        for field, name in enumerate(self.fields):
+        for field, name in enumerate(FIELDS):
             if name in (numbers.dtype.names or ()):
                 values[:, field] = numbers[name][:, order]
         return numbers["sec"].astype(np.int64) * 1_000_000_000 + numbers["nanosec"], values
@@ -66,10 +62,14 @@ class JointArrays:
         return int(self._parts[0][0][0])
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return times of arrival (n,) and stamps (n,) in ns, values (n, fields, joints); forget them."""
+        """Return times of arrival (n,) in order and stamps (n,) in ns, and the values (n, 3, joints) of `FIELDS`.
+
+        They are forgotten then.
+        """
         arrival, stamp, values = (np.concatenate(columns) for columns in zip(*self._parts, strict=True))
         self._parts.clear()
-        return arrival, stamp, values
+        order = np.argsort(arrival, kind="stable")
+        return arrival[order], stamp[order], values[order]
 
 
 def _layout(message: bytes) -> tuple[tuple[str, ...], np.ndarray, np.dtype[np.void]]:

@@ -24,12 +24,11 @@ from exo_gravity.bag.joints import FIELDS, TYPES, JointArrays
 from exo_gravity.bag.storage import Storage
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.safety.drive import State
-from exo_gravity.core.trial.recording import Recording, ScriptedStep, Span
+from exo_gravity.core.trial.recording import CARRIED, Recording, ScriptedStep, Span
 
 BATCH_SIZE = 5_000  # messages that are decoded at once
 MAX_COMMAND_AGE = 200_000_000  # ns; an older command is no longer in force
 MAX_CLOCK_OFFSET = 1_000_000_000  # ns between stamp and arrival
-CARRIED = (State.RAMPING_IN.value, State.ACTIVE.value)
 STATE_GAP = 1.0  # s; can_bridge reports its state twice a second, except while it ends
 TOPIC = itemgetter(0)
 
@@ -90,9 +89,7 @@ class _Contents:
             return
         try:
             if msgtype == JOINT_STATE:
-                fields = FIELDS if leaf(topic) == STATES else ("effort",)
-                joints = self.joints.get(topic) or self.joints.setdefault(topic, JointArrays(topic, fields))
-                joints.add(stamps, messages)
+                self.joints.setdefault(topic, JointArrays(topic)).add(stamps, messages)
                 return
             for stamp, data in zip(stamps, messages, strict=True):
                 self._add(topic, stamp, TYPES.deserialize_cdr(data, msgtype))
@@ -141,12 +138,11 @@ class _Contents:
         arrival, stamp, values = self.joints[topic].arrays()
         stamped = bool(np.all(np.diff(stamp) >= 0) and abs(np.median(arrival - stamp)) < MAX_CLOCK_OFFSET)
         clock, values = _in_order(stamp if stamped else arrival, values)
-        command = self._commands(topic, names, clock, stamped)
+        command, steps = self._commands(topic, names, clock, stamped), self._script(name, start)
         time = (clock - start) / 1e9
         carried = self._carried(name, start, float(time[-1]))
         try:
             position, velocity, effort = np.moveaxis(values, 1, 0)
-            steps = self._script(name, start)
             return Recording(name, names, time, position, velocity, effort, command, steps, carried)
         except DataError as error:
             self.problems.append(str(error))
@@ -166,7 +162,7 @@ class _Contents:
             return result
         arrival, stamp, values = self.joints[topic].arrays()
         sent, values = _in_order(stamp if stamped else arrival, values)
-        effort = values[:, 0, [given.index(name) for name in names]]
+        effort = values[:, FIELDS.index("effort"), [given.index(name) for name in names]]
         last = np.searchsorted(sent, clock, "left") - 1
         known = (last >= 0) & (clock - sent[last] < MAX_COMMAND_AGE)
         result[known] = effort[last[known]]

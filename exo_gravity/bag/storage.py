@@ -16,10 +16,11 @@ import shutil
 import sqlite3
 import struct
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from io import BytesIO
+from itertools import chain
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import BinaryIO
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -30,10 +31,9 @@ from rosbags.rosbag2 import Reader, ReaderError
 from exo_gravity.core.errors import DataError
 
 MAGIC = b"\x89MCAP0\r\n"
-# As plain numbers, which are faster to compare than an enumeration
-CHUNK_OPCODE, MESSAGE_OPCODE = int(Opcode.CHUNK), int(Opcode.MESSAGE)
+MESSAGE_OPCODE = int(Opcode.MESSAGE)  # a plain number is faster to compare than an enumeration
 RECORD = struct.Struct("<BQ")  # opcode, length of the content
-MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; the message follows
+MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time; the message follows
 
 Wanted = Callable[[str, str], bool]  # (topic, type) -> whether to yield its messages
 Topic = tuple[str, str]  # name, type
@@ -70,39 +70,63 @@ class Storage:
             yield from self._by_rosbags(wanted)
             return
         for file in self.files:
-            yield from self._mcap(file, wanted) if file.suffix == ".mcap" else self._sqlite(file, wanted)
+            parts = self._mcap(file, wanted) if file.suffix == ".mcap" else (self._sqlite(file, wanted),)
+            yield from chain.from_iterable(parts)
 
-    def _mcap(self, file: Path, wanted: Wanted) -> Iterator[Message]:
-        schemas: dict[int, Schema] = {}
-        chosen: dict[int, Topic] = {}  # by channel
+    def _mcap(self, file: Path, wanted: Wanted) -> Iterator[list[Message]]:
         with file.open("rb") as stream:
             if stream.read(len(MAGIC)) != MAGIC:
                 raise DataError(f"{file}: not an MCAP file, or empty")
-            try:
-                for opcode, body in _records(stream):
-                    if opcode == MESSAGE_OPCODE:
-                        channel, _, stamp, _ = MESSAGE.unpack_from(body)
-                        if channel in chosen:
-                            yield *chosen[channel], stamp, body[MESSAGE.size :]
-                    elif opcode == Opcode.SCHEMA:
-                        schema = Schema.read(ReadDataStream(BytesIO(body)))
-                        schemas[schema.id] = schema
-                    elif opcode == Opcode.CHANNEL:
-                        described = Channel.read(ReadDataStream(BytesIO(body)))
-                        topic = self._announce(described, schemas.get(described.schema_id))
-                        if wanted(*topic):
-                            chosen[described.id] = topic
-                    elif opcode == Opcode.DATA_END:
-                        return
+            data = mmap(stream.fileno(), 0, access=ACCESS_READ)
+        try:
+            if not (yield from self._records(data, len(MAGIC), wanted, {}, {})):
                 self.cut_short = f"{file.name} ends without an index"
-            except Exception:  # each decompressor raises its own type
-                self.cut_short = f"{file.name} ends within a record, or is damaged"
+        except Exception:  # each decompressor raises its own type
+            self.cut_short = f"{file.name} ends within a record, or is damaged"
 
-    def _announce(self, channel: Channel, schema: Schema | None) -> Topic:
-        msgtype, definition = (schema.name, schema.data.decode(errors="replace")) if schema else ("", "")
-        self.topics[channel.topic] = msgtype
-        self.announced[channel.topic] = definition, channel.metadata.get("offered_qos_profiles", "")
-        return channel.topic, msgtype
+    def _records(
+        self, data: bytes | mmap, at: int, wanted: Wanted, schemas: dict[int, Schema], chosen: dict[int, Topic]
+    ) -> Generator[list[Message], None, bool]:
+        """Yield the messages among the records from `at` on, also those in chunks; return whether all data were read.
+
+        schemas: read so far. chosen: the wanted topics by channel. Raises an error at a cut or damage.
+        """
+        found: list[Message] = []
+        end = len(data)
+        while at + RECORD.size <= end:
+            if data[at] == MESSAGE_OPCODE and at + MESSAGE.size <= end:
+                _, length, number, _, stamp, _ = MESSAGE.unpack_from(data, at)
+                start, at = at + MESSAGE.size, at + RECORD.size + length
+                if number in chosen and at <= end:
+                    found.append((*chosen[number], stamp, data[start:at]))
+                continue
+            opcode, length = RECORD.unpack_from(data, at)
+            at += RECORD.size + length
+            body = ReadDataStream(BytesIO(data[at - length : at]))
+            yield found
+            found = []
+            if opcode == Opcode.CHUNK:
+                chunk, size = get_chunk_data_stream(Chunk.read(body))
+                yield from self._records(chunk.read(size), 0, wanted, schemas, chosen)
+            elif at > end:
+                break
+            elif opcode == Opcode.SCHEMA:
+                described = Schema.read(body)
+                schemas[described.id] = described
+            elif opcode == Opcode.CHANNEL:
+                channel = Channel.read(body)
+                schema = schemas.get(channel.schema_id)
+                msgtype, definition = (schema.name, schema.data.decode(errors="replace")) if schema else ("", "")
+                self.topics[channel.topic] = msgtype
+                self.announced[channel.topic] = definition, channel.metadata.get("offered_qos_profiles", "")
+                if wanted(channel.topic, msgtype):
+                    chosen[channel.id] = channel.topic, msgtype
+            elif opcode == Opcode.DATA_END:
+                return True
+        yield found
+        if at != end:
+            raise EOFError
+        return False
 
     def _sqlite(self, file: Path, wanted: Wanted) -> Iterator[Message]:
         try:
@@ -128,20 +152,6 @@ class Storage:
                     yield connection.topic, connection.msgtype, stamp, bytes(data)
         except (ReaderError, FileNotFoundError) as error:
             raise DataError(f"{self.path}: a compressed recording must be complete ({error})") from None
-
-
-def _records(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
-    """Yield opcode and content of each record, those in a chunk in its place. Raises an error at a cut or damage."""
-    while head := stream.read(RECORD.size):
-        opcode, length = RECORD.unpack(head)
-        body = stream.read(min(length, 2**32))
-        if opcode == CHUNK_OPCODE:
-            chunk = Chunk.read(ReadDataStream(BytesIO(body)))
-            yield from _records(BytesIO(get_chunk_data_stream(chunk)[0].read(chunk.uncompressed_size)))
-        if len(body) < length:
-            raise EOFError
-        if opcode != CHUNK_OPCODE:
-            yield opcode, body
 
 
 def _open_database(file: Path) -> tuple[sqlite3.Connection, dict[int, Topic]]:

@@ -9,7 +9,6 @@ delays this thread only: messages that find the queue full are lost and counted.
 from __future__ import annotations
 
 import contextlib
-import itertools
 import queue
 import threading
 import time
@@ -155,12 +154,10 @@ def repair(path: str | Path) -> tuple[Path, int]:
         raise DataError(f"{other}: must be an .mcap file; try `ros2 bag reindex`")
     folder = source.path.resolve().with_name(f"{source.path.resolve().stem}_repaired")
     types, connections, count = get_typestore(Stores.ROS2_JAZZY), dict[str, Connection](), 0
-    messages = source.messages(lambda topic, msgtype: bool(msgtype))
-    if (first := next(messages, None)) is None:
-        raise DataError(f"{folder}: not written: the recording has no message")
     try:
-        writer = _opened(folder)
-        for topic, msgtype, stamp, data in itertools.chain([first], messages):
+        for count, (topic, msgtype, stamp, data) in enumerate(source.messages(lambda topic, msgtype: bool(msgtype)), 1):
+            if count == 1:
+                writer = _opened(folder)
             if topic not in connections:
                 definition, qos = source.announced[topic]
                 if msgtype not in types.fielddefs:
@@ -169,12 +166,9 @@ def repair(path: str | Path) -> tuple[Path, int]:
                     topic, msgtype, typestore=types, offered_qos_profiles=parse_qos(qos)
                 )
             writer.write(connections[topic], stamp, data)
-            count += 1
+        if not count:
+            raise DataError(f"{folder}: not written: the recording has no message")
         writer.close()
-        with Reader(folder) as reader:
-            found = sum(1 for _ in reader.messages())
     except (WriterError, OSError) as error:
         raise DataError(f"{folder}: cannot write the repaired recording ({error})") from None
-    if found != count:
-        raise DataError(f"{folder}: {found} messages can be read: must be {count}")
     return folder, count

@@ -29,6 +29,9 @@ GONE: dict[str, str] = {
     "damping": "always 5 Nm s/rad, the most that the motors can",
     "home": "always 0: joint angles are measured from the hanging arm, see the parameter zero",
     "home_tolerance": "always 0.5 rad for an AK60-6 and 0.34 rad for an AK80-9, less than half a turn of the rotor",
+    "max_velocity": "always 5, 5, 5, 6 rad/s",
+    "reply_timeout": "always 0.05 s, or 7 cycles if that is longer",
+    "torque_per_ampere": "always rated torque by rated current, as in the motors' data sheets",
     "status_rate": "V3 boards are to send 500 status frames a second, 200 on a bus below 500 kbit/s",
     # compensator
     "max_total_mass": "always 10 kg",

@@ -18,12 +18,11 @@ from queue import SimpleQueue
 from typing import Any
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.bus_load import REPLY_SHARE
-from exo_gravity.core.safety.descent import RestTracker
+from exo_gravity.core.motors.joint_motor import REPLY_SHARE
 from exo_gravity.core.safety.drive import NO_COMMAND, OFF, Drive, EffortCommand, FaultCode, State
 from exo_gravity.core.safety.limits import DAMPING, JointSample
 from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.core.safety.supply import SupplyMonitor
+from exo_gravity.core.safety.monitors import RestTracker, SupplyMonitor
 from exo_gravity.hardware.can.motor_bus import MotorBus
 
 EFFORT_WAIT = 0.5  # share of a cycle's idle time for which the loop may wait for late efforts
@@ -165,8 +164,22 @@ class ControlLoop:
             pass
 
     def _control(self, due: float) -> None:
-        efforts = self._efforts(due)
-        self._run_calls()
+        # While another sender commands the motors, receiving comes first.
+        latest = due if self.bus.is_contested else due + EFFORT_WAIT * (self.period - self._work)
+        try:
+            efforts = self._get_efforts(latest)
+        except Exception as error:
+            reason = f"efforts cannot be received: {type(error).__name__}: {error}"
+            self.safety.trip(FaultCode.INTERNAL_ERROR, reason, self._now())
+            efforts = NO_COMMAND
+        while not self._calls.empty():  # nobody else takes from it
+            function, future = self._calls.get()
+            if not future.set_running_or_notify_cancel():
+                continue
+            try:
+                future.set_result(function())
+            except Exception as error:
+                future.set_exception(error)
         now = self._now()
         if (suspended := self._clock.suspended() - self._suspended) > SUSPENDED:
             self._suspended += suspended
@@ -190,26 +203,6 @@ class ControlLoop:
             self.cycle_errors += 1
             self.cycle_error = f"{type(error).__name__}: {error}"
         self._work += SMOOTHING * (self._now() - now - self._work)
-
-    def _efforts(self, due: float) -> EffortCommand:
-        is_contested = self.bus.is_contested  # then receiving comes first
-        latest = due if is_contested else due + EFFORT_WAIT * (self.period - self._work)
-        try:
-            return self._get_efforts(latest)
-        except Exception as error:
-            reason = f"efforts cannot be received: {type(error).__name__}: {error}"
-            self.safety.trip(FaultCode.INTERNAL_ERROR, reason, self._now())
-            return NO_COMMAND
-
-    def _run_calls(self) -> None:
-        while not self._calls.empty():  # nobody else takes from it
-            function, future = self._calls.get()
-            if not future.set_running_or_notify_cancel():
-                continue
-            try:
-                future.set_result(function())
-            except Exception as error:
-                future.set_exception(error)
 
     def _wait(self, deadline: float) -> float:
         """Wait until `deadline`; return it, or the present time if that is more than a period late.

@@ -17,21 +17,13 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.model.rotation import ZERO, Floats3, Quaternion, plus, product, unit_quaternion, up_in_body
 from exo_gravity.core.model.tilt import angle_between, pitch_roll, rotation_matrix
 from exo_gravity.core.numbers import one_float
-from exo_gravity.core.trunk.imu_checks import Agreement, ClockCheck, Contradiction, EqualValues
-from exo_gravity.core.trunk.imu_sample import (
-    ACCELEROMETER_RANGE,
-    ACCELEROMETER_RANGES,
-    GYROSCOPE_RANGE,
-    GYROSCOPE_RANGES,
-    ImuSample,
-    check_living,
-    in_range,
-    three_floats,
-)
-from exo_gravity.core.trunk.uncertainty import OVERSHOOT, TiltUncertainty
+from exo_gravity.core.trunk import imu_checks
+from exo_gravity.core.trunk.imu_checks import Contradiction, ImuSample, in_range, three_floats
+from exo_gravity.core.trunk.uncertainty import GAP, JUMP, MAX_SIGMA, TiltUncertainty
 
 try:
     from vqf import VQF
@@ -41,19 +33,18 @@ except ImportError:  # needed only for an IMU that reports no orientation
 __all__ = ["ImuSample", "TrunkEstimator", "TrunkOrientation"]
 
 MAX_GAP = 0.1  # s between two samples, after which the estimate begins anew
-REPORTED_SIGMA = math.radians(1.0)  # rad; data sheets of fused sensors state 1 to 2 degrees
 MAX_REPORTED_RATE = 15.0  # rad/s; a reported orientation that turns faster has jumped: no trunk turns so fast
 MAX_JUMP = 0.01  # rad by which rounding may turn a reported orientation
+CHECK_PERIOD = 0.0195  # s between two judgements
+OVERSHOOT = 0.25  # share of the range by which the true rate exceeds it
 BIAS_INTERVAL = 10  # samples; the bias changes slowly
 
 
 class TrunkOrientation(NamedTuple):
     """The trunk's orientation by one sample."""
 
-    #: (x, y, z, w), world from trunk; its heading is arbitrary
-    orientation: Quaternion
-    #: one standard deviation of the tilt, rad
-    uncertainty: float
+    orientation: Quaternion  #: (x, y, z, w), world from trunk; its heading is arbitrary
+    uncertainty: float  #: one standard deviation of the tilt, rad
 
     @property
     def gravity(self) -> np.ndarray:
@@ -74,18 +65,16 @@ class TrunkOrientation(NamedTuple):
 class TrunkEstimator:
     """Follows one IMU; where VQF is installed, it need not report its orientation."""
 
-    _agreement = Agreement()
-    _speed = 0.0  # rad/s, the highest in the last second
-    _up: Floats3 | None  # the world's z axis in the IMU's axes, by the last sample
-    _last_rate: Floats3 | None
-    _last_acceleration: Floats3 | None
+    _agreement, _clock = imu_checks.Agreement(), imu_checks.ClockCheck()
+    _is_fused: bool | None = None  # None before the first sample
+    _time = -math.inf
 
     def __init__(
         self,
         rotation_trunk_from_imu: Sequence[float],
         rate: float = 100.0,
-        gyroscope_range: float = GYROSCOPE_RANGE,
-        accelerometer_range: float = ACCELEROMETER_RANGE,
+        gyroscope_range: float = imu_checks.GYROSCOPE_RANGE,
+        accelerometer_range: float = imu_checks.ACCELEROMETER_RANGE,
     ) -> None:
         """Create an estimator for an IMU mounted at `rotation_trunk_from_imu`, (x, y, z, w), known from a calibration.
 
@@ -97,16 +86,12 @@ class TrunkEstimator:
         x, y, z, w = unit_quaternion("rotation_trunk_from_imu", rotation_trunk_from_imu)
         self._imu_from_trunk = (-x, -y, -z, w)
         self._period = 1.0 / one_float("rate", rate, 2.0 / MAX_GAP, 10_000.0, "Hz")
-        fastest = one_float("gyroscope_range", gyroscope_range, *GYROSCOPE_RANGES, "rad/s")
-        strongest = one_float("accelerometer_range", accelerometer_range, *ACCELEROMETER_RANGES, "m/s^2")
-        limit = f"gyroscope_range = {fastest:.4g} rad/s about each axis (is it in deg/s?)"
-        self._gyroscope = "angular_velocity", fastest, limit
-        limit = f"accelerometer_range = {strongest:.4g} m/s^2 along each axis"
-        self._accelerometer = "linear_acceleration", strongest, limit
+        self._fastest = one_float("gyroscope_range", gyroscope_range, *imu_checks.GYROSCOPE_RANGES, "rad/s")
+        self._strongest = one_float(
+            "accelerometer_range", accelerometer_range, *imu_checks.ACCELEROMETER_RANGES, "m/s^2"
+        )
         self._fusion = VqfFusion(self._period) if VQF else None
-        self._equal, self._clock = EqualValues(), ClockCheck()
-        self._is_fused: bool | None = None  # None before the first sample
-        self._time = -math.inf
+        self._equal = imu_checks.EqualValues()
         self._restart("no sample yet")
 
     @property
@@ -119,7 +104,7 @@ class TrunkEstimator:
         """Why there is no orientation yet; empty once there is."""
         if self._agreement.is_suspect:
             return f"until gyroscope and accelerometer agree on a turn of the trunk; {self._why}"
-        return "" if self._uncertainty.is_settled else self._why
+        return "" if self._uncertainty.sigma <= MAX_SIGMA else self._why
 
     def update(self, sample: ImuSample, arrival: float | None = None) -> TrunkOrientation | None:
         """Process a sample; return the trunk's orientation, or None while it is not sure enough.
@@ -135,63 +120,71 @@ class TrunkEstimator:
         except Contradiction as error:
             self._restart(f"{error.name} must be {error.expected}", is_suspect=True)
             raise
-        if self._agreement.is_suspect or not self._uncertainty.is_settled:
+        self._quaternion, sigma = quaternion, self._uncertainty.sigma
+        if sigma > MAX_SIGMA or self._agreement.is_suspect:
             return None
-        return TrunkOrientation(product(quaternion, self._imu_from_trunk), math.sqrt(self._uncertainty.variance))
+        return TrunkOrientation(product(quaternion, self._imu_from_trunk), sigma)
 
     def _reported(self, sample: ImuSample) -> Quaternion:
         """Return the orientation that the IMU reports, world from IMU."""
-        quaternion = unit_quaternion("orientation", sample.orientation)
-        given, force = sample.angular_velocity, sample.acceleration
-        rate = ZERO if given is None else three_floats("angular_velocity", given)
-        acceleration = None if force is None else three_floats("linear_acceleration", force)
-        dt = self._step(sample, rate, acceleration, None)
-        up = up_in_body(quaternion)
-        if self._up and angle_between(up, self._up) > MAX_REPORTED_RATE * max(dt, self._period) + MAX_JUMP:
+        quaternion, last = unit_quaternion("orientation", sample.orientation), self._quaternion
+        turning, force = (ZERO if given is None else given for given in sample[1:3])
+        rate, force = three_floats("angular_velocity", turning), three_floats("linear_acceleration", force)
+        dt, up = self._step(sample, rate + force, None), up_in_body(quaternion)
+        if last and angle_between(up, up_in_body(last)) > MAX_REPORTED_RATE * max(dt, self._period) + MAX_JUMP:
             self._restart("orientation jumped")
-        self._up = up
-        self._uncertainty.advance(dt, ZERO, ZERO)
-        self._uncertainty.variance = REPORTED_SIGMA**2
-        if acceleration:
-            self._agreement.check_reported(dt, up, acceleration)
+        self._uncertainty.report(dt)
+        self._agreement.check_reported(dt, up, force)
         return quaternion
 
     def _fused(self, sample: ImuSample) -> Quaternion:
         """Return the IMU's orientation, world from IMU, by gyroscope and accelerometer."""
-        fusion = self._fusion
-        if fusion is None:
+        if self._fusion is None:
             raise ParameterError("orientation", None, "reported by the IMU, or install vqf to fuse it")
-        rate, is_saturated = in_range(sample.angular_velocity, *self._gyroscope)
-        force, is_cut = in_range(sample.acceleration, *self._accelerometer)
-        check_living(force, self._last_acceleration)
-        acceleration = None if is_cut else force
-        dt = self._step(sample, rate, acceleration, None if is_saturated else self._up)
-        unknown = OVERSHOOT * self._gyroscope[1] if is_saturated else 0.0
-        self._uncertainty.advance(dt, rate, self._last_rate or rate, unknown, self._equal.duration)
-        if self._uncertainty.is_lost:
-            self._restart("too much rotation was not measured")
-        quaternion = fusion.advance(dt, rate, self._last_rate or rate, acceleration)
-        self._last_rate, self._last_acceleration = rate, acceleration
-        self._up = up_in_body(quaternion)
-        if acceleration:
-            self._agreement.check(dt, quaternion, self._up, acceleration, rate)
-        self._speed = max(abs(rate[0]) + abs(rate[1]) + abs(rate[2]), self._speed * (1.0 - dt))
-        contradiction = self._agreement.contradiction + self._speed * self._clock.offset
-        self._uncertainty.combine(fusion.bias_sigma, self._agreement.square, contradiction)
+        rate, is_saturated = in_range("angular_velocity", sample.angular_velocity, self._fastest)
+        force, is_cut = in_range("linear_acceleration", sample.acceleration, self._strongest)
+        imu_checks.check_living(force, self._forces[-1] if self._forces else None)
+        dt = self._step(sample, rate + force, None if is_saturated or is_cut else self._quaternion)
+        last = self._rates[-1] if self._rates else rate
+        change, repeated, uncertainty = math.dist(rate, last), self._equal.duration, self._uncertainty
+        if is_saturated or repeated or change * dt > JUMP or uncertainty.run or dt > GAP * uncertainty.period:
+            unknown = OVERSHOOT * self._fastest if is_saturated else 0.0
+            if uncertainty.miss(dt, change, unknown, repeated):
+                self._restart("too much rotation was not measured")
+        quaternion = self._fusion.advance(dt, rate, last, None if is_cut else force)
+        self._rates.append(rate)
+        if not is_cut:
+            self._forces.append(force)
+        if self._time - self._judged >= CHECK_PERIOD:
+            self._judge(quaternion, self._fusion.bias_sigma)
         return quaternion
 
-    def _step(self, sample: ImuSample, rate: Floats3, acceleration: Floats3 | None, up: Floats3 | None) -> float:
+    def _judge(self, quaternion: Quaternion, bias_sigma: float) -> None:
+        """Judge what the samples since the last judgement tell together."""
+        dt, rates, agreement = self._time - self._judged, self._rates, self._agreement
+        first, middle, rate, count = rates[0], rates[len(rates) // 2], rates[-1], len(self._forces)
+        spin_up, speed = (math.dist(first, middle) + math.dist(middle, rate)) / dt, math.dist(rate, ZERO)
+        if count:
+            x, y, z = map(sum, zip(*self._forces, strict=True))
+            one = count * STANDARD_GRAVITY
+            agreement.check(dt, quaternion, (x / one, y / one, z / one), spin_up + speed * speed)
+        self._speed = max(sum(map(abs, rate)), self._speed * (1.0 - dt))
+        contradiction = agreement.contradiction + self._speed * self._clock.offset
+        self._uncertainty.advance(dt, len(rates) - 1, spin_up, bias_sigma, agreement.square, contradiction)
+        self._judged, self._rates, self._forces = self._time, [rate], []
+
+    def _step(self, sample: ImuSample, values: tuple[float, ...], quaternion: Quaternion | None) -> float:
         """Return the time in s since the last sample, 0 if the estimate begins with this one; check both."""
         time, is_fused = float(sample.time), sample.orientation is None
         dt = time - self._time
         if not math.isfinite(time) or -MAX_GAP <= dt <= 0.0:  # far in the past: another clock, like a gap
             raise ParameterError("stamp", time, "a finite number, later than the last stamp")
-        self._equal.check(time, rate, acceleration, up)
+        self._equal.check(time, values, quaternion)
         self._time = time
         if 0.0 < dt <= MAX_GAP and is_fused is self._is_fused:
             return dt
         self._restart(f"gap of {dt:.2f} s" if is_fused is self._is_fused else "started")
-        self._is_fused, self._clock = is_fused, ClockCheck()
+        self._is_fused, self._clock = is_fused, imu_checks.ClockCheck()
         return 0.0
 
     def _restart(self, why: str, is_suspect: bool = False) -> None:
@@ -199,10 +192,13 @@ class TrunkEstimator:
         if self._fusion:
             self._fusion.restart()
         self._uncertainty = TiltUncertainty(self._period)
-        self._agreement = Agreement(is_suspect or self._agreement.is_suspect)
+        self._agreement = imu_checks.Agreement(is_suspect or self._agreement.is_suspect)
         self._why = why  # there is no orientation yet
-        self._speed = 0.0
-        self._up = self._last_rate = self._last_acceleration = None
+        self._speed = 0.0  # rad/s, the highest in the last second
+        self._quaternion: Quaternion | None = None  # of the IMU by the last sample, world from IMU
+        self._judged = self._time  # s, the sample at which the last judgement was
+        self._rates: list[Floats3] = []  # rad/s, since then and at it
+        self._forces: list[Floats3] = []  # m/s^2, since then
 
 
 class VqfFusion:
@@ -218,6 +214,7 @@ class VqfFusion:
         """Create a fusion for samples that are usually `period` s apart."""
         self._period = self._due = period  # s; for which the accelerometer has not been passed on
         self._vqf = VQF(period)
+        self._rate, self._force = np.zeros(3), np.zeros(3)  # reused
         self._count = 0
         self._read_bias()
 
@@ -233,20 +230,20 @@ class VqfFusion:
         rate, last_rate: of this sample and the last one, each of the period that it ends; over several periods those
         between the two are interpolated. acceleration: None if it is not known.
         """
-        vqf, periods = self._vqf, dt / self._period
+        vqf, periods, scaled, force = self._vqf, dt / self._period, self._rate.data, self._force.data
         (x, y, z), (a, b, c) = rate, self.bias
-        if periods > 1.0:
+        if periods > 1.001:
             x, y, z = plus(rate, plus(last_rate, rate, -1.0), 0.5 - 0.5 / periods)
-        scaled = np.array((a + periods * (x - a), b + periods * (y - b), c + periods * (z - c)))
+        scaled[0], scaled[1], scaled[2] = a + periods * (x - a), b + periods * (y - b), c + periods * (z - c)
         count = round((self._due + dt) / self._period)
         self._due += dt - count * self._period
         if acceleration and count:
-            measured = np.array(acceleration)
-            vqf.update(scaled, measured)
+            force[0], force[1], force[2] = acceleration
+            vqf.update(self._rate, self._force)
             for _ in range(1, count):
-                vqf.updateAcc(measured)
+                vqf.updateAcc(self._force)
         else:
-            vqf.updateGyr(scaled)
+            vqf.updateGyr(self._rate)
         self._count += 1
         if self._count % BIAS_INTERVAL == 0:
             self._read_bias()

@@ -36,18 +36,14 @@ class UrdfArm:
             expected = f"a URDF that Pinocchio reads, without xacro elements: run xacro first ({error})"
             raise ParameterError("urdf", f"{text[:60].strip()} ...", expected) from None
         self._data = self._model.createData()
-        self._gravity_torque = pin.computeGeneralizedGravity
-        self._q = pin.neutral(self._model)
+        self._pin, self._neutral = pin, pin.neutral(self._model)
         numbers = dict(zip(self._model.names, range(self._model.njoints), strict=True))
         turning = [name for name, n in numbers.items() if n and self._model.joints[n].shortname().startswith(TURNING)]
         for name in joint_names:
             if name not in turning:
                 expected = f"turning joints of the URDF ({', '.join(turning) or 'it has none'})"
                 raise ParameterError("joint_names", name, expected)
-        joints = [self._model.joints[numbers[name]] for name in joint_names]
-        # A continuous joint has two coordinates, cosine and sine.
-        self._places = [(joint.idx_q, joint.nq == 2) for joint in joints]
-        self._order = [joint.idx_v for joint in joints]
+        self._order = [self._model.joints[numbers[name]].idx_v for name in joint_names]
         limits = (float(self._model.effortLimit[index]) for index in self._order)
         self.max_effort = tuple(limit if 0.0 < limit < math.inf else 0.0 for limit in limits)
         pin.computeSubtreeMasses(self._model, self._data)
@@ -60,12 +56,9 @@ class UrdfArm:
 
         gravity: (3,) m/s^2 in the axes of the URDF's root link.
         """
-        q = self._q
-        for angle, (place, is_pair) in zip(theta, self._places, strict=True):
-            if is_pair:
-                q[place], q[place + 1] = math.cos(angle), math.sin(angle)
-            else:
-                q[place] = angle
+        moved = np.zeros(self._model.nv)
+        moved[self._order] = theta
+        q = self._pin.integrate(self._model, self._neutral, moved)
         self._model.gravity.linear = np.array(gravity)
-        torque = self._gravity_torque(self._model, self._data, q)
+        torque = self._pin.computeGeneralizedGravity(self._model, self._data, q)
         return tuple(float(torque[index]) for index in self._order)

@@ -26,10 +26,10 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.tilt_input import TiltInput
-from exo_gravity.nodes.ros.hot_path import NEWEST, HotPath, SolePublisher, TiltSubscription
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, by_name
 from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
+from exo_gravity.nodes.ros.subscriptions import NEWEST, HotPath, Publishers, Repeated, TiltSubscription
 
 REPORT_PERIOD = 0.1  # s
 PLAN_PERIOD = 0.05  # s
@@ -52,40 +52,38 @@ class CalibratorNode(Node):
         self._printed = 0  # observations
         self._trouble = ""  # outside the tour
         self._diagnostics = Diagnostics(self)
-        self._source = SolePublisher(self, "joint_states")
+        self._sources = {"joint_states": Publishers()}  # of what the torque depends on
         self._publisher = self.create_publisher(JointState, "effort_commands", 1)
         self._command = JointState(name=self._names)  # one message, reused
         self._lock = threading.Lock()  # guards tilt and state: joint states arrive on another thread
         self._joint_states = HotPath(self, JointState, "joint_states", self._on_joint_states, NEWEST)
         if values["use_imu"]:
-            TiltSubscription(self, self._tilt, self._lock, self._on_refused_tilt, self._on_intruder)
+            self._sources |= TiltSubscription(self, self._tilt, self._lock, self._on_refused_tilt).senders
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self.create_timer(REPORT_PERIOD, self._report)
+        # Poses are chosen on a thread of their own: neither joint states nor tilts may wait for it.
+        self._planner = Repeated("plan", self._tour.plan, PLAN_PERIOD)
         self._joint_states.start()
-        self._stopping = threading.Event()
-        threading.Thread(target=self._plan, daemon=True).start()
+        self._planner.start()
 
     @property
     def failure(self) -> Exception | None:
-        """The exception that ended the thread of the joint states."""
-        return self._joint_states.failure
+        """The exception that ended the thread of the joint states, or that of the poses."""
+        return self._joint_states.failure or self._planner.failure
 
     def close(self) -> None:
         """Stop answering joint states, and report what is still unreported."""
-        self._stopping.set()
         self._joint_states.stop()
+        self._planner.stop()
         self._report()
-
-    def _plan(self) -> None:
-        """Choose poses on a thread of its own: neither joint states nor tilts may wait for it."""
-        while not self._stopping.wait(PLAN_PERIOD):
-            self._tour.plan()
 
     def _on_joint_states(self, message: JointState, info: dict[str, Any]) -> None:
         self._command.header.stamp = message.header.stamp
         try:
-            if self._source.is_another(info):
-                self._on_intruder("joint_states")
+            self._sources["joint_states"].is_another(info)
+            for topic, publishers in self._sources.items():
+                if publishers.are_several:
+                    self._trouble = f"more than one publisher of {topic}"
             effort = self._effort(by_name(message, "position", self._names), by_name(message, "velocity", self._names))
         except ParameterError as error:
             self._trouble, effort = f"joint_states: {error}", None
@@ -108,9 +106,6 @@ class CalibratorNode(Node):
     def _on_refused_tilt(self, topic: str, error: ParameterError) -> None:
         self.get_logger().error(f"{topic}: {error}", throttle_duration_sec=1.0)
 
-    def _on_intruder(self, topic: str) -> None:
-        self._trouble = f"more than one publisher of {topic}"
-
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name == self._bridge:
@@ -123,23 +118,19 @@ class CalibratorNode(Node):
                     self._trouble = status.message if has_fault else f"the bridge stopped carrying: {state}"
 
     def _report(self) -> None:
-        tour = self._tour
+        tour, events = self._tour, list[dict[str, Any]]()
         while self._printed < len(tour.measured):
-            _print({"observation": tour.measured[self._printed]._asdict()})
+            events.append({"observation": tour.measured[self._printed]._asdict()})
             self._printed += 1
         trouble = tour.trouble or self._trouble
         progress = tour.progress if self._began else f"waiting for the arm to be carried: {self._bridge_message}"
-        for key, value in (("progress", progress), ("trouble", trouble), ("done", tour.done)):
-            if value != self._reported[key]:
-                self._reported[key] = value
-                _print({key: value})
+        reported = {"progress": progress, "trouble": trouble, "done": tour.done}
+        events += [{key: value} for key, value in reported.items() if value != self._reported[key]]
+        self._reported = reported
+        sys.stdout.writelines(json.dumps(event, default=np.ndarray.tolist) + "\n" for event in events)
+        sys.stdout.flush()
         level = ERROR if trouble else OK if self._began else WARN
         self._diagnostics.report(level, f"withdrawn: {trouble}" if trouble else progress)
-
-
-def _print(event: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(event, default=np.ndarray.tolist) + "\n")
-    sys.stdout.flush()
 
 
 def main() -> None:

@@ -9,13 +9,11 @@ from __future__ import annotations
 import json
 import threading
 from collections import deque
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import yaml
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Imu
 from std_msgs.msg import String
@@ -23,11 +21,13 @@ from std_msgs.msg import String
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS
 from exo_gravity.core.trial.script import Step, TrialScript
+from exo_gravity.core.trunk.imu_checks import ImuSample
 from exo_gravity.hardware.can.can_port import open_bus
-from exo_gravity.nodes.ros.hot_path import LATCHED
+from exo_gravity.nodes.imu.device import message_of
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
-from exo_gravity.nodes.ros.parameters import bus_of, declare, values_after
+from exo_gravity.nodes.ros.parameters import accept_changes, bus_of, declare
 from exo_gravity.nodes.ros.run import run
+from exo_gravity.nodes.ros.subscriptions import LATCHED
 from exo_gravity.sim import SimulatedImu, VirtualWearer
 from exo_gravity.sim.device import MAX_CATCH_UP
 from exo_gravity.sim.params import SIMULATOR, device_of, imu_of, set_faults
@@ -36,10 +36,10 @@ from exo_gravity.sim.trunk_motion import TrunkState
 TRUNK_SPEED = 0.5  # rad/s at which the trunk moves to a new tilt
 
 
-def script_of(path: str) -> TrialScript:
-    """Return the script in a YAML file. Raises ParameterError."""
+def script_of(path: str) -> TrialScript | None:
+    """Return the script in a YAML file, None if `path` is empty. Raises ParameterError."""
     try:
-        return TrialScript.parse(yaml.safe_load(Path(path).read_text(encoding="utf-8")))
+        return TrialScript.parse(yaml.safe_load(Path(path).read_text(encoding="utf-8"))) if path else None
     except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
         raise ParameterError("trial", path, f"a readable script file ({error})") from None
 
@@ -56,11 +56,11 @@ class Simulator(Node):
         values = declare(self, SIMULATOR, free_prefix=OPTIONS)
         self._device = device_of(values)
         set_faults(self._device, values)
-        self._script = script_of(values["trial"]) if values["trial"] else None
-        self._delay = values["trial_delay"]
+        self._trial = values["trial"]
+        # Scripts, and when they start, in s after the motors are on.
+        self._scripts = deque([(script, values["trial_delay"])] if (script := script_of(self._trial)) else [])
         self._trunk_target = (values["trunk.pitch"], values["trunk.roll"])
         self._wearer: VirtualWearer | None = None
-        self._new_scripts: deque[TrialScript] = deque()  # set by a parameter, started by the device's thread
         self._published_step: int | None = None
         self._diagnostics = Diagnostics(self)
         self._step_publisher = self.create_publisher(String, "wearer_step", LATCHED)
@@ -69,8 +69,7 @@ class Simulator(Node):
         self._imu_publisher = self.create_publisher(Imu, topic, qos_profile_sensor_data) if topic else None
         self._trunk_period = 1.0 / self._imu.config.rate
         self._trunk_due = 0.0  # monotonic s
-        self.add_on_set_parameters_callback(self._check_parameters)
-        self.add_post_set_parameters_callback(self._apply_parameters)
+        accept_changes(self, SIMULATOR, lambda values: (values, script_of(values["trial"])), self._apply)
         self.failure: Exception | None = None  # ends the node, see run()
         self._stopping = threading.Event()
         self._bus = open_bus(*bus_of(self, values))
@@ -88,8 +87,6 @@ class Simulator(Node):
         self._stopping.set()
         self._thread.join()
         self._bus.shutdown()
-
-    # Device thread
 
     def _play(self) -> None:
         try:
@@ -119,22 +116,17 @@ class Simulator(Node):
             rates = pitch_step / self._trunk_period, roll_step / self._trunk_period
             state = TrunkState(device.pitch, device.roll, *rates)
         if self._imu_publisher:
-            message = Imu()
-            message.header.stamp = self.get_clock().now().to_msg()
-            message.header.frame_id = "imu"
-            message.orientation_covariance[0] = -1.0  # REP-145: no orientation
-            readings = self._imu.sample_of(state)
-            for vector, value in zip((message.angular_velocity, message.linear_acceleration), readings, strict=True):
-                vector.x, vector.y, vector.z = value.tolist()
-            self._imu_publisher.publish(message)
+            time = self.get_clock().now().nanoseconds * 1e-9
+            sample = ImuSample(time, *(vector.tolist() for vector in self._imu.sample_of(state)))
+            self._imu_publisher.publish(message_of(sample))
 
     def _follow_wearer(self) -> None:
         """Start the wearer when the motors are on, and publish each new step."""
         device = self._device
-        while self._new_scripts:
-            self._start_wearer(self._new_scripts.popleft(), 0.0)
-        if self._script and self._wearer is None and all(motor.entered for motor in device.motors):
-            self._start_wearer(self._script, self._delay)
+        while self._scripts and all(motor.entered for motor in device.motors):
+            script, delay = self._scripts.popleft()
+            self._wearer, self._published_step = VirtualWearer(script), None
+            device.start(self._wearer, delay)
         if self._wearer is None or self._wearer.step is None or self._wearer.step == self._published_step:
             return
         number, steps = self._wearer.step, self._wearer.script.steps
@@ -143,11 +135,6 @@ class Simulator(Node):
         content = {"step": number, "of": len(steps), "action": step.action, "duration": step.duration}
         self._step_publisher.publish(String(data=json.dumps(content)))
         self.get_logger().info(f"wearer: {step.action} ({number} of {len(steps)})")
-
-    def _start_wearer(self, script: TrialScript, delay: float) -> None:
-        self._script, self._published_step = script, None
-        self._wearer = VirtualWearer(script)
-        self._device.start(self._wearer, delay)
 
     def _report(self) -> None:
         device = self._device
@@ -165,22 +152,13 @@ class Simulator(Node):
             level, message = WARN, "a simulated fault disconnects a motor"
         self._diagnostics.report(level, message, values)
 
-    # ROS callbacks
-
-    def _check_parameters(self, changes: Sequence[Parameter]) -> SetParametersResult:
-        try:
-            if path := values_after(self, SIMULATOR, changes)["trial"]:
-                script_of(path)
-        except ParameterError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
-
-    def _apply_parameters(self, changes: Sequence[Parameter]) -> None:
-        values = values_after(self, SIMULATOR)
+    def _apply(self, changed: tuple[dict[str, Any], TrialScript | None]) -> None:
+        values, script = changed
         self._trunk_target = (values["trunk.pitch"], values["trunk.roll"])
         set_faults(self._device, values)
-        if any(change.name == "trial" for change in changes) and values["trial"]:
-            self._new_scripts.append(script_of(values["trial"]))
+        if script and values["trial"] != self._trial:
+            self._scripts.append((script, 0.0))
+        self._trial = values["trial"]
 
 
 def main() -> None:

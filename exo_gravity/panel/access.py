@@ -17,6 +17,7 @@ from pathlib import Path
 from urllib.parse import parse_qs
 
 from starlette.datastructures import MutableHeaders
+from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection, Request
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -78,7 +79,9 @@ class Access:
             nonlocal left
             message = await receive()
             left -= len(message.get("body", b""))
-            return message if left >= 0 else {"type": "http.disconnect"}  # a proxy need not say how long a request is
+            if left < 0:  # found here, since a proxy need not say how long a request is
+                raise HTTPException(413, "413: too long")
+            return message
 
         async def confined(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -87,12 +90,12 @@ class Access:
                 answer.update(HEADERS)
             await send(message)
 
-        refusal = self._refusal(HTTPConnection(scope))
-        if refusal is None and _is_login(scope):
-            request = Request(scope, limited)
-            given = parse_qs((await request.body()).decode("utf-8", "replace")).get("token", [""])[0]
-            refusal = self._opened_by(given, request)
-        await (refusal or self._app)(scope, limited, confined)
+        await (self._refusal(HTTPConnection(scope)) or self._app)(scope, limited, confined)
+
+    async def login(self, request: Request) -> Response:
+        """Answer the form that asks for the token."""
+        given = parse_qs((await request.body()).decode("utf-8", "replace")).get("token", [""])[0]
+        return self._opened_by(given, request)
 
     def allows_host(self, host: str) -> bool:
         """Return whether a request with this header `Host` may be answered."""
@@ -124,9 +127,8 @@ class Access:
         changes = scope.get("method") not in ("GET", "HEAD")  # a live connection has no method
         if changes and not is_same_origin(headers.get("origin", ""), headers.get("host", "")):
             return PlainTextResponse("403: this request does not come from the panel's page", 403)
-        if int(headers.get("content-length", "0")) > MAX_BODY:
-            return PlainTextResponse("413: too long", 413)
-        if _is_login(scope) or self.allows(connection.cookies.get(COOKIE, "")):
+        is_login = (scope["path"], scope.get("method")) == ("/login", "POST")
+        if is_login or self.allows(connection.cookies.get(COOKIE, "")):
             return None
         return self._opened_by(connection.query_params.get("token", ""), connection)  # as the log shows it
 
@@ -144,10 +146,6 @@ class Access:
 def address_of(connection: HTTPConnection) -> str:
     """Return the address of the client."""
     return connection.client.host if connection.client else "unknown"
-
-
-def _is_login(scope: Scope) -> bool:
-    return (scope["path"], scope.get("method")) == ("/login", "POST")
 
 
 def _equal(one: str, other: str) -> bool:

@@ -24,8 +24,8 @@ import asyncio
 import logging
 import secrets
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.panel.view import SETTABLE
@@ -42,23 +42,8 @@ MAX_PAGES = 32
 BURST, REFILL = 20.0, 10.0  # requests that a page may send at once, and per second
 
 
-@dataclass(frozen=True)
-class Action:
-    """What one request asks for."""
-
-    kind: str
-    arm: str = ""  #: '' for all arms or none
-    values: Mapping[str, Any] = field(default_factory=dict)  #: parameters of the arm's compensator
-    name: str = ""  #: of the trial
-
-    def __str__(self) -> str:
-        """Describe the action for the log, without the wearer's data."""
-        shown = [key if key.startswith("wearer.") else f"{key} = {value}" for key, value in self.values.items()]
-        return " ".join(filter(None, (self.kind.replace("_", " "), self.arm, ", ".join(shown), self.name)))
-
-
-def parse(body: Any, arms: Collection[str], trials: Collection[str]) -> Action:
-    """Return the action that the JSON value `body` describes. Raises ParameterError."""
+def parse(body: Any, arms: Collection[str], trials: Collection[str]) -> dict[str, Any]:
+    """Return the request that the JSON value `body` is, with its values in their types. Raises ParameterError."""
     kind = body.get("do") if isinstance(body, dict) else None
     if not isinstance(kind, str) or kind not in KEYS:
         raise ParameterError("do", kind, f"one of {', '.join(KEYS)}")
@@ -71,11 +56,19 @@ def parse(body: Any, arms: Collection[str], trials: Collection[str]) -> Action:
     if kind == "trial" and name not in trials:
         raise ParameterError("trial", name, f"one of {', '.join(sorted(trials))}")
     if kind != "set":
-        return Action(kind, arm, name=name)
+        return dict(body)
     values = body.get("values") if isinstance(body.get("values"), dict) else {}
     if not values or not values.keys() <= SETTABLE.keys():  # the error has no values: they may be the wearer's
         raise ParameterError("values", list(values), f"an object with some of {', '.join(SETTABLE)}")
-    return Action(kind, arm, {key: SETTABLE[key].check(value) for key, value in values.items()})
+    return {**body, "values": {key: SETTABLE[key].check(value) for key, value in values.items()}}
+
+
+def sentence(request: Mapping[str, Any]) -> str:
+    """Describe a request for the log, without the wearer's data."""
+    values = request.get("values", {}).items()
+    shown = ", ".join(key if key.startswith("wearer.") else f"{key} = {value}" for key, value in values)
+    words = (request["do"].replace("_", " "), request.get("arm"), shown, request.get("name"))
+    return " ".join(filter(None, words))
 
 
 @dataclass
@@ -88,36 +81,26 @@ class Page:
     seen: float  #: monotonic s of its last confirmation
     credited: float  #: monotonic s of its last request
     credit: float = BURST  #: requests that it may send
-    connected: bool = True
+    connection: Any = None  #: its open live connection
 
     def __str__(self) -> str:
         """Name the page in log lines."""
         return f"{self.address} page {self.number}"
 
 
-class Reply(NamedTuple):
-    """The answer to a request: an HTTP status and '' or what is wrong."""
-
-    status: int
-    text: str
-
-
 class Control:
     """The pages, which of them holds control, and what is done for them.
 
-    arms: has their `names`; a coroutine function `ask(kind, arm, values)` for each request with the key "arm";
-    `lease(page, kind)`, which sends a page's request for control to all arms, and `other_holder(arm, page)`, the name
-    of who else holds control of an arm. files: has the names of the `trials` and a coroutine function for each other
-    request, of which `trial` takes a name. Each returns '' or why it failed. note: called with a sentence for the log
-    and the recording. clock: monotonic s.
+    arms: `Arms` of nodes/panel/node.py. files: `Recordings`. note: called with a sentence for the log and the
+    recording. clock: monotonic s.
     """
 
     def __init__(self, arms: Any, files: Any, note: Callable[[str], object], clock: Callable[[], float]) -> None:
         self.holder: Page | None = None  #: the page that holds control
-        self._arms = arms
-        self._files = files
+        self.arms = arms
+        self.files = files
         self._note = note
-        self._clock = clock
+        self.clock = clock
         self._pages: dict[str, Page] = {}  # by secret
         self._numbers = 0
 
@@ -128,10 +111,10 @@ class Control:
         is gone.
         """
         page = self._pages.get(secret)
-        now = self._clock()
+        now = self.clock()
         if page is None:
             if len(self._pages) >= MAX_PAGES:  # those that are closed lose their numbers
-                self._pages = {known.secret: known for known in self._pages.values() if known.connected}
+                self._pages = {known.secret: known for known in self._pages.values() if known.connection}
             if len(self._pages) >= MAX_PAGES:
                 return None
             self._numbers += 1
@@ -139,64 +122,70 @@ class Control:
             self._pages[page.secret] = page
         if self.holder is None or self.is_gone():
             self.holder = page
-        page.connected = True
         self.confirm(page)
         return page
 
     def confirm(self, page: Page) -> None:
         """Note that the page shows the present state, and renew its lease."""
-        page.seen = self._clock()
+        page.seen = self.clock()
         if page is self.holder:
-            self._arms.lease(str(page), "hold")
+            self.arms.lease(str(page), "hold")
 
     def is_gone(self) -> bool:
         """Return whether a page holds control that is gone."""
-        return self.holder is not None and self._clock() - self.holder.seen > GONE
+        return self.holder is not None and self.clock() - self.holder.seen > GONE
 
     @property
     def elsewhere(self) -> str:
         """The name of another operator who holds control of an arm, instead of this panel's page; '' for none."""
-        others = [self._arms.other_holder(arm, str(self.holder)) for arm in self._arms.names]
+        others = [self.arms.other_holder(arm, str(self.holder)) for arm in self.arms.names]
         return next(filter(None, others), "")
 
-    async def perform(self, body: Any, secret: str, address: str) -> Reply:
-        """Do what the JSON value `body` asks for, sent by the page with `secret`, at `address`."""
+    async def perform(self, body: Any, secret: str, address: str) -> tuple[int, str]:
+        """Do what the JSON value `body` asks for, sent by the page with `secret`, at `address`.
+
+        Returns an HTTP status, and '' or what is wrong.
+        """
         page = self._pages.get(secret)
         try:
-            action = parse(body, self._arms.names, self._files.trials)
+            request = parse(body, self.arms.names, self.files.trials)
         except ExoGravityError as error:
             return self._refused(page, 400, str(error))
-        if action.kind != "let_down":
+        kind, arm, text = request["do"], request.get("arm", ""), sentence(request)
+        if kind != "let_down":
             if page is None:
-                return Reply(403, "unknown page: reload it")
+                return (403, "unknown page: reload it")
             if not self._spend(page):
-                return Reply(429, "too many requests: wait a moment")
-            if action.kind != "take" and page is not self.holder:
-                return self._refused(page, 403, f"{action}: another page holds control")
-            if action.arm and (other := self._arms.other_holder(action.arm, str(page))):
-                return self._refused(page, 403, f"{action}: {other} holds control of this arm")
-        if action.kind in ("enable", "resume"):  # by a page that confirms nothing, the arm is not carried for long
-            self._arms.lease(str(page), "hold")
-        problem = await self._carry_out(action, page)
-        self._log(f"{page or f'{address} unknown page'}: {action}: {problem or 'done'}")
-        return Reply(409 if problem else 200, problem)
+                return (429, "too many requests: wait a moment")
+            if kind != "take" and page is not self.holder:
+                return self._refused(page, 403, f"{text}: another page holds control")
+            if arm and (other := self.arms.other_holder(arm, str(page))):
+                return self._refused(page, 403, f"{text}: {other} holds control of this arm")
+        if kind in ("enable", "resume"):  # by a page that confirms nothing, the arm is not carried for long
+            self.arms.lease(str(page), "hold")
+        problem = await self._carry_out(request, kind, arm, page)
+        self._log(f"{page or f'{address} unknown page'}: {text}: {problem or 'done'}")
+        return (409 if problem else 200, problem)
 
-    def _refused(self, page: Page | None, status: int, text: str) -> Reply:
+    def _refused(self, page: Page | None, status: int, text: str) -> tuple[int, str]:
         if page and self._spend(page):  # a flood of wrong requests must not fill the log
             self._log(f"{page}: refused: {text}")
-        return Reply(status, text)
+        return (status, text)
 
-    async def _carry_out(self, action: Action, page: Page | None) -> str:
-        if action.kind in ("take", "release"):
-            self.holder = page if action.kind == "take" else None
-            self._arms.lease(str(page), action.kind)
+    async def _carry_out(self, request: Mapping[str, Any], kind: str, arm: str, page: Page | None) -> str:
+        if kind == "let_down":
+            return await self._let_down([arm] if arm else self.arms.names)
+        if kind in ("take", "release"):
+            self.holder = page if kind == "take" else None
+            self.arms.lease(str(page), kind)
             return ""
-        if action.kind != "let_down":
-            if action.arm:
-                return str(await self._arms.ask(action.kind, action.arm, action.values))
-            return str(await getattr(self._files, action.kind)(*filter(None, (action.name,))))
-        arms = [action.arm] if action.arm else self._arms.names  # all at once, and none waits for another
-        asked = (self._arms.ask("let_down", arm, {}) for arm in arms)
+        if arm:
+            return str(await self.arms.ask(kind, arm, request.get("values", {})))
+        return str(await getattr(self.files, kind)(*filter(None, (request.get("name"),))))
+
+    async def _let_down(self, arms: Collection[str]) -> str:
+        """Let the arms down all at once: none waits for another."""
+        asked = (self.arms.ask("let_down", arm, {}) for arm in arms)
         results = await asyncio.gather(*asked, return_exceptions=True)
         problems = [f"{type(r).__name__}: {r}" if isinstance(r, BaseException) else r for r in results]
         failed = [f"{arm}: {problem}" for arm, problem in zip(arms, problems, strict=True) if problem]
@@ -210,7 +199,7 @@ class Control:
 
     def _spend(self, page: Page) -> bool:
         """Return whether the page may send one more request now."""
-        now = self._clock()
+        now = self.clock()
         page.credit = min(BURST, page.credit + REFILL * (now - page.credited))
         page.credited = now
         if page.credit < 1.0:

@@ -14,10 +14,10 @@ import json
 import os
 import sys
 from asyncio.subprocess import DEVNULL, PIPE
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import yaml
 
@@ -26,35 +26,22 @@ from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trial.script import TrialScript
 
 STOP_TIMEOUT = 10.0  # s for a recorder to end
-Parameters = Mapping[str, Mapping[str, Any]]
-
-
-class Device(Protocol):
-    """What a trial needs of the arms."""
-
-    def parameters(self) -> Parameters:
-        """Return the parameters of every node by full name."""
-
-    def states(self) -> Mapping[str, str | None]:
-        """Return the state of each arm; None if its bridge is silent."""
-
-    async def perform(self, script: str) -> str:
-        """Let the virtual wearer perform the script at this path; return '' or why not. '' without a simulator."""
 
 
 class Recordings:
-    """`Files` of `exo_gravity.panel.control`. note: called with a sentence for the log. clock: monotonic s."""
+    """`files` of `exo_gravity.panel.control.Control`.
+
+    device: the arms. It has `parameters()` of every node by full name, `states()` of each arm (None if its bridge is
+    silent), and a coroutine function `perform(path)` that lets the virtual wearers perform a script, and returns '' or
+    why not. note: called with a sentence for the log. clock: monotonic s.
+    """
 
     def __init__(
-        self,
-        output: str,
-        scripts: Path | None,
-        device: Device,
-        note: Callable[[str], None],
-        clock: Callable[[], float],
+        self, output: str, scripts: Path | None, device: Any, note: Callable[[str], None], clock: Callable[[], float]
     ) -> None:
+        #: the scripts to choose from, by name
+        self.trials = {path.stem: path for path in sorted(scripts.glob("*.yaml"))} if scripts else {}
         self._output = Path(output).expanduser().resolve()
-        self._scripts = {path.stem: path for path in sorted(scripts.glob("*.yaml"))} if scripts else {}
         self._device = device
         self._note = note
         self._clock = clock
@@ -66,11 +53,6 @@ class Recordings:
         self._progress: dict[str, Any] = {"phase": "none"}
         self._reports: dict[str, Path] = {}
         self._saved = ""
-
-    @property
-    def trials(self) -> Collection[str]:
-        """The trials to choose from."""
-        return tuple(self._scripts)
 
     def state(self) -> dict[str, Any]:
         """Return what the page shows."""
@@ -152,7 +134,7 @@ class Recordings:
         states = self._device.states()
         if not states or set(states.values()) != {State.ACTIVE.value}:
             return "a trial starts when every arm is active"
-        path = self._scripts[name]
+        path = self.trials[name]
         try:
             script = TrialScript.parse(yaml.safe_load(path.read_text(encoding="utf-8")))
         except (OSError, yaml.YAMLError, ParameterError) as error:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import asyncio
 import socket
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -41,38 +41,23 @@ FULL, REPLACED = 4000, 4001  # why a live connection was closed: too many pages;
 
 
 class PanelServer:
-    """Serves the panel at `host` and `port`, on a thread.
+    """Serves the panel at `host` and `port`, on a thread."""
 
-    report: returns the report of a trial by name, or None. parameters: returns those in force by node. clock: of
-    `access`, monotonic s.
-    """
-
-    def __init__(
-        self,
-        host: str,
-        port: int,
-        token: str,
-        control: Control,
-        report: Callable[[str], Path | None],
-        parameters: Callable[[], Mapping[str, Any]],
-        clock: Callable[[], float],
-    ) -> None:
+    def __init__(self, host: str, port: int, token: str, control: Control) -> None:
         self.state = NONE_YET  #: what the pages show, replaced by a new object in any thread
         self.setup = NONE_YET  #: what changes rarely, replaced likewise
         self._control = control
-        self._report = report
-        self._connections: dict[str, WebSocket] = {}  # by the page's secret
         routes = [
             Route("/", lambda request: FileResponse(FOLDER / "static" / "index.html")),
             Route("/strings", lambda request: FileResponse(FOLDER / "strings.json")),
             Route("/action", self._on_action, methods=["POST"]),
             Route("/report/{name}", self._on_report),
-            Route("/parameters", lambda request: JSONResponse(parameters())),
+            Route("/parameters", lambda request: JSONResponse(control.arms.parameters())),
             WebSocketRoute("/live", self._on_live),
-            Route("/login", lambda request: RedirectResponse("/")),
+            Route("/login", self._on_login, methods=["GET", "POST"]),
             Mount("/static", StaticFiles(directory=FOLDER / "static")),
         ]
-        self.access = Access(Starlette(routes=routes), host, token, clock)
+        self.access = Access(Starlette(routes=routes), host, token, control.clock)
         try:
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
             self._socket = socket.create_server((host, port), family=family)
@@ -108,9 +93,9 @@ class PanelServer:
             if page is None:
                 await connection.close(FULL)
                 return
-            if page.secret in self._connections:
-                await self._connections[page.secret].close(REPLACED)
-            self._connections[page.secret] = connection
+            replaced, page.connection = page.connection, connection
+            if replaced:
+                await replaced.close(REPLACED)
             sender = asyncio.create_task(self._send(connection, page))
             try:
                 while True:
@@ -118,9 +103,8 @@ class PanelServer:
                     self._control.confirm(page)
             finally:
                 sender.cancel()
-                if self._connections.get(page.secret) is connection:
-                    del self._connections[page.secret]
-                    page.connected = False
+                if page.connection is connection:
+                    page.connection = None
 
     async def _send(self, connection: WebSocket, page: Page) -> None:
         """Send the page's number, then setup and state whenever they are new, until it is cancelled."""
@@ -147,8 +131,11 @@ class PanelServer:
         status, text = await self._control.perform(content, secret, address_of(request))
         return JSONResponse({"error": text}, status)
 
+    async def _on_login(self, request: Request) -> Response:
+        return await self.access.login(request) if request.method == "POST" else RedirectResponse("/")
+
     async def _on_report(self, request: Request) -> Response:
-        path = self._report(request.path_params["name"])
+        path = self._control.files.report(request.path_params["name"])
         return FileResponse(path) if path else PlainTextResponse("404: no such report", 404)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import chain, repeat, zip_longest
 from typing import Any
 
@@ -20,7 +19,8 @@ PANEL = (
     Param("token", "", "secret that opens the page; empty: none on loopback, elsewhere a random one in the log",
           fixed=True),
     Param("dead_man", False, "let the arms down when the page that holds control has been gone for 1 s", fixed=True),
-    Param("language", "en", "language of the page until its user chooses another", choices=("en", "de"), fixed=True),
+    Param("language", "auto", "language of the page until its user chooses another; auto: the browser's",
+          choices=("auto", "en", "de"), fixed=True),
     Param("trials", "", "folder with trial scripts; empty: those of the package", fixed=True),
     Param("output", "recordings", "folder for recordings, trials and saved parameters", fixed=True),
 )
@@ -32,21 +32,11 @@ SETTABLE = {
     if param.name in ("support", "mode", "wearer.body_mass", "wearer.sex", "wearer.segment_length")
 }
 
+# Buses of python-can that lead to no motor.
+SIMULATED = ("udp_multicast", "virtual")
+
 Values = Mapping[str, Any]
 NUMBERS = ("position", "velocity", "effort")
-SILENT = 1.5  # s without diagnostics or joint states after which the last ones are not shown any more
-
-
-@dataclass(frozen=True)
-class Newest:
-    """The newest message of one kind, as the page gets it."""
-
-    content: Any = None
-    time: float = -math.inf  #: monotonic s of its arrival
-
-    def at(self, now: float) -> Any:
-        """Return the content; None if it is old."""
-        return self.content if now - self.time < SILENT else None
 
 
 def joint_rows(
@@ -75,4 +65,5 @@ def _arm_setup(bridge: Values, compensator: Values) -> dict[str, Any]:
     return {
         "max_effort": [min(column) for column in zip(*efforts, strict=True)] if efforts else None,
         "settings": {name: compensator.get(name) for name in SETTABLE},
+        "simulated": bridge.get("can.interface") in SIMULATED,
     }

@@ -226,7 +226,9 @@ class SimulatedDevice:
             given, step = wearer.torque(self.time - start, theta, velocity), wearer.step
             self._follow_trunk(wearer.script, self.time - start)
         if self.truth:
-            self.truth.note(self.time, theta, velocity, torque, self.motors, self._frames, (given, step))
+            damping, on = zip(*((motor.damping, motor.entered) for motor in self.motors), strict=True)
+            number = -1 if step is None else step
+            self.truth.note(self.time, theta, velocity, torque, damping, given, self._frames, number, on)
         self.arm.step(list(map(operator.add, torque, given)), count)
         self._steps += count
 

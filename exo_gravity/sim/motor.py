@@ -19,8 +19,7 @@ import random
 from dataclasses import dataclass, replace
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.bus_load import MAX_STATUS_RATE
-from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.joint_motor import MAX_STATUS_RATE, JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, SET_ZERO, MotorCommand, MotorReply, unpack_command
 from exo_gravity.core.motors.wire_formats import EXTENDED, MASTER_ID, MIT_V3, MODE_CURRENT, Frame
 from exo_gravity.core.params import owned

@@ -14,50 +14,48 @@ from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.model.rotation import ZERO
+from exo_gravity.core.model.tilt import Tilt, gravity_in_trunk
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import NO_COMMAND, Drive, EffortCommand, State
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.core.trial.recording import Recording, ScriptedStep, Span
+from exo_gravity.core.trial.recording import CARRIED, Recording, ScriptedStep, Span
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 GRACE = 0.5  # s from the end of the script until the arm is let down
-TILT_PERIOD = 0.01  # s between two tilts for the compensator
 CACHED_FRAMES = 64
 COLUMNS = 1 + 4 * JOINT_COUNT  # of the recording: time, position, velocity, effort, command
 NO_EFFORT = (math.nan,) * JOINT_COUNT
-MOTORS_OFF = (State.DISABLED, State.FAULT)
-CARRIED = (State.RAMPING_IN, State.ACTIVE)
 
 
 class TrunkReading(NamedTuple):
     """What the `imu` node publishes, vectors (3,) in the trunk's axes."""
 
     gravity: Sequence[float]  #: unit vector
-    specific_force: Sequence[float]  #: m/s^2, as measured
-    angular_velocity: Sequence[float]  #: rad/s, as measured
+    specific_force: Sequence[float] | None = None  #: m/s^2, as measured
+    angular_velocity: Sequence[float] = ZERO  #: rad/s, as measured
 
 
-class TrunkSensor(Protocol):
-    """An IMU that samples in every n-th cycle, n being `cycles`."""
+# Called in every cycle, in s; returns the reading of a sample, None if there is none.
+TrunkSensor = Callable[[float, TrunkState], TrunkReading | None]
 
-    cycles: int
 
-    def measure(self, now: float, state: TrunkState) -> TrunkReading | None:
-        """Return the reading of a sample at `now` in s, None if there is none."""
-        ...
+def resting(pitch: float, roll: float) -> TrunkSensor:
+    """Return the sensor of a trunk that stays at this measured tilt in rad, and of whose motion nothing is known."""
+    reading = TrunkReading(gravity_in_trunk(pitch, roll).tolist())
+    return lambda now, state: reading
 
 
 @dataclass(frozen=True)
@@ -70,8 +68,7 @@ class ArmSetup:
     limits: Limits
     settings: Settings
     rate: float  #: control cycles per s
-    tilt: tuple[float, float] | None  #: pitch and roll of the trunk in rad as measured, None without an IMU
-    trunk: TrunkSensor | None = None  #: the IMU of a trunk that moves, in place of `tilt`
+    trunk: TrunkSensor | None  #: None without an IMU
 
 
 class OfflineTrial:
@@ -100,8 +97,9 @@ class OfflineTrial:
         self.compensator = compensator or Compensator(arm.settings)
         self._command = NO_COMMAND
         self._reason = ""  # why the compensator has withdrawn
-        self._tilt_time = -math.inf  # of the compensator's newest tilt
-        self._reading: tuple[TrunkReading | None, float] = (None, 0.0)  # on its way, and when it was taken
+        before = -1.0 / arm.rate
+        # On its way, and when it was taken
+        self._reading = arm.trunk and arm.trunk(before, arm.device.trunk), before
         self._samples = [UNKNOWN] * JOINT_COUNT
         self._powered = False
         # Both are pure, and an arm at rest repeats its frames: caching them saves the most time.
@@ -118,9 +116,9 @@ class OfflineTrial:
         second = 0.0
         for cycle in itertools.count():
             now = cycle / self.arm.rate
-            self._deliver_tilt(cycle, now)
+            self._deliver_tilt(now)
             self._cycle(now)
-            if self.safety.state in MOTORS_OFF:
+            if self.safety.state in (State.DISABLED, State.FAULT):
                 break
             if now >= second:
                 second += 1.0
@@ -151,24 +149,18 @@ class OfflineTrial:
             self._reason = answer.reason
         arm.device.advance(1.0 / arm.rate)
 
-    def _deliver_tilt(self, cycle: int, now: float) -> None:
-        """Give the compensator the newest tilt; that of an IMU arrives one cycle after the sample."""
+    def _deliver_tilt(self, now: float) -> None:
+        """Give the compensator the newest tilt, which arrives one cycle after the sample."""
         arm, (reading, taken) = self.arm, self._reading
-        if not arm.settings.use_imu:
-            return
-        if arm.trunk is None:
-            if arm.tilt and now - self._tilt_time >= TILT_PERIOD:
-                self.compensator.tilt.set_tilt(now, *arm.tilt)
-                self.safety.motion.gravity = Tilt.of(arm.device.side, *arm.tilt).direction
-                self._tilt_time = now
+        if not arm.settings.use_imu or arm.trunk is None:
             return
         if reading:
             age, turning = now - taken, reading.angular_velocity
             self.compensator.tilt.set_gravity(now, reading.gravity, turning, age)
             self.safety.motion.gravity = Tilt.of_gravity(arm.device.side, reading.gravity).direction
-            self.compensator.motion.add(now, reading.specific_force, turning, age)
-        due = cycle % arm.trunk.cycles == 0
-        self._reading = (arm.trunk.measure(now, arm.device.trunk) if due else None), now
+            if reading.specific_force:
+                self.compensator.motion.add(now, reading.specific_force, turning, age)
+        self._reading = arm.trunk(now, arm.device.trunk), now
 
     def _exchange(self, drive: Drive, now: float) -> None:
         """Send `drive` to the motors and read their replies, with the same frames as `MotorBus`."""

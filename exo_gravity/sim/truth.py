@@ -6,16 +6,14 @@ what was written stays when the process is frozen or killed.
 
 from __future__ import annotations
 
-import struct
 import time
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.sim.motor import SimulatedMotor
 
 # time: wall clock in s. position, velocity: of the joints, rad and rad/s. torque: of the motors on the joints, Nm.
 # damping: Nm s/rad, the part of that torque that is proportional to the velocity. wearer: Nm of the wearer on the
@@ -34,7 +32,6 @@ RECORD = np.dtype(
         ("on", "?", JOINT_COUNT),
     ]
 )
-_ROW = struct.Struct(f"<d{5 * JOINT_COUNT}f{JOINT_COUNT}Ii{JOINT_COUNT}?")
 FLUSH_PERIOD = 0.02  # s
 
 
@@ -54,21 +51,10 @@ class TruthLog:
         """Note that the simulated time `now` (s) is the present time."""
         self._offset = time.time() - now
 
-    def note(
-        self,
-        now: float,
-        position: Sequence[float],
-        velocity: Sequence[float],
-        torque: Sequence[float],
-        motors: Sequence[SimulatedMotor],
-        frames: Sequence[int],
-        wearer: tuple[Sequence[float], int | None],
-    ) -> None:
-        """Append the state of the arm at the simulated time `now` (s); sequences are (4,); wearer: torque, step."""
-        stamp, (given, step) = now + self._offset, wearer
-        damping, entered = [motor.damping for motor in motors], [motor.entered for motor in motors]
-        number = -1 if step is None else step
-        self._rows += _ROW.pack(stamp, *position, *velocity, *torque, *damping, *given, *frames, number, *entered)
+    def note(self, now: float, *state: Any) -> None:
+        """Append the `state` of the arm at the simulated time `now` (s): the fields of RECORD from position on."""
+        stamp = now + self._offset
+        self._rows += np.array((stamp, *state), RECORD).tobytes()
         if abs(stamp - self._flushed) >= FLUSH_PERIOD:
             self._flushed = stamp
             self._file.write(self._rows)

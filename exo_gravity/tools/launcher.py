@@ -31,6 +31,7 @@ from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.tools.cli import require_ros
 from exo_gravity.tools.inputs.parameter_file import (
+    ABSOLUTE_TOPICS,
     ENDED_WELL,
     OBSERVERS,
     RECOVERY,
@@ -40,12 +41,14 @@ from exo_gravity.tools.inputs.parameter_file import (
     check_buses,
     chosen,
     executable,
+    in_namespace,
     load,
     node_names,
     packaged_config,
     stages,
 )
 
+LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 LOG_FORMAT = "{severity} {message}"
 
 OnLine = Callable[[str, str], None]  # (node, line of its log)
@@ -62,15 +65,23 @@ class Launcher:
     """The processes of one parameter file.
 
     on_line is called with each line that a node prints. only: shell patterns of the nodes to start; () starts all.
-    more: nodes to start in addition to those of the file, with their default parameters. Raises ParameterError.
+    more: nodes to start in addition to those of the file, with their default parameters. namespace: '/lab' in front of
+    every node and of the IMU's topics. log_level: of every node. Raises ParameterError.
     """
 
     def __init__(
-        self, params: str | Path, on_line: OnLine = print_line, only: Sequence[str] = (), more: Sequence[str] = ()
+        self,
+        params: str | Path,
+        on_line: OnLine = print_line,
+        only: Sequence[str] = (),
+        more: Sequence[str] = (),
+        namespace: str = "",
+        log_level: str = "info",
     ) -> None:
         self._path = Path(params).resolve()
         nodes = {**{node: {} for node in more}, **load(self._path)}
         check_buses(nodes)
+        self._path, self._namespace, self._log_level = in_namespace(self._path, namespace), namespace, log_level
         self._commands = {node: self._command(node) for node in chosen(nodes, only)}
         self._processes: dict[str, subprocess.Popen[str]] = {}
         self._readers: dict[str, threading.Thread] = {}
@@ -171,9 +182,12 @@ class Launcher:
             self.stop()
 
     def _command(self, node: str) -> list[str]:
+        node = f"{self._namespace}{node}"
         namespace, name = node.rsplit("/", 1)
-        remaps = ("-r", f"__node:={name}", "-r", f"__ns:={namespace or '/'}")
-        return [executable(node), "--ros-args", *remaps, "--enclave", node, "--params-file", str(self._path)]
+        topics = [f"{topic}:={self._namespace}{topic}" for topic in ABSOLUTE_TOPICS if self._namespace]
+        remaps = [word for rule in (f"__node:={name}", f"__ns:={namespace or '/'}", *topics) for word in ("-r", rule)]
+        options = ("--enclave", node, "--params-file", str(self._path), "--log-level", self._log_level)
+        return [executable(node), "--ros-args", *remaps, *options]
 
     def _read(self, node: str, process: subprocess.Popen[str]) -> None:
         for line in process.stdout or ():
@@ -182,12 +196,19 @@ class Launcher:
 
 
 def stop_on_signals() -> Stopping:
-    """Return an event that Ctrl-C, SIGTERM or a closed terminal sets; nohup keeps the last one away."""
+    """Return an event that Ctrl-C, SIGTERM, a closed terminal or a dead `ros2 launch` sets; nohup keeps SIGHUP away."""
     stopping = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
             # On a thread, which waits where the handler interrupts a holder of the event's lock.
             signal.signal(number, lambda *_: _thread.start_new_thread(stopping.set, ()))
+
+    def follow_owner() -> None:  # `ros2 launch`, which holds our standard input open
+        sys.stdin.read()
+        stopping.set()
+
+    if os.environ.get("EXO_GRAVITY_SUPERVISED"):
+        threading.Thread(target=follow_owner, daemon=True).start()
     return stopping
 
 
@@ -202,6 +223,8 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     only = "start only the nodes whose full names match a shell pattern: '*/can_bridge' /imu"
     parser.add_argument("--only", metavar="PATTERN", nargs="+", default=(), help=only)
     parser.add_argument("--panel", action="store_true", help="also start the operator's panel, where the file has none")
+    parser.add_argument("--namespace", metavar="NAME", default="", help="in front of every node and of /imu/...")
+    parser.add_argument("--log-level", default="info", choices=LOG_LEVELS, help="of every node (default: info)")
     return parser.parse_args(args)
 
 
@@ -212,7 +235,9 @@ def main(args: Sequence[str] | None = None) -> None:
     stopping = stop_on_signals()
     try:
         more = ["/panel"] if options.panel else []
-        launcher = Launcher(options.params or packaged_config("sim.yaml"), only=options.only, more=more)
+        path, space = options.params or packaged_config("sim.yaml"), options.namespace.strip("/")
+        namespace = f"/{space}" if space else ""
+        launcher = Launcher(path, print_line, options.only, more, namespace, options.log_level)
         dead = launcher.run(stopping)
     except ExoGravityError as error:
         print(f"launcher: {error}", file=sys.stderr)

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.bus_load import (
+from exo_gravity.core.motors.joint_motor import (
     BITRATE,
     COMMAND,
     REPLY,
     STATUS,
     V3_COMMAND,
     Traffic,
+    traffic_of,
 )
-from exo_gravity.core.motors.joint_motor import traffic_of
 from exo_gravity.core.motors.specs import MOTORS, MotorReply, pack_command, pack_reply
 from exo_gravity.core.motors.wire_formats import ID_BITS, MIT_V3
 

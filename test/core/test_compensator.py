@@ -55,9 +55,7 @@ def gravity_at(bow, lean):
     return turn @ down
 
 
-@pytest.mark.parametrize(
-    ("lean", "way"), [(-0.2, 1.0), (-1e-9, -1.0), (0.0, 1.0), (0.0, -1.0), (1e-3, 1.0), (0.3, -1.0)]
-)
+@pytest.mark.parametrize(("lean", "way"), [(-1e-9, -1.0), (0.0, 1.0), (0.3, -1.0)])
 def test_a_bow_through_90_degrees_and_lying_down_stay_compensated(lean, way):
     run = CompensatorRun(use_imu=True)
     base_from_trunk = np.array(((0, 1, 0), (1, 0, 0), (0, 0, -1)))  # left arm: x0 left, y0 forward, z0 down
@@ -269,7 +267,7 @@ CHANGES = st.fixed_dictionaries(
 PERIODS = st.sampled_from([0.001, 0.002, 0.004, 0.009, 0.011, 0.03, 0.045])  # late ones too
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.lists(st.tuples(CHANGES, st.lists(PERIODS, max_size=60), st.tuples(*[st.floats(-1.5, 1.5)] * 4)), max_size=9))
 def test_no_sequence_of_changes_poses_and_late_cycles_exceeds_the_torque_rate(sequence):
     run = CompensatorRun()

@@ -65,7 +65,7 @@ def wobble(run, seconds, width=0.02, hertz=3.0):
     return replaced
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(st.floats(0.001, 0.2), st.floats(0.1, 10.0))
 def test_along_a_path_across_the_edge_of_the_box_the_torque_neither_steps_nor_chatters(width, hertz):
     run = CompensatorRun(law="anfis", anfis=learned())

@@ -36,15 +36,15 @@ def upright(rng, count=200):
 @pytest.mark.parametrize("reference", [pinocchio, gravload])
 def test_the_exact_law_agrees_for_random_arms_poses_and_gravity_directions_with(reference):
     rng = np.random.default_rng(1)
-    for _ in range(10):
-        arm, theta, direction = random_arm(rng), random_poses(rng), random_directions(rng)
+    for _ in range(4):
+        arm, theta, direction = random_arm(rng), random_poses(rng, 50), random_directions(rng, 50)
         expected = reference(arm)(theta, direction)
         assert gravity_torque(arm, theta, direction) == pytest.approx(expected, abs=ROUNDING)
 
 
 def test_eq2_to_eq5_agree_with_gravload_if_each_centre_of_gravity_is_at_its_links_end():
     rng = np.random.default_rng(2)
-    for _ in range(10):
+    for _ in range(4):
         arm, theta = random_arm(rng, at_link_ends=True), upright(rng)
         expected = gravload(arm)(theta, np.tile(DOWN, (len(theta), 1)))
         assert paper_static_torque(arm, theta) == pytest.approx(expected, abs=ROUNDING)

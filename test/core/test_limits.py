@@ -31,9 +31,9 @@ def test_a_hot_motor_gets_less_torque():
     assert "derating (b)" in arm.machine.acted
 
 
-@pytest.mark.parametrize("rate", [20.0, 50.0, 100.0, 250.0, 500.0, 1000.0])
-@pytest.mark.parametrize("inertia", [0.005, 0.008, 0.03, 0.1, 0.3])
-@pytest.mark.parametrize("speed", [0.1, 0.5, 2.0, 5.0])
+@pytest.mark.parametrize("rate", [20.0, 100.0, 500.0])
+@pytest.mark.parametrize("inertia", [0.005, 0.03, 0.3])
+@pytest.mark.parametrize("speed", [0.5, 5.0])
 def test_the_soft_wall_never_throws_a_joint_back_faster_than_it_came(rate, inertia, speed):
     """One joint without friction or gravity runs into its wall; the motor applies torque and damping at once."""
     period, limit = 1.0 / rate, LIMITS.position_max[0]
@@ -67,7 +67,6 @@ def test_a_wall_pushes_back_before_a_joint_limit():
     ("field", "value"),
     [
         ("max_effort", (3.0, 9.0, 3.0)),
-        ("max_velocity", (0.0,) * 4),
         ("position_max", (0.0,) * 4),
         ("command_timeout", 5.0),
         ("sign_check_torque", math.nan),

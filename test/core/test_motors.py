@@ -38,7 +38,7 @@ SPECIAL_NUDGE = 3  # codes by which the torque is reduced at most if the command
 LONGEST = 80  # bytes; CAN FD has up to 64
 IDS = frozenset((1, 2, 3, 126))
 
-seeded = settings(max_examples=200, derandomize=True, database=None, deadline=None)
+seeded = settings(max_examples=60, derandomize=True, database=None, deadline=None)
 BYTES = st.binary(max_size=LONGEST) | st.binary(min_size=6, max_size=6) | st.binary(min_size=8, max_size=8)
 NUMBERS = st.floats() | st.floats(-20.0, 20.0) | st.floats(0.0, 600.0) | st.integers(-(10**30), 10**30)
 EXTREME_CODES = st.lists(st.sampled_from((0x00, 0xFF)), min_size=8, max_size=8).map(bytes)
@@ -244,11 +244,16 @@ def test_damping_alone_does_not_push_an_arm_at_rest(spec):
 LAYOUT = (("position", 16), ("velocity", 12), ("kp", 12), ("kd", 12), ("torque", 12))  # as in the manual's table
 
 
+def some_codes(width):
+    """Every 13th code, and the highest."""
+    return *range(0, 1 << width, 13), (1 << width) - 1
+
+
 @SPECS
 @pytest.mark.parametrize(("field", "width"), LAYOUT)
-def test_every_code_of_every_command_field_survives_unpack_and_pack(spec, field, width):
+def test_the_codes_of_every_command_field_survive_unpack_and_pack(spec, field, width):
     codes = {"position": 0x1234, "velocity": 0x567, "kp": 0x89A, "kd": 0xBC, "torque": 0xDEF}
-    for codes[field] in range(1 << width):
+    for codes[field] in some_codes(width):
         bits = "".join(f"{codes[name]:0{size}b}" for name, size in LAYOUT)
         data = int(bits, 2).to_bytes(8, "big")
         assert pack_command(spec, *unpack_command(spec, data)) == data
@@ -256,8 +261,8 @@ def test_every_code_of_every_command_field_survives_unpack_and_pack(spec, field,
 
 @SPECS
 @pytest.mark.parametrize(("offset", "width"), [(24, 16), (12, 12), (0, 12)])
-def test_every_code_of_every_reply_field_survives_unpack_and_pack(spec, offset, width):
-    for code in range(1 << width):
+def test_the_codes_of_every_reply_field_survive_unpack_and_pack(spec, offset, width):
+    for code in some_codes(width):
         data = (5 << 40 | (0x123456789 & ~(((1 << width) - 1) << offset)) | code << offset).to_bytes(6, "big")
         assert pack_reply(spec, *unpack_reply(spec, data)) == data
 
@@ -334,7 +339,6 @@ def test_each_joint_has_the_ranges_of_its_own_wire_format():
     assert [motor.wire_format.name for motor in motors] == ["mit", "mit_v3", "mit_v3", "mit"]
     assert [motor.spec.torque_range for motor in motors] == [15.0, 18.0, 12.0, 15.0]
     assert [motor.spec.velocity_range for motor in motors] == [45.0, 65.0, 60.0, 45.0]
-    assert motors_of(parameters(torque_per_ampere=[0.5, 0.0, 0.0, 0.0]))[0].spec.torque_per_ampere == 0.5
 
 
 def test_the_torque_range_of_a_v1_board_is_refused_for_a_v3_board():

@@ -33,12 +33,12 @@ def possible(param, rng):
     return rng.choice([low, rng.uniform(low, high)])
 
 
-def test_a_thousand_valid_and_invalid_changes_are_applied_or_rejected_and_never_step_the_torque():
+def test_hundreds_of_valid_and_invalid_changes_are_applied_or_rejected_and_never_step_the_torque():
     rng = random.Random(7)
     values = values_of(COMPENSATOR, {"use_imu": False})
     compensator = Compensator(settings_of(values))
     now, last, refused, moved = 100.0, np.zeros(4), 0, 0.0
-    for _ in range(1000):
+    for _ in range(300):
         changed = {p.name: possible(p, rng) for p in rng.sample(LIVE, rng.choice([1, 1, 2, 5]))}
         if rng.random() < 0.4:
             changed[rng.choice([*LIVE]).name if rng.random() < 0.9 else "suport"] = rng.choice(WRONG)
@@ -57,7 +57,7 @@ def test_a_thousand_valid_and_invalid_changes_are_applied_or_rejected_and_never_
             step = np.abs(effort - last).max()
             assert step <= values["max_effort_rate"] * min(period, LONGEST_STEP) * (1 + 1e-9)
             last, moved = effort, moved + step
-    assert 300 < refused < 700
+    assert 90 < refused < 210
     assert moved > 100.0  # Nm; the torque followed the changes
 
 

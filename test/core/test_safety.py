@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from exo_gravity.core.safety.descent import DAMPING_RISE
 from exo_gravity.core.safety.drive import CARRYING, NOTHING, OFF, Fault, FaultCode, State
 from exo_gravity.core.safety.limits import DAMPING, GUIDE_BRAKE, GUIDE_SPEED, MAX_EFFORT_RATE
-from exo_gravity.core.safety.ride import LONGEST_AGE, LONGEST_RIDE
+from exo_gravity.core.safety.monitors import LONGEST_AGE, LONGEST_RIDE
 
 from ..support.safety_run import EFFORT, LIMITS, PERIOD, SafetyRun
 

@@ -18,12 +18,11 @@ from exo_gravity.core.view.scene import (
     TORQUE_RADIUS,
     TORQUE_SPAN,
     ArmView,
-    arm_pose,
     arm_shapes,
     gravity_shapes,
     state_of,
 )
-from exo_gravity.core.view.urdf import ArmDescription, urdf
+from exo_gravity.core.view.urdf import ArmDescription, arm_pose, urdf
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")
 ROBOT = ArmModel((0.05, 0.13, 0.3, 0.3), (0.04, 0.1, 0.2, 0.15), (0.6, 0.5, 0.6, 0.2))

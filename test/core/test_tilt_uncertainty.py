@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from exo_gravity.core.trunk.uncertainty import BASE, DECAY_TIME, OVERSHOOT, TiltUncertainty
-from exo_gravity.hardware.trunk_estimator import VqfFusion
+from exo_gravity.core.trunk.uncertainty import BASE, DECAY_TIME, MAX_SIGMA, TiltUncertainty
+from exo_gravity.hardware.trunk_estimator import OVERSHOOT, VqfFusion
 
 G = 9.80665
 RANGE = 34.9  # rad/s
@@ -16,75 +16,70 @@ STILL = (0.0, 0.0, 0.0)
 
 
 def settled(acceleration=0.0, seconds=12.0):
-    """An uncertainty after `seconds` at 100 Hz, while the rate about x swings with `acceleration` rad/s^2."""
-    uncertainty, rate = TiltUncertainty(0.01), STILL
-    for k in range(round(100 * seconds)):
-        last, rate = rate, (0.01 * acceleration * (k % 2), 0.0, 0.0)
-        uncertainty.advance(0.01, rate, last)
-        uncertainty.combine(0.0, 0.0, 0.0)
+    """An uncertainty after `seconds` at 100 Hz, while the rate changes by `acceleration` rad/s^2."""
+    uncertainty = TiltUncertainty(0.01)
+    for _ in range(round(50 * seconds)):
+        go_on(uncertainty, acceleration)
     return uncertainty
+
+
+def go_on(uncertainty, acceleration=0.0, square=0.0):
+    uncertainty.advance(0.02, 2, acceleration, 0.0, square, 0.0)
 
 
 def added(uncertainty):
     """The standard deviation in rad beyond that of an estimate that has lost nothing."""
-    uncertainty.combine(0.0, 0.0, 0.0)
-    return math.sqrt(uncertainty.variance - BASE**2)
+    return math.sqrt(uncertainty.sigma**2 - BASE**2)
 
 
 def test_an_estimate_that_has_lost_nothing_has_vqfs_own_error():
-    assert math.sqrt(settled().variance) == pytest.approx(BASE)
+    assert settled().sigma == pytest.approx(BASE)
 
 
 def test_saturated_samples_add_up_over_a_run():
     uncertainty = settled()
     for _ in range(3):
-        uncertainty.advance(0.001, STILL, STILL, unknown=OVERSHOOT * RANGE)
+        uncertainty.miss(0.001, 0.0, OVERSHOOT * RANGE, 0.0)
     assert added(uncertainty) == pytest.approx(3 * OVERSHOOT * RANGE * 0.001, rel=0.01)
 
 
 @pytest.mark.parametrize(("acceleration", "assumed"), [(0.0, 20.0), (100.0, 100.0)])
-def test_a_gap_adds_by_its_square_and_the_angular_acceleration_of_late(acceleration, assumed):
+@pytest.mark.parametrize(("gap", "share"), [(0.05, 1 / 6), (0.02, 1 / 15)])
+def test_a_gap_adds_by_its_square_and_the_angular_acceleration_before_it(acceleration, assumed, gap, share):
     uncertainty = settled(acceleration)
-    uncertainty.advance(0.05, STILL, STILL)
-    assert added(uncertainty) == pytest.approx(assumed * 0.05**2 / 6, rel=0.05)
-
-
-def test_one_lost_sample_adds_less_than_a_long_gap():
-    uncertainty = settled(acceleration=100.0)
-    uncertainty.advance(0.02, STILL, STILL)
-    assert added(uncertainty) == pytest.approx(100.0 * 0.02**2 / 15, rel=0.05)
+    uncertainty.miss(gap, 0.0, 0.0, 0.0)
+    assert added(uncertainty) == pytest.approx(assumed * gap**2 * share, rel=0.05)
 
 
 def test_repeated_samples_add_by_the_square_of_their_time():
     uncertainty = settled(acceleration=100.0)
     for k in range(1, 4):
-        uncertainty.advance(0.01, STILL, STILL, repeated=0.01 * k)
+        uncertainty.miss(0.01, 0.0, 0.0, 0.01 * k)
     assert added(uncertainty) == pytest.approx(0.5 * 100.0 * 0.03**2, rel=0.1)
 
 
 def test_what_was_lost_decays_and_too_much_makes_the_estimate_begin_anew():
     uncertainty = settled()
-    uncertainty.advance(0.002, STILL, STILL, unknown=OVERSHOOT * RANGE)
+    assert not uncertainty.miss(0.002, 0.0, OVERSHOOT * RANGE, 0.0)
     before = added(uncertainty)
-    assert not uncertainty.is_lost
-    for _ in range(round(100 * DECAY_TIME)):
-        uncertainty.advance(0.01, STILL, STILL)
+    uncertainty.miss(0.01, 0.0, 0.0, 0.0)  # a good sample ends the run
+    for _ in range(round(50 * DECAY_TIME)):
+        go_on(uncertainty)
     assert added(uncertainty) == pytest.approx(before / math.e, rel=0.02)
-    uncertainty.advance(0.004, STILL, STILL, unknown=OVERSHOOT * RANGE)
-    assert added(uncertainty) > 0.03 and uncertainty.is_lost and not uncertainty.is_settled
+    assert uncertainty.miss(0.004, 0.0, OVERSHOOT * RANGE, 0.0)
+    assert added(uncertainty) > 0.03 and uncertainty.sigma > MAX_SIGMA
 
 
 def test_a_start_in_motion_takes_longer_and_an_unknown_bias_and_a_contradiction_widen_it():
     still, moving = TiltUncertainty(0.01), TiltUncertainty(0.01)
-    for _ in range(120):
-        for uncertainty, square in ((still, 4e-6), (moving, 0.5)):
-            uncertainty.advance(0.01, STILL, STILL)
-            uncertainty.combine(0.0, square, 0.0)
-    assert still.is_settled and not moving.is_settled
-    still.combine(0.02, 0.0, 0.0)
-    assert not still.is_settled
-    still.combine(0.0, 0.0, math.radians(3.5))
-    assert not still.is_settled
+    for _ in range(60):
+        go_on(still, square=4e-6)
+        go_on(moving, square=0.5)
+    assert still.sigma < MAX_SIGMA < moving.sigma
+    still.advance(0.02, 2, 0.0, 0.02, 0.0, 0.0)
+    assert still.sigma > MAX_SIGMA
+    still.advance(0.02, 2, 0.0, 0.0, 0.0, math.radians(3.5))
+    assert still.sigma > MAX_SIGMA
 
 
 def turned(samples):

@@ -27,7 +27,7 @@ def check(**given):
         {"max_effort": [9.0, 18.0, 9.0, 9.0]},  # peak torque
         {"max_effort": [6.75, 18.0, 9.0, 9.0], "torque_scale": [0.75, 1.0, 1.0, 1.0]},
         {"rate": 40.0},
-        {"rate": 25.0, "command_timeout": 0.08, "reply_timeout": 0.1},
+        {"rate": 25.0, "command_timeout": 0.08},
         {"rate": 200.0, "command_timeout": 0.01},
     ],
 )
@@ -52,9 +52,8 @@ def test_consistent_parameters_are_accepted(given):
         ({"max_effort": [3.0, 18.0, 3.0, 3.0], "torque_scale": [1.0, 0.9, 1.0, 1.0]}, "peak torque, [9.0, 16.2, 9.0"),
         ({"max_effort": [6.0, 9.0, 3.0, 3.0], "torque_range": [5.0, 18.0, 15.0, 15.0]}, "peak torque, [5.0, 18.0, 9.0"),
         ({"rate": 39.0}, "rate = 39.0: must be at least 40 Hz: command_timeout = 0.05 s must span 2 periods"),
-        ({"rate": 30.0, "command_timeout": 0.1}, "at least 40 Hz: reply_timeout = 0.05 s must span 2 periods"),
         (
-            {"rate": 20.0, "command_timeout": 0.1, "reply_timeout": 0.1},
+            {"rate": 20.0, "command_timeout": 0.1},
             "at least 25 Hz: the watchdog's time-out = 0.08 s must span 2 periods",
         ),
     ],
@@ -69,7 +68,7 @@ def test_impossible_and_contradicting_parameters_are_refused_with_their_values(g
     "name",
     [
         *("max_effort_rate", "max_temperature", "ramp_time", "fade_time", "damping", "home", "home_tolerance"),
-        *("status_rate", "lock_memory"),
+        *("status_rate", "lock_memory", "max_velocity", "reply_timeout", "torque_per_ampere"),
     ],
 )
 def test_a_parameter_that_is_gone_is_refused_with_what_replaces_it(name):
@@ -84,3 +83,9 @@ def test_a_joint_that_is_off_by_a_turn_of_its_rotor_is_never_near_its_zero():
         assert tolerance < math.pi / MOTORS[motor].gear_ratio
     values = values_of(CAN_BRIDGE, {"can.interface": "virtual", "can.channel": "arm", "motor": ["AK80-9"] * 4})
     assert limits_of(values).home_tolerance == (0.34,) * 4
+
+
+@pytest.mark.parametrize(("rate", "timeout"), [(500.0, 0.05), (250.0, 0.05), (100.0, 0.07), (50.0, 0.1)])
+def test_a_motor_is_silent_after_50_ms_or_7_cycles_up_to_100_ms(rate, timeout):
+    values = values_of(CAN_BRIDGE, {"can.interface": "virtual", "can.channel": "arm", "rate": rate})
+    assert limits_of(values).reply_timeout == pytest.approx(timeout)

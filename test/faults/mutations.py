@@ -53,8 +53,8 @@ MUTATIONS = (
         (
             Edit(
                 DESCENT,
-                "return tuple(joint.damping for joint in self._joints)",
-                "return (self._joints[0].damping, 0.0, 0.0, 0.0)",
+                "tuple(joint.damping for joint in self._joints)",
+                "(self._joints[0].damping, 0.0, 0.0, 0.0)",
             ),
         ),
     ),
@@ -145,7 +145,7 @@ MUTATIONS = (
     Mutation(
         "a ride that never ends",
         ("compensator frozen, the rest runs on",),
-        (Edit("exo_gravity/core/safety/ride.py", "if self._left >= 0.0 and age <= LONGEST_AGE:", "if True:"),),
+        (Edit("exo_gravity/core/safety/monitors.py", "if self._left >= 0.0 and age <= LONGEST_AGE:", "if True:"),),
     ),
     Mutation(
         "a ride without damping",
@@ -212,7 +212,7 @@ MUTATIONS = (
     Mutation(
         "powered frames are sent while the supply is cut",
         ("V3 boards: supply cut for 2 s", "supply cut for 2 s"),
-        (Edit(SAFETY, "if all(readings.silent) and self._sent.powered:", "if False:"),),
+        (Edit(SAFETY, "if all(readings.silent) and sent.powered:", "if False:"),),
     ),
     Mutation(
         "an enable never expires",

@@ -1,7 +1,6 @@
 """A process that carries an arm as a bridge does; `python -m test.hardware.carrier FILE`, FILE a pickled arm.
 
-It prints the PID of its watchdog once the motors are on and the watchdog runs. Orders, on its standard input:
-"hand over" requests the watchdog to take over, "off" switches the motors off.
+It prints the PID of its watchdog once the motors are on and the watchdog runs.
 """
 
 from __future__ import annotations
@@ -9,12 +8,11 @@ from __future__ import annotations
 import os
 import pickle
 import sys
-import threading
 import time
 from pathlib import Path
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.safety.drive import NOTHING, OFF, Drive
+from exo_gravity.core.safety.drive import NOTHING, Drive
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, OwnedBus
 
@@ -31,15 +29,10 @@ def main(arm: ArmOnBus, drive: Drive) -> None:
         raise SystemExit(1) from None
     notes = owned.notes
     bus = MotorBus(arm.open(), arm.motors, powered=True, note=notes.note)  # the rig has switched the motors on
-    orders: list[str] = []
-    threading.Thread(target=lambda: [orders.append(line) for line in sys.stdin], daemon=True).start()
     is_announced = False
     while True:
         end = time.monotonic() + arm.period
-        bus.exchange(OFF if "off\n" in orders else drive, end)
-        if "hand over\n" in orders:
-            owned.watchdog.hand_over("a test")
-            orders.clear()
+        bus.exchange(drive, end)
         if not is_announced and notes.heartbeat and all(joint.time > 0.0 for joint in bus.samples):
             print(owned.watchdog.process.pid, flush=True)
             is_announced = True

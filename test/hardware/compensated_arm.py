@@ -27,7 +27,8 @@ from .virtual_time import Wire
 RATED, PEAK = (3.0, 9.0, 3.0, 3.0), (9.0, 18.0, 9.0, 9.0)  # Nm
 CYCLE = 0.004  # s
 POSE = (0.0, 0.4, 0.2, 0.5)  # rad, in which the rated torques carry the arm of 75 kg
-MOVE = 3.0  # s in which a hand brings the arm to its pose
+START = 2.2  # s until the bridge carries the arm
+MOVE = 2.0  # s in which a hand brings the arm to its pose
 WEARER = Wearer(75.0).on_links(DEFAULT_LINKS.length)
 Hand = Callable[[float, Sequence[float], Sequence[float]], Sequence[float]]  # s, angles, velocities -> (4,) Nm
 
@@ -93,9 +94,9 @@ class CompensatedArm:
         self.safety = SafetyMachine(limits, cycle, motors)
         self.loop = ControlLoop(bus, self.safety, cycle, get_efforts=self._get_efforts)
         self.person = Person(pose)
-        self.device.start(self.person, 3.0)
+        self.device.start(self.person, START)
         self.safety.enable(self.clock.monotonic())
-        self.run(3.0 + MOVE + 0.5)
+        self.run(START + MOVE + 0.5)
         assert self.safety.state is State.ACTIVE, (self.safety.fault, self.safety.waiting_for)
         self.top_speed = 0.0
         self.torques.clear()

@@ -49,7 +49,7 @@ def test_an_arm_is_let_down_after_its_computer_was_suspended():
     arm.assert_let_down()
 
 
-@pytest.mark.parametrize("error", [ValueError("garbled line"), can.CanOperationError("down"), OSError("no device")])
+@pytest.mark.parametrize("error", [ValueError("garbled line"), OSError("no device")])
 def test_an_exception_of_the_bus_lets_the_arm_down_on_a_bus_that_was_opened_again(error):
     arm = Carried()
     arm.wire.break_down(error)
@@ -178,11 +178,9 @@ def test_the_thread_runs_the_cycles_until_the_loop_is_stopped():
     ("data", "period", "echoes"),
     [
         (EXIT, 0.1, False),
-        (EXIT, 0.004, True),
-        (MOTORS_OF_ARM[1].command(6.0, 0.0), 0.002, False),
-        (MOTORS_OF_ARM[1].command(0.0, 0.0), 0.01, True),
+        (MOTORS_OF_ARM[1].command(6.0, 0.0), 0.002, True),
     ],
-    ids=["EXIT at 10 Hz", "EXIT at 250 Hz, echoed", "6 Nm at 500 Hz", "0 Nm at 100 Hz, echoed"],
+    ids=["EXIT at 10 Hz", "6 Nm at 500 Hz, echoed"],
 )
 def test_foreign_commands_are_opposed_at_once_and_the_arm_is_let_down(data: bytes, period: float, echoes: bool):
     arm = Carried(echoes)

@@ -5,17 +5,15 @@ import pytest
 
 from exo_gravity.core.safety.drive import FaultCode, State
 
-from .active_wearer import attach, hold_still, lift, push, reach, shake, throw
+from .active_wearer import attach, hold_still, lift, reach, shake, throw
 from .virtual_rig import POSE, Carried
 
 MOVED = 0.6  # rad/s that the motors may cause
 HAND_OFF = 0.1  # s, as in test/faults/judge.py
 
 WEARERS = {
-    "lifts the elbow": lambda: lift(3, 1.0, 1.0),
     "lifts the shoulder": lambda: lift(1, 1.0, 0.7),
     "pushes down": lambda: lift(1, -1.0, 0.5),
-    "leans on the arm": lambda: push((0.0, -8.0, 0.0, 0.0), 0.4),
     "holds still": lambda: hold_still(1.5),
     "shakes": lambda: shake((0.0, 6.0, 3.0, 2.0), 1.0),
     "reaches": lambda: reach((0.3, 1.0, 0.8, 1.2), 1.6),

@@ -12,7 +12,6 @@ from exo_gravity.core.compensation.guidance import MAX_FADE_RATE
 from exo_gravity.core.compensation.terms.springs import Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.model.wearer import Wearer
-from exo_gravity.core.motors.wire_formats import MIT_V3
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import GUIDE_BRAKE
 from exo_gravity.sim.arm import DEFAULT_LINKS
@@ -27,24 +26,18 @@ HEAVIER = dict(zip(("wearer_mass", "wearer_cog"), Wearer(100.0).on_links(DEFAULT
 SPRING = {"terms": TermSettings(spring=Spring((4.0, 14.0, 7.0, 3.9), (0.0, 0.0, -0.3, 1.3)))}
 CLAMPED = {"max_effort": (0.5,) * 4}
 HALVED = {"robot": ArmModel(DEFAULT_LINKS.length, DEFAULT_LINKS.cog, DEFAULT_LINKS.mass, (0.5,) * 4)}
-V3 = {"formats": (MIT_V3,) * 4}
 
 # An arm, what changes, and whether its end is the hanging arm.
 CHANGES = {
-    "Zero-G to One-G": ({}, ONE_G, True),
-    "Zero-G to One-G, raised, peak torque": ({"limit": PEAK, "pose": RAISED}, ONE_G, True),
     "Zero-G to One-G, above the shoulder": ({"limit": PEAK, "pose": UPRIGHT}, ONE_G, True),
     "Zero-G to One-G, almost no friction": ({"friction": 0.01}, ONE_G, True),
-    "Zero-G to One-G, V3 boards": (V3, ONE_G, True),
     "body mass 75 to 100, peak torque": ({"limit": PEAK}, HEAVIER, False),
     "max_effort 18 to 0.5, raised": ({"limit": PEAK, "pose": RAISED}, CLAMPED, True),
     "a spring without a wearer": (NO_WEARER, SPRING, False),
-    "Zero-G without a wearer": ({**NO_WEARER, "limit": PEAK}, {"mode": "zero_g"}, False),
-    "law": (NO_WEARER, {"law": "paper_static"}, False),
     "gain": ({"limit": PEAK, "pose": RAISED}, HALVED, True),
 }
 # Of those, in which an arm whose motors do not damp comes near to SAFE_SPEED.
-FASTEST = ("Zero-G to One-G, above the shoulder", "max_effort 18 to 0.5, raised", "gain")
+FASTEST = ("gain",)
 
 
 @pytest.mark.parametrize(
@@ -102,13 +95,12 @@ class Leading:
         return self.torques[-1].tolist()
 
 
-@pytest.mark.parametrize("change", [ONE_G, SPRING])
-def test_a_wearer_who_holds_still_feels_the_new_load_come_slowly_and_nothing_else(change):
+def test_a_wearer_who_holds_still_feels_the_new_load_come_slowly_and_nothing_else():
     arm = CompensatedArm()
     arm.person.hand = Leading(arm.device.arm.positions, 0.0)
     arm.run(1.0)
     arm.torques.clear()
-    arm.change(**change)
+    arm.change(**ONE_G)
     arm.run(4.5)
     assert arm.answer.remainder == ()
     of_tenth = np.array(arm.torques)[:: round(0.1 / CYCLE)]
@@ -116,9 +108,8 @@ def test_a_wearer_who_holds_still_feels_the_new_load_come_slowly_and_nothing_els
     assert arm.top_speed < 0.1
 
 
-@pytest.mark.parametrize(("speed", "most"), [(0.2, 0.1), (1.0, GUIDE_BRAKE + 1.0)])
-def test_a_wearer_who_moves_on_is_not_stopped(speed, most):
-    felt = {}
+def test_a_wearer_who_moves_on_is_not_stopped():
+    felt, speed = {}, 1.0
     for is_damped in (True, False):
         arm = CompensatedArm()
         arm.is_damped = is_damped
@@ -127,9 +118,9 @@ def test_a_wearer_who_moves_on_is_not_stopped(speed, most):
         hand.torques.clear()
         arm.top_speed = 0.0
         arm.change(**ONE_G)
-        arm.run(5.0)
+        arm.run(3.5)
         assert arm.safety.state is State.ACTIVE
         assert arm.top_speed < 1.3 * speed + 0.05
         felt[is_damped] = np.array(hand.torques)
     length = min(map(len, felt.values()))
-    assert np.abs(felt[True][:length] - felt[False][:length]).max() < most  # Nm that the damping costs him
+    assert np.abs(felt[True][:length] - felt[False][:length]).max() < GUIDE_BRAKE + 1.0  # Nm that the damping costs him

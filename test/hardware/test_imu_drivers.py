@@ -28,7 +28,7 @@ def longest_without_tilt(motion, outcome):
 
 @pytest.mark.parametrize(
     ("driver", "trunk"),
-    [*((name, "sways") for name in DRIVERS), *((name, "bows and walks") for name in list(DRIVERS)[::4])],
+    [*((name, "sways") for name in DRIVERS), *((name, "bows and walks") for name in list(DRIVERS)[::8])],
 )
 def test_no_sample_is_refused_and_the_tilt_is_always_there_and_right(driver, trunk):
     timing = DRIVERS[driver]

@@ -44,7 +44,7 @@ def without_a_number(array):
 FAULTS = {
     "frozen bytes": (values(frozen, frozen), "the IMU or its driver is frozen"),
     "NaN": (values(without_a_number), "angular_velocity .* 3 finite numbers"),
-    "a gyroscope in deg/s": (values(np.degrees), "check the gyroscope's unit|is it in deg/s"),
+    "a gyroscope in deg/s": (values(np.degrees), "check the gyroscope's unit|is its unit right"),
     "an accelerometer in g": (values(None, lambda a: a / G), "in m/s.2, not in g|check units, axes and signs"),
     "a clock at half the speed": (slow_clock(0.5), "by a clock as fast as this computer's"),
     "a second publisher": (second_publisher, "check units, axes and signs"),

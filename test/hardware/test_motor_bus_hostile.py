@@ -29,7 +29,7 @@ MASTER = 0
 POSE = (0.1, 0.2, 0.3, 0.4)
 POSITION_CODE = 25.0 / 65535
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
-FRAMES = 100_000  # in total
+FRAMES = 20_000  # in total
 BURST = 10  # frames before each reply
 LIMITS = Limits(tuple("1234"), (-1.65, -0.17, -0.78, -0.17), (1.65, 3.14, 2.53, 3.14), (5.0,) * 4, (3.0, 9.0, 3.0, 3.0))
 
@@ -109,13 +109,13 @@ def test_among_foreign_frames_of_every_kind_only_the_motors_are_read(wire: Wire,
             assert sample.temperature in (30, None) and sample.error in (0, None)
     bus.receive_until(wire.clock.monotonic() + 0.01)  # reads the frames after the last reply
     assert sum(bus.ignored.values()) == noisy.foreign
-    assert set(bus.ignored) == {"foreign command", "error frame", "extended, remote or FD frame", "foreign frame"}
+    assert set(bus.ignored) == {"foreign command", "error frame", "remote or FD frame", "foreign frame"}
 
 
 def test_a_frame_is_a_reply_exactly_if_it_has_the_layout_of_one(wire: Wire) -> None:
     """The manual's layout is the independent reference."""
     bus, rng, found = motor_bus(wire), random.Random(3), Counter()
-    for _ in range(FRAMES // 5):
+    for _ in range(FRAMES // 4):
         message = foreign_frame(rng)
         before, ignored = list(bus.samples), sum(bus.ignored.values())
         wire.carry(None, message)
@@ -127,7 +127,7 @@ def test_a_frame_is_a_reply_exactly_if_it_has_the_layout_of_one(wire: Wire) -> N
         else:
             assert not changed and sum(bus.ignored.values()) == ignored + 1
             found["foreign"] += 1
-    assert found["reply"] > 100 and sum(bus.ignored.values()) == found["foreign"]
+    assert found["reply"] > 20 and sum(bus.ignored.values()) == found["foreign"]
 
 
 @pytest.mark.parametrize(("length", "most"), [(8, 0.0001), (6, 0.005)])

@@ -23,13 +23,13 @@ def check(motion):
 
 @pytest.mark.parametrize(
     ("angle", "over", "rate"),
-    [(0.3, 0.6, 100.0), (0.3, 0.6, 200.0), (0.5, 0.8, 100.0), (0.5, 1.5, 200.0), (1.0, 1.5, 100.0)],
+    [(0.3, 0.6, 100.0), (0.5, 0.8, 200.0), (1.0, 1.5, 100.0)],
 )
 def test_a_bow_right_after_a_walk_is_followed(angle, over, rate):
     for number, walk in enumerate((5.0, 10.0, 10.3)):
         check(worn(bows(angle, over, walk), walk + 2.0 * over + 6.0, rate, number))
 
 
-@pytest.mark.parametrize(("seed", "rate"), [(0, 100.0), (1, 200.0), (2, 100.0)])
+@pytest.mark.parametrize(("seed", "rate"), [(0, 100.0), (1, 200.0)])
 def test_random_ordinary_motion_is_followed(seed, rate):
-    check(worn(day(seed, 90.0), 100.0, rate, seed))
+    check(worn(day(seed, 50.0), 60.0, rate, seed))

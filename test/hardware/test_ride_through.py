@@ -77,7 +77,7 @@ class RidingArm(CompensatedArm):
         return float(np.abs(torques - gravity_torque(self.links, positions)).max())
 
 
-def test_a_gap_while_the_arm_is_held_moves_nothing_and_one_too_long_lets_it_down_and_one_press_carries_it_on():
+def test_a_gap_while_the_arm_is_held_moves_nothing_and_one_too_long_lets_it_down():
     arm = RidingArm(pose=ZERO_G, wearer=True)
     arm.gap(0.15)
     arm.run(0.3)
@@ -85,14 +85,6 @@ def test_a_gap_while_the_arm_is_held_moves_nothing_and_one_too_long_lets_it_down
     assert arm.top_speed < 0.02 and arm.felt < 0.05 and arm.largest_step < 0.05
     arm.gap(0.25)
     assert (arm.safety.state, arm.safety.fault.code) == (State.LETTING_DOWN, FaultCode.COMMAND_STALE)
-    arm.run_while(State.LETTING_DOWN)
-    assert arm.safety.state is State.FAULT
-    assert arm.top_speed < SPEED
-    arm.forget()
-    assert arm.safety.resume(arm.clock.monotonic())
-    arm.run(2.4)
-    assert arm.safety.state is State.ACTIVE
-    assert arm.top_speed < SPEED and arm.largest_step < STEP
 
 
 def test_a_wearer_who_moves_is_slowed_gently_while_efforts_are_late():
@@ -131,10 +123,12 @@ def test_a_bus_that_is_silent_for_a_moment_lets_the_arm_down_and_one_press_carri
     arm.run(0.1)
     assert (arm.safety.state, arm.safety.fault.code) == (State.LETTING_DOWN, FaultCode.MOTOR_SILENT)
     arm.run_while(State.LETTING_DOWN)
+    assert arm.top_speed < SPEED
+    arm.forget()
     assert arm.safety.resume(arm.clock.monotonic()), arm.safety.why_not_resumed
     arm.run(2.4)
     assert arm.safety.state is State.ACTIVE
-    assert arm.top_speed < SPEED
+    assert arm.top_speed < SPEED and arm.largest_step < STEP
 
 
 def test_a_loop_that_stood_still_for_longer_than_the_time_out_carries_on():

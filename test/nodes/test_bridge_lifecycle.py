@@ -47,8 +47,8 @@ def make_bridge(rig: SimulatedRig, monkeypatch: pytest.MonkeyPatch) -> Iterator[
             "can.interface": rig.arm.address[0],
             "can.channel": rig.arm.address[1],
             "sign_check_torque": 0.0,
-            "command_timeout": 0.1,  # the tests share a busy machine
-            "reply_timeout": 0.1,
+            "rate": 100.0,  # the tests share a busy machine
+            "command_timeout": 0.1,
         }
         given = [f"{name}:={str(value).lower()}" for name, value in parameters.items()]
         rclpy.init(args=["--ros-args", *(word for text in given for word in ("-p", text))])

@@ -14,13 +14,13 @@ from sensor_msgs.msg import JointState
 
 from exo_gravity.core.compensation.compensator import Answer
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.bus_load import Traffic
-from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.joint_motor import JointMotor, Traffic
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.safety.drive import NO_COMMAND, FaultCode, State
 from exo_gravity.core.safety.lease import LEASE_TIME, Lease
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.hardware.ownership.owned_bus import ArmOnBus
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.can_bridge.operation import WATCH_PERIOD, BridgeReport, BridgeServices, Operator
@@ -51,7 +51,9 @@ def sent(node, monkeypatch):
     monkeypatch.setattr(operation, "time", SimpleNamespace(monotonic=lambda: clock.now))
 
     def sent(loop, count, answered=None):
-        report = BridgeReport(node, ("a", "b", "c", "elbow"), Traffic(4), 250.0, (3.0, 9.0, 3.0, 3.0), Lease())
+        motors = tuple(JointMotor(MOTORS["AK60-6"], can_id) for can_id in (1, 2, 3, 4))
+        arm = ArmOnBus(("virtual", "arm", {}), motors, Limits(("a", "b", "c", "elbow")), 0.004)
+        report = BridgeReport(node, arm, Traffic(4), Lease())
         for n in range(count):
             report.send(loop(n), NO_COMMAND._replace(answered=clock.now if answered is None else answered), "none")
             clock.now += 0.1
@@ -153,10 +155,11 @@ def test_the_zero_is_set_only_for_an_arm_that_is_off_at_rest_and_replies(ask, mo
     )
     assert ask("set_zero", loop) == ""
     loop.safety.enable(0.0)
-    assert ask("set_zero", loop) == "refused: the arm is checking, must be disabled"
+    refusal = "refused: the arm is {}; must be disabled and at rest, and all motors reply"
+    assert ask("set_zero", loop) == refusal.format("checking")
     loop.safety.disable(0.0)
     loop.samples = (*loop.samples[:3], loop.samples[3]._replace(time=-math.inf))
-    assert ask("set_zero", loop) == "refused: a motor does not reply"
+    assert ask("set_zero", loop) == refusal.format("disabled")
     assert loop.zeroed == 1
     monkeypatch.setattr(operation, "ZERO_TIMEOUT", 0.0)
     loop.samples = (*loop.samples[:3], JointSample(0.5, 0.0, 0.0, 40, 0, math.inf))

@@ -15,6 +15,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.time import Time
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
@@ -24,9 +25,8 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.nodes.compensator import arm
 from exo_gravity.nodes.compensator.node import CompensatorNode
-from exo_gravity.nodes.ros.hot_path import LATCHED
-from exo_gravity.nodes.ros.messages import to_time
 from exo_gravity.nodes.ros.run import keep_to_this_machine
+from exo_gravity.nodes.ros.subscriptions import LATCHED
 
 keep_to_this_machine()
 URDF = Path(rtbdata.__path__[0], "xacro/kuka_description/kuka_kr16/urdf/kr16_2.urdf")
@@ -92,7 +92,7 @@ class Rig:
         if self.is_feeding:
             still = [0.0] * len(self.names)
             states = JointState(name=self.names, position=self.pose, velocity=still, effort=self.applied)
-            states.header.stamp = to_time(time.time_ns() - round(self.lag * 1e9))
+            states.header.stamp = Time(nanoseconds=time.time_ns() - round(self.lag * 1e9)).to_msg()
             self.publisher.publish(states)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:

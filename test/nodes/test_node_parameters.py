@@ -5,12 +5,14 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 
 import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
+from exo_gravity.nodes.ros import parameters as parameters_module
 from exo_gravity.nodes.ros.parameters import ANSWER_TIMEOUT, NodeParameters
 from exo_gravity.nodes.ros.run import keep_to_this_machine
 
@@ -69,28 +71,6 @@ def test_a_node_that_has_gone_and_returned_is_read_anew(node, executor):
     parameters.destroy()
 
 
-def test_named_parameters_are_read_alone_and_all_or_none(node, executor):
-    other = other_node(node)
-    executor.add_node(other)
-    answers: dict[str, dict[str, object]] = {}
-    readers = {
-        names: NodeParameters(node, "other", lambda values, names=names: answers.update({names: values}), names)
-        for names in (("gain",), ("gain", "unknown"))
-    }
-
-    def spin() -> None:
-        executor.spin_once(timeout_sec=0.05)
-        for parameters in readers.values():
-            parameters.update()
-
-    wait_until(lambda: len(answers) == 2, spin)
-    assert answers == {("gain",): {"gain": 1.0}, ("gain", "unknown"): {}}
-    for parameters in readers.values():
-        parameters.destroy()
-    executor.remove_node(other)
-    other.destroy_node()
-
-
 def test_a_name_without_services_is_not_present(node):
     ghost = rclpy.create_node("ghost", context=node.context, start_parameter_services=False)
     parameters = NodeParameters(node, "/ghost")
@@ -99,16 +79,17 @@ def test_a_name_without_services_is_not_present(node):
     ghost.destroy_node()
 
 
-def test_answers_after_the_first_are_ignored_once_it_is_destroyed(node, executor):
+def test_answers_after_the_first_are_ignored_once_it_is_destroyed(node, executor, monkeypatch):
     other = other_node(node)
     clock = itertools.count(0.0, ANSWER_TIMEOUT).__next__  # every update asks again
+    monkeypatch.setattr(parameters_module, "time", SimpleNamespace(monotonic=clock))
     answers: list[object] = []
 
     def destroy(values: dict[str, object]) -> None:
         answers.append(values)
         parameters.destroy()
 
-    parameters = NodeParameters(node, "/right/other", destroy, clock=clock)
+    parameters = NodeParameters(node, "/right/other", destroy)
     wait_until(lambda: parameters.is_present, parameters.update)
     for _ in range(5):
         parameters.update()

@@ -19,14 +19,14 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.serialization import serialize_message
+from rclpy.time import Time
 from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.nodes.recorder.node import LiveLine
-from exo_gravity.nodes.ros.hot_path import LATCHED
-from exo_gravity.nodes.ros.messages import to_time
+from exo_gravity.nodes.ros.subscriptions import LATCHED
 
 NODE = [sys.executable, "-c", "from exo_gravity.nodes.recorder.node import main; main()", "--ros-args"]
 NAMES = ["j1", "j2", "j3", "j4"]
@@ -77,7 +77,7 @@ class PublishingArm:
         return all(publisher.get_subscription_count() for publisher in publishers)
 
     def publish(self, k):
-        stamp = to_time(time.time_ns())
+        stamp = Time(nanoseconds=time.time_ns()).to_msg()
         state = JointState(name=NAMES, position=[float(k)] * 4, velocity=[0.0] * 4, effort=[1.0] * 4)
         effort = JointState(name=NAMES, effort=[float(k)] * 4)
         image = Imu()
@@ -250,8 +250,8 @@ def test_a_recorder_whose_launcher_died_records_until_the_arm_is_down(arm, tmp_p
 
 def test_a_step_that_is_no_json_leaves_the_rest_of_the_live_line(capsys):
     live = LiveLine()
-    live.note("/right/wearer_step", [serialize_message(String(data="no JSON"))])
-    live.note("/right/joint_states", [serialize_message(JointState(name=NAMES, position=[1.0] * 4))])
+    live.note("/right/wearer_step", serialize_message(String(data="no JSON")))
+    live.note("/right/joint_states", serialize_message(JointState(name=NAMES, position=[1.0] * 4)))
     live.write({"messages": 2, "lost": 0})
     line = json.loads(capsys.readouterr().out)
     assert line["right"]["position"] == [1.0] * 4 and "step" not in line["right"]

@@ -18,7 +18,7 @@ from std_msgs.msg import String
 from visualization_msgs.msg import Marker, MarkerArray
 
 from exo_gravity.core.view.urdf import ROOT
-from exo_gravity.nodes.ros.hot_path import LATCHED
+from exo_gravity.nodes.ros.subscriptions import LATCHED
 from exo_gravity.tools.urdf import urdf_of
 
 from ..support import CONFIG
@@ -141,7 +141,8 @@ def test_a_viewer_gets_the_description_the_joint_states_of_both_arms_and_markers
     def is_complete():
         shown.append(viewer.markers)
         wanted = {"1.50 Nm", "right: inactive", "left: inactive"}
-        return {group for group, _ in shown[-1]} == groups and wanted <= texts(shown[-1])
+        is_tilted = ("gravity", 0) in shown[-1] and shown[-1]["gravity", 0].points  # a fresh tilt has arrived
+        return is_tilted and {group for group, _ in shown[-1]} == groups and wanted <= texts(shown[-1])
 
     viewer.wait_until(is_complete)
     assert {marker.header.frame_id for marker in shown[-1].values()} == {ROOT}

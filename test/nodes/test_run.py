@@ -74,13 +74,9 @@ def test_the_setting_that_admits_other_hosts_is_named(environment, settings, nam
 
 
 @pytest.mark.parametrize(
-    ("ignores_interrupts", "has_nohup", "ends"),
-    [(False, False, ["SIGTERM", "SIGINT", "SIGHUP"]), (False, True, ["SIGTERM", "SIGINT"]), (True, False, ["SIGTERM"])],
-    ids=["a bridge", "a bridge under nohup", "a node that a bridge needs"],
+    ("has_nohup", "ends"), [(False, ["SIGTERM", "SIGINT", "SIGHUP"]), (True, ["SIGTERM", "SIGINT"])]
 )
-def test_which_signals_end_a_node(environment, ignores_interrupts, has_nohup, ends):
-    if ignores_interrupts:
-        environment("EXO_GRAVITY_IGNORE_SIGINT", "1")
+def test_which_signals_end_a_node(has_nohup, ends):
     sent = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
     handlers = [signal.getsignal(number) for number in sent]
     ending = []

@@ -15,13 +15,13 @@ from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.tools import train_anfis
 
 from ..support import CONFIG
-from ..support.launched_nodes import NO_IMU, SIMULATED, LaunchedNodes
+from ..support.launched_nodes import CALM, NO_IMU, LaunchedNodes
 from ..support.ros_probe import TO_HOME, RosProbe
 
 pytestmark = pytest.mark.real_time
 
 POSE = [0.1, 0.8, 0.7, 0.6]  # rad
-RATE = SIMULATED["can_bridge"]["rate"]  # Hz
+RATE = CALM["can_bridge"]["rate"]  # Hz
 Observed = TypeVar("Observed")
 ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
 
@@ -51,8 +51,8 @@ def test_an_arm_stays_follows_live_changes_and_after_a_fault_is_carried_by_its_o
     launch, probe, scripts, listen
 ):
     # Under its own launcher, the compensator's death does not stop the other nodes.
-    nodes = launch(without=("compensator",))
-    compensator = launch(without=("can_bridge", "simulator", "imu"))
+    nodes = launch(without=("compensator",), timing=CALM)
+    compensator = launch(without=("can_bridge", "simulator", "imu"), timing=CALM)
     listener = listen(nodes)
 
     def hold_and_change() -> tuple[float, float, float]:
@@ -93,7 +93,7 @@ def test_an_arm_stays_follows_live_changes_and_after_a_fault_is_carried_by_its_o
     probe.wait_until(lambda: probe.state == "fault")
     assert probe.fault == "command_stale"
     assert abs(probe.joint_angles()[2]) < 0.2  # friction holds it there
-    launch(without=("can_bridge", "simulator", "imu"))
+    launch(without=("can_bridge", "simulator", "imu"), timing=CALM)
     probe.effort_commands.clear()
     probe.wait_until(lambda: len(probe.effort_commands) > 100)
     assert (probe.state, probe.fault) == ("fault", "command_stale")
@@ -116,6 +116,7 @@ def seated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosProbe]:
     nodes = LaunchedNodes(
         tmp_path_factory.mktemp("seated"),
         without=("imu",),
+        timing=CALM,
         simulator={"zero": [0.3, 0.0, 0.0, 0.2]},
         can_bridge={"zero": [0.0] * 4},
         compensator=NO_IMU,

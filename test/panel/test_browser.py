@@ -75,10 +75,13 @@ def test_a_let_down_that_is_not_confirmed_is_an_alarm(visit, stage):
     assert "can_bridge does not answer" in page.inner_text("#alarm")
 
 
-def test_a_fault_shows_its_remedy_and_is_cleared(visit, stage):
+def test_a_fault_shows_its_remedy_moves_no_button_and_is_cleared(visit, stage):
     page = visit()
+    buttons = [page.locator(f'[data-arm="right"] {name}') for name in (".enable", '[data-mode="zero_g"]')]
+    before = [button.bounding_box() for button in buttons]
     stage.arms.fail("right", "over_temperature")
     wait_for_state(page, "fault")
+    assert [button.bounding_box() for button in buttons] == before
     assert "Wait until it has cooled" in page.inner_text('[data-arm="right"] .remedy')
     assert page.is_disabled('[data-arm="right"] .enable')
     page.click('[data-arm="right"] .clear')
@@ -173,6 +176,22 @@ def test_an_arm_that_sinks_while_its_load_changes_is_not_called_carried(visit, s
     page.wait_for_selector(f"{state}:has-text('Carrying')")
 
 
+def test_the_bar_says_in_sight_what_the_arms_do_and_let_down_is_grey_while_the_motors_are_off(visit, stage):
+    page = visit()
+    wait_for_state(page, "disabled")
+    assert page.locator("#let-down[data-off]").count() == 1
+    assert "motors of all arms are off" in page.inner_text("#let-down-hint")
+    stage.arms.states["right"] = "active"
+    page.wait_for_selector("#chips .badge[data-state=active]:has-text('Right arm: Carrying')")
+    assert page.locator("#let-down[data-off]").count() == 0
+    page.evaluate("scrollTo(0, document.body.scrollHeight)")
+    box = page.locator("#chips").bounding_box()
+    assert box is not None and 0 <= box["y"] < 60
+    assert not page.is_visible("#light")
+    page.click("#record")
+    page.wait_for_selector("#light:visible")
+
+
 def test_a_reload_in_the_middle_keeps_control_and_shows_the_state(visit, stage):
     page = visit()
     enable(page)
@@ -206,8 +225,9 @@ def test_without_a_connection_the_page_shows_no_old_state(visit, stage):
     page = visit()
     wait_for_state(page, "active")
     stage.server.stop()
-    wait_for_state(page, "silent")
-    assert "No connection" in page.inner_text("#alarm")
+    wait_for_state(page, "unseen")
+    assert "cannot see the arms" in page.inner_text("#alarm")
+    assert "cannot see the arm" in page.inner_text('[data-arm="right"] .sentence')
     assert page.locator('[data-arm="right"] tbody tr').count() == 0
     page.keyboard.press("Space")
     page.wait_for_selector("#alarm:has-text('NOT confirmed')")

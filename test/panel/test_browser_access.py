@@ -39,6 +39,12 @@ def test_the_page_is_german_when_its_user_wants_it(visit, stage):
     page.wait_for_selector("#let-down:has-text('Absenken')")
 
 
+def test_the_page_starts_in_its_browsers_language(browser, stage):
+    page = browser.new_context(locale="de-AT").new_page()
+    page.goto(stage.url)
+    page.wait_for_selector("#let-down:has-text('Absenken')")
+
+
 def test_the_keyboard_alone_reaches_everything(visit, stage):
     page = visit()
     reached = set()
@@ -70,7 +76,7 @@ def test_let_down_is_always_in_sight_and_nothing_is_cut_off(visit, stage, width,
     assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 
-@pytest.mark.parametrize("state", ["off", "fault", "asking", "german", "login"])
+@pytest.mark.parametrize("state", ["off", "fault", "dark", "asking", "german", "login"])
 def test_axe_has_no_serious_findings(browser, visit, stage, state):
     if state == "login":
         locked = Stage(token="a token for this test")
@@ -86,7 +92,9 @@ def test_axe_has_no_serious_findings(browser, visit, stage, state):
             locked.close()
         return
     page = visit()
-    if state == "fault":
+    if state == "dark":
+        page.emulate_media(color_scheme="dark")
+    if state in ("fault", "dark"):
         stage.arms.fail("right", "motor_silent")
         wait_for_state(page, "fault")
     elif state == "asking":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from typing import NamedTuple
 
 import pytest
 
@@ -13,14 +14,21 @@ from exo_gravity.panel.control import (
     GONE,
     MAX_PAGES,
     REFILL,
-    Action,
     Control,
     Page,
-    Reply,
     parse,
+    sentence,
 )
 
 from ..support.panel_stage import PlayedArms, PlayedFiles
+
+
+class Reply(NamedTuple):
+    """The answer to a request."""
+
+    status: int
+    text: str
+
 
 DOWN = [("let_down", "right"), ("let_down", "left")]
 
@@ -43,11 +51,12 @@ class Panel(Control):
     def opened(self, address: str = "10.0.0.3", secret: str = "") -> Page:
         page = self.open(secret, address)
         assert page is not None
+        page.connection = "open"
         return page
 
     def ask(self, page: Page | str, **body: object) -> Reply:
         secret = page if isinstance(page, str) else page.secret
-        return asyncio.run(self.perform(body, secret, "10.0.0.9"))
+        return Reply(*asyncio.run(self.perform(body, secret, "10.0.0.9")))
 
 
 @pytest.fixture
@@ -60,18 +69,23 @@ def panel() -> Panel:
 
 
 @pytest.mark.parametrize(
-    ("body", "action"),
+    "body",
     [
-        ({"do": "let_down"}, Action("let_down")),
-        ({"do": "let_down", "arm": "left"}, Action("let_down", "left")),
-        ({"do": "enable", "arm": "right"}, Action("enable", "right")),
-        ({"do": "set", "arm": "right", "values": {"support": 1}}, Action("set", "right", {"support": 1.0})),
-        ({"do": "trial", "name": "demo"}, Action("trial", name="demo")),
-        ({"do": "take"}, Action("take")),
+        {"do": "let_down"},
+        {"do": "let_down", "arm": "left"},
+        {"do": "enable", "arm": "right"},
+        {"do": "set", "arm": "right", "values": {"support": 1}},
+        {"do": "trial", "name": "demo"},
+        {"do": "take"},
     ],
 )
-def test_a_right_request_is_understood(body, action):
-    assert parse(body, ("right", "left"), ("demo",)) == action
+def test_a_right_request_is_understood(body):
+    assert parse(body, ("right", "left"), ("demo",)) == body
+
+
+def test_a_whole_number_is_sent_as_the_parameters_type():
+    body = {"do": "set", "arm": "right", "values": {"support": 1}}
+    assert isinstance(parse(body, ("right",), ())["values"]["support"], float)
 
 
 @pytest.mark.parametrize(
@@ -114,7 +128,7 @@ def test_a_wrong_request_is_refused(body):
 
 def test_the_log_shows_the_support_but_not_the_wearers_data():
     values = {"support": 0.3, "wearer.body_mass": 81.5, "wearer.sex": "female"}
-    text = str(Action("set", "right", values))
+    text = sentence({"do": "set", "arm": "right", "values": values})
     assert text == "set right support = 0.3, wearer.body_mass, wearer.sex"
 
 
@@ -207,7 +221,7 @@ def test_control_is_taken_and_given_up(panel):
 
 
 def test_a_reloaded_page_keeps_its_number_and_control(panel):
-    panel.first.connected = False
+    panel.first.connection = None
     assert panel.opened(secret=panel.first.secret) is panel.first
     assert panel.holder is panel.first
     assert panel.first.number == 1
@@ -237,10 +251,10 @@ def test_a_new_page_holds_control_if_the_operators_page_is_gone(panel):
 def test_the_number_of_pages_is_limited(panel):
     pages = [panel.first, panel.second, *(panel.opened() for _ in range(MAX_PAGES - 2))]
     assert panel.open("", "10.0.0.1") is None
-    pages[5].connected = False
+    pages[5].connection = None
     panel.opened()
     assert panel.open(pages[5].secret, "10.0.0.1") is None
-    pages[6].connected = False
+    pages[6].connection = None
     assert panel.opened(secret=pages[6].secret) is pages[6]
 
 

@@ -133,15 +133,6 @@ def test_a_session_from_support_to_a_fault_and_back_with_a_recording(clinic):
     assert "token" not in probe.call(ListParameters, "/panel/list_parameters", ListParameters.Request()).result.names
 
 
-@pytest.mark.parametrize("clinic", [{"dead_man": True}], indirect=True, ids=["dead_man"])
-def test_with_dead_man_closing_the_page_lets_the_arm_down(clinic):
-    wait_for_state(clinic.page, "active")
-    clinic.probe.wait_until(lambda: "127.0.0.1 page 1" in clinic.probe.diagnostic("can_bridge", "control held by"))
-    clinic.page.context.close()
-    clinic.probe.wait_until(lambda: clinic.probe.state == "fault")
-    assert clinic.probe.fault == "control_lost"
-
-
 def test_a_trial_is_followed_recorded_and_reported_and_the_death_of_the_panel_changes_nothing(tmp_path: Path):
     scripts = tmp_path / "scripts"
     scripts.mkdir()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -143,7 +142,7 @@ def test_the_address_with_the_token_opens_the_page_and_leaves_the_address(stages
 
 def test_a_port_in_use_is_an_error_that_names_it(stage):
     with pytest.raises(ParameterError, match=f"{stage.port}.* must be a free address"):
-        PanelServer("127.0.0.1", stage.port, "", stage.control, stage.reports.get, dict, time.monotonic)
+        PanelServer("127.0.0.1", stage.port, "", stage.control)
 
 
 def test_every_page_gets_setup_and_state_and_a_reloaded_page_stays_the_same(stages):
@@ -152,7 +151,7 @@ def test_every_page_gets_setup_and_state_and_a_reloaded_page_stays_the_same(stag
         page = first(connection, "page")
         setup = first(connection, "setup")
         assert set(setup["arms"]) == {"right", "left"}
-        assert setup["language"] == "en"
+        assert setup["language"] == "auto"
         assert setup["urdf"].count('type="revolute"') == 8
         state = first(connection, "state")
         assert len(state["arms"]["right"]["joints"]) == 4
@@ -190,7 +189,7 @@ def test_a_request_that_is_not_json_or_too_long_is_refused(stage, content):
 
 def test_a_request_without_its_length_lets_down_unless_it_is_too_long(stage):
     headers = {"origin": stage.url.rstrip("/")}
-    for padding, status in ((b"", 200), (b" " * 5000, 500)):
+    for padding, status in ((b"", 200), (b" " * 5000, 413)):
         stage.arms.calls.clear()
         parts = iter((b'{"do": ', b'"let_down"}', padding))
         answer = httpx.post(stage.url + "action", content=parts, headers=headers, verify=False)
@@ -209,8 +208,8 @@ def test_the_operator_enables_and_a_watching_page_lets_down(stages):
 
 
 def test_a_report_may_hold_styles_but_no_scripts(stage, tmp_path: Path):
-    stage.reports["demo_1"] = tmp_path / "report.html"
-    stage.reports["demo_1"].write_text("<p>held</p>")
+    stage.files.reports["demo_1"] = tmp_path / "report.html"
+    stage.files.reports["demo_1"].write_text("<p>held</p>")
     answer = get(stage, "report/demo_1")
     assert answer.status_code == 200
     assert "script-src" not in answer.headers["content-security-policy"]

@@ -17,7 +17,7 @@ from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import ArmConfig, ImuConfig, SimulatedArm, SimulatedDevice, SimulatedImu, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.imu import measured_tilt
-from exo_gravity.sim.offline import ArmSetup, OfflineTrial
+from exo_gravity.sim.offline import ArmSetup, OfflineTrial, resting
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")
 POSE = [0.1, 0.6, 0.7, 0.5]
@@ -48,7 +48,7 @@ def make(links=DEFAULT_LINKS, tilt=(0.1, -0.06), ids=(1, 2, 3, 4)):
     device = SimulatedDevice(SimulatedArm(ArmConfig()), [SimulatedMotor(motor) for motor in MOTORS_AS_MOUNTED])
     device.pitch, device.roll = 0.1, -0.06
     assumed = [replace(motor, can_id=can_id) for motor, can_id in zip(MOTORS_AS_MOUNTED, ids, strict=True)]
-    arm = ArmSetup("right", device, assumed, LIMITS, Settings("right", links), 250.0, tilt)
+    arm = ArmSetup("right", device, assumed, LIMITS, Settings("right", links), 250.0, tilt and resting(*tilt))
     return OfflineTrial(arm, SCRIPT, 6.0)
 
 
@@ -104,9 +104,9 @@ def test_the_recorded_command_is_the_torque_that_the_motors_report(done):
 
 
 def test_the_same_trial_gives_the_same_recording(done):
-    again = make().run(lambda now: now >= 8.0).position
-    same = np.all(again[: 8 * 250] == done[1].position[: 8 * 250])
-    assert same and len(again) > 8 * 250
+    again = make().run(lambda now: now >= 4.0).position
+    same = np.all(again[: 4 * 250] == done[1].position[: 4 * 250])
+    assert same and len(again) > 4 * 250
 
 
 def test_after_a_motor_failure_the_arm_is_let_down_and_the_joint_named():
@@ -129,14 +129,6 @@ def test_a_stop_lets_the_arm_down_and_keeps_the_recording():
     assert 2.0 < start < 8.0  # the checks take a second without trouble, then the sign check of four joints
     assert end == pytest.approx(10.0, abs=0.01)
     assert end + 2.0 < recording.time[-1] < 36.0  # of letting down
-    assert not any(motor.entered for motor in trial.arm.device.motors)
-
-
-def test_a_stop_before_the_arm_is_carried_ends_the_trial_with_the_motors_off_and_keeps_the_recording():
-    trial = make()
-    recording = trial.run(lambda now: now >= 4.0)
-    assert trial.trouble == "right: stopped by the operator"
-    assert 6.0 < recording.time[-1] < 30.0  # of letting down
     assert not any(motor.entered for motor in trial.arm.device.motors)
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.compensation.settings import Settings
@@ -19,11 +18,13 @@ from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
-from exo_gravity.sim.offline import ArmSetup, OfflineTrial
+from exo_gravity.sim.offline import ArmSetup, OfflineTrial, resting
 
 RATED = (3.0, 9.0, 3.0, 3.0)
 NAMES = ("rotation", "abduction", "flexion", "elbow")
-LIMITS = Limits(NAMES, (-1.65, -0.17, -0.78, -0.17), (1.65, 3.14, 2.53, 3.14), (5.0, 5.0, 5.0, 6.0), RATED)
+LIMITS = Limits(
+    NAMES, (-1.65, -0.17, -0.78, -0.17), (1.65, 3.14, 2.53, 3.14), (5.0, 5.0, 5.0, 6.0), RATED, sign_check_torque=0.0
+)
 MOTORS_OF_ARM = [JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1)]
 ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
 MASS, COG = Wearer(75.0).on_links(ROBOT.length)
@@ -31,12 +32,7 @@ CONTROLLER = Settings("right", ROBOT, mode="zero_g", wearer_mass=MASS, wearer_co
 
 # Within the motors' limits with all of a 75 kg wearer's arm.
 UPRIGHT, BENT = (0.0, 0.0), (0.06, -0.04)
-HELD = [
-    (UPRIGHT, [-0.4, 0.30, 0.15, 0.1]),
-    (UPRIGHT, [0.3, 0.45, 0.10, 0.4]),
-    (UPRIGHT, [0.2, 0.35, -0.20, 0.9]),
-    (BENT, [0.1, 0.30, 0.10, 0.3]),
-]
+HELD = [0.2, 0.35, -0.20, 0.9]
 
 
 def carried(settings, pose, tilt=UPRIGHT, seconds=10.0, after=()):
@@ -46,7 +42,7 @@ def carried(settings, pose, tilt=UPRIGHT, seconds=10.0, after=()):
     device.pitch, device.roll = tilt
     steps = [{"move": pose, "over": 3.0}, *after, {"hold": seconds}]
     script = TrialScript.parse({"name": "release", "steps": steps})
-    return OfflineTrial(ArmSetup("right", device, MOTORS_OF_ARM, LIMITS, settings, 250.0, tilt), script, 8.0)
+    return OfflineTrial(ArmSetup("right", device, MOTORS_OF_ARM, LIMITS, settings, 250.0, resting(*tilt)), script, 3.0)
 
 
 def moved(trial):
@@ -57,28 +53,26 @@ def moved(trial):
     return np.degrees(np.abs(position - position[0]).max(axis=0))
 
 
-@pytest.mark.parametrize(("tilt", "pose"), HELD[1:])
-def test_zero_g_holds_the_wearers_arm_for_10_s_within_a_sixth_of_a_degree(tilt, pose):
-    needed = gravity_torque(ROBOT.with_wearer(MASS, COG), pose, Tilt.of("right", *tilt).direction)
+def test_zero_g_holds_the_wearers_arm_for_10_s_within_a_sixth_of_a_degree():
+    needed = gravity_torque(ROBOT.with_wearer(MASS, COG), HELD, Tilt.of("right", *BENT).direction)
     assert np.all(np.abs(needed) < RATED)
-    trial = carried(CONTROLLER, pose, tilt)
+    trial = carried(CONTROLLER, HELD, BENT)
     assert moved(trial).max() < 0.5 / 3.0
     assert trial.trouble == ""
 
 
-@pytest.mark.parametrize(("tilt", "pose"), HELD[:1])
-def test_one_g_lets_the_same_arm_sink(tilt, pose):
-    assert moved(carried(replace(CONTROLLER, mode="one_g"), pose, tilt, seconds=10.0))[1] > 10.0
+def test_one_g_lets_the_same_arm_sink():
+    assert moved(carried(replace(CONTROLLER, mode="one_g"), HELD, seconds=3.0))[1] > 10.0
 
 
 def test_a_sweep_of_the_support_changes_the_torque_smoothly_until_it_holds_the_arm_alone():
     pose = [0.3, 0.45, 0.10, 0.4]
-    trial = carried(replace(CONTROLLER, support=0.0), pose, seconds=5.0, after=[{"move": pose, "over": 14.0}])
+    trial = carried(replace(CONTROLLER, support=0.0), pose, seconds=3.0, after=[{"move": pose, "over": 12.0}])
     support = iter(np.linspace(0.1, 1.0, 10))
 
     def every_second(now):
         if now > 5.0:
-            trial.apply(replace(CONTROLLER, support=next(support, 1.0)))
+            trial.compensator.apply(replace(CONTROLLER, support=next(support, 1.0)))
         return False
 
     recording = trial.run(every_second)

@@ -10,7 +10,7 @@ import numpy as np
 
 from .imu_faults import Motion, Trunk, sampled
 
-DURATION = 30.0  # s
+DURATION = 20.0  # s
 BURST = 5e-5  # s between two messages of a batch
 SWAY, SWAY_SPEED = math.radians(14.0), 2.0 * math.pi * 0.2  # rad, rad/s
 GYROSCOPE_SPAN = 0.002  # s over which its low-pass filter averages

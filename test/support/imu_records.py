@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from exo_gravity.core.calibration.imu_mounting import ImuRecord
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu
+from exo_gravity.tools.calibration.imu import ImuRecord
 
 RATE = 100.0  # Hz
 

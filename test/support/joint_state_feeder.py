@@ -5,13 +5,12 @@ from __future__ import annotations
 import threading
 
 from rclpy.node import Node
+from rclpy.time import Time
 from sensor_msgs.msg import JointState
-
-from exo_gravity.nodes.ros.messages import to_time
 
 PARTS = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
 POSE = (0.2, 0.9, 0.7, 0.6)  # rad
-PERIOD = 0.004  # s
+PERIOD = 0.01  # s
 
 
 class JointStateFeeder:
@@ -28,7 +27,7 @@ class JointStateFeeder:
         number = 0
         while not self._stopping.wait(PERIOD):
             number += 1
-            self._message.header.stamp = to_time(number)
+            self._message.header.stamp = Time(nanoseconds=number).to_msg()
             self._publisher.publish(self._message)
 
     def close(self) -> None:

@@ -50,6 +50,9 @@ class PlayedArms:
             given = {"side": name, "joint_names": [f"{name}_{leaf}" for leaf in LEAVES], "wearer.body_mass": 75.0}
             self.settings[name] = values_of(COMPENSATOR, {**given, "support": 0.05})
 
+    def parameters(self) -> dict[str, Any]:
+        return {}
+
     def lease(self, page: str, kind: str) -> None:
         self.leases.append((page, kind))
 
@@ -96,6 +99,7 @@ class PlayedFiles:
 
     trials: tuple[str, ...] = ("demo", "two_poses")
     calls: list[str] = field(default_factory=list)
+    reports: dict[str, Path] = field(default_factory=dict)  #: of trials, by name
     content: dict[str, Any] = field(
         default_factory=lambda: {
             "recording": {"on": False, "foreign": False, "folder": "", "seconds": 0},
@@ -103,6 +107,9 @@ class PlayedFiles:
             "saved": "",
         }
     )
+
+    def report(self, name: str) -> Path | None:
+        return self.reports.get(name)
 
     async def record(self) -> str:
         self.content["recording"] = {"on": True, "foreign": False, "folder": "recordings/r", "seconds": 1}
@@ -127,17 +134,16 @@ class PlayedFiles:
 
 
 class Stage:
-    """A running panel at `url`. notes: what it wrote to the log. reports: trial reports by name."""
+    """A running panel at `url`. notes: what it wrote to the log."""
 
     def __init__(self, host: str = "127.0.0.1", token: str = "") -> None:
         self.arms = PlayedArms()
         self.files, self.notes = PlayedFiles(), list[str]()
-        self.reports: dict[str, Path] = {}
         self.control = Control(self.arms, self.files, self.notes.append, time.monotonic)
         self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}/"
-        self.server = PanelServer(host, self.port, token, self.control, self.reports.get, dict, time.monotonic)
-        self._own_setup = {"language": "en", "dead_man": False, "trials": list(self.files.trials)}
+        self.server = PanelServer(host, self.port, token, self.control)
+        self._own_setup = {"language": "auto", "dead_man": False, "trials": list(self.files.trials)}
         self._bridge = values_of(CAN_BRIDGE, BUS, "can.options")
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._play, daemon=True)

@@ -76,9 +76,7 @@ class SafetyRun:
 
     def until_active(self) -> SafetyRun:
         """Enable the machine and run it until the arm is carried."""
-        self.enable().cycle(3.0)
-        assert self.machine.state is State.ACTIVE
-        return self
+        return self.enable().until(State.ACTIVE).cycle(0.1)
 
     def until(self, state: State, limit: float = 10.0) -> SafetyRun:
         """Run the machine until it is in `state`, in `limit` s at most."""

@@ -16,7 +16,7 @@ from exo_gravity.core.trial.recording import Recording
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import ArmConfig, ImuConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial
-from exo_gravity.tools.trials.offline import TrunkImu
+from exo_gravity.tools.trials.offline import trunk_imu
 
 FRICTION = 0.03  # Nm in each joint
 POSE = (0.0, 0.4, 0.5, 1.0)  # rad
@@ -29,16 +29,23 @@ JOINTS = ("rotation", "abduction", "flexion", "elbow")
 
 
 def trunk_trial(*steps: dict[str, Any], seed: int = 0, **settings: Any) -> OfflineTrial:
-    """Return a trial: the arm is brought to POSE and let go, and 2 s later `steps` begin."""
+    """Return a trial: the arm is brought to POSE and let go, and 1 s later `steps` begin."""
     motors = [JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1)]
     rated = (3.0, 9.0, 3.0, 3.0)
-    limits = Limits(JOINTS, (-1.65, -0.17, -0.78, -0.17), (1.65, 3.14, 2.53, 3.14), (5.0, 5.0, 5.0, 6.0), rated)
+    limits = Limits(
+        JOINTS,
+        (-1.65, -0.17, -0.78, -0.17),
+        (1.65, 3.14, 2.53, 3.14),
+        (5.0, 5.0, 5.0, 6.0),
+        rated,
+        sign_check_torque=0.0,
+    )
     arm = SimulatedArm(ArmConfig(TRUE, coulomb_friction=(FRICTION,) * 4))
     device = SimulatedDevice(arm, [SimulatedMotor(motor) for motor in motors])
-    trunk = TrunkImu(ImuConfig(MOUNTING, seed=seed), MOUNTING, RATE)
-    script = TrialScript.parse({"name": "trunk", "steps": [{"move": list(POSE), "over": 3.0}, {"hold": 2.0}, *steps]})
-    setup = ArmSetup("right", device, motors, limits, Settings("right", ROBOT, **settings), RATE, None, trunk)
-    return OfflineTrial(setup, script, 8.0)
+    trunk = trunk_imu(ImuConfig(MOUNTING, seed=seed), MOUNTING, RATE)
+    script = TrialScript.parse({"name": "trunk", "steps": [{"move": list(POSE), "over": 2.0}, {"hold": 1.0}, *steps]})
+    setup = ArmSetup("right", device, motors, limits, Settings("right", ROBOT, **settings), RATE, trunk)
+    return OfflineTrial(setup, script, 3.0)
 
 
 def moved(recording: Recording, steps: Sequence[str]) -> float:

@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.calibration.identification import Observation, identify
+from exo_gravity.core.calibration.motion import fit_friction
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.model.moments import load_moments, regressor
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.tools.calibration.page import TorqueTable, page_of
-from exo_gravity.tools.calibration.result import CalibrationResult, Change, Curve
+from exo_gravity.tools.calibration.page import page_of, remainders
+from exo_gravity.tools.calibration.result import CalibrationResult, Change
 from exo_gravity.tools.inputs.arms import configured_arm
 
 DAY = datetime.date(2026, 11, 22)
@@ -67,36 +68,34 @@ def outcome(outlier: int | None = None, **changes: object) -> CalibrationResult:
     return replace(found, **changes)  # type: ignore[arg-type]
 
 
-def table_of(result: CalibrationResult) -> TorqueTable:
+def remainders_of(result: CalibrationResult) -> tuple[np.ndarray, ...]:
     assert result.identified and result.arm
-    return TorqueTable.of(result.identified, result.arm, result.observations)
+    return remainders(result.identified, result.arm, result.observations)
 
 
-def test_the_table_compares_the_old_and_the_new_file_with_what_was_measured() -> None:
+def test_the_page_compares_the_old_and_the_new_file_with_what_was_measured() -> None:
     found = outcome()
-    table = table_of(found)
-    assert table.measured == pytest.approx(np.array([o.effort for o in found.observations]))
+    old, new, *_ = remainders_of(found)
+    measured = np.array([o.effort for o in found.observations])
     unloaded = slice(0, None, 2)
     expected = gravity_torque(configured_arm().robot, POSES[unloaded], DOWN)
-    assert table.before[unloaded] == pytest.approx(expected)
+    assert (measured - old)[unloaded] == pytest.approx(expected)
     result = found.identified
     assert result is not None
     down = DOWN + np.cross(result.tilt, DOWN)  # the new file's mounting of the IMU
     by_new_file = regressor(POSES[unloaded], down / np.linalg.norm(down)) @ result.moments / result.scale
-    assert table.after[unloaded] == pytest.approx(by_new_file, abs=1e-3)
-    assert np.abs(table.measured - table.before).max() > 10.0 * np.abs(table.measured - table.after).max()
+    assert (measured - new)[unloaded] == pytest.approx(by_new_file, abs=1e-3)
+    assert np.abs(old).max() > 10.0 * np.abs(new).max()
     loads = regressor(POSES[1::2], DOWN) @ load_moments(configured_arm().robot.length, *LOAD)
-    assert table.before[1::2] == pytest.approx(gravity_torque(configured_arm().robot, POSES[1::2], DOWN) + loads)
+    weighed = gravity_torque(configured_arm().robot, POSES[1::2], DOWN) + loads
+    assert (measured - old)[1::2] == pytest.approx(weighed)
 
 
 @pytest.mark.usefixtures("without_pictures")
 def test_the_arm_creeps_where_the_remainder_exceeds_friction() -> None:
     found = outcome()
-    table = table_of(found)
-    assert found.identified is not None
-    before = np.abs(table.measured - table.before) > 0.2 * FRICTION
-    after = np.abs(found.identified.held_out + found.identified.offset) > 0.2 * FRICTION
-    creeping = [int(creeps.any(axis=1).sum()) for creeps in (before, after)]
+    old, _, held_out, _ = remainders_of(found)
+    creeping = [int((np.abs(wrong) > 0.2 * FRICTION).any(axis=1).sum()) for wrong in (old, held_out)]
     page = page_of(found, "gravity", "old.yaml", DAY)
     count = f"in {creeping[0]} of 12 poses with the old file, in {creeping[1]} with the new"
     assert f"With 0.2 times that the arm creeps {count}" in page
@@ -109,7 +108,7 @@ def test_the_page_says_what_was_found_and_what_does_not_show() -> None:
     assert "<b>Calibrated.</b>" in page
     assert "robot.first_moment" in page and "kg m, &lt;±0.001&gt;" in page
     assert "M4 is 20 % larger than in the file." in page
-    assert page.count("data:image/png;base64,") == 2
+    assert page.count("data:image/png;base64,") == 1
     assert found.identified is not None
     for sentence in found.identified.unknown:
         assert escape(sentence) in page
@@ -121,8 +120,8 @@ def test_the_page_says_what_was_found_and_what_does_not_show() -> None:
 @pytest.mark.usefixtures("without_pictures")
 def test_a_pose_that_was_left_out_is_not_counted() -> None:
     found = outcome(outlier=5)
-    table = table_of(found)
-    assert np.flatnonzero(~table.used).tolist() == [5]
+    *_, used = remainders_of(found)
+    assert np.flatnonzero(~used).tolist() == [5]
     assert " of 11 poses with the old file" in page_of(found, "gravity", "old.yaml", DAY)
 
 
@@ -134,8 +133,10 @@ def test_a_refusal_is_on_the_page_without_new_values() -> None:
 
 def test_friction_is_drawn_over_speed() -> None:
     speed = np.array((0.3, 0.05, 0.1))
-    curves = [Curve(speed, 0.1 + 0.02 * speed, 0.1 + 0.02 * speed) for _ in range(4)]
-    page = page_of(CalibrationResult((), ("friction found",), curves=tuple(curves)), "friction", "old.yaml", DAY)
+    curves = [fit_friction(speed, 0.1 + 0.02 * speed) for _ in range(4)]
+    comment = Change("/right/can_bridge", "", 0, "friction of the elbow")  # in the file alone
+    found = CalibrationResult((comment,), ("friction found",), (), configured_arm(), curves=tuple(curves))
+    page = page_of(found, "friction", "old.yaml", DAY)
     assert page.count("<img") == 1 and "Friction over speed" in page
 
 

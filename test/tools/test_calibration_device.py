@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.calibration.friction import friction_stations
-from exo_gravity.core.calibration.poses import BestPoses, FixedStations
+from exo_gravity.core.calibration.poses import BestPoses, FixedStations, friction_stations
 from exo_gravity.core.trial.recording import Recording
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
@@ -134,4 +133,4 @@ def test_sweeps_at_five_speeds_give_the_friction_of_each_joint_live_and_recorded
         for joint, curve in enumerate(result.curves):
             steady = curve.speed >= 0.05
             true = truth.coulomb_friction[joint] + truth.viscous_friction[joint] * curve.speed[steady]
-            np.testing.assert_allclose(curve.fit[steady], true, atol=0.02)
+            np.testing.assert_allclose(curve.fitted[steady], true, atol=0.02)

@@ -17,7 +17,7 @@ from exo_gravity.core.model.moments import load_moments, moments_of, regressor
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.params import values_of
 from exo_gravity.tools.calibration import live
-from exo_gravity.tools.calibration.tours import calibrate_scale, friction_from, moments_from, wearer_from, worn_arm
+from exo_gravity.tools.calibration.tours import calibrate_scale, friction_from, moments_from, wearer_from
 from exo_gravity.tools.inputs.arms import configured_arm
 from exo_gravity.tools.inputs.parameter_file import load, packaged_config
 
@@ -95,7 +95,7 @@ def test_an_implausible_wearer_is_refused():
     with pytest.raises(DataError, match=r"is the arm relaxed|add a pose"):
         wearer_from(arm, observed(arm=ARM.robot, scales=np.ones(4), poses=POSES[:4]))
     with pytest.raises(DataError, match="at least 3"):
-        worn_arm(arm, observed(poses=POSES[:2]), np.array((0.0, 0.0, 0.16, 0.18)))
+        wearer_from(arm, observed(poses=POSES[:2]))
 
 
 def test_scale_needs_a_weight_that_shows():

@@ -100,9 +100,9 @@ def test_an_arm_that_does_not_hold_ends_with_exit_code_1(run, capsys):
     assert code == 1 and "It did not hold." in capsys.readouterr().out
 
 
-def thirteen(hold: float) -> dict[str, Any]:
+def thirteen(hold: float, poses: int = 13) -> dict[str, Any]:
     content = yaml.safe_load((CONFIG / "trials" / "thirteen_poses.yaml").read_text())
-    steps = [{"hold": hold} if "hold" in step else step for step in content["steps"]]
+    steps = [{"hold": hold} if "hold" in step else step for step in content["steps"][: 2 * poses]]
     return {"name": "thirteen", "steps": steps}
 
 
@@ -120,8 +120,8 @@ def test_with_masses_a_tenth_off_and_half_the_friction_the_report_names_the_pose
     heavy = {"robot": {"mass": masses, "cog": [0.046, 0.113, 0.237, 0.128]}}
     slippery = {"friction": {"coulomb": [0.1, 0.2, 0.1, 0.1]}}
     changes = {"/right/compensator": heavy, "/right/simulator": slippery}
-    code, _ = run("--offline", script=thirteen(2.5), changes=changes)
-    assert code == 1 and capsys.readouterr().out.count("the arm was still moving at the end of a hold") > 5
+    code, _ = run("--offline", script=thirteen(2.5, poses=5), changes=changes)
+    assert code == 1 and capsys.readouterr().out.count("the arm was still moving at the end of a hold") > 1
 
 
 WRONG = {

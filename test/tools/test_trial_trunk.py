@@ -29,7 +29,3 @@ def test_the_arm_stays_where_it_is_in_a_bow_even_if_only_its_tilt_is_compensated
 @pytest.mark.thorough
 def test_walking_shakes_an_arm_of_which_only_the_tilt_is_compensated():
     assert moved(trunk_trial(SHORT_WALK).run(), ("walk",)) > 5.0
-
-
-def test_an_arm_that_knows_nothing_of_the_trunk_falls_in_a_bow():
-    assert moved(trunk_trial(BOW, use_imu=False).run(), ("bow",)) > 10.0

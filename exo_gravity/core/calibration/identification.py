@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -160,10 +160,9 @@ def _bounded(rows: Rows) -> tuple[Rows, Solution]:
     used, solution = final(rows)
     if solution.unknowns[0] >= 0.0:
         return used, solution
-    used, bounded = final(replace(rows, anchor=np.vstack((rows.anchor, UNKNOWN[:1] / EXACT))))
-    covariance = bounded.covariance.copy()
-    covariance[0, 0] = solution.covariance[0, 0]
-    return used, replace(bounded, unknowns=bounded.unknowns * (np.arange(COUNT) > 0), covariance=covariance)
+    used, bounded = final(rows._replace(anchor=np.vstack((rows.anchor, UNKNOWN[:1] / EXACT))))
+    bounded.unknowns[0], bounded.covariance[0, 0] = 0.0, solution.covariance[0, 0]
+    return used, bounded
 
 
 def _check_known(hidden: np.ndarray, count: int, direction: np.ndarray, gravity: float, is_relative: bool) -> None:

@@ -1,7 +1,11 @@
 """How the calibration moves the arm, slowly along straight lines in joint space, and what a pose's sweeps show.
 
 All joints sweep through a pose there and back. At the same angle the torque of the way there is gravity plus friction,
-that of the way back gravity minus friction.
+that of the way back gravity minus friction. Over its speed, a joint's friction is Coulomb, viscous and Stribeck:
+
+    F(v) = coulomb + viscous v + stribeck exp(-(v / v_s)^2)          B. Armstrong-Helouvry et al., Automatica 30 (1994)
+
+For a given Stribeck speed v_s this is linear in the other three, so v_s is searched on a grid.
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import JOINT_COUNT
 
 MAX_SPEED = 0.3  # rad/s, of any joint
@@ -21,6 +26,10 @@ WINDOW = 0.55  # of a sweep's amplitude: the part on both sides of the pose that
 LEAD = 0.3  # s at rest before each motion, in which the joints are brought to the edge of moving
 BINS = 4  # of each sweep: neighbouring samples share the slow oscillations of the controller
 RESOLUTION = 0.002  # Nm: standard error that is left of the 12-bit torque command (7.3 mNm per code) after averaging
+STRIBECK_SPEEDS = np.geomspace(0.01, 0.2, 30)  # rad/s
+SIGNIFICANT = 3.0  # standard errors, from which on a Stribeck part is kept
+LEAST_RATIO = 2.0  # of the fastest to the slowest speed
+FRICTION_RESOLUTION = 0.003  # Nm: standard error of a friction that was measured once
 
 
 class Station(NamedTuple):
@@ -70,21 +79,13 @@ class Line:
         return is_steady and abs(time - self.duration / 2.0) * self._speed <= WINDOW * self._length / 2.0
 
 
-class Average(NamedTuple):
-    """What sweeps show at a pose."""
+def average(sweeps: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, ...]:
+    """Return what `sweeps` show at a pose, which alternate between there and back.
 
-    theta: np.ndarray  #: (4,) rad
-    effort: np.ndarray  #: (4,) Nm
-    friction: np.ndarray  #: (4,) Nm
-    spread: np.ndarray  #: (4,) Nm, standard error of `effort`
-    unrest: np.ndarray  #: (4,) Nm, largest change of the effort from one cycle to another
-
-
-def average(sweeps: Sequence[tuple[np.ndarray, np.ndarray]]) -> Average:
-    """Return the average of `sweeps`, which alternate between there and back.
-
-    Each is the position (n, 4) rad and effort (n, 4) Nm of its samples. The effort minus that expected at its angle can
-    be given in its place: it does not change along a sweep (gravity does, and by up to 0.3 % more than in proportion).
+    These are the angles in rad, and in Nm: the effort, the friction, the standard error of the effort, and its largest
+    change from one cycle to another; (4,) each. A sweep is the position (n, 4) rad and effort (n, 4) Nm of its samples.
+    The effort minus that expected at its angle can be given in its place: it does not change along a sweep (gravity
+    does, and by up to 0.3 % more than in proportion).
     """
     bins = np.zeros((len(sweeps), BINS, JOINT_COUNT))  # mean effort in order of the angle
     for number, (_, effort) in enumerate(sweeps):
@@ -95,4 +96,46 @@ def average(sweeps: Sequence[tuple[np.ndarray, np.ndarray]]) -> Average:
     friction = (there - back).mean(axis=(0, 1)) / 2.0
     scatter = gravity.reshape(-1, JOINT_COUNT).std(axis=0, ddof=1) / np.sqrt(max(1.0, gravity[..., 0].size / 2.0))
     theta = np.mean([position.mean(axis=0) for position, _ in sweeps], axis=0)
-    return Average(theta, cycles.mean(axis=0), friction, np.hypot(scatter, RESOLUTION), np.ptp(cycles, axis=0))
+    return theta, cycles.mean(axis=0), friction, np.hypot(scatter, RESOLUTION), np.ptp(cycles, axis=0)
+
+
+class FrictionCurve(NamedTuple):
+    """Friction of a joint over its speed."""
+
+    speed: np.ndarray  #: (n,) rad/s
+    torque: np.ndarray  #: (n,) Nm, measured
+    fitted: np.ndarray  #: (n,) Nm
+    coulomb: float  #: Nm
+    viscous: float  #: Nm s/rad
+    stribeck: float  #: Nm, 0 if the data show none
+    stribeck_speed: float  #: rad/s, 0 without Stribeck friction
+    error: tuple[float, ...]  #: (3,), standard errors of coulomb, viscous and stribeck
+
+
+def fit_friction(speed: np.ndarray, torque: np.ndarray) -> FrictionCurve:
+    """Return the friction that fits `torque` (n,) in Nm at `speed` (n,) rad/s.
+
+    Raises DataError for fewer than 3 speeds, or less than a factor of 2 between them.
+    """
+    speeds = len(np.unique(speed))
+    if speeds < 3:
+        raise DataError(f"friction was measured at {speeds} speeds, must be at least 3")
+    if speed.max() < LEAST_RATIO * speed.min():
+        measured = f"from {speed.min():.2f} to {speed.max():.2f} rad/s"
+        raise DataError(f"friction was measured {measured}, the fastest must be {LEAST_RATIO:g} times the slowest")
+    fits = [_fit(speed, torque, own) for own in STRIBECK_SPEEDS.tolist()]
+    best = min(fits, key=lambda fit: float(np.sum((fit.fitted - torque) ** 2)))
+    return best if speeds > 3 and best.stribeck > SIGNIFICANT * best.error[2] else _fit(speed, torque)
+
+
+def _fit(speed: np.ndarray, torque: np.ndarray, stribeck_speed: float = 0.0) -> FrictionCurve:
+    """Return the fit with this Stribeck speed, 0 for a fit without Stribeck friction."""
+    columns = [np.ones_like(speed), speed, *([np.exp(-((speed / stribeck_speed) ** 2))] if stribeck_speed else [])]
+    matrix = np.stack(columns, axis=1)
+    values, *_ = np.linalg.lstsq(matrix, torque, rcond=None)
+    fitted = matrix @ values
+    scatter = float(np.sum((fitted - torque) ** 2)) / max(1, len(speed) - len(columns))
+    errors = np.sqrt(max(scatter, FRICTION_RESOLUTION**2) * np.diag(np.linalg.pinv(matrix.T @ matrix)))
+    coulomb, viscous, stribeck = (*values.tolist(), 0.0)[:3]
+    error = (*errors.tolist(), 0.0)[:3]
+    return FrictionCurve(speed, torque, fitted, coulomb, viscous, stribeck, stribeck_speed, error)

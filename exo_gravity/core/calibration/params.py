@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.calibration.friction import friction_stations
-from exo_gravity.core.calibration.poses import BestPoses, FixedStations, Itinerary
+from exo_gravity.core.calibration.poses import BestPoses, FixedStations, Itinerary, friction_stations
 from exo_gravity.core.calibration.tour import Tour
 from exo_gravity.core.calibration.tracking import TorqueGuess
 from exo_gravity.core.compensation.params import COMPENSATOR

@@ -13,7 +13,7 @@ joint gets a factor of its own, estimated from its residuals and pooled with the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -47,8 +47,7 @@ COMMON = 0.002  # of torque: error of all sweeps of a joint in one tour, which t
 OUTLIER = 32.0  # such a sum from which a pose is left out: of good poses, one in 500,000
 
 
-@dataclass(frozen=True, eq=False)
-class Rows:
+class Rows(NamedTuple):
     """What is fitted, for n poses."""
 
     along: np.ndarray  #: (n, 4, 8, 3) Nm per kg m, the torque with gravity along each axis of the base frame
@@ -57,12 +56,11 @@ class Rows:
     effort: np.ndarray  #: (n, 4) Nm
     sigma: np.ndarray  #: (n, 4) Nm, standard error of `effort`
     #: (k, 22), linear combinations of the unknowns that are 0, divided by their standard errors
-    anchor: np.ndarray = field(default_factory=lambda: np.zeros((0, COUNT)))
+    anchor: np.ndarray = np.zeros((0, COUNT))
 
     def only(self, keep: np.ndarray) -> Rows:
         """Return the poses that `keep` (n,) selects."""
-        names = ("along", "direction", "load", "effort", "sigma")
-        return replace(self, **{name: getattr(self, name)[keep] for name in names})
+        return Rows._make([*(column[keep] for column in self[:-1]), self.anchor])
 
     def predicted(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the commanded effort (n, 4) in Nm."""
@@ -79,8 +77,7 @@ class Rows:
         return np.stack(list(steps), axis=-1) / TINY
 
 
-@dataclass(frozen=True, eq=False)
-class Solution:
+class Solution(NamedTuple):
     """The fit of `Rows`."""
 
     unknowns: np.ndarray  #: (22,)
@@ -88,18 +85,10 @@ class Solution:
     hidden: np.ndarray  #: (22,), share 0..1 of each unknown that is not known
     singular_values: np.ndarray  #: of the poses alone, in units of `NATURAL`, the largest first
     residual: np.ndarray  #: (n, 4) Nm
+    left: np.ndarray  #: (n, 4), part of each residual's variance that the fit leaves, 0..1
+    freedom: np.ndarray  #: (4,), degrees of freedom of each joint's residuals
     hat: np.ndarray  #: (n, 4, n, 4), derivative of the predicted by the measured effort, both divided by sigma
     inverse: np.ndarray  #: (22, 4 n + k), change of the unknowns with each effort and condition, divided by its error
-
-    @property
-    def left(self) -> np.ndarray:
-        """The part (n, 4) of each residual's variance that the fit leaves, 0..1."""
-        return np.asarray(1.0 - np.einsum("njnj->nj", self.hat))
-
-    @property
-    def freedom(self) -> np.ndarray:
-        """Degrees of freedom of each joint's residuals, (4,)."""
-        return np.asarray(np.maximum(self.left.sum(axis=0), 0.0))
 
 
 def along_axes(theta: np.ndarray, gravity: float) -> np.ndarray:
@@ -128,7 +117,10 @@ def solve(rows: Rows, start: np.ndarray = START, weight: np.ndarray | float = 1.
     size = np.linalg.svd((poses * NATURAL)[:, : ANGLE.start], compute_uv=False)
     singular_values[: len(size)] = size
     hat = (poses @ inverse[:, : residual.size]).reshape(2 * residual.shape)
-    return Solution(unknowns, inverse @ inverse.T, hidden, singular_values, residual, hat, inverse)
+    left_over = 1.0 - np.einsum("njnj->nj", hat)
+    freedom = np.maximum(left_over.sum(axis=0), 0.0)
+    covariance = inverse @ inverse.T
+    return Solution(unknowns, covariance, hidden, singular_values, residual, left_over, freedom, hat, inverse)
 
 
 def robust(rows: Rows) -> tuple[Rows, Solution]:
@@ -140,7 +132,7 @@ def robust(rows: Rows) -> tuple[Rows, Solution]:
         factor = np.maximum(1.0, _pooled(np.median(squares, axis=0) / MEDIAN_SQUARE, solution.freedom))
         size = np.sqrt(squares / factor)
         solution = solve(rows, solution.unknowns, np.minimum(1.0, HUBER / np.maximum(size, 1e-9)))
-    return replace(rows, sigma=rows.sigma * np.sqrt(factor)), solution
+    return rows._replace(sigma=rows.sigma * np.sqrt(factor)), solution
 
 
 def final(rows: Rows) -> tuple[Rows, Solution]:
@@ -152,9 +144,9 @@ def final(rows: Rows) -> tuple[Rows, Solution]:
     for _ in range(3):
         squares = ((solution.residual / rows.sigma) ** 2).sum(axis=0)
         factor = _pooled(squares / np.maximum(solution.freedom, 1e-9), solution.freedom)
-        scaled = replace(rows, sigma=rows.sigma * np.sqrt(factor))
+        scaled = rows._replace(sigma=rows.sigma * np.sqrt(factor))
         solution = solve(scaled, solution.unknowns)
-    return scaled, replace(solution, covariance=solution.covariance + _common_error(scaled, solution))
+    return scaled, solution._replace(covariance=solution.covariance + _common_error(scaled, solution))
 
 
 def _common_error(rows: Rows, solution: Solution) -> np.ndarray:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from exo_gravity.core.calibration.motion import AMPLITUDE, LEAD, Line, Station
+from exo_gravity.core.calibration.motion import AMPLITUDE, LEAD, MAX_SPEED, Line, Station
 from exo_gravity.core.calibration.pose_fit import COUNT, MOMENT, NATURAL, START, TILT, TYPICAL_MOMENTS, Rows, along_axes
 from exo_gravity.core.calibration.tracking import TorqueGuess
 from exo_gravity.core.errors import DataError, ParameterError
@@ -26,6 +26,9 @@ WAYPOINTS = 8  # of the way to a pose, at which the motors must hold the arm too
 FIRST_EDGE = 0.1  # rad in addition, at the first pose
 EDGE = 0.02  # rad between a sweep's end and the soft wall
 TIME_SHARE = 1.5  # of the time left for each pose, that the next one may take
+SWEEP_SPEEDS = (0.02, 0.05, 0.1, 0.18, MAX_SPEED)  # rad/s, at which friction is measured
+SWEEP_TIME = 1.2  # s of such a sweep's half at steady speed
+SWEEP_AMPLITUDE = (0.05, 0.3)  # rad
 NOISE = 0.03  # Nm in any pose
 NOISE_SHARE = 0.02  # of the torque
 # deg of each joint, within the paper's ranges: from these a missing pose is suggested.
@@ -59,7 +62,7 @@ class BestPoses:
         self._candidates = candidates(limits)
 
     def next(
-        self, taken: np.ndarray, position: np.ndarray, elapsed: float, guess: TorqueGuess, friction: Sequence[float]
+        self, taken: np.ndarray, position: np.ndarray, elapsed: float, guess: TorqueGuess, friction: Vector
     ) -> Station | None:
         """Return the best of the candidates that can be held and reached; the first is the hanging arm.
 
@@ -93,7 +96,7 @@ class BestPoses:
         fits = way + self._first.duration <= budget * (TIME_SHARE if left > 1 else 1.0)
         return np.asarray(fits if fits.any() else way + home <= (way + home).min() + 1.0)
 
-    def _room(self, poses: np.ndarray, start: np.ndarray, guess: TorqueGuess, friction: Sequence[float]) -> np.ndarray:
+    def _room(self, poses: np.ndarray, start: np.ndarray, guess: TorqueGuess, friction: Vector) -> np.ndarray:
         """Return the room (n,) that the motors have to hold `poses`, reach them from `start`, and leave them for home.
 
         It is in standard deviations of the expected torque, below 0 where they have none; on the way home the torque is
@@ -116,6 +119,13 @@ def hanging(limits: Limits, speed: float = 0.1, amplitude: float = AMPLITUDE) ->
     """Return the hanging arm, off the soft walls by FIRST_EDGE: friction is not known there at first."""
     low, high = measurable(limits, amplitude)
     return Station(tuple(np.clip(limits.home, low + FIRST_EDGE, high - FIRST_EDGE).tolist()), speed, amplitude)
+
+
+def friction_stations(limits: Limits) -> list[Station]:
+    """Return sweeps through the hanging arm at each speed; the first lets the controller learn the friction."""
+    speeds = (0.1, *SWEEP_SPEEDS)
+    amplitudes = np.clip(np.array(speeds) * SWEEP_TIME, *SWEEP_AMPLITUDE).tolist()
+    return [hanging(limits, *sweep) for sweep in zip(speeds, amplitudes, strict=True)]
 
 
 def candidates(limits: Limits) -> np.ndarray:
@@ -148,10 +158,8 @@ def next_pose(
     """
     if len(candidates) == 0:
         raise ParameterError("candidates", [], "at least one pose")
-    information = np.diag(NATURAL**-2.0)
-    if len(taken):
-        rows = _sensitivity(np.asarray(taken, dtype=float), direction, moments, gravity).reshape(-1, COUNT)
-        information += rows.T @ rows
+    seen = _sensitivity(np.reshape(taken, (-1, JOINT_COUNT)), direction, moments, gravity).reshape(-1, COUNT)
+    information = np.diag(NATURAL**-2.0) + seen.T @ seen
     rows = _sensitivity(candidates, direction, moments, gravity)
     added = np.eye(JOINT_COUNT) + rows @ np.linalg.inv(information) @ rows.transpose(0, 2, 1)
     return int(np.argmax(np.linalg.slogdet(added)[1]))

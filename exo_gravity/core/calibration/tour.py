@@ -73,10 +73,10 @@ class Tour:
         self._awaits_plan = False
         self._plan: tuple[Station | None, str] = (None, "")  # the next pose, or None to go home, and the trouble
         self._sweep: list[tuple[Sequence[float], np.ndarray, Sequence[float]]] | None = None  # its samples
-        self._friction = [0.0] * JOINT_COUNT  # Nm, 0 until it is measured
-        self._unexplained = [0.0] * JOINT_COUNT  # s
+        self._friction = np.zeros(JOINT_COUNT)  # Nm, 0 until it is measured
+        self._unexplained = np.zeros(JOINT_COUNT)  # s
         self._refreshed = -math.inf
-        self._matrix, self._uncertain = np.eye(JOINT_COUNT), [0.0] * JOINT_COUNT
+        self._matrix, self._uncertain = np.eye(JOINT_COUNT), np.zeros(JOINT_COUNT)
         self._effort: Torque = (0.0,) * JOINT_COUNT
 
     def wait(self, position: Sequence[float], tilt: Tilt) -> Torque:
@@ -124,7 +124,7 @@ class Tour:
         self._refreshed = self._now
         moments = self._guess.common_moments[:JOINT_COUNT]
         self._matrix = inertia_of(self._guess.length, moments, self._load).matrix(position)
-        self._uncertain = self._guess.torques(np.array([position]))[1][0].tolist()
+        self._uncertain = self._guess.torques(np.array([position]))[1][0]
 
     def _wrong_motion(self, dt: float, error: Sequence[float], velocity: Sequence[float], tilt: Tilt) -> str:
         """Return what is wrong after `dt` s with the motion, or ''; error: (4,) rad, velocity: (4,) rad/s."""
@@ -142,16 +142,15 @@ class Tour:
 
     def _wrong_torque(self, dt: float) -> str:
         """Return which joint is saturated, or needs a torque that neither weight nor friction explains, or ''."""
-        for i, name in enumerate(self._limits.joint_names):
-            if self._tracker.saturated[i] > SATURATION:
-                return f"{name}: saturated: the pose needs more than max_effort = {self._most[i]:g} Nm"
-        for i, name in enumerate(self._limits.joint_names):
-            friction, torque = self._friction[i], self._tracker.correction[i]
-            limit = MAX_CORRECTION + DEVIATIONS * self._uncertain[i] + (0.5 * friction or UNKNOWN_FRICTION)
-            self._unexplained[i] = self._unexplained[i] + dt if abs(torque) > limit else 0.0
-            if self._unexplained[i] > PERSISTENCE:
-                reason = "is a hand on the arm?"
-                return f"{name}: {torque:.2f} Nm beyond its weight and friction, the limit is {limit:.2f}: {reason}"
+        for i in np.flatnonzero(self._tracker.saturated > SATURATION):
+            most = f"max_effort = {self._most[i]:g} Nm"
+            return f"{self._limits.joint_names[i]}: saturated: the pose needs more than {most}"
+        torque, slide = self._tracker.correction, np.where(self._friction, 0.5 * self._friction, UNKNOWN_FRICTION)
+        limit = MAX_CORRECTION + DEVIATIONS * self._uncertain + slide
+        self._unexplained = np.where(np.abs(torque) > limit, self._unexplained + dt, 0.0)
+        for i in np.flatnonzero(self._unexplained > PERSISTENCE):
+            beyond = f"{torque[i]:.2f} Nm beyond its weight and friction, the limit is {limit[i]:.2f}"
+            return f"{self._limits.joint_names[i]}: {beyond}: is a hand on the arm?"
         return ""
 
     def plan(self) -> None:
@@ -204,25 +203,21 @@ class Tour:
                 directions += direction
             ways = np.min([np.abs(position[-1] - position[0]) for position, _ in sweeps[-2:]], axis=0)
             followed = ways / (2.0 * WINDOW * station.amplitude)
-            was_known, sticks = any(self._friction), bool(np.min(followed) < FOLLOWED)
+            was_known, sticks = bool(np.any(self._friction)), bool(np.min(followed) < FOLLOWED)
             if station.speed >= STEADY_SPEED:
-                friction = np.maximum(average(sweeps[-2:]).friction, self._friction if sticks else 0.0)
-                self._friction, self._tracker.friction = friction.tolist(), friction
+                self._friction = np.maximum(average(sweeps[-2:])[2], self._friction if sticks else 0.0)
+                self._tracker.friction = self._friction
             # Sweep again what passed without friction, or what a joint did not follow.
             if sticks or not was_known:
                 sweeps, directions = [], []
             failures += sticks
             if failures > MAX_FAILURES:
-                self._skip(followed)
+                self._skipped += 1
+                if self._skipped > MAX_SKIPPED:
+                    name, share = self._limits.joint_names[int(np.argmin(followed))], float(np.min(followed))
+                    self.trouble = f"{name}: it sticks: it follows {share:.0%} of a slow motion, must be {FOLLOWED:.0%}"
                 return
         self._keep(station, sweeps, np.mean(directions, axis=0))
-
-    def _skip(self, followed: np.ndarray) -> None:
-        """Leave out a pose in which a joint sticks; the tour ends if that happens often."""
-        self._skipped += 1
-        if self._skipped > MAX_SKIPPED:
-            name, share = self._limits.joint_names[int(np.argmin(followed))], followed.min()
-            self.trouble = f"{name}: it sticks: it follows {share:.0%} of a slow motion, must be {FOLLOWED:.0%}"
 
     def _keep(self, station: Station, sweeps: list[tuple[np.ndarray, np.ndarray]], direction: np.ndarray) -> None:
         """Keep what the `sweeps` show, and improve the expected torque with it, unless the passes differ."""
@@ -232,10 +227,8 @@ class Tour:
         allowed = np.dot(MAX_UNREST, (np.ones(JOINT_COUNT), np.abs(friction), np.abs(effort)))
         for name, change, limit in zip(self._limits.joint_names, unrest, allowed, strict=True):
             if change > limit:
-                reason = "the arm was touched, or the joint slips"
-                self.trouble = (
-                    f"{name}: {change:.2f} Nm between two passes of a pose, the limit is {limit:.2f}: {reason}"
-                )
+                what = f"{change:.2f} Nm between two passes of a pose, the limit is {limit:.2f}"
+                self.trouble = f"{name}: {what}: the arm was touched, or the joint slips"
                 return
         self.measured.append(Observation(theta, direction, effort, friction, spread, *self._load, station.speed))
         before = self._guess.torque(theta.tolist())

@@ -1,4 +1,4 @@
-"""A motor on a joint, its parameters, and what they say about the bus.
+"""A motor on a joint, the parameters of an arm's motors, and the load of their frames on the CAN bus.
 
 A `JointMotor` translates joint angle, effort and damping to the frames of its wire format, and back.
 """
@@ -6,12 +6,11 @@ A `JointMotor` translates joint angle, effort and damping to the frames of its w
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.bus_load import BITRATE, Traffic
 from exo_gravity.core.motors.specs import MOTORS, WIRE_RANGE_BOUNDS, MotorReply, MotorSpec
 from exo_gravity.core.motors.wire_formats import FORMATS, MIT, Frame, WireFormat
 from exo_gravity.core.numbers import one_float
@@ -22,6 +21,14 @@ from exo_gravity.core.params import Param
 MAX_CAN_ID = 126
 TORQUE_SCALE_BOUNDS = (0.2, 2.0)
 OPTIONS = "can.options"  # parameters below this prefix go to python-can unchanged
+BITRATE = 1_000_000  # bit/s, of AK motors as delivered
+# Bits of a frame of 8 bytes: the mean over the poses, speeds and torques of an arm that is being carried, and the most.
+COMMAND, REPLY, V3_COMMAND, STATUS = (124, 135), (118, 135), (146, 160), (141, 160)
+# Status frames a second that are to be set on V3 boards: the most they can send, because each cycle waits for one; on a
+# slow bus fewer, or four boards would fill it.
+MAX_STATUS_RATE, SLOW_STATUS_RATE = 500.0, 200.0
+SLOW_BITRATE = 500_000  # bit/s, below which a bus is slow
+REPLY_SHARE = 0.8  # of a cycle in which replies are awaited
 # python-can's interfaces that open a bus at another bit rate than the motors' unless they are given one.
 NEED_BITRATE = ("cantact", "gs_usb", "ixxat", "kvaser", "pcan", "slcan", "usb2can", "vector")
 
@@ -36,6 +43,17 @@ class JointMotor:
     zero: float = 0.0  #: motor angle in rad at which the joint angle is 0
     torque_scale: float = 1.0  #: real output torque per commanded Nm (users report 0.75 for one AK80-9)
     wire_format: WireFormat = MIT  #: of the motor's board
+    command_id: int = field(init=False)  #: the arbitration ID of commands
+    #: the frames that switch the motor on, before its next command; that switch it off; and that make its present angle
+    #: zero, none if its board has no such frame
+    enter: tuple[Frame, ...] = field(init=False)
+    exit: tuple[Frame, ...] = field(init=False)
+    set_zero: tuple[Frame, ...] = field(init=False)
+    #: Nm at the joint, for any time: a motor that gives less than commanded already has its rated current when its
+    #: rated torque is commanded; and for seconds
+    rated_effort: float = field(init=False)
+    peak_effort: float = field(init=False)
+    peak_damping: float = field(init=False)  #: Nm s/rad at the joint, the most that a command can ask for
 
     def __post_init__(self) -> None:
         if not isinstance(self.can_id, int) or not 1 <= self.can_id <= MAX_CAN_ID:
@@ -46,47 +64,17 @@ class JointMotor:
         if not abs(self.zero) <= limit:
             raise ParameterError("zero", self.zero, f"from {-limit:.2f} to {limit:.2f} rad, or the angle would wrap")
         one_float("torque_scale", self.torque_scale, *TORQUE_SCALE_BOUNDS)
-
-    @property
-    def rated_effort(self) -> float:
-        """The largest torque in Nm at the joint that the motor bears for any time.
-
-        A motor that gives less than commanded already has its rated current when its rated torque is commanded.
-        """
-        return self.spec.rated_torque * min(1.0, self.torque_scale)
-
-    @property
-    def peak_effort(self) -> float:
-        """The largest torque in Nm at the joint, for seconds."""
-        return min(self.spec.peak_torque, self.spec.torque_range) * self.torque_scale
-
-    @property
-    def peak_damping(self) -> float:
-        """The largest damping in Nm s/rad at the joint that a command can ask for."""
-        return self.spec.kd_max * self.torque_scale
-
-    @property
-    def command_id(self) -> int:
-        """The arbitration ID of commands to this motor."""
-        return self.wire_format.first_id + self.can_id
-
-    @property
-    def enter(self) -> tuple[Frame, ...]:
-        """The frames that switch the motor on, before its next command."""
-        return self._own(self.wire_format.on)
-
-    @property
-    def exit(self) -> tuple[Frame, ...]:
-        """The frames that switch the motor off."""
-        return self._own(self.wire_format.off)
-
-    @property
-    def set_zero(self) -> tuple[Frame, ...]:
-        """The frames that make the motor's present angle zero; none if its board has no such frame."""
-        return self._own(self.wire_format.zero)
-
-    def _own(self, frames: Sequence[Frame]) -> tuple[Frame, ...]:
-        return tuple((first + self.can_id, data) for first, data in frames)
+        spec, board = self.spec, self.wire_format
+        frames = {"enter": board.on, "exit": board.off, "set_zero": board.zero}
+        derived: dict[str, object] = {
+            "command_id": board.first_id + self.can_id,
+            **{name: tuple((first + self.can_id, data) for first, data in own) for name, own in frames.items()},
+            "rated_effort": spec.rated_torque * min(1.0, self.torque_scale),
+            "peak_effort": min(spec.peak_torque, spec.torque_range) * self.torque_scale,
+            "peak_damping": spec.kd_max * self.torque_scale,
+        }
+        for name, value in derived.items():
+            object.__setattr__(self, name, value)
 
     def command(self, effort: float, damping: float, stiffness: float = 0.0, position: float = 0.0) -> bytes:
         """Return the data of a command: a joint `effort` in Nm and `damping` in Nm s/rad, clamped to the wire format.
@@ -135,8 +123,6 @@ MOTOR_PARAMETERS = (
           (0.0, WIRE_RANGE_BOUNDS[1]), "rad/s", fixed=True),
     Param("torque_range", [0.0] * 4, "torque range of the firmware's wire format; 0: the usual one of the motor",
           (0.0, WIRE_RANGE_BOUNDS[1]), "Nm", fixed=True),
-    Param("torque_per_ampere", [0.0] * 4, "V3: output torque by the current in status frames; 0: rated torque by "
-          "rated current", (0.0, 10.0), "Nm/A", fixed=True, expert=True),
 )
 # fmt: on
 _OF_A_MOTOR = tuple(param.name for param in MOTOR_PARAMETERS if isinstance(param.default, list))
@@ -161,9 +147,58 @@ def _motor_of(given: Mapping[str, Any]) -> JointMotor:
         own = getattr(usual, name)
         if given[name] == getattr(plain, name) != own:
             raise ParameterError(name, given[name], f"{own:g} or 0 for an {plain.name} with wire_format = {board.name}")
-    own_ranges = ("velocity_range", "torque_range", "torque_per_ampere")
-    spec = replace(usual, **{name: given[name] for name in own_ranges if given[name]})
+    spec = replace(usual, **{name: given[name] for name in ("velocity_range", "torque_range") if given[name]})
     return JointMotor(spec, given["can_id"], given["direction"], given["zero"], given["torque_scale"], board)
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """The motors on one bus, its bit rate, and the highest control rate that fits. Raises ParameterError.
+
+    In each cycle every motor gets a command of 8 bytes. V1 and V2 boards reply with 8 bytes, or 6 on older firmware; V3
+    boards send status frames of 8 bytes on their own timer, and have 29-bit IDs. Of a classic CAN frame with n bytes of
+    data (ISO 11898-1), 34 + 8 n bits are subject to stuffing, with a 29-bit ID 20 more, and 13 are not. It has at most
+    (34 + 8 n - 1) // 4 stuff bits (Davis et al. 2007, "Controller Area Network schedulability analysis", eq. 1). The
+    actual number depends on the bytes (test/core/test_bus_load.py).
+    """
+
+    replying: int  #: motors of V1 and V2 boards
+    reporting: int = 0  #: motors of V3 boards
+    bitrate: int = BITRATE  #: bit/s
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.bitrate, int) or not 10_000 <= self.bitrate <= 1_000_000:
+            raise ParameterError("can.options.bitrate", self.bitrate, "a whole number from 10000 to 1000000 bit/s")
+
+    @property
+    def status_rate(self) -> float:
+        """Status frames a second of each V3 board on this bus."""
+        return MAX_STATUS_RATE if self.bitrate >= SLOW_BITRATE else SLOW_STATUS_RATE
+
+    def load(self, rate: float, worst: bool = False) -> float:
+        """Return the share of the bus that `rate` cycles a second take, for typical or for `worst` stuffing."""
+        command, reply, v3_command, status = (bits[worst] for bits in (COMMAND, REPLY, V3_COMMAND, STATUS))
+        cycle = self.replying * (command + reply) + self.reporting * v3_command
+        return (rate * cycle + self.reporting * self.status_rate * status) / self.bitrate
+
+    @property
+    def largest_rate(self) -> float:
+        """Cycles/s that fill the bus, for typical stuffing."""
+        unasked = self.load(0.0)
+        return max(0.0, 1.0 - unasked) / (self.load(1.0) - unasked)
+
+    def is_crowded(self, rate: float) -> bool:
+        """Return whether replies may be late at `rate` although they fit on the bus."""
+        return self.load(rate) > REPLY_SHARE or self.load(rate, worst=True) > 1.0
+
+    def check(self, rate: float) -> None:
+        """Raise ParameterError if the typical load of `rate` exceeds the capacity of the bus."""
+        if (share := self.load(rate)) > 1.0:
+            motors, capacity = self.replying + self.reporting, self.bitrate / 1000.0
+            fits = f"at most {int(self.largest_rate)} Hz, the capacity of the CAN bus"
+            raise ParameterError(
+                "rate", rate, f"{fits}: {motors} motors need {share * capacity:.0f} kbit/s of its {capacity:g}"
+            )
 
 
 def traffic_of(values: Mapping[str, Any], options: Mapping[str, Any]) -> Traffic:

@@ -146,10 +146,11 @@ def pack_reply(
     Raises ParameterError on NaN, infinity or a value outside the spec's range.
     """
     word = pack_fields(spec, position=position, velocity=velocity, torque=torque)
-    data = (_whole("motor_id", motor_id, 0, 255) << 40 | word).to_bytes(6, "big")
-    if temperature is None:
+    data = (int(one_float("motor_id", motor_id, 0, 255)) << 40 | word).to_bytes(6, "big")
+    if temperature is None or error is None:
         return data
-    return data + bytes((_whole("temperature", temperature, -40, 215) + 40, _whole("error", error, 0, 255)))
+    warmth = one_float("temperature", temperature, -40, 215) + 40
+    return data + bytes((int(warmth), int(one_float("error", error, 0, 255))))
 
 
 def unpack_reply(spec: MotorSpec, data: bytes | bytearray) -> MotorReply:
@@ -180,9 +181,3 @@ def unpack_fields(spec: MotorSpec, word: int, *names: str) -> list[float]:
         values.append(low + (word & (1 << bits) - 1) * unit)
         word >>= bits
     return values[::-1]
-
-
-def _whole(name: str, value: int | None, low: int, high: int) -> int:
-    if not isinstance(value, int) or not low <= value <= high:
-        raise ParameterError(name, value, f"a whole number from {low} to {high}")
-    return value

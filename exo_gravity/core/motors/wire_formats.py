@@ -119,8 +119,8 @@ class V3Format(WireFormat):
         if len(data) != 8:
             raise FrameError(data, "8 bytes")
         order = "kp", "kd", "position", "velocity", "torque"
-        kp, kd, position, velocity, torque = specs.unpack_fields(spec, int.from_bytes(data, "big"), *order)
-        return MotorCommand(position, velocity, kp, kd, torque)
+        values = specs.unpack_fields(spec, int.from_bytes(data, "big"), *order)
+        return MotorCommand(**dict(zip(order, values, strict=True)))
 
     def pack_reply(self, spec: MotorSpec, reply: MotorReply) -> bytes:
         """Return the data of a status frame. Raises ParameterError."""
@@ -143,7 +143,7 @@ class V3Format(WireFormat):
     def classify(self, frame_id: int, data: bytes | bytearray, motor_ids: frozenset[int]) -> tuple[str, int]:
         """Return what a frame is: one of any control mode is a command."""
         motor_id, kind = frame_id & 0xFF, (frame_id & ID_BITS) >> 8
-        if motor_id not in motor_ids:
+        if motor_id not in motor_ids or frame_id < EXTENDED:
             return OTHER, 0
         if kind == STATUS and len(data) == 8:
             return REPLY, motor_id

@@ -27,14 +27,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE, UNKNOWN, JointSample
+from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE, JointSample
 
 REST_TIME = 2.0  # s at rest with nothing holding the arm, until it is down
 LONGEST_REST = 7.5  # s with nothing holding the arm, after which it is down even if the wearer moves it
 DESCENT_TIMEOUT = 40.0  # s for a bridge to let its arm down before its launcher kills it
 LONGEST_SILENCE = 5.0  # s for which the way down waits for a silent motor
 
-SETTLED = 0.005  # rad that a joint at rest may turn
 SETTLING_TIME = 0.5  # s
 
 DESCENT_SPEED = 0.35  # rad/s; a horizontal arm is down within 10 s
@@ -134,14 +133,9 @@ class ArmDescent:
         self._held = now  # when something last held the arm, s
 
     @property
-    def effort(self) -> tuple[float, ...]:
-        """Torque (4,) in Nm to apply now."""
-        return tuple(joint.effort for joint in self._joints)
-
-    @property
-    def damping(self) -> tuple[float, ...]:
-        """Damping (4,) in Nm s/rad to apply now."""
-        return tuple(joint.damping for joint in self._joints)
+    def applied(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Torque (4,) in Nm and damping (4,) in Nm s/rad to apply now."""
+        return tuple(joint.effort for joint in self._joints), tuple(joint.damping for joint in self._joints)
 
     def step(self, now: float, dt: float, samples: Sequence[JointSample], silent: Sequence[bool]) -> None:
         """Advance by `dt` s to `now` (s) with the newest readings; silent: (4,) whose motor does not reply."""
@@ -159,25 +153,3 @@ class ArmDescent:
         free = now - self._held
         is_down = free >= LONGEST_REST or (free >= REST_TIME and now - rest_since >= REST_TIME)
         return is_down and (not any(self._silent) or now - self._start >= LONGEST_SILENCE)
-
-
-class RestTracker:
-    """Whether an arm is at rest, judged by position: a damped arm can creep at less than one code of the velocity.
-
-    since: s, the time since which no replying joint has turned by more than SETTLED.
-    """
-
-    def __init__(self) -> None:
-        self.since = -math.inf
-        self._reference: Sequence[JointSample] = (UNKNOWN,) * 4
-
-    def step(self, now: float, joints: Sequence[JointSample], silent: Sequence[bool]) -> None:
-        """Take the newest readings at `now` (s); silent: (4,) whose motor does not reply."""
-        columns = zip(joints, self._reference, silent, strict=True)
-        if any(
-            not is_silent and not abs(joint.position - last.position) <= SETTLED for joint, last, is_silent in columns
-        ):
-            self.since, self._reference = now, joints
-        if any(silent):  # a silent joint may have moved by the time it replies again
-            known = zip(self._reference, silent, strict=True)
-            self._reference = [UNKNOWN if is_silent else last for last, is_silent in known]

@@ -49,14 +49,21 @@ def missing_for_a_start(
         for name, joint, low, high in columns
         if (excess := joint.position - max(low, min(high, joint.position)))
     ]
-    if not fault and not outside and not zeros_are_trusted:
-        fault = limits.find_wrong_zero(joints)
     if fault and fault.code not in WAITED_OUT:
         return fault
     if fault and fault.code is not FaultCode.OUTSIDE_LIMITS:
         return fault.reason
     if outside:
         return outside[0]
+    if not zeros_are_trusted:
+        zeros = zip(limits.joint_names, joints, limits.home, limits.home_tolerance, strict=True)
+        for name, joint, home, tolerance in zeros:
+            if not abs(joint.position - home) <= tolerance:
+                reason = (
+                    f"{name}: {joint.position:.3f} rad at the start, must be within {tolerance:g} of {home:g}: "
+                    "let the arm hang, or correct the parameter zero"
+                )
+                return Fault(FaultCode.IMPLAUSIBLE_ZERO, reason)
     return "the arm to be at rest" if any(abs(joint.velocity) > AT_REST for joint in joints) else ""
 
 
@@ -97,26 +104,21 @@ class SwitchOnCheck:
                 self._products[i] += self._commanded[i] * replied
                 self._squares[i] += self._commanded[i] ** 2
         pushes = int(self._elapsed / TEST_TIME)
-        if pushes > self._pushes and pushes % 2 == 0 and (fault := self._judge()):
-            return fault
+        if pushes > self._pushes and pushes % 2 == 0:
+            for i, name in enumerate(self._names):
+                share = self._products[i] / max(1e-9, self._squares[i])
+                self._is_on[i] = self._is_on[i] or share >= TEST_SHARE
+                self.enter[i] = not self._is_on[i]
+                if self.enter[i] and self._elapsed >= TEST_TIMEOUT - 1e-9:
+                    reason = f"{name}: the motor did not switch on: {share * 100:.0f} % of the commanded torque replied"
+                    return Fault(FaultCode.TORQUE_NOT_DELIVERED, reason)
+            self._products, self._squares = list(NOTHING), list(NOTHING)
         self._pushes = pushes
         for i, torque in enumerate(self._torque):
             target = 0.0 if all(self._is_on) else -torque if pushes % 2 else torque
             step = MAX_EFFORT_RATE * dt
             self.effort[i] += max(-step, min(step, target - self.effort[i]))
         self.done = all(self._is_on) and not any(self.effort)
-        return None
-
-    def _judge(self) -> Fault | None:
-        """After a push each way, note which motors are on; return a fault once the others have had their time."""
-        for i, name in enumerate(self._names):
-            share = self._products[i] / max(1e-9, self._squares[i])
-            self._is_on[i] = self._is_on[i] or share >= TEST_SHARE
-            self.enter[i] = not self._is_on[i]
-            if self.enter[i] and self._elapsed >= TEST_TIMEOUT - 1e-9:
-                reason = f"{name}: the motor did not switch on: {share * 100:.0f} % of the commanded torque replied"
-                return Fault(FaultCode.TORQUE_NOT_DELIVERED, reason)
-        self._products, self._squares = list(NOTHING), list(NOTHING)
         return None
 
 

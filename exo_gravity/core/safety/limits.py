@@ -1,6 +1,6 @@
 """The limits of a worn arm: which motor readings are a fault, and how an effort is limited before it reaches a motor.
 
-`find_fault` checks a motor's reading; readings.py confirms what it finds. `shape` limits the requested efforts, in this
+`find_fault` checks a motor's reading; monitors.py confirms what it finds. `shape` limits the requested efforts, in this
 order: soft wall before a joint limit, clamp to the permitted torque (derated when hot), rate limit. docs/safety.md
 compares the defaults with those of other systems.
 """
@@ -38,7 +38,9 @@ GUIDE_SPEED = 0.25  # rad/s; above the noise of a motor's velocity
 GUIDE_BRAKE = 1.5  # Nm
 MAX_TEMPERATURE = 80.0  # degC, an assumption: a motor whose own protection switches it off would drop the arm
 DERATING = 10.0  # degC below MAX_TEMPERATURE over which the permitted torque falls to half
-JUMP = 0.05  # rad that two readings may differ by in addition to what max_velocity allows
+MAX_VELOCITY = (5.0, 5.0, 5.0, 6.0)  # rad/s; a reach stays below, a throw does not
+REPLY_TIMEOUT = 0.05  # s, and MISSED cycles (monitors.py) at least; an ordinary computer is late by 0.02 s
+JUMP = 0.05  # rad that two readings may differ by in addition to what MAX_VELOCITY allows
 # rad from the hanging arm at the first start. The zero of a motor with a single encoder may be off by whole turns of
 # the rotor (60 degrees of an AK60-6's output, 40 of an AK80-9's): less than half of that shows it.
 HOME_TOLERANCE = {"AK60-6": 0.5, "AK80-9": 0.34}
@@ -68,14 +70,12 @@ class Limits:
     joint_names: tuple[str, ...]
     position_min: Sequence[float] = owned((-1.65, -0.17, -0.78, -0.17), "lower joint limits", (-3.15, 3.15), "rad")
     position_max: Sequence[float] = owned((1.65, 3.14, 2.53, 3.14), "upper joint limits", (-3.15, 3.15), "rad")
-    max_velocity: Sequence[float] = owned((5.0, 5.0, 5.0, 6.0), "joint speed that trips a fault", (0.1, 20.0), "rad/s")
+    max_velocity: Sequence[float] = MAX_VELOCITY  #: rad/s that trips a fault
     max_effort: Sequence[float] = owned(
         (3.0, 9.0, 3.0, 3.0), "torque limit, by default the motors' rated torque", (0.0, PEAK_TORQUE), "Nm"
     )
     command_timeout: float = owned(0.05, "age of effort commands that trips a fault", (0.01, 0.1), "s")
-    reply_timeout: float = owned(
-        0.05, "time without a reply from a motor, 7 cycles at least, that trips a fault", (0.01, 0.1), "s"
-    )
+    reply_timeout: float = REPLY_TIMEOUT  #: s without a reply that makes a motor silent; `limits_of` has it of the rate
     enable_timeout: float = owned(10.0, "time for the checks of a start to pass, else it is refused", (2.0, 60.0), "s")
     sign_check_torque: float = owned(
         1.5, "largest test torque of the sign check; 0 skips the check", (0.0, 3.0), "Nm", expert=True
@@ -132,17 +132,6 @@ class Limits:
         if not low - OVERSHOOT <= joint.position <= high + OVERSHOOT:
             reason = f"{name}: {joint.position:.3f} rad, the limits are {low:g} to {high:g}"
             return Fault(FaultCode.OUTSIDE_LIMITS, reason)
-        return None
-
-    def find_wrong_zero(self, joints: Sequence[JointSample]) -> Fault | None:
-        """Return the fault of the first joint that is not near `home`, or None."""
-        for name, joint, home, tolerance in zip(self.joint_names, joints, self.home, self.home_tolerance, strict=True):
-            if not abs(joint.position - home) <= tolerance:
-                reason = (
-                    f"{name}: {joint.position:.3f} rad at the start, must be within {tolerance:g} of {home:g}: "
-                    "let the arm hang, or correct the parameter zero"
-                )
-                return Fault(FaultCode.IMPLAUSIBLE_ZERO, reason)
         return None
 
     def shape(

@@ -14,13 +14,13 @@
 - LETTING_DOWN lowers each joint at a bounded speed (descent.py). The motors are switched off once nothing holds
   the arm and nothing moves it. A motor that cannot be reached stays in this state's care: if it replies again, however
   late, its joint is lowered from the torque that it then applies. If all were silent at once, their supply may have
-  been cut: a motor that returns without torque stays off (supply.py).
+  been cut: a motor that returns without torque stays off (`SupplyMonitor`).
 - FAULT latches the code and reason of the first fault. Only `clear` leaves it, and only to DISABLED: clearing a fault
   never enables the arm.
 
-A compensator that is late for a moment is waited for (ride.py): the last torque stays, and damping rises.
+A compensator that is late for a moment is waited for (`RideThrough`): the last torque stays, and damping rises.
 
-Zeros and signs are trusted once they were checked, until a motor may have lost its turn count (readings.py), or a fault
+Zeros and signs are trusted once they were checked, until a motor may have lost its turn count (`Readings`), or a fault
 casts doubt on them. Until then `resume` carries an arm on from any pose after a fault that was no one's.
 """
 
@@ -34,14 +34,12 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.delivery import DeliveryMonitor
-from exo_gravity.core.safety.descent import DAMPING_RISE, SETTLING_TIME, ArmDescent, RestTracker
+from exo_gravity.core.safety.descent import DAMPING_RISE, SETTLING_TIME, ArmDescent
 from exo_gravity.core.safety.drive import CARRYING, NOTHING, OFF, Drive, EffortCommand, Fault, FaultCode, State
 from exo_gravity.core.safety.gate import CALM, SignCheck, SwitchOnCheck, missing_for_a_start
 from exo_gravity.core.safety.limits import DAMPING, JointSample, Limits, guide_damping
+from exo_gravity.core.safety.monitors import Readings, RestTracker, RideThrough, SupplyMonitor
 from exo_gravity.core.safety.motion_monitor import MotionMonitor
-from exo_gravity.core.safety.readings import Readings
-from exo_gravity.core.safety.ride import RideThrough
-from exo_gravity.core.safety.supply import SupplyMonitor
 
 RAMP_TIME = 1.0  # s from no torque to full torque: the arm becomes light without a jolt
 
@@ -153,22 +151,34 @@ class SafetyMachine:
 
     def step(self, now: float, joints: Sequence[JointSample], command: EffortCommand) -> Drive:
         """Return what the motors receive in the cycle at `now` s; joints: the 4 newest readings."""
-        effort, effort_time, damped, held = command
+        effort, answered, damped, held = command
         now = max(now, self._now)  # a call may carry a slightly later time than the cycle that follows it
-        age = now - effort_time
+        age = now - answered
         self._now, self._dt = now, min(now - self._now, self._period)
-        self._track(joints)
+        readings, supply, sent = self._readings, self._supply, self._sent
+        readings.step(now, joints, sent.powered)
+        if readings.lost or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):
+            self._is_trusted = False
+        self._rest.step(now, readings.joints, readings.silent)
+        if all(readings.silent) and sent.powered:
+            supply.doubt(sent.effort)
+        self._is_found_on = supply.step(self._dt, readings.joints, readings.silent)
         if self.state is State.CHECKING:
             self._check(effort is not None and age <= self.limits.command_timeout)
-        if self._sent.powered:
-            fault = self._delivery.step(self._dt, self._readings.joints, self._sent.effort, self._sent.damping)
+        if sent.powered:
+            fault = self._delivery.step(self._dt, readings.joints, sent.effort, sent.damping)
             is_proven = self.state in (State.RAMPING_IN, State.ACTIVE) or self._switch_on.done
             if fault and self.state in CARRYING and is_proven:
                 self._trip(fault)
         if self.state in CARRYING:
-            self._watch(effort is not None, age, held)
+            fault = readings.fault
+            if fault is None and effort is None:
+                fault = Fault(FaultCode.COMMAND_WITHDRAWN, "the compensator withdrew its efforts; see its diagnostics")
+            elif fault is None:
+                fault = self.ride.step(now, self._dt, age, held)
+            self._trip(fault)
         if effort is not None and self.state in (State.RAMPING_IN, State.ACTIVE):
-            effort, fault = self.motion.step(self._dt, self._readings.joints, effort, age)
+            effort, fault = self.motion.step(self._dt, readings.joints, effort, age)
             self._trip(fault)
         if self.state is State.PROVING:
             self._prove()
@@ -208,14 +218,6 @@ class SafetyMachine:
             self._enter(State.PROVING)
         elif self._now - self._since >= limits.enable_timeout:
             self._refuse(f"not enabled within {limits.enable_timeout:g} s: waited for {self.waiting_for}")
-
-    def _watch(self, is_requested: bool, age: float, held: bool) -> None:
-        fault = self._readings.fault
-        if fault is None and not is_requested:
-            fault = Fault(FaultCode.COMMAND_WITHDRAWN, "the compensator withdrew its efforts; see its diagnostics")
-        elif fault is None:
-            fault = self.ride.step(self._now, self._dt, age, held)
-        self._trip(fault)
 
     def _prove(self) -> None:
         if self._switch_on.done:
@@ -263,7 +265,7 @@ class SafetyMachine:
         if any(enter):
             self._is_trusted = False
             self._delivery.reset()
-        return Drive(descent.effort, descent.damping, True, enter, supply.unsure)
+        return Drive(*descent.applied, True, enter, supply.unsure)
 
     def _stand(self) -> Drive:
         """Return what the motors receive while the arm is off: nothing, unless one of them may be on."""
@@ -277,7 +279,7 @@ class SafetyMachine:
         if not (self.is_unreached or is_doubtful or self._is_found_on):
             return OFF
         if not self._is_found_on and (is_doubtful or any(self._readings.silent)):
-            return Drive(self._descent.effort, self._descent.damping, True, unsure=supply.unsure)
+            return Drive(*self._descent.applied, True, unsure=supply.unsure)
         if self.state is State.CHECKING:
             self._refuse("a motor was still on: it is let down")
         self.is_unreached = False
@@ -286,17 +288,6 @@ class SafetyMachine:
     def _refuse(self, reason: str) -> None:
         self.refusal = reason
         self._enter(State.DISABLED)
-
-    def _track(self, joints: Sequence[JointSample]) -> None:
-        """Follow the readings: who is silent, who applies torque, whether the arm rests."""
-        readings = self._readings
-        readings.step(self._now, joints, self._sent.powered)
-        if readings.lost or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):
-            self._is_trusted = False
-        self._rest.step(self._now, readings.joints, readings.silent)
-        if all(readings.silent) and self._sent.powered:
-            self._supply.doubt(self._sent.effort)
-        self._is_found_on = self._supply.step(self._dt, readings.joints, readings.silent)
 
     def _let_down(self, now: float) -> None:
         applied = self._delivery.applied(self._sent, self._readings.silent)

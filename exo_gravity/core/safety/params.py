@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.bus_load import MAX_STATUS_RATE, REPLY_SHARE
-from exo_gravity.core.motors.joint_motor import MOTOR_PARAMETERS, JointMotor
+from exo_gravity.core.motors.joint_motor import MAX_STATUS_RATE, MOTOR_PARAMETERS, REPLY_SHARE, JointMotor
 from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, params_of
-from exo_gravity.core.safety.limits import HOME_TOLERANCE, Limits
+from exo_gravity.core.safety.limits import HOME_TOLERANCE, REPLY_TIMEOUT, Limits
+from exo_gravity.core.safety.monitors import MISSED
 
 FROZEN = 0.08  # s without a drive from the control loop while the watchdog itself runs, after which it takes over
 PERIODS = 2  # control periods that must fit into each time-out, so that one late cycle is not a fault
@@ -29,13 +29,10 @@ CAN_BRIDGE = (
 
 
 def limits_of(values: Mapping[str, Any]) -> Limits:
-    """Return the limits that `can_bridge`'s parameter values describe, or raise ParameterError.
-
-    `motor` may be missing from the values of another node: `home_tolerance` is then that of the usual motors.
-    """
+    """Return the limits that `can_bridge`'s parameter values describe, or raise ParameterError."""
     given = {param.name: values[param.name] for param in LIMIT_PARAMETERS}
-    if "motor" in values:
-        given["home_tolerance"] = tuple(HOME_TOLERANCE[name] for name in values["motor"])
+    given["home_tolerance"] = tuple(HOME_TOLERANCE[name] for name in values["motor"])
+    given["reply_timeout"] = min(2.0 * REPLY_TIMEOUT, max(REPLY_TIMEOUT, MISSED / values["rate"]))
     return Limits(tuple(values["joint_names"]), **given)
 
 
@@ -46,11 +43,7 @@ def check_bridge(
 
     status_rate: status frames a second of V3 boards. Raises ParameterError that names both values.
     """
-    timeouts = {
-        "command_timeout": limits.command_timeout,
-        "reply_timeout": limits.reply_timeout,
-        "the watchdog's time-out": FROZEN,
-    }
+    timeouts = {"command_timeout": limits.command_timeout, "the watchdog's time-out": FROZEN}
     name, shortest = min(timeouts.items(), key=lambda item: item[1])
     if rate * shortest < PERIODS - 1e-9:
         expected = f"at least {PERIODS / shortest:g} Hz: {name} = {shortest:g} s must span {PERIODS} periods"

@@ -14,12 +14,14 @@ import numpy as np
 
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.safety.drive import State
 
 BLOCK = 0.1  # s, the time resolution of the analysis
 STILL_SPEED = 0.02  # rad/s, or 69 degrees per minute: an arm that moves faster is not held
 MARGIN = 0.2  # s cut off at both ends of a still span, where a smooth motion can be slower than STILL_SPEED
 
 Span = tuple[float, float]  # start and end in s
+CARRIED = (State.RAMPING_IN, State.ACTIVE)  # the states of an arm's bridge in which its motors carry it
 
 
 class ScriptedStep(NamedTuple):

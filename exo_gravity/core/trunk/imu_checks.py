@@ -1,7 +1,9 @@
-"""What no working IMU does over several samples: repeat values, contradict gravity or itself, run by a wrong clock.
+"""What no working IMU does: exceed its ranges, repeat values, contradict gravity or itself, run by a wrong clock.
 
-While a person moves, the accelerometer also measures the movement. So each check against it waits until a movement
-cannot be the reason. The limits were set on the trials of docs/imu.md.
+A value at the end of the sensor's range is saturated: the true one is not known, only its sign. One beyond the range
+cannot come from the sensor: a unit or a parameter is wrong. While a person moves, the accelerometer also measures the
+movement. So each check against it waits until a movement cannot be the reason. The limits were set on the trials of
+docs/imu.md.
 """
 
 from __future__ import annotations
@@ -9,18 +11,26 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from operator import eq
+from typing import NamedTuple
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.rotation import ZERO, Floats3, Quaternion, dot, plus, rotated
+from exo_gravity.core.model.rotation import ZERO, Floats3, Quaternion, dot, plus, rotated, up_in_body
+
+# The usual widest ranges of a MEMS sensor, and those that any sensor may have.
+GYROSCOPE_RANGE, GYROSCOPE_RANGES = 34.9, (1.0, 200.0)  # rad/s; 2000 deg/s
+ACCELEROMETER_RANGE, ACCELEROMETER_RANGES = 156.9, (15.0, 4000.0)  # m/s^2; 16 g
+RANGES = {"angular_velocity": "gyroscope_range", "linear_acceleration": "accelerometer_range"}
+SATURATED, BEYOND = 0.995, 1.03  # shares of the range: scale factors of MEMS sensors are wrong by up to 3 %
+DEAD, ALMOST_NOTHING = 0.02, 1.5  # m/s^2: even in free fall noise and bias make more
+SAME = 0.15  # share of 1 g
 
 FROZEN_TIME, FROZEN_SAMPLES = 0.1, 10  # s of equal samples, and at least this many
-STUCK_SAMPLES, NO_REPEATS = 5, (0.0,) * 6  # that repeat the value of an axis; of each axis
+STUCK_SAMPLES, NO_REPEATS = 5, (0,) * 6  # that repeat the value of an axis; of each axis
 NEAR_GRAVITY = 0.15  # share of 1 g
 TURN = math.radians(3.0)
 STUCK_TURN = 0.09  # of gravity's unit vector along an axis
 
-CHECK_PERIOD = 0.0095  # s between two comparisons of gyroscope and accelerometer
 QUIET_TIME, QUIET = 0.15, 0.1  # s over which the deviation from 1 g is averaged; share of 1 g
 MAX_CONTRADICTION = math.radians(20.0)
 CONTRADICTION_TIME = 0.5  # s; less than the time to settle, so that a wrong orientation is never used
@@ -29,8 +39,8 @@ TURN_TIME = 1.0  # s over which the two turns are compared
 CLEAR_TURN = 0.04  # of a unit vector: 2.3 degrees
 CLEAR = 6.0  # times the deviation from 1 g, that a turn must also exceed
 UNLIKE, ALIKE = 0.6, 0.3  # share of the gyroscope's turn by which the two differ, with other axes or sign, or without
-LEVER, MOST = 0.35 / STANDARD_GRAVITY, 0.3  # s^2: m from the axis of a turn to the IMU, per 1 g; 1 g, at most
-PATIENCE = 0.01  # s 1 g: the velocity that a movement may add beyond this; 0.006 in ordinary motion
+LEVER, MOST = 0.38 / STANDARD_GRAVITY, 0.3  # s^2: m from the axis of a turn to the IMU, per 1 g; 1 g, at most
+PATIENCE = 0.0095  # s 1 g: the velocity that a movement may add beyond this; 0.009 in ordinary motion
 NOTICE = 0.0006  # s 1 g, by which the two differ fully
 FORGET_TIME = 2.0  # s
 AGREEMENT_TIME = 0.6  # s of like turns
@@ -40,65 +50,96 @@ AVERAGE_TIME, LEAST_TIME = 2.0, 0.5  # s of samples whose mean is gravity; fewer
 OFFSET = 0.04  # share of 1 g: bias and scale of an accelerometer that was never calibrated
 WALK = 0.75 / STANDARD_GRAVITY  # s: m/s, per 1 g; 0.45 m/s is needed for an IMU swung in a circle by hand
 DIRECTION_TIME = 0.3  # s for which a movement keeps its direction
+UPWARD = (0.0, 0.0, 1.0)
 
 WINDOW, DRIFTING_WINDOWS = 0.25, 2  # s; in a row
 MAX_DRIFT, MAX_OFFSET = 0.03, 0.06  # s a second, in each of these windows; s, in all of them
+
+
+class ImuSample(NamedTuple):
+    """One sample in the IMU's own axes; None marks what it does not report: the orientation, or one of the others."""
+
+    time: float  #: s, when it was taken, not when it arrived
+    angular_velocity: Sequence[float] | None  #: (3,) rad/s
+    acceleration: Sequence[float] | None  #: (3,) m/s^2, +9.8 upward at rest (REP-145)
+    orientation: Sequence[float] | None = None  #: (x, y, z, w), world from IMU, world z up
 
 
 class Contradiction(ParameterError):
     """The samples contradict each other: the estimate begins anew once gyroscope and accelerometer agree on a turn."""
 
 
+def three_floats(name: str, values: Sequence[float] | None) -> Floats3:
+    """Return `values` as 3 finite floats, or raise ParameterError that names them."""
+    try:
+        x, y, z = map(float, values)  # type: ignore[arg-type]  # None is one of the wrong values
+        if -math.inf < x + y + z < math.inf:
+            return x, y, z
+    except (TypeError, ValueError):
+        pass
+    raise ParameterError(name, values, "3 finite numbers")
+
+
+def in_range(name: str, values: Sequence[float] | None, limit: float) -> tuple[Floats3, bool]:
+    """Return `values` as 3 floats, and whether one is saturated; raise ParameterError if one is beyond `limit`."""
+    vector = x, y, z = three_floats(name, values)
+    largest = max(abs(x), abs(y), abs(z))
+    if largest > BEYOND * limit:
+        raise ParameterError(name, vector, f"at most {RANGES[name]} = {limit:.4g} (is its unit right?)")
+    return vector, largest >= SATURATED * limit
+
+
+def check_living(acceleration: Floats3, last: Floats3 | None) -> None:
+    """Raise ParameterError for an accelerometer that is dead, or in g; last: the acceleration before, None at first."""
+    if math.dist(acceleration, ZERO) < ALMOST_NOTHING:
+        in_si = [STANDARD_GRAVITY * value for value in acceleration]
+        if max(map(abs, acceleration)) < DEAD or (last and math.dist(in_si, last) < SAME * STANDARD_GRAVITY):
+            raise ParameterError("linear_acceleration", acceleration, "in m/s^2, not in g, and not dead")
+
+
 class EqualValues:
     """Values that an IMU repeats with new stamps: all from a frozen one, one axis from a broken one.
 
-    Gyroscope and accelerometer of a MEMS IMU have noise, so their values differ from sample to sample (measured: no two
-    samples in a row were equal in 13,514). A vector of zeros is not judged: some drivers fill in zeros for what the IMU
-    does not measure. At rest coarse steps can hide the noise of one axis; so an axis is stuck only if the trunk turned
-    meanwhile: if the accelerometer shows another direction of gravity than the estimate.
+    A MEMS IMU has noise: of 13,514 samples no two in a row were equal. Zeros alone are not judged: some drivers fill
+    them in for what the IMU does not measure. Coarse steps can hide the noise of one axis at rest; so an axis is stuck
+    only if the trunk turned: if the accelerometer shows another direction of gravity than the estimate.
     """
 
     duration = 0.0  #: s for which whole samples have been equal
-    _since = math.inf  # s, of the first of them
+    _since = 0.0  # s, of the first of them
     _values: tuple[float, ...] = (math.nan,) * 6  # gyroscope and accelerometer
-    _repeats: tuple[float, ...] = NO_REPEATS  # of each value
+    _repeats: tuple[int, ...] = NO_REPEATS  # of each value
 
-    def check(self, time: float, rate: Floats3, acceleration: Floats3 | None, up: Floats3 | None) -> None:
+    def check(self, time: float, values: tuple[float, ...], quaternion: Quaternion | None) -> None:
         """Raise ParameterError once the IMU is frozen, Contradiction once an axis is stuck, at the sample of `time` s.
 
-        up: the vertical in the IMU's axes by an estimate from the samples before; None if there is none.
+        quaternion: the estimate at the last sample, world from IMU; None if an axis cannot be judged by it.
         """
-        last, self._values = self._values, rate + (acceleration or ZERO)
-        if not any(map(eq, self._values, last)):
+        last, self._values = self._values, values
+        if not any(map(eq, values, last)):
             self._since, self.duration, self._repeats = time, 0.0, NO_REPEATS
             return
-        pairs = zip(self._repeats, self._values, last, strict=True)
-        repeats = self._repeats = tuple([count + 1.0 if value == before else 0.0 for count, value, before in pairs])
-        least, most = min(repeats), max(repeats)
-        self._since = min(self._since, time) if least else time
+        counts = zip(map(eq, values, last), self._repeats, strict=True)
+        repeats = self._repeats = tuple([same * (count + 1) for same, count in counts])
+        least, axis = min(repeats), repeats.index(max(repeats))
+        self._since = self._since if least else time
         self.duration = time - self._since
-        if least + 1 >= FROZEN_SAMPLES and self.duration >= FROZEN_TIME and any(self._values):
+        if least + 1 >= FROZEN_SAMPLES and self.duration >= FROZEN_TIME and any(values):
             expected = "different from sample to sample, as noise makes them: the IMU or its driver is frozen"
-            raise ParameterError("angular_velocity and linear_acceleration", list(self._values), expected)
-        axis = repeats.index(most)
-        if least or most < STUCK_SAMPLES or not up or not acceleration or not _should_change(axis, up, acceleration):
+            raise ParameterError("angular_velocity and linear_acceleration", list(values), expected)
+        if least or repeats[axis] < STUCK_SAMPLES or not quaternion:
             return
-        name, shown = ("angular_velocity", rate) if axis < 3 else ("linear_acceleration", acceleration)
-        expected = f"different from sample to sample while the trunk turns: the {'xyz'[axis % 3]} axis is stuck"
-        raise Contradiction(name, shown, expected)
-
-
-def _should_change(axis: int, up: Floats3, acceleration: Floats3) -> bool:
-    """Return whether gravity by the estimate is not what the accelerometer shows: for one of its axes, or at all."""
-    x, y, z = (component / STANDARD_GRAVITY for component in acceleration)
-    if axis >= 3:
-        return abs((x, y, z)[axis - 3] - up[axis - 3]) > STUCK_TURN
-    norm = math.hypot(x, y, z)
-    return abs(norm - 1.0) < NEAR_GRAVITY and math.dist(up, (x / norm, y / norm, z / norm)) > TURN
+        up, (x, y, z) = up_in_body(quaternion), [value / STANDARD_GRAVITY for value in values[3:]]
+        norm = math.hypot(x, y, z)
+        turned = math.dist(up, (x / norm, y / norm, z / norm)) > TURN and abs(norm - 1.0) < NEAR_GRAVITY
+        if turned if axis < 3 else abs((x, y, z)[axis - 3] - up[axis - 3]) > STUCK_TURN:
+            name = "linear_acceleration" if axis >= 3 else "angular_velocity"
+            expected = f"different from sample to sample while the trunk turns: the {'xyz'[axis % 3]} axis is stuck"
+            raise Contradiction(name, values[3:] if axis >= 3 else values[:3], expected)
 
 
 class Agreement:
-    """The orientation against the accelerometer. Every method raises Contradiction where no movement explains it.
+    """The orientation against the accelerometer. Every method raises where no movement explains the difference.
 
     Turns: gravity must have turned by gyroscope and accelerometer alike over the last second. The more the
     acceleration's length deviates from 1 g, the larger a turn must be to be compared.
@@ -111,11 +152,10 @@ class Agreement:
     contradiction = 0.0  #: rad by which the two turns differ, while they clearly do
     square = 0.0  #: of the acceleration's deviation from its mean, in shares of 1 g
     _deviation = 0.0  # of the acceleration's length from 1 g, mean over QUIET_TIME, as a share
-    _means: Sequence[float] = ()  # over TURN_TIME, of gravity's direction by the estimate and of the acceleration's
-    _rate = ZERO  # rad/s, at the last comparison
-    _unlike = _agreed = _rest = _contradicted = _age = 0.0  # s
+    _means: tuple[float, ...] = ()  # over TURN_TIME, of gravity's direction by the estimate and of the acceleration's
+    _unlike = 0.0  # s 1 g, by which the turns have differed
+    _agreed = _rest = _contradicted = _age = 0.0  # s
     _mean = ZERO  # acceleration in the world, in 1 g
-    _since = ZERO, 0.0, 0  # the last comparison: sum of the accelerations, s, samples
 
     def __init__(self, is_suspect: bool = False) -> None:
         #: whether the two must agree on a turn, or the trunk rest, before the estimate is used
@@ -135,34 +175,27 @@ class Agreement:
             expected = f"within {limit:g} degrees of the accelerometer at rest: check the IMU's axes, units and signs"
             raise ParameterError("gravity_in_imu", [round(-component, 2) for component in up], expected)
 
-    def check(self, dt: float, quaternion: Quaternion, up: Floats3, acceleration: Floats3, rate: Floats3) -> None:
-        """Compare a fused orientation, and its world z axis `up` in the IMU's axes, with the acceleration.
+    def check(self, dt: float, quaternion: Quaternion, acceleration: Floats3, swing: float) -> None:
+        """Compare a fused orientation, world from IMU, with the mean acceleration, in 1 g, of the `dt` s that it ends.
 
-        This is the mean since the last comparison, CHECK_PERIOD before.
+        swing: rad/s^2, the angular acceleration and the square of the angular velocity.
         """
-        total, span, count = self._since
-        total, dt, count = plus(acceleration, total), dt + span, count + 1
-        if dt < CHECK_PERIOD and self._means:
-            self._since = total, dt, count
-            return
-        self._since = ZERO, 0.0, 0
-        mean = plus(ZERO, total, 1.0 / (count * STANDARD_GRAVITY))
-        spin_up = math.dist(rate, self._rate) / dt if dt else 0.0
-        self._rate = rate
-        # Before and just after the first tilt nothing is lost by a refusal.
-        explained = min(MOST, LEVER * (spin_up + dot(rate, rate))) if self._age > AVERAGE_TIME else 0.0
-        self._check_turns(dt, up, mean, explained)
-        self._check_mean(dt, rotated(quaternion, mean))
+        self._age += dt
+        self._check_turns(dt, up_in_body(quaternion), acceleration, swing)
+        self._check_mean(dt, rotated(quaternion, acceleration))
 
-    def _check_turns(self, dt: float, up: Floats3, acceleration: Floats3, explained: float) -> None:
-        """Compare the turns. acceleration: in 1 g; explained: the part of it that the rotation may cause."""
-        norm = math.hypot(*acceleration)
+    def _check_turns(self, dt: float, up: Floats3, acceleration: Floats3, swing: float) -> None:
+        norm, share = math.hypot(*acceleration), dt / TURN_TIME
+        x, y, z = up
+        a, b, c = acceleration[0] / norm, acceleration[1] / norm, acceleration[2] / norm
+        mean_x, mean_y, mean_z, mean_a, mean_b, mean_c = self._means or (x, y, z, a, b, c)
+        x, y, z, a, b, c = x - mean_x, y - mean_y, z - mean_z, a - mean_a, b - mean_b, c - mean_c
+        mean_x, mean_y, mean_z = mean_x + share * x, mean_y + share * y, mean_z + share * z
+        self._means = mean_x, mean_y, mean_z, mean_a + share * a, mean_b + share * b, mean_c + share * c
+        turned = x, y, z
+        size, difference = math.dist(turned, ZERO), math.dist(turned, (a, b, c))
         self._deviation += (abs(norm - 1.0) - self._deviation) * min(1.0, dt / QUIET_TIME)
-        now = [*up, acceleration[0] / norm, acceleration[1] / norm, acceleration[2] / norm]
-        means = [mean + dt / TURN_TIME * (v - mean) for mean, v in zip(self._means or now, now, strict=True)]
-        turned = [v - mean for mean, v in zip(means, now, strict=True)]
-        size, difference = math.hypot(*turned[:3]), math.dist(turned[:3], turned[3:])
-        self._means, self.contradiction = means, 0.0
+        self.contradiction = 0.0
         self._unlike -= self._unlike * dt / FORGET_TIME
         if size <= CLEAR_TURN:
             self._rest = self._rest + dt if self._deviation < AT_REST else 0.0
@@ -171,6 +204,8 @@ class Agreement:
         self._rest = 0.0
         if size <= CLEAR * self._deviation:
             return
+        # Before and just after the first tilt nothing is lost by a refusal.
+        explained = min(MOST, LEVER * swing) if self._age > AVERAGE_TIME else 0.0
         excess = difference - UNLIKE * size - explained
         if difference < ALIKE * size:
             self._agreed += dt
@@ -181,22 +216,20 @@ class Agreement:
             self.contradiction = difference * self._unlike / NOTICE
             if self._unlike > PATIENCE:
                 expected = "the turn that the accelerometer shows: check the gyroscope's unit, axes and signs"
-                raise Contradiction("turn by angular_velocity", [round(v, 3) for v in turned[:3]], expected)
+                raise Contradiction("turn by angular_velocity", [round(v, 3) for v in turned], expected)
 
     def _check_mean(self, dt: float, acceleration: Floats3) -> None:
         """Compare the mean acceleration in the world, in 1 g, with gravity."""
-        self._age += dt
         span = min(self._age, AVERAGE_TIME)
-        share = dt / span if dt else 1.0
-        change = plus(acceleration, self._mean, -1.0)
-        self._mean = u, v, w = plus(self._mean, change, share)
+        share, change = dt / span, plus(acceleration, self._mean, -1.0)
+        self._mean = plus(self._mean, change, share)
         self.square += share * ((1.0 - share) * dot(change, change) - self.square)
-        shift = math.hypot(u, v, w - 1.0)
+        shift = math.dist(self._mean, UPWARD)
         if shift < OFFSET or self._age < LEAST_TIME:
             return
         limit = OFFSET + (WALK + DIRECTION_TIME * math.sqrt(self.square)) / span
         if shift > limit:
-            mean = [round(STANDARD_GRAVITY * component, 2) for component in (u, v, w)]
+            mean = [round(STANDARD_GRAVITY * component, 2) for component in self._mean]
             expected = f"within {STANDARD_GRAVITY * limit:.2f} m/s^2 of gravity upwards: check units, axes and signs"
             raise Contradiction("mean linear_acceleration in the world", mean, expected)
 
@@ -209,7 +242,7 @@ class ClockCheck:
     """
 
     offset = 0.0  #: s by which the clock may have gone wrong by the last sample
-    _end = math.inf  # s, of the present window
+    _end = -math.inf  # s, of the present window
     _shortest = _last = _least = math.inf  # s from stamp to arrival: in this window, the last one, and all before that
     _drift, _windows = 0.0, 0  # s in how many windows in a row
 
@@ -217,24 +250,18 @@ class ClockCheck:
         """Check the stamp `time` of a sample that arrived at `arrival`, both s. Raises Contradiction."""
         lag = arrival - time
         self._shortest = min(self._shortest, lag)
-        if self._end == math.inf:
-            self._end, self._last = arrival + WINDOW, lag
         if arrival >= self._end:
-            self._close(MAX_DRIFT * (WINDOW + arrival - self._end))
-            self._end = arrival + WINDOW
+            limit, self._end = MAX_DRIFT * (WINDOW + arrival - self._end), arrival + WINDOW
+            step, self._least = self._shortest - self._last, min(self._least, self._last)
+            drifts = step > limit or (step < -limit and self._last <= self._least)
+            if not drifts or step * self._drift < 0.0:
+                self._drift, self._windows = 0.0, 0
+            if drifts:
+                self._drift, self._windows = self._drift + step, self._windows + 1
+            self._last, self._shortest = self._shortest, math.inf
         before = self._last - self._drift
         self.offset = abs(lag - before) if lag > before or before <= self._least else 0.0
         if self._windows >= DRIFTING_WINDOWS and abs(self._drift) > MAX_OFFSET:
             drifted = f"{-1e3 * self._drift:+.0f} ms in {WINDOW * self._windows:.1f} s"
             expected = f"by a clock as fast as this computer's, not one that gains {drifted}"
             raise Contradiction("stamp", round(time, 4), expected)
-
-    def _close(self, limit: float) -> None:
-        """End the window, in which a drift by more than `limit` s is one."""
-        step, self._least = self._shortest - self._last, min(self._least, self._last)
-        drifts = step > limit or (step < -limit and self._last <= self._least)
-        if not drifts or step * self._drift < 0.0:
-            self._drift, self._windows = 0.0, 0
-        if drifts:
-            self._drift, self._windows = self._drift + step, self._windows + 1
-        self._last, self._shortest = self._shortest, math.inf

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from exo_gravity.core.params import Param
-from exo_gravity.core.trunk.imu_sample import (
+from exo_gravity.core.trunk.imu_checks import (
     ACCELEROMETER_RANGE,
     ACCELEROMETER_RANGES,
     GYROSCOPE_RANGE,

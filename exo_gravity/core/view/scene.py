@@ -12,11 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.model.kinematics import frames
 from exo_gravity.core.numbers import Vector
 from exo_gravity.core.safety.drive import CARRYING, State
 from exo_gravity.core.safety.limits import WALL_WIDTH
-from exo_gravity.core.view.urdf import ArmDescription
+from exo_gravity.core.view.urdf import ArmDescription, arm_pose
 
 Colour = tuple[float, float, float, float]
 
@@ -56,26 +55,6 @@ class ArmView(NamedTuple):
     effort: Sequence[float]  #: (4,) Nm, as the motors report it
     state: str  #: of its bridge, '' if not known
     message: str = ""  #: of its bridge
-
-
-def arm_pose(arm: ArmDescription, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return where `arm` is at `theta` (4,) rad, in the trunk's axes.
-
-    The origins (5, 3) in m of the four joints and the far end, the axes (4, 3) about which the joints turn, and unit
-    vectors (4, 3) along the links.
-    """
-    length = arm.robot.length
-    links = frames(length.tolist(), theta)
-    along = _in_trunk(arm, [link.along for link in links])
-    axes = _in_trunk(arm, [link.axis for link in links]) * arm.outward  # a mirror reverses rotations
-    origins = _in_trunk(arm, [link.origin for link in links]) + arm.base
-    return np.vstack((origins, origins[3] + length[3] * along[3])), axes, along
-
-
-def _in_trunk(arm: ArmDescription, points: Sequence[Sequence[float]]) -> np.ndarray:
-    """Return vectors (n, 3) of the arm's base frame in the trunk's axes: x0 outward, y0 forward, z0 down."""
-    x, y, z = np.array(points).T
-    return np.stack((y, arm.outward * x, -z), axis=1)
 
 
 def gravity_shapes(gravity: Vector | None) -> list[Shape]:

@@ -1,16 +1,9 @@
 """The robot description (URDF) of one arm or of both, made from the same values as the control law.
 
 Every frame has the trunk's axes (REP-103: x forward, y left, z up) while the arm hangs at theta = 0. So the origins of
-the joints are plain offsets, and the description needs no rotations. From the frames of Table 1 (model/arm.py), for the
-left arm:
-
-    joint 1  at the shoulder   turns about -z     link 1 points left, along +y
-    joint 2  at (0, l1, 0)     turns about +x     links 2 to 4 point down, along -z
-    joint 3  at (0, 0, -l2)    turns about -y
-    joint 4  at (0, 0, -l3)    turns about -y
-
-The right arm is the mirror image: y changes its sign in each offset, x and z theirs in each axis. So positive angles
-are abduction and flexion on both sides. The gain c_n is no part of a description, and neither is gravity.
+the joints are plain offsets, and the description needs no rotations: they and the axes are those of the hanging arm,
+link 1 sideways and links 2 to 4 down. The right arm is the mirror image, so positive angles are abduction and flexion
+on both sides. The gain c_n is no part of a description, and neither is gravity.
 """
 
 from __future__ import annotations
@@ -22,15 +15,18 @@ from typing import Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
+import numpy as np
+
 from exo_gravity.core.compensation.params import robot_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import ZEROS, ArmModel
+from exo_gravity.core.model.kinematics import frames
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.params import limits_of
 
-Point = tuple[float, float, float]
+Point = tuple[float, ...]  # (3,)
 
 ROOT = "trunk"
 NO_TURN = (0.0, 0.0, 0.0)  # rad
@@ -76,8 +72,8 @@ class ArmDescription:
     @property
     def base(self) -> Point:
         """Origin of joint 1 in the trunk's axes, m."""
-        x, y, z = map(float, self.shoulder)
-        return (x, y, z) if any((x, y, z)) else (0.0, self.outward * HALF_BREADTH, 0.0)
+        given = tuple(map(float, self.shoulder))
+        return given if any(given) else (0.0, self.outward * HALF_BREADTH, 0.0)
 
     @property
     def links(self) -> tuple[str, ...]:
@@ -96,6 +92,26 @@ def described(compensator: Mapping[str, Any], can_bridge: Mapping[str, Any]) -> 
         compensator["friction.coulomb"],
         compensator["shoulder_from_imu"],
     )
+
+
+def arm_pose(arm: ArmDescription, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where `arm` is at `theta` (4,) rad, in the trunk's axes.
+
+    The origins (5, 3) in m of the four joints and the far end, the axes (4, 3) about which the joints turn, and unit
+    vectors (4, 3) along the links.
+    """
+    length = arm.robot.length
+    links = frames(length.tolist(), theta)
+    along = _in_trunk(arm, [link.along for link in links])
+    axes = _in_trunk(arm, [link.axis for link in links]) * arm.outward  # a mirror reverses rotations
+    origins = _in_trunk(arm, [link.origin for link in links]) + arm.base
+    return np.vstack((origins, origins[3] + length[3] * along[3])), axes, along
+
+
+def _in_trunk(arm: ArmDescription, points: Sequence[Sequence[float]]) -> np.ndarray:
+    """Return vectors (n, 3) of the arm's base frame in the trunk's axes: x0 outward, y0 forward, z0 down."""
+    x, y, z = np.array(points).T
+    return np.stack((y, arm.outward * x, -z), axis=1)
 
 
 def urdf(arms: Sequence[ArmDescription], meshes: str = "") -> str:
@@ -152,11 +168,11 @@ def _bodies(arm: ArmDescription) -> list[tuple[float, Point]]:
 
 def _arm(arm: ArmDescription, names: Sequence[str], meshes: str) -> Iterator[Element]:
     """Yield the joints and links of one arm."""
-    out, limits, lengths = arm.outward, arm.limits, arm.robot.length.tolist()
-    axes: list[Point] = [(0.0, 0.0, -out), (out, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, -1.0, 0.0)]
-    ends: list[Point] = [(0.0, out * lengths[0], 0.0), *((0.0, 0.0, -length) for length in lengths[1:])]
+    limits, lengths = arm.limits, arm.robot.length.tolist()
+    _, axes, along = arm_pose(arm, (0.0,) * JOINT_COUNT)
     parent, origin = ROOT, arm.base
     for n, (mass, centre) in enumerate(_bodies(arm)):
+        end = tuple((lengths[n] * along[n]).tolist())
         lower, upper = limits.position_min[n], limits.position_max[n]
         largest = {"effort": limits.max_effort[n], "velocity": limits.max_velocity[n]}
         moving = [_element("axis", xyz=axes[n]), _element("limit", lower=lower, upper=upper, **largest)]
@@ -165,14 +181,13 @@ def _arm(arm: ArmDescription, names: Sequence[str], meshes: str) -> Iterator[Ele
         yield _joint(names[n], "revolute", parent, arm.links[n], origin, *moving)
         drawn = []
         if lengths[n]:
-            middle = ends[n][0] / 2, ends[n][1] / 2, ends[n][2] / 2
-            along = axes[3] if n == 0 else axes[0]  # of the link, but for its sign
-            drawn.append(_visual("tube", "cylinder", middle, along, radius=DRAWN_RADIUS, length=lengths[n]))
+            middle = tuple((lengths[n] / 2 * along[n]).tolist())
+            drawn.append(_visual("tube", "cylinder", middle, along[n], radius=DRAWN_RADIUS, length=lengths[n]))
         if n + 1 < JOINT_COUNT:
-            drawn.append(_visual("motor", "cylinder", ends[n], axes[n + 1], **MOTOR))
+            drawn.append(_visual("motor", "cylinder", end, axes[n + 1], **MOTOR))
         drawn.append(_visual("centre_of_gravity", "sphere", centre, radius=COG_RADIUS))
         yield _link(arm.links[n], meshes, *drawn, inertial=_tube(mass, centre, lengths[n], sideways=n == 0))
-        parent, origin = arm.links[n], ends[n]
+        parent, origin = arm.links[n], end
     yield _joint(f"{arm.links[-1]}_joint", "fixed", parent, arm.links[-1], origin)
     yield _element("link", name=arm.links[-1])
 
@@ -199,7 +214,7 @@ def _link(name: str, meshes: str, *drawn: Element, inertial: Element | None = No
     return _element("link", *([] if inertial is None else [inertial]), *drawn, name=name)
 
 
-def _visual(material: str, shape: str, centre: Point, axis: Point = (0.0, 0.0, 1.0), **size: float | Point) -> Element:
+def _visual(material: str, shape: str, centre: Point, axis: Vector = (0.0, 0.0, 1.0), **size: float | Point) -> Element:
     """Return a shape; axis: one of the frame's axes, of a cylinder, which in URDF lies along z."""
     turn = (abs(axis[1]) * math.pi / 2, abs(axis[0]) * math.pi / 2, 0.0)
     geometry = _element("geometry", _element(shape, **size))

@@ -20,7 +20,7 @@ import can
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID
 from exo_gravity.core.motors.specs import MOTORS, pack_command
-from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, MIT, MIT_V3, REPLY, Frame
+from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, MIT, MIT_V3, REPLY
 from exo_gravity.hardware.can.can_port import CanPort, open_bus
 from exo_gravity.hardware.can.motor_bus import LISTEN_TIME
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
@@ -85,19 +85,22 @@ class BusScan(contextlib.ExitStack):
         problems: dict[str, None] = {}
         for can_id in sorted(set(can_ids) - set(found)):
             for sent in range(1, ATTEMPTS + 1):
-                answers, others = self._ask(can_id)
-                for reply_id, data in others:
-                    what = f"a frame with ID {reply_id} [{data.hex(' ')}]"
-                    problems[f"ID {can_id}: {what} follows a command, and is no motor's reply"] = None
-                replies = [answer for answer in answers if answer.can_id == can_id]
-                found = {answer.can_id: answer for answer in answers} | found  # also late replies
-                if len(replies) > sent:  # a late reply to the first command may arrive after the second
-                    angles = " and ".join(sorted({f"{reply.position:.2f} rad" for reply in replies}))
+                angles = []
+                for message, answer in self._ask(can_id):
+                    if answer is None:
+                        what = f"a frame with ID {message.arbitration_id} [{message.data.hex(' ')}]"
+                        problems[f"ID {can_id}: {what} follows a command, and is no motor's reply"] = None
+                        continue
+                    found.setdefault(answer.can_id, answer)  # also late replies
+                    if answer.can_id == can_id:
+                        angles.append(f"{answer.position:.2f} rad")
+                if len(angles) > sent:  # a late reply to the first command may arrive after the second
                     problems[
-                        f"ID {can_id}: several replies to one command: two motors share it ({angles}); give one of "
-                        "them another ID with the vendor's tool, alone on the bus"
+                        f"ID {can_id}: several replies to one command: two motors share it "
+                        f"({' and '.join(sorted(set(angles)))}); give one of them another ID with the vendor's tool, "
+                        "alone on the bus"
                     ] = None
-                if replies:
+                if angles:
                     break
         for can_id in sorted(can_id for can_id in self._v3 if can_id > MAX_CAN_ID):
             problems[f"ID {can_id}: a V3 board; its ID must be from 1 to {MAX_CAN_ID}"] = None
@@ -106,14 +109,20 @@ class BusScan(contextlib.ExitStack):
     def poll(self, can_ids: Iterable[int]) -> dict[int, MotorAnswer]:
         """Return the newest answer of each of these motors; a silent one is missing. Raises BusError."""
         reporting = set(can_ids) & set(self._v3)
-        asked = [self._ask(can_id, is_alone=False)[0] for can_id in can_ids if can_id not in reporting]
-        found = {answer.can_id: answer for answers in asked for answer in answers}
+        found: dict[int, MotorAnswer] = {}
+        for can_id in set(can_ids) - reporting:
+            for _, answer in self._ask(can_id):
+                if answer:
+                    found[answer.can_id] = answer
+                    if answer.can_id == can_id:
+                        break
         list(self._port.waiting())  # read: what came before is no answer
-        before = self._v3.copy()
-        for _ in self._frames(STATUS_TIME if reporting else 0.0):
-            if all(self._v3[can_id] is not before[can_id] for can_id in reporting):
+        for _, _, answer in self._frames(STATUS_TIME if reporting else 0.0):
+            if answer and answer.can_id in reporting:
+                found[answer.can_id] = answer
+            if reporting <= set(found):
                 break
-        return found | {can_id: self._v3[can_id] for can_id in reporting if self._v3[can_id] is not before[can_id]}
+        return found
 
     def _listen(self) -> None:
         for message, kind, _ in self._frames(LISTEN_TIME):
@@ -124,26 +133,13 @@ class BusScan(contextlib.ExitStack):
                     "another host, two motors share an ID and answer each other: switch off their power"
                 )
 
-    def _ask(self, can_id: int, is_alone: bool = True) -> tuple[list[MotorAnswer], list[Frame]]:
-        """Send one command; return the replies of V1 and V2 boards, and other short frames.
-
-        is_alone: whether to wait for further replies after the first.
-        """
+    def _ask(self, can_id: int) -> Iterator[tuple[can.Message, MotorAnswer | None]]:
+        """Send one command; yield the frames with 11-bit IDs that arrive within REPLY_TIME, each with its answer."""
         list(self._port.waiting())  # read: what came before is no answer
         self._port.send((can_id, NOTHING))
-        answers: list[MotorAnswer] = []
-        others: list[Frame] = []
         for message, _, answer in self._frames(REPLY_TIME):
-            if message.is_extended_id or message.data == NOTHING:
-                continue  # a V3 board; our own command, echoed by the bus
-            if answer is None:
-                others.append((message.arbitration_id, bytes(message.data)))
-                continue
-            answers.append(answer)
-            if answer.can_id == can_id and not is_alone:
-                break
-        self._port.confirm()
-        return answers, others
+            if not message.is_extended_id and message.data != NOTHING:  # our own command, echoed by the bus
+                yield message, answer
 
     def _frames(self, duration: float) -> Iterator[tuple[can.Message, str, MotorAnswer | None]]:
         """Yield the data frames that arrive within `duration` s, what each is, and the answer in it."""

@@ -2,13 +2,19 @@
 
 Backends raise more than `can.CanError`: slcan raises ValueError on a garbled line. A USB adapter that is plugged in
 again is a new device, which only a newly opened bus can reach. Opening may block, so another thread does it.
+
+Most buses return no echoes of our own frames. Some return them and mark them (`is_rx` is false). udp_multicast returns
+them unmarked, in order. SocketCAN sets the same mark on every frame from this computer, also on those of another
+process (Documentation/networking/can.rst of Linux, MSG_DONTROUTE): there it does not show an echo.
 """
 
 from __future__ import annotations
 
 import contextlib
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from operator import methodcaller
 from typing import Any, TypeVar
 
 import can
@@ -21,6 +27,7 @@ from exo_gravity.hardware.clock import Clock
 
 REOPEN_AFTER = 0.02  # s of failures in a row after which the bus is opened again
 REOPEN_PERIOD = 0.1  # s between two attempts
+MOST_AWAITED = 512  # echoes; twice the frames that a udp_multicast socket keeps unread
 MAX_STALE_FRAMES = 256  # the capacity of udp_multicast, more than any cycle produces
 Result = TypeVar("Result")
 
@@ -44,10 +51,9 @@ class CanPort:
 
     def __init__(self, bus: can.BusABC, clock: Clock, reopen: Callable[[], can.BusABC] | None = None) -> None:
         self.name = str(bus.channel_info)  #: name of the bus
-        #: Whether `is_rx` is false only for frames that this port sent.
-        self.marks_echoes = not isinstance(bus, SocketcanBus)
-        #: Whether each frame that this port sends comes back to it, unmarked.
-        self.echoes = isinstance(bus, UdpMulticastBus)
+        self._marks_echoes = not isinstance(bus, SocketcanBus)
+        # Frames that were sent and come back, unmarked.
+        self._awaited: deque[Frame] = deque(maxlen=MOST_AWAITED if isinstance(bus, UdpMulticastBus) else 0)
         self._bus: can.BusABC | None = bus  # None while a failed one is opened again
         self._clock = clock
         self._reopen = reopen
@@ -55,11 +61,13 @@ class CanPort:
         self._error = ""
         self._is_closing = False
 
-    def send(self, frame: Frame) -> None:
-        """Send a frame. Raises BusError."""
-        frame_id, data = frame
-        message = can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED)
-        self._guarded(lambda bus: bus.send(message))
+    def send(self, *frames: Frame) -> None:
+        """Send frames. Raises BusError."""
+        for frame in frames:
+            self._awaited.append(frame)
+            frame_id, data = frame
+            message = can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED)
+            self._guarded(methodcaller("send", message))
 
     def receive(self, timeout: float) -> can.Message | None:
         """Return the next frame, or None if there is none within `timeout` s. Raises BusError."""
@@ -75,6 +83,17 @@ class CanPort:
                 if not self._guarded(_has_lines):
                     return
             yield message
+
+    def is_echo(self, message: can.Message) -> bool:
+        """Return whether the frame is one that this port sent."""
+        if self._marks_echoes and not message.is_rx:
+            return True
+        frame = message.arbitration_id | (EXTENDED if message.is_extended_id else 0), bytes(message.data)
+        if frame not in self._awaited:
+            return False
+        while self._awaited.popleft() != frame:
+            pass  # echoes come in order, so those before it are lost
+        return True
 
     def confirm(self) -> None:
         """Note that the bus works: its last failure, if any, was not the first of a row."""

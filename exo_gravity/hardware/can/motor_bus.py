@@ -6,10 +6,7 @@ Frames of other devices are ignored and counted by kind.
 
 A motor obeys every sender. A command to one of our motors that we did not send is answered at once with our own, under
 full damping: until then the other sender's torque acts, and no damping. What it moves the joint in between must not add
-up, so for a while all our commands to that motor also hold the joint. To know a foreign command, echoes of our own
-frames are set apart: most buses return none. Some return them and mark them (`is_rx` is false). udp_multicast returns
-them unmarked, in order. SocketCAN sets the same mark on every frame from this computer, also on those of another
-process (Documentation/networking/can.rst of Linux, MSG_DONTROUTE): there it does not show an echo.
+up, so for a while all our commands to that motor also hold the joint.
 
 A zero command precedes the frames that switch a V1 or V2 board on or off: the motor remembers its last command, and
 ENTER would carry it out. A command switches a V3 board on, so it gets none while the arm is off.
@@ -22,7 +19,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Sequence
 from itertools import chain
 
@@ -30,7 +27,7 @@ import can
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, REPLY, Frame, WireFormat
+from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, REPLY, Frame
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import OFF, Drive
 from exo_gravity.core.safety.limits import DAMPING, UNKNOWN, JointSample
@@ -49,7 +46,6 @@ HOLD_STIFFNESS = 60.0  # Nm/rad by which a contested motor holds its joint: the 
 HOLD_REACH = 0.15  # rad at most from where the joint is,
 HOLD_SPEED = 0.3  # rad/s with which the held position follows the joint
 FOREIGN_COMMAND = "foreign command"
-MOST_AWAITED = 512  # twice the frames that a udp_multicast socket keeps unread
 
 
 class MotorBus:
@@ -76,14 +72,14 @@ class MotorBus:
         self.clock = clock
         self._now = clock.monotonic
         self._port = CanPort(bus, clock, reopen)
-        self._filter = FrameFilter(motors, self._port.marks_echoes, self._port.echoes)
         self._motors = tuple(motors)
+        boards = {motor.wire_format for motor in motors}
+        self._ids = {board: frozenset(m.can_id for m in motors if m.wire_format == board) for board in boards}
         self._asked = frozenset(joint for joint, motor in enumerate(motors) if motor.wire_format.replies)
         self._joint_of = {motor.can_id: joint for joint, motor in enumerate(motors)}
         self._powered = powered
         self._unsure: Sequence[bool] = (False,) * JOINT_COUNT  # of the last powered drive
         self._unconfirmed = set(range(JOINT_COUNT)) if powered else set()  # not known to be off
-        self._ids = tuple(motor.command_id for motor in motors)
         self._drive = OFF  # last sent
         self._corrected = [-math.inf] * JOINT_COUNT  # s
         self._contested = [-math.inf] * JOINT_COUNT  # s of the last foreign command to the motor
@@ -133,7 +129,7 @@ class MotorBus:
             if not any(drive.unsure):
                 self._send_commands(OFF)
                 for motor in self._motors:
-                    self._send(*motor.enter)
+                    self._port.send(*motor.enter)
         self._send_commands(drive)
         if not drive.powered:
             self._switch_off()
@@ -157,7 +153,7 @@ class MotorBus:
         if not all(frames):
             raise BusError(f"set_zero: motor {self._motors[frames.index(())].can_id} has a board without such a frame")
         self._send_commands(OFF)
-        self._send(*chain.from_iterable(frames))
+        self._port.send(*chain.from_iterable(frames))
 
     def stop(self) -> None:
         """Send the last frames, a zero command and EXIT, twice; then close the bus. Never raises.
@@ -169,10 +165,8 @@ class MotorBus:
             self._is_confirming = True
             for joint, motor in enumerate(self._motors):
                 for frame in (*self._zero_command(joint), *motor.exit):
-                    try:
-                        self._send(frame)
-                    except BusError:
-                        self.ignored["unsent"] += 1
+                    with contextlib.suppress(BusError):
+                        self._port.send(frame)
             self._powered, self._exit_sent = False, self._now()
             end = self._exit_sent + LAST_REPLIES
             with contextlib.suppress(BusError):
@@ -189,7 +183,7 @@ class MotorBus:
         period = UNCONFIRMED_EXIT_PERIOD if self._unconfirmed else EXIT_PERIOD
         if self._powered or self._now() - self._exit_sent > period:
             for joint, motor in enumerate(self._motors):
-                self._send(*(() if joint in self._asked else self._zero_command(joint)), *motor.exit)
+                self._port.send(*(() if joint in self._asked else self._zero_command(joint)), *motor.exit)
             self._exit_sent = self._now()
         self._powered = False
 
@@ -197,7 +191,7 @@ class MotorBus:
         """Return a command without torque and gains; none for a V3 board that may be off: it would switch it on."""
         if joint not in self._asked and (joint not in self._unconfirmed or self._unsure[joint]):
             return ()
-        return ((self._ids[joint], self._motors[joint].command(0.0, 0.0)),)
+        return ((self._motors[joint].command_id, self._motors[joint].command(0.0, 0.0)),)
 
     def _send_commands(self, drive: Drive) -> None:
         self._drive = drive
@@ -207,16 +201,26 @@ class MotorBus:
                 continue
             command = self._command(joint, now)
             if drive.enter[joint]:
-                self._send(command, *motor.enter)
-            self._send(command)
+                self._port.send(command, *motor.enter)
+            self._port.send(command)
 
-    def _send(self, *frames: Frame) -> None:
-        for frame in frames:
-            self._filter.awaited.append(frame)
-            self._port.send(frame)
+    def _sort(self, message: can.Message) -> tuple[str, int]:
+        """Return REPLY or FOREIGN_COMMAND with the motor's ID, or the kind of a frame that does not matter with 0."""
+        if message.is_error_frame:
+            return "error frame", 0
+        if message.is_remote_frame or message.is_fd:
+            return "remote or FD frame", 0
+        frame_id = message.arbitration_id | EXTENDED if message.is_extended_id else message.arbitration_id
+        for board, can_ids in self._ids.items():
+            kind, can_id = board.classify(frame_id, message.data, can_ids)
+            if kind == REPLY:
+                return kind, can_id
+            if kind == COMMAND:
+                return ("echo", 0) if self._port.is_echo(message) else (FOREIGN_COMMAND, can_id)
+        return "foreign frame", 0
 
     def _take(self, message: can.Message) -> None:
-        kind, can_id = self._filter.sort(message)
+        kind, can_id = self._sort(message)
         if kind != REPLY:
             self.ignored[kind] += 1
             if kind == FOREIGN_COMMAND:
@@ -251,8 +255,8 @@ class MotorBus:
             if not math.isnan(self._held[joint]):
                 data = motor.command(effort, damping, hold * HOLD_STIFFNESS, self._held[joint])
                 if data[0] not in self._joint_of:  # or its echo would look like a reply
-                    return self._ids[joint], data
-        return self._ids[joint], motor.command(effort, damping)
+                    return motor.command_id, data
+        return motor.command_id, motor.command(effort, damping)
 
     def _oppose(self, joint: int, foreign: bytes) -> None:
         """Answer a foreign command with our last one, under the motor's full damping; hold the joint meanwhile."""
@@ -268,47 +272,5 @@ class MotorBus:
         command = self._command(joint, now)
         is_exit = foreign in [data for _, data in motor.exit]
         if is_exit or now - self._corrected[joint] >= CORRECTION_PERIOD:
-            self._send(*((command, *motor.enter) if is_exit else ()), command)
+            self._port.send(*((command, *motor.enter) if is_exit else ()), command)
             self._corrected[joint] = now
-
-
-class FrameFilter:
-    """Knows `motors` and which frames were sent.
-
-    marks_echoes: whether `is_rx` is false for echoes only. echoes: whether sent frames come back unmarked.
-    """
-
-    def __init__(self, motors: Sequence[JointMotor], marks_echoes: bool = True, echoes: bool = False) -> None:
-        # The motors of each format, by whether its IDs have 29 bits.
-        self._groups: dict[bool, list[tuple[WireFormat, frozenset[int]]]] = {False: [], True: []}
-        for board in {motor.wire_format for motor in motors}:
-            can_ids = frozenset(motor.can_id for motor in motors if motor.wire_format == board)
-            self._groups[board.first_id >= EXTENDED].append((board, can_ids))
-        self._marks_echoes = marks_echoes
-        #: Frames that were sent and whose echoes have not been received.
-        self.awaited: deque[Frame] = deque(maxlen=MOST_AWAITED if echoes else 0)
-
-    def sort(self, message: can.Message) -> tuple[str, int]:
-        """Return REPLY or FOREIGN_COMMAND with the motor's ID, or the kind of a frame that does not matter with 0."""
-        if message.is_error_frame:
-            return "error frame", 0
-        is_extended = message.is_extended_id
-        groups = self._groups[is_extended]
-        if message.is_remote_frame or message.is_fd or (is_extended and not groups):
-            return "extended, remote or FD frame", 0
-        frame_id = message.arbitration_id | EXTENDED if is_extended else message.arbitration_id
-        for wire_format, motor_ids in groups:
-            kind, motor_id = wire_format.classify(frame_id, message.data, motor_ids)
-            if kind == REPLY:
-                return kind, motor_id
-            if kind == COMMAND:
-                is_echo = (self._marks_echoes and not message.is_rx) or self._is_echo((frame_id, bytes(message.data)))
-                return ("echo", 0) if is_echo else (FOREIGN_COMMAND, motor_id)
-        return "foreign frame", 0
-
-    def _is_echo(self, frame: Frame) -> bool:
-        if frame not in self.awaited:
-            return False
-        while self.awaited.popleft() != frame:
-            pass  # echoes come in order, so those before it are lost
-        return True

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 from exo_gravity.core.errors import DeviceError, ParameterError
@@ -17,9 +17,10 @@ from exo_gravity.hardware.imu_sources.source import Axes, Clock, ImuSource, Meas
 
 MAX_BLOCK = 32  # bytes
 TEMPERATURE_PERIOD = 1.0  # s
-THREE_NUMBERS = {order: struct.Struct(f"{order}3h") for order in "<>"}
+BANK_SELECT = 0x7F  # of a chip whose registers lie in banks
 
 Bus = Any  # a `smbus2.SMBus`
+Limits = tuple[float, float]
 Wait = Callable[[float], Any]  # s, e.g. time.sleep
 
 
@@ -36,7 +37,10 @@ def open_bus(number: int) -> Bus:
 
 
 class Registers:
-    """The registers of one device."""
+    """The registers of one device; where they lie in banks, one of which is visible, 0x2nn is register nn of bank 2."""
+
+    is_banked = False
+    _bank: int | None = None  # None: not known, as after a program that was killed
 
     def __init__(self, bus: Bus, address: int, device: str, bus_name: str) -> None:
         self._bus = bus
@@ -59,11 +63,12 @@ class Registers:
         """Write one register."""
         self._transfer(self._bus.write_byte_data, register, value)
 
-    def set(self, register: int, value: int) -> None:
-        """Write one register and read it back."""
-        self.write(register, value)
-        if (found := self.read(register)) != value:
-            raise DeviceError(self.name, f"holds 0x{found:02X} after 0x{value:02X} was written", register)
+    def set(self, values: Mapping[int, int]) -> None:
+        """Write registers in order, each of which is read back."""
+        for register, value in values.items():
+            self.write(register, value)
+            if (found := self.read(register)) != value:
+                raise DeviceError(self.name, f"holds 0x{found:02X} after 0x{value:02X} was written", register)
 
     def identify(self, register: int, known: dict[int, str]) -> str:
         """Return the name of the device by its WHO_AM_I `register`; raise DeviceError for one that is not known."""
@@ -79,22 +84,30 @@ class Registers:
             self._bus.close()
 
     def _transfer(self, function: Callable[..., Any], register: int, *arguments: int) -> Any:
+        bank, number = divmod(register, 0x100)
         try:
-            return function(self._address, register, *arguments)
+            if self.is_banked and bank != self._bank:
+                self._bus.write_byte_data(self._address, BANK_SELECT, bank << 4)
+                self._bank = bank
+            return function(self._address, number, *arguments)
         except OSError as error:  # 121, EREMOTEIO: the address was not acknowledged
-            raise DeviceError(self.name, f"does not answer: {error.strerror or error}", register) from None
+            self._bank = None
+            raise DeviceError(self.name, f"does not answer: {error.strerror or error}", number) from None
 
 
 class FifoSource(ImuSource):
     """Base of the chips on I2C.
 
-    A chip's class states WHO_AM_I and how to reset, test and start the chip, and how to read its FIFO. A FIFO that
-    overflows is emptied: its oldest bytes are gone, and with them where a sample begins.
+    A chip's class states WHO_AM_I and how to set up the chip, and how to read its FIFO. A FIFO that overflows is
+    emptied: its oldest bytes are gone, and with them where a sample begins.
     """
 
     IDENTITY: ClassVar[int]  # the register WHO_AM_I
     KNOWN: ClassVar[dict[int, str]]  # its values
+    TEMPERATURE: ClassVar[int]  # the first of its registers
+    ORDER: ClassVar[str]  # of the two bytes of a number: '>' for high byte first, '<' for low byte first
     SETTLING: ClassVar[float]  # s after the self-test's actuators were switched
+    thermometer: tuple[float, float]  # LSB/degC; degC at 0
 
     def __init__(self, registers: Registers, rate: float, clock: Clock, wait: Wait, self_test: bool = True) -> None:
         """Set up the chip for about `rate` samples a second; with `self_test` it must be still for a second.
@@ -104,10 +117,7 @@ class FifoSource(ImuSource):
         self._registers = registers
         self._wait = wait
         self.chip = registers.identify(self.IDENTITY, self.KNOWN)
-        self._reset()
-        if self_test:
-            self._test()
-        super().__init__(registers.name, self._start(rate), clock)
+        super().__init__(registers.name, self._set_up(rate, self_test), clock)
         self._temperature_due = -math.inf
 
     def close(self) -> None:
@@ -118,7 +128,8 @@ class FifoSource(ImuSource):
         try:
             if not now < self._temperature_due <= now + TEMPERATURE_PERIOD:
                 self._temperature_due = now + TEMPERATURE_PERIOD
-                self.temperature = self._read_temperature()
+                (raw,) = struct.unpack(f"{self.ORDER}h", self._registers.read_block(self.TEMPERATURE, 2))
+                self.temperature = raw / self.thermometer[0] + self.thermometer[1]
             return self._drain()
         except DeviceError as error:
             # A disturbed transfer: where a sample begins in the FIFO is no longer known.
@@ -135,44 +146,41 @@ class FifoSource(ImuSource):
         return []
 
     def _responses(
-        self, switch: Callable[[bool], None], registers: Sequence[int], count: int, period: float, order: str = ">"
+        self, off: Mapping[int, int], on: Mapping[int, int], data: Sequence[int], count: int, period: float
     ) -> list[float]:
         """Return how the self-test's actuators change the mean of `count` readings, `period` s apart, in LSB.
 
-        switch: switches the actuators on and off. registers: of three axes each, whose means follow one another.
+        off, on: registers that switch the actuators. data: registers of three axes each, whose means follow.
         """
         means = []
-        for on in (False, True):
-            switch(on)
+        for actuators in (off, on):
+            self._registers.set(actuators)
             self._wait(self.SETTLING)
             readings = []
             for _ in range(count):
                 self._wait(period)
-                blocks = (self._registers.read_block(register, 6) for register in registers)
-                readings.append([value for block in blocks for value in axes(block, 1.0, order)])
+                readings.append([v for first in data for v in self._axes(self._registers.read_block(first, 6), 1.0)])
             means.append([sum(axis) / count for axis in zip(*readings, strict=True)])
         return [on - off for off, on in zip(*means, strict=True)]
 
-    def _judge(self, sensor: str, response: Sequence[float], limits: Sequence[tuple[float, float]], unit: str) -> None:
-        """Raise DeviceError unless the response of each axis lies within its limits."""
-        for axis, value, (low, high) in zip("xyz", response, limits, strict=True):
-            if not low <= value <= high:
-                raise DeviceError(
-                    self._registers.name,
-                    f"self-test failed: {sensor} {axis} responds by {value:.0f} {unit}, must be {low:.0f} to "
-                    f"{high:.0f}: keep it still and try again, or replace it",
-                )
+    def _judge(self, axis: int, response: float, limits: Sequence[float], unit: str) -> None:
+        """Raise DeviceError unless the response lies within its limits; axis: 0 to 2 of the gyroscope, 3 to 5."""
+        low, high = limits
+        if not low <= response <= high:
+            sensor = f"{('gyroscope', 'accelerometer')[axis // 3]} {'xyz'[axis % 3]}"
+            raise DeviceError(
+                self._registers.name,
+                f"self-test failed: {sensor} responds by {response:.0f} {unit}, must be {low:.0f} to {high:.0f}: "
+                "keep it still and try again, or replace it",
+            )
 
-    def _reset(self) -> None:
-        """Return the chip to its reset values, and wake it."""
-        raise NotImplementedError
+    def _axes(self, data: bytes, scale: float) -> Axes:
+        """Return three 16-bit numbers times `scale`."""
+        x, y, z = struct.unpack(f"{self.ORDER}3h", data)
+        return x * scale, y * scale, z * scale
 
-    def _test(self) -> None:
-        """Run the self-test; raise DeviceError if it fails."""
-        raise NotImplementedError
-
-    def _start(self, rate: float) -> float:
-        """Set ranges, filters, rate and FIFO; return the rate that the chip has."""
+    def _set_up(self, rate: float, self_test: bool) -> float:
+        """Reset the chip, test it, set ranges, filters, rate and FIFO; return the rate that it has."""
         raise NotImplementedError
 
     def _drain(self) -> list[Measurement]:
@@ -182,13 +190,3 @@ class FifoSource(ImuSource):
     def _empty_fifo(self) -> None:
         """Empty the FIFO and let it fill anew."""
         raise NotImplementedError
-
-    def _read_temperature(self) -> float:
-        """Return degrees Celsius."""
-        raise NotImplementedError
-
-
-def axes(data: bytes, scale: float, order: str = ">") -> Axes:
-    """Return three 16-bit numbers times `scale`; order: '>' for high byte first, '<' for low byte first."""
-    x, y, z = THREE_NUMBERS[order].unpack(data)
-    return x * scale, y * scale, z * scale

@@ -11,12 +11,11 @@ against PX4, InvenSense_ICM20948_registers.hpp.
 from __future__ import annotations
 
 import math
-import struct
-from collections.abc import Sequence
-from typing import Any, ClassVar
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, NamedTuple
 
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.hardware.imu_sources.i2c import FifoSource, Registers, axes
+from exo_gravity.hardware.imu_sources.i2c import FifoSource, Limits, Registers
 from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Measurement
 
 SAMPLE = 12  # bytes in the FIFO
@@ -25,232 +24,169 @@ ACCELERATION_PER_LSB = STANDARD_GRAVITY / 2048.0  # at 16 g
 READINGS = 200  # of each mean of the self-test
 START_UP = 0.1  # s after a reset, and after waking
 RESET, BEST_CLOCK = 0x80, 0x01  # PWR_MGMT_1
-ENABLE_FIFO = 0x40  # USER_CTRL
 
-# MPU
-SELF_TEST_GYRO_6500, SELF_TEST_6050, SELF_TEST_ACCEL_6500 = 0x00, 0x0D, 0x0D
-SMPLRT_DIV, CONFIG, GYRO_CONFIG, ACCEL_CONFIG, ACCEL_CONFIG_2 = 0x19, 0x1A, 0x1B, 0x1C, 0x1D
-FIFO_EN, ACCEL_XOUT_H, TEMP_OUT_H, GYRO_XOUT_H = 0x23, 0x3B, 0x41, 0x43
-USER_CTRL, PWR_MGMT_1, PWR_MGMT_2, FIFO_COUNTH, FIFO_R_W, WHO_AM_I = 0x6A, 0x6B, 0x6C, 0x72, 0x74, 0x75
+Values = dict[int, int]  # of registers, in the order in which they are written
 
-GYROSCOPE_TO_FIFO, ACCELEROMETER_TO_FIFO = 0x70, 0x08  # FIFO_EN
-RESET_FIFO = 0x04  # USER_CTRL
-SELECT_2000_DPS = SELECT_16_G = 0x18
-SELECT_8_G, ALL_AXES = 0x10, 0xE0  # ALL_AXES: self-test
 
-# ICM-20948
-REG_BANK_SEL = 0x7F  # in every bank
-# bank 0
-ICM_WHO_AM_I, ICM_USER_CTRL, ICM_PWR_MGMT_1, ICM_PWR_MGMT_2 = 0x00, 0x03, 0x06, 0x07
-ICM_ACCEL_XOUT_H, ICM_GYRO_XOUT_H, ICM_TEMP_OUT_H = 0x2D, 0x33, 0x39
-FIFO_EN_2, FIFO_RST, FIFO_MODE, ICM_FIFO_COUNTH, ICM_FIFO_R_W = 0x67, 0x68, 0x69, 0x70, 0x72
-# bank 1
-ICM_SELF_TEST_GYRO, ICM_SELF_TEST_ACCEL = 0x02, 0x0E
-# bank 2
-GYRO_SMPLRT_DIV, GYRO_CONFIG_1, GYRO_CONFIG_2, ODR_ALIGN_EN = 0x00, 0x01, 0x02, 0x09
-ACCEL_SMPLRT_DIV_1, ACCEL_SMPLRT_DIV_2, ICM_ACCEL_CONFIG, ICM_ACCEL_CONFIG_2 = 0x10, 0x11, 0x14, 0x15
+def _factory_6500(registers: Registers, firsts: tuple[int, int]) -> list[float]:
+    """Return the factory's responses, angular velocity first, in LSB at 250 deg/s and 2 g; 0: it stored none."""
+    codes = [code for first in firsts for code in registers.read_block(first, 3)]
+    return [2620.0 * 1.01 ** (code - 1) if code else 0.0 for code in codes]
 
-BOTH_TO_FIFO = 0x1E  # FIFO_EN_2: accelerometer, gyroscope z, y, x
-ICM_RESET_FIFO = 0x1F  # FIFO_RST
-USE_FILTER, ICM_SELECT_2000_DPS, ICM_SELECT_16_G = 0x01, 0x06, 0x06  # GYRO_CONFIG_1, ACCEL_CONFIG
-GYROSCOPE_ACTUATORS, ACCELEROMETER_ACTUATORS = 0x38, 0x1C  # GYRO_CONFIG_2, ACCEL_CONFIG_2
+
+def _factory_6050(registers: Registers, firsts: tuple[int, int]) -> list[float]:
+    """Return the same of an MPU-6050, at 250 deg/s and 8 g (RM-MPU-6000A 4.1)."""
+    *codes, low_bits = registers.read_block(firsts[0], 4)
+    rates = [25.0 * 131.0 * 1.046 ** ((code & 0x1F) - 1) if code & 0x1F else 0.0 for code in codes]
+    codes = [code >> 5 << 2 | low_bits >> (4 - 2 * axis) & 3 for axis, code in enumerate(codes)]
+    forces = [4096.0 * 0.34 * (0.92 / 0.34) ** ((code - 1) / 30.0) if code else 0.0 for code in codes]
+    return [rates[0], -rates[1], rates[2], *forces]
+
+
+class Map(NamedTuple):
+    """What a chip has where."""
+
+    power: tuple[int, int]  #: PWR_MGMT_1, PWR_MGMT_2
+    data: tuple[int, int]  #: first registers of angular velocity and of acceleration
+    fifo: tuple[int, int]  #: registers of its count of bytes and of its data
+    bandwidths: dict[int, float]  #: Hz of the low-pass filters by their code
+    base_rate: float  #: Hz, divided by 1 + the divider
+    set_up: Callable[[int, int], Values]  #: by divider and code of the low-pass filter
+    emptied: tuple[tuple[int, int], ...]  #: register and value, which empty the FIFO and let it fill
+    tested: Values  #: of the self-test, for 250 deg/s, 1 kHz
+    off: Values  #: without the self-test's actuators
+    on: Values  #: with them
+    firsts: tuple[int, int]  #: registers of the factory's response, of angular velocity and of acceleration
+    #: The response that these say, and its limits: shares of it, or in LSB of either sign without one.
+    factory: Callable[[Registers, tuple[int, int]], list[float]] = _factory_6500
+    shares: tuple[Limits, Limits] = (0.5, math.inf), (0.5, 1.5)
+    without: tuple[Limits, Limits] = (60.0 * 131.0, math.inf), (225.0 * 16.384, 675.0 * 16.384)  # 60 deg/s, 225 mg
+
+
+MPU_6500 = Map(
+    power=(0x6B, 0x6C),
+    data=(0x43, 0x3B),
+    fifo=(0x72, 0x74),
+    bandwidths={1: 184.0, 2: 94.0, 3: 44.0, 4: 21.0, 5: 10.0, 6: 5.0},
+    base_rate=1000.0,
+    set_up=lambda divider, low_pass: {
+        0x1A: low_pass,  # CONFIG
+        0x1D: low_pass,  # ACCEL_CONFIG_2
+        0x19: divider,  # SMPLRT_DIV
+        0x1B: 0x18,  # GYRO_CONFIG: 2000 deg/s
+        0x1C: 0x18,  # ACCEL_CONFIG: 16 g
+        0x23: 0x78,  # FIFO_EN: both
+    },
+    emptied=((0x6A, 0x00), (0x6A, 0x04), (0x6A, 0x40)),  # USER_CTRL: off, FIFO_RESET, FIFO_EN
+    tested={0x1A: 2, 0x1D: 2, 0x19: 0},
+    off={0x1B: 0, 0x1C: 0},
+    on={0x1B: 0xE0, 0x1C: 0xE0},
+    firsts=(0x00, 0x0D),
+)
+# Its CONFIG filters both sensors, and its test is at 8 g. Limits: 14 % (PS-MPU-6000A 6.1), or none.
+MPU_6050 = MPU_6500._replace(
+    set_up=lambda *values: {key: value for key, value in MPU_6500.set_up(*values).items() if key != 0x1D},
+    tested={0x1A: 2, 0x19: 0},
+    off={0x1B: 0, 0x1C: 0x10},
+    on={0x1B: 0xE0, 0x1C: 0xF0},
+    firsts=(0x0D, 0x0D),
+    factory=_factory_6050,
+    shares=((0.86, 1.14), (0.86, 1.14)),
+    without=((0.0, math.inf), (0.0, math.inf)),
+)
+ICM_20948 = Map(
+    power=(0x006, 0x007),
+    data=(0x033, 0x02D),
+    fifo=(0x070, 0x072),
+    bandwidths={2: 119.5, 3: 51.2, 4: 23.9, 5: 11.6, 6: 5.7},  # the accelerometer's: at most 8 Hz narrower
+    base_rate=1125.0,
+    set_up=lambda divider, low_pass: {
+        0x209: 1,  # ODR_ALIGN_EN: both sensors sample at the same time
+        0x200: divider,  # GYRO_SMPLRT_DIV
+        0x210: 0,  # ACCEL_SMPLRT_DIV_1
+        0x211: divider,  # ACCEL_SMPLRT_DIV_2
+        0x201: 0x07 | low_pass << 3,  # GYRO_CONFIG_1: filter, 2000 deg/s
+        0x202: 0,  # GYRO_CONFIG_2
+        0x214: 0x07 | low_pass << 3,  # ACCEL_CONFIG: filter, 16 g
+        0x215: 0,  # ACCEL_CONFIG_2
+        0x069: 0,  # FIFO_MODE: the newest samples replace the oldest
+        0x067: 0x1E,  # FIFO_EN_2: accelerometer, gyroscope z, y, x
+        0x003: 0x40,  # USER_CTRL: FIFO_EN
+    },
+    emptied=((0x068, 0x1F), (0x068, 0x00)),  # FIFO_RST
+    tested={0x200: 0, 0x211: 0, 0x201: 0x11, 0x214: 0x11},  # filter 2, 250 deg/s, 2 g
+    off={0x202: 0, 0x215: 0},
+    on={0x202: 0x38, 0x215: 0x1C},
+    firsts=(0x102, 0x10E),
+)
 
 
 class InvenSense(FifoSource):
     """Base of the InvenSense chips."""
 
-    DATA: ClassVar[tuple[int, int, int]]  # registers of acceleration, angular velocity and temperature
-    FIFO: ClassVar[tuple[int, int]]  # registers of its count of bytes and of its data
-    POWER: ClassVar[tuple[int, int]]  # PWR_MGMT_1, PWR_MGMT_2
-    BANDWIDTHS: ClassVar[dict[int, float]]  # Hz of the low-pass filters by their code
-    FILTER_RATE: ClassVar[float]  # Hz, divided by 1 + SMPLRT_DIV
-    SETTLING = 0.02
+    ORDER, SETTLING = ">", 0.02
+    map: Map
     capacity = 512  # bytes of the FIFO
-    thermometer = 333.87, 21.0  # LSB/degC, degC
+    thermometer = 333.87, 21.0
 
-    def _reset(self) -> None:
+    def _set_up(self, rate: float, self_test: bool) -> float:
         for value in (RESET, BEST_CLOCK):
-            self._registers.write(self.POWER[0], value)
+            self._registers.write(self.map.power[0], value)
             self._wait(START_UP)
-        self._registers.set(self.POWER[1], 0)
+        self._registers.set({self.map.power[1]: 0})
+        if self_test:
+            self._registers.set(self.map.tested)
+            self._test(self._responses(self.map.off, self.map.on, self.map.data, READINGS, 1e-3))
+        divider = min(max(round(self.map.base_rate / rate) - 1, 0), 255)
+        rate = self.map.base_rate / (1 + divider)
+        widest = next((code for code, width in self.map.bandwidths.items() if width <= rate / 2), 6)
+        self._registers.set(self.map.set_up(divider, widest))
+        self._empty_fifo()
+        return rate
 
-    def _rate(self, rate: float) -> tuple[float, int, int]:
-        """Return the rate nearest to `rate`, its divider, and the code of the widest filter below half of it."""
-        divider = min(max(round(self.FILTER_RATE / rate) - 1, 0), 255)
-        rate = self.FILTER_RATE / (1 + divider)
-        return rate, divider, next((code for code, width in self.BANDWIDTHS.items() if width <= rate / 2), 6)
+    def _test(self, response: Sequence[float]) -> None:
+        factory = self.map.factory(self._registers, self.map.firsts)
+        for axis, (value, expected) in enumerate(zip(response, factory, strict=True)):
+            low, high = self.map.shares[axis // 3]
+            limits = sorted((low * expected, high * expected)) if expected else self.map.without[axis // 3]
+            self._judge(axis, value if expected else abs(value), limits, "LSB")
+
+    def _empty_fifo(self) -> None:
+        for register, value in self.map.emptied:
+            self._registers.write(register, value)
 
     def _drain(self) -> list[Measurement]:
-        count = int.from_bytes(self._registers.read_block(self.FIFO[0], 2), "big") & 0x1FFF
+        count = int.from_bytes(self._registers.read_block(self.map.fifo[0], 2), "big") & 0x1FFF
         # Not the overflow flag: on some of these chips it is always set (Linux: inv_mpu_ring.c).
         if count > self.capacity - SAMPLE:
             return self._lose("FIFO overflowed")
-        data = self._registers.read_block(self.FIFO[1], count // SAMPLE * SAMPLE, SAMPLE)
+        data = self._registers.read_block(self.map.fifo[1], count // SAMPLE * SAMPLE, SAMPLE)
+        samples = (data[start : start + SAMPLE] for start in range(0, len(data), SAMPLE))
         return [
-            Measurement(
-                axes(data[start + 6 : start + 12], RADIANS_PER_LSB), axes(data[start : start + 6], ACCELERATION_PER_LSB)
-            )
-            for start in range(0, len(data), SAMPLE)
+            Measurement(self._axes(sample[6:], RADIANS_PER_LSB), self._axes(sample[:6], ACCELERATION_PER_LSB))
+            for sample in samples
         ]
-
-    def _read_temperature(self) -> float:
-        (raw,) = struct.unpack(">h", self._registers.read_block(self.DATA[2], 2))
-        return float(raw / self.thermometer[0] + self.thermometer[1])
-
-    def _judge_6500(self, response: Sequence[float], gyroscope_codes: bytes, accelerometer_codes: bytes) -> None:
-        """Judge a chip since the MPU-6500, angular velocity first, by its SELF_TEST registers.
-
-        A response, at 250 deg/s (131 LSB each) and 2 g, must be over half the factory's, an accelerometer's at most 1.5
-        times. Without one it must be at least 60 deg/s, and 225 to 675 mg (16.384 LSB each), of either sign.
-        """
-        for sensor, values, codes, shares, without in (
-            ("gyroscope", response[:3], gyroscope_codes, (0.5, math.inf), (60.0 * 131.0, math.inf)),
-            ("accelerometer", response[3:], accelerometer_codes, (0.5, 1.5), (225.0 * 16.384, 675.0 * 16.384)),
-        ):
-            low, high = (2620.0 * share for share in shares)
-            limits = [(low * 1.01 ** (code - 1), high * 1.01 ** (code - 1)) if code else without for code in codes]
-            judged = [value if code else abs(value) for value, code in zip(values, codes, strict=True)]
-            self._judge(sensor, judged, limits, "LSB")
 
 
 class Mpu6050(InvenSense):
     """An MPU-6050 or one of its successors."""
 
-    IDENTITY = WHO_AM_I
+    IDENTITY, TEMPERATURE, map = 0x75, 0x41, MPU_6500
     KNOWN: ClassVar = {0x68: "MPU-6050", 0x70: "MPU-6500", 0x71: "MPU-9250", 0x73: "MPU-9255"}
-    DATA = (ACCEL_XOUT_H, GYRO_XOUT_H, TEMP_OUT_H)
-    FIFO = (FIFO_COUNTH, FIFO_R_W)
-    POWER = (PWR_MGMT_1, PWR_MGMT_2)
-    BANDWIDTHS: ClassVar = {1: 184.0, 2: 94.0, 3: 44.0, 4: 21.0, 5: 10.0, 6: 5.0}
-    FILTER_RATE = 1000.0
 
-    @property
-    def _is_6050(self) -> bool:
-        return self.chip == "MPU-6050"
-
-    def _reset(self) -> None:
-        super()._reset()
-        if self._is_6050:
-            self.capacity, self.thermometer = 1024, (340.0, 36.53)
-
-    def _start(self, rate: float) -> float:
-        rate, divider, bandwidth = self._rate(rate)
-        self._set_filter(bandwidth)
-        self._registers.set(SMPLRT_DIV, divider)
-        self._registers.set(GYRO_CONFIG, SELECT_2000_DPS)
-        self._registers.set(ACCEL_CONFIG, SELECT_16_G)
-        self._registers.set(FIFO_EN, GYROSCOPE_TO_FIFO | ACCELEROMETER_TO_FIFO)
-        self._empty_fifo()
-        return rate
-
-    def _set_filter(self, code: int) -> None:
-        self._registers.set(CONFIG, code)
-        if not self._is_6050:  # the 6050's CONFIG filters both sensors
-            self._registers.set(ACCEL_CONFIG_2, code)
-
-    def _empty_fifo(self) -> None:
-        self._registers.write(USER_CTRL, 0)
-        self._registers.write(USER_CTRL, RESET_FIFO)
-        self._registers.write(USER_CTRL, ENABLE_FIFO)
-
-    def _test(self) -> None:
-        self._set_filter(2)
-        self._registers.set(SMPLRT_DIV, 0)
-        response = self._responses(self._switch_actuators, self.DATA[1::-1], READINGS, 1e-3)
-        if self._is_6050:
-            limits = _limits_6050(self._registers.read_block(SELF_TEST_6050, 4))
-            self._judge("gyroscope", response[:3], limits[:3], "LSB")
-            self._judge("accelerometer", response[3:], limits[3:], "LSB")
-        else:
-            codes = (self._registers.read_block(start, 3) for start in (SELF_TEST_GYRO_6500, SELF_TEST_ACCEL_6500))
-            self._judge_6500(response, *codes)
-
-    def _switch_actuators(self, on: bool) -> None:
-        actuators = ALL_AXES if on else 0
-        self._registers.set(GYRO_CONFIG, actuators)  # 250 deg/s
-        self._registers.set(ACCEL_CONFIG, actuators | (SELECT_8_G if self._is_6050 else 0))
+    def _set_up(self, rate: float, self_test: bool) -> float:
+        if self.chip == "MPU-6050":
+            self.map, self.capacity, self.thermometer = MPU_6050, 1024, (340.0, 36.53)
+        return super()._set_up(rate, self_test)
 
 
 class Icm20948(InvenSense):
-    """An ICM-20948, whose registers lie in four banks, one visible at a time. Its magnetometer is not used."""
+    """An ICM-20948, whose registers lie in four banks. Its magnetometer is not used."""
 
-    IDENTITY = ICM_WHO_AM_I
+    IDENTITY, TEMPERATURE, map = 0x000, 0x039, ICM_20948
     KNOWN: ClassVar = {0xEA: "ICM-20948"}
-    DATA = (ICM_ACCEL_XOUT_H, ICM_GYRO_XOUT_H, ICM_TEMP_OUT_H)
-    FIFO = (ICM_FIFO_COUNTH, ICM_FIFO_R_W)
-    POWER = (ICM_PWR_MGMT_1, ICM_PWR_MGMT_2)
-    BANDWIDTHS: ClassVar = {2: 119.5, 3: 51.2, 4: 23.9, 5: 11.6, 6: 5.7}  # the accelerometer's: at most 8 Hz narrower
-    FILTER_RATE = 1125.0
 
     def __init__(self, registers: Registers, *arguments: Any, **options: Any) -> None:
         """Set up the chip; see `FifoSource`."""
-        registers.write(REG_BANK_SEL, 0x00)  # a program that was killed may have left another bank
+        registers.is_banked = True
         super().__init__(registers, *arguments, **options)
-
-    def _start(self, rate: float) -> float:
-        rate, divider, low_pass = self._rate(rate)
-        low_pass <<= 3
-        self._set_bank_2(
-            {
-                ODR_ALIGN_EN: 1,  # both sensors sample at the same time
-                GYRO_SMPLRT_DIV: divider,
-                ACCEL_SMPLRT_DIV_1: 0,
-                ACCEL_SMPLRT_DIV_2: divider,
-                GYRO_CONFIG_1: USE_FILTER | ICM_SELECT_2000_DPS | low_pass,
-                GYRO_CONFIG_2: 0,
-                ICM_ACCEL_CONFIG: USE_FILTER | ICM_SELECT_16_G | low_pass,
-                ICM_ACCEL_CONFIG_2: 0,
-            }
-        )
-        self._registers.set(FIFO_MODE, 0)  # the newest samples replace the oldest
-        self._registers.set(FIFO_EN_2, BOTH_TO_FIFO)
-        self._registers.write(ICM_USER_CTRL, ENABLE_FIFO)
-        self._empty_fifo()
-        return rate
-
-    def _set_bank_2(self, values: dict[int, int]) -> None:
-        self._registers.write(REG_BANK_SEL, 0x20)
-        for register, value in values.items():
-            self._registers.set(register, value)
-        self._registers.write(REG_BANK_SEL, 0x00)
-
-    def _empty_fifo(self) -> None:
-        self._registers.write(FIFO_RST, ICM_RESET_FIFO)
-        self._registers.write(FIFO_RST, 0)
-
-    def _test(self) -> None:
-        low_pass = 2 << 3
-        self._set_bank_2(
-            {
-                GYRO_SMPLRT_DIV: 0,
-                ACCEL_SMPLRT_DIV_2: 0,
-                GYRO_CONFIG_1: USE_FILTER | low_pass,  # 250 deg/s
-                ICM_ACCEL_CONFIG: USE_FILTER | low_pass,  # 2 g
-            }
-        )
-        response = self._responses(self._switch_actuators, self.DATA[1::-1], READINGS, 1e-3)
-        self._registers.write(REG_BANK_SEL, 0x10)
-        gyroscope_codes = self._registers.read_block(ICM_SELF_TEST_GYRO, 3)
-        accelerometer_codes = self._registers.read_block(ICM_SELF_TEST_ACCEL, 3)
-        self._registers.write(REG_BANK_SEL, 0x00)
-        self._judge_6500(response, gyroscope_codes, accelerometer_codes)
-
-    def _switch_actuators(self, on: bool) -> None:
-        self._set_bank_2({GYRO_CONFIG_2: on * GYROSCOPE_ACTUATORS, ICM_ACCEL_CONFIG_2: on * ACCELEROMETER_ACTUATORS})
-
-
-def _limits_6050(codes: bytes) -> list[tuple[float, float]]:
-    """Return the limits of the responses, gyroscope first, in LSB at 250 deg/s and 8 g.
-
-    They lie 14 % (PS-MPU-6000A 6.1) about the factory's response (RM-MPU-6000A 4.1); a chip without one has no limits.
-    """
-    gyroscope, accelerometer = [], []
-    for axis, sign in enumerate((1.0, -1.0, 1.0)):
-        code = codes[axis] & 0x1F
-        gyroscope.append(sign * 25.0 * 131.0 * 1.046 ** (code - 1) if code else math.inf)
-        code = codes[axis] >> 5 << 2 | codes[3] >> (4 - 2 * axis) & 3
-        accelerometer.append(4096.0 * 0.34 * (0.92 / 0.34) ** ((code - 1) / 30.0) if code else math.inf)
-    return [
-        (factory - 0.14 * abs(factory), factory + 0.14 * abs(factory)) if factory < math.inf else (-math.inf, math.inf)
-        for factory in gyroscope + accelerometer
-    ]

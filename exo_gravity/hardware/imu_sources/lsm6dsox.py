@@ -6,12 +6,11 @@ DS12814 (LSM6DSOX), DS12140 (LSM6DSO).
 
 from __future__ import annotations
 
-import struct
 from typing import ClassVar
 
 from exo_gravity.core.errors import DeviceError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.hardware.imu_sources.i2c import FifoSource, axes
+from exo_gravity.hardware.imu_sources.i2c import FifoSource
 from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Axes, Measurement
 
 FIFO_CTRL3, FIFO_CTRL4, WHO_AM_I, CTRL1_XL, CTRL2_G, CTRL3_C, CTRL5_C, CTRL9_XL = (
@@ -30,21 +29,19 @@ GYROSCOPE, ACCELEROMETER = 1, 2  # tags
 
 RADIANS_PER_LSB = 0.070 * RADIANS_PER_DEGREE  # at 2000 deg/s
 ACCELERATION_PER_LSB = 0.488e-3 * STANDARD_GRAVITY  # at 16 g
-MILLI_G_PER_LSB = 0.122  # at 4 g, in the self-test
-DEGREES_PER_LSB = 0.070  # per second, in the self-test
-Limits = tuple[float, float]
-ACCELEROMETER_RESPONSE, GYROSCOPE_RESPONSE = (50.0, 1700.0), (150.0, 700.0)  # mg; deg/s
+# In the self-test, at 4 g and 2000 deg/s: what an LSB is, and the limits.
+RESPONSES = (0.070, (150.0, 700.0), "deg/s"), (0.122, (50.0, 1700.0), "mg")  # gyroscope, accelerometer
 
 
 class Lsm6dsox(FifoSource):
     """An LSM6DSOX or LSM6DSO. Its low-pass filters follow its rate without further registers."""
 
-    IDENTITY = WHO_AM_I
+    IDENTITY, TEMPERATURE, ORDER, SETTLING = WHO_AM_I, OUT_TEMP_L, "<", 0.1
     KNOWN: ClassVar = {0x6C: "LSM6DSOX"}
-    SETTLING = 0.1
+    thermometer = 256.0, 25.0
+    _half: tuple[int, int, Axes] | None = None  # tag, time slot and axes that wait for the other sensor's
 
-    def _reset(self) -> None:
-        self._half: tuple[int, int, Axes] | None = None  # tag, time slot and axes that wait for the other sensor's
+    def _set_up(self, rate: float, self_test: bool) -> float:
         self._registers.write(CTRL3_C, SOFTWARE_RESET)
         for _ in range(10):
             self._wait(0.01)
@@ -52,36 +49,26 @@ class Lsm6dsox(FifoSource):
                 break
         else:
             raise DeviceError(self._registers.name, "does not finish its reset", CTRL3_C)
-        self._registers.set(CTRL9_XL, NO_I3C)
-        self._registers.set(CTRL3_C, WHOLE_SAMPLES)
-
-    def _test(self) -> None:
-        """Compare means of 5 samples with the actuators off and on, as the manufacturer's example does."""
-        self._registers.set(CTRL1_XL, RATES[52.0] << 4 | SELECT_4_G)
-        self._test_sensor("accelerometer", OUTX_L_A, 0x01, 52.0, MILLI_G_PER_LSB, ACCELEROMETER_RESPONSE, "mg")
-        self._registers.set(CTRL1_XL, OFF)
-        self._registers.set(CTRL2_G, RATES[208.0] << 4 | SELECT_2000_DPS)
-        self._test_sensor("gyroscope", OUTX_L_G, 0x04, 208.0, DEGREES_PER_LSB, GYROSCOPE_RESPONSE, "deg/s")
-        self._registers.set(CTRL2_G, OFF)
-
-    def _test_sensor(
-        self, sensor: str, register: int, actuators: int, rate: float, scale: float, limits: Limits, unit: str
-    ) -> None:
-        def switch(on: bool) -> None:
-            self._registers.set(CTRL5_C, on * actuators)
-
-        response = self._responses(switch, [register], 5, 1.1 / rate, "<")  # the chip's clock may be slow
-        switch(False)
-        self._judge(sensor, [abs(scale * value) for value in response], [limits] * 3, unit)
-
-    def _start(self, rate: float) -> float:
+        self._registers.set({CTRL9_XL: NO_I3C, CTRL3_C: WHOLE_SAMPLES})
+        if self_test:
+            self._test(1, CTRL1_XL, SELECT_4_G, 52.0, OUTX_L_A, 0x01)
+            self._test(0, CTRL2_G, SELECT_2000_DPS, 208.0, OUTX_L_G, 0x04)
         rate = min(RATES, key=lambda candidate: abs(candidate - rate))
         code = RATES[rate]
-        self._registers.set(FIFO_CTRL3, code << 4 | code)
-        self._registers.set(CTRL1_XL, code << 4 | SELECT_16_G)
-        self._registers.set(CTRL2_G, code << 4 | SELECT_2000_DPS)
+        rates = {FIFO_CTRL3: code << 4 | code, CTRL1_XL: code << 4 | SELECT_16_G, CTRL2_G: code << 4 | SELECT_2000_DPS}
+        self._registers.set(rates)
         self._empty_fifo()
         return rate
+
+    def _test(self, sensor: int, control: int, scale: int, rate: float, data: int, actuators: int) -> None:
+        """Compare means of 5 samples with the actuators off and on, as the manufacturer's example does."""
+        self._registers.set({control: RATES[rate] << 4 | scale})
+        # The chip's clock may be slow.
+        response = self._responses({CTRL5_C: 0}, {CTRL5_C: actuators}, [data], 5, 1.1 / rate)
+        self._registers.set({CTRL5_C: 0, control: OFF})
+        lsb, limits, unit = RESPONSES[sensor]
+        for axis, value in enumerate(response):
+            self._judge(3 * sensor + axis, abs(lsb * value), limits, unit)
 
     def _empty_fifo(self) -> None:
         self._half = None
@@ -100,9 +87,9 @@ class Lsm6dsox(FifoSource):
         """Return the measurement that `word` completes: one word of each sensor with the same time slot (TAG_CNT)."""
         tag, slot = word[0] >> 3, word[0] >> 1 & 0x03
         if tag == GYROSCOPE:
-            half = tag, slot, axes(word[1:], RADIANS_PER_LSB, "<")
+            half = tag, slot, self._axes(word[1:], RADIANS_PER_LSB)
         elif tag == ACCELEROMETER:
-            half = tag, slot, axes(word[1:], ACCELERATION_PER_LSB, "<")
+            half = tag, slot, self._axes(word[1:], ACCELERATION_PER_LSB)
         else:
             return None
         other, self._half = self._half, half
@@ -110,7 +97,3 @@ class Lsm6dsox(FifoSource):
             return None
         self._half = None
         return Measurement(half[2], other[2]) if tag == GYROSCOPE else Measurement(other[2], half[2])
-
-    def _read_temperature(self) -> float:
-        (raw,) = struct.unpack("<h", self._registers.read_block(OUT_TEMP_L, 2))
-        return float(raw / 256.0 + 25.0)

@@ -21,8 +21,8 @@ from typing import ClassVar
 
 from exo_gravity.core.errors import DeviceError, ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.rotation import Quaternion, product
-from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Axes, Clock, ImuSource, Measurement
+from exo_gravity.core.model.rotation import ZERO, Quaternion, plus, product
+from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Clock, ImuSource, Measurement
 
 ACCELERATION, ANGULAR_VELOCITY, ANGLES, QUATERNION = 0x51, 0x52, 0x53, 0x59
 UNLOCK = b"\xff\xaa\x69\x88\xb5"
@@ -49,6 +49,7 @@ class SerialSource(ImuSource):
 
     HEADER: ClassVar[bytes]
     LENGTH: ClassVar[int]  # bytes of a packet
+    SUMMED: ClassVar[int]  # the first byte that counts into the sum in its last one
 
     def __init__(self, device: str, port: str, baud: int, rate: float, clock: Clock) -> None:
         """Open `port`. Raises DeviceError, and ParameterError without pyserial."""
@@ -98,8 +99,8 @@ class SerialSource(ImuSource):
         return packets
 
     def _is_whole(self, packet: bytes) -> bool:
-        """Return whether the packet's sum is right."""
-        raise NotImplementedError
+        """Return whether the sum of the packet's content is right."""
+        return sum(packet[self.SUMMED : -1]) & 0xFF == packet[-1]
 
     def _decode(self, packet: bytes) -> Measurement | None:
         """Return the measurement that a packet completes."""
@@ -109,7 +110,7 @@ class SerialSource(ImuSource):
 class WitMotion(SerialSource):
     """A WitMotion sensor. A sample is complete with its orientation: a quaternion, or angles if it sends none."""
 
-    HEADER, LENGTH = b"\x55", 11
+    HEADER, LENGTH, SUMMED = b"\x55", 11, 0
 
     def __init__(self, port: str, baud: int, rate: float, clock: Clock) -> None:
         """Open the port and set the sensor's rate. Raises DeviceError, ParameterError."""
@@ -129,7 +130,7 @@ class WitMotion(SerialSource):
             raise DeviceError(self.name, f"cannot be written: {error}") from None
 
     def _is_whole(self, packet: bytes) -> bool:
-        return 0x50 <= packet[1] <= 0x5F and sum(packet[:10]) & 0xFF == packet[10]
+        return 0x50 <= packet[1] <= 0x5F and super()._is_whole(packet)
 
     def _decode(self, packet: bytes) -> Measurement | None:
         kind, numbers = packet[1], struct.unpack_from("<4h", packet, 2)
@@ -149,49 +150,33 @@ class WitMotion(SerialSource):
             self._skipped += 1
             return None
         skipped, self._skipped = self._skipped, 0
-        return Measurement(
-            _axes(parts[ANGULAR_VELOCITY], RATE_PER_LSB),
-            _axes(parts[ACCELERATION], WITMOTION_ACCELERATION),
-            _orientation(parts),
-            skipped,
-        )
-
-
-def _orientation(parts: dict[int, Numbers]) -> Quaternion | None:
-    if QUATERNION in parts:
-        w, x, y, z = (number / 32768 for number in parts[QUATERNION])
-        return x, y, z, w
-    if ANGLES in parts:
-        roll, pitch, yaw, _ = (number * WITMOTION_ANGLE for number in parts[ANGLES])
-        return from_angles(("z", yaw), ("y", pitch), ("x", roll))
-    return None
-
-
-def _axes(numbers: Numbers, scale: float) -> Axes:
-    x, y, z, _ = numbers
-    return x * scale, y * scale, z * scale
+        orientation: Quaternion | None = None
+        if QUATERNION in parts:
+            w, x, y, z = (number / 32768 for number in parts[QUATERNION])
+            orientation = x, y, z, w
+        elif ANGLES in parts:
+            roll, pitch, yaw, _ = (number * WITMOTION_ANGLE for number in parts[ANGLES])
+            orientation = from_angles(("z", yaw), ("y", pitch), ("x", roll))
+        rate = plus(ZERO, parts[ANGULAR_VELOCITY][:3], RATE_PER_LSB)
+        return Measurement(rate, plus(ZERO, parts[ACCELERATION][:3], WITMOTION_ACCELERATION), orientation, skipped)
 
 
 class Bno085(SerialSource):
     """A BNO085 with PS0 high and PS1 low, which selects UART-RVC."""
 
-    HEADER, LENGTH = b"\xaa\xaa", 19
+    HEADER, LENGTH, SUMMED = b"\xaa\xaa", 19, 2
 
     def __init__(self, port: str, baud: int, clock: Clock) -> None:
         """Open the port. Raises DeviceError, ParameterError."""
         super().__init__("BNO085", port, baud, RVC_RATE, clock)
         self._counter: int | None = None
 
-    def _is_whole(self, packet: bytes) -> bool:
-        return sum(packet[2:18]) & 0xFF == packet[18]
-
     def _decode(self, packet: bytes) -> Measurement:
         counter, yaw, pitch, roll, x, y, z = struct.unpack_from("<B6h", packet, 2)
         skipped = 0 if self._counter is None else (counter - self._counter - 1) & 0xFF
         self._counter = counter
         orientation = from_angles(("z", yaw * RVC_ANGLE), ("x", pitch * RVC_ANGLE), ("y", roll * RVC_ANGLE))
-        acceleration = (x * RVC_ACCELERATION, y * RVC_ACCELERATION, z * RVC_ACCELERATION)
-        return Measurement(None, acceleration, orientation, skipped)
+        return Measurement(None, plus(ZERO, (x, y, z), RVC_ACCELERATION), orientation, skipped)
 
 
 def from_angles(*turns: tuple[str, float]) -> Quaternion:

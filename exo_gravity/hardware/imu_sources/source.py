@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from exo_gravity.core.errors import DeviceError
-from exo_gravity.core.trunk.imu_sample import ImuSample
+from exo_gravity.core.trunk.imu_checks import ImuSample
 
 RADIANS_PER_DEGREE = math.pi / 180.0
 

@@ -40,7 +40,6 @@ FOLDERS = ("/run/lock", "/dev/shm", "/tmp")
 FLAGS = os.O_NOFOLLOW | os.O_NONBLOCK  # another user may have put a link or a pipe there
 SHARED = stat.S_ISVTX | stat.S_IWOTH | stat.S_IXOTH
 NOTE = struct.Struct("=10d")  # the first fields of `DriveNotes`, written at once
-CREDENTIALS = struct.Struct("3i")  # PID, user and group of a socket's other end
 UNKNOWN_DRIVE = Drive(NOTHING, (DAMPING,) * JOINT_COUNT, True)  # of motors that may be on: the first frames hold
 
 Address = tuple[str, str, Mapping[str, Any]]  # interface, channel and options of a python-can bus
@@ -188,7 +187,6 @@ def _lock(address: Address, patience: float, clock: Clock, asks: bool) -> socket
     name, end = NAME + bus_name(address), clock.monotonic() + patience
     with socket.socket(socket.AF_UNIX) as asking:
         asking.setblocking(False)
-        is_asking = False
         while True:
             lock = socket.socket(socket.AF_UNIX)
             try:
@@ -199,23 +197,16 @@ def _lock(address: Address, patience: float, clock: Clock, asks: bool) -> socket
                 lock.close()
                 if error.errno != errno.EADDRINUSE:
                     raise BusError(f"CAN bus {address[1]} cannot be locked: {error.strerror}") from error
-            is_late = clock.monotonic() > end
-            if (asks or is_late) and not is_asking:
-                is_asking = not asking.connect_ex(name)
-            if is_late:
-                raise BusError(f"CAN bus {address[1]} is held by {_holder(address, asking if is_asking else None)}")
+            asks = asks and asking.connect_ex(name) != 0
+            if clock.monotonic() > end:
+                raise BusError(f"CAN bus {address[1]} is held by {_holder(address)}")
             clock.sleep(ATTEMPT_PERIOD)
 
 
-def _holder(address: Address, asking: socket.socket | None) -> str:
-    """Return who holds the bus, as noted, or as the kernel tells who is connected to him by `asking`."""
+def _holder(address: Address) -> str:
     with contextlib.suppress(OSError, ValueError):
         descriptor = os.open(notes_file(address), os.O_RDONLY | FLAGS)
         with os.fdopen(descriptor, "rb"):
             if owner := DriveNotes.from_buffer_copy(os.pread(descriptor, mmap.PAGESIZE, 0)).owner:
                 return owner
-    if asking:
-        pid, user, _ = CREDENTIALS.unpack(asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size))
-        if pid:
-            return f"PID {pid} of user {user}"
-    return "a process of another container"
+    return f"a process that left no notes here, as of another container: `ss -xlp | grep {bus_name(address)}` shows it"

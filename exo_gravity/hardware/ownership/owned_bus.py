@@ -19,7 +19,6 @@ import can
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.delivery import ABSOLUTE, RELATIVE
-from exo_gravity.core.safety.drive import Drive
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.can_port import open_bus
@@ -67,10 +66,23 @@ def let_down(arm: ArmOnBus, notes: DriveNotes, log: Callable[[str], None], is_wa
             if is_wanted():
                 return False
             notes.clock.sleep(OPEN_PERIOD)
-    drive = notes.drive
-    motors = MotorBus(bus, arm.motors, powered=True, note=notes.note, reopen=arm.open, clock=notes.clock)
+    drive, clock, is_complete = notes.drive, notes.clock, False
+    motors = MotorBus(bus, arm.motors, powered=True, note=notes.note, reopen=arm.open, clock=clock)
+    first = drive._replace(powered=True, unsure=(True,) * len(drive.effort))
+    end = clock.monotonic() + FIRST_REPLIES
+    while not is_complete and clock.monotonic() < end:
+        try:
+            is_complete = motors.exchange(first, clock.monotonic() + arm.period)
+        except BusError:
+            clock.sleep(arm.period)
+    # A motor that replies another torque than it received has been switched off or obeyed another sender.
+    effort, damping = list(drive.effort), list(drive.damping)
+    for i, joint in enumerate(motors.samples):
+        expected = effort[i] - damping[i] * joint.velocity
+        if abs(joint.effort - expected) > ABSOLUTE + RELATIVE * abs(expected):  # not without a reply: that is NaN
+            effort[i], damping[i] = joint.effort, 0.0
     machine = SafetyMachine(arm.limits, arm.period, arm.motors)
-    machine.take_over(*_applied(motors, drive, arm.period), notes.clock.monotonic())
+    machine.take_over(effort, damping, clock.monotonic())
     loop = ControlLoop(motors, machine, arm.period)
     was_unreached = False
     while not loop.is_off and loop.cycle():
@@ -82,28 +94,6 @@ def let_down(arm: ArmOnBus, notes: DriveNotes, log: Callable[[str], None], is_wa
             return False
     loop.stop()
     return not motors.may_be_powered
-
-
-def _applied(motors: MotorBus, drive: Drive, period: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return the effort (4,) in Nm and damping (4,) in Nm s/rad that the motors apply, which received `drive`.
-
-    A motor that replies another torque has been switched off or obeyed another sender. Then its reply is used.
-    """
-    clock = motors.clock
-    end = clock.monotonic() + FIRST_REPLIES
-    first = drive._replace(powered=True, unsure=(True,) * len(drive.effort))
-    is_complete = False
-    while not is_complete and clock.monotonic() < end:
-        try:
-            is_complete = motors.exchange(first, clock.monotonic() + period)
-        except BusError:
-            clock.sleep(period)
-    effort, damping = list(drive.effort), list(drive.damping)
-    for i, joint in enumerate(motors.samples):
-        expected = effort[i] - damping[i] * joint.velocity
-        if abs(joint.effort - expected) > ABSOLUTE + RELATIVE * abs(expected):  # not without a reply: that is NaN
-            effort[i], damping[i] = joint.effort, 0.0
-    return tuple(effort), tuple(damping)
 
 
 class Silence:

@@ -21,8 +21,8 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.drive import CARRYING, NO_COMMAND, EffortCommand, FaultCode
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.nodes.ros.hot_path import HotPath, SolePublisher
 from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, to_nanoseconds
+from exo_gravity.nodes.ros.subscriptions import HotPath, Publishers
 
 # The control thread reads them once a cycle; the depth lets it notice a second commander. Not reliable: an old effort
 # sent again is useless, and acknowledging each one wakes a thread in both nodes (measured: 2 % of a core).
@@ -45,7 +45,7 @@ class EffortExchange:
         self.command = NO_COMMAND  #: the newest from the compensator
         self._measured = -math.inf  # monotonic s, when the last published joint state was measured
         self._published: OrderedDict[int, float] = OrderedDict()
-        self._commander = SolePublisher(node, "effort_commands")
+        self._commander = Publishers()
         self._publisher = node.create_publisher(JointState, "joint_states", 1)
         self._joint_states = JointState(name=list(limits.joint_names))  # one message, reused
         self._efforts = HotPath(node, JointState, "effort_commands", self._on_efforts, EFFORTS)

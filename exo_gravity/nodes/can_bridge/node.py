@@ -30,14 +30,14 @@ from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.params import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.trunk.tilt_input import TiltInput
 from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.clock import request_real_time
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, OwnedBus, Watchdog, take_over
-from exo_gravity.hardware.scheduling import request_real_time
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
-from exo_gravity.nodes.ros.hot_path import TiltSubscription
 from exo_gravity.nodes.ros.parameters import bus_of, declare
 from exo_gravity.nodes.ros.run import keep_to_this_machine, run
+from exo_gravity.nodes.ros.subscriptions import TiltSubscription
 
 REPORT_PERIOD = 0.1  # s
 TILT_TIMEOUT = 0.08  # s for which /imu/data goes before /imu/pitch_yaw
@@ -103,8 +103,7 @@ class CanBridge(LifecycleNode):
         self.error = ""  #: why the last transition failed
         self._exchange = EffortExchange(self, limits, lambda: self.loop)
         lease = operation.Operator(self, lambda: self.loop).lease
-        rated = [motor.rated_effort for motor in motors]
-        self._report = operation.BridgeReport(self, limits.joint_names, traffic, values["rate"], rated, lease)
+        self._report = operation.BridgeReport(self, self._arm, traffic, lease)
         operation.BridgeServices(self, lambda: self.loop, motors)
         if any(limits.largest_moment):
             _follow_gravity(self, lambda: self.loop)

@@ -18,17 +18,17 @@ from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity.core.errors import BusError, ParameterError
-from exo_gravity.core.motors.bus_load import REPLY_SHARE, Traffic
-from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.joint_motor import REPLY_SHARE, JointMotor, Traffic
 from exo_gravity.core.numbers import Rate
 from exo_gravity.core.safety.delivery import MotorLoad
 from exo_gravity.core.safety.drive import EffortCommand, FaultCode, State
 from exo_gravity.core.safety.lease import Lease
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.nodes.ros.hot_path import HotPath
+from exo_gravity.hardware.ownership.owned_bus import ArmOnBus
 from exo_gravity.nodes.ros.messages import ERROR, HELD_BY, NOBODY, OK, WARN, Diagnostics, milliseconds, row
 from exo_gravity.nodes.ros.run import open_to_others
+from exo_gravity.nodes.ros.subscriptions import HotPath
 
 RECENT = 2.0  # s for which a limit that acted is still shown
 SLOW = 0.9  # share of the set rate below which the loop is slow
@@ -94,12 +94,9 @@ class BridgeServices:
         safety, now = loop.safety, time.monotonic()
         if any(self._zero):
             return f"zero = {self._zero}: must be all 0 when the motors store the zero"
-        if safety.state is not State.DISABLED:
-            return f"refused: the arm is {safety.state.value}, must be disabled"
-        if any(safety.limits.is_silent(now, joint) for joint in loop.samples):
-            return "refused: a motor does not reply"
-        if not safety.settled(now):
-            return "refused: the arm is not at rest"
+        is_silent = any(safety.limits.is_silent(now, joint) for joint in loop.samples)
+        if safety.state is not State.DISABLED or is_silent or not safety.settled(now):
+            return f"refused: the arm is {safety.state.value}; must be disabled and at rest, and all motors reply"
         loop.bus.set_zero()
         return ""
 
@@ -185,21 +182,16 @@ def log_risks(node: Node, traffic: Traffic, rate: float) -> None:
 
 
 class BridgeReport:
-    """The status of one bridge.
+    """The status of one bridge. lease: of control."""
 
-    rate: Hz, as set. rated: (4,) Nm, the motors' rated torque at the joints. lease: of control.
-    """
-
-    def __init__(
-        self, node: Node, names: Sequence[str], traffic: Traffic, rate: float, rated: Sequence[float], lease: Lease
-    ) -> None:
+    def __init__(self, node: Node, arm: ArmOnBus, traffic: Traffic, lease: Lease) -> None:
         self._diagnostics = Diagnostics(node)
-        self._names = names
+        self._names = arm.limits.joint_names
         self._lease = lease
         self._traffic = traffic
         self._rate = Rate()
-        self._slow = SLOW * rate  # Hz
-        self._motors = MotorLoad(rated)
+        self._slow = SLOW / arm.period  # Hz
+        self._motors = MotorLoad([motor.rated_effort for motor in arm.motors])
 
     def send(self, loop: ControlLoop | None, newest: EffortCommand, refusal: str) -> None:
         """Report on `loop`, None while the node is inactive. refusal: why the last message was refused."""

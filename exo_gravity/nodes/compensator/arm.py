@@ -30,9 +30,9 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import Param
 from exo_gravity.core.trunk.tilt_input import MAX_LEAD
 from exo_gravity.hardware.urdf_arm import UrdfArm
-from exo_gravity.nodes.ros.hot_path import LATCHED, Repeated
 from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, row, to_nanoseconds, velocity_of
 from exo_gravity.nodes.ros.parameters import declare
+from exo_gravity.nodes.ros.subscriptions import LATCHED, Repeated
 
 DESCRIPTION_TIMEOUT = 10.0  # s in which robot_description must arrive
 TICK = 0.01  # s between two messages of a fade

@@ -24,7 +24,7 @@ from exo_gravity.nodes.ros.parameters import NodeParameters
 
 PAUSE = 0.005  # s, about 500 times per budget
 WITHIN = "within rated torque everywhere"
-BRIDGE_PARAMETERS = ("motor", "torque_scale", "position_min", "position_max")
+BRIDGE_PARAMETERS = {"motor", "torque_scale", "position_min", "position_max"}
 Load = tuple[tuple[float, ...], tuple[float, ...]]  # the wearer's mass (4,) kg and centre of gravity (4,) m
 Request = tuple[ArmModel, Load, float, float]  # robot, wearer, support 0..1, largest tilt in rad
 
@@ -42,7 +42,7 @@ class BudgetWatch:
         self._logger = node.get_logger()
         self._names = tuple(joint_names)
         # Without its clients the executor then waits for two entities less.
-        self._bridge = NodeParameters(node, "can_bridge", lambda values: self._bridge.destroy(), BRIDGE_PARAMETERS)
+        self._bridge = NodeParameters(node, "can_bridge", lambda values: self._bridge.destroy())
         self._request: Request | None = None
         self._job: Future[tuple[str, str]] | None = None
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="budget")
@@ -55,7 +55,7 @@ class BudgetWatch:
                 (self.text, self.largest_support), self._job = self._job.result(), None
                 if self.text != WITHIN:
                     self._logger.warning(f"{self.text}; efforts stay clamped to max_effort")
-        elif self._bridge.values:
+        elif self._bridge.values.keys() >= BRIDGE_PARAMETERS:
             s = settings
             load = tuple(s.wearer_mass), tuple(s.wearer_cog)
             support = s.support if s.mode == "zero_g" else 0.0
@@ -68,7 +68,7 @@ class BudgetWatch:
 def compute(names: Sequence[str], request: Request, bridge: Mapping[str, Any]) -> tuple[str, str]:
     """Return `text` and `largest_support` of `BudgetWatch`, with pauses and without real-time scheduling.
 
-    names: of the joints (4,). bridge: values of BRIDGE_PARAMETERS.
+    names: of the joints (4,). bridge: its parameter values.
     """
     # A thread inherits its creator's policy, and thread_priority sets that of all threads: never SCHED_FIFO here.
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))

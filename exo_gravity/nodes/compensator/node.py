@@ -14,22 +14,20 @@ import time
 from collections import deque
 from typing import Any
 
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core.compensation.compensator import Answer, Compensator
-from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.compensation.settings import Settings, UrdfSettings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Rate
-from exo_gravity.hardware.scheduling import request_real_time
+from exo_gravity.hardware.clock import request_real_time
 from exo_gravity.nodes.compensator.arm import JointStateInterface, MultiArrayInterface, declared, report, sentence
 from exo_gravity.nodes.compensator.budget_watch import BudgetWatch
-from exo_gravity.nodes.ros.hot_path import DISTRUST, NEWEST, HotPath, Repeated, SolePublisher, TiltSubscription
 from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row, to_nanoseconds
-from exo_gravity.nodes.ros.parameters import values_after
+from exo_gravity.nodes.ros.parameters import accept_changes
 from exo_gravity.nodes.ros.run import run
+from exo_gravity.nodes.ros.subscriptions import NEWEST, HotPath, Publishers, Repeated, TiltSubscription
 
 SILENCE = 0.5  # s without joint states until diagnostics report it
 REPORT_PERIOD = 0.5  # s
@@ -41,21 +39,21 @@ class CompensatorNode(Node):
     """The ROS shell around a compensator."""
 
     def __init__(self) -> None:
-        # A parameter that is not in the table is refused by `_check_parameters`, which names it: rclpy does not.
+        # A parameter that is not in the table is refused by `accept_changes`, which names it: rclpy does not.
         super().__init__(
             "compensator", automatically_declare_parameters_from_overrides=True, allow_undeclared_parameters=True
         )
         self._lock = threading.Lock()  # guards the control: joint states arrive on another thread
-        self._table, values, self._read = declared(self)
+        table, values, read = declared(self)
         self._names = values["joint_names"]
-        self._checked = self._read(values)  # the settings that the parameters describe
-        self._control = Compensator(self._checked, self._names)
+        settings = read(values)
+        self._control = Compensator(settings, self._names)
         self._budget: BudgetWatch | None = None
         self._threads: list[Repeated] = []
         if self._control.terms:
             self._budget = BudgetWatch(self, self._names)
             self._assist = self._control.terms.assist
-            self._assistant = SolePublisher(self, "assist_efforts")
+            self._assistant = Publishers()
             self._assistants = 0  # changes whenever a message comes from another publisher than the one before
             path = HotPath(self, JointState, "assist_efforts", self._on_assist_efforts, pause=ASSIST_PAUSE)
             self._threads.append(path)
@@ -73,18 +71,17 @@ class CompensatorNode(Node):
         self._rate = Rate()
         self._refusal = "none"
         topic = self._interface.topic
-        self._source = SolePublisher(self, topic)
-        # Which input had a second publisher, as a sentence, and when (monotonic s).
-        self._intruder, self._intruded = "", -math.inf
+        self._source = Publishers()
+        self._sources = {topic: self._source}  # of what the torque depends on
         self._threads.append(HotPath(self, JointState, topic, self._on_joint_states, NEWEST))
         if values["use_imu"]:
-            TiltSubscription(self, self._control.tilt, self._lock, self._refused, self._withdraw, self._on_motion)
-        self.add_on_set_parameters_callback(self._check_parameters)
-        self.add_post_set_parameters_callback(self._apply_parameters)
+            tilt = TiltSubscription(self, self._control.tilt, self._lock, self._refused, self._on_motion)
+            self._sources |= tilt.senders
+        accept_changes(self, table, read, self._apply)
         # Only the executor's thread reports: diagnostics and budget are not for two threads.
         self._changed = self.create_guard_condition(self._report_changes)
         self.create_timer(REPORT_PERIOD, self._report_current)
-        self.get_logger().info(sentence(self._checked))
+        self.get_logger().info(sentence(settings))
         for thread in self._threads:
             thread.start()
         request_real_time(values["thread_priority"], self.get_logger().warning)
@@ -102,8 +99,7 @@ class CompensatorNode(Node):
     def _on_joint_states(self, message: JointState, info: dict[str, Any]) -> None:
         now = time.monotonic()
         try:
-            if self._source.is_another(info):
-                self._withdraw(self._interface.topic)
+            self._source.is_another(info)
             theta, velocity = self._interface.read(message)
             if self._interface.problem:  # no step: the torque must ramp in from zero
                 answer = Answer(None, self._interface.problem)
@@ -112,8 +108,9 @@ class CompensatorNode(Node):
                     answer = self._control.step(now, theta, velocity)
         except ParameterError as error:
             answer = Answer(None, self._refused(self._interface.topic, error))
-        if now - self._intruded < DISTRUST:
-            answer = Answer(None, self._intruder)
+        for topic, publishers in self._sources.items():
+            if publishers.are_several:
+                answer = Answer(None, f"more than one publisher of {topic}")
         self._interface.send(now, message, answer)
         self._answers += answer.effort is not None
         self._rides += bool(answer.held and not self._answer.held)
@@ -134,26 +131,15 @@ class CompensatorNode(Node):
         if self._control.settings.inertial:  # each sample takes a fit, under the lock
             self._control.motion.add(*sample)
 
-    def _withdraw(self, topic: str) -> None:
-        """Withdraw for a while: a second publisher sends on `topic`."""
-        self._intruder, self._intruded = f"more than one publisher of {topic}", time.monotonic()
-
     def _refused(self, topic: str, error: ParameterError) -> str:
         """Note an impossible message. Its value goes to /diagnostics only: a hostile sender could fill the log."""
         self._refusal = f"{topic}: {error}"
         return f"{topic}: {error.name} must be {error.expected}"
 
-    def _check_parameters(self, changes: list[Parameter]) -> SetParametersResult:
-        try:
-            self._checked = self._read(values_after(self, self._table, changes))
-        except ParameterError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
-
-    def _apply_parameters(self, _changes: list[Parameter]) -> None:
+    def _apply(self, settings: Settings | UrdfSettings) -> None:
         with self._lock:
-            self._control.apply(self._checked)
-        self.get_logger().info(sentence(self._checked))
+            self._control.apply(settings)
+        self.get_logger().info(sentence(settings))
 
     def _values(self, now: float, answer: Answer) -> dict[str, object]:
         return {

@@ -11,13 +11,13 @@ from typing import Any
 
 from geometry_msgs.msg import Vector3
 from rclpy.node import Node
+from rclpy.time import Time
 from sensor_msgs.msg import Imu
 
-from exo_gravity.core.trunk.imu_sample import ImuSample
+from exo_gravity.core.trunk.imu_checks import ImuSample
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.imu_sources import Reopening, open_source
-from exo_gravity.nodes.ros.hot_path import Callback
-from exo_gravity.nodes.ros.messages import to_time
+from exo_gravity.nodes.ros.subscriptions import Callback
 
 POLLS_A_SAMPLE = 2.0
 MIN_PERIOD = 0.002  # s between two polls
@@ -103,7 +103,7 @@ class ImuDevice:
 def message_of(sample: ImuSample) -> Imu:
     """Return the sample's message, in the IMU's axes; what was not measured has the covariance -1 (REP-145)."""
     message = Imu()
-    message.header.stamp, message.header.frame_id = to_time(round(sample.time * 1e9)), "imu"
+    message.header.stamp, message.header.frame_id = Time(nanoseconds=round(sample.time * 1e9)).to_msg(), "imu"
     if sample.orientation is None:
         message.orientation_covariance[0] = -1.0
     else:

@@ -22,10 +22,10 @@ from exo_gravity.core.numbers import Rate
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator, TrunkOrientation
 from exo_gravity.nodes.imu.device import ImuDevice
-from exo_gravity.nodes.ros.hot_path import DISTRUST, HotPath, SolePublisher
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
+from exo_gravity.nodes.ros.subscriptions import HotPath, Publishers
 
 PITCH_YAW, DATA = "/imu/pitch_yaw", "/imu/data"
 # The fusion integrates every sample. A queue of depth 1 would lose samples whenever the node is delayed.
@@ -52,8 +52,7 @@ class ImuNode(Node):
         )
         self._timeout = values["timeout"]
         self._arrived = time.monotonic()
-        self._driver = SolePublisher(self, self._topic)
-        self._intruded = -math.inf  # monotonic s, when a second publisher was seen
+        self._driver = Publishers()
         self._received = self._published = self._refused = 0
         self._rate = Rate()
         self._refusal: ParameterError | None = None  # since the last report
@@ -80,9 +79,8 @@ class ImuNode(Node):
     def _on_imu(self, message: Imu, info: dict[str, Any]) -> None:
         self._arrived = time.monotonic()
         self._received += 1
-        if self._driver.is_another(info):
-            self._intruded = self._arrived
-        if self._is_intruded(self._arrived):  # the estimator starts anew after the gap
+        self._driver.is_another(info)
+        if self._driver.are_several:  # the estimator starts anew after the gap
             self._refused += 1
             return
         sample, now = sample_of(message), self.get_clock().now().nanoseconds * 1e-9
@@ -96,9 +94,6 @@ class ImuNode(Node):
         if orientation is not None:
             self._published += 1
             self._publish(message, orientation)
-
-    def _is_intruded(self, now: float) -> bool:
-        return now - self._intruded < DISTRUST
 
     def _publish(self, message: Imu, orientation: TrunkOrientation) -> None:
         tilt = Vector3Stamped()
@@ -139,7 +134,7 @@ class ImuNode(Node):
             self._diagnostics.report(WARN, f"waiting for {self._topic}", values)
         elif age > self._timeout:
             self._diagnostics.report(ERROR, f"no samples on {self._topic}", values)
-        elif self._is_intruded(now):
+        elif self._driver.are_several:
             self._diagnostics.report(ERROR, f"more than one publisher of {self._topic}", values)
         elif refusal:
             self._diagnostics.report(ERROR, f"refused: {refusal.name} must be {refusal.expected}", values)

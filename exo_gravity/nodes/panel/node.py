@@ -3,7 +3,7 @@
 It is a ROS client like any other: it uses the topics, services and parameters that `ros2` can use, and nothing depends
 on it. The web server (exo_gravity/panel/server.py) runs on a separate thread, which calls the services; this node's
 executor receives the answers, collects the state of the arms and sends it to the pages ten times a second. Joint states
-arrive hundreds of times a second: their subscription keeps the newest message outside the executor (`hot_path`).
+arrive hundreds of times a second: their subscription keeps the newest message outside the executor (`HotPath`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import os
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,16 +29,17 @@ from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity import packaged
 from exo_gravity.core.errors import ExoGravityError, ParameterError
-from exo_gravity.nodes.ros.hot_path import HotPath
-from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics
+from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics, Newest, status_values
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
+from exo_gravity.nodes.ros.subscriptions import HotPath
 from exo_gravity.panel.control import Control
 from exo_gravity.panel.recordings import Recordings
-from exo_gravity.panel.view import PANEL, Newest, Values, joint_rows, setup_of
+from exo_gravity.panel.view import PANEL, Values, joint_rows, setup_of
 
 STATE_PERIOD = 0.1  # s between two states that the pages get
 DISCOVERY_PERIOD = 0.5  # s between two searches for nodes
+SILENT = 1.5  # s without diagnostics or joint states after which the last ones are not shown any more
 CALL_TIMEOUT = 3.0  # s, longer than can_bridge itself waits
 ABSENT_TIMEOUT = 0.5  # s, where the service seems to be absent
 LOOK_PERIOD = 0.005  # s between two looks for an answer
@@ -64,14 +64,14 @@ class ArmClient:
         self.control = node.create_publisher(KeyValue, f"/{name}/{BRIDGE}/control", 10)
         self._states = HotPath(node, JointState, f"/{name}/joint_states", self._on_states)
 
-    def state(self, now: float) -> dict[str, Any]:
+    def state(self) -> dict[str, Any]:
         """Take the newest joint states, and return what the page shows; None in the place of what is old."""
         self._states.poll()
-        return {kind: newest.at(now) for kind, newest in self.newest.items()}
+        return {kind: newest.within(SILENT) for kind, newest in self.newest.items()}
 
     def report(self) -> dict[str, str]:
         """Return what the bridge reports; {} if it is silent."""
-        return self.newest["bridge"].at(time.monotonic()) or {}
+        return self.newest["bridge"].within(SILENT) or {}
 
     def _on_states(self, message: JointState, _info: dict[str, Any]) -> None:
         rows = joint_rows(message.name, message.position, message.velocity, message.effort)
@@ -87,10 +87,9 @@ class Arms:
 
     def __init__(self, node: Node, has_lease: bool) -> None:
         self.clients: dict[str, ArmClient] = {}
-        self.known: dict[str, dict[str, Any]] = {}  #: the newest parameters of each node by full name, also if it ended
         self._node = node
         self._lessee = f"panel {os.getpid()}, " if has_lease else ""
-        self._parameters: dict[str, NodeParameters] = {}
+        self._parameters: dict[str, NodeParameters] = {}  # by full name, also of nodes that ended
         self._wearers: dict[str, Client] = {}  # the virtual ones, by their simulator's name
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
         node.create_subscription(ParameterEvent, "/parameter_events", self._on_parameter_event, 50)
@@ -106,26 +105,23 @@ class Arms:
         nodes = {f"{space.rstrip('/')}/{name}" for name, space in found if not name.startswith("_")}
         nodes.discard(self._node.get_fully_qualified_name())
         for name in nodes - set(self._parameters):
-            self._parameters[name] = NodeParameters(self._node, name, partial(self.known.__setitem__, name))
+            self._parameters[name] = NodeParameters(self._node, name)
             arm, _, leaf = name.strip("/").rpartition("/")
             if leaf == BRIDGE and arm and arm not in self.clients:
                 self.clients[arm] = ArmClient(self._node, arm)
             if leaf == "simulator" and name not in self._wearers:
                 self._wearers[name] = parameter_client(self._node, name)
-        for name in set(self._parameters) - nodes:
-            self._parameters.pop(name).destroy()
         for parameters in self._parameters.values():
             parameters.update()
 
     def state(self) -> dict[str, Any]:
         """Return what the page shows of each arm."""
-        now = time.monotonic()
-        return {name: client.state(now) for name, client in sorted(self.clients.items(), reverse=True)}
+        return {name: client.state() for name, client in sorted(self.clients.items(), reverse=True)}
 
     def nodes(self) -> dict[str, tuple[Values, Values]]:
         """Return the newest parameters of bridge and compensator by arm, {} while they are not known."""
-        get = self.known.get
-        return {arm: (get(f"/{arm}/{BRIDGE}", {}), get(f"/{arm}/{COMPENSATOR}", {})) for arm in self.names}
+        known = {name: parameters.values for name, parameters in self._parameters.items()}
+        return {arm: (known[f"/{arm}/{BRIDGE}"], known.get(f"/{arm}/{COMPENSATOR}", {})) for arm in self.names}
 
     # For a trial (`Device` of exo_gravity.panel.recordings); called on the web server's thread
 
@@ -169,9 +165,7 @@ class Arms:
         for status in message.status:
             arm, _, leaf = status.name.strip("/").rpartition("/")
             if arm in self.clients and leaf in SHOWN:
-                values = {pair.key: pair.value for pair in status.values}
-                values |= {"level": int.from_bytes(status.level, "big"), "message": status.message}
-                self.clients[arm].newest[SHOWN[leaf]] = Newest(values, time.monotonic())
+                self.clients[arm].newest[SHOWN[leaf]] = Newest(status_values(status), time.monotonic())
 
     def _on_parameter_event(self, event: ParameterEvent) -> None:
         if event.node in self._parameters:
@@ -232,8 +226,7 @@ class Panel(Node):
         except ModuleNotFoundError as error:
             missing = f"the Python package {error.name} is not installed: pip install 'exo_gravity[panel]'"
             raise ExoGravityError(missing) from None
-        address = (values["host"], values["port"], values["token"])
-        self._server = PanelServer(*address, control, self._recordings.report, self._arms.parameters, time.monotonic)
+        self._server = PanelServer(values["host"], values["port"], values["token"], control)
         self.create_timer(STATE_PERIOD, self._send_state)
         self.create_timer(DISCOVERY_PERIOD, self._arms.discover)
         self._log_address(values["host"], values["port"])
@@ -267,7 +260,7 @@ class Panel(Node):
         if nodes != self._shown:
             self._shown = nodes
             self._server.setup = {**self._own_setup, **setup_of(nodes)}
-        tilt = self._tilt.at(time.monotonic())
+        tilt = self._tilt.within(SILENT)
         self._server.state = {"arms": self._arms.state(), "tilt": tilt, **self._recordings.state()}
 
     def _on_tilt(self, message: Vector3Stamped, _info: dict[str, Any]) -> None:

@@ -31,9 +31,10 @@ from exo_gravity.bag import content
 from exo_gravity.bag.content import PARAMETERS, STATES, arm_of, leaf
 from exo_gravity.bag.writer import BagWriter, offered_qos
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
-from exo_gravity.nodes.ros.hot_path import Drain
+from exo_gravity.nodes.ros.messages import status_values
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
+from exo_gravity.nodes.ros.subscriptions import HotPath, Publishers
 
 SHARED_TOPICS = {"/imu/pitch_yaw": Vector3Stamped, "/imu/data": Imu, "/imu/data_raw": Imu}
 SHARED_TOPICS |= {content.DIAGNOSTICS: DiagnosticArray, content.PARAMETER_EVENTS: ParameterEvent}
@@ -61,9 +62,10 @@ class Recorder(Node):
         self._failed: set[str] = set()  # topics and nodes whose failure was reported
         self._last_states, self._orphaned = -math.inf, math.inf  # monotonic s
         self._reported = (0, 0)  # lost messages
-        self._drains: list[Drain] = []
-        self._nodes: set[str] = set()
-        self._unwritten: dict[str, NodeParameters] = {}  # of nodes whose parameters are not in the recording yet
+        self._topics: dict[str, HotPath] = {}
+        self._counted: list[Publishers] = []  # of joints and IMU; other topics have several
+        self._taken: list[tuple[str, int, bytes]] = []  # topic, time of arrival in ns since 1970, serialised
+        self._nodes: dict[str, NodeParameters] = {}  # until their parameters are in the recording
         self._live = LiveLine() if values["live"] else None
         self.create_timer(DRAIN_PERIOD, self._drain)
         self.create_timer(DISCOVERY_PERIOD, self._discover)
@@ -96,58 +98,47 @@ class Recorder(Node):
             self.get_logger().info(f"{self._writer.count} messages in {self._writer.path}")
 
     def _drain(self) -> None:
-        messages = []
-        for drain in self._drains:
-            taken = self._guarded(drain.topic, drain.take) or []
-            messages += [(drain.topic, stamp, data) for stamp, data in taken]
-            if not taken:
-                continue
-            if leaf(drain.topic) == STATES:
-                self._last_states = time.monotonic()
-            if self._live:
-                self._guarded(drain.topic, self._live.note, drain.topic, [data for _, data in taken])
-        messages.sort(key=lambda message: message[1])
-        self._writer.write(messages)
+        for topic, path in self._topics.items():
+            self._guarded(topic, path.poll)
+        self._writer.write(sorted(self._taken, key=lambda message: message[1]))
+        self._taken.clear()
         self.failure = self._writer.error
 
     def _discover(self) -> None:
         """Subscribe to new topics, and note new nodes."""
-        known = {drain.topic for drain in self._drains}
-        for topic, types in self.get_topic_names_and_types():
+        for topic, _types in self.get_topic_names_and_types():
             msgtype = SHARED_TOPICS.get(topic) or OF_ARMS.get(leaf(topic))
-            if msgtype and topic not in known and type_name(msgtype) in types:
+            if msgtype and topic not in self._topics:
                 self._guarded(topic, self._subscribe, topic, msgtype)
         for name, namespace in self.get_node_names_and_namespaces():
             node = f"{namespace.rstrip('/')}/{name}"
             if node not in self._nodes and node != self.get_fully_qualified_name() and not name.startswith("_"):
-                self._nodes.add(node)
                 self._guarded(node, self._add_node, node)
 
     def _add_node(self, node: str) -> None:
         write = partial(self._guarded, node, self._write_parameters, node)
-        self._unwritten[node] = NodeParameters(self, node, write)
+        self._nodes[node] = NodeParameters(self, node, write)
 
     def _look(self) -> None:
         """Ask the nodes whose parameters are not known, and print the live line."""
-        for node, parameters in list(self._unwritten.items()):
+        for node, parameters in self._nodes.items():
             self._guarded(node, parameters.update)
         if self._live:
             counts = {"messages": self._writer.count, "lost": sum(self._losses())}
             self._guarded("live state", self._live.write, counts)
 
-    def _guarded(self, name: str, function: Callable[..., Any], *args: Any) -> Any:
-        """Return the function's result; None after an exception, which is logged once for each `name`."""
+    def _guarded(self, name: str, function: Callable[..., object], *args: Any) -> None:
+        """Call the function; an exception is logged, once for each `name`."""
         try:
-            return function(*args)
+            function(*args)
         except Exception as error:
             if name not in self._failed:
                 self._failed.add(name)
                 self.get_logger().error(f"{name}: {type(error).__name__}: {error}; the rest is recorded")
-            return None
 
     def _losses(self) -> tuple[int, int]:
         """Return how many messages of joints and IMU did not arrive, and how many were not written."""
-        return sum(drain.lost for drain in self._drains), self._writer.lost
+        return sum(publishers.missed for publishers in self._counted), self._writer.lost
 
     def _report_losses(self) -> None:
         if (lost := self._losses()) != self._reported:
@@ -155,10 +146,12 @@ class Recorder(Node):
             self.get_logger().warning(f"messages lost so far: {lost[0]} did not arrive, {lost[1]} were not written")
 
     def _subscribe(self, topic: str, msgtype: type) -> None:
-        publishers = self.get_publishers_info_by_topic(topic)
-        offered = [publisher.qos_profile for publisher in publishers if publisher.node_name != REPEATER]
+        found = self.get_publishers_info_by_topic(topic)
+        others = [publisher for publisher in found if publisher.node_name != REPEATER]
+        named = [publisher for publisher in others if leaf(publisher.topic_type) == msgtype.__name__]
+        offered = [publisher.qos_profile for publisher in named]
         if not offered:
-            return  # a subscriber without a publisher; try again later
+            return  # a subscriber without a publisher, or a topic of another type; try again later
         reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
         latched = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
         # A recorder must not make the control loops' publishers wait for acknowledgements.
@@ -168,26 +161,29 @@ class Recorder(Node):
             reliability=ReliabilityPolicy.RELIABLE if acknowledged else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
-        self._writer.add_topic(topic, type_name(msgtype), offered_qos(reliable, latched, offered[0].depth or 1))
-        # Other topics have several publishers, each with its own numbers.
-        self._drains.append(Drain(self, msgtype, topic, qos, counts_lost=msgtype in (JointState, Imu, Vector3Stamped)))
+        self._writer.add_topic(topic, named[0].topic_type, offered_qos(reliable, latched, offered[0].depth or 1))
+        publishers = Publishers()
+        self._counted += [publishers] if msgtype in (JointState, Imu, Vector3Stamped) else []
+        self._topics[topic] = HotPath(self, msgtype, topic, partial(self._on_message, topic, publishers), qos, raw=True)
+
+    def _on_message(self, topic: str, publishers: Publishers, data: bytes, info: dict[str, Any]) -> None:
+        self._taken.append((topic, info["received_timestamp"], bytes(data)))
+        if leaf(topic) == STATES:
+            self._last_states = time.monotonic()
+        if self._live:
+            self._live.note(topic, data)
+        publishers.is_another(info)
 
     def _write_parameters(self, node: str, values: dict[str, Any]) -> None:
         # ROS's parameter files have no empty lists.
         given = {name: value for name, value in values.items() if value != []}
         text = yaml.safe_dump({node: {"ros__parameters": given}}, default_flow_style=None, width=120)
         self._write_text(PARAMETERS, text)
-        self._unwritten.pop(node).destroy()
+        self._nodes[node].destroy()
 
     def _write_text(self, topic: str, text: str) -> None:
         now = self.get_clock().now().nanoseconds
         self._writer.write([(topic, now, serialize_message(String(data=text)))])
-
-
-def type_name(msgtype: type) -> str:
-    """Return 'sensor_msgs/msg/JointState' for that class."""
-    package, kind, *_ = msgtype.__module__.split(".")
-    return f"{package}/{kind}/{msgtype.__name__}"
 
 
 class LiveLine:
@@ -204,16 +200,13 @@ class LiveLine:
         self._latest: dict[str, bytes] = {}
         self._status: dict[str, dict[str, Any]] = {}
 
-    def note(self, topic: str, messages: list[bytes]) -> None:
+    def note(self, topic: str, data: bytes) -> None:
         """Keep the newest message of a topic, and the newest status of each node."""
         if topic != content.DIAGNOSTICS:
-            self._latest[topic] = messages[-1]
+            self._latest[topic] = data
             return
-        for data in messages:
-            for status in deserialize_message(data, DiagnosticArray).status:
-                values = {pair.key: pair.value for pair in status.values}
-                level = int.from_bytes(status.level, "big")
-                self._status[status.name] = values | {"level": level, "message": status.message}
+        for status in deserialize_message(data, DiagnosticArray).status:
+            self._status[status.name] = status_values(status)
 
     def write(self, recorder: dict[str, int]) -> None:
         """Write the line to standard output."""

@@ -11,13 +11,12 @@ It only reads: nothing depends on it, and the arms run on if it ends.
 
 from __future__ import annotations
 
-import math
 import time
 from contextlib import suppress
 from typing import Any
 
 from builtin_interfaces.msg import Duration
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Point, Vector3Stamped
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -28,10 +27,10 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.tilt import gravity_in_trunk
 from exo_gravity.core.view.scene import ARROW, LINE, SPHERE, TEXT, ArmView, Shape, arm_shapes, gravity_shapes
 from exo_gravity.core.view.urdf import ROBOT_MODEL, ROOT, ArmDescription, described, joint_names, urdf
-from exo_gravity.nodes.ros.hot_path import LATCHED, NEWEST, HotPath
-from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics, by_name, to_nanoseconds
+from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics, Newest, by_name, status_values, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
+from exo_gravity.nodes.ros.subscriptions import LATCHED, NEWEST, HotPath
 
 DISCOVERY_PERIOD = 0.5  # s between two searches for arms
 MARKER_PERIOD = 0.1  # s
@@ -52,7 +51,8 @@ class RobotModel(Node):
         self._views: list[tuple[ViewedArm, ArmView]] = []
         self._described: dict[ViewedArm, ArmDescription] = {}
         self._problem = ""  # of the description
-        self._tilt, self._tilt_time = (0.0, 0.0), -math.inf
+        self._tilt = Newest()  # gravity in the trunk's axes
+        self._status: dict[str, Newest] = {}  # of each node
         self._diagnostics = Diagnostics(self)
         self._description = self.create_publisher(String, "robot_description", LATCHED)
         self._joint_states = self.create_publisher(JointState, "joint_states", 1)
@@ -70,26 +70,22 @@ class RobotModel(Node):
         for arm in self._arms.values():
             for parameters in arm.parameters:
                 parameters.update()
-        self._describe()
+        known = {arm: arm.description for _, arm in sorted(self._arms.items()) if arm.description}
+        if known != self._described:
+            self._described, self._problem = known, ""
+            try:
+                self._description.publish(String(data=urdf(list(known.values()), self._meshes)))
+            except ParameterError as error:
+                self._problem = str(error)
         problems = [self._problem, *(arm.problem for arm in self._arms.values())]
         problem = next(filter(None, problems), "" if self._arms else "waiting for a compensator")
         level, message = (WARN, problem) if problem else (OK, f"publishing {', '.join(sorted(self._arms))}")
         self._diagnostics.report(level, message, {"arms": len(self._arms), "shown": len(self._views)})
 
-    def _describe(self) -> None:
-        """Publish the description if what is known of the arms has changed."""
-        known = {arm: arm.description for _, arm in sorted(self._arms.items()) if arm.description}
-        if known == self._described:
-            return
-        self._described, self._problem = known, ""
-        try:
-            self._description.publish(String(data=urdf(list(known.values()), self._meshes)))
-        except ParameterError as error:
-            self._problem = str(error)
-
     def _publish_states(self) -> None:
         names = dict(zip(self._described, joint_names(list(self._described.values())), strict=True))
-        self._views = views = [(arm, view) for arm in self._described if (view := arm.view())]
+        found = ((arm, arm.view(self._status.get(arm.bridge, Newest()))) for arm in self._described)
+        self._views = views = [(arm, view) for arm, view in found if view]
         own_topic = self._joint_states.topic_name
         if not views or self._problem or own_topic in {arm.states_topic for arm in self._arms.values()}:
             return
@@ -106,8 +102,7 @@ class RobotModel(Node):
         self._tilts.poll()
         if not self._markers.get_subscription_count():
             return
-        fresh = time.monotonic() - self._tilt_time < STALE
-        groups = [("", gravity_shapes(gravity_in_trunk(*self._tilt) if fresh else None))]
+        groups = [("", gravity_shapes(self._tilt.within(STALE)))]
         groups += [(f"{view.arm.side}/", arm_shapes(view)) for _, view in self._views]
         markers = [marker(owner, n, shape) for owner, shapes in groups for n, shape in enumerate(shapes)]
         stamp = self.get_clock().now().to_msg()
@@ -116,12 +111,11 @@ class RobotModel(Node):
         self._markers.publish(MarkerArray(markers=markers))
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            for arm in self._arms.values():
-                arm.note(status)
+        now = time.monotonic()
+        self._status.update({status.name: Newest(status_values(status), now) for status in message.status})
 
     def _on_tilt(self, message: Vector3Stamped, _info: dict[str, Any]) -> None:
-        self._tilt, self._tilt_time = (message.vector.y, message.vector.x), time.monotonic()
+        self._tilt = Newest(gravity_in_trunk(message.vector.y, message.vector.x), time.monotonic())
 
 
 class ViewedArm:
@@ -133,27 +127,19 @@ class ViewedArm:
         self.problem = f"waiting for the parameters of {namespace}/compensator and {namespace}/can_bridge"
         self.states_topic = f"{namespace}/joint_states"
         self.states = JointState()
-        self._bridge = f"{namespace}/can_bridge".lstrip("/")
-        self._status, self._status_time = ("", ""), -math.inf
-        self._time = -math.inf
+        self.bridge = f"{namespace}/can_bridge".lstrip("/")
+        self._arrived = Newest()
         self.parameters = [
             NodeParameters(node, f"{namespace}/{leaf}", self._on_values) for leaf in ("compensator", "can_bridge")
         ]
         self._subscription = HotPath(node, JointState, self.states_topic, self._on_states, NEWEST)
 
-    def note(self, status: DiagnosticStatus) -> None:
-        """Keep the status of this arm's bridge; ignore any other."""
-        if status.name == self._bridge:
-            state = next((pair.value for pair in status.values if pair.key == "state"), "")
-            self._status, self._status_time = (state, status.message), time.monotonic()
-
-    def view(self) -> ArmView | None:
-        """Return what is known of the arm now; None without a description or a fresh reading."""
+    def view(self, status: Newest) -> ArmView | None:
+        """Return what is known of the arm now; None without a description or a fresh reading. status: its bridge's."""
         self._subscription.poll()
-        now = time.monotonic()
         if self.description is None:
             return None
-        self.problem = "" if now - self._time < STALE else f"no messages on {self.states_topic}"
+        self.problem = "" if self._arrived.within(STALE) else f"no messages on {self.states_topic}"
         try:
             names = self.description.limits.joint_names
             fields = ("position", "velocity", "effort")
@@ -162,18 +148,18 @@ class ViewedArm:
             self.problem = self.problem or f"{self.states_topic}: {error.name} must be {error.expected}"
         if self.problem:
             return None
-        status = self._status if now - self._status_time < STALE_STATE else ("", "")
-        return ArmView(self.description, theta, velocity, effort, *status)
+        values = status.within(STALE_STATE) or {}
+        return ArmView(self.description, theta, velocity, effort, values.get("state", ""), values.get("message", ""))
 
     def _on_states(self, message: JointState, _info: dict[str, Any]) -> None:
-        self.states, self._time = message, time.monotonic()
+        self.states, self._arrived = message, Newest(True, time.monotonic())
 
     def _on_values(self, _values: object) -> None:
         try:
             with suppress(KeyError):  # one of them has not answered yet, or is of another kind of arm
                 self.description = described(*(parameters.values for parameters in self.parameters))
         except ParameterError as error:
-            self.problem = f"{self._bridge.rpartition('/')[0] or 'arm'}: {error}"
+            self.problem = f"{self.bridge.rpartition('/')[0] or 'arm'}: {error}"
 
 
 def marker(owner: str, number: int, shape: Shape) -> Marker:

@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -22,11 +24,6 @@ HELD_BY, NOBODY = "control held by", "nobody"  # key in can_bridge's status; val
 LATE_TILT = "late tilt"  # frame_id of efforts that are computed from one
 
 PERIOD = 0.45  # s; a little less than a multiple of the nodes' timer periods, which jitter
-
-
-def to_time(nanoseconds: int) -> Time:
-    """Return the stamp of `nanoseconds`."""
-    return Time(sec=nanoseconds // 1_000_000_000, nanosec=nanoseconds % 1_000_000_000)
 
 
 def to_nanoseconds(stamp: Time) -> int:
@@ -59,6 +56,18 @@ def velocity_of(message: JointState, names: Sequence[str], exact: bool = True) -
         return by_name(message, "velocity", names, exact)
     except ParameterError:
         return None
+
+
+@dataclass(frozen=True)
+class Newest:
+    """The newest message of one kind, or what is used of it."""
+
+    content: Any = None
+    time: float = -math.inf  #: monotonic s of its arrival
+
+    def within(self, timeout: float) -> Any:
+        """Return the content; None if it is older than `timeout` s."""
+        return self.content if time.monotonic() - self.time < timeout else None
 
 
 class Diagnostics:
@@ -97,6 +106,12 @@ class Diagnostics:
                 logger.warning(message)
             else:
                 logger.error(message)
+
+
+def status_values(status: DiagnosticStatus) -> dict[str, Any]:
+    """Return the values of a status by key, with its `level` as a number and its `message`."""
+    values = {pair.key: pair.value for pair in status.values}
+    return values | {"level": int.from_bytes(status.level, "big"), "message": status.message}
 
 
 def row(values: Iterable[float], digits: int = 3) -> str:

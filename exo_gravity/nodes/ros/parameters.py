@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.task import Future
 
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS
 from exo_gravity.core.params import Param, values_of
+
+T = TypeVar("T")
 
 ANSWER_TIMEOUT = 5.0  # s after which a request to a node that has died is repeated
 
@@ -35,11 +38,23 @@ def declare(node: Node, table: Sequence[Param], free_prefix: str = "") -> dict[s
     return values
 
 
-def values_after(node: Node, table: Sequence[Param], changes: Sequence[Parameter] = ()) -> dict[str, Any]:
-    """Return the values of the table by name as they would be after `changes`, or raise ParameterError."""
-    values = {param.name: node.get_parameter(param.name).value for param in table}
-    values.update({change.name: change.value for change in changes})
-    return values_of(table, {name: plain(value) for name, value in values.items()})
+def accept_changes(
+    node: Node, table: Sequence[Param], read: Callable[[dict[str, Any]], T], apply: Callable[[T], object]
+) -> None:
+    """From now on, `apply` what `read` makes of the table's values after a change; its ParameterError refuses that."""
+    accepted: list[T] = []
+
+    def check(changes: list[Parameter]) -> SetParametersResult:
+        values = {param.name: node.get_parameter(param.name).value for param in table}
+        values.update({change.name: change.value for change in changes})
+        try:
+            accepted[:] = [read(values_of(table, {name: plain(value) for name, value in values.items()}))]
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(check)
+    node.add_post_set_parameters_callback(lambda _changes: apply(*accepted))
 
 
 def bus_of(node: Node, values: dict[str, Any]) -> tuple[str, str, dict[str, Any]]:
@@ -52,7 +67,7 @@ def descriptor_of(param: Param) -> ParameterDescriptor:
     """Return the descriptor that `ros2 param describe` shows."""
     unit = f" [{param.unit}]" if param.unit else ""
     first = param.default[0] if isinstance(param.default, list) and param.default else param.default
-    # A whole number is accepted for a float, as in `ros2 param set ... support 1`; `values_after` checks the type.
+    # A whole number is accepted for a float, as in `ros2 param set ... support 1`; `accept_changes` checks the type.
     descriptor = ParameterDescriptor(
         description=f"{param.description}{unit}", read_only=param.fixed, dynamic_typing=isinstance(first, float)
     )
@@ -74,27 +89,18 @@ class NodeParameters:
     """The parameters of another node, in `values` once they are known.
 
     name: its full name, or its name in `node`'s namespace. on_change: called with `values` on the executor's thread
-    each time that they were read. names: of the parameters to read, all by default; `values` is empty if the node lacks
-    one of them. clock: monotonic s.
+    each time that they were read.
     """
 
     def __init__(
-        self,
-        node: Node,
-        name: str,
-        on_change: Callable[[dict[str, Any]], object] = lambda values: None,
-        names: Sequence[str] = (),
-        clock: Callable[[], float] = time.monotonic,
+        self, node: Node, name: str, on_change: Callable[[dict[str, Any]], object] = lambda values: None
     ) -> None:
         self.values: dict[str, Any] = {}
         self.is_present = False  #: whether it has its services; a node that has died can stay in ROS's list of names
         self._node = node
         self._on_change = on_change
-        self._names = names
-        self._clock = clock
         self._get = node.create_client(GetParameters, f"{name}/get_parameters")
-        self._list = None if names else node.create_client(ListParameters, f"{name}/list_parameters")
-        self._clients = [self._get] if self._list is None else [self._get, self._list]
+        self._list = node.create_client(ListParameters, f"{name}/list_parameters")
         self._due = -math.inf  # s, when to ask; infinite while the values are known
         self._is_destroyed = False
 
@@ -106,36 +112,31 @@ class NodeParameters:
         """Read the parameters if they may have changed and the node answers. Call it on the executor's thread."""
         if self._is_destroyed:
             return
-        self.is_present = all(client.service_is_ready() for client in self._clients)
+        self.is_present = self._get.service_is_ready() and self._list.service_is_ready()
+        now = time.monotonic()
         if not self.is_present:
             self._due = -math.inf  # it may return with other values
-            return
-        now = self._clock()
-        if now >= self._due:
+        elif now >= self._due:
             self._due = now + ANSWER_TIMEOUT
-            if self._list is None:
-                self._request(self._names)
-            else:
-                listed = self._list.call_async(ListParameters.Request())
-                listed.add_done_callback(lambda done: self._request(done.result().result.names))
+            self._list.call_async(ListParameters.Request()).add_done_callback(self._on_names)
 
     def destroy(self) -> None:
         """Remove the clients; answers that are still on their way are ignored."""
         self._is_destroyed = True
-        for client in self._clients:
-            self._node.destroy_client(client)
+        self._node.destroy_client(self._get)
+        self._node.destroy_client(self._list)
 
-    def _request(self, names: Sequence[str]) -> None:
+    def _on_names(self, listed: Future) -> None:
         if not self._is_destroyed:
-            asked = self._get.call_async(GetParameters.Request(names=list(names)))
+            names = listed.result().result.names
+            asked = self._get.call_async(GetParameters.Request(names=names))
             asked.add_done_callback(lambda done: self._on_values(names, done))
 
-    def _on_values(self, names: Sequence[str], future: Future) -> None:
+    def _on_values(self, names: Sequence[str], asked: Future) -> None:
         if self._is_destroyed:
             return
         if math.isfinite(self._due):  # else they have changed since
             self._due = math.inf
-        values = map(parameter_value_to_python, future.result().values)
-        known = {name: plain(value) for name, value in zip(names, values, strict=False) if value is not None}
-        self.values = known if not self._names or len(known) == len(names) else {}
+        values = map(parameter_value_to_python, asked.result().values)
+        self.values = {name: plain(value) for name, value in zip(names, values, strict=False) if value is not None}
         self._on_change(self.values)

@@ -22,7 +22,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from exo_gravity.core.errors import ExoGravityError
-from exo_gravity.hardware.scheduling import favour
+from exo_gravity.hardware.clock import favour
 
 NEEDED_CHECK_PERIOD = 0.1  # s
 CLOSE_TIMEOUT = 5  # s for the middleware to close
@@ -106,14 +106,11 @@ def run(make_node: Callable[[], Node], priority: int = 0) -> int:
 def handle_signals(ending: list[int]) -> None:
     """Let each signal that ends the node be appended to `ending`.
 
-    A terminal sends Ctrl-C, and SIGHUP when it is closed, to all nodes of a launch file at once; those that a bridge
-    needs wait for SIGTERM, or for the end of `ros2 launch`. A SIGHUP that is ignored, as nohup does, stays ignored.
+    A SIGHUP that is ignored, as nohup does, stays ignored.
     """
-    waits = bool(os.environ.get("EXO_GRAVITY_IGNORE_SIGINT"))
-    signal.signal(signal.SIGTERM, lambda received, _: ending.append(received))
-    for number in (signal.SIGINT, signal.SIGHUP):
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, signal.SIG_IGN if waits else lambda received, _: ending.append(received))
+            signal.signal(number, lambda received, _: ending.append(received))
 
 
 def _end_with_launcher(node: Node, ending: list[int]) -> None:

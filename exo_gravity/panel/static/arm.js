@@ -2,7 +2,7 @@
 
 import { degrees, finite, has, number, t, translate, write } from "./texts.js";
 
-const SIGNS = { disabled: "○", checking: "◔", "proving signs": "◑", "ramping in": "◕", active: "●", "letting down": "▼", fault: "✖", silent: "?" };
+const SIGNS = { disabled: "○", checking: "◔", "proving signs": "◑", "ramping in": "◕", active: "●", "letting down": "▼", fault: "✖", silent: "?", unseen: "?" };
 const PAUSE = 300; // ms without a move of the slider after which its support is asked for
 const SETTLING = 2000; // ms after that until the parameters in force are known again
 const CARRIED = ["proving signs", "ramping in", "active"];
@@ -47,6 +47,17 @@ export class ArmCard {
 
   armText() {
     return has(`arm.${this.name}`) ? t(`arm.${this.name}`) : this.name;
+  }
+
+  get state() {
+    return this.find(".badge").dataset.state;
+  }
+
+  // State, mode and support in one line.
+  summary() {
+    const head = this.find("h2").textContent;
+    const mode = this.mode === "zero_g" ? `Zero-G, ${number(100 * this.support, 0)} %` : "One-G";
+    return `${this.find(".sign").textContent} ${head}: ${this.find(".state").textContent} · ${mode}`;
   }
 
   get support() {
@@ -107,7 +118,7 @@ export class ArmCard {
   // The state, ten times a second.
   show(state, operates, alive) {
     const bridge = alive ? state.bridge : null;
-    const name = bridge ? bridge.state || "disabled" : "silent";
+    const name = bridge ? bridge.state || "disabled" : alive ? "silent" : "unseen";
     const badge = this.find(".badge");
     badge.dataset.state = name;
     write(this.find(".sign"), SIGNS[name] ?? "?");
@@ -118,7 +129,7 @@ export class ArmCard {
     this.showRemedy(bridge);
     write(this.find(".detail"), bridge?.message ? t("detail", bridge.message) : "");
     const other = alive ? state.compensator : null;
-    write(this.find(".compensator"), other ? (other.level ? t("compensator_detail", other.message) : t("carried", other["mass carried (kg)"])) : t("compensator_silent"));
+    write(this.find(".compensator"), other ? (other.level ? t("compensator_detail", other.message) : t("carried", number(finite(other["mass carried (kg)"]), 2))) : alive ? t("compensator_silent") : "");
     this.limit = finite(other?.["largest support"]);
     this.root.classList.toggle("stale", !alive);
     this.find(".enable").disabled = !operates || name !== "disabled";
@@ -154,7 +165,7 @@ export class ArmCard {
   }
 
   get isCarried() {
-    return CARRIED.includes(this.find(".badge").dataset.state);
+    return CARRIED.includes(this.state);
   }
 }
 

@@ -109,7 +109,7 @@ function onState(message) {
   show();
   if (!document.hidden) {
     plots.add(message.arms);
-    picture.pose(message.arms, message.tilt, setup?.arms ?? {});
+    picture.pose(message.arms, message.tilt, setup?.arms ?? {}, targetOf(message.trial));
   }
 }
 
@@ -118,11 +118,34 @@ function show() {
   const operates = link.alive && state.control?.page === link.number;
   for (const [name, card] of cards) if (state.arms[name]) card.show(state.arms[name], operates, link.alive);
   byId("no-arm").hidden = cards.size > 0;
+  showBar();
   showConnection();
   showControl(operates);
   sections.show(state, operates);
   const tilt = state.tilt;
   write(byId("tilt"), tilt ? t("tilt", number((tilt.pitch * 180) / Math.PI, 1), number((tilt.roll * 180) / Math.PI, 1)) : t("tilt_none"));
+}
+
+// The bar that stays in sight: each arm in a few words, and whether a recording runs.
+function showBar() {
+  const chips = byId("chips");
+  while (chips.children.length > cards.size) chips.lastElementChild.remove();
+  while (chips.children.length < cards.size) chips.append(Object.assign(document.createElement("li"), { className: "badge" }));
+  [...cards.values()].forEach((card, n) => {
+    chips.children[n].dataset.state = card.state;
+    write(chips.children[n], card.summary());
+  });
+  const off = link.alive && cards.size > 0 && [...cards.values()].every((card) => card.state === "disabled");
+  byId("let-down").toggleAttribute("data-off", off);
+  write(byId("let-down-hint"), t(off ? "let_down_off" : "let_down_hint"));
+  byId("light").hidden = !(link.alive && (state.recording.on || state.recording.foreign));
+  byId("simulated").hidden = !Object.values(setup.arms ?? {}).some((arm) => arm.simulated);
+}
+
+// The pose to which the running step of a trial leads the arms; null without one.
+function targetOf(trial) {
+  const step = trial.phase === "running" ? trial.steps?.[trial.step] : null;
+  return step?.action === "move" ? step.value : null;
 }
 
 function showConnection() {

@@ -8,6 +8,7 @@ import { t } from "./texts.js";
 
 const VIEWS = { oblique: [1.5, -0.9, 0.35], front: [1.85, 0, 0], side: [0, -1.85, 0] };
 const CENTRE = [0, 0, -0.27];
+const GHOST = [0.04, 0.31, 0.62, 0.3]; // red, green, blue, opacity
 
 export class Picture {
   constructor(place, views) {
@@ -67,30 +68,39 @@ export class Picture {
 
   // robot: the root element of the URDF
   build(robot) {
+    for (const old of [this.arms, this.ghost]) if (old) dispose(old.trunk);
+    this.arms = this.assemble(robot);
+    this.ghost = this.assemble(robot, GHOST);
+    this.ghost.trunk.visible = false;
+    for (const one of [this.arms, this.ghost]) this.scene.add(one.trunk);
+    this.render();
+  }
+
+  // Returns the trunk with all that hangs on it, and its joints by name; in one colour, where one is given.
+  assemble(robot, colour) {
     const T = this.three;
-    if (this.trunk) dispose(this.trunk);
     const named = (tag) => [...robot.children].filter((part) => part.tagName === tag);
     const frames = Object.fromEntries(named("link").map((link) => [link.getAttribute("name"), new T.Group()]));
-    const colours = Object.fromEntries(named("material").map((material) => [material.getAttribute("name"), numbers(material, "color", "rgba")]));
+    const colours = Object.fromEntries(named("material").map((material) => [material.getAttribute("name"), colour ?? numbers(material, "color", "rgba")]));
     for (const link of named("link"))
       for (const visual of link.querySelectorAll("visual")) frames[link.getAttribute("name")].add(this.shape(visual, colours));
-    this.joints = {};
+    const joints = {};
     for (const joint of named("joint")) {
       const child = frames[joint.querySelector("child").getAttribute("link")];
       const parent = frames[joint.querySelector("parent").getAttribute("link")];
       setPose(child, joint);
       parent.add(child);
-      if (joint.querySelector("axis")) this.joints[joint.getAttribute("name")] = this.joint(joint, parent, child);
+      if (joint.querySelector("axis")) joints[joint.getAttribute("name")] = this.joint(joint, parent, child, !colour);
     }
-    this.trunk = frames[robot.querySelector("joint > parent").getAttribute("link")];
-    this.scene.add(this.trunk);
-    this.render();
+    return { trunk: frames[robot.querySelector("joint > parent").getAttribute("link")], joints };
   }
 
-  // A joint turns its child, and has a bar for its torque and an arc from limit to limit.
-  joint(joint, parent, child) {
+  // A joint turns its child. Where it is marked, it has a bar for its torque and an arc from limit to limit.
+  joint(joint, parent, child, marked) {
     const T = this.three;
     const axis = new T.Vector3(...numbers(joint, "axis", "xyz"));
+    const start = new T.Quaternion().copy(child.quaternion);
+    if (!marked) return { child, axis, start };
     const [lower] = numbers(joint, "limit", "lower");
     const [upper] = numbers(joint, "limit", "upper");
     const bar = new T.Mesh(new T.CylinderGeometry(0.014, 0.014, 1, 12), new T.MeshLambertMaterial({ color: 0xa61218 }));
@@ -103,7 +113,7 @@ export class Picture {
     fixed.position.copy(child.position);
     fixed.add(arc, bar);
     parent.add(fixed);
-    return { child, axis, bar, start: new T.Quaternion().copy(child.quaternion) };
+    return { child, axis, bar, start };
   }
 
   shape(visual, colours) {
@@ -122,21 +132,27 @@ export class Picture {
     return mesh;
   }
 
-  pose(arms, tilt, setups) {
-    if (!this.renderer || !this.joints) return;
-    const T = this.three;
+  // target: rad, the pose to which a trial leads the arms: the ghost shows it.
+  pose(arms, tilt, setups, target) {
+    if (!this.renderer || !this.arms) return;
     for (const [arm, state] of Object.entries(arms))
       (state.joints ?? []).forEach((joint, n) => {
-        const part = this.joints[joint.name];
+        const part = this.arms.joints[joint.name];
         if (!part) return;
-        part.child.quaternion.copy(part.start).multiply(new T.Quaternion().setFromAxisAngle(part.axis, joint.position));
+        this.turn(part, joint.position);
+        if (target) this.turn(this.ghost.joints[joint.name], target[n]);
         const share = (joint.effort ?? 0) / (setups[arm]?.max_effort?.[n] || 1);
         part.bar.scale.y = Math.max(0.001, 0.25 * Math.abs(share));
         part.bar.position.copy(part.axis).multiplyScalar(0.125 * share);
       });
     // pitch: forward, about y; roll: to the right, about x
-    if (tilt) this.trunk.rotation.set(tilt.roll, tilt.pitch, 0, "ZYX");
+    if (tilt) for (const one of [this.arms, this.ghost]) one.trunk.rotation.set(tilt.roll, tilt.pitch, 0, "ZYX");
+    this.ghost.trunk.visible = Boolean(target);
     this.render();
+  }
+
+  turn(part, angle) {
+    part.child.quaternion.copy(part.start).multiply(new this.three.Quaternion().setFromAxisAngle(part.axis, angle));
   }
 
   render() {

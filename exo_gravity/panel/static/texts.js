@@ -16,7 +16,8 @@ export async function loadTexts(onChange) {
     localStorage.setItem("language", select.value);
     use(select.value, codes);
   });
-  return (preferred) => use(localStorage.getItem("language") || preferred, codes);
+  const browser = navigator.languages.map((tag) => tag.slice(0, 2)).find((code) => codes.includes(code));
+  return (preferred) => use(localStorage.getItem("language") || (codes.includes(preferred) ? preferred : browser ?? codes[0]), codes);
 }
 
 function use(code, codes) {

@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from statistics import fmean
-from typing import TypeVar
 
 from rich.table import Table
 
@@ -30,7 +29,6 @@ from exo_gravity.tools.calibration.result import CalibrationResult, Change
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.inputs.parameter_file import load
 
-Rest = TypeVar("Rest")
 Clock = Callable[[], float]
 Wait = Callable[[str, Callable[[], Table]], None]
 """(request, watch): shows the request and calls watch() for the table to show, until the person has done it."""
@@ -58,16 +56,11 @@ def calibrate_motors(options: argparse.Namespace, arm: ConfiguredArm, say: Say) 
 
     Raises BusError if the bus cannot be used.
     """
-    given = load(options.params)[f"{arm.namespace}/can_bridge"]
-    prefix = f"{OPTIONS}."
+    given, prefix = load(options.params)[f"{arm.namespace}/can_bridge"], f"{OPTIONS}."
     can_options = {name.removeprefix(prefix): value for name, value in given.items() if name.startswith(prefix)}
-    with BusScan((given["can.interface"], given["can.channel"], can_options)) as bus:
-        say(f"Asking IDs 1 to {MAX_CAN_ID} on {given['can.channel']}: nothing moves")
+    with BusScan((arm.can_bridge["can.interface"], arm.can_bridge["can.channel"], can_options)) as bus:
+        say(f"Asking IDs 1 to {MAX_CAN_ID} on {bus.name}: nothing moves")
         return MotorSearch(bus, arm, options.wait, say).result(options.pose)
-
-
-class UnclearError(DataError):
-    """What the person did does not show what was asked for: they are asked once more."""
 
 
 class MotorSearch:
@@ -98,12 +91,14 @@ class MotorSearch:
             problems = (*problems, f"{count}: check power, plugs, terminators and the bit rate")
         if problems:
             raise DataError("; ".join(problems))
-        where = "" if not any(pose) else f"{' '.join(f'{angle:g}' for angle in pose)} deg"
         for name, motion in zip(arm.joint_names, MOTIONS, strict=True):
-            self._repeat(partial(self._find, name, motion))
+            self._watch(f"{name}: {motion}, by 30 degrees or so, and back", partial(self._found_by, name))
         ids, directions = list(self._found), [direction for _, direction in self._found.values()]
-        request = f"bring the arm to {where}" if where else "let the arm hang"
-        angles, unrest = self._repeat(partial(self._at_rest, request))
+        where = f"{' '.join(f'{angle:g}' for angle in pose)} deg" if any(pose) else ""
+        rest = f"bring the arm to {where}" if where else "let the arm hang"
+        self._watch(f"{rest}, hands off, until it is still", self._unrest)
+        angles = [fmean(self._angles[can_id]) for can_id in ids]
+        unrest = max(max(self._angles[can_id]) - min(self._angles[can_id]) for can_id in ids)
         zeros = [a - d * math.radians(p) for a, d, p in zip(angles, directions, pose, strict=True)]
         survival, jumps = self._after_power_up(angles)
         node, formats = f"{arm.namespace}/can_bridge", [self._last[can_id].wire_format for can_id in ids]
@@ -124,22 +119,22 @@ class MotorSearch:
                 impossible.append(f"{name}: {error}: {SET_ZERO}")
         return CalibrationResult(changes, (*lines, survival), (*impossible, *jumps), arm)
 
-    def _repeat(self, attempt: Callable[[], Rest]) -> Rest:
-        """Return what `attempt` returns; ask once more while it is unclear, ATTEMPTS times in all."""
-        for _ in range(ATTEMPTS - 1):
-            try:
-                return attempt()
-            except UnclearError as error:
-                self._say(f"{error}; once more, please")
-        return attempt()
+    def _watch(self, request: str, unclear: Callable[[], str] = str) -> None:
+        """Let the person do what is requested, and keep what all motors answer meanwhile.
 
-    def _watch(self, request: str) -> None:
-        """Let the person do what is requested, and keep what all motors answer meanwhile."""
-        self._angles = {can_id: [] for can_id in self._last}
-        self._answered, self._was_silent = dict.fromkeys(self._last, self._clock()), set()
-        self._poll()
-        self._wait(request, self._poll)
-        self._poll()
+        unclear: returns why that does not show what was asked for, or ''. Raises DataError after ATTEMPTS.
+        """
+        for left in reversed(range(ATTEMPTS)):
+            self._angles = {can_id: [] for can_id in self._last}
+            self._answered, self._was_silent = dict.fromkeys(self._last, self._clock()), set()
+            self._poll()
+            self._wait(request, self._poll)
+            self._poll()
+            if not (why := unclear()):
+                return
+            if not left:
+                raise DataError(why)
+            self._say(f"{why}; once more, please")
 
     def _poll(self) -> Table:
         answers = self._bus.poll(list(self._last))
@@ -173,30 +168,27 @@ class MotorSearch:
             )
         return table
 
-    def _find(self, name: str, motion: str) -> None:
-        """Find the motor of the joint `name`, and its direction. Raises UnclearError."""
-        self._watch(f"{name}: {motion}, by 30 degrees or so, and back")
+    def _found_by(self, name: str) -> str:
+        """Take the motor that turned most for that of the joint `name`; return why none can be taken, or ''."""
         ways = []
         for can_id, angles in self._angles.items():
             turns = [math.degrees(angle - angles[0]) for angle in angles] or [0.0]
             ways.append((max(turns, key=abs), min(max(turns), -min(turns)), can_id))
         (other, _, second), (turn, back, most) = sorted(ways, key=lambda way: abs(way[0]))[-2:]
-        why = ""
         if self._was_silent:
-            why = f"motor {min(self._was_silent)} did not answer while the arm was moved: check its plug"
-        elif abs(turn) < MIN_TURN:
-            why = f"no motor turned by {MIN_TURN:g} degrees; motor {most} by {abs(turn):.1f}"
-        elif abs(other) > MAX_OTHER * abs(turn):
+            return f"{name}: motor {min(self._was_silent)} did not answer while the arm was moved: check its plug"
+        if abs(turn) < MIN_TURN:
+            return f"{name}: no motor turned by {MIN_TURN:g} degrees; motor {most} by {abs(turn):.1f}"
+        if abs(other) > MAX_OTHER * abs(turn):
             both = f"{abs(turn):.0f} and {abs(other):.0f} degrees"
-            why = f"motors {most} and {second} both turned, by {both}: move one joint alone"
-        elif back > MAX_BACK * abs(turn):
-            why = f"motor {most} turned both ways: move the joint in one direction only"
-        elif most in self._found:
-            why = f"motor {most} turned, which is that of {self._found[most][0]}"
-        if why:
-            raise UnclearError(f"{name}: {why}")
+            return f"{name}: motors {most} and {second} both turned, by {both}: move one joint alone"
+        if back > MAX_BACK * abs(turn):
+            return f"{name}: motor {most} turned both ways: move the joint in one direction only"
+        if most in self._found:
+            return f"{name}: motor {most} turned, which is that of {self._found[most][0]}"
         self._found[most] = name, 1 if turn > 0.0 else -1
         self._say(f"{name}: motor {most}, direction {self._found[most][1]:+d}")
+        return ""
 
     def _sample(self) -> list[list[float]]:
         """Return the angles of the arm's motors in REST_SAMPLES polls from now on, in rad."""
@@ -205,17 +197,14 @@ class MotorSearch:
             self._poll()
         return [self._angles[can_id] for can_id in self._found]
 
-    def _at_rest(self, request: str) -> tuple[list[float], float]:
-        """Return the motor angles (4,) of the arm at rest and their spread in rad. Raises UnclearError without rest."""
-        self._watch(f"{request}, hands off, until it is still")
-        angles, unrest, moved = self._sample(), 0.0, ""
-        for (can_id, (name, _)), column in zip(self._found.items(), angles, strict=True):
-            if len(column) < REST_SAMPLES // 2:
-                raise UnclearError(f"motor {can_id} did not answer: check its plug")
-            unrest, moved = max((unrest, moved), (max(column) - min(column), name))
-        if unrest > MAX_UNREST:
-            raise UnclearError(f"{moved} moved by {math.degrees(unrest):.1f} degrees: the arm must be still")
-        return [fmean(column) for column in angles], unrest
+    def _unrest(self) -> str:
+        """Sample the arm at rest; return why it is not at rest, or ''."""
+        for (can_id, (name, _)), angles in zip(self._found.items(), self._sample(), strict=True):
+            if len(angles) < REST_SAMPLES // 2:
+                return f"motor {can_id} did not answer: check its plug"
+            if (moved := max(angles) - min(angles)) > MAX_UNREST:
+                return f"{name} moved by {math.degrees(moved):.1f} degrees: the arm must be still"
+        return ""
 
     def _after_power_up(self, before: Sequence[float]) -> tuple[str, list[str]]:
         """Return whether the angles survive a power-up, as a note, and the reasons why not."""
@@ -232,8 +221,7 @@ class MotorSearch:
                 turns = round(away / turn)
                 is_turn = turns and abs(away - turns * turn) < SAME_ANGLE
                 cause = f"{turns:+d} rotor turns" if is_turn else "no whole number of rotor turns"
-                refusals.append(
-                    f"{name}: {math.degrees(away):+.0f} degrees off after the power-up, {cause}: {SET_ZERO}"
-                )
+                off = f"{math.degrees(away):+.0f} degrees off after the power-up"
+                refusals.append(f"{name}: {off}, {cause}: {SET_ZERO}")
         unchecked = f"{UNCHECKED}: hang the arm each time the motors are switched on"
         return "the same after a power-up with the arm hanging" if is_checked else unchecked, refusals

@@ -8,48 +8,37 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from exo_gravity.core.calibration.identification import Identified, Observation, columns
+from exo_gravity.core.calibration.motion import FrictionCurve
 from exo_gravity.core.model.moments import load_moments, moments_of, regressor
 from exo_gravity.core.numbers import Vector
-from exo_gravity.tools.calibration.result import CalibrationResult, Curve, plain, value_text
+from exo_gravity.tools.calibration.result import CalibrationResult, plain, value_text
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.reporting import html
 from exo_gravity.tools.reporting.html import FAINT, HOLD_COLOUR, INK, JOINT_COLOURS, make_plain
 
 DPI = 130
 FIGURE_WIDTH = 11.0  # inches
-ROOM = 0.08  # of the data's range, around it
 SMALL_FRICTION = 0.2  # of the friction that was measured: a well-run-in gear
 
 
-class TorqueTable(NamedTuple):
-    """One row per pose, n in all, one column per joint, in Nm as commanded."""
+def remainders(found: Identified, arm: ConfiguredArm, poses: Sequence[Observation]) -> tuple[np.ndarray, ...]:
+    """Return measured minus predicted torque (n, 4) in Nm as commanded, and which of the poses (n,) were used.
 
-    theta: np.ndarray  #: (n, 4) rad
-    measured: np.ndarray  #: (n, 4), the effort that holds the arm
-    spread: np.ndarray  #: (n, 4), its standard error
-    before: np.ndarray  #: (n, 4), as the old file predicts
-    after: np.ndarray  #: (n, 4), as the new file predicts, which cannot hold the motors' constant offset
-    held_out: np.ndarray  #: (n, 4), measured minus predicted by a result that was found without that pose
-    friction: np.ndarray  #: (4,)
-    used: np.ndarray  #: (n,), false for poses left out
-
-    @classmethod
-    def of(cls, found: Identified, arm: ConfiguredArm, poses: Sequence[Observation]) -> TorqueTable:
-        """Return the table of what was identified of `arm` from `poses`."""
-        theta, direction, measured, spread = columns(poses)
-        loads = np.array([load_moments(arm.robot.length, pose.load_mass, pose.load_lever) for pose in poses])
-        moments = moments_of(arm.robot) + loads
-        before = np.einsum("njk,nk->nj", regressor(theta, direction, arm.robot.gravity), moments)
-        after, held_out = measured - found.residual - found.offset, found.held_out + found.offset
-        used = ~np.isin(np.arange(len(poses)), [index for index, _ in found.rejected])
-        return cls(theta, measured, spread, before, after, held_out, found.friction, used)
+    Predicted by the old file; by the new one, which cannot hold the motors' constant offset; and by a result that was
+    found without that pose.
+    """
+    theta, direction, measured, _ = columns(poses)
+    loads = np.array([load_moments(arm.robot.length, pose.load_mass, pose.load_lever) for pose in poses])
+    rows = regressor(theta, direction, arm.robot.gravity)
+    old = measured - np.einsum("njk,nk->nj", rows, moments_of(arm.robot) + loads)
+    used = ~np.isin(np.arange(len(poses)), [index for index, _ in found.rejected])
+    return old, found.residual + found.offset, found.held_out + found.offset, used
 
 
 def page_of(result: CalibrationResult, command: str, params: str, today: datetime.date | None = None) -> str:
@@ -60,37 +49,34 @@ def page_of(result: CalibrationResult, command: str, params: str, today: datetim
 
 
 def _sections(result: CalibrationResult) -> Iterator[str]:
-    labels = result.arm.joint_names if result.arm else tuple(f"joint {n}" for n in (1, 2, 3, 4))
     refused = "Not calibrated; no file was written."
     yield html.verdict(refused if result.refusals else "Calibrated.", result.refusals, good=not result.refusals)
     found = result.identified
     unknown = found.unknown if found else ()
     yield html.bullets("Result", [line for line in result.lines if line not in unknown])
-    if result.changes and not result.refusals:
+    rows = [(c.node, c.name, value_text(plain(c.value)), c.note) for c in result.changes if c.name]
+    if rows and not result.refusals:
         yield html.heading("New values")
-        rows = ((c.node, c.name, value_text(plain(c.value)), c.note) for c in result.changes if c.name)
         yield html.table(("node", "parameter", "value", "note"), [((), rows)])
     if found and result.arm:
-        table = TorqueTable.of(found, result.arm, result.observations)
-        caption = "Predicted against measured torque: on the line, the file is right."
-        yield html.picture(html.png_of(prediction_figure(table, labels), DPI), caption)
-        caption = "The torque that remains in each pose. Inside the band, friction holds the arm; outside, it creeps."
-        yield html.picture(html.png_of(remainder_figure(table, labels), DPI), caption)
-        yield html.bullets("Drift to expect", _drift(table))
+        line = "Predicted against measured torque: on the line, the file is right"
+        caption = f"{line}. What remains in each pose: inside the band, friction holds the arm; outside, it creeps."
+        yield html.picture(html.png_of(torque_figure(found, result.arm, result.observations), DPI), caption)
+        yield html.bullets("Drift to expect", _drift(found, *remainders(found, result.arm, result.observations)))
         values = " ".join(f"{value:.3g}" for value in found.singular_values)
         yield html.bullets("What these poses do not show", [*unknown, f"Singular values of the information: {values}"])
     if result.suggestion is not None:
         yield html.bullets("Next best pose, if more is wanted", [f"{_degrees(result.suggestion)} degrees"])
-    if result.curves:
+    if result.curves and result.arm:
         caption = "Friction over speed, half the difference between both directions."
-        yield html.picture(html.png_of(friction_figure(result.curves, labels), DPI), caption)
+        yield html.picture(html.png_of(friction_figure(result.curves, result.arm.joint_names), DPI), caption)
 
 
-def _drift(table: TorqueTable) -> Iterator[str]:
+def _drift(found: Identified, old: np.ndarray, _: np.ndarray, held_out: np.ndarray, used: np.ndarray) -> Iterator[str]:
     """Yield in how many poses the arm creeps, with all of the measured friction and with little of it."""
-    wrong = np.abs((table.measured - table.before, table.held_out))[:, table.used]
+    wrong = np.abs((old, held_out))[:, used]
     for share, friction in ((1.0, "the friction measured"), (SMALL_FRICTION, f"{SMALL_FRICTION:g} times that")):
-        before, after = np.any(wrong > share * table.friction, axis=2).sum(axis=1)
+        before, after = np.any(wrong > share * found.friction, axis=2).sum(axis=1)
         count = f"in {before} of {wrong.shape[1]} poses with the old file, in {after} with the new"
         yield f"With {friction} the arm creeps {count}."
 
@@ -99,70 +85,55 @@ def _degrees(theta: Vector) -> str:
     return " ".join(f"{angle:.0f}" for angle in np.degrees(theta))
 
 
-def prediction_figure(table: TorqueTable, labels: Sequence[str]) -> Figure:
-    """Return predicted against measured torque, a panel per joint, with the old file's predictions behind."""
-    figure = Figure(figsize=(FIGURE_WIDTH, 3.4), layout="constrained")
-    for joint, axis in enumerate(figure.subplots(1, 4)):
-        measured, before, after = (column[:, joint] for column in (table.measured, table.before, table.after))
-        everything = np.concatenate((measured, before, after))
-        room = max(ROOM * np.ptp(everything), 0.05)
-        limits = everything.min() - room, everything.max() + room
-        axis.plot(limits, limits, color=FAINT, lw=0.8, zorder=0)
-        axis.plot(measured, before, "o", ms=4.5, mfc="none", color=FAINT, label="old file")
-        axis.plot(measured[table.used], after[table.used], "o", ms=4.5, color=JOINT_COLOURS[joint], label="new file")
-        if not table.used.all():
-            axis.plot(measured[~table.used], after[~table.used], "x", ms=6, color=INK, label="left out")
-        axis.set(xlim=limits, ylim=limits, aspect="equal", xlabel="Measured (Nm)")
-        axis.legend(frameon=False, fontsize=8, loc="upper left", handletextpad=0.1)
-        _finish(axis, joint, labels)
-    figure.axes[0].set_ylabel("Predicted (Nm)")
-    return figure
-
-
-def remainder_figure(table: TorqueTable, labels: Sequence[str]) -> Figure:
-    """Return the torque that remains unbalanced in each pose, with the friction that holds it, a panel per joint."""
-    figure = Figure(figsize=(FIGURE_WIDTH, 6.2), layout="constrained")
-    axes = figure.subplots(4, 1, sharex=True)
-    numbers, used = np.arange(1, len(table.theta) + 1), table.used
-    for joint, axis in enumerate(axes):
-        friction = table.friction[joint]
-        axis.axhspan(-friction, friction, color=HOLD_COLOUR, lw=0, zorder=0, label="friction holds")
-        axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
-        before = table.measured[:, joint] - table.before[:, joint]
-        axis.plot(numbers[used] - 0.12, before[used], "o", ms=5, mfc="none", color=INK, label="old file")
-        axis.errorbar(
-            numbers[used] + 0.12, table.held_out[used, joint], 2.0 * table.spread[used, joint], fmt="o", ms=4.5, lw=1.2,
-            color=JOINT_COLOURS[joint], label="new file, this pose held out, ± 2 standard errors",
+def torque_figure(found: Identified, arm: ConfiguredArm, poses: Sequence[Observation]) -> Figure:
+    """Return a row per joint: predicted against measured torque, and what remains in each pose, with the friction."""
+    figure = Figure(figsize=(FIGURE_WIDTH, 10.0), layout="constrained")
+    theta, _, effort, spread = columns(poses)
+    *remaining, used = remainders(found, arm, poses)
+    numbers = np.arange(1, len(poses) + 1)
+    for joint, (left, right) in enumerate(figure.subplots(4, 2, width_ratios=(1.0, 3.0))):
+        colour, friction = JOINT_COLOURS[joint], found.friction[joint]
+        measured, old, new, held_out = (column[:, joint] for column in (effort, *remaining))
+        left.axline((0.0, 0.0), slope=1.0, color=FAINT, lw=0.8, zorder=0)
+        left.plot(measured, measured - old, "o", ms=4.5, mfc="none", color=INK)
+        left.plot(measured[used], (measured - new)[used], "o", ms=4.5, color=colour)
+        left.plot(measured[~used], (measured - new)[~used], "x", ms=6, color=INK)
+        left.set(aspect="equal", adjustable="datalim", ylabel="Predicted (Nm)")
+        right.axhspan(-friction, friction, color=HOLD_COLOUR, lw=0, zorder=0, label="friction holds")
+        right.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
+        right.plot(numbers[used] - 0.12, old[used], "o", ms=5, mfc="none", color=INK, label="old file")
+        right.errorbar(
+            numbers[used] + 0.12, held_out[used], 2.0 * spread[used, joint], fmt="o", ms=4.5, lw=1.2, color=colour,
+            label="new file; right: this pose held out, ± 2 standard errors",
         )  # fmt: skip
-        _finish(axis, joint, labels)
-    axes[1].set_ylabel("Measured minus predicted torque (Nm)", y=0.0)
-    axes[-1].set_xlabel("Pose, with its four angles in degrees")
-    poses = [[str(n), *_degrees(theta).split()] for n, theta in zip(numbers, table.theta, strict=True)]
-    ticks = ["\n".join(pose if kept else [*pose, "left out"]) for pose, kept in zip(poses, used, strict=True)]
-    axes[-1].set_xticks(numbers, ticks, fontsize=8)
-    axes[-1].set_xlim(0.4, len(numbers) + 0.6)
-    handles, names = axes[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside upper center", ncols=3, frameon=False, fontsize=9)
+        right.set(xlim=(0.4, len(numbers) + 0.6), ylabel="Remainder (Nm)")
+        right.set_xticks(numbers, [])
+        _finish(left, joint, arm.joint_names[joint])
+        _finish(right, joint)
+    left.set_xlabel("Measured (Nm)")
+    rows = [[str(n), *_degrees(pose).split()] for n, pose in zip(numbers, theta, strict=True)]
+    ticks = ["\n".join(row if kept else [*row, "left out"]) for row, kept in zip(rows, used, strict=True)]
+    right.set_xticks(numbers, ticks, fontsize=8)
+    right.set_xlabel("Pose, with its four angles in degrees")
+    figure.legend(*right.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False, fontsize=9)
     return figure
 
 
-def friction_figure(curves: Sequence[Curve], labels: Sequence[str]) -> Figure:
+def friction_figure(curves: Sequence[FrictionCurve], labels: Sequence[str]) -> Figure:
     """Return the friction of each joint over its speed, as measured and as fitted."""
     figure = Figure(figsize=(FIGURE_WIDTH, 3.2), layout="constrained")
-    axes = figure.subplots(1, len(curves), sharey=True, squeeze=False)[0]
-    for joint, (axis, curve) in enumerate(zip(axes, curves, strict=True)):
-        order = np.argsort(curve.speed)
+    for joint, axis in enumerate(figure.subplots(1, 4, sharey=True)):
+        curve, order = curves[joint], np.argsort(curves[joint].speed)
         axis.plot(curve.speed, curve.torque, "o", ms=4.5, color=JOINT_COLOURS[joint], label="measured")
-        axis.plot(curve.speed[order], curve.fit[order], color=INK, lw=1.0, label="fitted")
+        axis.plot(curve.speed[order], curve.fitted[order], color=INK, lw=1.0, label="fitted")
         axis.set_xlabel("Speed (rad/s)")
         axis.legend(frameon=False, fontsize=8)
-        _finish(axis, joint, labels)
-    axes[0].set_ylabel("Friction (Nm)")
-    axes[0].set_ylim(bottom=0.0)
+        _finish(axis, joint, labels[joint])
+    figure.axes[0].set(ylabel="Friction (Nm)", ylim=(0.0, None))
     return figure
 
 
-def _finish(axis: Axes, joint: int, labels: Sequence[str]) -> None:
-    axis.set_title(labels[joint], fontsize=10, color=JOINT_COLOURS[joint], loc="left", weight="bold")
+def _finish(axis: Axes, joint: int, title: str = "") -> None:
+    axis.set_title(title, fontsize=10, color=JOINT_COLOURS[joint], loc="left", weight="bold")
     make_plain(axis)
     axis.margins(y=0.12)

@@ -20,7 +20,7 @@ from rosbags.typesys import Stores, get_typestore
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.bag.storage import Storage
 from exo_gravity.core.calibration.identification import Observation
-from exo_gravity.core.calibration.motion import BINS, Average, average
+from exo_gravity.core.calibration.motion import BINS, average
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.trial.recording import Recording, in_blocks, still_spans
@@ -99,19 +99,32 @@ def _mean_of(down: np.ndarray) -> np.ndarray:
 
 
 def _sweeps(recording: Recording, down: np.ndarray) -> Iterator[Observation]:
-    """Yield an observation for every two runs one after the other in which all joints turn to and fro."""
+    """Yield an observation for every two runs one after the other in which all joints turn to and fro.
+
+    It is what the middle of the way shows that both runs have in common.
+    """
     time, position = recording.time, recording.position
     runs = [run for span in recording.while_carried(-math.inf, math.inf) for run in _runs(recording, *span)]
     used = 0  # samples: each run is used once
     for there, back in pairwise(runs):
-        ways = [position[run.stop - 1] - position[run.start] for run in (there, back)]
-        if np.any(ways[0] * ways[1] >= 0.0) or time[back.start] - time[there.stop - 1] > LONGEST_TURN:
+        ends = position[[there.start, there.stop - 1, back.start, back.stop - 1]]
+        way, way_back = ends[1] - ends[0], ends[3] - ends[2]
+        is_late = time[back.start] - time[there.stop - 1] > LONGEST_TURN
+        if there.start < used or is_late or np.any(way * way_back >= 0.0):
             continue
-        if there.start >= used and (seen := _there_and_back(recording, there, back)):
-            used = back.stop
-            (theta, effort, friction, spread, _), speed = seen
-            direction = _mean_of(down[there.start : back.stop])
-            yield Observation(theta, direction, effort, np.sign(ways[0]) * friction, spread, speed=speed)
+        low = np.maximum(ends[:2].min(axis=0), ends[2:].min(axis=0))
+        high = np.minimum(ends[:2].max(axis=0), ends[2:].max(axis=0))
+        middles = []
+        for run in (there, back):
+            is_inside = np.abs(position[run] - (low + high) / 2.0) <= (high - low) * (0.5 - EDGE)
+            middles.append(np.flatnonzero(np.all(is_inside, axis=1)) + run.start)
+        if np.any(high - low < LEAST_WAY) or min(map(len, middles)) < 2 * BINS:
+            continue
+        used, first_last = back.stop, np.array([middle[[0, -1]] for middle in middles])
+        speed = np.mean(np.abs(np.diff(position[first_last], axis=1)[:, 0]) / np.diff(time[first_last]), axis=0)
+        theta, effort, friction, spread, _ = average([(position[part], recording.effort[part]) for part in middles])
+        direction = _mean_of(down[there.start : back.stop])
+        yield Observation(theta, direction, effort, np.sign(way) * friction, spread, speed=speed)
 
 
 def _runs(recording: Recording, start: float, end: float) -> Iterator[slice]:
@@ -126,28 +139,6 @@ def _runs(recording: Recording, start: float, end: float) -> Iterator[slice]:
     for low, high in pairwise(edges.tolist()):
         if is_slow[low] and high - low > 4 * BINS:
             yield slice(int(first) + low, int(first) + high)
-
-
-def _there_and_back(recording: Recording, there: slice, back: slice) -> tuple[Average, np.ndarray] | None:
-    """Return what is seen in the middle of the way that both runs have in common, and the speed (4,) in rad/s.
-
-    None if that way is short.
-    """
-    time, position = recording.time, recording.position
-    low, high = np.sort([position[[run.start, run.stop - 1]] for run in (there, back)], axis=1).swapaxes(0, 1)
-    low, high = low.max(axis=0), high.min(axis=0)
-    if np.any(high - low < LEAST_WAY):
-        return None
-    sweeps, speeds = [], []
-    for run in (there, back):
-        is_inside = np.all(np.abs(position[run] - (low + high) / 2.0) <= (high - low) * (0.5 - EDGE), axis=1)
-        inside = np.flatnonzero(is_inside) + run.start
-        if len(inside) < 2 * BINS:
-            return None
-        ends = inside[[0, -1]]
-        speeds.append(np.abs(np.diff(position[ends], axis=0)[0]) / np.diff(time[ends]))
-        sweeps.append((position[inside], recording.effort[inside]))
-    return average(sweeps), np.mean(speeds, axis=0)
 
 
 def _held(recording: Recording, down: np.ndarray, sweeps: list[Observation]) -> Iterator[Observation]:

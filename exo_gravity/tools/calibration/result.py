@@ -19,6 +19,7 @@ import numpy as np
 import yaml
 
 from exo_gravity.core.calibration.identification import Identified, Observation
+from exo_gravity.core.calibration.motion import FrictionCurve
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Vector
 from exo_gravity.tools.inputs.arms import ConfiguredArm
@@ -29,8 +30,6 @@ WIDTH = 118  # characters of a comment line
 DIGITS = 7  # significant
 
 Value = bool | int | float | str | list[int] | list[float] | list[str]
-Edit = tuple[int, int, str]
-"""(start, end, text): replace the characters from start to end by text."""
 
 
 class Change(NamedTuple):
@@ -40,14 +39,6 @@ class Change(NamedTuple):
     name: str  #: dotted, 'robot.first_moment'; '' for a comment alone
     value: Value
     note: str = ""  #: uncertainty and unit, for a comment in the file
-
-
-class Curve(NamedTuple):
-    """Friction of one joint."""
-
-    speed: np.ndarray  #: (n,) rad/s
-    torque: np.ndarray  #: (n,) Nm, measured
-    fit: np.ndarray  #: (n,) Nm
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +52,7 @@ class CalibrationResult:
     observations: tuple[Observation, ...] = ()
     identified: Identified | None = None
     suggestion: Vector | None = None  #: the next best pose, (4,) rad, None if none is wanted
-    curves: tuple[Curve, ...] = ()  #: of each joint
+    curves: tuple[FrictionCurve, ...] = ()  #: of each joint
 
 
 def check_output(path: Path) -> None:
@@ -99,11 +90,10 @@ def write_changes(
 
 def plain(value: Any) -> Any:
     """Return a value in Python's own types, floats rounded to DIGITS."""
-    if isinstance(value, (list, tuple, np.ndarray)):
+    value = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+    if isinstance(value, (list, tuple)):
         return [plain(item) for item in value]
-    if isinstance(value, (float, np.floating)):
-        return float(f"{value:.{DIGITS}g}")
-    return value.item() if isinstance(value, np.generic) else value
+    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
 
 
 def value_text(value: Value) -> str:
@@ -123,14 +113,21 @@ def _changed(text: str, change: Change) -> str:
         # Of a list, entry by entry: the comments between them stay.
         pairs = zip(nodes, items, strict=False) if change.name else ()
         edits = [(node.start_mark.index, node.end_mark.index, value_text(item)) for node, item in pairs]
-        return _edited(text, [_above(text, key, change.note), *edits])
+        return _edited(text, key, change.note, edits)
     parent = max((name for name in entries if target.startswith(f"{name}.")), key=len, default="")
     if PARAMETERS not in parent:
         raise ParameterError("params", change.node, "a node of the file that has parameters")
     mapping = entries[parent][1]
     if not isinstance(mapping, yaml.MappingNode) or not mapping.value:
         raise ParameterError(f"{change.node} {change.name}", mapping.value, "a mapping, to add a value to it")
-    return _added(text, mapping, target.removeprefix(f"{parent}."), change)
+    entry = f"{target.removeprefix(f'{parent}.')}: {value_text(change.value)}"
+    last_key, last_value = mapping.value[-1]
+    end = _end(last_value)
+    if mapping.flow_style:
+        return _edited(text, last_key, change.note, [(end, end, f", {entry}")])
+    line_end = end + len(text[end:].partition("\n")[0])
+    indent = " " * last_key.start_mark.column
+    return f"{text[:line_end]}\n{_comment(indent, change.note)}{indent}{entry}{text[line_end:]}"
 
 
 def _entries(prefix: str, mapping: yaml.MappingNode) -> Iterator[tuple[str, tuple[yaml.Node, yaml.Node]]]:
@@ -141,18 +138,6 @@ def _entries(prefix: str, mapping: yaml.MappingNode) -> Iterator[tuple[str, tupl
             yield from _entries(f"{prefix}{key.value}.", value)
 
 
-def _added(text: str, mapping: yaml.MappingNode, name: str, change: Change) -> str:
-    """Add a value at the end of `mapping`; name: the key in it, dotted."""
-    last_key, last_value = mapping.value[-1]
-    entry, end = f"{name}: {value_text(change.value)}", _end(last_value)
-    if mapping.flow_style:
-        return _edited(text, [_above(text, last_key, change.note), (end, end, f", {entry}")])
-    at = text.find("\n", end) + 1 or len(text)
-    column = mapping.value[0][0].start_mark.column
-    line_break = "" if at == 0 or text[at - 1] == "\n" else "\n"
-    return _edited(text, [(at, at, f"{line_break}{_comment(column, change.note)}{' ' * column}{entry}\n")])
-
-
 def _end(value: yaml.Node) -> int:
     """Return where the text of a value ends, without the comments after it, which PyYAML adds to a block."""
     if isinstance(value, yaml.CollectionNode) and not value.flow_style:
@@ -161,19 +146,16 @@ def _end(value: yaml.Node) -> int:
     return int(value.end_mark.index)
 
 
-def _above(text: str, key: yaml.Node, note: str) -> Edit:
-    """Return the edit that puts a comment above the line of `key`, as far in as that line's first character."""
+def _edited(text: str, key: yaml.Node, note: str, edits: Iterable[tuple[int, int, str]]) -> str:
+    """Return the text with a comment above the line of `key`, and with each edit: from, to, new characters."""
     at = text.rfind("\n", 0, key.start_mark.index) + 1
     line = text[at : key.start_mark.index]
-    return at, at, _comment(len(line) - len(line.lstrip()), note)
-
-
-def _comment(column: int, note: str) -> str:
-    lines = textwrap.wrap(note, WIDTH - column, break_long_words=False, break_on_hyphens=False)
-    return "".join(f"{' ' * column}# {line}\n" for line in lines)
-
-
-def _edited(text: str, edits: Iterable[Edit]) -> str:
-    for start, end, new in sorted(edits, reverse=True):
+    indent = line[: len(line) - len(line.lstrip())]
+    for start, end, new in sorted([*edits, (at, at, _comment(indent, note))], reverse=True):
         text = text[:start] + new + text[end:]
     return text
+
+
+def _comment(indent: str, note: str) -> str:
+    lines = textwrap.wrap(note, WIDTH - len(indent), break_long_words=False, break_on_hyphens=False)
+    return "".join(f"{indent}# {line}\n" for line in lines)

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.calibration.friction import FrictionCurve, fit_friction
 from exo_gravity.core.calibration.identification import Identified, Observation, columns, identify
+from exo_gravity.core.calibration.motion import FrictionCurve, fit_friction
 from exo_gravity.core.calibration.poses import candidates, next_pose
 from exo_gravity.core.compensation.params import wearer_of
 from exo_gravity.core.errors import DataError, ParameterError
@@ -33,7 +33,7 @@ from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.tools.calibration import live
 from exo_gravity.tools.calibration.live import Say, tour_parameters
 from exo_gravity.tools.calibration.recorded import observations_of
-from exo_gravity.tools.calibration.result import CalibrationResult, Change, Curve
+from exo_gravity.tools.calibration.result import CalibrationResult, Change
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 
 SCALE_POSES = 8  # of each tour of `calibrate scale`
@@ -153,18 +153,17 @@ def calibrate_friction(options: argparse.Namespace, arm: ConfiguredArm, say: Say
 
 def friction_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
     """Return the friction of each joint that `observations` show. Raises DataError as `fit_friction` does."""
-    changes, lines, negative, curves = [], [], [], []
-    for joint, name in enumerate(arm.joint_names):
-        speed = np.array([np.broadcast_to(one.speed, JOINT_COUNT)[joint] for one in observations])
-        torque = np.array([one.friction[joint] for one in observations])
-        fit = fit_friction(speed, torque)
-        lines.append(f"{name}: {_sentence(fit)}")
-        changes.append(Change(f"{arm.namespace}/can_bridge", "", 0, f"friction of {lines[-1]}"))
-        curves.append(Curve(speed, torque, fit.at(speed)))
-        if fit.coulomb <= 0.0:
-            negative.append(f"{name}: friction of {fit.coulomb:.3f} Nm: must be above 0: was the arm touched?")
-    observed = tuple(observations)
-    return CalibrationResult(tuple(changes), tuple(lines), tuple(negative), arm, observed, curves=tuple(curves))
+    speed = np.array([np.broadcast_to(one.speed, JOINT_COUNT) for one in observations])
+    curves = tuple(map(fit_friction, speed.T, np.array([one.friction for one in observations]).T))
+    named = list(zip(arm.joint_names, curves, strict=True))
+    lines = tuple(f"{name}: {_sentence(fit)}" for name, fit in named)
+    changes = tuple(Change(f"{arm.namespace}/can_bridge", "", 0, f"friction of {line}") for line in lines)
+    negative = tuple(
+        f"{name}: friction of {fit.coulomb:.3f} Nm: must be above 0: was the arm touched?"
+        for name, fit in named
+        if fit.coulomb <= 0.0
+    )
+    return CalibrationResult(changes, lines, negative, arm, tuple(observations), curves=curves)
 
 
 def _sentence(fit: FrictionCurve) -> str:
@@ -179,77 +178,57 @@ def calibrate_wearer(options: argparse.Namespace, arm: ConfiguredArm, say: Say) 
     # Few poses, in a comfortable range, with the weight that the table expects.
     low, high = np.maximum(arm.low, COMFORTABLE[0]), np.minimum(arm.high, COMFORTABLE[1])
     changes = {"tour.poses": WEARER_POSES, "position_min": low.tolist(), "position_max": high.tolist()}
-    expected = moments_of(arm.robot.with_wearer(*_expected_wearer(arm)))
+    expected = moments_of(arm.robot.with_wearer(*_wearer(arm)))
     request = "Wear the arm, sit upright and relax: it will be moved slowly. Pull to stop it"
     return wearer_from(arm, _observations(options, arm, say, changes, request, expected))
 
 
 def wearer_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
-    """Return the wearer's masses that `observations` show. Raises DataError as `worn_arm` does."""
-    cog = np.array(_expected_wearer(arm)[1])
-    mass, error, remainder = worn_arm(arm, observations, cog)
+    """Return the masses on links 3 and 4 that explain what the robot alone does not. Raises DataError if none do."""
+    if len(observations) < 3:
+        raise DataError(f"{len(observations)} poses were measured, must be at least 3")
+    theta, direction, effort, spread = columns(observations)
+    cog, length, rows = np.array(_wearer(arm)[1]), arm.robot.length, regressor(theta, direction, arm.robot.gravity)
+    per_mass = np.stack([moments_along(length, cog, one) for one in np.eye(JOINT_COUNT)[2:]], axis=1)
+    weight = 1.0 / np.hypot(spread, BREATHING).ravel()
+    matrix = (rows[..., :JOINT_COUNT] @ per_mass).reshape(-1, 2) * weight[:, None]
+    extra = (effort - rows @ moments_of(arm.robot)).ravel() * weight
+    covariance = np.linalg.pinv(matrix.T @ matrix)
+    mass = covariance @ matrix.T @ extra
+    remainder = extra - matrix @ mass
+    error = np.sqrt(np.diag(covariance) * max(1.0, float(remainder @ remainder) / (remainder.size - 2)))
+    moments = (per_mass @ mass)[2:]
+    lines = []
+    for part, own, e, name, moment in zip(WORN, mass, error, ("M3", "M4"), moments, strict=True):
+        if not 0.0 < own < MOST:
+            relaxed = "is the arm relaxed, the robot calibrated?"
+            raise DataError(f"{part}: {own:.2f} kg: must be from 0 to {MOST:g}: {relaxed}")
+        if e > LARGEST_ERROR * own:
+            raise DataError(f"{part}: {own:.2f} +- {e:.2f} kg: add a pose with the arm further forward")
+        lines.append(f"{part}: {own:.2f} +- {e:.2f} kg, {name} {moment:.3f} kg m")
+    lines.append(f"largest remainder of a pose: {np.abs(remainder / weight).max():.2f} Nm")
     node, note = f"{arm.namespace}/compensator", f"kg, +-{error[0]:.2f} and {error[1]:.2f}"
     changes = (
-        Change(node, "wearer.mass", np.round(mass, 3).tolist(), note),
-        Change(node, "wearer.cog", np.round(cog, 4).tolist(), "m, of the body-mass table"),
+        Change(node, "wearer.mass", [0.0, 0.0, *mass.round(3).tolist()], note),
+        Change(node, "wearer.cog", cog.round(4).tolist(), "m, of the body-mass table"),
     )
-    length = arm.robot.length
-    moments = moments_along(length, cog, mass)[2:]
-    rows = zip(WORN, mass[2:], error, ("M3", "M4"), moments, strict=True)
-    lines = [f"{part}: {own:.2f} +- {e:.2f} kg, {name} {moment:.3f} kg m" for part, own, e, name, moment in rows]
-    lines.append(f"largest remainder of a pose: {np.abs(remainder).max():.2f} Nm")
     body_mass, (low, high) = arm.compensator["wearer.body_mass"], TABLE_RATIO
-    tabled_mass, tabled_cog = map(np.array, _tabled_wearer(arm))
+    tabled_mass, tabled_cog = map(np.array, _wearer(arm, tabled=True))
     ratio = moments / moments_along(length, tabled_cog, tabled_mass)[2:]
     refusals: tuple[str, ...] = ()
     if not body_mass:
         lines.append(f"a person of {TYPICAL_BODY_MASS * ratio[0]:.0f} kg has this M3 by the table {Wearer.table}")
     else:
-        shares = f"{ratio[0]:.0%} of M3 and {ratio[1]:.0%} of M4 by the table {Wearer.table} for {body_mass:g} kg"
-        lines.append(shares)
+        lines.append(f"{ratio[0]:.0%} of M3 and {ratio[1]:.0%} of M4 by the table {Wearer.table} for {body_mass:g} kg")
         if not np.all((ratio >= low) & (ratio <= high)):
-            refusals = (f"implausible: {shares}: must be from {low:.0%} to {high:.0%}",)
+            refusals = (f"implausible: {lines[-1]}: must be from {low:.0%} to {high:.0%}",)
     return CalibrationResult(changes, tuple(lines), refusals, arm, tuple(observations))
 
 
-def worn_arm(
-    arm: ConfiguredArm, observations: Sequence[Observation], cog: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the masses (4,) kg, at `cog` (4,) m, that explain what the robot alone does not, on links 3 and 4.
-
-    Also the standard errors (2,) kg of these two, and the torque (n, 4) Nm that remains in each pose. Raises DataError
-    if the poses do not show the masses.
-    """
-    if len(observations) < 3:
-        raise DataError(f"{len(observations)} poses were measured, must be at least 3")
-    theta, direction, effort, spread = columns(observations)
-    rows = regressor(theta, direction, arm.robot.gravity)
-    moments = np.stack([moments_along(arm.robot.length, cog, one) for one in np.eye(JOINT_COUNT)[2:]], axis=1)
-    per_mass = rows[..., :JOINT_COUNT] @ moments
-    extra = effort - rows @ moments_of(arm.robot)
-    weight = 1.0 / np.hypot(spread, BREATHING).ravel()
-    matrix = per_mass.reshape(-1, 2) * weight[:, None]
-    covariance = np.linalg.pinv(matrix.T @ matrix)
-    mass = covariance @ matrix.T @ (extra.ravel() * weight)
-    remainder = extra - per_mass @ mass
-    chi = float(np.sum((remainder.ravel() * weight) ** 2)) / (remainder.size - 2)
-    error = np.sqrt(np.diag(covariance) * max(1.0, chi))
-    for name, own, deviation in zip(WORN, mass, error, strict=True):
-        if not 0.0 < own < MOST:
-            relaxed = "is the arm relaxed, the robot calibrated?"
-            raise DataError(f"{name}: {own:.2f} kg: must be from 0 to {MOST:g}: {relaxed}")
-        if deviation > LARGEST_ERROR * own:
-            raise DataError(f"{name}: {own:.2f} +- {deviation:.2f} kg: add a pose with the arm further forward")
-    return np.append((0.0, 0.0), mass), error, remainder
-
-
-def _tabled_wearer(arm: ConfiguredArm) -> tuple[Sequence[float], Sequence[float]]:
-    """Return mass (4,) in kg and cog (4,) in m on each link, by the body-mass table."""
-    body_mass = arm.compensator["wearer.body_mass"] or TYPICAL_BODY_MASS
-    return wearer_of({**arm.compensator, "wearer.mass": (0.0,) * 4, "wearer.body_mass": body_mass})
-
-
-def _expected_wearer(arm: ConfiguredArm) -> tuple[Sequence[float], Sequence[float]]:
-    """Return the same of the file's wearer, if it gives both masses."""
-    mass = arm.compensator["wearer.mass"]
-    return (mass, arm.compensator["wearer.cog"]) if mass[2] and mass[3] else _tabled_wearer(arm)
+def _wearer(arm: ConfiguredArm, tabled: bool = False) -> tuple[Sequence[float], Sequence[float]]:
+    """Return mass (4,) in kg and cog (4,) in m on each link: the file's if it gives both masses, else the table's."""
+    values = arm.compensator
+    if not tabled and all(values["wearer.mass"][2:]):
+        return values["wearer.mass"], values["wearer.cog"]
+    body_mass = values["wearer.body_mass"] or TYPICAL_BODY_MASS
+    return wearer_of({**values, "wearer.mass": (0.0,) * JOINT_COUNT, "wearer.body_mass": body_mass})

@@ -4,8 +4,7 @@
     /right/can_bridge: {ros__parameters: {can: {interface: socketcan}, ...}}
 
 The tools read it to find out which nodes to start and which arms they have; the nodes read it through ROS. `launcher`
-and `launch/exo.launch.py` stop them in the same order: bridges first, because they need the others while they let the
-arms down, and the recorder last.
+stops them in order: bridges first, because they need the others while they let the arms down, and the recorder last.
 """
 
 from __future__ import annotations

@@ -5,6 +5,7 @@ It is the only tool that imports `sim`: without ROS it cannot start the simulato
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -16,11 +17,10 @@ from rich.progress import Progress, TaskID
 
 from exo_gravity.bag.content import Bag, Event
 from exo_gravity.core.errors import ParameterError, named
-from exo_gravity.core.model.tilt import rotation_matrix
 from exo_gravity.core.trial.script import TRUNK_ACTIONS, TrialScript
 from exo_gravity.hardware.trunk_estimator import VQF, ImuSample, TrunkEstimator
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu, measured_tilt
-from exo_gravity.sim.offline import ArmSetup, OfflineTrial, TrunkReading
+from exo_gravity.sim.offline import ArmSetup, OfflineTrial, TrunkReading, TrunkSensor, resting
 from exo_gravity.sim.params import SIMULATOR, device_of, imu_of, set_faults
 from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.tools.inputs.arms import node_values, read_arm
@@ -40,19 +40,21 @@ def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
     with_imu = next((values for values in simulators.values() if values["imu.topic"] and "/imu" in nodes), None)
     rotation = nodes.get("/imu", {}).get("rotation_trunk_from_imu", [])
     moves = any(step.action in TRUNK_ACTIONS for step in script.steps)
-    tilt, trials = None, []
+    trials: list[OfflineTrial] = []
+    trunk: TrunkSensor | None = None
     if with_imu and not moves:
         with named("/imu "):
-            trunk = with_imu["trunk.pitch"], with_imu["trunk.roll"]
-            tilt = measured_tilt(*trunk, SimulatedImu(imu_of(with_imu)), rotation)
+            true = with_imu["trunk.pitch"], with_imu["trunk.roll"]
+            trunk = resting(*measured_tilt(*true, SimulatedImu(imu_of(with_imu)), rotation))
     for namespace, simulator in simulators.items():
         arm = read_arm(nodes, namespace)
         with named(f"{namespace}/simulator "):
             device = device_of(simulator)
             set_faults(device, simulator)
         rate = arm.can_bridge["rate"]
-        imu = TrunkImu(imu_of(with_imu), rotation, rate) if with_imu and moves else None
-        setup = ArmSetup(arm.name, device, arm.motors, arm.limits, arm.settings(), rate, tilt, imu)
+        if with_imu and moves:
+            trunk = trunk_imu(imu_of(with_imu), rotation, rate)
+        setup = ArmSetup(arm.name, device, arm.motors, arm.limits, arm.settings(), rate, trunk)
         trials.append(OfflineTrial(setup, script, simulator["trial_delay"]))
     return trials
 
@@ -90,31 +92,30 @@ def run_offline(
     return Bag(params.parent, start, tuple(recordings), tuple(events), texts, notes, ()), trouble
 
 
-class TrunkImu:
-    """A simulated IMU and the estimator that follows it, for `ArmSetup.trunk`."""
+def trunk_imu(config: ImuConfig, rotation_trunk_from_imu: Sequence[float], cycle_rate: float) -> TrunkSensor:
+    """Return the simulated IMU `config`, and the estimator that follows it, in every n-th of `cycle_rate` cycles per s.
 
-    def __init__(self, config: ImuConfig, rotation_trunk_from_imu: Sequence[float], cycle_rate: float) -> None:
-        """Create the IMU `config`, which samples in every n-th of `cycle_rate` cycles per s.
+    rotation_trunk_from_imu: the mounting that the controller assumes. Raises ParameterError.
+    """
+    if VQF is None:
+        raise ParameterError("vqf", None, "installed (extra imu) for a trial in which the trunk moves")
+    cycles = max(1, round(cycle_rate / config.rate))
+    rate = cycle_rate / cycles
+    imu = SimulatedImu(replace(config, rate=rate))
+    estimator = TrunkEstimator(rotation_trunk_from_imu, rate, config.gyroscope_range, config.accelerometer_range)
+    due = itertools.cycle((True, *[False] * (cycles - 1)))
 
-        rotation_trunk_from_imu: the mounting that the controller assumes. Raises ParameterError.
-        """
-        self.cycles = max(1, round(cycle_rate / config.rate))
-        rate = cycle_rate / self.cycles
-        self._imu = SimulatedImu(replace(config, rate=rate))
-        if VQF is None:
-            raise ParameterError("vqf", None, "installed (extra imu) for a trial in which the trunk moves")
-        ranges = config.gyroscope_range, config.accelerometer_range
-        self._estimator = TrunkEstimator(rotation_trunk_from_imu, rate, *ranges)
-        self._rotation = rotation_matrix(rotation_trunk_from_imu, "rotation_trunk_from_imu")
-
-    def measure(self, now: float, state: TrunkState) -> TrunkReading | None:
-        """Return what the trunk's IMU tells of `state` at `now` in s, None while it publishes nothing."""
-        angular_velocity, acceleration = self._imu.sample_of(state)
+    def measure(now: float, state: TrunkState) -> TrunkReading | None:
+        if not next(due):
+            return None
+        angular_velocity, acceleration = imu.sample_of(state)
         try:
-            answer = self._estimator.update(ImuSample(now, angular_velocity.tolist(), acceleration.tolist()))
+            answer = estimator.update(ImuSample(now, angular_velocity.tolist(), acceleration.tolist()))
         except ParameterError:  # refused samples are not published
             return None
         if answer is None:
             return None
-        force, turning = self._rotation @ acceleration, self._rotation @ angular_velocity
+        force, turning = estimator.rotation @ acceleration, estimator.rotation @ angular_velocity
         return TrunkReading(answer.gravity.tolist(), force.tolist(), turning.tolist())
+
+    return measure

@@ -35,18 +35,14 @@ ATTEMPTS = 3
 BUSY_CODE = 3
 ADVICE = "Close other programs and try again. The arm has no fault."
 LONG_GAP = 50.0  # ms; a simulated device loses time after such a stall
-# Faults that a busy computer can cause; '' stands for a trial that ended early without a fault.
-POSSIBLE = (
-    "",
-    FaultCode.MOTOR_SILENT.value,
-    FaultCode.COMMAND_STALE.value,
-    FaultCode.COMMAND_WITHDRAWN.value,
-    FaultCode.SIGN_UNPROVEN.value,
-)
-# A connected simulated motor always replies and the compensator always answers: if they are late, the computer is.
-LATE = {
+# Faults that a busy computer can cause; '' stands for a trial that ended early without a fault. A connected simulated
+# motor always replies and the compensator always answers: if they are late, the computer is, also without a long gap.
+POSSIBLE = {
+    "": "",
     FaultCode.MOTOR_SILENT.value: "the replies of the simulated motors came too late",
     FaultCode.COMMAND_STALE.value: "the efforts came too late",
+    FaultCode.COMMAND_WITHDRAWN.value: "",
+    FaultCode.SIGN_UNPROVEN.value: "",
 }
 
 Status = Mapping[str, Mapping[str, Any]]  # of each node on /diagnostics, as in the recorder's live lines
@@ -71,10 +67,7 @@ def prepare(params: Path | None, script: Path, folder: Path, recorded: bool) -> 
 
     It is `params` with the script for each simulator and, if `recorded`, a recorder. Raises ParameterError.
     """
-    content: dict[str, Any] = {}
-    if params:
-        load(params)  # checks the form of the file
-        content = yaml.safe_load(params.read_text(encoding="utf-8"))
+    content: dict[str, Any] = yaml.safe_load(params.read_text(encoding="utf-8")) if params else {}
     for node, entry in content.items():
         if node.endswith("/simulator"):
             entry["ros__parameters"]["trial"] = str(script)
@@ -194,4 +187,4 @@ def too_busy(status: Status) -> str:
             return f"{name} was not run for {stall:.0f} ms"
         if silence >= LONG_GAP:
             return f"{name.removesuffix('simulator')}can_bridge was not run for {silence:.0f} ms"
-    return LATE.get(code, "") if simulators else ""
+    return POSSIBLE[code] if simulators else ""

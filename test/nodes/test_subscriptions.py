@@ -16,8 +16,8 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import String
 
-from exo_gravity.nodes.ros.hot_path import NEWEST, Drain, HotPath, LossCounter
 from exo_gravity.nodes.ros.run import keep_to_this_machine
+from exo_gravity.nodes.ros.subscriptions import NEWEST, HotPath, Publishers
 
 keep_to_this_machine()
 
@@ -48,6 +48,7 @@ class Pair:
     def __init__(self, node: Node, qos: QoSProfile = QUEUE, **options: float) -> None:
         self.topic = f"topic_{next(NUMBERS)}"
         self.received: list[tuple[str, int, str]] = []
+        self.arrivals: list[int] = []  # ns since 1970
         self.error: Exception | None = None
         self.on_message: Callable[[], object] = lambda: None
         self.hot = HotPath(node, String, self.topic, self._on_message, qos, **options)
@@ -55,7 +56,9 @@ class Pair:
         self.wait_until(lambda: self.publisher.get_subscription_count() == 1)
 
     def _on_message(self, message: String, info: dict[str, Any]) -> None:
-        self.received.append((message.data, info["publication_sequence_number"], threading.current_thread().name))
+        self.arrivals.append(info["received_timestamp"])
+        text = message if isinstance(message, bytes) else message.data
+        self.received.append((text, info["publication_sequence_number"], threading.current_thread().name))
         self.on_message()
         if self.error:
             raise self.error
@@ -155,35 +158,32 @@ def test_an_exception_in_the_callback_ends_the_thread_and_is_kept(pair):
     assert pair.texts() == ["a"]
 
 
-def test_a_drain_takes_all_waiting_messages_at_once_in_bytes(executor):
-    node = executor.get_nodes()[0]
-    drain = Drain(node, String, "drained", QUEUE, counts_lost=True)
-    publisher = node.create_publisher(String, "drained", 8)
-    while publisher.get_subscription_count() < 1:
-        time.sleep(0.005)
-    for text in ("a", "b"):
-        publisher.publish(String(data=text))
-    taken: list[tuple[int, bytes]] = []
-    while len(taken) < 2:
-        taken += drain.take()
-    assert [deserialize_message(data, String).data for _, data in taken] == ["a", "b"]
-    assert taken[0][0] <= taken[1][0]
-    assert drain.take() == [] and drain.lost == 0
+def test_raw_messages_are_passed_on_in_bytes_with_their_time_of_arrival(executor):
+    pair = Pair(executor.get_nodes()[0], raw=True)
+    pair.send("a", "b")
+    pair.wait_until(lambda: len(pair.received) == 2, pair.hot.poll)
+    assert [deserialize_message(data, String).data for data in pair.texts()] == ["a", "b"]
+    assert 0 < pair.arrivals[0] <= pair.arrivals[1]
 
 
 @pytest.mark.parametrize(
-    ("numbers", "lost"),
+    ("numbers", "others", "missed"),
     [
-        ([1, 2, 3, 4], 0),
-        ([7, 8, 11], 2),
-        ([500, 501, 1, 2, 3], 0),
-        ([500, 1, 501, 2, 502, 4], 1),
-        ([0, 0, 0], 0),
+        ([1, 2, 3, 4], [], 0),
+        ([7, 8, 11], [], 2),
+        ([500, 501, 1, 2, 3], [2], 0),
+        ([500, 1, 501, 2, 502, 4], [1, 3, 5], 1),
+        ([7, 8, 1, 9, 2], [2, 4], 0),
     ],
-    ids=["none lost", "two lost", "a publisher that was started again", "two publishers, one lost", "no numbers"],
+    ids=["none lost", "two lost", "a publisher that was started again", "two publishers, one lost", "two publishers"],
 )
-def test_gaps_in_the_numbers_of_each_publisher_are_counted(numbers, lost):
-    counter = LossCounter()
-    for number in numbers:
-        counter.count(number)
-    assert counter.lost == lost
+def test_publishers_are_told_apart_and_their_losses_counted_by_the_numbers_of_their_messages(numbers, others, missed):
+    publishers = Publishers()
+    changes = [publishers.is_another({"publication_sequence_number": number}) for number in numbers]
+    assert [n for n, is_another in enumerate(changes) if is_another] == others
+    assert publishers.missed == missed
+
+
+def test_a_middleware_that_does_not_number_messages_is_refused_with_one_that_does():
+    with pytest.raises(RuntimeError, match="rmw_fastrtps_cpp"):
+        Publishers().is_another({"publication_sequence_number": None})

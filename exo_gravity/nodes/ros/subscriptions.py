@@ -17,7 +17,7 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Vector3Stamped
-from rclpy.callback_groups import CallbackGroup
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -26,30 +26,26 @@ from sensor_msgs.msg import Imu
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.rotation import unit_quaternion, up_in_body
 from exo_gravity.core.trunk.tilt_input import STILL, TiltInput
-from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # reliable
 STOP_CHECK_PERIOD = 0.1  # s
 PAUSE = 0.0004  # s, less than the shortest period of a control loop
-MAX_PUBLISHERS = 4  # of one topic whose messages are counted
+MAX_PUBLISHERS = 4  # of one topic that are told apart
 DISTRUST = 0.2  # s for which a topic is not trusted after a second publisher was seen
-COUNT_PERIOD = 0.5  # s between two counts of the publishers
 DATA, PITCH_YAW = "/imu/data", "/imu/pitch_yaw"
 NOT_REPORTED = -1.0  # first entry of a covariance (REP-145)
 
 Callback = Callable[[Any, dict[str, Any]], None]
 
 
-class Unexecuted(CallbackGroup):
+class Unexecuted(ReentrantCallbackGroup):
     """Keeps its subscriptions out of the executor's wait set."""
 
     def can_execute(self, entity: Any) -> bool:
         """Return that no entity may be executed."""
         return False
-
-    beginning_execution = ending_execution = can_execute
 
 
 class Repeated:
@@ -83,15 +79,25 @@ class Repeated:
 class HotPath(Repeated):
     """Calls `callback(message, info)` for each message of `topic`: on a thread after `start`, or in each `poll`.
 
-    pause: s for which the thread rests after each look; of what arrives meanwhile, it gets the last `qos.depth`.
+    pause: s for which the thread rests after each look; of what arrives meanwhile, it gets the last `qos.depth`. raw:
+    whether the messages are passed on as bytes.
     """
 
     def __init__(
-        self, node: Node, msgtype: type, topic: str, callback: Callback, qos: QoSProfile = NEWEST, pause: float = PAUSE
+        self,
+        node: Node,
+        msgtype: type,
+        topic: str,
+        callback: Callback,
+        qos: QoSProfile = NEWEST,
+        pause: float = PAUSE,
+        raw: bool = False,
     ) -> None:
         super().__init__(topic, lambda: self.poll(STOP_CHECK_PERIOD), pause)
         self._callback, self._depth = callback, qos.depth
-        self._subscription = node.create_subscription(msgtype, topic, callback, qos, callback_group=Unexecuted())
+        self._subscription = node.create_subscription(
+            msgtype, topic, callback, qos, callback_group=Unexecuted(), raw=raw
+        )
         self._wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
 
     def poll(self, timeout: float = 0.0) -> None:
@@ -99,112 +105,60 @@ class HotPath(Repeated):
 
         It ends after as many as the queue holds, however many arrive meanwhile.
         """
-        handle, msgtype = self._subscription.handle, self._subscription.msg_type
+        handle, msgtype, raw = self._subscription.handle, self._subscription.msg_type, self._subscription.raw
         if timeout > 0.0:
             with handle:
                 self._wait_set.clear_entities()
                 self._wait_set.add_subscription(handle)
                 self._wait_set.wait(int(timeout * 1e9))
         for _ in range(self._depth):
-            item = handle.take_message(msgtype, False)
+            item = handle.take_message(msgtype, raw)
             if item is None:
                 return
             self._callback(*item)
 
 
-class LossCounter:
-    """Counts missing messages by the numbers that each publisher of a topic gives them, from 1. lost: so far."""
+class Publishers:
+    """Those of one topic, told apart by the numbers that each gives its messages, from 1; rclpy passes them on.
+
+    So a second publisher shows at once, without discovery, which still lists a killed publisher for 20 s. missed:
+    messages that were published and not received.
+    """
 
     def __init__(self) -> None:
-        self.lost = 0
+        self.missed = 0
         self._newest: deque[int] = deque(maxlen=MAX_PUBLISHERS)  # number of each publisher's last message
+        self._changed = -math.inf  # monotonic s
 
-    def count(self, number: int) -> None:
-        """Count the message `number`, 0 if it has none.
+    def is_another(self, info: dict[str, Any]) -> bool:
+        """Return whether this message comes from a different publisher than the previous one: its number is no higher.
 
         It continues the nearest lower number, or is the first of a new publisher.
         """
-        previous = max((other for other in self._newest if other < number), default=0)
-        if previous:
-            self.lost += number - previous - 1
-            self._newest.remove(previous)
-        if number:
-            self._newest.append(number)
-
-
-class Drain(LossCounter):
-    """A subscription to `topic` that queues up to `qos.depth` serialised messages until `take` is called.
-
-    The middleware notes their time of arrival. counts_lost: whether to count the messages that did not arrive.
-    """
-
-    def __init__(self, node: Node, msgtype: type, topic: str, qos: QoSProfile, counts_lost: bool = False) -> None:
-        super().__init__()
-        self.topic = topic
-        self._counts_lost = counts_lost
-        self._subscription = node.create_subscription(
-            msgtype, topic, lambda message: None, qos, raw=True, callback_group=Unexecuted()
-        )
-
-    def take(self) -> list[tuple[int, bytes]]:
-        """Return the messages since the last call: time of arrival in ns since 1970, and bytes."""
-        taken = []
-        subscription = self._subscription
-        with subscription.handle:
-            while (item := subscription.handle.take_message(subscription.msg_type, subscription.raw)) is not None:
-                data, about = item
-                taken.append((about["received_timestamp"], bytes(data)))
-                if self._counts_lost:
-                    self.count(about.get("publication_sequence_number") or 0)
-        return taken
-
-
-class SolePublisher:
-    """Detects a second publisher of `topic` by the `info` of each message, which rclpy passes on.
-
-    Each publisher numbers its messages from 1, so from a single publisher the numbers rise. A second one shows at once,
-    without discovery, which still lists a killed publisher for 20 s. Where the middleware does not number messages, the
-    publishers that discovery lists are counted instead.
-    """
-
-    def __init__(self, node: Node, topic: str, clock: Clock = COMPUTER_CLOCK) -> None:
-        self._node, self._clock = node, clock
-        self._topic = node.resolve_topic_name(topic)
-        self._number = 0
-        self.missed = 0  #: messages that were published and not received, where the middleware numbers them
-        self._count = 1
-        self._counted = -math.inf  # monotonic s
-
-    def is_another(self, info: dict[str, Any]) -> bool:
-        """Return whether this message comes from a different publisher than the previous one."""
-        number = info.get("publication_sequence_number")
+        number = info["publication_sequence_number"]
         if number is None:
-            return self._count_publishers() > 1
-        previous, self._number = self._number, number
-        if number <= previous:
-            return True
-        self.missed += number - previous - 1 if previous else 0
-        return False
+            raise RuntimeError("the middleware does not number messages: set RMW_IMPLEMENTATION=rmw_fastrtps_cpp")
+        last = self._newest[-1] if self._newest else 0
+        if previous := max((other for other in self._newest if other < number), default=0):
+            self.missed += number - previous - 1
+            self._newest.remove(previous)
+        self._newest.append(number)
+        if is_another := bool(number <= last):
+            self._changed = time.monotonic()
+        return is_another
 
-    def _count_publishers(self) -> int:
-        """Return the number of publishers that discovery lists, at most COUNT_PERIOD old."""
-        now = self._clock.monotonic()
-        if self._counted == -math.inf:
-            self._node.get_logger().warning(
-                f"{self._topic}: the middleware does not number messages: a second publisher is detected up to "
-                f"{COUNT_PERIOD:g} s late"
-            )
-        if now - self._counted > COUNT_PERIOD:
-            self._counted, self._count = now, self._node.count_publishers(self._topic)
-        return self._count
+    @property
+    def are_several(self) -> bool:
+        """Whether a message came from another publisher than the one before, within DISTRUST s."""
+        return time.monotonic() - self._changed < DISTRUST
 
 
 class TiltSubscription:
     """Passes the trunk's tilt on to `target`, under `lock`: `/imu/data`, and `/imu/pitch_yaw` of who sends that alone.
 
-    on_refusal(topic, error): a message is impossible; the last tilt then grows old. on_intruder(topic): a second
-    publisher sends on it. on_motion(now, specific force (3,) m/s^2, angular velocity (3,) rad/s, age in s): a sample
-    of the trunk's motion, in its axes, under `lock` too. on_tilt(now): `target` has a message of `now`, in s.
+    on_refusal(topic, error): a message is impossible; the last tilt then grows old. on_motion(now, specific force (3,)
+    m/s^2, angular velocity (3,) rad/s, age in s): a sample of the trunk's motion, in its axes, under `lock` too.
+    on_tilt(now): `target` has a message of `now`, in s. senders: the publishers by topic.
     """
 
     def __init__(
@@ -213,14 +167,12 @@ class TiltSubscription:
         target: TiltInput,
         lock: threading.Lock,
         on_refusal: Callable[[str, ParameterError], object] = lambda topic, error: None,
-        on_intruder: Callable[[str], object] = lambda topic: None,
         on_motion: Callable[..., object] = lambda *sample: None,
         on_tilt: Callable[[float], object] = lambda now: None,
     ) -> None:
         self._node, self._target, self._lock = node, target, lock
-        self._on_refusal, self._on_intruder, self._on_motion = on_refusal, on_intruder, on_motion
-        self._on_tilt = on_tilt
-        self._senders = {topic: SolePublisher(node, topic) for topic in (DATA, PITCH_YAW)}
+        self._on_refusal, self._on_motion, self._on_tilt = on_refusal, on_motion, on_tilt
+        self.senders = {topic: Publishers() for topic in (DATA, PITCH_YAW)}
         node.create_subscription(Imu, DATA, self._on_data, NEWEST)
         node.create_subscription(Vector3Stamped, PITCH_YAW, self._on_pitch_yaw, NEWEST)
 
@@ -246,8 +198,7 @@ class TiltSubscription:
 
     def _pass_on(self, topic: str, stamp: Time, info: dict[str, Any], use: Callable[[float, float], None]) -> None:
         """Call `use` with the present monotonic time in s, and the age of the stamp in s by the node's clock."""
-        if self._senders[topic].is_another(info):
-            self._on_intruder(topic)
+        self.senders[topic].is_another(info)
         age = (self._node.get_clock().now().nanoseconds - to_nanoseconds(stamp)) * 1e-9
         try:
             with self._lock:
