@@ -18,8 +18,7 @@ import numpy as np
 from exo_gravity.core.model.anfis import Anfis
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.tools.anfis import train
-from exo_gravity.tools.comparison import rms
+from exo_gravity.tools.anfis import rms, train
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 
 INPUTS = ("theta_3", "theta_4", "theta_2", "theta_1", "pitch", "tilt")

@@ -208,7 +208,9 @@ class OrdinaryArm:
         try:
             if answer := self._estimator.update(sample, now):
                 assert sample.angular_velocity
-                self._compensator.set_gravity(now, answer.gravity.tolist(), sample.angular_velocity, now - sample.time)
+                self._compensator.tilt.set_gravity(
+                    now, answer.gravity.tolist(), sample.angular_velocity, now - sample.time
+                )
                 self._note_tilt(now)
         except ParameterError:
             result.refused_samples += 1

@@ -156,10 +156,10 @@ class OfflineTrial:
             return
         if reading:
             age, turning = now - taken, reading.angular_velocity
-            self.compensator.set_gravity(now, reading.gravity, turning, age)
+            self.compensator.tilt.set_gravity(now, reading.gravity, turning, age)
             self.safety.motion.gravity = Tilt.of_gravity(arm.device.side, reading.gravity).direction
             if reading.specific_force:
-                self.compensator.set_motion(now, reading.specific_force, turning, age)
+                self.compensator.motion.add(now, reading.specific_force, turning, age)
         self._reading = arm.trunk(now, arm.device.trunk), now
 
     def _exchange(self, drive: Drive, now: float) -> None:

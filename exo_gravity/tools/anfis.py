@@ -214,7 +214,7 @@ def train(
     most = max_evaluations or MAX_EVALUATIONS
     found = least_squares(problem.residual, start, problem.jacobian, (low, high), max_nfev=most, ftol=1e-4, xtol=1e-8)
     model = problem.model(found.x)
-    return Trained(model, _rmse(model.output(inputs)[:, 0] - output), found.nfev, time.perf_counter() - started)
+    return Trained(model, float(rms(model.output(inputs)[:, 0] - output)), found.nfev, time.perf_counter() - started)
 
 
 def train_law(
@@ -228,10 +228,11 @@ def train_law(
     parts = (np.concatenate([getattr(r.model, part) for r in results]) for part in ("centre", "sigma", "consequent"))
     model = Anfis(*parts)
     held_out = model.output(scaled(samples.held_out_angle, samples.low, samples.high)) - samples.held_out_torque
-    error = {"training": [result.rmse for result in results], "held_out": list(map(_rmse, held_out.T))}
+    error = {"training": [result.rmse for result in results], "held_out": rms(held_out).tolist()}
     box = tuple(samples.low.tolist()), tuple(samples.high.tolist())
     return AnfisLaw(model, *box, arm.first_moment[1:], arm.gravity, samples.source, error), results
 
 
-def _rmse(error: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(error**2)))
+def rms(values: np.ndarray) -> np.ndarray:
+    """Return the root mean square of each column."""
+    return np.asarray(np.sqrt(np.mean(np.square(values), axis=0)))

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from exo_gravity.core.errors import ExoGravityError, ParameterError, named
+from exo_gravity.core.errors import ExoGravityError, named
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.budget import (
     USUAL_TILT,
@@ -138,14 +138,11 @@ def _write_figures(arms: Sequence[ArmBudget], folder: Path) -> str:
     if not find_spec("matplotlib"):
         return f"No figures: {missing('matplotlib', 'report')}"
     names = []
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for arm in arms:
-            for joint in range(len(arm.joints)):
-                names.append(f"{arm.name.strip('/').replace('/', '_')}_joint_{joint + 1}.png")
-                _joint_figure(arm, joint).savefig(folder / names[-1], dpi=DPI)
-    except OSError as error:
-        raise ParameterError("output", str(folder), f"a folder to write to ({error.strerror})") from None
+    folder.mkdir(parents=True, exist_ok=True)
+    for arm in arms:
+        for joint in range(len(arm.joints)):
+            names.append(f"{arm.name.strip('/').replace('/', '_')}_joint_{joint + 1}.png")
+            _joint_figure(arm, joint).savefig(folder / names[-1], dpi=DPI)
     return f"Written: {', '.join(names)} in {folder}"
 
 
@@ -157,7 +154,7 @@ def _joint_figure(arm: ArmBudget, joint: int) -> Figure:
     axes = [np.linspace(low, high, REST) for low, high in arm.bounds.T]
     axes[joint] = axes[other] = np.zeros(1)
     rest = np.vstack((list(product(*axes)), arm.joints[joint].worst))
-    across, up = (np.linspace(*arm.bounds[:, axis], CELLS) for axis in (joint, other))
+    across, up = (np.linspace(low, high, CELLS) for low, high in arm.bounds.T[[joint, other]])
     points = np.tile(rest, (CELLS * CELLS, 1))
     grid = np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2)
     points[:, [joint, other]] = np.repeat(grid, len(rest), axis=0)
@@ -204,7 +201,7 @@ def main(args: Sequence[str] | None = None) -> int:
         tilt = math.radians(one_float("max_tilt", options.max_tilt, 0.0, 90.0, "deg"))
         arms = [arm_budget(arm, wearer, support, tilt) for arm in configured_arms(options.params)]
         written = _write_figures(arms, Path(options.output))
-    except ExoGravityError as error:
+    except (ExoGravityError, OSError) as error:
         print(f"budget: {error}", file=sys.stderr)
         return 2
     masses = zip(("upper arm", "forearm", "hand"), wearer.segments, strict=True)

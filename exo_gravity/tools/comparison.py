@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import astuple, dataclass, fields
 from itertools import groupby, product
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from exo_gravity.core.model.anfis import AnfisLaw
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import gravity_torque, paper_mobile_torque, paper_static_torque
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.tools.anfis import GRID, Trained, from_gravload, train_law
+from exo_gravity.tools.anfis import GRID, Trained, from_gravload, rms, train_law
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.inputs.references import PAPER_ANALYTICAL, PAPER_ANFIS, PAPER_SECONDS, REFERENCES, gravload
 
@@ -111,11 +111,6 @@ def compare(case: Case, torque: dict[str, np.ndarray], reference: str, expected:
     return rows
 
 
-def rms(values: np.ndarray) -> np.ndarray:
-    """Return the root mean square of each column."""
-    return np.asarray(np.sqrt(np.mean(np.square(values), axis=0)))
-
-
 @dataclass(frozen=True)
 class Part:
     """The results of one arm: its rows, its ANFIS and how that was trained."""
@@ -192,9 +187,7 @@ def write(link_ends: Part, as_configured: Part, output: Path) -> list[str]:
     """Write the rows as CSV, one column per field in Nm (`limit` in degrees), and the figures; return the names."""
     rows = link_ends.rows + as_configured.rows
     with (output / "laws.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=list(asdict(rows[0])))
-        writer.writeheader()
-        writer.writerows(map(asdict, rows))
+        csv.writer(file).writerows([[field.name for field in fields(Row)], *map(astuple, rows)])
     _workspace_figure(as_configured).savefig(output / "workspace.png", dpi=130)
     _tilt_figure(rows).savefig(output / "tilt.png", dpi=130)
     return ["laws.csv", "workspace.png", "tilt.png"]

@@ -34,7 +34,7 @@ def test_after_the_ramp_the_torque_equals_that_of_the_law():
 def test_a_tilted_trunk_changes_the_torque():
     run = CompensatorRun(use_imu=True)
     for _ in range(600):
-        run.compensator.set_tilt(run.now, pitch=0.3, roll=-0.2)
+        run.compensator.tilt.set_tilt(run.now, pitch=0.3, roll=-0.2)
         run.cycle()
     expected = gravity_torque(ROBOT, THETA, Tilt.of("left", 0.3, -0.2).direction)
     np.testing.assert_allclose(run.efforts[-1], expected, rtol=1e-12)
@@ -43,7 +43,7 @@ def test_a_tilted_trunk_changes_the_torque():
 def test_without_a_fresh_tilt_there_is_a_reason_instead_of_a_torque():
     run = CompensatorRun(use_imu=True)
     assert run.cycle()[:2] == (None, "no trunk tilt yet")
-    run.compensator.set_tilt(run.now, 0.0, 0.0)
+    run.compensator.tilt.set_tilt(run.now, 0.0, 0.0)
     assert run.cycle().effort is not None
     assert "older than 80 ms" in run.cycle(0.1).reason
 
@@ -63,7 +63,7 @@ def test_a_bow_through_90_degrees_and_lying_down_stay_compensated(lean, way):
     for k in range(2400):
         bow = way * min(math.pi, 2.0 * max(0.0, k * PERIOD - 1.1))  # 2 rad/s, to 180 degrees
         gravities.append(gravity_at(bow, lean))
-        run.compensator.set_tilt(run.now, *pitch_roll(gravities[-1]))
+        run.compensator.tilt.set_tilt(run.now, *pitch_roll(gravities[-1]))
         assert run.cycle().reason == ""
     ramped = slice(round(1.1 / PERIOD) + 1, None)
     directions = np.array(gravities[ramped]) @ base_from_trunk.T
@@ -74,25 +74,25 @@ def test_a_bow_through_90_degrees_and_lying_down_stay_compensated(lean, way):
 def test_a_tilt_that_turns_faster_than_a_trunk_is_refused_whichever_way_it_turns():
     for pitch, roll in ((0.3, 0.0), (0.0, -0.3), (-math.pi / 2, 0.0)):
         run = CompensatorRun(use_imu=True)
-        run.compensator.set_tilt(run.now, 0.0, 0.0)
+        run.compensator.tilt.set_tilt(run.now, 0.0, 0.0)
         with pytest.raises(ParameterError, match=r"trunk tilt = .*: must be within 0.1 rad plus 5 rad/s"):
-            run.compensator.set_tilt(run.now + 0.01, pitch, roll)
+            run.compensator.tilt.set_tilt(run.now + 0.01, pitch, roll)
 
 
 def test_a_tilt_is_as_old_as_its_stamp():
     run = CompensatorRun(use_imu=True)
     for _ in range(100):
-        run.compensator.set_tilt(run.now, 0.1, 0.0, age=0.07)
+        run.compensator.tilt.set_tilt(run.now, 0.1, 0.0, age=0.07)
         assert run.cycle().effort is not None
     for _ in range(20):
-        run.compensator.set_tilt(run.now, 0.1, 0.0, age=0.09)
+        run.compensator.tilt.set_tilt(run.now, 0.1, 0.0, age=0.09)
         answer = run.cycle()
     assert answer.reason == "trunk tilt older than 80 ms by its stamp: the IMU driver lags, or its clock differs"
 
 
 def test_a_stamp_ahead_of_the_clock_makes_a_tilt_no_younger_than_its_arrival():
     run = CompensatorRun(use_imu=True)
-    run.compensator.set_tilt(run.now, 0.0, 0.0, age=-MAX_LEAD)
+    run.compensator.tilt.set_tilt(run.now, 0.0, 0.0, age=-MAX_LEAD)
     assert run.cycle(0.078).held == ""
     assert run.cycle(0.004).held.startswith("trunk tilt older than 80 ms: held on")
     assert run.cycle(0.02).reason == "trunk tilt older than 80 ms"
@@ -102,7 +102,7 @@ def test_a_stamp_ahead_of_the_clock_makes_a_tilt_no_younger_than_its_arrival():
 def test_a_late_tilt_is_turned_on_within_the_bound_that_it_states_and_then_withdrawn(acceleration):
     run = CompensatorRun(use_imu=True)
     for _ in range(600):  # past the ramp
-        run.compensator.set_gravity(run.now, (0.0, 0.0, -1.0), (0.0, 0.3, 0.0))
+        run.compensator.tilt.set_gravity(run.now, (0.0, 0.0, -1.0), (0.0, 0.3, 0.0))
         run.cycle()
     start, held = run.now, 0
     while (answer := run.cycle()).effort is not None:
@@ -115,16 +115,16 @@ def test_a_late_tilt_is_turned_on_within_the_bound_that_it_states_and_then_withd
     assert held * PERIOD == pytest.approx(HOLD - 0.08, abs=2 * PERIOD)
     assert answer.reason == "trunk tilt older than 80 ms"
     before = [effort for effort in run.efforts if effort is not None][-1]
-    run.compensator.set_gravity(run.now, (math.sin(0.1), 0.0, -math.cos(0.1)), (0.0, 0.3, 0.0))
+    run.compensator.tilt.set_gravity(run.now, (math.sin(0.1), 0.0, -math.cos(0.1)), (0.0, 0.3, 0.0))
     after = run.cycle()
     assert after.held == "" and np.abs(np.subtract(after.effort, before)).max() < 50.0 * 2 * PERIOD + 1e-9
 
 
 def test_a_tilt_whose_successor_was_refused_is_not_held_on():
     run = CompensatorRun(use_imu=True)
-    run.compensator.set_tilt(run.now, 0.0, 0.0)
+    run.compensator.tilt.set_tilt(run.now, 0.0, 0.0)
     with pytest.raises(ParameterError):
-        run.compensator.set_tilt(run.now + 0.01, math.nan, 0.0)
+        run.compensator.tilt.set_tilt(run.now + 0.01, math.nan, 0.0)
     assert run.cycle(0.082).effort is None
 
 
@@ -132,10 +132,10 @@ def test_a_tilt_whose_successor_was_refused_is_not_held_on():
 def test_a_stamp_of_another_clock_is_refused_and_the_reason_names_it(age):
     run = CompensatorRun(use_imu=True)
     with pytest.raises(ParameterError, match="synchronise the clocks"):
-        run.compensator.set_tilt(run.now, 0.0, 0.0, age)
+        run.compensator.tilt.set_tilt(run.now, 0.0, 0.0, age)
     reason = run.cycle().reason
     assert "no trunk tilt yet (the newest was refused: age of the trunk tilt by its stamp must be from" in reason
-    run.compensator.set_tilt(run.now, 0.0, 0.0)
+    run.compensator.tilt.set_tilt(run.now, 0.0, 0.0)
     assert run.cycle().effort is not None
 
 
@@ -154,9 +154,9 @@ def test_impossible_joint_angles_get_no_torque(theta):
 @pytest.mark.parametrize("angle", [math.nan, math.inf, 4.0])
 def test_an_impossible_tilt_is_rejected_and_the_last_one_stays(angle):
     run = CompensatorRun(use_imu=True)
-    run.compensator.set_tilt(run.now, 0.1, 0.0)
+    run.compensator.tilt.set_tilt(run.now, 0.1, 0.0)
     with pytest.raises(ParameterError):
-        run.compensator.set_tilt(run.now, angle, 0.0)
+        run.compensator.tilt.set_tilt(run.now, angle, 0.0)
     assert run.cycle().effort is not None
 
 

@@ -44,7 +44,7 @@ def test_inside_its_box_the_anfis_gives_the_torque():
 )
 def test_where_the_anfis_was_not_trained_the_exact_law_replaces_it_and_the_reason_is_given(theta, pitch, moments, why):
     run = CompensatorRun(law="anfis", anfis=learned(moments))
-    run.compensator.set_tilt(run.now, pitch, 0.0)
+    run.compensator.tilt.set_tilt(run.now, pitch, 0.0)
     answer = run.cycle(1.2, theta)
     assert why in answer.fallback
     np.testing.assert_allclose(answer.effort, gravity_torque(ROBOT, theta, Tilt.of("left", pitch).direction))

@@ -21,9 +21,9 @@ def run_with(force, spin_up=STILL, seconds=1.3, **changes):
     for cycle in range(round(seconds / PERIOD)):
         if cycle % 5 == 0:
             turning = [run.now * component for component in spin_up]
-            run.compensator.set_tilt(run.now, 0.0, 0.0)
+            run.compensator.tilt.set_tilt(run.now, 0.0, 0.0)
             if force is not None:
-                run.compensator.set_motion(run.now, force, turning)
+                run.compensator.motion.add(run.now, force, turning)
         run.cycle()
     return run
 
@@ -58,8 +58,8 @@ def test_switching_it_on_does_not_step_the_torque():
     run.compensator.apply(settings)
     before = len(run.efforts)
     for _ in range(1200):
-        run.compensator.set_tilt(run.now, 0.0, 0.0)
-        run.compensator.set_motion(run.now, FORCE, STILL)
+        run.compensator.tilt.set_tilt(run.now, 0.0, 0.0)
+        run.compensator.motion.add(run.now, FORCE, STILL)
         run.cycle()
     assert np.abs(np.diff(run.efforts[before - 1 :], axis=0)).max() < 0.01
     assert np.abs(np.subtract(run.efforts[-1], run.efforts[before - 1])).max() > 0.1
@@ -67,7 +67,7 @@ def test_switching_it_on_does_not_step_the_torque():
 
 def test_with_a_tilt_that_is_too_old_there_is_no_torque_whatever_the_motion():
     run = run_with(FORCE, inertial=True)
-    run.compensator.set_motion(run.now, FORCE, STILL)
+    run.compensator.motion.add(run.now, FORCE, STILL)
     run.cycle(0.1)
-    run.compensator.set_motion(run.now, FORCE, STILL)
+    run.compensator.motion.add(run.now, FORCE, STILL)
     assert "older than 80 ms" in run.cycle().reason

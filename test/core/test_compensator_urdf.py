@@ -51,7 +51,7 @@ def test_gravity_comes_from_the_tilt_in_the_root_links_axes():
     arm = Compensator(settings(use_imu=True, max_effort_rate=1000.0, tilt_timeout=0.5))
     assert arm.step(1.0, POSE).reason == "no trunk tilt yet"
     for n in range(300):
-        arm.set_gravity(2.0 + n * PERIOD, (0.6, 0.0, -0.8))
+        arm.tilt.set_gravity(2.0 + n * PERIOD, (0.6, 0.0, -0.8))
         answer = arm.step(2.0 + n * PERIOD, POSE)
     assert answer.effort == pytest.approx(Pendulum().torque(POSE, (0.6 * 9.80665, 0.0, -0.8 * 9.80665)), abs=1e-9)
     assert arm.step(4.0, POSE).reason == "trunk tilt older than 500 ms"
@@ -60,7 +60,7 @@ def test_gravity_comes_from_the_tilt_in_the_root_links_axes():
 def test_pitch_and_roll_give_the_same_gravity_as_the_vector():
     arm = Compensator(settings(use_imu=True, max_effort_rate=1000.0))
     for n in range(300):
-        arm.set_tilt(2.0 + n * PERIOD, math.asin(0.6), 0.0)
+        arm.tilt.set_tilt(2.0 + n * PERIOD, math.asin(0.6), 0.0)
         answer = arm.step(2.0 + n * PERIOD, POSE)
     assert answer.effort == pytest.approx(Pendulum().torque(POSE, (0.6 * 9.80665, 0.0, -0.8 * 9.80665)), abs=1e-9)
 

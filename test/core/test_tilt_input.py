@@ -37,11 +37,11 @@ def test_bowed_beyond_90_degrees_lying_and_upside_down_the_torque_is_pinocchios_
     for circle in great_circles():
         run = CompensatorRun(side=side, use_imu=True)
         for _ in range(600):  # past the ramp
-            run.compensator.set_gravity(run.now, circle[0])
+            run.compensator.tilt.set_gravity(run.now, circle[0])
             run.cycle()
         efforts = []
         for gravity in circle:
-            run.compensator.set_gravity(run.now, gravity)
+            run.compensator.tilt.set_gravity(run.now, gravity)
             efforts.append(run.cycle().effort)
         directions = circle @ BASE_FROM_TRUNK[side].T
         expected = reference(np.tile(THETA, (len(circle), 1)), directions)

@@ -59,10 +59,9 @@ class Compensator:
         self.settings = settings
         #: what is added to gravity compensation; None if `settings` have no terms
         self.terms = Terms(names, settings.terms, settings.moving) if isinstance(settings, Settings) else None
-        #: the trunk's tilt, or that of the root link of another arm
+        #: of the trunk, or of the root link of another arm
         self.tilt = TiltInput(settings.side, settings.tilt_timeout)
-        self.set_tilt, self.set_gravity = self.tilt.set_tilt, self.tilt.set_gravity
-        self._motion = FeltMotion()
+        self.motion = FeltMotion()  #: of the trunk, used with `inertial` while the tilt is fresh
         self._nothing = (0.0,) * len(settings.max_effort)
         self._effort = self._nothing  # the last answer's,
         self._last_answer = self._ramp_start = -math.inf  # its time, and that of the first one after a break
@@ -78,15 +77,6 @@ class Compensator:
         if settings.side != self.settings.side:
             raise ParameterError("side", settings.side, f"{self.settings.side}, because the side cannot change")
         self._pending = settings
-
-    def set_motion(
-        self, now: float, specific_force: Sequence[float], angular_velocity: Sequence[float], age: float = 0.0
-    ) -> None:
-        """Set what the trunk's IMU measured `age` s before `now`; used with `inertial`, while the tilt is fresh.
-
-        specific_force m/s^2, angular_velocity rad/s: (3,) in the trunk's axes. Raises ParameterError.
-        """
-        self._motion.add(now - max(0.0, age), specific_force, angular_velocity)
 
     def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Answer:
         """Return the torque for joint angles `theta` (n,) rad at `now` s on a monotonic clock.
@@ -154,8 +144,8 @@ class Compensator:
         ways = []
         for origin in [before] if self._change.is_over else [self._origin, before]:
             change = GuidedChange(len(torque))
-            change.begin(self._torque, self._torque_of(origin, state) if origin else torque, torque)
-            ways.append((change.unexplained, origin, change))
+            start = self._torque_of(origin, state) if origin else torque
+            ways.append((change.begin(self._torque, start, torque), origin, change))
         _, self._origin, self._change = min(ways, key=operator.itemgetter(0))
 
     def _torque_of(self, load: Load, state: State) -> Torque:
@@ -185,7 +175,7 @@ class Compensator:
         """
         tilt, felt = self.tilt.at(now), None
         if isinstance(settings, Settings) and settings.inertial and settings.use_imu:
-            felt = self._motion.at(now, settings.shoulder_from_imu)
+            felt = self.motion.at(now, settings.shoulder_from_imu)
         if felt:
             magnitude = math.hypot(*felt.gravity) / STANDARD_GRAVITY
             tilt = Tilt.of_gravity(settings.side, felt.gravity)._replace(magnitude=magnitude)

@@ -103,6 +103,7 @@ class UrdfSettings:
     """Settings of any serial arm of n joints, whose torques come from `arm`."""
 
     law: ClassVar[str] = URDF_LAW
+    inertial: ClassVar[bool] = False
     side: ClassVar[str] = "left"  # the root link's axes are not mirrored
 
     arm: GravityModel

@@ -19,6 +19,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -131,10 +132,10 @@ class AnfisLaw:
             joints = [content["joints"][joint] for joint in JOINTS]
             box = [tuple(float(bound) for bound in content["box"][name]) for name in INPUTS]
             low, high = zip(*box, strict=True)
-            model = Anfis(*([joint[part] for joint in joints] for part in PARTS))
+            parts: Any = ([joint[part] for joint in joints] for part in PARTS)
             error = {kind: [float(joint[f"{kind}_rmse"]) for joint in joints] for kind in ("training", "held_out")}
             moment, gravity = tuple(map(float, content["arm"]["first_moment"])), float(content["arm"]["gravity"])
-            return cls(model, low, high, moment, gravity, str(content["source"]), error)
+            return cls(Anfis(*parts), low, high, moment, gravity, str(content["source"]), error)
         except KeyError as error:
             raise DataError(f"ANFIS file: the key {error.args[0]} is missing") from None
         except (TypeError, ValueError) as error:

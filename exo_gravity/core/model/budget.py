@@ -63,7 +63,8 @@ def workspace(position_min: Vector, position_max: Vector, max_tilt: float) -> np
 
 def random_points(bounds: np.ndarray, count: int = SAMPLES) -> np.ndarray:
     """Return points (count, 6), uniform over the workspace `bounds` (2, 6) and the same in every call."""
-    return np.random.default_rng(0).uniform(*bounds, (count, JOINT_COUNT + 2))
+    low, high = bounds
+    return np.random.default_rng(0).uniform(low, high, (count, JOINT_COUNT + 2))
 
 
 @dataclass(frozen=True)

@@ -44,14 +44,17 @@ class FeltMotion:
         self._time = -math.inf  # of the newest sample
         self._parabola: np.ndarray | None = None  # (3, 6), coefficients of (t^2, t, 1) for force and angular velocity
 
-    def add(self, time: float, specific_force: Sequence[float], angular_velocity: Sequence[float]) -> None:
-        """Add the sample taken at `time` (s): (3,) m/s^2 and (3,) rad/s in the trunk's axes.
+    def add(
+        self, now: float, specific_force: Sequence[float], angular_velocity: Sequence[float], age: float = 0.0
+    ) -> None:
+        """Add the sample taken `age` s before `now`: (3,) m/s^2 and (3,) rad/s in the trunk's axes.
 
         An older sample than the newest is ignored. Raises ParameterError unless all numbers are finite.
         """
         values = [*map(float, specific_force), *map(float, angular_velocity)]
         if len(values) != 6 or not all(map(math.isfinite, values)):
             raise ParameterError("linear_acceleration, angular_velocity", values, "3 finite numbers each")
+        time = now - max(0.0, age)
         if not time > self._time:
             return
         self._time = time

@@ -87,7 +87,7 @@ def report(control: Compensator, answer: Answer, names: Sequence[str]) -> dict[s
     if terms:
         values["terms"] = ", ".join(terms.active) or "none"
         values["assist"] = terms.assist.report
-        values["inertia tank (J)"] = f"{terms.energy:.2f}"
+        values["inertia tank (J)"] = f"{terms.tank.level:.2f}"
     return values
 
 

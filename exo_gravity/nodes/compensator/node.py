@@ -129,7 +129,7 @@ class CompensatorNode(Node):
 
     def _on_motion(self, *sample: Any) -> None:
         if self._control.settings.inertial:  # each sample takes a fit, under the lock
-            self._control.set_motion(*sample)
+            self._control.motion.add(*sample)
 
     def _refused(self, topic: str, error: ParameterError) -> str:
         """Note an impossible message. Its value goes to /diagnostics only: a hostile sender could fill the log."""

@@ -34,31 +34,11 @@ class ConfiguredArm:
     motors: tuple[JointMotor, ...]
     limits: Limits
     robot: ArmModel  #: the arm without a wearer
-
-    @property
-    def name(self) -> str:
-        """The namespace without slashes, 'arm' for the root namespace."""
-        return self.namespace.strip("/") or "arm"
-
-    @property
-    def side(self) -> str:
-        """'left' or 'right'."""
-        return str(self.compensator["side"])
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """The four joints from the shoulder to the elbow."""
-        return tuple(self.compensator["joint_names"])
-
-    @property
-    def low(self) -> np.ndarray:
-        """Lower joint limits (4,) in rad."""
-        return np.array(self.limits.position_min)
-
-    @property
-    def high(self) -> np.ndarray:
-        """Upper joint limits (4,) in rad."""
-        return np.array(self.limits.position_max)
+    name: str  #: the namespace without slashes, 'arm' for the root namespace
+    side: str  #: 'left' or 'right'
+    joint_names: tuple[str, ...]  #: from the shoulder to the elbow
+    low: np.ndarray  #: lower joint limits (4,) in rad
+    high: np.ndarray  #: upper joint limits
 
     def settings(self) -> Settings:
         """Return the compensator's settings, with the model in `anfis_file`. Raises ParameterError."""
@@ -83,7 +63,9 @@ def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:
     with named(f"{namespace}/compensator "):
         # The robot does not depend on the law, and the model of `law: anfis` may not be trained yet.
         robot = settings_of({**compensator, "law": "exact"}).robot
-    return ConfiguredArm(namespace, can_bridge, compensator, motors, limits, robot)
+    name, names, side = namespace.strip("/") or "arm", tuple(compensator["joint_names"]), compensator["side"]
+    bounds = np.array(limits.position_min), np.array(limits.position_max)
+    return ConfiguredArm(namespace, can_bridge, compensator, motors, limits, robot, name, side, names, *bounds)
 
 
 def configured_arms(params: str | Path) -> list[ConfiguredArm]:

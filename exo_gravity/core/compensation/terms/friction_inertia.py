@@ -19,7 +19,6 @@ moved the shoulder's rotation against its friction, by up to 1 degree a minute.
 from __future__ import annotations
 
 import math
-import operator
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -122,7 +121,7 @@ class InertiaTerm(NamedTuple):
 
 
 def _dot(a: Iterable[float], b: Iterable[float]) -> float:
-    return sum(map(operator.mul, a, b))
+    return sum(x * y for x, y in zip(a, b, strict=True))
 
 
 class AccelerationFilter:

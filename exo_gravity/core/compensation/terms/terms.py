@@ -111,8 +111,8 @@ class Active(NamedTuple):
 class Terms:
     """What one compensator adds to gravity compensation.
 
-    names: of the joints (4,). arm: what moves, with known masses, for `inertia`. `assist` is the outer loop's input.
-    now: the terms in force.
+    names: of the joints (4,). arm: what moves, with known masses, for `inertia`. `assist` is the outer loop's input,
+    `tank` the energy of `inertia`. now: the terms in force.
     """
 
     def __init__(self, names: Sequence[str], settings: TermSettings, arm: ArmModel) -> None:
@@ -120,7 +120,7 @@ class Terms:
         self.assist = AssistInput(names, settings.assist)
         self._refusal = ""  # why the sum is not used
         self._output = self._assisted = NO_TORQUE
-        self._tank = EnergyTank()
+        self.tank = EnergyTank()
         self._acceleration = AccelerationFilter()
         self._time = -math.inf
         self._state = TermState(0.0, NO_TORQUE, NO_TORQUE, NO_TORQUE, 0.0)
@@ -131,11 +131,6 @@ class Terms:
     def active(self) -> list[str]:
         """The names of the terms that are on, and 'assist' if efforts are used."""
         return [name for name in GROUPS if getattr(self.settings, name).on]
-
-    @property
-    def energy(self) -> float:
-        """Energy in J left in the tank of `inertia`."""
-        return self._tank.level
 
     @property
     def problem(self) -> str:
@@ -188,7 +183,7 @@ class Terms:
         if s.inertia.on:
             self._has_inertia = True
             left = [(MAX_FRICTION_SHARE - s.friction.share) * coulomb for coulomb in s.friction.coulomb]
-            terms.append(InertiaTerm(s.inertia.share, LinkInertia.of(arm), left, self._tank))
+            terms.append(InertiaTerm(s.inertia.share, LinkInertia.of(arm), left, self.tank))
         return terms
 
 
