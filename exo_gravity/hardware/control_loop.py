@@ -228,28 +228,24 @@ def lower(bus: MotorBus, drive: Drive, period: float) -> None:
     joint under damping creeps, and would fall if it were switched off before it hangs. While no motor replies the
     torque is held, and one that then returns without torque stays off. No exception ends this.
     """
-    now, faded = bus.clock.monotonic, 0.0
+    clock, faded, is_down = bus.clock, 0.0, False
     rest, supply = RestTracker(), SupplyMonitor()
     if any(drive.unsure):
         supply.doubt(drive.effort)
     while True:
-        time, joints = now(), tuple(bus.samples)
+        time, joints = clock.monotonic(), tuple(bus.samples)
         silent = [time - joint.time > REPLY_TIMEOUT for joint in joints]
         rest.step(time, joints, silent)
-        if faded >= LOWERING_FADE and not any(silent) and time - rest.since >= REST_TIME:
-            break
+        is_down |= faded >= LOWERING_FADE and not any(silent) and time - rest.since >= REST_TIME
+        if is_down and not bus.may_be_powered:
+            return
         effort = tuple(max(0.0, 1.0 - faded / LOWERING_FADE) * effort for effort in drive.effort)
         if all(silent):
             supply.doubt(effort)
         else:
             faded += period
         supply.step(period, joints, silent)
-        _exchange(bus, Drive(effort, (DAMPING,) * len(effort), True, unsure=supply.unsure), time + period)
-    while bus.may_be_powered:
-        _exchange(bus, OFF, now() + period)
-
-
-def _exchange(bus: MotorBus, drive: Drive, deadline: float) -> None:
-    with contextlib.suppress(Exception):
-        bus.exchange(drive, deadline)
-    bus.clock.sleep(max(0.0, deadline - bus.clock.monotonic()))
+        lowered = Drive(effort, (DAMPING,) * len(effort), True, unsure=supply.unsure)
+        with contextlib.suppress(Exception):
+            bus.exchange(OFF if is_down else lowered, time + period)
+        clock.sleep(max(0.0, time + period - clock.monotonic()))

@@ -1,9 +1,4 @@
-"""The start gate: what must hold before the motors of an arm are switched on, and before they carry it.
-
-The machine waits until, for CALM seconds, every motor has replied without a fault, at rest and within its limits
-(`missing_for_a_start`), and fresh efforts have arrived. `SwitchOnCheck` then checks that the motors are on, and
-`SignCheck` that their signs are right.
-"""
+"""The start gate: what must hold before the motors of an arm are switched on, and before they carry it."""
 
 from __future__ import annotations
 

@@ -150,8 +150,11 @@ class Limits:
             above = joint.position - self.position_max[i] + WALL_WIDTH
             below = self.position_min[i] + WALL_WIDTH - joint.position
             depth = above if above > 0.0 else -max(0.0, below)  # rad in a wall, > 0 in the upper one
-            permitted = self.max_effort[i] * _derating(joint.temperature)
-            wall = _wall_torque(depth, joint.velocity) if depth else 0.0
+            # Once the joint leaves the wall, no spring pushes it.
+            is_left = math.copysign(joint.velocity, joint.velocity * depth) < -WALL_RELEASE
+            wall = 0.0 if is_left or not depth else -max(-WALL_TORQUE, min(WALL_TORQUE, WALL_STIFFNESS * depth))
+            colder = DERATING if joint.temperature is None else MAX_TEMPERATURE - joint.temperature
+            permitted = self.max_effort[i] * (0.5 + 0.5 * max(0.0, min(1.0, colder / DERATING)))
             wanted = share * (effort[i] + wall)
             clamped = max(-permitted, min(permitted, wanted))
             limited = max(before[i] - step, min(before[i] + step, clamped))
@@ -172,16 +175,3 @@ def guide_damping(velocity: float) -> float:
     """Return the damping in Nm s/rad of a joint at `velocity` rad/s while its load changes."""
     speed = max(GUIDE_SPEED, abs(velocity))
     return min(DAMPING * (speed - GUIDE_SPEED), GUIDE_BRAKE) / speed
-
-
-def _derating(temperature: int | None) -> float:
-    """Return the share of torque that a motor of `temperature` (degC) is permitted."""
-    colder = DERATING if temperature is None else MAX_TEMPERATURE - temperature
-    return 0.5 + 0.5 * max(0.0, min(1.0, colder / DERATING))
-
-
-def _wall_torque(depth: float, velocity: float) -> float:
-    """Return the torque in Nm of a soft wall at `depth` (rad), none while the joint leaves it (`velocity`, rad/s)."""
-    if math.copysign(velocity, velocity * depth) < -WALL_RELEASE:
-        return 0.0
-    return -max(-WALL_TORQUE, min(WALL_TORQUE, WALL_STIFFNESS * depth))

@@ -74,7 +74,13 @@ class BusScan(contextlib.ExitStack):
                 )
             self._port = CanPort(open_bus(*address), clock)
             self.callback(self._port.close)
-            self._listen()
+            for message, kind, _ in self._frames(LISTEN_TIME):
+                heard = message.arbitration_id
+                if (kind == COMMAND) if message.is_extended_id else (heard <= MAX_CAN_ID):
+                    raise BusError(
+                        f"CAN bus {self.name} is in use: a frame with ID {heard} was heard; stop the other host. "
+                        "Without another host, two motors share an ID and answer each other: switch off their power"
+                    )
         except BaseException:
             self.close()
             raise
@@ -123,15 +129,6 @@ class BusScan(contextlib.ExitStack):
             if reporting <= set(found):
                 break
         return found
-
-    def _listen(self) -> None:
-        for message, kind, _ in self._frames(LISTEN_TIME):
-            heard = message.arbitration_id
-            if (kind == COMMAND) if message.is_extended_id else (heard <= MAX_CAN_ID):
-                raise BusError(
-                    f"CAN bus {self.name} is in use: a frame with ID {heard} was heard; stop the other host. Without "
-                    "another host, two motors share an ID and answer each other: switch off their power"
-                )
 
     def _ask(self, can_id: int) -> Iterator[tuple[can.Message, MotorAnswer | None]]:
         """Send one command; yield the frames with 11-bit IDs that arrive within REPLY_TIME, each with its answer."""

@@ -55,7 +55,8 @@ class DriveNotes(ctypes.Structure):
     _fields_ = (
         ("time", ctypes.c_double),  #: s, of the last note
         ("_powered", ctypes.c_double),
-        ("_applied", ctypes.c_double * (2 * JOINT_COUNT)),  # effort and damping
+        ("_effort", ctypes.c_double * JOINT_COUNT),
+        ("_damping", ctypes.c_double * JOINT_COUNT),
         ("heartbeat", ctypes.c_double),  #: s, at which the watchdog last ran; 0 before it runs
         ("_owner", ctypes.c_char * 512),
     )
@@ -68,8 +69,7 @@ class DriveNotes(ctypes.Structure):
     @property
     def drive(self) -> Drive:
         """What the motors received last."""
-        applied = tuple(self._applied)
-        return Drive(applied[:JOINT_COUNT], applied[JOINT_COUNT:], bool(self._powered))
+        return Drive(tuple(self._effort), tuple(self._damping), bool(self._powered))
 
     @property
     def owner(self) -> str:

@@ -182,11 +182,7 @@ class OwnedBus:
         self._arm = arm
         self._lock = take_over(arm, owner, log, ATTEMPT_TIME, clock)
         self.notes = self._lock.notes  #: what the motors receive, for a process that outlives this one
-        try:
-            self.watchdog = Watchdog(self._lock, arm)
-        except BaseException:
-            self._lock.release()
-            raise
+        self.watchdog = Watchdog(self._lock, arm)
 
     def open(self) -> MotorBus:
         """Open the bus. Raises BusError if it cannot be opened, or if another host commands the motors."""
