@@ -131,11 +131,14 @@ class EqualValues:
             return
         up, (x, y, z) = up_in_body(quaternion), [value / STANDARD_GRAVITY for value in values[3:]]
         norm = math.hypot(x, y, z)
-        turned = math.dist(up, (x / norm, y / norm, z / norm)) > TURN and abs(norm - 1.0) < NEAR_GRAVITY
-        if turned if axis < 3 else abs((x, y, z)[axis - 3] - up[axis - 3]) > STUCK_TURN:
-            name = "linear_acceleration" if axis >= 3 else "angular_velocity"
+        if axis >= 3:
+            name, is_stuck = "linear_acceleration", abs((x, y, z)[axis - 3] - up[axis - 3]) > STUCK_TURN
+        else:
+            turn = math.dist(up, (x / norm, y / norm, z / norm))
+            name, is_stuck = "angular_velocity", turn > TURN and abs(norm - 1.0) < NEAR_GRAVITY
+        if is_stuck:
             expected = f"different from sample to sample while the trunk turns: the {'xyz'[axis % 3]} axis is stuck"
-            raise Contradiction(name, values[3:] if axis >= 3 else values[:3], expected)
+            raise Contradiction(name, values[axis // 3 * 3 :][:3], expected)
 
 
 class Agreement:
