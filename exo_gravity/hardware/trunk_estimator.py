@@ -174,7 +174,8 @@ class TrunkEstimator:
         if count:
             x, y, z = map(sum, zip(*self._forces, strict=True))
             one = count * STANDARD_GRAVITY
-            agreement.check(dt, quaternion, (x / one, y / one, z / one), spin_up + speed * speed)
+            last = math.dist(self._forces[-1], ZERO) / STANDARD_GRAVITY
+            agreement.check(dt, quaternion, (x / one, y / one, z / one), last, spin_up + speed * speed)
         self._speed = max(sum(map(abs, rate)), self._speed * (1.0 - dt))
         contradiction = agreement.contradiction + self._speed * self._clock.offset
         self._uncertainty.advance(dt, len(rates) - 1, spin_up, bias_sigma, agreement.square, contradiction)
