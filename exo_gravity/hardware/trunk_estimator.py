@@ -68,6 +68,12 @@ class TrunkEstimator:
     _agreement, _clock = imu_checks.Agreement(), imu_checks.ClockCheck()
     _is_fused: bool | None = None  # None before the first sample
     _time = -math.inf
+    _quaternion: Quaternion | None  # of the IMU by the last sample, world from IMU
+    _force: Floats3 | None  # m/s^2, of the last sample
+    _rates: list[Floats3]  # rad/s, since the last judgement and at it
+    _forces: list[Floats3]  # m/s^2, since then
+    _judged: float  # s, of the sample of the last judgement
+    _speed: float  # rad/s, the highest in the last second
 
     def __init__(
         self,
@@ -143,7 +149,7 @@ class TrunkEstimator:
             raise ParameterError("orientation", None, "reported by the IMU, or install vqf to fuse it")
         rate, is_saturated = in_range("angular_velocity", sample.angular_velocity, self._fastest)
         force, is_cut = in_range("linear_acceleration", sample.acceleration, self._strongest)
-        imu_checks.check_living(force, self._forces[-1] if self._forces else None)
+        imu_checks.check_living(force, self._force)
         dt = self._step(sample, rate + force, None if is_saturated or is_cut else self._quaternion)
         last = self._rates[-1] if self._rates else rate
         change, repeated, uncertainty = math.dist(rate, last), self._equal.duration, self._uncertainty
@@ -153,6 +159,7 @@ class TrunkEstimator:
                 self._restart("too much rotation was not measured")
         quaternion = self._fusion.advance(dt, rate, last, None if is_cut else force)
         self._rates.append(rate)
+        self._force = None if is_cut else force
         if not is_cut:
             self._forces.append(force)
         if self._time - self._judged >= CHECK_PERIOD:
@@ -167,7 +174,8 @@ class TrunkEstimator:
         if count:
             x, y, z = map(sum, zip(*self._forces, strict=True))
             one = count * STANDARD_GRAVITY
-            agreement.check(dt, quaternion, (x / one, y / one, z / one), spin_up + speed * speed)
+            last = math.dist(self._forces[-1], ZERO) / STANDARD_GRAVITY
+            agreement.check(dt, quaternion, (x / one, y / one, z / one), last, spin_up + speed * speed)
         self._speed = max(sum(map(abs, rate)), self._speed * (1.0 - dt))
         contradiction = agreement.contradiction + self._speed * self._clock.offset
         self._uncertainty.advance(dt, len(rates) - 1, spin_up, bias_sigma, agreement.square, contradiction)
@@ -194,11 +202,8 @@ class TrunkEstimator:
         self._uncertainty = TiltUncertainty(self._period)
         self._agreement = imu_checks.Agreement(is_suspect or self._agreement.is_suspect)
         self._why = why  # there is no orientation yet
-        self._speed = 0.0  # rad/s, the highest in the last second
-        self._quaternion: Quaternion | None = None  # of the IMU by the last sample, world from IMU
-        self._judged = self._time  # s, the sample at which the last judgement was
-        self._rates: list[Floats3] = []  # rad/s, since then and at it
-        self._forces: list[Floats3] = []  # m/s^2, since then
+        self._quaternion = self._force = None
+        self._rates, self._forces, self._judged, self._speed = [], [], self._time, 0.0
 
 
 class VqfFusion:
@@ -230,7 +235,7 @@ class VqfFusion:
         rate, last_rate: of this sample and the last one, each of the period that it ends; over several periods those
         between the two are interpolated. acceleration: None if it is not known.
         """
-        vqf, periods, scaled, force = self._vqf, dt / self._period, self._rate.data, self._force.data
+        vqf, periods, scaled, force = self._vqf, dt / self._period, self._rate, self._force
         (x, y, z), (a, b, c) = rate, self.bias
         if periods > 1.001:
             x, y, z = plus(rate, plus(last_rate, rate, -1.0), 0.5 - 0.5 / periods)
@@ -239,11 +244,11 @@ class VqfFusion:
         self._due += dt - count * self._period
         if acceleration and count:
             force[0], force[1], force[2] = acceleration
-            vqf.update(self._rate, self._force)
+            vqf.update(scaled, force)
             for _ in range(1, count):
-                vqf.updateAcc(self._force)
+                vqf.updateAcc(force)
         else:
-            vqf.updateGyr(self._rate)
+            vqf.updateGyr(scaled)
         self._count += 1
         if self._count % BIAS_INTERVAL == 0:
             self._read_bias()

@@ -131,11 +131,14 @@ class EqualValues:
             return
         up, (x, y, z) = up_in_body(quaternion), [value / STANDARD_GRAVITY for value in values[3:]]
         norm = math.hypot(x, y, z)
-        turned = math.dist(up, (x / norm, y / norm, z / norm)) > TURN and abs(norm - 1.0) < NEAR_GRAVITY
-        if turned if axis < 3 else abs((x, y, z)[axis - 3] - up[axis - 3]) > STUCK_TURN:
-            name = "linear_acceleration" if axis >= 3 else "angular_velocity"
+        if axis >= 3:
+            name, is_stuck = "linear_acceleration", abs((x, y, z)[axis - 3] - up[axis - 3]) > STUCK_TURN
+        else:
+            turn = math.dist(up, (x / norm, y / norm, z / norm))
+            name, is_stuck = "angular_velocity", turn > TURN and abs(norm - 1.0) < NEAR_GRAVITY
+        if is_stuck:
             expected = f"different from sample to sample while the trunk turns: the {'xyz'[axis % 3]} axis is stuck"
-            raise Contradiction(name, values[3:] if axis >= 3 else values[:3], expected)
+            raise Contradiction(name, values[axis // 3 * 3 :][:3], expected)
 
 
 class Agreement:
@@ -175,12 +178,14 @@ class Agreement:
             expected = f"within {limit:g} degrees of the accelerometer at rest: check the IMU's axes, units and signs"
             raise ParameterError("gravity_in_imu", [round(-component, 2) for component in up], expected)
 
-    def check(self, dt: float, quaternion: Quaternion, acceleration: Floats3, swing: float) -> None:
+    def check(self, dt: float, quaternion: Quaternion, acceleration: Floats3, last: float, swing: float) -> None:
         """Compare a fused orientation, world from IMU, with the mean acceleration, in 1 g, of the `dt` s that it ends.
 
-        swing: rad/s^2, the angular acceleration and the square of the angular velocity.
+        last: length of the last acceleration, in 1 g. swing: rad/s^2, the angular acceleration and the square of the
+        angular velocity.
         """
         self._age += dt
+        self._deviation += (abs(last - 1.0) - self._deviation) * min(1.0, dt / QUIET_TIME)
         self._check_turns(dt, up_in_body(quaternion), acceleration, swing)
         self._check_mean(dt, rotated(quaternion, acceleration))
 
@@ -194,7 +199,6 @@ class Agreement:
         self._means = mean_x, mean_y, mean_z, mean_a + share * a, mean_b + share * b, mean_c + share * c
         turned = x, y, z
         size, difference = math.dist(turned, ZERO), math.dist(turned, (a, b, c))
-        self._deviation += (abs(norm - 1.0) - self._deviation) * min(1.0, dt / QUIET_TIME)
         self.contradiction = 0.0
         self._unlike -= self._unlike * dt / FORGET_TIME
         if size <= CLEAR_TURN:
