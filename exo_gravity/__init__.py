@@ -1,7 +1,5 @@
 """Feed-forward gravity compensation for a worn upper-body exoskeleton (ROS 2)."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

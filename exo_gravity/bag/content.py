@@ -1,7 +1,5 @@
 """What a recording holds: its topics, and what the reader makes of them, as plain data that needs no bag library."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple

@@ -7,8 +7,6 @@ and names. So the first one gives the offsets of the numbers, and NumPy extracts
 bytes are equal.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

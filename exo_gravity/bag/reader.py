@@ -6,8 +6,6 @@ header stamps; where these run backwards or are far from the recorder's clock, i
 was carried comes from the key `state` of its can_bridge on /diagnostics, never from the text.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from itertools import groupby, islice

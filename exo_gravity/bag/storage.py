@@ -9,8 +9,6 @@ chunk's content, once decompressed, is such records again. This module extracts 
 chunk that is cut, and create an object for each message, while seven million must be read in seconds.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 import sqlite3

@@ -6,8 +6,6 @@ are then missing; `report` reads the chunks without them, and `report --repair` 
 delays this thread only: messages that find the queue full are lost and counted. A full disk ends the recording.
 """
 
-from __future__ import annotations
-
 import contextlib
 import queue
 import threading

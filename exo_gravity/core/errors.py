@@ -3,8 +3,6 @@
 Each message names the item, its value and what would be valid.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

@@ -1,7 +1,5 @@
 """Numbers in joint order, their checks, and the rate of a counter."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

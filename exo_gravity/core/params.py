@@ -5,8 +5,6 @@ frozen dataclass uses a parameter, the dataclass owns its default, bounds, unit 
 takes them from there (`param_of`). These dataclasses also check the rules that relate several values.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Devices: the CAN bus of the motors, the IMU. Drivers raise, nodes decide."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:

@@ -1,7 +1,5 @@
 """What is asked of the computer: the time, and to be run in time. A test gives the logic a clock with virtual time."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import os

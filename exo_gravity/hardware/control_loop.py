@@ -8,8 +8,6 @@ silent bus, one in the state machine as a fault. If the state machine keeps fail
 last noted drive; without a watchdog, the loop lowers the arm without the state machine (`lower`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import threading
 from collections.abc import Callable, Sequence

@@ -8,8 +8,6 @@ measured, in a gap or in saturation, makes the estimate less certain (`core.trun
 more than 3 degrees there is no output: the output never jumps.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -5,8 +5,6 @@ accelerations zero, recursive Newton-Euler leaves the torque that holds the arm 
 comes as a vector in the root link's axes, so that the base may tilt.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

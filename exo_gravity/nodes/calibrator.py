@@ -8,8 +8,6 @@ withdraws, so that the bridge lets the arm down. It prints one line of JSON for 
     {"trouble": "elbow: ..."}           {"done": true}
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import threading

@@ -4,8 +4,6 @@ CAN frames and an IMU topic are its only connection to the other nodes. It also 
 the virtual wearer performs.
 """
 
-from __future__ import annotations
-
 import json
 import threading
 from collections import deque

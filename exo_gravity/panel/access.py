@@ -5,8 +5,6 @@ On loopback no token is needed. A page from elsewhere could still reach it throu
 that changes something must come from the panel's own page (`Origin`). Other headers confine the page.
 """
 
-from __future__ import annotations
-
 import hmac
 import ipaddress
 import re

@@ -18,8 +18,6 @@ no page, no panel, no lease. The requests:
 {"do": "trial", "name": "demo"}, {"do": "stop_trial"}
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import secrets

@@ -5,8 +5,6 @@ starts, follows and ends. A simulated device's virtual wearer or a person perfor
 every arm active and ends early when one is not.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import itertools

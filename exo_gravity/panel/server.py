@@ -10,8 +10,6 @@ up.
                          to the page: {"type": "page"}, {"type": "setup"}, {"type": "state"}
 """
 
-from __future__ import annotations
-
 import asyncio
 import socket
 import threading

@@ -1,7 +1,5 @@
 """The parameters of `panel`, those of other nodes that its page may change, and what the page shows of the arms."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from itertools import chain, repeat, zip_longest

@@ -14,8 +14,6 @@ MuJoCo models dry friction as a soft constraint, which creeps. Measured on a 0.3
 0.05 Nm of imbalance: 18 degrees per minute with MuJoCo's defaults, 0.002 with the stiffness below.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Sequence

@@ -9,8 +9,6 @@ udp_multicast returns every frame to its sender, unmarked; most buses do not. An
 byte of a reply is its ID.
 """
 
-from __future__ import annotations
-
 import heapq
 import math
 import operator

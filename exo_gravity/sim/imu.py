@@ -4,8 +4,6 @@ The trunk's orientation in the world is Ry(pitch) Rx(roll) (`core.model.tilt`; h
 measures specific force, the acceleration of its location less gravity: at rest +g upward (REP-145).
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Sequence

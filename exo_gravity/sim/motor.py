@@ -12,8 +12,6 @@ What a V3 board does (CubeMars driver manual V3.0.0; frames in core/motors/wire_
 - It replies to nothing. It sends its state `status_rate` times a second, on or off.
 """
 
-from __future__ import annotations
-
 import math
 import random
 from dataclasses import dataclass, replace

@@ -6,8 +6,6 @@ angles, and time advances. Torques and angles pass through CAN frames. Nothing i
 shows the delays and lost frames of a busy computer.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from array import array

@@ -1,7 +1,5 @@
 """The parameters of `simulator`, and the device that they describe."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any

@@ -5,8 +5,6 @@ and roll as in model/tilt.py; the heading stays constant. Bowing and leaning tur
 modelled as sines at the frequencies of steps and strides, fading in and out over a second.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple

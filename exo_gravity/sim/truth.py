@@ -4,8 +4,6 @@ The file is a sequence of `RECORD`, the only description of the format. Records 
 what was written stays when the process is frozen or killed.
 """
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import Any

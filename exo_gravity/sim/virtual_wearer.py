@@ -5,8 +5,6 @@ quarter of the time, and lets go. The hand is a spring, a damper and an integrat
 limited to the strength of a hand. Hold: no torque. Push: half a sine wave of the scripted torques.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

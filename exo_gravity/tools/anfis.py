@@ -11,8 +11,6 @@ so the error depends on the premises alone, and a trust-region method minimises 
 after Kaufman 1975). 100 evaluations achieve what thousands of epochs do not.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, replace
 from itertools import product

@@ -6,8 +6,6 @@ what was measured (NEW.jsonl). No existing file is ever overwritten.
 Exit code 0: calibrated. 1: not calibrated, and why. 2: wrong use or wrong file.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Callable, Sequence

@@ -4,8 +4,6 @@ A tool imports packages that only some tools need inside `extras`, after it has 
 without them, and a missing one ends the tool with one line instead of a traceback.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import sys

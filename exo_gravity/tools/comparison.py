@@ -5,8 +5,6 @@ are uniform within a limit. The paper's laws take the angle between joint 1's ax
 compensator.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Iterator, Sequence

@@ -12,8 +12,6 @@ Exit code 0: stopped by Ctrl-C, SIGTERM or a closed terminal. 1: a node ended, o
 use or wrong file.
 """
 
-from __future__ import annotations
-
 import _thread
 import argparse
 import contextlib

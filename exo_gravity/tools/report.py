@@ -6,8 +6,6 @@ Exit code 0: the arm held, or the recording is complete. 1: it drifted more than
 use, or part of the recording could not be read; the rest is reported first.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import sys

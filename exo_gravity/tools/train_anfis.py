@@ -6,8 +6,6 @@ a rosbag2 recording. The compensator reads the file for `law: anfis`.
 Exit code 0: saved. 2: wrong use, wrong file, or too few samples.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

@@ -6,8 +6,6 @@ The root link is `trunk` (REP-103); the joints have the names and the order of `
 Exit code 0: written. 2: wrong use or wrong file.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

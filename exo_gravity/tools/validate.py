@@ -7,8 +7,6 @@ the terminal, CSV and figures to a folder.
 Exit code 0: all checks held. 1: a check failed. 2: wrong use or wrong file.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

@@ -9,8 +9,6 @@ refused, with the pose that is missing. Held poses do not show a common factor o
 weight; nor can they tell a moment across link 3 or 4 from an error of that joint's zero.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ that of the way back gravity minus friction. Over its speed, a joint's friction 
 For a given Stribeck speed v_s this is linear in the other three, so v_s is searched on a grid.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -3,8 +3,6 @@
 `calibrate` writes its parameter file: what the arm is expected to be, and the tour. Its limits are the arm's own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any

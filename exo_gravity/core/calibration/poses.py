@@ -1,7 +1,5 @@
 """Which poses the calibration visits: given ones, or the most informative ones that the motors can hold."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence

@@ -6,8 +6,6 @@ distinguishes a hand on it from its weight. The tour begins and ends at the hang
 efforts.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 

@@ -8,8 +8,6 @@ The controller's output is an acceleration, which the arm's approximate mass mat
 have the same natural frequency, however they are coupled.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -9,8 +9,6 @@ The exoskeleton's own arm (`Settings`) has a wearer and terms on top of gravity 
 (`UrdfSettings`) has the torque of its URDF alone.
 """
 
-from __future__ import annotations
-
 import math
 import operator
 from collections.abc import Iterable, Sequence

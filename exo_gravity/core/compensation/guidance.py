@@ -15,8 +15,6 @@ What the two settings do not explain, because a change follows another or a law 
 constant offset of the start.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """What keeps torques from stepping, for any number of joints: the limits of ramp and rate, and a last fade."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from enum import Enum

@@ -1,7 +1,5 @@
 """The parameters of `compensator`, and the settings that they describe."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any

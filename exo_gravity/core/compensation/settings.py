@@ -1,7 +1,5 @@
 """The settings of the compensator, checked against each other, and what follows from them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol

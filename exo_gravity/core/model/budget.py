@@ -8,8 +8,6 @@ Shares of the workspace are estimated from uniform random poses. The search for 
 these and improves one coordinate after another until nothing gets worse.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

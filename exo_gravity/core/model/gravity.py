@@ -9,8 +9,6 @@ arrays (analysis). Symbols: t1..t4 joint angles in rad, M1..M4 first moments alo
 them in kg m (`core.model.moments`), g gravity in m/s^2; l, d and m1..m4 as in the paper.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from types import ModuleType

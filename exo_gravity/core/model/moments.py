@@ -11,8 +11,6 @@ of link 1 along z_1 and of link 2 along y_2 = z_1. Z: of links 2, 3 and 4 along 
 their y. What lies along a joint's own axis (link 1 along y_1) needs no torque.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

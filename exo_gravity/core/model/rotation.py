@@ -3,8 +3,6 @@
 For one at a time this is faster than NumPy.
 """
 
-from __future__ import annotations
-
 import math
 
 from exo_gravity.core.errors import ParameterError

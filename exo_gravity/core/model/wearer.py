@@ -10,8 +10,6 @@ Link 3 carries the upper arm and link 4 the forearm and hand; the robot's joints
 shoulder and elbow. A table is an average: a person's arm can differ from it by more than 10 %.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple

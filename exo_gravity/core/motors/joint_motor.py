@@ -3,8 +3,6 @@
 A `JointMotor` translates joint angle, effort and damping to the frames of its wire format, and back.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

@@ -13,8 +13,6 @@ rounded to the nearest step: the manual's 2^b overflows at the maximum, and trun
 code is exactly 0 Nm.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple

@@ -21,8 +21,6 @@ command without gains and torque comes before it (`MotorBus`), but is not enough
 A further format is one subclass of `WireFormat` that overrides what differs, and one entry in `FORMATS`.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from dataclasses import dataclass, replace

@@ -7,8 +7,6 @@ lost one: it lies within the span of what the commands of the last `SPAN` asked 
 tolerance is evidence; it is summed over the replies, so that noise of 0.15 Nm cancels and a lost frame adds nothing.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Sequence

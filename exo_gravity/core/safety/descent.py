@@ -22,8 +22,6 @@ A motor that cannot be reached keeps applying its torque, so s and k of a silent
 s continues from the torque that it reports.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """The start gate: what must hold before the motors of an arm are switched on, and before they carry it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Generator, Iterator, Sequence
 

@@ -12,8 +12,6 @@ silent for 0.1 to 0.5 s. TCP sends again 0.2 and 0.6 s after a loss, so after a 
 at most 0.9 s behind the last one. A longer gap lets the arm down.
 """
 
-from __future__ import annotations
-
 LEASE_TIME = 1.0  # s
 LONGEST_NAME = 64
 

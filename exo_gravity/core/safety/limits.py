@@ -5,8 +5,6 @@ order: soft wall before a joint limit, clamp to the permitted torque (derated wh
 compares the defaults with those of other systems.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -24,8 +24,6 @@ Zeros and signs are trusted once they were checked, until a motor may have lost 
 casts doubt on them. Until then `resume` carries an arm on from any pose after a fault that was no one's.
 """
 
-from __future__ import annotations
-
 import math
 import operator
 from collections.abc import Sequence

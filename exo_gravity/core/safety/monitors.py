@@ -4,8 +4,6 @@ Chosen against ordinary equipment: 3 % of the frames lost each way, a computer t
 ten, adapters that deliver in batches of 1 ms, and a motor that reports one wrong reading now and then.
 """
 
-from __future__ import annotations
-
 import math
 import operator
 from collections.abc import Sequence

@@ -12,8 +12,6 @@ with moment M has an inertia of about M l, l = 0.3 m: so the impulse that is per
 g M, is a speed of about g PATIENCE / l.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

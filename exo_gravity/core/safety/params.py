@@ -1,7 +1,5 @@
 """The parameters of `can_bridge`, the limits that they describe, and the checks of one against another."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

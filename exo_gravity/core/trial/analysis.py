@@ -11,8 +11,6 @@ the end of a scripted hold. The last criterion fails an arm that falls at once a
 SI units throughout: rad, rad/s, Nm, s. Arrays (4,) are in the order of the recording's joints.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Stillness is judged from position only. Motors report velocity in steps of 22 to
 motor at rest reports half a step. Position has steps of 0.38 mrad, and `STILL_SPEED` over two blocks is ten of them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple

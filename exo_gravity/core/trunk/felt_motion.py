@@ -6,8 +6,6 @@ torque takes effect 10 to 20 ms after the sample that it answers. Walking shakes
 moment of the effect, leaves 1 and 7 %; from 10 Hz on, extrapolating is worse than ignoring the acceleration.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Sequence

@@ -6,8 +6,6 @@ movement. So each check against it waits until a movement cannot be the reason. 
 docs/imu.md.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from operator import eq

@@ -1,7 +1,5 @@
 """The parameters of `imu`."""
 
-from __future__ import annotations
-
 from exo_gravity.core.params import Param
 from exo_gravity.core.trunk.imu_checks import (
     ACCELEROMETER_RANGE,

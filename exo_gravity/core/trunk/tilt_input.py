@@ -5,8 +5,6 @@ roll (`/imu/pitch_yaw`), which are used only while no vector arrives: it comes w
 extrapolates it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 

@@ -4,8 +4,6 @@ One standard deviation of the tilt is the root of the sum of the squares of the 
 gap, of saturation, of repeated samples and of a jump of the rate add up, and decay with VQF's time constant.
 """
 
-from __future__ import annotations
-
 import math
 
 MAX_SIGMA = math.radians(1.5)  # of a tilt that is used; it may be off by two

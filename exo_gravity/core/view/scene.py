@@ -4,8 +4,6 @@ Every shape is given in the trunk's axes, so that a viewer needs no transforms f
 its axis, and its torque a second, smaller arc, which spans `TORQUE_SPAN` at the joint's torque limit.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

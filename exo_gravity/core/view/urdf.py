@@ -6,8 +6,6 @@ link 1 sideways and links 2 to 4 down. The right arm is the mirror image, so pos
 on both sides. The gain c_n is no part of a description, and neither is gravity.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

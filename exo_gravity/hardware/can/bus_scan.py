@@ -8,8 +8,6 @@ for a reply.
 V3 boards: they are found by their status frames, and are never sent anything, because a command switches them on.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping

@@ -8,8 +8,6 @@ them unmarked, in order. SocketCAN sets the same mark on every frame from this c
 process (Documentation/networking/can.rst of Linux, MSG_DONTROUTE): there it does not show an echo.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping

@@ -15,8 +15,6 @@ A motor that is `unsure` in a drive may have restarted or kept its power. A V1 o
 it if it is on, and is ignored if it is off, but no ENTER. A V3 board gets nothing: its status frames come unasked.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections import Counter

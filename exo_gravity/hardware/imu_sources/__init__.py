@@ -1,7 +1,5 @@
 """IMUs that the `imu` node reads itself; `open_source` opens the one that the parameters name."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from typing import Any

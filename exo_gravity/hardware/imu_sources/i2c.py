@@ -4,8 +4,6 @@ Every failure names the device, its address and the register. A read is at most 
 allows, so that adapters that support only SMBus work too.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import struct

@@ -8,8 +8,6 @@ Register maps: RM-MPU-6000A-00 4.2, RM-MPU-9250A-00 1.4, checked against Linux, 
 against PX4, InvenSense_ICM20948_registers.hpp.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple

@@ -4,8 +4,6 @@ Registers, scales and self-test limits: STMicroelectronics' lsm6dsox_reg.h and i
 DS12814 (LSM6DSOX), DS12140 (LSM6DSO).
 """
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 from exo_gravity.core.errors import DeviceError

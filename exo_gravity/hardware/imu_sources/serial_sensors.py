@@ -12,8 +12,6 @@ an acceleration of (-371, -20, 977) mg, which is what gravity gives for a pitch 
 done here: yaw about z, pitch about x', roll about y''.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import struct

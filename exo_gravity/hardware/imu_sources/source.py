@@ -1,7 +1,5 @@
 """What every source of IMU samples shares: their stamps, and an IMU that is unplugged and plugged in again."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple

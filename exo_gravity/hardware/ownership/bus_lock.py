@@ -9,8 +9,6 @@ The notes are a file in a folder that all users share. It is removed once the mo
 killed, it tells the next owner what the motors still apply.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import errno

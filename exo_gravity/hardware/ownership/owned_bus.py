@@ -4,8 +4,6 @@ AK motors keep applying the last command: an arm that another process has left w
 watchdog does it for a bridge that has died, and a new bridge does it if both had died.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess

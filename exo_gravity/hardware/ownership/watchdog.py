@@ -11,8 +11,6 @@ The process acts first and logs afterwards, on a thread: the pipe of its log may
 Its exit code is 0 if the motors were off, or have confirmed that they are; 1 if they may still be powered.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import mmap

@@ -5,8 +5,6 @@ stamped state was measured: so the age of an answer does not depend on the wall 
 While the load changes, the compensator asks for the motors' damping by velocities of 0. Others are refused.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections import OrderedDict

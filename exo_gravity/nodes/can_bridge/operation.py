@@ -3,8 +3,6 @@
 Each service runs on the control thread between two cycles. Who holds control is a lease (core/safety/lease.py).
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from concurrent import futures

@@ -8,8 +8,6 @@ command for ever, so `MultiArrayInterface` watches the age of the joint states i
 torque (core/compensation/limiter.py).
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence

@@ -5,8 +5,6 @@ pauses, at any priority, it kept the control loop's threads from their processor
 two busy cores).
 """
 
-from __future__ import annotations
-
 import math
 import os
 import time

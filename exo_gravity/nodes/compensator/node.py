@@ -6,8 +6,6 @@ Where there is no safe answer it withdraws: it sends a command without efforts, 
 (nodes/compensator/arm.py).
 """
 
-from __future__ import annotations
-
 import math
 import threading
 import time

@@ -3,8 +3,6 @@
 The messages also go out on the topic that a driver would use, so that recordings and `calibrate imu` have them.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Mapping
 from typing import Any

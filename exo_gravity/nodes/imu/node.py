@@ -5,8 +5,6 @@ grows old, the compensator withdraws, and `can_bridge` latches the fault. The re
 /diagnostics while it lasts.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from typing import Any

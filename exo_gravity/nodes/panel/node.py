@@ -6,8 +6,6 @@ executor receives the answers, collects the state of the arms and sends it to th
 arrive hundreds of times a second: their subscription keeps the newest message outside the executor (`HotPath`).
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 import os

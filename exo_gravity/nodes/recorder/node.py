@@ -6,8 +6,6 @@ both std_msgs/String: `/recorder/parameters`, ROS 2 parameter YAML of each node 
 how many messages were lost, if any were. A topic that fails is reported, and the others are recorded.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

@@ -9,8 +9,6 @@ It looks for compensators, requests the parameters of each and of its bridge, an
 It only reads: nothing depends on it, and the arms run on if it ends.
 """
 
-from __future__ import annotations
-
 import time
 from contextlib import suppress
 from typing import Any

@@ -4,8 +4,6 @@ Levels of a status: OK works, WARN works within a limit or waits, ERROR does not
 arrives.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence

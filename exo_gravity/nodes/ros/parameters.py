@@ -1,7 +1,5 @@
 """A node's own parameters, declared from a table of `core`, and those of another node, read over its services."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Sequence

@@ -4,8 +4,6 @@ rclpy's own signal handlers close the context before a node can react. Here a si
 `close` still has a valid context, and its last CAN frames are sent.
 """
 
-from __future__ import annotations
-
 import gc
 import os
 import signal

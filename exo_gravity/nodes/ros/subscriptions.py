@@ -6,8 +6,6 @@ of a core). A flood is shed before Python sees it: the middleware keeps `qos.dep
 `pause` between two looks. `WaitSet` and `take_message` are inner interfaces of rclpy, which `wait_for_message` uses.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 import time

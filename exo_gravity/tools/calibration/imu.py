@@ -11,8 +11,6 @@ gravity, from two leans the heading as well.
 Six rests of the IMU on different sides show the accelerometer's scale and bias: in each it must show one g.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import tempfile

@@ -4,8 +4,6 @@ Every observation is written to the record as it comes, so that Ctrl-C and fault
 last pose and after any trouble the launcher stops the bridge first, which lets the arm down.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import json

@@ -8,8 +8,6 @@ The encoder is on the rotor. After power-up the angle is ambiguous by a turn of 
 AK60-6, 40 on an AK80-9. Whether `zero` survives is tried by switching the power off and on.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import time

@@ -4,8 +4,6 @@ An arm whose torque is wrong by less than the friction of a joint stays where it
 torque balances the rest.
 """
 
-from __future__ import annotations
-
 import datetime
 from collections.abc import Iterator, Sequence
 

@@ -4,8 +4,6 @@ A pose that was passed there and back gives gravity and friction. A held pose gi
 arm would stay with any torque inside it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import replace

@@ -5,8 +5,6 @@ is replaced in the text, at the place that PyYAML's parser reports. A line above
 exactly. The copy is read again before it is kept: it must differ in the new values only.
 """
 
-from __future__ import annotations
-
 import datetime
 import math
 import textwrap

@@ -11,8 +11,6 @@ wearer     the weight of the wearer's relaxed arm, from supported poses: what th
            table: torque shows only mass times distance.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -4,8 +4,6 @@ An arm is a namespace with a `can_bridge` and a `compensator`. Both are checked 
 unknown parameter is an error here too. Errors name node and parameter: `/right/can_bridge position_min`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

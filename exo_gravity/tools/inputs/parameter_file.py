@@ -7,8 +7,6 @@ The tools read it to find out which nodes to start and which arms they have; the
 stops them in order: bridges first, because they need the others while they let the arms down, and the recorder last.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys

@@ -5,8 +5,6 @@ Pinocchio's `computeGeneralizedGravity` runs one over spatial inertias. They sha
 with each other.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -4,8 +4,6 @@ The arms are drawn in the trunk's axes, from the parameters that the recording h
 frames, which keeps it small.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from itertools import pairwise

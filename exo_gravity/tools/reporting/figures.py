@@ -3,8 +3,6 @@
 A long recording is drawn as the minimum and maximum of each of 2,000 intervals, so that no peak is lost.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

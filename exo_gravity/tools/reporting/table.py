@@ -1,7 +1,5 @@
 """The numbers of a report, in degrees: for the CSV files, for the page, and for the terminal."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence

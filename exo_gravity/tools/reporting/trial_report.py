@@ -1,7 +1,5 @@
 """The report of a recorded trial: analysis and verdict of each arm, printed, and written as CSV, figures and a page."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

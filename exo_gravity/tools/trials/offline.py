@@ -3,8 +3,6 @@
 It is the only tool that imports `sim`: without ROS it cannot start the simulator as a node.
 """
 
-from __future__ import annotations
-
 import itertools
 import time
 from collections.abc import Callable, Sequence

@@ -6,8 +6,6 @@ and how long it got no command: its arm, motors and bus are programs on this com
 computer ran other programs instead.
 """
 
-from __future__ import annotations
-
 import signal
 import threading
 import time

@@ -4,8 +4,6 @@ It reads the lines of JSON that `recorder` prints ten times a second. If a simul
 in those lines. At a real arm a clock leads the person through the script.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import time

@@ -14,8 +14,6 @@ The input remembers only the torque that it applies. That torque moves towards t
 next sender starts from it, and from zero once it has faded or the compensator has paused.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass

@@ -16,8 +16,6 @@ At standstill there is no torque: 12-bit velocities alternate between two codes,
 moved the shoulder's rotation against its friction, by up to 1 degree a minute.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence

@@ -4,8 +4,6 @@ The torque reaches the joint late: the motor's reply, the computation, the bus. 
 without harm; the tests vary it from 0 to 10 ms. A stiffness or viscosity that the arm cannot bear is refused.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
