@@ -6,8 +6,6 @@ and over the trunk's tilt. Holding an arm up is continuous work, so rated torque
 Exit code 0: within rated torque everywhere. 1: beyond it somewhere. 2: wrong use or wrong file.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import sys
@@ -146,7 +144,7 @@ def _write_figures(arms: Sequence[ArmBudget], folder: Path) -> str:
     return f"Written: {', '.join(names)} in {folder}"
 
 
-def _joint_figure(arm: ArmBudget, joint: int) -> Figure:
+def _joint_figure(arm: ArmBudget, joint: int) -> "Figure":
     """Map the largest torque of a joint (0..3) over two angles: the maximum over the others and the trunk's tilt."""
     from matplotlib.figure import Figure
 

@@ -12,8 +12,6 @@ Exit code 0: the arm held. 1: it did not hold, or the trial did not finish. 2: w
 device could not run in real time because this computer was too busy.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math
@@ -82,7 +80,7 @@ def shortest_hold(script: TrialScript, guided: bool) -> float:
     return max(MIN_HOLD, min(holds) / 2.0) if guided and holds else MIN_HOLD
 
 
-def missing_holds(script: TrialScript, report: Report) -> str:
+def missing_holds(script: TrialScript, report: "Report") -> str:
     """Return which arm has fewer holds than the script, or ''.
 
     A real arm's recording has no script, so a hold in which the arm never came to rest leaves no other trace.
@@ -98,7 +96,7 @@ def _hold_durations(script: TrialScript) -> list[float]:
     return [step.duration for step in script.steps if step.action == "hold"]
 
 
-def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, console: Console) -> int:
+def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, console: "Console") -> int:
     """Run and report a trial; return the exit code. Raises ExoGravityError."""
     from exo_gravity.bag.reader import read_bag
     from exo_gravity.tools.reporting import trial_report
@@ -151,8 +149,8 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
 
 
 def _attached(
-    guided: bool, path: Path, script: TrialScript, folder: Path, console: Console, stopped: Stopping
-) -> TrialEnd:
+    guided: bool, path: Path, script: TrialScript, folder: Path, console: "Console", stopped: Stopping
+) -> "TrialEnd":
     """Run the script on arms that are carried already; a fault is then never excused by a busy computer."""
     from exo_gravity.tools.trials.run import TrialEnd, prepare, run_nodes
     from exo_gravity.tools.trials.screen import LEAD, TrialScreen

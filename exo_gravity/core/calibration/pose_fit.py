@@ -11,8 +11,6 @@ Errors are larger in some joints than the observations state (gear friction is n
 joint gets a factor of its own, estimated from its residuals and pooled with the others where poses are few.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -58,7 +56,7 @@ class Rows(NamedTuple):
     #: (k, 22), linear combinations of the unknowns that are 0, divided by their standard errors
     anchor: np.ndarray = np.zeros((0, COUNT))
 
-    def only(self, keep: np.ndarray) -> Rows:
+    def only(self, keep: np.ndarray) -> "Rows":
         """Return the poses that `keep` (n,) selects."""
         return Rows._make([*(column[keep] for column in self[:-1]), self.anchor])
 

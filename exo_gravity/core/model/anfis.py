@@ -12,8 +12,6 @@ box, on a tilted trunk or with another arm the model would extrapolate with an u
 reason, and the caller uses the exact law instead. Gains c_n and gravity scale the torque as in every other law.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -123,7 +121,7 @@ class AnfisLaw:
         one_float("gravity", self.gravity, 0.1, MAX_GRAVITY, "m/s^2")
 
     @classmethod
-    def load(cls, text: str) -> AnfisLaw:
+    def load(cls, text: str) -> "AnfisLaw":
         """Return the law from JSON text. Raises DataError that names what is wrong."""
         try:
             content = json.loads(text)

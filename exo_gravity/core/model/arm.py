@@ -5,8 +5,6 @@ Table 1 of the paper (standard Denavit-Hartenberg): a = `length`, alpha = (-pi/2
 vertical, shoulder abduction, shoulder flexion, elbow flexion. At theta = (any, 0, 0, 0) the arm hangs straight down.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields
 
 import numpy as np
@@ -85,7 +83,7 @@ class ArmModel:
         off_axis: Vector = ZEROS,
         gain: Vector = ONES,
         gravity: float = STANDARD_GRAVITY,
-    ) -> ArmModel:
+    ) -> "ArmModel":
         """Return the arm with links of `length` (4,) m that is given by its moments, (4,) kg m each.
 
         first_moment: M1..M4, 0..MAX_MOMENT. The other arguments are those of the constructor. Raises ParameterError.
@@ -117,7 +115,7 @@ class ArmModel:
         if any(self.off_axis):
             raise ParameterError("robot.off_axis", self.off_axis, f"0 for {what}, which knows no moments across links")
 
-    def with_wearer(self, mass: Vector, cog: Vector, support: float = 1.0) -> ArmModel:
+    def with_wearer(self, mass: Vector, cog: Vector, support: float = 1.0) -> "ArmModel":
         """Return this arm plus a share `support` (0..1) of the wearer's arm: 0 is One-G, 1 is full Zero-G.
 
         mass: (4,) kg and cog: (4,) m of the wearer's segments on each link. Masses add up, and so do first moments.

@@ -12,8 +12,6 @@ rotor of joint k. Links are thin rods around their centres of gravity, Q_n = m_n
 moments are known, they are points of mass at REACH. Offsets of the centres of gravity across the links are left out.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import operator
@@ -73,14 +71,14 @@ class LinkInertia(NamedTuple):
     rotors: tuple[float, ...] = ROTORS  #: at the joints, (4,) kg m^2
 
     @classmethod
-    def of(cls, arm: ArmModel, rotors: Sequence[float] = ROTORS) -> LinkInertia:
+    def of(cls, arm: ArmModel, rotors: Sequence[float] = ROTORS) -> "LinkInertia":
         """Return the inertia of `arm`. Raises ParameterError if it is given by its moments."""
         if arm.by_moments:
             arm.check_masses("terms that depend on the inertia")
         return _links_of(arm)._replace(rotors=tuple(rotors))
 
     @classmethod
-    def of_moments(cls, length: Vector, moment: Vector, load: tuple[float, float] = (0.0, 0.0)) -> LinkInertia:
+    def of_moments(cls, length: Vector, moment: Vector, load: tuple[float, float] = (0.0, 0.0)) -> "LinkInertia":
         """Return the approximate inertia of an arm that is known by its moments.
 
         length: (4,) m. moment: M1..M4 in kg m, with the load. load: a weight in kg on link 4, and its distance from

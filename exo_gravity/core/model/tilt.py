@@ -5,8 +5,6 @@ p > 0 bows forward, r > 0 leans to the right. The heading does not affect gravit
 axes: x0 left, y0 forward, z0 down. The right arm is its mirror image: its gravity is the left arm's at roll -r.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -42,14 +40,14 @@ class Tilt(NamedTuple):
         return y, x, -z
 
     @classmethod
-    def of(cls, side: str, pitch: float = 0.0, roll: float = 0.0) -> Tilt:
+    def of(cls, side: str, pitch: float = 0.0, roll: float = 0.0) -> "Tilt":
         """Return the tilt of the `side` ('left' or 'right') arm for a trunk at `pitch` and `roll` in rad."""
         pitch = one_float("pitch", pitch, -math.pi, math.pi, "rad")
         roll = one_float("roll", roll, -math.pi, math.pi, "rad")
         return cls._of(side, pitch, roll, *gravity_in_trunk(pitch, roll).tolist())
 
     @classmethod
-    def of_gravity(cls, side: str, gravity_in_trunk: Vector) -> Tilt:
+    def of_gravity(cls, side: str, gravity_in_trunk: Vector) -> "Tilt":
         """Return the tilt of the `side` arm for gravity's direction in the trunk's axes, a vector (3,) of any length.
 
         It has no singularity: a trunk that bows past 90 degrees, or lies, has a direction like any other. Raises
@@ -61,7 +59,7 @@ class Tilt(NamedTuple):
         return cls._of(side, pitch, roll, x / norm, y / norm, z / norm)
 
     @classmethod
-    def _of(cls, side: str, pitch: float, roll: float, x: float, y: float, z: float) -> Tilt:
+    def _of(cls, side: str, pitch: float, roll: float, x: float, y: float, z: float) -> "Tilt":
         if side not in SIDES:
             raise ParameterError("side", side, f"one of {', '.join(SIDES)}")
         y, outward = (y, roll) if side == "left" else (-y, -roll)

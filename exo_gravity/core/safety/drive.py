@@ -3,8 +3,6 @@
 Every fault has a code for programs and a sentence for people.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from enum import Enum
@@ -72,7 +70,7 @@ class FaultCode(str, Enum):
     casts_doubt: bool
     is_no_ones: bool
 
-    def __new__(cls, value: str, meaning: str, then: str = "") -> FaultCode:
+    def __new__(cls, value: str, meaning: str, then: str = "") -> "FaultCode":
         """Create a code from its text, its meaning and what follows."""
         code = str.__new__(cls, value)
         code._value_, code.meaning = value, meaning

@@ -13,8 +13,6 @@
 A human wearer reads the steps from the screen; the simulator's virtual wearer executes them.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -45,7 +43,7 @@ class Step:
     value: tuple[float, ...] = ()
 
     @classmethod
-    def parse(cls, entry: Any, where: str) -> Step:
+    def parse(cls, entry: Any, where: str) -> "Step":
         """Return the step described by a mapping from YAML; `where` is its name in a ParameterError."""
         keys = set(entry) if isinstance(entry, Mapping) else set()
         action = next(iter(keys - {"over"}), "")
@@ -74,7 +72,7 @@ class TrialScript:
     steps: tuple[Step, ...]
 
     @classmethod
-    def parse(cls, content: Any) -> TrialScript:
+    def parse(cls, content: Any) -> "TrialScript":
         """Return the script described by YAML content. Raises ParameterError that names the invalid entry."""
         if not isinstance(content, Mapping) or set(content) != {"name", "steps"}:
             raise ParameterError("script", content, "a mapping with the keys name and steps only")

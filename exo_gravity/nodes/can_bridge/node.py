@@ -7,8 +7,6 @@ Started with EXO_GRAVITY_RECOVER, it does one thing only: it lets down an arm th
 left with its motors on.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import threading
@@ -69,7 +67,7 @@ def _transition(function: Callable[[Any], None]) -> Callable[..., TransitionCall
     """Return a transition callback of a method; if that raises, it logs why, which rclpy does not."""
 
     @wraps(function)
-    def callback(node: CanBridge, _state: LifecycleState) -> TransitionCallbackReturn:
+    def callback(node: "CanBridge", _state: LifecycleState) -> TransitionCallbackReturn:
         try:
             function(node)
             return TransitionCallbackReturn.SUCCESS

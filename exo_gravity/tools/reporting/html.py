@@ -4,8 +4,6 @@ A function that returns a piece of HTML escapes every text that it is given; a l
 palette is that of Okabe and Ito (2008), told apart with any colour vision.
 """
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Iterable, Sequence
 from html import escape
@@ -69,7 +67,7 @@ def bullets(title: str, lines: Iterable[str]) -> str:
     return (items := _items(lines)) and heading(title) + items
 
 
-def make_plain(axis: Axes) -> None:
+def make_plain(axis: "Axes") -> None:
     """Leave two spines of a figure's axes, and faint horizontal lines."""
     axis.spines[["top", "right"]].set_visible(False)
     axis.spines[["left", "bottom"]].set_color(FAINT)
@@ -78,7 +76,7 @@ def make_plain(axis: Axes) -> None:
     axis.set_axisbelow(True)
 
 
-def png_of(figure: Figure, dpi: int = DPI) -> bytes:
+def png_of(figure: "Figure", dpi: int = DPI) -> bytes:
     """Return a figure as PNG."""
     buffer = BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi)

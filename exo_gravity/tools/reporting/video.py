@@ -1,7 +1,5 @@
 """Where a clip goes, and whether this computer can draw it: checked before a trial runs, not after."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import os
@@ -88,7 +86,7 @@ def frame_times(end: float, clip: Clip) -> list[float]:
     return [step * i for i in range(math.floor(end / step) + 1)]
 
 
-def write(bag: Bag, clip: Clip, console: Console) -> None:
+def write(bag: Bag, clip: Clip, console: "Console") -> None:
     """Write the clip of a recording, and print where it is. Raises DataError."""
     os.environ["MUJOCO_GL"] = backend()
     from rich.progress import track

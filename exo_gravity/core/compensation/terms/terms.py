@@ -4,8 +4,6 @@ The sum is bounded and rate-limited. The compensator guides a change of paramete
 gravity compensation goes on beneath it. A new term is a field of `TermSettings` and an item in `Terms._built`.
 """
 
-from __future__ import annotations
-
 import math
 import operator
 from collections.abc import Mapping, Sequence
@@ -56,7 +54,7 @@ class TermSettings:
     limits: SoftLimits = field(default_factory=SoftLimits)
     assist: Assist = field(default_factory=Assist)
 
-    def on_arm(self, robot: ArmModel) -> TermSettings:
+    def on_arm(self, robot: ArmModel) -> "TermSettings":
         """Return these settings with limits as stiff as `robot` can bear.
 
         Raises ParameterError unless every spring and damper is stable on `robot`, without a wearer in it.
