@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from exo_gravity.core import gravity_torque
-from exo_gravity.core.compensation.params import COMPENSATOR, settings_of
+from exo_gravity.core.compensation.settings import COMPENSATOR, settings_of
 from exo_gravity.core.model.gravity import LAWS
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.params import values_of

@@ -15,11 +15,11 @@ from typing import Any
 from xml.etree import ElementTree
 
 from exo_gravity.bag.content import RECORDER
-from exo_gravity.core.calibration.params import CALIBRATOR
-from exo_gravity.core.compensation.params import COMPENSATOR, urdf_table
+from exo_gravity.core.calibration.tour import CALIBRATOR
+from exo_gravity.core.compensation.settings import COMPENSATOR, urdf_table
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.drive import FaultCode
-from exo_gravity.core.safety.params import CAN_BRIDGE
+from exo_gravity.core.safety.limits import CAN_BRIDGE
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.core.view.urdf import ROBOT_MODEL
 from exo_gravity.panel.view import PANEL

@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 
 from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.model.moments import moments_of
+from exo_gravity.core.model.gravity import moments_of
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.sim.arm import DEFAULT_LINKS

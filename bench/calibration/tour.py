@@ -16,16 +16,14 @@ from typing import Any
 import numpy as np
 import yaml
 
-from exo_gravity.core.calibration.params import CALIBRATOR, tour_of
-from exo_gravity.core.calibration.tour import Tour
+from exo_gravity.core.calibration.tour import CALIBRATOR, Tour, tour_of
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.motors.joint_motor import JointMotor, motors_of
 from exo_gravity.core.motors.specs import ENTER, EXIT
 from exo_gravity.core.safety.drive import Drive, EffortCommand, State
-from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
+from exo_gravity.core.safety.limits import CAN_BRIDGE, UNKNOWN, JointSample, Limits, limits_of
 from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.core.safety.params import CAN_BRIDGE, limits_of
 from exo_gravity.sim import SimulatedDevice
 from exo_gravity.sim.imu import SimulatedImu, measured_tilt
 from exo_gravity.sim.params import SIMULATOR, device_of, imu_of

@@ -63,9 +63,7 @@ class Bag:
 
 
 # The parameters of `recorder`.
-# fmt: off
 RECORDER = (
     Param("output", "", "new folder for the recording", fixed=True, required=True),
     Param("live", False, "print the latest state as one line of JSON, ten times a second", fixed=True),
 )
-# fmt: on

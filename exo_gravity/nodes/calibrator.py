@@ -19,11 +19,11 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from exo_gravity.core.calibration.params import CALIBRATOR, tour_of
+from exo_gravity.core.calibration.tour import CALIBRATOR, tour_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.safety.drive import State
-from exo_gravity.core.trunk.tilt_input import TiltInput
+from exo_gravity.core.trunk.inputs import TiltInput
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, by_name
 from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from itertools import chain, repeat, zip_longest
 from typing import Any
 
-from exo_gravity.core.compensation.params import COMPENSATOR
+from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.params import Param
 from exo_gravity.core.view.urdf import described, urdf

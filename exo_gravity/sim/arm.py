@@ -25,7 +25,7 @@ import numpy as np
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import MAX_LENGTH, MAX_MASS, ArmModel
-from exo_gravity.core.model.moments import MAX_OFFSET
+from exo_gravity.core.model.gravity import MAX_OFFSET
 from exo_gravity.core.model.tilt import gravity_in_trunk
 from exo_gravity.core.numbers import JOINT_COUNT, four_floats
 from exo_gravity.core.params import check_owned, owned

@@ -30,7 +30,6 @@ ARM_FIELDS = {
 }
 IMU_FIELDS = ("rate", "rotation_trunk_from_imu", "delay")
 _LENGTH, _MASS, _COG = (a.tolist() for a in (DEFAULT_LINKS.length, DEFAULT_LINKS.mass, DEFAULT_LINKS.cog))
-# fmt: off
 SIMULATOR = (
     Param("side", "right", "which arm; the right arm mirrors the left", choices=SIDES, fixed=True),
     *MOTOR_PARAMETERS,
@@ -57,7 +56,6 @@ SIMULATOR = (
     Param("fault.error", [0] * 4, "motor error codes", (0, 255)),
     Param("fault.bus_silent", False, "the bus passes no frames"),
 )
-# fmt: on
 
 
 def device_of(values: Mapping[str, Any]) -> SimulatedDevice:

@@ -16,7 +16,7 @@ from exo_gravity.core.compensation.terms.springs import Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.tilt import Tilt, pitch_roll
-from exo_gravity.core.trunk.tilt_input import HOLD, MAX_LEAD
+from exo_gravity.core.trunk.inputs import HOLD, MAX_LEAD
 
 from ..support.compensator_run import PERIOD, ROBOT, THETA, CompensatorRun, settings_with
 

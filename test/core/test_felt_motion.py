@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.trunk.felt_motion import EFFECT, FELT_RANGE, FeltMotion
+from exo_gravity.core.trunk.inputs import EFFECT, FELT_RANGE, FeltMotion
 
 G = 9.80665
 STILL = (0.0, 0.0, 0.0)

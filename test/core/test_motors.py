@@ -28,7 +28,7 @@ from exo_gravity.core.motors.specs import (
 )
 from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, FORMATS, MIT, MIT_V3, OTHER, REPLY
 from exo_gravity.core.params import values_of
-from exo_gravity.core.safety.params import CAN_BRIDGE
+from exo_gravity.core.safety.limits import CAN_BRIDGE
 
 AK60 = MOTORS["AK60-6"]
 V3_AK60, V3_AK80 = MIT_V3.ranged(AK60), MIT_V3.ranged(MOTORS["AK80-9"])

@@ -9,7 +9,7 @@ import pytest
 
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.limiter import LONGEST_STEP
-from exo_gravity.core.compensation.params import COMPENSATOR, settings_of, urdf_table
+from exo_gravity.core.compensation.settings import COMPENSATOR, settings_of, urdf_table
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import GONE, values_of
 from exo_gravity.tools.inputs.parameter_file import load

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.tilt import angle_between
-from exo_gravity.core.trunk.tilt_input import HOLD, TILT_SPEED, TiltInput
+from exo_gravity.core.trunk.inputs import HOLD, TILT_SPEED, TiltInput
 from exo_gravity.tools.inputs.references import pinocchio
 
 from ..support.compensator_run import ROBOT, THETA, CompensatorRun

@@ -11,8 +11,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import motors_of
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.params import GONE, values_of
-from exo_gravity.core.safety.limits import HOME_TOLERANCE
-from exo_gravity.core.safety.params import CAN_BRIDGE, check_bridge, limits_of
+from exo_gravity.core.safety.limits import CAN_BRIDGE, HOME_TOLERANCE, check_bridge, limits_of
 
 
 def check(**given):

@@ -11,7 +11,7 @@ import pytest
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.drive import OFF
-from exo_gravity.core.safety.params import FROZEN
+from exo_gravity.core.safety.limits import FROZEN
 from exo_gravity.hardware.ownership.bus_lock import BusLock, DriveNotes
 from exo_gravity.hardware.ownership.owned_bus import HEARTBEAT_TIMEOUT, LONGEST_LOOK, OwnedBus, Silence
 from exo_gravity.hardware.ownership.watchdog import SleepInhibitor, guard

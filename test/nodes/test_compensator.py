@@ -20,7 +20,7 @@ from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.compensation.limiter import LONGEST_STEP
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.model.wearer import Wearer
-from exo_gravity.core.safety.params import CAN_BRIDGE
+from exo_gravity.core.safety.limits import CAN_BRIDGE
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 
 from ..support.joint_state_feeder import POSE, JointStateFeeder

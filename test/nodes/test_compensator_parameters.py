@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 from rcl_interfaces.srv import DescribeParameters, SetParametersAtomically
 
-from exo_gravity.core.compensation.params import COMPENSATOR
+from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.trial.script import TrialScript
 
 from ..support.launched_nodes import NO_IMU, LaunchedNodes

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from exo_gravity.core.compensation.params import COMPENSATOR
+from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.params import values_of
-from exo_gravity.core.safety.params import CAN_BRIDGE
+from exo_gravity.core.safety.limits import CAN_BRIDGE
 from exo_gravity.panel.control import Control
 from exo_gravity.panel.server import PanelServer
 from exo_gravity.panel.view import joint_rows, setup_of

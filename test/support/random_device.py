@@ -11,7 +11,7 @@ from exo_gravity.core import ArmModel, Tilt
 from exo_gravity.core.calibration.identification import Observation
 from exo_gravity.core.calibration.pose_fit import TYPICAL_MOMENTS
 from exo_gravity.core.calibration.poses import next_pose
-from exo_gravity.core.model.moments import load_moments, moments_of, regressor
+from exo_gravity.core.model.gravity import load_moments, moments_of, regressor
 from exo_gravity.core.numbers import Vector
 
 LENGTH = (0.05, 0.13, 0.30, 0.30)

@@ -13,9 +13,8 @@ from exo_gravity.core import ArmModel
 from exo_gravity.core.calibration.poses import BestPoses, Itinerary
 from exo_gravity.core.calibration.tour import Tour
 from exo_gravity.core.calibration.tracking import TorqueGuess
-from exo_gravity.core.model.gravity import Torque
+from exo_gravity.core.model.gravity import Torque, load_moments, moments_of
 from exo_gravity.core.model.kinematics import LinkInertia
-from exo_gravity.core.model.moments import load_moments, moments_of
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS

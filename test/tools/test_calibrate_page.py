@@ -14,8 +14,7 @@ import pytest
 from exo_gravity.core.calibration.identification import Observation, identify
 from exo_gravity.core.calibration.motion import fit_friction
 from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.model.gravity import gravity_torque
-from exo_gravity.core.model.moments import load_moments, regressor
+from exo_gravity.core.model.gravity import gravity_torque, load_moments, regressor
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.tools.calibration.page import page_of, remainders
 from exo_gravity.tools.calibration.result import CalibrationResult, Change

@@ -10,10 +10,10 @@ import pytest
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.calibration.identification import Observation
-from exo_gravity.core.calibration.params import CALIBRATOR, tour_of
-from exo_gravity.core.compensation.params import wearer_of
+from exo_gravity.core.calibration.tour import CALIBRATOR, tour_of
+from exo_gravity.core.compensation.settings import wearer_of
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.model.moments import load_moments, moments_of, regressor
+from exo_gravity.core.model.gravity import load_moments, moments_of, regressor
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.params import values_of
 from exo_gravity.tools.calibration import live

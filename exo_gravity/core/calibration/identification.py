@@ -2,7 +2,7 @@
 
 The commanded effort that holds the arm in a pose is, without friction, which averages out over both directions,
 
-    effort = torque(moments + load) / scale + offset          torque: `core.model.moments.regressor` times the moments
+    effort = torque(moments + load) / scale + offset          torque: `core.model.gravity.regressor` times the moments
 
 A pose that does not fit the others (a hand on the arm, a slipping joint) is left out. A result that no arm can have is
 refused, with the pose that is missing. Held poses do not show a common factor of all scales and moments without a known
@@ -35,7 +35,7 @@ from exo_gravity.core.calibration.pose_fit import (
 from exo_gravity.core.calibration.poses import missing_pose
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.moments import MOMENTS, load_moments
+from exo_gravity.core.model.gravity import MOMENTS, load_moments
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 
 LEAST_SPREAD = 0.003  # Nm; about half a code of an AK motor's 12-bit torque

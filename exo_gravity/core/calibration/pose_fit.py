@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.moments import MOMENTS, regressor
+from exo_gravity.core.model.gravity import MOMENTS, regressor
 from exo_gravity.core.numbers import JOINT_COUNT
 
 MOMENT = slice(0, 8)

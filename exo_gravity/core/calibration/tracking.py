@@ -13,9 +13,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.model.gravity import LAWS, Torque
+from exo_gravity.core.model.gravity import LAWS, Torque, regressor
 from exo_gravity.core.model.kinematics import ROTORS, LinkInertia
-from exo_gravity.core.model.moments import regressor
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 
@@ -41,7 +40,7 @@ FULL_FRICTION_SPEED = 0.03  # rad/s of the reference, from which on friction is 
 class TorqueGuess:
     """The commanded torque that holds the arm, as far as it is known.
 
-    length: (4,) m. moments: (8,) kg m, as in `core.model.moments`, with the load. tilt: of the trunk or the stand.
+    length: (4,) m. moments: (8,) kg m, as in `core.model.gravity`, with the load. tilt: of the trunk or the stand.
     """
 
     def __init__(self, length: Vector, moments: Vector, tilt: Tilt, gravity: float) -> None:

@@ -23,8 +23,7 @@ from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.model.kinematics import turning_torque
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.trunk.felt_motion import FeltMotion
-from exo_gravity.core.trunk.tilt_input import MAX_TURN, TiltInput
+from exo_gravity.core.trunk.inputs import MAX_TURN, FeltMotion, TiltInput
 
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
 JOINTS = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")

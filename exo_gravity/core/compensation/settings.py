@@ -1,17 +1,26 @@
-"""The settings of the compensator, checked against each other, and what follows from them."""
+"""The settings of the compensator, checked against each other, and the parameters that describe them."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import ClassVar, Protocol
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Protocol
 
-from exo_gravity.core.compensation.terms.terms import TermSettings
-from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.compensation.terms.terms import TermSettings, term_parameters, term_settings_of
+from exo_gravity.core.errors import DataError, ParameterError, named
 from exo_gravity.core.model.anfis import AnfisLaw
-from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.model.arm import (
+    MAX_GAIN,
+    MAX_GRAVITY,
+    MAX_LENGTH,
+    MAX_MASS,
+    MAX_MOMENT,
+    STANDARD_GRAVITY,
+    ArmModel,
+)
 from exo_gravity.core.model.gravity import LAWS, NO_TORQUE, Torque
 from exo_gravity.core.model.rotation import Floats3
 from exo_gravity.core.model.tilt import SIDES, Tilt
-from exo_gravity.core.params import check_owned, owned
+from exo_gravity.core.model.wearer import SEX, TYPICAL_LENGTH, Wearer
+from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, check_owned, owned, param_of, params_of
 from exo_gravity.core.safety.limits import MAX_COMMAND
 
 MODES = ("one_g", "zero_g")
@@ -120,3 +129,142 @@ class UrdfSettings:
     def outside(self, theta: Sequence[float], tilt: Tilt) -> str:
         """Return '': the law applies everywhere."""
         return ""
+
+
+MAX_JOINTS = 32
+MAX_EFFORT = 1000.0  # Nm; an industrial arm's largest joint
+
+# fmt: off
+COMPENSATOR = (
+    Param("side", "right", "side of the arm; the right arm mirrors the left", choices=SIDES, fixed=True),
+    JOINT_NAMES,
+    Param("link_length", [0.05, 0.13, 0.30, 0.30], "l_n, link lengths", (0.0, MAX_LENGTH), "m", fixed=True),
+    param_of(Settings, "law"),
+    Param("anfis_file", "", "model for the law anfis, written by train_anfis", expert=True),
+    param_of(Settings, "mode"),
+    param_of(Settings, "support"),
+    Param("gain", [1.0, 1.0, 1.0, 1.0], "c_n, scales the torque of joint n", (0.0, MAX_GAIN)),
+    Param("gravity", STANDARD_GRAVITY, "g, acceleration of gravity", (0.0, MAX_GRAVITY), "m/s^2"),
+    Param("robot.mass", [0.585, 0.468, 0.598, 0.203], "m_n, link masses", (0.0, MAX_MASS), "kg"),
+    Param("robot.cog", [0.046, 0.113, 0.237, 0.128], "d_n, centre of gravity from joint n", (0.0, MAX_LENGTH), "m"),
+    Param("robot.first_moment", [0.0] * 4, "M1 to M4 by `calibrate`, in place of mass and cog; zeros: not given",
+          (0.0, MAX_MOMENT), "kg m", expert=True),
+    Param("robot.off_axis", [0.0] * 4, "W, Z, Y3, Y4 by `calibrate`: moments across the links, for the law exact",
+          (-MAX_MOMENT, MAX_MOMENT), "kg m", expert=True),
+    Param("wearer.mass", [0.0, 0.0, 0.0, 0.0], "mass of the wearer's arm on each link", (0.0, MAX_MASS), "kg"),
+    Param("wearer.cog", [0.0, 0.0, 0.0, 0.0], "centre of gravity of that mass from joint n", (0.0, MAX_LENGTH), "m"),
+    Param("wearer.body_mass", 0.0, "body mass; computes wearer.mass and wearer.cog if these are 0", (0.0, 300.0), "kg"),
+    Param("wearer.sex", "male", "selects the column of the segment table", choices=SEX),
+    Param("wearer.segment_length", list(TYPICAL_LENGTH), "upper arm, forearm, hand", (0.0, 0.6), "m"),
+    param_of(Settings, "max_effort"),
+    param_of(Settings, "max_effort_rate"),
+    param_of(Settings, "inertial"),
+    Param("shoulder_from_imu", [0.0] * 3, "the arm's base from the IMU along the trunk's axes, for inertial",
+          (-1.0, 1.0), "m"),
+    Param("use_imu", True, "false assumes an upright trunk (the paper's seated wearer)", fixed=True),
+    param_of(Settings, "tilt_timeout"),
+    *term_parameters(),
+    *REAL_TIME_PARAMETERS,
+)
+# What is declared where a file gives `command_interface`, for an arm with an effort controller of ros2_control.
+COMMAND_PARAMETERS = (
+    Param("command_interface", "joint_state",
+          "joint_state: to can_bridge; multi_array: to an effort controller of ros2_control", fixed=True,
+          choices=("joint_state", "multi_array")),
+    Param("multi_array.topic", "effort_controller/commands", "topic of the effort controller's commands", fixed=True),
+    Param("multi_array.joint_states", "joint_states", "topic of the joint states, which may have further joints",
+          fixed=True),
+    Param("multi_array.timeout", 0.05, "age of the joint states at which the torque begins to fade", (0.01, 0.15), "s",
+          fixed=True, expert=True),
+)
+# What the law `urdf` adds.
+URDF = (
+    Param("urdf.file", "", "path of the URDF; empty: the topic urdf.topic", fixed=True),
+    Param("urdf.topic", "/robot_description", "latched topic of the URDF, a std_msgs/String", fixed=True),
+)
+# fmt: on
+
+
+def compensator_table(given: Collection[str], table: Sequence[Param] = COMPENSATOR) -> tuple[Param, ...]:
+    """Return `table` and what is added to it where a file gives the names `given`."""
+    is_command = any(param.name in given for param in COMMAND_PARAMETERS)
+    return (*table, *(COMMAND_PARAMETERS if is_command else ()))
+
+
+def urdf_table(count: int, given: Collection[str]) -> tuple[Param, ...]:
+    """Return the parameters of `compensator` for the law `urdf`, `count` joints and a file with the names `given`."""
+    other = {
+        "law": {"default": URDF_LAW, "choices": (URDF_LAW,), "fixed": True,
+                "description": "urdf computes the torque of any serial arm from its URDF"},
+        "joint_names": {"default": [f"joint{n + 1}" for n in range(count)],
+                        "description": "in the order of the commands; the URDF's other joints are taken as fixed at 0"},
+        "gain": {"default": [1.0] * count, "description": "scales the torque of each joint"},
+        "gravity": {},
+        "max_effort": {"default": [0.0] * count, "bounds": (0.0, MAX_EFFORT),
+                       "description": "torque limit per joint; 0: the URDF's"},
+        "max_effort_rate": {},
+        "use_imu": {"description": "false assumes that the root link's z axis points up"},
+        "tilt_timeout": {},
+        "thread_priority": {},
+    }  # fmt: skip
+    shared = [
+        replace(param, **other[param.name])  # type: ignore[arg-type]
+        for param in COMPENSATOR
+        if param.name in other
+    ]
+    return compensator_table(given, (*shared, *URDF))
+
+
+def settings_of(values: Mapping[str, Any], read: Callable[[str], str] | None = None) -> Settings:
+    """Return the settings that `compensator`'s parameter values describe, or raise ParameterError.
+
+    read: returns the text of the file `anfis_file`; without it the file is left out.
+    """
+    path = values["anfis_file"]
+    try:
+        anfis = AnfisLaw.load(read(path)) if path and read else None
+    except (OSError, UnicodeDecodeError, DataError) as error:
+        raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
+    mass, cog = wearer_of(values)
+    return Settings(
+        side=values["side"],
+        robot=robot_of(values),
+        wearer_mass=mass,
+        wearer_cog=cog,
+        shoulder_from_imu=tuple(values["shoulder_from_imu"]),
+        use_imu=values["use_imu"],
+        anfis=anfis,
+        terms=term_settings_of(values),
+        robot_by_mass=ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"]),
+        **{param.name: values[param.name] for param in params_of(Settings)},
+    )
+
+
+def urdf_settings_of(values: Mapping[str, Any], model: GravityModel) -> UrdfSettings:
+    """Return the settings that parameter values describe for the arm `model`, or raise ParameterError."""
+    limits = []
+    for name, given, own in zip(values["joint_names"], values["max_effort"], model.max_effort, strict=True):
+        if not (given or own):
+            raise ParameterError(f"max_effort of {name}", given, "greater than 0, because the URDF has no effort limit")
+        limits.append(given or own)
+    others = {name: values[name] for name in ("gain", "gravity", "max_effort_rate", "tilt_timeout", "use_imu")}
+    return UrdfSettings(model, max_effort=tuple(limits), **others)
+
+
+def robot_of(values: Mapping[str, Any]) -> ArmModel:
+    """Return the robot's arm, by its moments if robot.first_moment is given, or raise ParameterError."""
+    length, off_axis, rest = values["link_length"], values["robot.off_axis"], (values["gain"], values["gravity"])
+    with named("robot."):
+        if any(values["robot.first_moment"]):
+            return ArmModel.from_moments(length, values["robot.first_moment"], off_axis, *rest)
+        return ArmModel(length, values["robot.cog"], values["robot.mass"], *rest, off_axis)
+
+
+def wearer_of(values: Mapping[str, Any]) -> tuple[Sequence[float], Sequence[float]]:
+    """Return mass and centre of gravity (4,) of the wearer on each link; explicit values override the table's."""
+    if any(values["wearer.mass"]) or not values["wearer.body_mass"]:
+        return values["wearer.mass"], values["wearer.cog"]
+    person = {name: values[f"wearer.{name}"] for name in ("body_mass", "sex", "segment_length")}
+    with named("wearer."):
+        load = Wearer(**person).on_links(values["link_length"])
+    return load.mass.tolist(), load.cog.tolist()

@@ -39,7 +39,7 @@ class ArmModel:
     mass: np.ndarray  #: (4,) kg, link masses m_n
     gain: np.ndarray  #: (4,), the paper's c_n, which scales the torque of joint n; 0..2, 1 by default
     gravity: float  #: m/s^2
-    off_axis: tuple[float, ...]  #: (W, Z, Y3, Y4) kg m across the links, see `core.model.moments`; 0 by default
+    off_axis: tuple[float, ...]  #: (W, Z, Y3, Y4) kg m across the links, see `core.model.gravity`; 0 by default
     #: M1..M4 in kg m: the mass of link n times d_n plus all mass beyond link n times l_n; plain floats
     first_moment: tuple[float, ...] = field(init=False, repr=False)
     #: (4,) m/s^2, c_n times gravity; plain floats

@@ -6,15 +6,16 @@ compares the defaults with those of other systems.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import MAX_MOMENT
+from exo_gravity.core.motors.joint_motor import MAX_STATUS_RATE, MOTOR_PARAMETERS, REPLY_SHARE, JointMotor
 from exo_gravity.core.motors.specs import MOTOR_ERRORS, MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.params import check_owned, owned
+from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, check_owned, owned, params_of
 from exo_gravity.core.safety.drive import Fault, FaultCode
 
 MAX_COMMAND = 40.0  # Nm: no arm needs half of it, so a larger effort command is wrong
@@ -37,7 +38,9 @@ GUIDE_BRAKE = 1.5  # Nm
 MAX_TEMPERATURE = 80.0  # degC, an assumption: a motor whose own protection switches it off would drop the arm
 DERATING = 10.0  # degC below MAX_TEMPERATURE over which the permitted torque falls to half
 MAX_VELOCITY = (5.0, 5.0, 5.0, 6.0)  # rad/s; a reach stays below, a throw does not
-REPLY_TIMEOUT = 0.05  # s, and MISSED cycles (monitors.py) at least; an ordinary computer is late by 0.02 s
+# Cycles in a row without a reply. At 3 % lost each way one arm loses so many in a row once in 270 hours at 100 Hz.
+MISSED = 7
+REPLY_TIMEOUT = 0.05  # s, and MISSED cycles at least; an ordinary computer is late by 0.02 s
 JUMP = 0.05  # rad that two readings may differ by in addition to what MAX_VELOCITY allows
 # rad from the hanging arm at the first start. The zero of a motor with a single encoder may be off by whole turns of
 # the rotor (60 degrees of an AK60-6's output, 40 of an AK80-9's): less than half of that shows it.
@@ -173,3 +176,46 @@ def guide_damping(velocity: float) -> float:
     """Return the damping in Nm s/rad of a joint at `velocity` rad/s while its load changes."""
     speed = max(GUIDE_SPEED, abs(velocity))
     return min(DAMPING * (speed - GUIDE_SPEED), GUIDE_BRAKE) / speed
+
+
+FROZEN = 0.08  # s without a drive from the control loop while the watchdog itself runs, after which it takes over
+PERIODS = 2  # control periods that must fit into each time-out, so that one late cycle is not a fault
+
+LIMIT_PARAMETERS = params_of(Limits, fixed=True)
+CAN_BRIDGE = (
+    JOINT_NAMES,
+    Param("autostart", True, "configure and activate once at the start, without an operator", fixed=True),
+    Param("rate", 250.0, "control cycles per second, as far as the CAN bus allows", (20.0, 2000.0), "Hz", fixed=True),
+    *MOTOR_PARAMETERS,
+    *LIMIT_PARAMETERS,
+    *REAL_TIME_PARAMETERS,
+)
+
+
+def limits_of(values: Mapping[str, Any]) -> Limits:
+    """Return the limits that `can_bridge`'s parameter values describe, or raise ParameterError."""
+    given = {param.name: values[param.name] for param in LIMIT_PARAMETERS}
+    given["home_tolerance"] = tuple(HOME_TOLERANCE[name] for name in values["motor"])
+    given["reply_timeout"] = min(2.0 * REPLY_TIMEOUT, max(REPLY_TIMEOUT, MISSED / values["rate"]))
+    return Limits(tuple(values["joint_names"]), **given)
+
+
+def check_bridge(
+    rate: float, motors: Sequence[JointMotor], limits: Limits, status_rate: float = MAX_STATUS_RATE
+) -> None:
+    """Check the parameters of a `can_bridge` with control rate `rate` (Hz) against each other.
+
+    status_rate: status frames a second of V3 boards. Raises ParameterError that names both values.
+    """
+    timeouts = {"command_timeout": limits.command_timeout, "the watchdog's time-out": FROZEN}
+    name, shortest = min(timeouts.items(), key=lambda item: item[1])
+    if rate * shortest < PERIODS - 1e-9:
+        expected = f"at least {PERIODS / shortest:g} Hz: {name} = {shortest:g} s must span {PERIODS} periods"
+        raise ParameterError("rate", rate, expected)
+    if rate > REPLY_SHARE * status_rate + 1e-9 and not all(motor.wire_format.replies for motor in motors):
+        expected = f"at most {REPLY_SHARE * status_rate:g} Hz: each cycle waits for a status frame of a V3 board"
+        raise ParameterError("rate", rate, f"{expected}, which sends {status_rate:g} a second")
+    peak = [motor.peak_effort for motor in motors]
+    if any(effort > most + 1e-9 for effort, most in zip(limits.max_effort, peak, strict=True)):
+        shown = [round(effort, 2) for effort in peak]
+        raise ParameterError("max_effort", list(limits.max_effort), f"at most the motors' peak torque, {shown} Nm")

@@ -10,10 +10,8 @@ from collections.abc import Sequence
 
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import NOTHING, Fault, FaultCode
-from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
+from exo_gravity.core.safety.limits import MISSED, UNKNOWN, JointSample, Limits
 
-# Cycles in a row without a reply. At 3 % lost each way one arm loses so many in a row once in 270 hours at 100 Hz.
-MISSED = 7
 # s without a reply, while the motors hold the arm and while they are off, for which a motor's turn count stays trusted
 # if its angle is then within `home_tolerance` of the one before: a lost turn is twice as large, less what the joint has
 # moved. A forearm whose motor has lost its power falls by 0.3 rad in 0.1 s; an arm that is down, only a person moves.

@@ -15,14 +15,13 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from exo_gravity.core.compensation.params import robot_of
+from exo_gravity.core.compensation.settings import robot_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import ZEROS, ArmModel
 from exo_gravity.core.model.kinematics import frames
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 from exo_gravity.core.params import Param
-from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.safety.params import limits_of
+from exo_gravity.core.safety.limits import Limits, limits_of
 
 Point = tuple[float, ...]  # (3,)
 

@@ -27,7 +27,7 @@ from queue import SimpleQueue
 
 import can
 
-from exo_gravity.core.safety.params import FROZEN
+from exo_gravity.core.safety.limits import FROZEN
 from exo_gravity.hardware.ownership.bus_lock import DriveNotes, is_asked_for, remove_notes
 from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, Silence, let_down
 

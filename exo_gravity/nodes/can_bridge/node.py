@@ -24,9 +24,9 @@ from exo_gravity.core.errors import BusError, ExoGravityError, ParameterError
 from exo_gravity.core.model.tilt import SIDES
 from exo_gravity.core.motors.joint_motor import OPTIONS, motors_of, traffic_of
 from exo_gravity.core.safety.drive import NO_COMMAND, FaultCode, State
+from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.core.safety.params import CAN_BRIDGE, check_bridge, limits_of
-from exo_gravity.core.trunk.tilt_input import TiltInput
+from exo_gravity.core.trunk.inputs import TiltInput
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import request_real_time
 from exo_gravity.hardware.control_loop import ControlLoop

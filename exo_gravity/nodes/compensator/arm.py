@@ -20,13 +20,13 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
-from exo_gravity.core.compensation import params
+from exo_gravity.core.compensation import settings
 from exo_gravity.core.compensation.compensator import Answer, Compensator
 from exo_gravity.core.compensation.limiter import CommandFade, Output
 from exo_gravity.core.compensation.settings import URDF_LAW, Settings, UrdfSettings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import Param
-from exo_gravity.core.trunk.tilt_input import MAX_LEAD
+from exo_gravity.core.trunk.inputs import MAX_LEAD
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, row, to_nanoseconds, velocity_of
 from exo_gravity.nodes.ros.parameters import declare
@@ -46,13 +46,13 @@ def declared(node: Node) -> tuple[Sequence[Param], dict[str, Any], Read]:
     """
     given = node.get_parameters_by_prefix("")
     if "law" not in given or given["law"].value != URDF_LAW:
-        table = params.compensator_table(given)
-        return table, declare(node, table), lambda values: params.settings_of(values, _text)
-    table = params.urdf_table(len(_joint_names(node)), given)
+        table = settings.compensator_table(given)
+        return table, declare(node, table), lambda values: settings.settings_of(values, _text)
+    table = settings.urdf_table(len(_joint_names(node)), given)
     _forget_unused(node, {param.name for param in table})
     values = declare(node, table)
     model = UrdfArm(_description(node, values), values["joint_names"])
-    return table, values, lambda values: params.urdf_settings_of(values, model)
+    return table, values, lambda values: settings.urdf_settings_of(values, model)
 
 
 def sentence(s: Settings | UrdfSettings) -> str:
@@ -91,7 +91,7 @@ def report(control: Compensator, answer: Answer, names: Sequence[str]) -> dict[s
 
 def _forget_unused(node: Node, used: set[str]) -> None:
     """Undeclare the parameters of the exoskeleton's own arm, which a file may have, and log them."""
-    unused = [param.name for param in params.COMPENSATOR if param.name not in used and node.has_parameter(param.name)]
+    unused = [param.name for param in settings.COMPENSATOR if param.name not in used and node.has_parameter(param.name)]
     for name in unused:
         node.undeclare_parameter(name)
     if unused:
@@ -100,8 +100,8 @@ def _forget_unused(node: Node, used: set[str]) -> None:
 
 def _joint_names(node: Node) -> list[str]:
     names = list(node.get_parameter("joint_names").value or ()) if node.has_parameter("joint_names") else []
-    if not 1 <= len(set(names)) == len(names) <= params.MAX_JOINTS:
-        raise ParameterError("joint_names", names, f"1 to {params.MAX_JOINTS} different joints of the URDF")
+    if not 1 <= len(set(names)) == len(names) <= settings.MAX_JOINTS:
+        raise ParameterError("joint_names", names, f"1 to {settings.MAX_JOINTS} different joints of the URDF")
     return names
 
 

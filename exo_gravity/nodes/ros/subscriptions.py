@@ -23,7 +23,7 @@ from sensor_msgs.msg import Imu
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.rotation import unit_quaternion, up_in_body
-from exo_gravity.core.trunk.tilt_input import STILL, TiltInput
+from exo_gravity.core.trunk.inputs import STILL, TiltInput
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)

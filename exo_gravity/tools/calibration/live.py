@@ -24,9 +24,9 @@ from rich.live import Live
 from rich.text import Text
 
 from exo_gravity.core.calibration.identification import Observation
-from exo_gravity.core.calibration.params import ARM, BRIDGE
+from exo_gravity.core.calibration.tour import ARM, BRIDGE
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.model.moments import moments_of
+from exo_gravity.core.model.gravity import moments_of
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.launcher import Launcher, stop_on_signals
 

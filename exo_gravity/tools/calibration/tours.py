@@ -20,11 +20,10 @@ import numpy as np
 from exo_gravity.core.calibration.identification import Identified, Observation, columns, identify
 from exo_gravity.core.calibration.motion import FrictionCurve, fit_friction
 from exo_gravity.core.calibration.poses import candidates, next_pose
-from exo_gravity.core.compensation.params import wearer_of
+from exo_gravity.core.compensation.settings import wearer_of
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.arm import moments_along
-from exo_gravity.core.model.gravity import gravity_torque
-from exo_gravity.core.model.moments import MOMENTS, load_moments, moments_of, regressor
+from exo_gravity.core.model.gravity import MOMENTS, gravity_torque, load_moments, moments_of, regressor
 from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS
 from exo_gravity.core.numbers import JOINT_COUNT

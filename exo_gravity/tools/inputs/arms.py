@@ -11,14 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.compensation.params import compensator_table, settings_of
-from exo_gravity.core.compensation.settings import URDF_LAW, Settings
+from exo_gravity.core.compensation.settings import URDF_LAW, Settings, compensator_table, settings_of
 from exo_gravity.core.errors import ParameterError, named
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.motors.joint_motor import OPTIONS, JointMotor, motors_of
 from exo_gravity.core.params import Param, values_of
-from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.safety.params import CAN_BRIDGE, limits_of
+from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, limits_of
 from exo_gravity.tools.inputs.parameter_file import Nodes, load, packaged_config
 
 

@@ -17,10 +17,10 @@ import yaml
 from PIL import Image, ImageDraw, ImageFont
 
 from exo_gravity.bag.content import Bag
-from exo_gravity.core.compensation.params import COMPENSATOR
+from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.drive import State
-from exo_gravity.core.safety.params import CAN_BRIDGE
+from exo_gravity.core.safety.limits import CAN_BRIDGE
 from exo_gravity.core.trial.recording import Recording
 from exo_gravity.core.view.scene import ARROW, LINE, SPHERE, ArmView, Shape, arm_shapes
 from exo_gravity.core.view.urdf import ArmDescription, described, joint_names, urdf

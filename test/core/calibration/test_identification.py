@@ -11,7 +11,7 @@ from exo_gravity.core import ArmModel, Tilt
 from exo_gravity.core.calibration.identification import Observation, identify
 from exo_gravity.core.calibration.pose_fit import COMMON, TYPICAL_MOMENTS
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.moments import MOMENTS, load_moments, moments_of, regressor
+from exo_gravity.core.model.gravity import MOMENTS, load_moments, moments_of, regressor
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
 
 from ...support.random_device import CANDIDATES, CODE, LEANING, LENGTH, UPRIGHT, WEIGHT, Device, best, off_axis_of

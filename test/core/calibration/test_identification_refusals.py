@@ -9,7 +9,7 @@ from exo_gravity.core.calibration.identification import check_physical, identify
 from exo_gravity.core.calibration.pose_fit import COUNT
 from exo_gravity.core.calibration.poses import missing_pose, next_pose
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.model.moments import regressor
+from exo_gravity.core.model.gravity import regressor
 
 from ...support.random_device import LEANING, LENGTH, Device, best
 

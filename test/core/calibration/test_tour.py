@@ -14,7 +14,7 @@ from exo_gravity.core.calibration.poses import BestPoses, FixedStations, candida
 from exo_gravity.core.calibration.tour import Tour
 from exo_gravity.core.calibration.tracking import TorqueGuess, inertia_of
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.moments import load_moments, moments_of
+from exo_gravity.core.model.gravity import load_moments, moments_of
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.limits import Limits
