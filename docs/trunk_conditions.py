@@ -1,4 +1,4 @@
-"""Prints what the benefit of `inertial` depends on: the figures of docs/trunk.md that are not in its first two tables.
+"""Prints what the benefit of `inertial` depends on: the figures of docs/imu.md that are not in its first two tables.
 
 `python docs/trunk_conditions.py` takes about ten minutes and does not need ROS.
 """

@@ -1,4 +1,4 @@
-"""Draws docs/trunk_motion.png and writes the table of docs/trunk.md: an arm on the back of a wearer who moves.
+"""Draws docs/trunk_motion.png and writes the table of docs/imu.md: an arm on the back of a wearer who moves.
 
 The simulated arm is brought to a pose and let go; then the trunk bows, leans, walks or sits down hard. Everything that
 the software does takes part: CAN frames, safety machine, compensator, IMU and estimator. `python docs/trunk_motion.py`
@@ -146,7 +146,7 @@ def main() -> None:
     low = {(law.name, motion): worst(law, motion, LOW) for law in LAWS for motion in MOTIONS}
     usual = {(law.name, motion): worst(law, motion, USUAL) for law in LAWS for motion in DRAWN}
     draw(low).savefig(here / "trunk_motion.png", dpi=120)
-    path = here / "trunk.md"
+    path = here / "imu.md"
     text = path.read_text(encoding="utf-8")
     for name, content in (("low", table(low, list(MOTIONS))), ("usual", table(usual, list(DRAWN)))):
         place = re.compile(rf"(<!-- {name} friction -->\n).*?(<!-- end -->)", re.DOTALL)

@@ -18,6 +18,17 @@ from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.tools.inputs.parameter_file import RECOVERY_TIMEOUT, STOP_TIMEOUT, SUPERVISED, packaged_config
 
 LONGEST_STOP = DESCENT_TIMEOUT + RECOVERY_TIMEOUT + 2 * STOP_TIMEOUT  # s, of the launcher
+ARGUMENTS = (  # name, default, description
+    (
+        "params",
+        str(packaged_config("sim.yaml")),
+        "parameter file: one top-level key per node; default: a simulated arm",
+    ),
+    ("namespace", "", "namespace in front of every node of the file, and of the topics /imu/..."),
+    ("only", "", "start only the nodes whose full names match one of these shell patterns"),
+    ("panel", "false", "true: also start the operator's panel, where the file has none"),
+    ("log_level", "info", "debug, info, warn, error or fatal, for every node"),
+)
 RUN = "from exo_gravity.tools.launcher import main; main()"
 
 
@@ -27,10 +38,20 @@ def _on_exit(event: ProcessExited, _context: LaunchContext) -> None:
         raise RuntimeError(f"the launcher ended with exit code {event.returncode}")
 
 
+def _check(words: list[str]) -> None:
+    """Raise RuntimeError if a word names no argument of this file. `ros2 launch` would ignore it."""
+    names = [name for name, *_ in ARGUMENTS]
+    unknown = sorted({word.partition(":=")[0] for word in words if ":=" in word}.difference(names))
+    if unknown:
+        raise RuntimeError(f"{', '.join(unknown)}: not an argument of exo.launch.py; it has {', '.join(names)}")
+
+
 def _start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     def argument(name: str) -> str:
         return LaunchConfiguration(name).perform(context)
 
+    if any(word.endswith("exo.launch.py") for word in sys.argv):  # else another launch file includes this one
+        _check(context.argv)
     words = ["--params", argument("params"), "--log-level", argument("log_level")]
     words += ["--namespace", argument("namespace")] if argument("namespace") else []
     words += ["--only", *argument("only").split()] if argument("only") else []
@@ -51,12 +72,5 @@ def _start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
 
 def generate_launch_description() -> LaunchDescription:
     """Return what `ros2 launch` runs."""
-    arguments = (
-        ("params", str(packaged_config("exo.yaml")), "parameter file: one top-level key per node"),
-        ("namespace", "", "namespace in front of every node of the file, and of the topics /imu/..."),
-        ("only", "", "start only the nodes whose full names match one of these shell patterns"),
-        ("panel", "false", "true: also start the operator's panel, where the file has none"),
-        ("log_level", "info", "debug, info, warn, error or fatal, for every node"),
-    )
-    declared = [DeclareLaunchArgument(name, default_value=value, description=text) for name, value, text in arguments]
+    declared = [DeclareLaunchArgument(name, default_value=value, description=text) for name, value, text in ARGUMENTS]
     return LaunchDescription([*declared, OpaqueFunction(function=_start)])

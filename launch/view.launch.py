@@ -3,49 +3,57 @@
 Starts robot_model, robot_state_publisher and RViz, and no arm. `rviz:=false` leaves RViz out, for other viewers.
 """
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
+from pathlib import Path
+
+from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
 from launch.conditions import IfCondition
-from launch.substitutions import Command, EnvironmentVariable, LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import EnvironmentVariable, LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
-from launch_ros.substitutions import ExecutableInPackage, FindPackageShare
+
+from exo_gravity.tools.inputs.parameter_file import packaged_config
+from exo_gravity.tools.urdf import urdf_of
+
+
+def _start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
+    meshes = LaunchConfiguration("meshes").perform(context)
+    # Read before any node starts: a file that is refused leaves none behind.
+    description = urdf_of(Path(LaunchConfiguration("params").perform(context)), meshes=meshes)
+    return [
+        Node(
+            package="exo_gravity",
+            executable="robot_model",
+            parameters=[{"meshes": ParameterValue(meshes, value_type=str)}],
+            output="screen",
+        ),
+        Node(
+            package="robot_state_publisher",
+            executable="robot_state_publisher",
+            parameters=[{"robot_description": ParameterValue(description, value_type=str)}],
+            remappings=[("robot_description", "/robot_state_publisher/robot_description")],  # robot_model has it
+        ),
+        Node(
+            package="rviz2",
+            executable="rviz2",
+            arguments=["--display-config", str(packaged_config("rviz/exo.rviz"))],
+            condition=IfCondition(LaunchConfiguration("rviz")),
+        ),
+    ]
 
 
 def generate_launch_description() -> LaunchDescription:
     """Return what `ros2 launch` runs."""
-    config = PathJoinSubstitution([FindPackageShare("exo_gravity"), "config"])
-    urdf = ExecutableInPackage(package="exo_gravity", executable="urdf")
-    meshes = LaunchConfiguration("meshes")
-    description = Command([urdf, " --params '", LaunchConfiguration("params"), "' --meshes '", meshes, "'"])
+    arguments = (
+        ("params", str(packaged_config("sim.yaml")), "parameter file of the arms, the one that they were started with"),
+        ("meshes", "", "address of a folder with LINK.stl per link"),
+        ("rviz", "true", "whether to start RViz"),
+    )
     reach = EnvironmentVariable("ROS_AUTOMATIC_DISCOVERY_RANGE", default_value="LOCALHOST")
     return LaunchDescription(
         [
-            DeclareLaunchArgument(
-                "params",
-                default_value=PathJoinSubstitution([config, "exo.yaml"]),
-                description="parameter file of the arms, the one that they were started with",
-            ),
-            DeclareLaunchArgument("meshes", default_value="", description="address of a folder with LINK.stl per link"),
-            DeclareLaunchArgument("rviz", default_value="true", description="whether to start RViz"),
+            *(DeclareLaunchArgument(name, default_value=value, description=text) for name, value, text in arguments),
             SetEnvironmentVariable("ROS_AUTOMATIC_DISCOVERY_RANGE", reach),  # as the arms' own nodes set it
-            Node(
-                package="exo_gravity",
-                executable="robot_model",
-                parameters=[{"meshes": ParameterValue(meshes, value_type=str)}],
-                output="screen",
-            ),
-            Node(
-                package="robot_state_publisher",
-                executable="robot_state_publisher",
-                parameters=[{"robot_description": ParameterValue(description, value_type=str)}],
-                remappings=[("robot_description", "/robot_state_publisher/robot_description")],  # robot_model has it
-            ),
-            Node(
-                package="rviz2",
-                executable="rviz2",
-                arguments=["--display-config", PathJoinSubstitution([config, "rviz", "exo.rviz"])],
-                condition=IfCondition(LaunchConfiguration("rviz")),
-            ),
+            OpaqueFunction(function=_start),
         ]
     )

@@ -115,9 +115,9 @@ def test_foxglove_places_each_panel_once():
 
 def test_the_launch_file_names_executables_and_files_that_exist():
     texts = [node.value for node in ast.walk(ast.parse(LAUNCH.read_text(encoding="utf-8"))) if is_text(node)]
-    assert {"robot_model", "robot_state_publisher", "rviz2", "urdf"} <= set(texts)
+    assert {"robot_model", "robot_state_publisher", "rviz2"} <= set(texts)
     assert "robot_model" in node_names()
-    for parts in (("exo.yaml",), ("rviz", "exo.rviz")):
+    for parts in (("sim.yaml",), ("rviz/exo.rviz",)):
         assert set(parts) <= set(texts) and Path(CONFIG, *parts).is_file()
 
 
