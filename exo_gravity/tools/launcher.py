@@ -194,20 +194,18 @@ class Launcher:
 
 
 def stop_on_signals() -> Stopping:
-    """Return an event that Ctrl-C, SIGTERM, a closed terminal or a dead `ros2 launch` sets; nohup keeps SIGHUP away."""
+    """Return an event that Ctrl-C, SIGTERM or a closed terminal sets; nohup keeps SIGHUP away."""
     stopping = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
             # On a thread, which waits where the handler interrupts a holder of the event's lock.
             signal.signal(number, lambda *_: _thread.start_new_thread(stopping.set, ()))
-
-    def follow_owner() -> None:  # `ros2 launch`, which holds our standard input open
-        sys.stdin.read()
-        stopping.set()
-
-    if os.environ.get("EXO_GRAVITY_SUPERVISED"):
-        threading.Thread(target=follow_owner, daemon=True).start()
     return stopping
+
+
+def _stop_with_owner(stopping: threading.Event) -> None:
+    sys.stdin.read()  # `ros2 launch` holds it open as long as it lives
+    stopping.set()
 
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
@@ -231,6 +229,8 @@ def main(args: Sequence[str] | None = None) -> None:
     options = _arguments(args)
     require_ros("launcher")
     stopping = stop_on_signals()
+    if os.environ.get("EXO_GRAVITY_SUPERVISED"):
+        threading.Thread(target=_stop_with_owner, args=(stopping,), daemon=True).start()
     try:
         more = ["/panel"] if options.panel else []
         path, space = options.params or packaged_config("sim.yaml"), options.namespace.strip("/")

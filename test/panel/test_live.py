@@ -153,7 +153,7 @@ def test_a_trial_is_followed_recorded_and_reported_and_the_death_of_the_panel_ch
             address = page.get_attribute("#trial-report", "href")
             assert "short" in page.request.get(url.rstrip("/") + str(address)).text()
             nodes.process("/panel").kill()
-            wait_for_state(page, "silent")
+            wait_for_state(page, "unseen")
             seen = len(probe.joint_states)
             probe.wait_until(lambda: len(probe.joint_states) > seen + 200)  # 2 s
             assert probe.state == "active"
