@@ -1,11 +1,11 @@
 # make demo         four nodes as processes on the simulated device, about 75 s; a table and figures in trials/
 # make calibrate-demo  a simulated arm with a wrong parameter file, calibrated, 5 minutes; a picture before and after
 # make calibrate-study  20 random simulated devices, calibrated from motors to an arm that holds, offline, 20 minutes
-# make test         the tests, 5.5 minutes on two cores
+# make test         the tests, 4 minutes on two cores
 # make test-all     the same, then the longer ones (make test-long): studies, browser, 13 poses, video, SROS2
 # make lint         ruff, mypy, ament's flake8 and pep257, shellcheck
 # make docs         these documents as a site, in build/site; a warning is an error
-# make faults       the whole fault matrix on the simulated device, 24 minutes; a table and build/faults.json
+# make faults       the whole fault matrix on the simulated device, 40 minutes; a table and build/faults.json
 # make mutations    deliberate defects, each of which must turn a row of the fault matrix unsafe; 7 minutes
 # make bench        the laws, the loop and the tools against peers, 12 minutes on a quiet machine; QUICK=1: part of it
 # make ordinary     ordinary motors, sensors and computers for an hour of virtual time: no alarm; a table, 10 minutes
