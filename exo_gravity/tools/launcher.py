@@ -203,8 +203,9 @@ def stop_on_signals() -> Stopping:
     return stopping
 
 
-def _stop_with_owner(stopping: threading.Event) -> None:
-    sys.stdin.read()  # `ros2 launch` holds it open as long as it lives
+def stop_with_owner(stopping: threading.Event) -> None:
+    """Set `stopping` when `ros2 launch` has ended, which holds our standard input open."""
+    sys.stdin.read()
     stopping.set()
 
 
@@ -230,7 +231,7 @@ def main(args: Sequence[str] | None = None) -> None:
     require_ros("launcher")
     stopping = stop_on_signals()
     if os.environ.get("EXO_GRAVITY_SUPERVISED"):
-        threading.Thread(target=_stop_with_owner, args=(stopping,), daemon=True).start()
+        threading.Thread(target=stop_with_owner, args=(stopping,), daemon=True).start()
     try:
         more = ["/panel"] if options.panel else []
         path, space = options.params or packaged_config("sim.yaml"), options.namespace.strip("/")

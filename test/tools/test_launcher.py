@@ -6,6 +6,7 @@ test/nodes starts real nodes.
 import os
 import signal
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import yaml
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.tools.inputs.parameter_file import chosen, in_namespace, load, node_names, stages
-from exo_gravity.tools.launcher import Launcher, main, stop_on_signals
+from exo_gravity.tools.launcher import Launcher, main, stop_on_signals, stop_with_owner
 
 NODES = Path(__file__).parents[2] / "exo_gravity" / "nodes"
 SIM = Path(__file__).parents[2] / "config" / "sim.yaml"
@@ -51,18 +52,22 @@ def test_a_closed_terminal_stops_the_launcher_as_ctrl_c_does():
     assert stopping.wait(10.0)
 
 
-def test_the_end_of_ros2_launch_stops_its_launcher(monkeypatch):
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    handlers = [signal.getsignal(number) for number in numbers]
+def test_the_end_of_ros2_launch_stops_its_launcher_and_no_program_below_it(monkeypatch):
     monkeypatch.setenv("EXO_GRAVITY_SUPERVISED", "1")
     reading, writing = os.pipe()
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    handlers = [signal.getsignal(number) for number in numbers]
     try:
         with open(reading) as held:
             monkeypatch.setattr(sys, "stdin", held)
-            stopping = stop_on_signals()
-            assert not stopping.wait(0.1)
+            trial, launcher = stop_on_signals(), threading.Event()
+            owner = threading.Thread(target=stop_with_owner, args=(launcher,))
+            owner.start()
+            assert not launcher.wait(0.1)
             os.close(writing)
-            assert stopping.wait(10.0)
+            owner.join(10.0)
+            assert launcher.is_set()
+            assert not trial.is_set()  # the page starts it with a standard input that has ended
     finally:
         for number, handler in zip(numbers, handlers, strict=True):
             signal.signal(number, handler)

@@ -38,8 +38,7 @@ GUIDE_BRAKE = 1.5  # Nm
 MAX_TEMPERATURE = 80.0  # degC, an assumption: a motor whose own protection switches it off would drop the arm
 DERATING = 10.0  # degC below MAX_TEMPERATURE over which the permitted torque falls to half
 MAX_VELOCITY = (5.0, 5.0, 5.0, 6.0)  # rad/s; a reach stays below, a throw does not
-# Cycles in a row without a reply. At 3 % lost each way one arm loses so many in a row once in 270 hours at 100 Hz.
-MISSED = 7
+MISSED = 7  # cycles without a reply; with 3 % lost each way an arm misses so many once in 270 hours at 100 Hz
 REPLY_TIMEOUT = 0.05  # s, and MISSED cycles at least; an ordinary computer is late by 0.02 s
 JUMP = 0.05  # rad that two readings may differ by in addition to what MAX_VELOCITY allows
 # rad from the hanging arm at the first start. The zero of a motor with a single encoder may be off by whole turns of
