@@ -27,7 +27,7 @@ def main() -> None:
                 page.wait_for_selector("[data-arm=right] .mark:not([hidden])", state="attached")
                 if language == "de":
                     page.locator("#picture").scroll_into_view_if_needed()
-                    page.wait_for_timeout(8000)
+                page.wait_for_timeout(8000)  # so that the picture is drawn and the plots have curves
                 page.screenshot(path=DOCS / f"{name}.png")
                 page.context.close()
     finally:

@@ -106,6 +106,7 @@ export class Picture {
     const bar = new T.Mesh(new T.CylinderGeometry(0.014, 0.014, 1, 12), new T.MeshLambertMaterial({ color: 0xa61218 }));
     const turn = new T.Quaternion().setFromUnitVectors(new T.Vector3(0, 1, 0), axis);
     bar.quaternion.copy(turn);
+    bar.scale.y = 0.001; // until a torque is known
     const arc = new T.Mesh(new T.TorusGeometry(0.07, 0.004, 6, 40, upper - lower), new T.MeshLambertMaterial({ color: 0x7a4b00 }));
     arc.quaternion.copy(new T.Quaternion().setFromUnitVectors(new T.Vector3(0, 0, 1), axis));
     arc.rotateZ(lower);
