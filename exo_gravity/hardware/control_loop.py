@@ -170,7 +170,7 @@ class ControlLoop:
             reason = f"efforts cannot be received: {type(error).__name__}: {error}"
             self.safety.trip(FaultCode.INTERNAL_ERROR, reason, self._now())
             efforts = NO_COMMAND
-        while not self._calls.empty():  # nobody else takes from it
+        while not self._calls.empty():  # only this thread takes from it
             function, future = self._calls.get()
             if not future.set_running_or_notify_cancel():
                 continue

@@ -46,7 +46,7 @@ class TrunkReading(NamedTuple):
     angular_velocity: Sequence[float] = ZERO  #: rad/s, as measured
 
 
-# Called in every cycle, in s; returns the reading of a sample, None if there is none.
+# Called in every cycle with its time in s. Returns a reading when the IMU takes a sample, else None.
 TrunkSensor = Callable[[float, TrunkState], TrunkReading | None]
 
 

@@ -29,7 +29,7 @@ CANDIDATES = np.radians(
 
 
 def off_axis_of(mass: Vector, cog_y: Vector, cog_z: Vector) -> Vector:
-    """Return (W, Z, Y3, Y4) in kg m of links with centres of gravity (4,) m beside them, along y_n and z_n."""
+    """Return (W, Z, Y3, Y4) in kg m; the centres of gravity lie off the links, by (4,) m along y_n and z_n."""
     return mass[0] * cog_z[0] + mass[1] * cog_y[1], np.dot(mass[1:], cog_z[1:]), mass[2] * cog_y[2], mass[3] * cog_y[3]
 
 

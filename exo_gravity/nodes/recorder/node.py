@@ -63,7 +63,7 @@ class Recorder(Node):
         self._topics: dict[str, HotPath] = {}
         self._counted: list[Publishers] = []  # of joints and IMU; other topics have several
         self._taken: list[tuple[str, int, bytes]] = []  # topic, time of arrival in ns since 1970, serialised
-        self._nodes: dict[str, NodeParameters] = {}  # until their parameters are in the recording
+        self._nodes: dict[str, NodeParameters] = {}  # destroyed once their parameters are in the recording
         self._live = LiveLine() if values["live"] else None
         self.create_timer(DRAIN_PERIOD, self._drain)
         self.create_timer(DISCOVERY_PERIOD, self._discover)

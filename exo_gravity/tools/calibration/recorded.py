@@ -75,7 +75,7 @@ def _down(path: Path, arm: ConfiguredArm, times: np.ndarray) -> np.ndarray:
 def messages_of(path: Path, topic: str, msgtype: str, required: bool = True) -> Iterator[tuple[int, Any]]:
     """Yield stamp in ns and message of each message of `topic` in a recording.
 
-    Raises DataError for one that cannot be read, and if there are none although they are `required`.
+    Raises DataError if a message cannot be read, or if `required` and there is none.
     """
     storage, types = Storage(path), get_typestore(Stores.ROS2_JAZZY)
     found = False
