@@ -27,7 +27,7 @@ from exo_gravity.core.trunk.inputs import TiltInput
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, by_name
 from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import NEWEST, HotPath, Publishers, Repeated, TiltSubscription
+from exo_gravity.nodes.ros.subscriptions import NEWEST, HotPath, Publishers, Repeated, TiltSubscription, crowded
 
 REPORT_PERIOD = 0.1  # s
 PLAN_PERIOD = 0.05  # s
@@ -79,9 +79,7 @@ class CalibratorNode(Node):
         self._command.header.stamp = message.header.stamp
         try:
             self._sources["joint_states"].is_another(info)
-            for topic, publishers in self._sources.items():
-                if publishers.are_several:
-                    self._trouble = f"more than one publisher of {topic}"
+            self._trouble = crowded(self._sources) or self._trouble
             effort = self._effort(by_name(message, "position", self._names), by_name(message, "velocity", self._names))
         except ParameterError as error:
             self._trouble, effort = f"joint_states: {error}", None

@@ -12,7 +12,6 @@ from typing import Any
 
 import yaml
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Imu
 from std_msgs.msg import String
@@ -55,9 +54,10 @@ class Simulator(Node):
         values = declare(self, SIMULATOR, free_prefix=OPTIONS)
         self._device = device_of(values)
         set_faults(self._device, values)
-        # Scripts that have not begun; that of the parameter file does so `delay` s after the motors are on.
-        self._scripts = deque([script] if (script := script_of(values["trial"])) else [])
-        self._delay: float | None = values["trial_delay"]  # None for a script that was set live
+        # The script that begins next, and how many s after the motors are on; None for one that is set live: at once.
+        self._next = deque[tuple[TrialScript, float | None]](maxlen=1)
+        if script := script_of(values["trial"]):
+            self._next.append((script, values["trial_delay"]))
         self._trunk_target = (values["trunk.pitch"], values["trunk.roll"])
         self._wearer: VirtualWearer | None = None
         self._published_step: int | None = None
@@ -68,8 +68,7 @@ class Simulator(Node):
         self._imu_publisher = self.create_publisher(Imu, topic, qos_profile_sensor_data) if topic else None
         self._trunk_period = 1.0 / self._imu.config.rate
         self._trunk_due = 0.0  # monotonic s
-        accept_changes(self, SIMULATOR, lambda values: (values, script_of(values["trial"]))[0], self._apply)
-        self.add_post_set_parameters_callback(self._start_trial)
+        accept_changes(self, SIMULATOR, lambda values: (values, script_of(values["trial"])), self._apply)
         self.failure: Exception | None = None  # ends the node, see run()
         self._stopping = threading.Event()
         self._bus = open_bus(*bus_of(self, values))
@@ -123,9 +122,10 @@ class Simulator(Node):
     def _follow_wearer(self) -> None:
         """Start the wearer when it is time, and publish each new step."""
         device = self._device
-        while self._scripts and (self._delay is None or all(motor.entered for motor in device.motors)):
-            self._wearer, self._published_step = VirtualWearer(self._scripts.popleft()), None
-            device.start(self._wearer, self._delay or 0.0)
+        while self._next and (self._next[0][1] is None or all(motor.entered for motor in device.motors)):
+            script, delay = self._next.popleft()
+            self._wearer, self._published_step = VirtualWearer(script), None
+            device.start(self._wearer, delay or 0.0)
         if self._wearer is None or self._wearer.step is None or self._wearer.step == self._published_step:
             return
         number, steps = self._wearer.step, self._wearer.script.steps
@@ -151,14 +151,12 @@ class Simulator(Node):
             level, message = WARN, "a simulated fault disconnects a motor"
         self._diagnostics.report(level, message, values)
 
-    def _apply(self, values: dict[str, Any]) -> None:
+    def _apply(self, accepted: tuple[dict[str, Any], TrialScript | None], changed: set[str]) -> None:
+        values, script = accepted
         self._trunk_target = (values["trunk.pitch"], values["trunk.roll"])
         set_faults(self._device, values)
-
-    def _start_trial(self, changes: list[Parameter]) -> None:
-        for change in changes:
-            if change.name == "trial" and (script := script_of(change.value)):
-                self._scripts, self._delay = deque([script]), None
+        if script and "trial" in changed:
+            self._next.append((script, None))
 
 
 def main() -> None:

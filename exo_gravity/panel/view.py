@@ -7,6 +7,7 @@ from typing import Any
 
 from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.errors import ExoGravityError
+from exo_gravity.core.motors.joint_motor import SIMULATED_BUSES
 from exo_gravity.core.params import Param
 from exo_gravity.core.view.urdf import described, urdf
 
@@ -29,9 +30,6 @@ SETTABLE = {
     for param in COMPENSATOR
     if param.name in ("support", "mode", "wearer.body_mass", "wearer.sex", "wearer.segment_length")
 }
-
-# Buses of python-can that lead to no motor.
-SIMULATED = ("udp_multicast", "virtual")
 
 Values = Mapping[str, Any]
 NUMBERS = ("position", "velocity", "effort")
@@ -63,5 +61,5 @@ def _arm_setup(bridge: Values, compensator: Values) -> dict[str, Any]:
     return {
         "max_effort": [min(column) for column in zip(*efforts, strict=True)] if efforts else None,
         "settings": {name: compensator.get(name) for name in SETTABLE},
-        "simulated": bridge.get("can.interface") in SIMULATED,
+        "simulated": bridge.get("can.interface") in SIMULATED_BUSES,
     }

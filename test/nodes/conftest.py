@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import rclpy
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from ..support.bus_listener import BusListener
@@ -22,6 +23,20 @@ def node() -> Iterator[Node]:
     rclpy.init(context=context)
     node = rclpy.create_node("listener", namespace="/right", context=context)
     yield node
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)
+
+
+@pytest.fixture(scope="module")
+def executor() -> Iterator[SingleThreadedExecutor]:
+    """The executor of one node in the namespace /right, which the tests of a module share."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node("spinning", namespace="/right", context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    yield executor
+    executor.shutdown()
     node.destroy_node()
     rclpy.try_shutdown(context=context)
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import pytest
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from exo_gravity.nodes.ros import parameters as parameters_module
@@ -17,20 +16,6 @@ from exo_gravity.nodes.ros.parameters import ANSWER_TIMEOUT, NodeParameters
 from exo_gravity.nodes.ros.run import keep_to_this_machine
 
 keep_to_this_machine()
-
-
-@pytest.fixture(scope="module")
-def executor() -> Iterator[SingleThreadedExecutor]:
-    """The executor of the node that asks."""
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    node = rclpy.create_node("asking", namespace="/right", context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    yield executor
-    executor.shutdown()
-    node.destroy_node()
-    rclpy.try_shutdown(context=context)
 
 
 @pytest.fixture

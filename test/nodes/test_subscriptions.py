@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
-import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -23,20 +22,6 @@ keep_to_this_machine()
 
 NUMBERS = itertools.count(1)
 QUEUE = QoSProfile(depth=8)
-
-
-@pytest.fixture(scope="module")
-def executor() -> Iterator[SingleThreadedExecutor]:
-    """The executor of one node, which all tests share."""
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    node = rclpy.create_node("hot_path_test", context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    yield executor
-    executor.shutdown()
-    node.destroy_node()
-    rclpy.try_shutdown(context=context)
 
 
 class Pair:

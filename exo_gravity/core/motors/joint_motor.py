@@ -105,6 +105,8 @@ class JointMotor:
         return self.direction * joint_position + self.zero
 
 
+SIMULATED_BUSES = ("udp_multicast", "virtual")  # interfaces of python-can that lead to no motor
+
 # fmt: off
 # `can_bridge` assumes these properties of its motors; `simulator` builds motors that have them.
 MOTOR_PARAMETERS = (

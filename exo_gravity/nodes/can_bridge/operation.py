@@ -16,7 +16,7 @@ from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity.core.errors import BusError, ParameterError
-from exo_gravity.core.motors.joint_motor import REPLY_SHARE, JointMotor, Traffic
+from exo_gravity.core.motors.joint_motor import REPLY_SHARE, SIMULATED_BUSES, JointMotor, Traffic
 from exo_gravity.core.numbers import Rate
 from exo_gravity.core.safety.delivery import MotorLoad
 from exo_gravity.core.safety.drive import EffortCommand, FaultCode, State
@@ -32,7 +32,6 @@ RECENT = 2.0  # s for which a limit that acted is still shown
 SLOW = 0.9  # share of the set rate below which the loop is slow
 ZERO_TOLERANCE = 0.02  # rad that a motor may report after set_zero
 ZERO_TIMEOUT = 3.0  # s; motors are silent for up to 1.5 s while they write their memory
-SIMULATED = ("udp_multicast", "virtual")  # interfaces of python-can that no motor listens to
 REQUESTS = 32  # of control, that wait for the next look
 WATCH_PERIOD = 0.1  # s between two looks at them
 CALL_TIMEOUT = 2.0  # s that a service waits for the control thread
@@ -46,7 +45,7 @@ def refuse_simulated_time(node: Node, interface: str) -> None:
     Efforts are as old as the joint states whose stamp they carry: a clock that stops would hide a dead compensator.
     Raises ParameterError.
     """
-    if interface in SIMULATED:
+    if interface in SIMULATED_BUSES:
         return
     why = f"with a real bus (can.interface {interface}): it stamps the joint states with a clock that can stop"
     if node.get_parameter("use_sim_time").value:

@@ -25,7 +25,7 @@ from exo_gravity.nodes.compensator.budget_watch import BudgetWatch
 from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import accept_changes
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import NEWEST, HotPath, Publishers, Repeated, TiltSubscription
+from exo_gravity.nodes.ros.subscriptions import NEWEST, HotPath, Publishers, Repeated, TiltSubscription, crowded
 
 SILENCE = 0.5  # s without joint states until diagnostics report it
 REPORT_PERIOD = 0.5  # s
@@ -106,9 +106,8 @@ class CompensatorNode(Node):
                     answer = self._control.step(now, theta, velocity)
         except ParameterError as error:
             answer = Answer(None, self._refused(self._interface.topic, error))
-        for topic, publishers in self._sources.items():
-            if publishers.are_several:
-                answer = Answer(None, f"more than one publisher of {topic}")
+        if problem := crowded(self._sources):
+            answer = Answer(None, problem)
         self._interface.send(now, message, answer)
         self._answers += answer.effort is not None
         self._rides += bool(answer.held and not self._answer.held)
@@ -134,7 +133,7 @@ class CompensatorNode(Node):
         self._refusal = f"{topic}: {error}"
         return f"{topic}: {error.name} must be {error.expected}"
 
-    def _apply(self, settings: Settings | UrdfSettings) -> None:
+    def _apply(self, settings: Settings | UrdfSettings, _changed: set[str]) -> None:
         with self._lock:
             self._control.apply(settings)
         self.get_logger().info(sentence(settings))

@@ -23,9 +23,8 @@ from exo_gravity.nodes.imu.device import ImuDevice
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import HotPath, Publishers
+from exo_gravity.nodes.ros.subscriptions import DATA, PITCH_YAW, HotPath, Publishers
 
-PITCH_YAW, DATA = "/imu/pitch_yaw", "/imu/data"
 # The fusion integrates every sample. A queue of depth 1 would lose samples whenever the node is delayed.
 DEPTH = 50
 WATCH_PERIOD = 0.1  # s

@@ -37,9 +37,9 @@ def declare(node: Node, table: Sequence[Param], free_prefix: str = "") -> dict[s
 
 
 def accept_changes(
-    node: Node, table: Sequence[Param], read: Callable[[dict[str, Any]], T], apply: Callable[[T], object]
+    node: Node, table: Sequence[Param], read: Callable[[dict[str, Any]], T], apply: Callable[[T, set[str]], object]
 ) -> None:
-    """From now on, `apply` what `read` makes of the table's values after a change; its ParameterError refuses that."""
+    """Call `apply(read(values), names set)` after each change of the table; a ParameterError of `read` refuses it."""
     accepted: list[T] = []
 
     def check(changes: list[Parameter]) -> SetParametersResult:
@@ -52,7 +52,7 @@ def accept_changes(
         return SetParametersResult(successful=True)
 
     node.add_on_set_parameters_callback(check)
-    node.add_post_set_parameters_callback(lambda _changes: apply(*accepted))
+    node.add_post_set_parameters_callback(lambda changes: apply(accepted[0], {change.name for change in changes}))
 
 
 def bus_of(node: Node, values: dict[str, Any]) -> tuple[str, str, dict[str, Any]]:

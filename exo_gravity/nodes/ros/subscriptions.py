@@ -10,7 +10,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -30,7 +30,7 @@ NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # reliable
 STOP_CHECK_PERIOD = 0.1  # s
 PAUSE = 0.0004  # s, less than the shortest period of a control loop
-MAX_PUBLISHERS = 4  # of one topic that are told apart
+MAX_PUBLISHERS = 4  # publishers of one topic that can be told apart
 DISTRUST = 0.2  # s for which a topic is not trusted after a second publisher was seen
 DATA, PITCH_YAW = "/imu/data", "/imu/pitch_yaw"
 NOT_REPORTED = -1.0  # first entry of a covariance (REP-145)
@@ -117,7 +117,7 @@ class HotPath(Repeated):
 
 
 class Publishers:
-    """Those of one topic, told apart by the numbers that each gives its messages, from 1; rclpy passes them on.
+    """The publishers of one topic. Each numbers its messages from 1, and rclpy passes the numbers on.
 
     So a second publisher shows at once, without discovery, which still lists a killed publisher for 20 s. missed:
     messages that were published and not received.
@@ -149,6 +149,12 @@ class Publishers:
     def are_several(self) -> bool:
         """Whether a message came from another publisher than the one before, within DISTRUST s."""
         return time.monotonic() - self._changed < DISTRUST
+
+
+def crowded(sources: Mapping[str, Publishers]) -> str:
+    """Return the sentence that a topic of `sources` has more than one publisher, '' if none has."""
+    topics = [topic for topic, publishers in sources.items() if publishers.are_several]
+    return f"more than one publisher of {topics[-1]}" if topics else ""
 
 
 class TiltSubscription:
