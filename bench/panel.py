@@ -19,7 +19,7 @@ from pathlib import Path
 import yaml
 
 from exo_gravity.core.motors.specs import MOTORS, SPECIAL_FRAMES, unpack_command
-from test.faults.soak import resident
+from test.faults.live_arm import resident
 from test.support.bus_listener import CAN_IDS, BusListener, Frame
 from test.support.launched_nodes import LaunchedNodes
 from test.support.panel_browser import chromium, enable, open_page, wait_for_state

@@ -26,11 +26,12 @@ class V3WearerRig(WearerRig):
     simulator: ClassVar[Parameters] = {**WearerRig.simulator, **V3Rig.simulator}
 
 
-def compensator(**values: Any) -> Action:
+def compensator(values: dict[str, Any]) -> Action:
     """Set parameters of the compensator together."""
 
     def inject(rig: Rig) -> None:
-        result = rig.probe.set_parameters("compensator", atomically=True, **values)
+        named = {name.replace(".", "__"): value for name, value in values.items()}
+        result = rig.probe.set_parameters("compensator", atomically=True, **named)
         assert result.successful, result.reason
 
     return inject
@@ -39,21 +40,17 @@ def compensator(**values: Any) -> Action:
 def load_case(name: str, change: dict[str, Any], back: dict[str, Any], rig: type[Rig] = WearerRig) -> FaultCase:
     return FaultCase(
         name,
-        in_turn(compensator(**_named(change)), pause(MOTION)),
+        in_turn(compensator(change), pause(MOTION)),
         rig,
         limit=None,
         outcomes=("active",),
-        clear=in_turn(compensator(**_named(back)), pause(3.0)),
+        clear=in_turn(compensator(back), pause(3.0)),
         speed_limit=GUIDED_SPEED,
     )
 
 
 def _ask_for_speed(message: JointState) -> None:
     message.velocity = [0.5] * 4
-
-
-def _named(values: dict[str, Any]) -> dict[str, Any]:
-    return {name.replace(".", "__"): value for name, value in values.items()}
 
 
 ZERO_G, ONE_G = {"mode": "zero_g"}, {"mode": "one_g"}

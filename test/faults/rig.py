@@ -94,7 +94,7 @@ class Rig:
             if stage in ("checking", "proving signs", "ramping in"):
                 self._start_over(stage)
                 return
-            while not self._is_at_pose():
+            while not self.is_at_pose():
                 self.get_carried(self.probe)
                 self.probe.bring_to(self.script)
                 self._wait_for_states(self.rate / 4)
@@ -118,7 +118,8 @@ class Rig:
         self._bridges.add(self.pid("can_bridge"))
         prefer(os.getpid())
 
-    def _is_at_pose(self) -> bool:
+    def is_at_pose(self) -> bool:
+        """Return whether the arm is carried in its pose."""
         newest = self.truth.newest()
         is_near = newest is not None and np.abs(newest["position"] - self.pose).max() < NEAR
         return self.probe.state == "active" and bool(is_near)

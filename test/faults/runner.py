@@ -174,7 +174,7 @@ class RigPool:
 
     def run(self, case: FaultCase) -> Result:
         """Run `case` on a rig of its type; an unsafe result has the last lines of the nodes' `log` too."""
-        rig = self._rig_for(case)
+        rig = self.rig_for(case.rig)
         try:
             result = run_case(case, rig)
         except Exception as error:  # the other cases may still show something
@@ -188,14 +188,15 @@ class RigPool:
             result["log"] = rig.log[-LOG_LINES:]
         return result
 
-    def _rig_for(self, case: FaultCase) -> Rig:
-        if self.rig is not None and (type(self.rig) is not case.rig or self.rig.have_ended):
+    def rig_for(self, kind: type[Rig]) -> Rig:
+        """Return the running rig of this kind."""
+        if self.rig is not None and (type(self.rig) is not kind or self.rig.have_ended):
             self._close()
         if self.rig is None:
             self._count += 1
             folder = self._folder / str(self._count)
             folder.mkdir()
-            self.rig = case.rig(folder, self._shipped_timeouts)
+            self.rig = kind(folder, self._shipped_timeouts)
             self.rig.start()
         return self.rig
 

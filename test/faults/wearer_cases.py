@@ -37,13 +37,18 @@ THROW = pushes([0.0, 2.5, 0.0, 0.2])
 REACH: Steps = [{"move": pose, "over": 0.8} for pose in ([0.3, 1.2, 0.8, 1.2], POSE) * 4]
 
 
+def begin(rig: Rig, steps: Steps) -> None:
+    """Let the wearer do these steps from now on."""
+    script = rig.write_script(f"wearer_{time.monotonic_ns()}", steps)
+    result = rig.probe.set_parameters("simulator", trial=str(script))
+    assert result.successful, result.reason
+
+
 def while_wearer(does: str, steps: Steps, after: float, **options: Any) -> FaultCase:
     """The compensator freezes `after` s after the wearer began his `steps`, with which he goes on."""
 
     def inject(rig: Rig) -> float:
-        script = rig.write_script(f"wearer_{time.monotonic_ns()}", steps)
-        result = rig.probe.set_parameters("simulator", trial=str(script))
-        assert result.successful, result.reason
+        begin(rig, steps)
         time.sleep(after)
         start = time.time()
         os.kill(rig.pid("compensator"), signal.SIGSTOP)
