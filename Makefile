@@ -18,6 +18,7 @@
 # make two-computers  the arm on two computers over better and worse wires, 6 minutes; a table and build/two_computers.json
 # make dist         wheel and source distribution in dist/, the wheel installed in an empty environment and tried
 # make release      what a release needs, from its version to the fault matrix; one line says what is missing; QUICK=1
+# make doctor       whether this computer is fit to carry an arm, half a minute; PARAMS=FILE, the simulated arm by default
 # make panel        the simulated right arm and the operator's page, until Ctrl-C
 # make presses      from a press on the operator's page to the torque on the bus; PRESSES=50
 # make pythons      for each supported Python found here: set-up from nothing, a short trial, the nodes
@@ -38,7 +39,7 @@ SETUP := VENV=$(VENV) .ci/setup
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo calibrate-demo calibrate-study test lint docs faults mutations bench motion-monitor ordinary effort-study baselines imu-report \
-        socketcan pythons constraints clean ros2-launch two-computers dist panel presses release test-all test-long
+        socketcan pythons constraints clean ros2-launch two-computers dist doctor panel presses release test-all test-long
 
 demo:
 	@$(SETUP) $(DEMO)
@@ -132,6 +133,10 @@ dist:
 
 release:
 	.ci/release
+
+doctor:
+	@$(SETUP) report
+	$(BIN)/doctor $(if $(PARAMS),--params $(PARAMS))
 
 panel:
 	@$(SETUP) $(DEMO) panel

@@ -11,7 +11,7 @@ declared = ElementTree.parse(here / "package.xml").getroot()
 # The one list of executables. The launcher reads the nodes from the entry points. A large node is a folder.
 nodes = ("can_bridge", "compensator", "imu", "panel", "recorder", "robot_model")
 small_nodes = ("calibrator", "simulator")
-tools = ("launcher", "trial", "report", "budget", "validate", "train_anfis", "calibrate", "urdf")
+tools = ("launcher", "trial", "report", "budget", "validate", "train_anfis", "calibrate", "urdf", "doctor")
 
 extras = {
     # Jazzy as wheels, for a machine without ROS. Where ROS 2 is installed, leave this extra out.

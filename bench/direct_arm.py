@@ -9,10 +9,9 @@ from pathlib import Path
 
 from exo_gravity.core.model.gravity import LAWS, Torque
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.motors.joint_motor import OPTIONS
 from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.tools.inputs.arms import read_arm
+from exo_gravity.tools.inputs.arms import can_options, read_arm
 from exo_gravity.tools.inputs.parameter_file import load
 
 
@@ -28,9 +27,7 @@ class DirectArm:
         self.joint_names = arm.joint_names
         self.motors = arm.motors
         self.interface, self.channel = str(arm.can_bridge["can.interface"]), str(arm.can_bridge["can.channel"])
-        bridge = nodes[f"{namespace}/can_bridge"]
-        prefix = f"{OPTIONS}."
-        self.options = {name.removeprefix(prefix): bridge[name] for name in bridge if name.startswith(prefix)}
+        self.options = can_options(nodes[f"{namespace}/can_bridge"])
         settings = arm.settings()
         self._model, self._law, self._tilt = settings.arm, LAWS[settings.law], Tilt.of(settings.side)
 

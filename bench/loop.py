@@ -32,6 +32,9 @@ START_LIMIT = 60.0  # s until the wearer must move
 SETTLING = 0.5  # s of movement before the measurement
 THREAD_PRIORITY = {"nodes": 0, "fifo": 50}  # of the kinds that run the package's nodes
 TICKS = os.sysconf("SC_CLK_TCK")
+CORES = 2  # on which everything runs that belongs to a loop, so that loops of every kind have the same
+QUIET = 0.01  # share of these cores that a hypervisor may give to others in a run that counts as quiet
+QUIET_OTHERS = 0.1  # the same for other programs: Linux counts that time in ticks
 
 Windows = list[tuple[float, float]]  # begin and end in s since 1970
 Watch = Callable[[dict[str, int]], Windows | None]
@@ -41,15 +44,22 @@ Watch = Callable[[dict[str, int]], Windows | None]
 class LoopRun:
     """One run.
 
-    arms: the timing of each. cpu: share of a core by process. stolen: share of a core that the hypervisor gave to
-    others. start: s from launch to carried. windows: the first arm's timing in each of the times that `watch` returned.
+    arms: the timing of each. cpu: share of a core by process. stolen, others: share of the bench's cores that the
+    hypervisor and other programs took. start: s from launch to carried. windows: the first arm's timing in each of the
+    times that `watch` returned.
     """
 
     arms: list[LoopTiming]
     cpu: dict[str, float]
     stolen: float
+    others: float
     start: float
     windows: list[LoopTiming]
+
+    @property
+    def is_disturbed(self) -> bool:
+        """Whether more was taken than a quiet machine takes."""
+        return self.stolen > QUIET or self.others > QUIET_OTHERS
 
 
 def run_loop(kind: str, rate: float, both_arms: bool, seconds: float, watch: Watch | None = None) -> LoopRun:
@@ -58,7 +68,7 @@ def run_loop(kind: str, rate: float, both_arms: bool, seconds: float, watch: Wat
     watch: called with the process IDs during the measurement, in place of a wait for `seconds`. It may return times
     that are timed separately too. Raises RuntimeError if the arm is not carried to the end.
     """
-    with tempfile.TemporaryDirectory() as folder_name, contextlib.ExitStack() as stack:
+    with tempfile.TemporaryDirectory() as folder_name, _pinned(), contextlib.ExitStack() as stack:
         folder = Path(folder_name)
         params, simulators = write_parameters(folder, rate, both_arms, seconds, THREAD_PRIORITY.get(kind, 0))
         namespaces = ["/right", "/left"] if both_arms else ["/right"]
@@ -82,13 +92,13 @@ def run_loop(kind: str, rate: float, both_arms: bool, seconds: float, watch: Wat
         if line := log.find("not permitted"):
             raise RuntimeError(line)
         time.sleep(SETTLING)
-        times, cpu, stolen = _measure(pids, seconds, watch)
+        times, cpu, taken = _measure(pids, seconds, watch)
         _check_run(launcher, log)
         stack.close()
         if any(listener.wait() for listener in listeners):
             raise RuntimeError("the listener lost frames: the machine is too busy to measure anything")
         whole = [_timings(arm, recording, times[:1], rate)[0] for arm, recording in zip(arms, recordings, strict=True)]
-        return LoopRun(whole, cpu, stolen, start, _timings(arms[0], recordings[0], times[1:], rate))
+        return LoopRun(whole, cpu, *taken, start, _timings(arms[0], recordings[0], times[1:], rate))
 
 
 def _timings(arm: DirectArm, recording: Path, times: Windows, rate: float) -> list[LoopTiming]:
@@ -133,9 +143,12 @@ def _check_run(launcher: Launcher, log: NodeLog) -> None:
         raise RuntimeError(f"the arm was let down during the run: {line}")
 
 
-def _measure(pids: dict[str, int], seconds: float, watch: Watch | None) -> tuple[Windows, dict[str, float], float]:
-    """Let `seconds` pass; return that time and those of `watch`, each process's share of a core, the stolen share."""
-    before, stolen, begin = {name: _cpu_time(pid) for name, pid in pids.items()}, _stolen_time(), time.time()
+def _measure(
+    pids: dict[str, int], seconds: float, watch: Watch | None
+) -> tuple[Windows, dict[str, float], tuple[float, float]]:
+    """Let `seconds` pass; return that time and those of `watch`, each process's share of a core, and what was taken."""
+    before, begin = {name: _cpu_time(pid) for name, pid in pids.items()}, time.time()
+    (stolen, used), ours = _core_times(), _own_time()
     windows: Windows = []
     if watch:
         windows = watch(pids) or []
@@ -143,7 +156,31 @@ def _measure(pids: dict[str, int], seconds: float, watch: Watch | None) -> tuple
         time.sleep(seconds)
     end = time.time()
     shares = {name: (_cpu_time(pid) - before[name]) / (end - begin) for name, pid in pids.items()}
-    return [(begin, end), *windows], shares, (_stolen_time() - stolen) / (end - begin)
+    (stolen_later, used_later), total = _core_times(), (end - begin) * len(os.sched_getaffinity(0))
+    others = max(0.0, used_later - used - (_own_time() - ours))
+    return [(begin, end), *windows], shares, ((stolen_later - stolen) / total, others / total)
+
+
+@contextlib.contextmanager
+def _pinned() -> Iterator[None]:
+    """Keep this thread, and the processes that it starts in the context, on `CORES` cores.
+
+    Where there are more, they are not two threads of one core, and not the first, which serves most interrupts.
+    """
+    permitted = os.sched_getaffinity(0)
+    by_core = {_siblings(cpu): cpu for cpu in sorted(permitted)}
+    chosen = sorted(by_core.values() if len(by_core) >= CORES else permitted)[-CORES:]
+    os.sched_setaffinity(0, chosen)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, permitted)
+
+
+def _siblings(cpu: int) -> str:
+    """Return the hardware threads of a CPU's core."""
+    path = Path(f"/sys/devices/system/cpu/cpu{cpu}/topology/thread_siblings_list")
+    return path.read_text() if path.exists() else str(cpu)
 
 
 def _peer_commands(kind: str, params: Path, namespace: str, rate: float) -> list[tuple[str, ...]]:
@@ -177,6 +214,25 @@ def _cpu_time(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / TICKS
 
 
-def _stolen_time() -> float:
-    """Return the processor time in s, of all cores together, that the hypervisor has given to others."""
-    return int(Path("/proc/stat").read_text().split("\n", 1)[0].split()[8]) / TICKS
+def _own_time() -> float:
+    """Return the processor time in s of this process and of all that descend from it."""
+    parents = {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):  # it has ended
+            parents[int(path.parent.name)] = int(path.read_text().rpartition(")")[2].split()[1])
+    ours = {os.getpid()}
+    while more := {pid for pid, parent in parents.items() if parent in ours} - ours:
+        ours |= more
+    total = 0.0
+    for pid in ours:
+        with contextlib.suppress(OSError):
+            total += _cpu_time(pid)
+    return total
+
+
+def _core_times() -> tuple[float, float]:
+    """Return the processor time in s of this thread's cores that a hypervisor took, and that all programs used."""
+    cores = {f"cpu{core}" for core in os.sched_getaffinity(0)}
+    rows = (line.split() for line in Path("/proc/stat").read_text().splitlines())
+    times = [[int(field) / TICKS for field in row[1:9]] for row in rows if row[0] in cores]
+    return sum(row[7] for row in times), sum(sum(row[:3]) for row in times)

@@ -8,7 +8,7 @@ import numpy as np
 
 from exo_gravity.core.safety.gate import CALM
 
-from .loop import THREAD_PRIORITY, LoopRun, run_loop
+from .loop import QUIET, QUIET_OTHERS, THREAD_PRIORITY, LoopRun, run_loop
 from .table import Row
 from .timing import percentile
 
@@ -18,8 +18,7 @@ QUICK_RATES = (RATES[1], RATES[3])
 RAMP = 1.0  # s, can_bridge's RAMP_TIME
 KINDS = ("nodes", "fifo", "python", "rclpy")
 PEERS = ("python", "Python without ROS"), ("rclpy", "bare rclpy")
-ATTEMPTS = 3
-QUIET = 0.01  # share of a core that a hypervisor may give to others in a run that counts as quiet
+ATTEMPTS = 2
 PARTS = 5  # of a run; the lowest and the highest of their figures are the spread
 
 Runs = dict[str, LoopRun]  # by kind
@@ -49,7 +48,7 @@ def measure_loops(quick: bool, progress: Progress) -> Iterator[Row]:
 
 
 def _quietest_run(kind: str, rate: int, both_arms: bool, seconds: float, progress: Progress) -> LoopRun | None:
-    """Return the run from which the hypervisor took least, of up to `ATTEMPTS`; None if none carried the arm."""
+    """Return the run from which least was taken, of up to `ATTEMPTS`; None if none carried the arm."""
     best = None
     for _ in range(ATTEMPTS):
         try:
@@ -57,50 +56,52 @@ def _quietest_run(kind: str, rate: int, both_arms: bool, seconds: float, progres
         except RuntimeError as error:
             progress(f"  {error}")
             continue
-        best = run if best is None or run.stolen < best.stolen else best
-        if best.stolen <= QUIET:
+        best = run if best is None or run.stolen + run.others < best.stolen + best.others else best
+        if not best.is_disturbed:
             break
-        progress(f"  the hypervisor took {100 * run.stolen:.1f}% of a core")
+        progress(f"  disturbed: the hypervisor took {run.stolen:.1%} of the cores, other programs {run.others:.1%}")
     return best
 
 
 def _rows(name: str, rate: int, runs: Runs, kind: str) -> Iterator[Row]:
     period, allowed = 1e3 / rate, 1.0 if rate == 1000 else 0.1
     if kind not in runs:
-        yield Row(f"{name}, missed (it did not run): limit", 100.0, allowed, "%")
+        disturbed = any(run.is_disturbed for run in runs.values())
+        yield Row(f"{name}, missed (it did not run): limit", 100.0, allowed, "%", disturbed=disturbed)
         return
     ours = runs[kind]
+
+    def row(what: str, figure: float, other: float, unit: str, spread: str = "", of: str = kind) -> Row:
+        """Return a row whose second figure is one of the kind `of`."""
+        return Row(f"{name}, {what}", figure, other, unit, spread, disturbed=ours.is_disturbed or runs[of].is_disturbed)
+
+    peers = [(peer_kind, peer) for peer_kind, peer in PEERS if peer_kind in runs]
     for share in (50, 99, 99.9):
         figure, spread = _latency(ours, share)
-        for peer_kind, peer in PEERS:
-            if peer_kind in runs:
-                yield Row(f"{name}, p{share:g}: {peer}", figure, _latency(runs[peer_kind], share)[0], "ms", spread)
+        for of, peer in peers:
+            yield row(f"p{share:g}: {peer}", figure, _latency(runs[of], share)[0], "ms", spread, of)
         if share == 99:
-            yield Row(f"{name}, p99: one period", figure, period, "ms", spread)
+            yield row("p99: one period", figure, period, "ms", spread)
     spacing = np.concatenate([arm.spacing for arm in ours.arms]) * 1e3
     for share in (99, 99.9):
-        yield Row(f"{name}, spacing p{share:g}: one period", percentile(spacing, share), period, "ms")
+        yield row(f"spacing p{share:g}: one period", percentile(spacing, share), period, "ms")
     for what in ("missed", "late", "incomplete", "lost"):
         percents = _percents(ours, what)
-        yield Row(f"{name}, {what}: limit", float(np.mean(percents)), allowed, "%", _range(percents))
-        for peer_kind, peer in PEERS:
-            if peer_kind in runs:
-                theirs = float(np.mean(_percents(runs[peer_kind], what)))
-                yield Row(f"{name}, {what}: {peer}", float(np.mean(percents)), theirs, "%", _range(percents))
-    yield Row(f"{name}, taken by the hypervisor: quiet", 100.0 * ours.stolen, 100.0 * QUIET, "%")
-    yield from _cpu_rows(name, runs, kind)
-
-
-def _cpu_rows(name: str, runs: Runs, kind: str) -> Iterator[Row]:
-    """Yield each node's share of a core, against its bare counterpart, or against the core."""
+        mean, spread = float(np.mean(percents)), _range(percents)
+        yield row(f"{what}: limit", mean, allowed, "%", spread)
+        for of, peer in peers:
+            yield row(f"{what}: {peer}", mean, float(np.mean(_percents(runs[of], what))), "%", spread, of)
+    yield row("taken by the hypervisor: quiet", 100.0 * ours.stolen, 100.0 * QUIET, "%")
+    yield row("taken by other programs: quiet", 100.0 * ours.others, 100.0 * QUIET_OTHERS, "%")
     counterparts = {"can_bridge": "bridge", "compensator": "compensator"}
-    for node in sorted({full_name.rpartition("/")[2] for full_name in runs[kind].cpu}):
-        shares = _cpu_shares(runs[kind], node)
+    for node in sorted({full_name.rpartition("/")[2] for full_name in ours.cpu}):
+        shares = _cpu_shares(ours, node)
+        total, spread = sum(shares), _range(shares)
         if node in counterparts and "rclpy" in runs:
-            peer, limit = "bare rclpy", sum(_cpu_shares(runs["rclpy"], counterparts[node]))
+            bare = sum(_cpu_shares(runs["rclpy"], counterparts[node]))
+            yield row(f"CPU of {node}: bare rclpy", total, bare, "%", spread, "rclpy")
         else:
-            peer, limit = "a core", 100.0
-        yield Row(f"{name}, CPU of {node}: {peer}", sum(shares), limit, "%", _range(shares))
+            yield row(f"CPU of {node}: a core", total, 100.0, "%", spread)
 
 
 def _cpu_shares(run: LoopRun, node: str) -> list[float]:

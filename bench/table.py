@@ -15,7 +15,10 @@ from rich.table import Table
 
 @dataclass(frozen=True)
 class Row:
-    """One comparison. name: what is measured, and against what. ours, peer: in `unit`. spread: of our figure."""
+    """One comparison. name: what is measured, and against what. ours, peer: in `unit`. spread: of our figure.
+
+    disturbed: whether other programs, or a hypervisor, took much of the processor from either.
+    """
 
     name: str
     ours: float
@@ -23,6 +26,7 @@ class Row:
     unit: str
     spread: str = ""
     more_is_better: bool = False
+    disturbed: bool = False
 
     @property
     def ratio(self) -> float:
@@ -68,7 +72,7 @@ def show(rows: Sequence[Row], console: Console) -> None:
     for column in table.columns[1:4] + table.columns[5:6]:
         column.justify = "right"
     for row in rows:
-        mark = "x, more is better" if row.more_is_better else "x"
+        mark = f"x{', more is better' * row.more_is_better}{', disturbed' * row.disturbed}"
         table.add_row(row.name, f"{row.ours:.4g}", row.spread, f"{row.peer:.4g}", row.unit, f"{row.ratio:.3g}", mark)
     console.print(table)
 
@@ -76,5 +80,6 @@ def show(rows: Sequence[Row], console: Console) -> None:
 def save(rows: Sequence[Row], path: Path) -> None:
     """Write the rows as JSON."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    content = [{name: getattr(row, name) for name in ("name", "ours", "peer", "unit", "ratio")} for row in rows]
+    names = "name", "ours", "peer", "unit", "ratio", "disturbed"
+    content = [{name: getattr(row, name) for name in names} for row in rows]
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

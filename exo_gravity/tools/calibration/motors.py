@@ -18,13 +18,13 @@ from statistics import fmean
 from rich.table import Table
 
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, OPTIONS, JointMotor
+from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, JointMotor
 from exo_gravity.core.motors.specs import MOTOR_ERRORS
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.hardware.can.bus_scan import BusScan, MotorAnswer
 from exo_gravity.tools.calibration.live import Say
 from exo_gravity.tools.calibration.result import CalibrationResult, Change
-from exo_gravity.tools.inputs.arms import ConfiguredArm
+from exo_gravity.tools.inputs.arms import ConfiguredArm, can_options
 from exo_gravity.tools.inputs.parameter_file import load
 
 Clock = Callable[[], float]
@@ -54,9 +54,8 @@ def calibrate_motors(options: argparse.Namespace, arm: ConfiguredArm, say: Say) 
 
     Raises BusError if the bus cannot be used.
     """
-    given, prefix = load(options.params)[f"{arm.namespace}/can_bridge"], f"{OPTIONS}."
-    can_options = {name.removeprefix(prefix): value for name, value in given.items() if name.startswith(prefix)}
-    with BusScan((arm.can_bridge["can.interface"], arm.can_bridge["can.channel"], can_options)) as bus:
+    bus_options = can_options(load(options.params)[f"{arm.namespace}/can_bridge"])
+    with BusScan((arm.can_bridge["can.interface"], arm.can_bridge["can.channel"], bus_options)) as bus:
         say(f"Asking IDs 1 to {MAX_CAN_ID} on {bus.name}: nothing moves")
         return MotorSearch(bus, arm, options.wait, say).result(options.pose)
 

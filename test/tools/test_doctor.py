@@ -1,0 +1,251 @@
+"""doctor: from what a computer states of itself to findings, commands and an exit code."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from exo_gravity.core.motors.joint_motor import Traffic
+from exo_gravity.tools import diagnosis, doctor
+from exo_gravity.tools.diagnosis import Computer, Finding, Level, Wakeups
+
+CONFIG = Path(__file__).parents[2] / "config"
+IN_TIME = Wakeups(np.full(2500, 1e-4), -20)
+FINE = Computer(
+    "Linux version 6.8.1-rt (gcc) #1 SMP PREEMPT_RT", "1", "performance", {"state0": 0.0}, 4, "", "tsc", "rtprio 0"
+)
+LINK = {"linkinfo": {"info_kind": "can", "info_data": {
+    "state": "ERROR-ACTIVE", "restart_ms": 100, "bittiming": {"bitrate": 1_000_000}}}}  # fmt: skip
+
+
+def wakeups(late: int, by: float) -> Wakeups:
+    """10 s at 250 Hz, of which `late` are late by `by` s."""
+    return replace(IN_TIME, lateness=np.r_[np.full(2500 - late, 1e-4), np.full(late, by)])
+
+
+def of_computer(computer: Computer, is_late: bool = False, woken: Wakeups = IN_TIME, priority: int = 0):
+    return {row.what: row for row in diagnosis.of_computer(computer, woken, 0.004, is_late, priority)}
+
+
+def of_interface(is_up: bool | None = True, queue: int = 1000, link=LINK, bitrate: int = 1_000_000):
+    rows = list(diagnosis.of_interface("can1", is_up, queue, link, bitrate, 50))
+    return {row.what: row for row in rows if row.level}, max(row.level for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("late", "by", "level"),
+    [
+        (0, 0.0, Level.FINE),
+        (2500, 0.0019, Level.FINE),  # less than half a period
+        (2, 0.002, Level.FINE),
+        (3, 0.002, Level.WARNING),
+        (1, 0.024, Level.FINE),
+        (1, 0.025, Level.WARNING),  # half of what lets the arm down
+        (1, 0.05, Level.FAULT),
+    ],
+)
+def test_wake_ups_are_judged_by_how_many_are_late_and_by_the_worst(late: int, by: float, level: Level):
+    row = diagnosis.of_wakeups(wakeups(late, by), 0.004, 0.05)
+    assert row.level is level and bool(row.mend) == bool(level)
+
+
+def test_a_computer_that_could_not_be_better_gets_no_advice():
+    assert {row.level for row in of_computer(FINE).values()} == {Level.FINE}
+
+
+@pytest.mark.parametrize(
+    ("what", "change"),
+    [
+        ("kernel", {"kernel": "Linux version 6.8.0 (gcc) #1 SMP PREEMPT_DYNAMIC", "real_time": ""}),
+        ("CPU governor", {"governors": "performance, powersave"}),
+        ("idle states", {"idle_states": {"state0": 0.0, "state3": 890e-6}}),
+        ("clock source", {"clock_source": "hpet"}),
+    ],
+)
+def test_what_delays_threads_is_a_warning_only_where_they_were_late(what: str, change: dict[str, object]):
+    levels = [of_computer(replace(FINE, **change), is_late)[what].level for is_late in (False, True)]
+    assert levels == [Level.NOTE, Level.WARNING]
+
+
+def test_a_container_that_states_nothing_of_its_cpus_is_not_at_fault():
+    silent = Computer("", "", "", {}, 4, "", "", "rtprio 0, memlock 65536")
+    assert max(row.level for row in of_computer(silent, is_late=True).values()) is Level.UNKNOWN
+
+
+def test_the_command_for_idle_states_names_those_that_are_too_deep_for_the_rate():
+    states = {"state1": 2e-6, "state2": 390e-6, "state3": 410e-6}
+    mend = of_computer(replace(FINE, idle_states=states))["idle states"].mend
+    assert "cpuidle/state3/disable" in mend and "state2" not in mend
+
+
+def test_limits_matter_only_where_a_thread_priority_is_asked_for():
+    refused = replace(IN_TIME, refused=("thread_priority 50 is not permitted",))
+    assert of_computer(FINE, woken=refused)["real-time limits"].level is Level.FINE
+    row = of_computer(FINE, woken=refused, priority=50)["real-time limits"]
+    assert row.level is Level.WARNING and "rtprio 99" in row.mend
+    assert of_computer(FINE, priority=50)["real-time limits"].level is Level.FINE
+
+
+def test_one_cpu_is_too_few_and_isolated_ones_are_named():
+    found = of_computer(replace(FINE, cores=1, isolated="2-3"))
+    assert found["CPUs for the nodes"].level is Level.WARNING and found["isolated CPUs"].found == "2-3"
+
+
+@pytest.mark.parametrize(
+    ("middleware", "reach", "opening", "level"),
+    [
+        ("rmw_fastrtps_cpp", "LOCALHOST", "", Level.FINE),
+        ("rmw_zenoh_cpp", "LOCALHOST", "", Level.WARNING),
+        ("rmw_fastrtps_cpp", "SUBNET", "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET", Level.WARNING),
+        ("rmw_fastrtps_cpp", "SUBNET", "", Level.FINE),  # SROS2 is enforced
+        ("rmw_fastrtps_cpp", "OFF", "", Level.FAULT),
+    ],
+)
+def test_the_middleware_and_who_may_command_the_arm(middleware: str, reach: str, opening: str, level: Level):
+    assert max(row.level for row in diagnosis.of_middleware(middleware, reach, opening)) is level
+
+
+def test_multicast_is_needed_by_the_simulated_bus_alone():
+    problem = "Network is unreachable"
+    assert diagnosis.of_multicast(problem, True).level is Level.FAULT
+    assert diagnosis.of_multicast(problem, False).level is diagnosis.of_multicast("", True).level is Level.FINE
+
+
+@pytest.mark.parametrize(("rate", "level"), [(250, Level.FINE), (900, Level.WARNING), (1100, Level.FAULT)])
+def test_the_bus_load_at_the_wanted_rate(rate: float, level: Level):
+    row = diagnosis.of_load("/right/can_bridge", Traffic(4), rate)
+    assert row.level is level and ("826" in row.mend) == bool(level)  # the table of docs/wiring.md
+
+
+def test_an_interface_as_docs_first_arming_sets_it_up_is_fine():
+    assert of_interface() == ({}, Level.FINE)
+
+
+@pytest.mark.parametrize(
+    ("change", "what", "level", "command"),
+    [
+        ({"state": "ERROR-PASSIVE"}, "state", Level.WARNING, "termination"),
+        ({"state": "BUS-OFF"}, "state", Level.FAULT, "up type can bitrate 1000000"),
+        ({"bittiming": {"bitrate": 500_000}}, "bit rate", Level.FAULT, "bitrate 1000000"),
+        ({"restart_ms": 0}, "restart", Level.WARNING, "restart-ms 100"),
+    ],
+)
+def test_what_ip_tells_of_an_interface(change, what: str, level: Level, command: str):
+    told = {"linkinfo": {"info_data": {**LINK["linkinfo"]["info_data"], **change}}}
+    bad, worst = of_interface(link=told)
+    assert list(bad) == [f"can1: {what}"] and worst is level and command in bad[f"can1: {what}"].mend
+
+
+def test_an_interface_that_is_missing_or_down_and_a_queue_that_overflows_before_the_fault_is_noticed():
+    assert of_interface(is_up=None)[1] is of_interface(is_up=False)[1] is Level.FAULT
+    bad, worst = of_interface(queue=10)
+    assert worst is Level.WARNING and bad["can1: txqueuelen"].mend == "sudo ip link set can1 txqueuelen 1000"
+
+
+def test_without_ip_the_state_is_unknown_and_a_virtual_interface_has_none():
+    assert of_interface(link={})[1] is Level.UNKNOWN
+    virtual = {"linkinfo": {"info_kind": "vcan"}}
+    assert of_interface(queue=0, link=virtual) == ({}, Level.FINE)
+    assert of_interface(is_up=False, link=virtual)[0]["can1: state"].mend == "sudo ip link set can1 up"
+
+
+@pytest.fixture
+def computer(tmp_path, monkeypatch):
+    """A folder that looks like / on a computer where all is well, with `can0` and `can1`; `ip` tells of both."""
+    files = {
+        "proc/version": FINE.kernel,
+        "sys/kernel/realtime": "1",
+        "sys/devices/system/cpu/isolated": "",
+        "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor": "performance",
+        "sys/devices/system/cpu/cpu1/cpufreq/scaling_governor": "performance",
+        "sys/devices/system/clocksource/clocksource0/current_clocksource": "tsc",
+        "dev/ttyUSB3": "",
+        "sys/bus/usb-serial/devices/ttyUSB3/latency_timer": "16",
+        "bin/ip": f"#!/bin/sh\necho '{json.dumps([LINK])}'",
+    }
+    for state, (latency, disabled) in enumerate([("0", "0"), ("50", "0"), ("900", "1")]):
+        folder = f"sys/devices/system/cpu/cpu0/cpuidle/state{state}"
+        files |= {f"{folder}/latency": latency, f"{folder}/disable": disabled}
+    for name in ("can0", "can1"):
+        files |= {f"sys/class/net/{name}/flags": "0x40041", f"sys/class/net/{name}/tx_queue_len": "1000"}
+    for path, content in files.items():
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_text(f"{content}\n")
+    (tmp_path / "bin/ip").chmod(0o755)
+    link = tmp_path / "dev/serial/by-id/usb-IMU"
+    link.parent.mkdir(parents=True)
+    link.symlink_to("../../ttyUSB3")
+    monkeypatch.setenv("PATH", f"{tmp_path}/bin:/usr/bin:/bin")
+    for name, value in {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "FASTRTPS_DEFAULT_PROFILES_FILE": ""}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.delenv("RMW_IMPLEMENTATION", raising=False)
+    return tmp_path
+
+
+@pytest.fixture
+def run(computer, monkeypatch, capsys):
+    """Run doctor there, with wake-ups in time or as given; return its code and text."""
+
+    def run(*arguments: object, woken: Wakeups = IN_TIME):
+        monkeypatch.setattr(doctor, "measured", lambda *_: woken)
+        code = doctor.main([*map(str, arguments)], computer)
+        output = capsys.readouterr()
+        return code, output.out + output.err
+
+    return run
+
+
+def test_it_reads_what_a_computer_states_below_proc_and_sys(computer):
+    found = doctor.read_computer(computer)
+    assert found.idle_states == {"state0": 0.0, "state1": pytest.approx(50e-6)}  # state2 is disabled
+    assert replace(found, idle_states=FINE.idle_states, cores=4, limits="rtprio 0") == FINE
+
+
+def test_the_real_device_on_a_computer_where_all_is_well(run):
+    code, text = run("--params", CONFIG / "exo.yaml")
+    assert code == 0 and text.splitlines()[-1] == "Fine"
+    assert "can1: bit rate" in text and "24% at 250 Hz" in text
+
+
+def test_a_warning_is_exit_code_1_and_a_fault_2_each_with_its_command(run, computer):
+    queue = computer / "sys/class/net/can1/tx_queue_len"
+    queue.write_text("10\n")
+    code, text = run("--params", CONFIG / "exo.yaml")
+    assert code == 1 and "-> sudo ip link set can1 txqueuelen 1000\n" in text
+    code, text = run("--params", CONFIG / "exo.yaml", woken=wakeups(1, 0.06))
+    assert code == 2 and "No one may wear an arm" in text
+
+
+def test_a_serial_adapter_that_keeps_bytes_is_found_by_its_name(run, tmp_path):
+    content = yaml.safe_load((CONFIG / "exo.yaml").read_text())
+    content["/imu"]["ros__parameters"].update(source="witmotion", serial={"port": "/dev/serial/by-id/usb-IMU"})
+    path = tmp_path / "params.yaml"
+    path.write_text(yaml.safe_dump(content))
+    code, text = run("--params", path)
+    assert code == 1 and "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB3/latency_timer" in text
+    (tmp_path / "dev/ttyUSB3").unlink()
+    code, text = run("--params", path)
+    assert code == 2 and "no such port" in text
+
+
+def test_a_rate_that_can_bridge_would_refuse_is_refused_here(run, tmp_path):
+    content = yaml.safe_load((CONFIG / "sim.yaml").read_text())
+    content["/right/can_bridge"]["ros__parameters"].update(rate=500.0, wire_format=["mit_v3"] * 4)
+    path = tmp_path / "params.yaml"
+    path.write_text(yaml.safe_dump(content))
+    code, text = run("--params", path)
+    assert code == 2 and "/right/can_bridge rate = 500.0: must be at most 400 Hz" in text
+
+
+def test_it_measures_in_a_process_of_its_own_at_the_rate_of_the_file():
+    woken = doctor.measured(0.01, 0.2, 0)
+    assert woken.lateness.shape == (20,) and (woken.lateness > -1e-6).all() and not woken.refused
+
+
+def test_each_line_has_level_what_found_and_wanted(run):
+    _, text = run()
+    row = next(line for line in text.splitlines() if "bus load" in line)
+    assert row.split("  ")[0] == "fine" and Finding("", "", "").level is Level.FINE
