@@ -31,7 +31,7 @@
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := imu sim report
-TEST := $(DEMO) panel validate video test
+TEST := $(DEMO) analysis panel validate video test
 SETUP := VENV=$(VENV) .ci/setup
 
 # Where it is set, as in many containers, each process would compile every library that it imports anew: a node takes

@@ -21,6 +21,7 @@ extras = {
     "report": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11", "scipy>=1.11"],
     "video": ["imageio[pyav]>=2.31", "mujoco>=3.2", "pillow>=10.1"],
     "calibrate": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11", "scipy>=1.11"],
+    "analysis": ["pandas>=2.1"],  # Bag.to_frame
     "panel": ["starlette>=0.40", "uvicorn>=0.30", "websockets>=13.0"],
     "validate": [
         "imufusion>=1.3",

@@ -20,13 +20,13 @@ from exo_gravity.core.trial.recording import Recording
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial, resting
+from exo_gravity.tools.reporting.html import HOLD_COLOUR, INK, JOINT_COLOURS, make_plain
 
 POSE = [0.3, 0.45, 0.10, 0.4]  # rad; carrying the whole arm of the wearer takes less than rated torque here
 HELD, RELEASED = 30.0, 10.0  # s, how long the hand holds the arm in the pose, and how long the arm is alone
 SETTLING, PAUSE = 3, 2  # s in the pose: before the figure begins, and from there until the sweep
 RATED = (3.0, 9.0, 3.0, 3.0)
 JOINTS = ("shoulder rotation", "shoulder abduction", "shoulder flexion", "elbow flexion")
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")  # Okabe and Ito (2008)
 
 
 def sweep() -> tuple[Recording, np.ndarray]:
@@ -64,20 +64,20 @@ def draw(recording: Recording, supports: np.ndarray) -> Figure:
     time = recording.time[during] - start
     figure = Figure(figsize=(9.0, 6.0), layout="constrained")
     set_to, torque, angle = figure.subplots(3, 1, sharex=True, height_ratios=(1.0, 2.2, 1.6))
-    set_to.step(np.append(supports[:, 0] - start, end - start), np.append(supports[:, 1], 1.0), "k", where="post")
-    set_to.set_ylabel("support setting")
+    set_to.step(np.append(supports[:, 0] - start, end - start), np.append(supports[:, 1], 1.0), color=INK, where="post")
+    set_to.set_ylabel("Support (0 to 1)")
     position = np.degrees(recording.position[during])
-    for joint, (name, colour) in enumerate(zip(JOINTS, COLOURS, strict=True)):
+    for joint, (name, colour) in enumerate(zip(JOINTS, JOINT_COLOURS, strict=True)):
         torque.plot(time, recording.effort[during][:, joint], color=colour, lw=1.6, label=name)
         angle.plot(time, position[:, joint] - position[0, joint], color=colour, lw=1.2)
-    torque.set_ylabel("motor torque (Nm)")
+    torque.set_ylabel("Motor torque (Nm)")
     torque.legend(loc="upper left", frameon=False, fontsize=9)
-    angle.set_ylabel("displacement (deg)")
+    angle.set_ylabel("Displacement (deg)")
     angle.set_ylim(-0.5, 0.5)
-    angle.set_xlabel("time (s)")
+    angle.set_xlabel("Time (s)")
     for axis in (set_to, torque, angle):
-        axis.axvspan(let_go - start, end - start, color="0.92", zorder=0)
-        axis.spines[["top", "right"]].set_visible(False)
+        axis.axvspan(let_go - start, end - start, color=HOLD_COLOUR, lw=0, zorder=0)
+        make_plain(axis)
         axis.set_xlim(0.0, end - start)
     set_to.text(let_go - start + 0.2, 0.05, "arm released", fontsize=9)
     return figure

@@ -2,9 +2,14 @@
 
 Subscribes to /emg (std_msgs/Float32MultiArray, biceps and triceps in V, sample after sample, 1,000 a second) and
 publishes /right/assist_efforts at 100 Hz. The compensator adds them once `assist.max_effort` is not 0.
+
+Without electrodes: `python examples/emg_assistance.py --pretend` publishes a pretended EMG on /emg as well, biceps and
+triceps in turn, 2 s each.
 """
 
-from math import exp, pi
+import random
+import sys
+from math import exp, pi, sqrt
 
 import rclpy
 from rclpy.duration import Duration
@@ -19,6 +24,9 @@ REST, STRONGEST = 0.02e-3, 0.4e-3  # V, envelopes of the resting and of the stro
 LEAST = 0.05  # share of the strongest contraction below which nothing happens
 SILENCE = Duration(seconds=0.05)  # without EMG
 FULL_EFFORT = 2.0  # Nm for the strongest contraction
+WAITING = "waiting for /emg (std_msgs/Float32MultiArray: biceps, triceps in V, 1,000 samples a second), or --pretend"
+UNHEARD = "no compensator subscribes to /right/assist_efforts: start the right arm, and set its assist.max_effort"
+CONTRACTIONS = ((0.3e-3, REST), (REST, REST), (REST, 0.3e-3), (REST, REST))  # V, biceps and triceps, 2 s each
 
 
 class Envelope:
@@ -47,10 +55,26 @@ class EmgAssistance(Node):
     def __init__(self):
         super().__init__("emg_assistance")
         self.biceps, self.triceps = Envelope(), Envelope()
-        self.heard = self.get_clock().now()
+        self.heard = None
         self.publisher = self.create_publisher(JointState, "/right/assist_efforts", 1)
         self.create_subscription(Float32MultiArray, "/emg", self.on_emg, 10)
         self.create_timer(0.01, self.publish)
+        self.create_timer(5.0, self.report)
+        self.report()
+
+    def is_silent(self):
+        """Return whether no EMG arrives."""
+        return self.heard is None or self.get_clock().now() - self.heard > SILENCE
+
+    def report(self):
+        """Say what the assistance waits for, or what it does."""
+        if self.is_silent():
+            self.get_logger().info(WAITING)
+        elif not self.publisher.get_subscription_count():
+            self.get_logger().info(UNHEARD)
+        else:
+            biceps, triceps = (100.0 * muscle.activation for muscle in (self.biceps, self.triceps))
+            self.get_logger().info(f"sending efforts: biceps {biceps:.0f} %, triceps {triceps:.0f} %")
 
     def on_emg(self, message):
         """Take samples of both muscles, in turn."""
@@ -61,7 +85,7 @@ class EmgAssistance(Node):
 
     def publish(self):
         """Send the elbow's effort while there is EMG."""
-        if self.get_clock().now() - self.heard > SILENCE:  # no message: the compensator fades the assistance
+        if self.is_silent():  # no message: the compensator fades the assistance
             return
         elbow = FULL_EFFORT * (self.biceps.activation - self.triceps.activation)
         message = JointState(name=NAMES, effort=[0.0, 0.0, 0.0, elbow])
@@ -69,6 +93,23 @@ class EmgAssistance(Node):
         self.publisher.publish(message)
 
 
+def pretend(node):
+    """Publish a pretended EMG: noise on an electrode's offset, as strong as the contraction of the moment."""
+    publisher = node.create_publisher(Float32MultiArray, "/emg", 10)
+    begin = node.get_clock().now()
+
+    def send():
+        now = (node.get_clock().now() - begin).nanoseconds / 1e9
+        strengths = CONTRACTIONS[int(now / 2.0) % len(CONTRACTIONS)]  # rectified means
+        samples = [random.gauss(1e-3, strength * sqrt(pi / 2.0)) for _ in range(10) for strength in strengths]
+        publisher.publish(Float32MultiArray(data=samples))
+
+    node.create_timer(0.01, send)
+
+
 if __name__ == "__main__":
     rclpy.init()
-    rclpy.spin(EmgAssistance())
+    node = EmgAssistance()
+    if "--pretend" in sys.argv:
+        pretend(node)
+    rclpy.spin(node)

@@ -1,11 +1,15 @@
 """Teach and repeat on a simulated arm, without ROS: a hand leads the weightless arm, then a soft spring leads it back.
 
 The law carries the arm; the term `spring` pulls it along the recorded path with little torque, so that a person in it
-can stop or divert it at any time.
+can stop or divert it at any time. A plot shows both ways; with a file's name (.png, .pdf, .svg) it is written there
+instead.
 """
 
+import sys
 from dataclasses import replace
 from math import degrees, dist
+
+import matplotlib.pyplot as plt
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.compensation.compensator import Compensator
@@ -18,6 +22,7 @@ from exo_gravity.core.motors.specs import ENTER, MOTORS
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
 
+JOINTS = ("rotation", "abduction", "flexion", "elbow")
 PERIOD = 0.004  # s
 APPROACH = 12.0  # s for the spring to take effect, a guided change, and to bring the arm to the begin of the path
 LED = [[0.2, 0.6, 0.5, 0.6], [0.3, 0.9, 0.8, 0.9], [0.0, 0.5, 0.4, 0.5]]  # rad, where the hand goes, 2 s each
@@ -57,3 +62,12 @@ for _ in range(round(APPROACH / PERIOD)):
 repeated = [cycle() for _ in poses]
 errors = [degrees(dist(a, b)) for a, b in zip(poses, repeated, strict=True)]
 print(f"The arm repeats the way within {max(errors):.1f} degrees, on average {sum(errors) / len(errors):.1f}.")
+
+axis = plt.figure(layout="constrained").subplots()
+times = [PERIOD * row for row in range(len(poses))]
+for joint, name in enumerate(JOINTS):
+    (line,) = axis.plot(times, [degrees(pose[joint]) for pose in repeated], label=name)
+    axis.plot(times, [degrees(pose[joint]) for pose in poses], "--", color=line.get_color())
+axis.set(title="Dashed: taught. Solid: repeated.", xlabel="Time (s)", ylabel="Position (deg)")
+axis.legend(frameon=False)
+plt.savefig(sys.argv[1]) if len(sys.argv) > 1 else plt.show()

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import re
 import runpy
+import sys
+import tempfile
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import rclpy
+from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float32MultiArray
@@ -24,8 +29,12 @@ ROUNDING = 0.006  # Nm
 
 
 def run(name: str, capsys: pytest.CaptureFixture[str]) -> tuple[dict[str, Any], str]:
-    """Return the variables of an example and what it printed."""
-    variables = runpy.run_path(str(ROOT / "examples" / name))
+    """Return the variables of an example and what it printed; its plot must have been drawn."""
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        plot = Path(folder, "plot.svg")
+        patch.setattr(sys, "argv", [name, str(plot)])
+        variables = runpy.run_path(str(ROOT / "examples" / name))
+        assert plot.read_text(encoding="utf-8").count("<path") > 10
     return variables, capsys.readouterr().out
 
 
@@ -108,12 +117,34 @@ def test_the_simulated_arm_repeats_the_way_that_a_hand_taught_it(capsys):
     assert np.abs(repeated[-1] - taught[-1]).max() < 6.0
 
 
+@pytest.mark.thorough
+@pytest.mark.timeout(600)
+def test_the_notebook_leads_to_drift_effort_and_the_share_that_was_set():
+    cells = json.loads((ROOT / "examples" / "recording_to_figures.ipynb").read_text(encoding="utf-8"))["cells"]
+    cells = [cell for cell in cells if cell["cell_type"] == "code"]
+    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
+    assert all(cell["outputs"] for cell in cells[1:])
+    lines = [line for cell in cells for line in "".join(cell["source"]).split("\n") if not line.startswith("%")]
+    variables: dict[str, Any] = {}
+    exec("\n".join(lines), variables)
+    assert len(variables["share"]) == 2
+    np.testing.assert_allclose(variables["share"]["measured"], 0.15, atol=0.02)
+    assert np.abs(variables["drift"].to_numpy()[:, :4]).max() < 0.2
+    # By another way than the law: the torque that holds the robot and 15 % of the wearer's arm in each pose.
+    robot, load = ArmModel(LENGTH, COG, MASS), Wearer(body_mass=75.0).on_links(LENGTH)
+    whole = robot.with_wearer(*load, 0.15)
+    for row, hold in zip(variables["effort"].to_numpy(), variables["analysis"].holds, strict=True):
+        torque = np.abs(holding_torque(hold.pose, whole, np.array((0.0, 0.0, 1.0))))
+        np.testing.assert_allclose(row / 100.0 * (3.0, 9.0, 3.0, 3.0), torque, atol=0.05)
+
+
 class EmgRig:
     """The node of emg_assistance.py, and one that publishes a synthetic EMG and hears the efforts for the elbow."""
 
     def __init__(self) -> None:
         rclpy.init()
-        self.node = runpy.run_path(str(ROOT / "examples" / "emg_assistance.py"))["EmgAssistance"]()
+        self.example = runpy.run_path(str(ROOT / "examples" / "emg_assistance.py"))
+        self.node = self.example["EmgAssistance"]()
         self.user = rclpy.create_node("emg_driver")
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
@@ -166,3 +197,22 @@ def test_the_elbow_is_assisted_in_proportion_to_the_biceps_and_against_the_trice
     heard = len(emg.elbow)
     emg.wait(0.2)
     assert len(emg.elbow) == heard  # without a signal nothing is sent
+
+
+@pytest.mark.thorough
+def test_the_pretended_emg_bends_and_stretches_the_elbow_in_turn(emg):
+    emg.example["pretend"](emg.node)
+    for reached in (lambda effort: effort > 1.0, lambda effort: effort < -1.0):
+        end = time.monotonic() + 30.0
+        while not any(map(reached, emg.elbow)):
+            assert time.monotonic() < end
+            emg.wait(0.1)
+
+
+def test_the_emg_example_says_what_it_waits_for(emg, capfd):
+    emg.node.report()
+    assert "waiting for /emg (std_msgs/Float32MultiArray" in capfd.readouterr().err
+    emg.node.publisher = emg.node.create_publisher(JointState, "/right/nobody_listens", 1)
+    emg.node.heard = emg.node.get_clock().now() + Duration(seconds=600)  # on a busy computer too, not long ago
+    emg.node.report()
+    assert "no compensator subscribes to /right/assist_efforts" in capfd.readouterr().err

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from exo_gravity.tools.reporting.html import JOINT_COLOURS, make_plain
+
 from .growth import Growth
 from .learned import Baseline
-
-LEAST = 0.01  # Nm or degrees; a smaller bar is drawn as 0
 
 
 def growth_line(row: Growth | None = None) -> str:
@@ -50,41 +50,46 @@ def write_csv(path: Path, rows: Sequence[Growth] | Sequence[Baseline]) -> None:
 
 
 def figure(rows: Sequence[Baseline]) -> Figure:
-    """Return each law's error inside and outside the training box, and each controller's cost for the wearer."""
-    result = Figure(figsize=(10, 7.5), layout="constrained")
-    axis, below = result.subplots(2)
-    _draw_burdens(below, [row for row in rows if not math.isnan(row.exertion)])
-    rows = [row for row in rows if not math.isnan(row.inside_rmse)]
-    place = np.arange(len(rows))
-    for shift, part, colour in ((-0.2, "inside", "tab:blue"), (0.2, "outside", "tab:orange")):
-        error, largest = (np.array([getattr(row, f"{part}_{name}") for row in rows]) for name in ("rmse", "largest"))
-        bars = axis.bar(place + shift, error, 0.38, color=colour, label=f"RMSE {part} the training box")
-        axis.bar_label(bars, [f"{value:.1g}" for value in error], fontsize=8)
-        axis.plot(place + shift, largest, "v", color=colour, markeredgecolor="black", label=f"largest error {part}")
-    axis.set_yscale("log")
-    axis.set_xticks(place, [f"{row.law}\n{row.memory / 1e3:,.0f} kB, {1e6 * row.pose_time:,.0f} µs" for row in rows])
-    axis.set_ylabel("error against gravload (Nm)")
-    axis.set_ylim(1e-17, 1e3)
-    axis.legend(fontsize=8, ncols=4, loc="upper center")
-    axis.grid(axis="y", alpha=0.3)
+    """Return each law's error inside and outside the training box, and what each controller costs the wearer."""
+    result = Figure(figsize=(10.0, 9.0), layout="constrained")
+    error, exertion, sag = result.subplots(3, height_ratios=(1.2, 1.0, 1.0))
+    laws = [row for row in rows if not math.isnan(row.inside_rmse)]
+    inside, outside = JOINT_COLOURS[:2]
+    for values, marker, colour, label, side in (
+        ([row.inside_rmse for row in laws], "o", inside, "RMSE inside the training box", "right"),
+        ([row.outside_rmse for row in laws], "o", outside, "RMSE outside", "left"),
+        ([row.outside_largest for row in laws], "v", outside, "largest error outside", "left"),
+    ):
+        error.plot(values, marker, color=colour, label=label)
+        for place, value in enumerate(values):
+            away = (-7 if side == "right" else 7, 0)
+            error.annotate(
+                f"{value:.1g}", (place, value), away, textcoords="offset points", fontsize=8, va="center", ha=side
+            )
+    error.set_yscale("log")
+    error.set_xticks(range(len(laws)), [f"{row.law}\n{row.memory / 1e3:,.0f} kB" for row in laws])
+    error.set(ylabel="Error against gravload (Nm)", xlim=(-0.5, len(laws) - 0.5), ylim=(1e-17, 1e2))
+    driven = [row for row in rows if not math.isnan(row.exertion)]
+    _draw_bars(exertion, driven, {"exertion in a reach": [row.exertion for row in driven]})
+    exertion.set_ylabel("Exertion, RMS (Nm)")
+    sags = {
+        "trunk upright": [math.degrees(row.sag) for row in driven],
+        "trunk bowed by 30 degrees": [math.degrees(row.sag_bowed) for row in driven],
+    }
+    _draw_bars(sag, driven, sags)
+    sag.set_ylabel("Largest sag after letting go (deg)")
+    for axis in (error, exertion, sag):
+        axis.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False, fontsize=9)
+        make_plain(axis)
     return result
 
 
-def _draw_burdens(axis: Axes, rows: Sequence[Baseline]) -> None:
-    """Draw the wearer's exertion and the sag after letting go."""
-    place = np.arange(len(rows))
-    for shift, values, colour, label in (
-        (-0.27, [row.exertion for row in rows], "tab:green", "exertion in a reach, RMS in Nm"),
-        (0.0, [math.degrees(row.sag) for row in rows], "tab:red", "largest sag after letting go, in degrees"),
-        (0.27, [math.degrees(row.sag_bowed) for row in rows], "tab:purple", "the same, trunk bowed by 30 degrees"),
-    ):
-        bars = axis.bar(place + shift, np.maximum(values, LEAST), 0.26, color=colour, label=label)
-        axis.bar_label(
-            bars, [f"{value:.{int(value < 10.0)}f}" if value > LEAST else "0" for value in values], fontsize=8
-        )
-    axis.set_yscale("log")
-    axis.set_ylim(LEAST, 3e3)
-    axis.set_ylabel("in the simulator")
+def _draw_bars(axis: Axes, rows: Sequence[Baseline], groups: Mapping[str, Sequence[float]]) -> None:
+    """Draw a bar of each row in each group, by its label, on an axis that begins at 0."""
+    place, width = np.arange(len(rows)), 0.8 / len(groups)
+    for n, (label, values) in enumerate(groups.items()):
+        shift = (n - (len(groups) - 1) / 2) * width
+        bars = axis.bar(place + shift, values, 0.95 * width, color=JOINT_COLOURS[2 + n], label=label)
+        axis.bar_label(bars, [f"{value:.{int(value < 10.0)}f}" for value in values], fontsize=8)
     axis.set_xticks(place, [row.law.replace(" ", "\n", 1) for row in rows])
-    axis.legend(fontsize=8, ncols=3, loc="upper center")
-    axis.grid(axis="y", alpha=0.3)
+    axis.margins(y=0.1)

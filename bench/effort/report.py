@@ -13,11 +13,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 
+from exo_gravity.tools.reporting.html import FAINT, JOINT_COLOURS, make_plain
+
 from .exertion import Exertion
 from .study import NOTHING, ONE_G, ZERO_G
 
 JOINTS = ("rotation", "abduction", "flexion", "elbow")
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")  # Okabe and Ito (2008)
 
 
 class Results(NamedTuple):
@@ -120,25 +121,24 @@ def write_csv(results: Results, folder: Path) -> None:
 def figure(results: Results) -> Figure:
     """Return the figure of all that was measured."""
     tasks = list(filter(results.has, ("reach", "poses")))
-    result = Figure(figsize=(11.0, 9.2), layout="constrained")
-    result.suptitle("How hard the arm is to move", x=0.01, ha="left", weight="bold")
+    result = Figure(figsize=(11.0, 9.6), layout="constrained")
     top, bottom = result.subfigures(2, 1, squeeze=False)[:, 0]
     for axis, task in zip(np.atleast_1d(top.subplots(1, len(tasks), sharey=True)), tasks, strict=True):
         _draw_task(axis, results, task)
-    top.axes[0].legend(loc="lower right", edgecolor="none", fontsize=8)
+    top.legend(*top.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=5, frameon=False, fontsize=9)
     felt, workspace = bottom.subplots(1, 2)
     if results.has("sweep 1"):
         inertia = np.array([[f[0] for f in _felt_by_joint(results, setting)] for setting in results.settings])
         _draw_lines(felt, results.settings, dict(zip(JOINTS, inertia.T, strict=True)))
-    felt.set_ylabel("reflected inertia (kg m²)")
+    felt.set(ylabel="Reflected inertia (kg m²)", ylim=(0.0, None))
     names = list(dict.fromkeys(setting for setting, _ in results.workspaces))
     strengths = sorted({share for _, share in results.workspaces})
     reached = {
-        f"{100 * share:.0f} % of the strength": np.array([100.0 * results.workspaces[name, share] for name in names])
+        f"{100 * share:.0f} % of its strength": np.array([100.0 * results.workspaces[name, share] for name in names])
         for share in strengths
     }
     _draw_lines(workspace, names, reached)
-    workspace.set(ylabel="workspace reached by a weak arm (%)", ylim=(-3.0, 103.0))
+    workspace.set(ylabel="Workspace that a weak arm reaches (%)", ylim=(-3.0, 103.0))
     return result
 
 
@@ -147,24 +147,28 @@ def _draw_task(axis: Axes, results: Results, task: str) -> None:
     names = results.settings
     places, left = np.arange(len(names))[::-1], np.zeros(len(names))
     totals = np.array([results.exertions[name, task].total for name in names])
-    for joint, colour in enumerate(COLOURS):
+    for joint, colour in enumerate(JOINT_COLOURS):
         share = np.array([results.exertions[name, task].rms[joint] ** 2 for name in names]) / totals
         axis.barh(places, share, left=left, color=colour, label=JOINTS[joint])
         left += share
     for place, total in zip(places, totals, strict=True):
-        axis.annotate(f"{total:.2f}", (total, place), (3, 0), textcoords="offset points", va="center", fontsize=8)
+        axis.annotate(
+            f"{total:.2f}", (total, place), (3, 0), textcoords="offset points", va="center", fontsize=8,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5},
+        )  # fmt: skip
     half = 0.5 * results.exertions[ZERO_G, task].total
-    axis.axvline(half, color="0.6", ls="--", lw=1.0, label="half of Zero-G")
+    axis.axvline(half, color=FAINT, ls="--", lw=1.0, label="half of Zero-G")
     axis.set_yticks(places, names)
-    axis.set_xlabel(f"{task}: RMS torque of all joints (Nm)")
+    axis.set_xlabel(f"{task.capitalize()}: RMS torque of all joints (Nm)")
     axis.margins(x=0.1)
-    axis.spines[["top", "right"]].set_visible(False)
+    make_plain(axis)
+    axis.grid(visible=False)
 
 
 def _draw_lines(axis: Axes, names: list[str], lines: dict[str, np.ndarray]) -> None:
-    """Draw lines over the settings `names`, each with its label."""
-    for (label, values), colour in zip(lines.items(), COLOURS, strict=False):
+    """Draw lines over the settings `names`, each with its label above the axes."""
+    for (label, values), colour in zip(lines.items(), JOINT_COLOURS, strict=False):
         axis.plot(values, "o-", color=colour, ms=4, lw=1.0, label=label)
     axis.set_xticks(range(len(names)), names, rotation=60, ha="right", fontsize=8)
-    axis.legend(edgecolor="none", fontsize=8)
-    axis.spines[["top", "right"]].set_visible(False)
+    axis.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False, fontsize=9)
+    make_plain(axis)

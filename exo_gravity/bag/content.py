@@ -2,10 +2,16 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import Param
 from exo_gravity.core.trial.recording import Recording
+
+if TYPE_CHECKING:
+    import pandas
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 STRING = "std_msgs/msg/String"
@@ -60,6 +66,45 @@ class Bag:
     notes: tuple[str, ...]  #: missing parts that do no harm
     problems: tuple[str, ...]  #: unreadable parts, one sentence each
     is_partial: bool = False  #: whether it was cut short, or ends before its arms were down
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """Return the time series, a row for each arm, sample and joint: columns of equal length by their names.
+
+        arm, joint; time_s since the start; step: of the script from 1 on, and its action, 0 and '' outside of it;
+        carried: whether the motors carried the arm; position_rad, velocity_rad_per_s, torque_nm as measured,
+        command_nm as requested, NaN where unknown.
+        """
+        arms = [_columns(recording) for recording in self.recordings]
+        return {name: np.concatenate([arm[name] for arm in arms]) for name in arms[0]}
+
+    def to_frame(self) -> "pandas.DataFrame":
+        """Return `columns` as a table. Raises ModuleNotFoundError, one sentence, without pandas (extra `analysis`)."""
+        try:
+            import pandas
+        except ModuleNotFoundError:
+            sentence = "to_frame needs pandas, which is not installed: pip install 'exo_gravity[analysis]'"
+            raise ModuleNotFoundError(sentence, name="pandas") from None
+        return pandas.DataFrame(self.columns())
+
+
+def _columns(recording: Recording) -> dict[str, np.ndarray]:
+    time = recording.time
+    step, action = np.zeros(len(time), int), np.full(len(time), "", object)
+    for number, one in enumerate(recording.steps, 1):
+        within = slice(*np.searchsorted(time, (one.start, one.end)))
+        step[within], action[within] = number, one.action
+    carried = np.zeros(len(time), bool)
+    for start, end in recording.while_carried(-np.inf, np.inf):
+        carried |= (start <= time) & (time <= end)
+    shared = {"time_s": time, "step": step, "action": action, "carried": carried}
+    values = (recording.position, recording.velocity, recording.effort, recording.command)
+    names = ("position_rad", "velocity_rad_per_s", "torque_nm", "command_nm")
+    return {
+        "arm": np.full(len(time) * JOINT_COUNT, recording.name, object),
+        "joint": np.tile(np.array(recording.joint_names, object), len(time)),
+        **{name: np.repeat(column, JOINT_COUNT) for name, column in shared.items()},
+        **{name: np.ravel(column) for name, column in zip(names, values, strict=True)},
+    }
 
 
 # The parameters of `recorder`.

@@ -25,6 +25,7 @@ from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.tools.anfis import GRID, Trained, from_gravload, rms, train_law
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.inputs.references import PAPER_ANALYTICAL, PAPER_ANFIS, PAPER_SECONDS, REFERENCES, gravload
+from exo_gravity.tools.reporting.html import JOINT_COLOURS, make_plain
 
 TILTS = (0, 5, 10, 20, 30)  # degrees
 ROUNDING = 1e-12  # Nm; the exact law may differ this much from a reference
@@ -205,8 +206,8 @@ def _workspace_figure(part: Part) -> Figure:
                 norm=LogNorm(FLOOR, CEILING), cmap="viridis", rasterized=True,
             )  # fmt: skip
             axis.set_title(f"{name}: joint {joint}", fontsize=10)
-    figure.supxlabel("joint 2, abduction (degrees)")
-    figure.supylabel("joint 3, flexion (degrees)")
+    figure.supxlabel("Joint 2, abduction (deg)")
+    figure.supylabel("Joint 3, flexion (deg)")
     figure.colorbar(image, ax=grid, label="RMSE over the elbow's range (Nm)", extend="min")
     figure.suptitle("Error against gravload over the workspace, trunk upright, configured centres of gravity")
     return figure
@@ -219,12 +220,12 @@ def _tilt_figure(rows: Sequence[Row]) -> Figure:
     grid = figure.subplots(2, 4, sharex=True, sharey="col")
     for cog, line in zip((LINK_ENDS, CONFIGURED), grid, strict=True):
         for joint, axis in enumerate(line, start=1):
-            for (law, style), width in zip(STYLES.items(), (4, 2, 1.5, 1.5), strict=True):
+            for (law, style), width, colour in zip(STYLES.items(), (4, 2, 1.5, 1.5), JOINT_COLOURS, strict=True):
                 chosen = [(row.limit, row.rmse) for row in rows if (row.cog, row.joint, row.law) == (cog, joint, law)]
-                axis.plot(*zip(*chosen, strict=True), style, label=law, linewidth=width)
+                axis.plot(*zip(*chosen, strict=True), style, color=colour, label=law, linewidth=width)
             axis.set_title(f"joint {joint}, CoGs {cog}", fontsize=10)
-            axis.grid(alpha=0.3)
-    figure.supxlabel("tilt up to (degrees)")
+            make_plain(axis)
+    figure.supxlabel("Tilt up to (deg)")
     figure.supylabel("RMSE (Nm)")
     figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(STYLES))
     figure.suptitle("Error against gravload over trunk tilt, random poses; the ANFIS was trained upright")

@@ -26,6 +26,9 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
         "--repair", action="store_true", help="write a complete copy, BAG_repaired, of a recording cut short; no report"
     )
     option("--output", metavar="DIR", help="folder for the report (default: BAG_report next to the recording)")
+    option("--csv", action="store_true", help="also write the time series, time_series.csv, a row per sample and joint")
+    formats = "also write each figure in this format; twice for both"
+    option("--figures", action="append", choices=("pdf", "svg"), default=[], help=formats)
 
     def limit(name: str, default: float, unit: str, description: str) -> None:
         option(name, type=non_negative, default=default, metavar=unit, help=description)
@@ -78,7 +81,7 @@ def _run(options: argparse.Namespace) -> int:
             bag = read_bag(path)
         report = trial_report.analyse(bag, criteria, options.min_hold)
         beside = path.resolve().with_name(f"{path.resolve().stem}_report")
-        written = trial_report.write(report, options.output or beside)
+        written = trial_report.write(report, options.output or beside, options.figures, options.csv)
         if clip:
             video.write(bag, clip, screen)
     except (ExoGravityError, OSError) as error:

@@ -14,11 +14,14 @@ from pathlib import Path
 import matplotlib.image
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from rich.console import Console
 
 from exo_gravity.bag.content import Event
+from exo_gravity.bag.reader import read_bag
 from exo_gravity.core.errors import DataError
 from exo_gravity.tools.report import main
+from exo_gravity.tools.reporting import figures
 from exo_gravity.tools.reporting.trial_report import analyse, print_report, write
 
 from ..support import csv_rows
@@ -248,6 +251,34 @@ def test_the_report_is_written_next_to_its_recording_by_default(short_bag, capsy
     assert sorted(path.name for path in short_bag.with_name("short_report").iterdir()) == [
         "holds.csv", "motions.csv", "report.html", "right_drift.png", "right_overview.png",
     ]  # fmt: skip
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_on_request_the_time_series_is_written_with_its_units(short_bag, tmp_path):
+    assert main([str(short_bag), "--output", str(tmp_path), "--csv"]) == 0
+    rows, (recording,) = csv_rows(tmp_path / "time_series.csv"), read_bag(short_bag).recordings
+    assert len(rows) == 4 * len(recording.time)
+    head = "arm joint time_s step action carried position_rad velocity_rad_per_s torque_nm command_nm"
+    assert list(rows[0]) == head.split()
+    elbow = [row for row in rows if row["joint"] == recording.joint_names[3]]
+    values = (recording.time, recording.position[:, 3], recording.velocity[:, 3], recording.effort[:, 3])
+    for name, expected in zip(("time_s", "position_rad", "velocity_rad_per_s", "torque_nm"), values, strict=True):
+        np.testing.assert_allclose([float(row[name]) for row in elbow], expected, atol=1e-6)
+    assert elbow[0]["command_nm"] == ""  # no command before the first joint state
+    assert float(elbow[-1]["command_nm"]) == pytest.approx(recording.command[-1, 3], abs=1e-6)
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_on_request_each_figure_is_also_a_pdf_or_an_svg_with_text(short_bag, tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "overview", lambda *_: labelled)
+    monkeypatch.setattr(figures, "drift", lambda *_: labelled)
+    labelled = Figure(figsize=(1.0, 1.0))
+    labelled.text(0.5, 0.5, "Torque (Nm)")
+    assert main([str(short_bag), "--output", str(tmp_path), "--figures", "pdf", "--figures", "svg"]) == 0
+    for name in ("right_overview", "right_drift"):
+        pdf = (tmp_path / f"{name}.pdf").read_bytes()
+        assert pdf.startswith(b"%PDF") and b"/Type3" not in pdf and b"/FontFile2" in pdf
+        assert ">Torque (Nm)</text>" in (tmp_path / f"{name}.svg").read_text(encoding="utf-8")
 
 
 @pytest.mark.usefixtures("without_pictures")

@@ -77,7 +77,7 @@ def arm_shapes(view: ArmView) -> list[Shape]:
         arc = _arc(origin, axis, along, 0.0, share * TORQUE_SPAN, TORQUE_RADIUS)
         strength = RED if abs(share) >= 1.0 else AMBER if abs(share) > 0.5 else GREEN
         shapes.append(Shape("torques", LINE, arc, TORQUE_WIDTH, strength))
-        shapes.append(Shape("torques", TEXT, tip[None], TEXT_HEIGHT, strength, f"{effort + 0.0:.2f} Nm"))
+        shapes.append(Shape("torques", TEXT, tip[None], TEXT_HEIGHT, strength, f"{round(effort, 2) + 0.0:.2f} Nm"))
     colour, state = state_of(view)
     above = np.add([view.arm.base], (0.0, 0.0, STATE_HEIGHT))
     shapes.append(Shape("states", SPHERE, above, SPHERE_SIZE, colour))

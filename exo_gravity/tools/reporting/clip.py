@@ -1,7 +1,7 @@
-"""A recording -> a clip: the arms as they moved, their torques and limits, and a caption with time, step and torques.
+"""A recording -> a clip: a wearer whose arms move as they did, torques and limits, and a caption with time and step.
 
-The arms are drawn in the trunk's axes, from the parameters that the recording holds. A GIF has one palette for all
-frames, which keeps it small.
+Everything is drawn in the trunk's axes, the arms from the parameters that the recording holds, and the wearer as a
+dummy. A GIF has one palette for all frames, which keeps it small.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,26 +22,39 @@ from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import CAN_BRIDGE
 from exo_gravity.core.trial.recording import Recording
-from exo_gravity.core.view.scene import ARROW, LINE, SPHERE, ArmView, Shape, arm_shapes
-from exo_gravity.core.view.urdf import ArmDescription, described, joint_names, urdf
-from exo_gravity.tools.reporting.table import shown
+from exo_gravity.core.view.scene import ARROW, LINE, SPHERE, TEXT, ArmView, Shape, arm_shapes
+from exo_gravity.core.view.urdf import COLOURS as MATERIALS
+from exo_gravity.core.view.urdf import ArmDescription, arm_pose, described, joint_names, urdf
 
 SIZE, GIF_SIZE = (640, 480), (480, 360)  # pixels
 COLOURS, SAMPLES = 256, 12  # of a GIF, and the frames of which these are
 LINE_HEIGHT = 0.042  # of the picture's height
-INK = (40, 44, 52)
+INK, LEADER = (40, 44, 52), (150, 156, 164)
 NO_TORQUE = 0.05  # Nm, below which a motor is off
 STEPS = {"move": "the wearer moves the arm", "hold": "hands off", "push": "a push"}
 MAX_SHAPES = 4000
 AZIMUTH = {"left": 215.0, "right": 145.0}  # deg, of the camera: in front, on the arm's side
 BOTH_SIDES, ELEVATION, DISTANCE = 165.0, -8.0, 1.75  # deg, deg, m
-CENTRE = 0.28  # m below the shoulders, what the camera looks at
+CENTRE = 0.24  # m below the shoulders, what the camera looks at
 FIELD_OF_VIEW = 38.0  # deg
 GEOMS = {
     LINE: mujoco.mjtGeom.mjGEOM_CAPSULE,
     ARROW: mujoco.mjtGeom.mjGEOM_ARROW,
     SPHERE: mujoco.mjtGeom.mjGEOM_SPHERE,
 }
+BODY, LIMB = (0.80, 0.76, 0.70, 1.0), (0.80, 0.70, 0.62, 0.3)  # the wearer, and the arms that are worn
+# Parts of the wearer between two points in m, relative to the middle of the shoulders, and their diameters. Those that
+# have a breadth stand on both sides.
+DUMMY = (
+    ((0.0, 0.0, 0.02), (0.0, 0.0, 0.12), 0.10),
+    ((0.02, 0.0, 0.18), (0.0, 0.0, 0.24), 0.17),
+    ((0.0, 0.06, -0.07), (0.0, 0.05, -0.30), 0.19),
+    ((0.0, 0.11, -0.05), (0.0, 0.06, -0.16), 0.13),
+    ((0.0, 0.05, -0.30), (0.0, 0.07, -0.52), 0.18),
+    ((0.0, 0.09, -0.54), (0.0, 0.10, -1.00), 0.16),
+)
+FREE_ARM = ((0.0, 0.18, -0.06), (-0.02, 0.22, -0.34), (0.03, 0.23, -0.62))  # m, of a side without an exoskeleton
+LIMB_SIZE = 0.075  # m, the diameter of an arm
 SKY = ((0.97, 0.98, 1.0), (0.80, 0.84, 0.89))  # above and below
 
 
@@ -78,6 +91,7 @@ class Stage:
         arms = [_description(bag.parameters, recording.name) for recording in bag.recordings]
         self._arms = list(zip(arms, bag.recordings, strict=True))
         self._model = _model(arms, width, height)
+        self._dummy = _dummy(arms)
         self._data = mujoco.MjData(self._model)
         names = [name for four in joint_names(arms) for name in four]
         self._at = [int(self._model.joint(name).qposadr[0]) for name in names]
@@ -94,16 +108,61 @@ class Stage:
         self._data.qpos[self._at] = [angle for view in views for angle in view.theta]
         mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, self._camera)
+        labels = []
         for view in views:
-            for shape in arm_shapes(view):
+            shapes = arm_shapes(view)
+            labels.append([shape for shape in shapes if shape.kind == TEXT and shape.group == "torques"])
+            for shape in (*shapes, *_worn(view)):
                 _add(self._renderer.scene, shape)
+        for shape in self._dummy:
+            _add(self._renderer.scene, shape)
         picture = Image.fromarray(self._renderer.render())
         height = LINE_HEIGHT * picture.height
-        torques = (f"{view.arm.side} {' '.join(shown(effort, 2) for effort in view.effort)} Nm" for view in views)
-        caption = "\n".join((f"{time:.1f} s  {_step(self._arms[0][1], time)}", *torques))
-        font = ImageFont.load_default(height)
-        ImageDraw.Draw(picture).text((height / 2, height / 2), caption, INK, font)
+        font, draw = ImageFont.load_default(height), ImageDraw.Draw(picture)
+        draw.text((height / 2, height / 2), f"{time:.1f} s  {_step(self._arms[0][1], time)}", INK, font)
+        for view, texts in zip(views, labels, strict=True):
+            self._label(draw, font, view, texts)
         return picture
+
+    def _label(self, draw: ImageDraw.ImageDraw, font: Any, view: ArmView, texts: Sequence[Shape]) -> None:
+        """Write the torque of each joint at the picture's edge on the arm's side of the trunk, with a line to it."""
+        width, height = self._renderer.width, self._renderer.height
+        places = [self._pixel(joint) for joint in arm_pose(view.arm, view.theta)[0][:4]]
+        middle, _ = self._pixel(np.multiply(view.arm.base, (1.0, 0.0, 1.0)))
+        is_left, below, line = places[0][0] < middle, 0.16 * height, 1.15 * LINE_HEIGHT * height
+        for name, shape, (x, y) in zip(view.arm.limits.joint_names, texts, places, strict=True):
+            label = f"{name.removeprefix(f'{view.arm.side}_').replace('_', ' ')}\n{shape.text}"
+            top = max(below, y - line)
+            below = top + 2.4 * line
+            at, anchor = ((line / 2, top), "la") if is_left else ((width - line / 2, top), "ra")
+            draw.multiline_text(at, label, INK, font, anchor, align="left" if is_left else "right")
+            start, _, end, _ = draw.multiline_textbbox(at, label, font, anchor)
+            draw.line(((end + 4 if is_left else start - 4, top + line), (x, y)), LEADER)
+
+    def _pixel(self, point: np.ndarray) -> tuple[float, float]:
+        """Return where a point (3,) is in the picture, from the left and from above."""
+        left, right = self._renderer.scene.camera
+        forward, up, away = np.array(left.forward), np.array(left.up), point - np.add(left.pos, right.pos) / 2
+        scale = self._renderer.height / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2) / (away @ forward)
+        across = away @ np.cross(forward, up) * scale
+        return self._renderer.width / 2 + across, self._renderer.height / 2 - away @ up * scale
+
+
+def _dummy(arms: Sequence[ArmDescription]) -> list[Shape]:
+    """Return the wearer without the arms that are worn."""
+    middle, worn = np.mean([arm.base for arm in arms], axis=0) * (1.0, 0.0, 1.0), {arm.outward for arm in arms}
+    parts = [(ends, size, {1.0, -1.0} if ends[0][1] else {1.0}) for *ends, size in DUMMY]
+    parts += [(list(ends), LIMB_SIZE, {1.0, -1.0} - worn) for ends in pairwise(FREE_ARM)]
+    return [
+        Shape("wearer", LINE, middle + np.multiply(ends, (1.0, side, 1.0)), size, BODY)
+        for ends, size, sides in parts
+        for side in sides
+    ]
+
+
+def _worn(view: ArmView) -> list[Shape]:
+    """Return the wearer's arm in the exoskeleton, which shows through."""
+    return [Shape("wearer", LINE, arm_pose(view.arm, view.theta)[0][1:], LIMB_SIZE, LIMB)]
 
 
 def _view(arm: ArmDescription, recording: Recording, time: float) -> ArmView:
@@ -164,6 +223,9 @@ def _model(arms: Sequence[ArmDescription], width: int, height: int) -> Any:
         rgb1=SKY[0], rgb2=SKY[1], width=256, height=1536,
     )  # fmt: skip
     spec.worldbody.add_light(pos=(1.5, -1.0, 2.0), dir=(-1.5, 1.0, -2.0), diffuse=(0.5,) * 3, castshadow=False)
+    for geom in spec.geoms:
+        if np.allclose(geom.rgba, MATERIALS["person"]):  # the dummy stands in its place
+            geom.rgba = np.zeros(4)
     return spec.compile()
 
 
@@ -176,7 +238,7 @@ def _camera(arms: Sequence[ArmDescription]) -> Any:
 
 
 def _add(scene: Any, shape: Shape) -> None:
-    """Add a shape to MuJoCo's scene; a text is left out, since the caption carries the words."""
+    """Add a shape to MuJoCo's scene; a text is drawn on the picture instead."""
     if shape.kind not in GEOMS:
         return
     kind, radius, colour = GEOMS[shape.kind], shape.size / 2, np.array(shape.colour, np.float32)

@@ -8,6 +8,7 @@ import base64
 from collections.abc import Iterable, Sequence
 from html import escape
 from io import BytesIO
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -81,6 +82,14 @@ def png_of(figure: "Figure", dpi: int = DPI) -> bytes:
     buffer = BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi)
     return buffer.getvalue()
+
+
+def save_vector(figure: "Figure", path: Path) -> None:
+    """Write a figure as PDF or SVG whose text stays text, in fonts that journals accept (no Type 3)."""
+    import matplotlib
+
+    with matplotlib.rc_context({"pdf.fonttype": 42, "svg.fonttype": "none"}):
+        figure.savefig(path)
 
 
 def picture(png: bytes, caption: str) -> str:

@@ -2,7 +2,7 @@
 
 import csv
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +14,8 @@ from rich.table import Table
 from exo_gravity.core.trial.analysis import Hold, Motion, TrialAnalysis
 from exo_gravity.core.trial.recording import Recording
 from exo_gravity.tools.reporting import html
+
+ROWS = 100_000  # of a time series, that are written at once
 
 
 def per_minute(values: Any) -> Any:
@@ -96,6 +98,22 @@ def write_csv(path: Path, arms: Iterable[tuple[Recording, TrialAnalysis]]) -> No
             writer = csv.DictWriter(file, rows[0])
             writer.writeheader()
             writer.writerows(rows)
+
+
+def write_time_series(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Write the columns of `Bag.columns` as CSV; an unknown number is an empty cell."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        for start in range(0, len(columns["time_s"]), ROWS):
+            parts = (column[start : start + ROWS] for column in columns.values())
+            writer.writerows(zip(*(_cells_of(part) for part in parts), strict=True))
+
+
+def _cells_of(column: np.ndarray) -> list[Any]:
+    if column.dtype.kind != "f":
+        return column.tolist()
+    return [value if math.isfinite(value) else "" for value in column.astype(float).round(6).tolist()]
 
 
 def _csv_value(value: Any) -> str:

@@ -1,7 +1,7 @@
 """The report of a recorded trial: analysis and verdict of each arm, printed, and written as CSV, figures and a page."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from html import escape
@@ -18,6 +18,7 @@ from exo_gravity.core.trial.recording import Recording
 from exo_gravity.tools.reporting import figures, html, table
 
 MAX_EVENTS = 200
+WRITTEN = (".csv", ".png", ".html", ".pdf", ".svg")
 EARLY = 0.2  # s; can_bridge publishes its state every 0.1 s, so a shorter gap to the script's end means nothing
 TIMESTAMP = re.compile(r"_\d{8}_\d{6}$")  # which `trial` adds to the script's name
 CAPTIONS = {
@@ -88,10 +89,12 @@ def _reservations(bag: Bag) -> Iterator[str]:
             yield f"{recording.name}: {what} at {end:.1f} s, before the script ended: only the time before is judged"
 
 
-def write(report: Report, folder: str | Path) -> list[Path]:
+def write(
+    report: Report, folder: str | Path, formats: Iterable[str] = (), with_time_series: bool = False
+) -> list[Path]:
     """Write holds.csv, motions.csv, a PNG of each figure and report.html into `folder`; return the files.
 
-    Raises DataError if the folder can't be written.
+    formats: 'pdf' or 'svg', of each figure beside its PNG. Raises DataError if the folder can't be written.
     """
     folder = Path(folder)
     sections: list[str] = []
@@ -99,6 +102,8 @@ def write(report: Report, folder: str | Path) -> list[Path]:
         folder.mkdir(parents=True, exist_ok=True)
         for name in ("holds.csv", "motions.csv"):
             table.write_csv(folder / name, report.arms)
+        if with_time_series:
+            table.write_time_series(folder / "time_series.csv", report.bag.columns())
         for recording, analysis in report.arms:
             drawn = {"overview": figures.overview(recording, analysis)}
             if analysis.holds:
@@ -106,13 +111,16 @@ def write(report: Report, folder: str | Path) -> list[Path]:
             pictures = []
             for kind, figure in drawn.items():
                 png = html.png_of(figure)
-                (folder / f"{recording.name.replace('/', '_')}_{kind}.png").write_bytes(png)
+                path = folder / f"{recording.name.replace('/', '_')}_{kind}.png"
+                path.write_bytes(png)
+                for suffix in formats:
+                    html.save_vector(figure, path.with_suffix(f".{suffix}"))
                 pictures.append(html.picture(png, CAPTIONS[kind]))
             sections += table.arm_section(recording, analysis, pictures)
         (folder / "report.html").write_text(_page(report, sections), encoding="utf-8")
     except OSError as error:
         raise DataError(f"{folder}: cannot write the report there ({error.strerror})") from None
-    return sorted(path for path in folder.iterdir() if path.suffix in (".csv", ".png", ".html"))
+    return sorted(path for path in folder.iterdir() if path.suffix in WRITTEN)
 
 
 def print_report(report: Report, console: Console | None = None) -> None:
