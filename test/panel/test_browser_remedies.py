@@ -65,6 +65,9 @@ def test_a_silent_motor_of_a_simulated_arm_is_the_computers_fault(visit, stage):
     stage.arms.simulator = {"longest stall (ms)": "8", "longest silence (ms)": "212", "disconnected": "no"}
     page.wait_for_selector(f"{remedy}:has-text('This computer was too busy')")
     assert "212 ms" in page.inner_text(remedy) and "CAN cable" not in page.inner_text(remedy)
+    stage.arms.fail("right", "wrong_sign")
+    page.wait_for_selector(f"{remedy}:has-text('212 ms'):has-text('wrong way')")
+    stage.arms.fail("right", "motor_silent")
     stage.arms.simulator = {**stage.arms.simulator, "disconnected": "yes"}  # a fault that is simulated
     page.wait_for_selector(f"{remedy}:has-text('CAN cable')")
     stage.arms.simulator = None

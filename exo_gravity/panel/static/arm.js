@@ -11,6 +11,7 @@ const MEAN = 3; // states over which speed and power are averaged: a velocity is
 const RESTED = 1000; // ms at rest after which an arm no longer moves
 const OFF = ["disabled", "checking", "fault"]; // the motors are off
 const CAUSED = ["over_speed", "torque_not_delivered", "outside_limits", "unexplained_torque"]; // perhaps by a change of load
+const STALLED = ["motor_silent", "torque_not_delivered", "wrong_sign", "sign_unproven"]; // perhaps by a computer that stood still
 const STALL = 50; // ms; a simulated arm that stands still for longer seems silent
 
 export class ArmCard {
@@ -186,9 +187,11 @@ export class ArmCard {
     const box = this.find(".remedy");
     box.hidden = !code;
     if (!code) return;
-    const ofComputer = code === "motor_silent" && this.setup?.simulated ? ofSimulation(state.simulator) : "";
-    const remedy = ofComputer || t(has(`fault.${code}`) ? `fault.${code}` : "fault.unknown");
-    write(box.querySelector("p"), state.cause && CAUSED.includes(code) ? `${causeText(state.cause)} ${remedy}` : remedy);
+    const causes = [];
+    if (this.setup?.simulated && STALLED.includes(code)) causes.push(ofSimulation(state.simulator));
+    if (state.cause && CAUSED.includes(code)) causes.push(causeText(state.cause));
+    if (!causes[0] || code !== "motor_silent") causes.push(t(has(`fault.${code}`) ? `fault.${code}` : "fault.unknown")); // no cable is simulated
+    write(box.querySelector("p"), causes.join(" ").trim());
   }
 
   showJoints(joints, bridge) {
