@@ -13,6 +13,7 @@ no page, no panel, no lease. The requests:
 {"do": "clear_fault", "arm": "right"}
 {"do": "resume", "arm": "right"}                     clear and enable, after a fault that was no one's
 {"do": "set", "arm": "right", "values": {"support": 0.3}}
+{"do": "bring_home", "arm": "right"}                 a simulated arm: its virtual wearer lets it hang
 {"do": "release"}                                    control
 {"do": "record"}, {"do": "stop_recording"}, {"do": "save"}
 {"do": "trial", "name": "demo"}, {"do": "stop_trial"}
@@ -31,7 +32,7 @@ from exo_gravity.panel.view import SETTABLE
 # The kinds of requests, and the keys that each has besides "do".
 KEYS: Mapping[str, frozenset[str]] = {
     **dict.fromkeys(("take", "release", "record", "stop_recording", "save", "stop_trial"), frozenset()),
-    **dict.fromkeys(("let_down", "enable", "clear_fault", "resume"), frozenset({"arm"})),
+    **dict.fromkeys(("let_down", "enable", "clear_fault", "resume", "bring_home"), frozenset({"arm"})),
     "set": frozenset({"arm", "values"}),
     "trial": frozenset({"name"}),
 }

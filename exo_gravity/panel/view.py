@@ -25,14 +25,13 @@ PANEL = (
 )
 # fmt: on
 # What the page may change on a compensator. Every limit stays with the compensator and the bridge.
-SETTABLE = {
-    param.name: param
-    for param in COMPENSATOR
-    if param.name in ("support", "mode", "wearer.body_mass", "wearer.sex", "wearer.segment_length")
-}
+LOAD = ("mode", "wearer.body_mass", "wearer.sex", "wearer.segment_length", "support")
+SETTABLE = {param.name: param for param in COMPENSATOR if param.name in LOAD}
 
 Values = Mapping[str, Any]
 NUMBERS = ("position", "velocity", "effort")
+CAUSE = 5.0  # s before a fault within which a change of load may be its cause
+LATE = 1.5  # s after a fault in which the panel may still learn of a change that came before it
 
 
 def joint_rows(
@@ -54,6 +53,48 @@ def setup_of(nodes: Mapping[str, tuple[Values, Values]]) -> dict[str, Any]:
     except (ExoGravityError, KeyError):
         picture = None
     return {"arms": {arm: _arm_setup(*both) for arm, both in nodes.items()}, "urdf": picture}
+
+
+class LoadChanges:
+    """Names the change of load that came shortly before an arm's fault, and may be its cause."""
+
+    def __init__(self) -> None:
+        self._loads: dict[str, Values] = {}  # the newest known, by arm
+        self._changes: dict[str, tuple[float, dict[str, Any]]] = {}  # monotonic s of the newest one, and what it was
+        self._faults: dict[str, float] = {}  # monotonic s at which the present one was seen first
+
+    def told(self, arms: Mapping[str, Any], nodes: Mapping[str, tuple[Values, Values]], now: float) -> dict[str, Any]:
+        """Return the states of `arms`, each with its `cause`, None if there is none. Call it with every new state.
+
+        nodes: the parameters of `can_bridge` and `compensator` by arm. now: monotonic s.
+        """
+        return {arm: {**state, "cause": self._cause(arm, state, nodes[arm][1], now)} for arm, state in arms.items()}
+
+    def _cause(self, arm: str, state: Mapping[str, Any], compensator: Values, now: float) -> dict[str, Any] | None:
+        is_faulty = (state["bridge"] or {}).get("fault", "none") != "none"
+        if not is_faulty:
+            self._faults.pop(arm, None)
+        began = self._faults.setdefault(arm, now) if is_faulty else now
+        new = self._new(arm, compensator) if compensator else None
+        at, change = self._changes.get(arm, (-math.inf, {}))
+        if new and now - began <= LATE:
+            if now - at <= CAUSE and new["what"] == change["what"] == "support":  # a slider on its way
+                new["from"] = change["from"]
+            self._changes[arm] = at, change = now, new
+        elif change and not is_faulty and (state["compensator"] or {}).get("changing load", "none") != "none":
+            self._changes[arm] = at, change = now, change
+        return change if is_faulty and began - at <= CAUSE else None
+
+    def _new(self, arm: str, compensator: Values) -> dict[str, Any] | None:
+        """Return what has changed since the last call, None for nothing; of the wearer's data, only that they have."""
+        load = {name: compensator.get(name) for name in LOAD}
+        last = self._loads.get(arm, load)
+        self._loads[arm] = load
+        name = next((name for name in LOAD if load[name] != last[name]), "")
+        if not name or (name != "mode" and load["mode"] == "one_g"):
+            return None
+        what = name.partition(".")[0]
+        return {"what": what} if what == "wearer" else {"what": what, "from": last[name], "to": load[name]}
 
 
 def _arm_setup(bridge: Values, compensator: Values) -> dict[str, Any]:

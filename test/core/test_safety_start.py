@@ -39,7 +39,7 @@ def test_torque_ramps_in_over_the_ramp_time_without_a_step():
         (lambda arm: setattr(arm.machine, "hindrance", "the watchdog to start"), "the watchdog to start"),
         (lambda arm: setattr(arm, "effort", None), "effort commands"),
         (lambda arm: setattr(arm, "effort_age", 0.06), "effort commands"),
-        (lambda arm: arm.changes[2].update(position=2.6), "c to be moved by -0.10 rad, within its limits -0.8 to 2.5"),
+        (lambda arm: arm.changes[2].update(position=2.6), "c to be moved by -5.8 degrees, within its limits -46"),
     ],
 )
 def test_the_checks_wait_and_name_what_they_wait_for(spoil, waits_for):

@@ -164,7 +164,7 @@ def test_the_wearers_data_of_a_carried_arm_ask_first_and_the_first_ones_set_the_
     assert (right["wearer.body_mass"], right["support"], left["support"]) == (62.0, 0.0, 0.05)
 
 
-def test_an_arm_that_sinks_while_its_load_changes_is_not_called_carried(visit, stage):
+def test_an_arm_that_moves_is_not_called_carried(visit, stage):
     stage.arms.states["right"] = "active"
     stage.arms.changing, stage.arms.sinking = "right_elbow_flexion, 2.1 Nm to go", 0.2
     page = visit()
@@ -172,8 +172,35 @@ def test_an_arm_that_sinks_while_its_load_changes_is_not_called_carried(visit, s
     page.wait_for_selector(f"{state}:has-text('Sinking')")
     stage.arms.sinking = -0.2
     page.wait_for_selector(f"{state}:has-text('Moving')")
+    assert "The load is changing" in page.inner_text('[data-arm="right"] .sentence')
     stage.arms.changing = "none"
+    page.wait_for_selector("[data-arm=right] .sentence:has-text('If the wearer does not move it')")
+    stage.arms.sinking = 0.2
+    page.wait_for_selector("#chips .badge[data-moves]:has-text('Right arm: Sinking')")
+    stage.arms.sinking = 0.0
     page.wait_for_selector(f"{state}:has-text('Carrying')")
+    assert "The arm is carried." in page.inner_text('[data-arm="right"] .sentence')
+
+
+def test_a_heavier_wearers_data_lower_the_support_to_what_rated_torque_allows(visit, stage):
+    page = visit()
+    page.wait_for_selector("[data-arm=right] .mark:not([hidden])", state="attached")  # at 6.8 %
+    page.fill("input[name=body_mass]", "60")
+    page.click("#wearer button")
+    page.wait_for_selector("#message:has-text('Applied')")
+    assert "raise it" not in page.inner_text("#message")
+    page.fill("input[name=body_mass]", "100")  # the stage's limit stays that of 60 kg: 4.08 %
+    page.click("#wearer button")
+    page.wait_for_selector("#message:has-text('The support of the right arm is now 4.0 %')")
+    assert [stage.arms.settings[arm]["support"] for arm in ("right", "left")] == [0.04, 0.04]
+
+
+def test_to_enable_an_arm_beyond_rated_torque_is_asked_with_that_warning(visit, stage):
+    stage.arms.settings["right"].update({"mode": "zero_g", "support": 0.5})
+    page = visit()
+    page.wait_for_selector("[data-arm=right] .mark:not([hidden])", state="attached")
+    page.click('[data-arm="right"] .enable')
+    assert "More than rated torque" in page.inner_text("#ask-text")
 
 
 def test_the_bar_says_in_sight_what_the_arms_do_and_let_down_is_grey_while_the_motors_are_off(visit, stage):

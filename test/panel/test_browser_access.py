@@ -76,7 +76,7 @@ def test_let_down_is_always_in_sight_and_nothing_is_cut_off(visit, stage, width,
     assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 
-@pytest.mark.parametrize("state", ["off", "fault", "dark", "asking", "german", "login"])
+@pytest.mark.parametrize("state", ["off", "fault", "dark", "moving", "asking", "german", "login"])
 def test_axe_has_no_serious_findings(browser, visit, stage, state):
     if state == "login":
         locked = Stage(token="a token for this test")
@@ -97,6 +97,9 @@ def test_axe_has_no_serious_findings(browser, visit, stage, state):
     if state in ("fault", "dark"):
         stage.arms.fail("right", "motor_silent")
         wait_for_state(page, "fault")
+    elif state == "moving":
+        stage.arms.states["right"], stage.arms.sinking = "active", 0.2
+        page.wait_for_selector("#chips .badge[data-moves]")
     elif state == "asking":
         page.click('[data-arm="right"] .enable')
     elif state == "german":

@@ -133,6 +133,20 @@ def test_a_session_from_support_to_a_fault_and_back_with_a_recording(clinic):
     assert "token" not in probe.call(ListParameters, "/panel/list_parameters", ListParameters.Request()).result.names
 
 
+def test_an_arm_that_hangs_astray_is_put_back_and_carried(clinic):
+    page, probe, away = clinic.page, clinic.probe, clinic.folder / "away.yaml"
+    pose = [0.0, 0.9, 0.6, 0.8]
+    away.write_text(yaml.safe_dump({"name": "away", "steps": [{"move": pose, "over": over} for over in (2.0, 60.0)]}))
+    page.keyboard.press("Space")
+    wait_for_state(page, "disabled")
+    assert probe.set_parameters("simulator", trial=str(away)).successful
+    probe.wait_until(lambda: probe.joint_states[-1].position[1] > 0.8)
+    page.click(".home")
+    probe.wait_until(lambda: max(map(abs, probe.joint_states[-1].position)) < 0.15)
+    enable(page)
+    wait_for_state(page, "active")
+
+
 def test_a_trial_is_followed_recorded_and_reported_and_the_death_of_the_panel_changes_nothing(tmp_path: Path):
     scripts = tmp_path / "scripts"
     scripts.mkdir()

@@ -15,7 +15,7 @@ from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE
 from exo_gravity.panel.control import Control
 from exo_gravity.panel.server import PanelServer
-from exo_gravity.panel.view import joint_rows, setup_of
+from exo_gravity.panel.view import LoadChanges, joint_rows, setup_of
 
 from .ports import free_port
 
@@ -41,6 +41,11 @@ class PlayedArms:
     errors: dict[str, Exception] = field(default_factory=dict)
     changing: str = "none"  #: what a compensator reports of a change of load
     sinking: float = 0.0  #: rad/s at which the joints give way to gravity
+    messages: dict[str, str] = field(default_factory=dict)  #: of the bridges, by arm, if not the usual ones
+    #: what the simulators report
+    simulator: dict[str, str] | None = field(
+        default_factory=lambda: {"longest stall (ms)": "3", "longest silence (ms)": "14", "disconnected": "no"}
+    )
     leases: list[tuple[str, str]] = field(default_factory=list)
     others: dict[str, str] = field(default_factory=dict)
 
@@ -86,11 +91,12 @@ class PlayedArms:
         values |= {"limits acting": "none", **{f"{joint} temperature (degC)": "31" for joint in names}}
         values["resume"] = "possible" if fault == "command_stale" else "refused"
         message = f"fault: {fault}: {name} elbow" if fault != "none" else state
-        bridge = {**values, "level": 2 if fault != "none" else 0, "message": message}
+        bridge = {**values, "level": 2 if fault != "none" else 0, "message": self.messages.get(name, message)}
         carried = {"mass carried (kg)": "1.854", "largest support": "0.068", "level": 0, "message": "compensating"}
         carried |= {"changing load": self.changing}
         velocity = [-self.sinking * math.copysign(1.0, tau) for tau in effort]
-        return {"bridge": bridge, "compensator": carried, "joints": joint_rows(names, position, velocity, effort)}
+        joints = joint_rows(names, position, velocity, effort)
+        return {"bridge": bridge, "compensator": carried, "simulator": self.simulator, "joints": joints}
 
 
 @dataclass
@@ -156,6 +162,7 @@ class Stage:
 
     def _play(self) -> None:
         shown: Any = None
+        changes = LoadChanges()
         while not self._stopping.wait(PERIOD):
             nodes = {
                 arm: ({**self._bridge, "joint_names": settings["joint_names"]}, dict(settings))
@@ -165,5 +172,5 @@ class Stage:
                 shown = nodes
                 self.server.setup = {**self._own_setup, **setup_of(nodes)}
             now = time.monotonic()
-            arms = {arm: self.arms.state(arm, now) for arm in self.arms.names}
+            arms = changes.told({arm: self.arms.state(arm, now) for arm in self.arms.names}, nodes, now)
             self.server.state = {"arms": arms, "tilt": {"pitch": 0.2, "roll": -0.1}, **self.files.content}

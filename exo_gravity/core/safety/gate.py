@@ -38,7 +38,8 @@ def missing_for_a_start(
     """
     columns = zip(limits.joint_names, joints, limits.position_min, limits.position_max, strict=True)
     outside = [
-        f"{name} to be moved by {-excess:+.2f} rad, within its limits {low:g} to {high:g}"
+        f"{name} to be moved by {_at_least(-excess)} degrees, within its limits {math.degrees(low):.0f} to "
+        f"{math.degrees(high):.0f}"
         for name, joint, low, high in columns
         if (excess := joint.position - max(low, min(high, joint.position)))
     ]
@@ -58,6 +59,11 @@ def missing_for_a_start(
                 )
                 return Fault(FaultCode.IMPLAUSIBLE_ZERO, reason)
     return "the arm to be at rest" if any(abs(joint.velocity) > AT_REST for joint in joints) else ""
+
+
+def _at_least(angle: float) -> str:
+    """Return `angle` (rad) in degrees, rounded away from zero, so that a joint turned by it is far enough."""
+    return f"{math.degrees(angle) + math.copysign(0.05, angle):+.1f}"
 
 
 class SwitchOnCheck:

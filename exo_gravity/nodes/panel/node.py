@@ -33,7 +33,7 @@ from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import HotPath
 from exo_gravity.panel.control import Control
 from exo_gravity.panel.recordings import Recordings
-from exo_gravity.panel.view import PANEL, Values, joint_rows, setup_of
+from exo_gravity.panel.view import PANEL, LoadChanges, Values, joint_rows, setup_of
 
 STATE_PERIOD = 0.1  # s between two states that the pages get
 DISCOVERY_PERIOD = 0.5  # s between two searches for nodes
@@ -43,7 +43,8 @@ ABSENT_TIMEOUT = 0.5  # s, where the service seems to be absent
 LOOK_PERIOD = 0.005  # s between two looks for an answer
 TILT = "/imu/pitch_yaw"
 BRIDGE, COMPENSATOR = "can_bridge", "compensator"
-SHOWN = {BRIDGE: "bridge", COMPENSATOR: "compensator"}  # what the page calls the status of each
+SIMULATOR = "simulator"
+SHOWN = {BRIDGE: "bridge", COMPENSATOR: "compensator", SIMULATOR: "simulator"}  # what the page calls the status of each
 ASKED = {  # service and request for each request of a page but `set`
     "let_down": (SetBool, f"{BRIDGE}/enable", SetBool.Request(data=False)),
     "enable": (SetBool, f"{BRIDGE}/enable", SetBool.Request(data=True)),
@@ -107,7 +108,7 @@ class Arms:
             arm, _, leaf = name.strip("/").rpartition("/")
             if leaf == BRIDGE and arm and arm not in self.clients:
                 self.clients[arm] = ArmClient(self._node, arm)
-            if leaf == "simulator" and name not in self._wearers:
+            if leaf == SIMULATOR and name not in self._wearers:
                 self._wearers[name] = parameter_client(self._node, name)
         for parameters in self._parameters.values():
             parameters.update()
@@ -155,6 +156,10 @@ class Arms:
 
     async def ask(self, kind: str, arm: str, values: Mapping[str, Any]) -> str:
         """Do what a page asks of one arm. The request is sent even where the service seems to be absent."""
+        if kind == "bring_home":
+            simulator = self._wearers.get(f"/{arm}/{SIMULATOR}")
+            script = {"trial": str(packaged("home.yaml"))}
+            return await call(simulator, parameter_request(script)) if simulator else "the arm is not simulated"
         request = parameter_request(values) if kind == "set" else ASKED[kind][-1]
         return await call(self.clients[arm].services[kind], request)
 
@@ -217,6 +222,7 @@ class Panel(Node):
         own = {name: values[name] for name in ("language", "dead_man")}
         self._own_setup = {**own, "trials": list(self._recordings.trials)}
         self._shown: Any = None  # the nodes' parameters that the pages have
+        self._changes = LoadChanges()
         control = Control(self._arms, self._recordings, self._note, time.monotonic)
         try:
             from exo_gravity.panel.server import PanelServer
@@ -258,7 +264,8 @@ class Panel(Node):
             self._shown = nodes
             self._server.setup = {**self._own_setup, **setup_of(nodes)}
         tilt = self._tilt.within(SILENT)
-        self._server.state = {"arms": self._arms.state(), "tilt": tilt, **self._recordings.state()}
+        arms = self._changes.told(self._arms.state(), nodes, time.monotonic())
+        self._server.state = {"arms": arms, "tilt": tilt, **self._recordings.state()}
 
     def _on_tilt(self, message: Vector3Stamped, _info: dict[str, Any]) -> None:
         pitch, roll = message.vector.y, message.vector.x

@@ -7,6 +7,12 @@ const PAUSE = 300; // ms without a move of the slider after which its support is
 const SETTLING = 2000; // ms after that until the parameters in force are known again
 const CARRIED = ["proving signs", "ramping in", "active"];
 const STILL = 0.08; // rad/s; slower joints rest
+const MEAN = 3; // states over which speed and power are averaged: a velocity is noisy
+const RESTED = 1000; // ms at rest after which an arm no longer moves
+const OFF = ["disabled", "checking", "fault"]; // the motors are off
+const CAUSED = ["over_speed", "torque_not_delivered", "outside_limits", "unexplained_torque"]; // perhaps by a change of load
+const STALLED = ["motor_silent", "torque_not_delivered", "wrong_sign", "sign_unproven"]; // perhaps by a computer that stood still
+const STALL = 50; // ms; a simulated arm that stands still for longer seems silent
 
 export class ArmCard {
   constructor(name, actions) {
@@ -24,9 +30,12 @@ export class ArmCard {
     this.slider.disabled = true; // until the support in force is known
     this.timer = null;
     this.moved = -Infinity; // ms, when its user moved the slider or the support was sent
+    this.speed = this.power = 0; // means of the joints' largest speed in rad/s, and of the motors' power in W
+    this.went = -Infinity; // ms, when the arm last moved
     this.find(".enable").addEventListener("click", () => actions.enable(this));
     this.find(".clear").addEventListener("click", () => actions.send({ do: "clear_fault", arm: name }));
     this.find(".resume").addEventListener("click", () => actions.send({ do: "resume", arm: name }));
+    this.find(".home").addEventListener("click", () => actions.send({ do: "bring_home", arm: name }));
     this.find(".down").addEventListener("click", () => actions.down(name));
     for (const button of this.root.querySelectorAll("[data-mode]"))
       button.addEventListener("click", () => actions.mode(this, button.dataset.mode));
@@ -41,6 +50,7 @@ export class ArmCard {
     this.find(".enable").setAttribute("aria-label", t("enable_arm", arm));
     this.find(".clear").setAttribute("aria-label", t("clear_fault_arm", arm));
     this.find(".resume").setAttribute("aria-label", t("resume_arm", arm));
+    this.find(".home").setAttribute("aria-label", t("bring_home_arm", arm));
     this.find(".down").setAttribute("aria-label", t("let_down_arm", arm));
     write(this.find(".down"), t("let_down_arm", arm));
   }
@@ -51,6 +61,10 @@ export class ArmCard {
 
   get state() {
     return this.find(".badge").dataset.state;
+  }
+
+  get moves() {
+    return this.find(".badge").hasAttribute("data-moves");
   }
 
   // State, mode and support in one line.
@@ -71,6 +85,7 @@ export class ArmCard {
   // Limits and settings, which change rarely.
   configure(setup) {
     this.setup = setup;
+    this.find(".home").hidden = !setup.simulated;
     this.follow();
     for (const button of this.root.querySelectorAll("[data-mode]"))
       button.setAttribute("aria-pressed", String(button.dataset.mode === this.mode));
@@ -122,11 +137,11 @@ export class ArmCard {
     const badge = this.find(".badge");
     badge.dataset.state = name;
     write(this.find(".sign"), SIGNS[name] ?? "?");
-    const moving = name === "active" && alive ? motion(state) : "";
+    const moving = name === "active" ? this.motion(state) : "";
+    badge.toggleAttribute("data-moves", moving !== "");
     write(this.find(".state"), moving ? t(moving) : has(`state.${name}`) ? t(`state.${name}`) : name);
-    const unreached = bridge?.message.includes("may still be powered");
-    write(this.find(".sentence"), unreached ? t("unreached") : moving ? t("sentence.changing") : has(`sentence.${name}`) ? t(`sentence.${name}`) : "");
-    this.showRemedy(bridge);
+    write(this.find(".sentence"), this.sentence(name, moving, state, bridge));
+    this.showRemedy(bridge, state);
     write(this.find(".detail"), bridge?.message ? t("detail", bridge.message) : "");
     const other = alive ? state.compensator : null;
     write(this.find(".compensator"), other ? (other.level ? t("compensator_detail", other.message) : t("carried", number(finite(other["mass carried (kg)"]), 2))) : alive ? t("compensator_silent") : "");
@@ -136,6 +151,7 @@ export class ArmCard {
     this.find(".clear").disabled = !operates || name !== "fault";
     this.find(".resume").hidden = bridge?.resume !== "possible";
     this.find(".resume").disabled = !operates;
+    this.find(".home").disabled = !operates || !OFF.includes(name);
     for (const control of [this.slider, ...this.root.querySelectorAll("[data-mode]")]) control.disabled = !operates || !other || !isFinite(this.support);
     if (this.setup?.settings) this.follow();
     this.showSupport();
@@ -145,11 +161,37 @@ export class ArmCard {
     write(this.find(".rates"), limits && limits !== "none" ? `${rates} ${t("limits", limits)}` : rates);
   }
 
-  showRemedy(bridge) {
+  sentence(name, moving, state, bridge) {
+    if (bridge?.message.includes("may still be powered")) return t("unreached");
+    if (moving) return t(changes(state) ? "sentence.changing" : `sentence.${moving}`);
+    const outside = ["checking", "disabled"].includes(name) && bridge?.message.match(/(\S+) to be moved by ([-+][\d.]+) degrees/);
+    if (outside) return t(`outside.${name}`, jointText(this.name, outside[1]), number(Math.abs(outside[2]), 1));
+    return has(`sentence.${name}`) ? t(`sentence.${name}`) : "";
+  }
+
+  // What the arm does in place of resting; '' while it rests. Gravity moves it where the motors' torque opposes that.
+  motion(state) {
+    const joints = state.joints ?? [];
+    const speed = Math.max(0, ...joints.map((joint) => Math.abs(joint.velocity)));
+    const power = joints.reduce((sum, joint) => sum + joint.effort * joint.velocity, 0);
+    this.speed += (speed - this.speed) / MEAN;
+    this.power += (power - this.power) / MEAN;
+    const now = performance.now();
+    if (this.speed > STILL) this.went = now;
+    if (now - this.went < RESTED) return this.power < 0 ? "sinking" : "moving";
+    return changes(state) ? "changing" : "";
+  }
+
+  showRemedy(bridge, state) {
     const code = bridge?.fault && bridge.fault !== "none" ? bridge.fault : "";
     const box = this.find(".remedy");
     box.hidden = !code;
-    if (code) write(box.querySelector("p"), t(has(`fault.${code}`) ? `fault.${code}` : "fault.unknown"));
+    if (!code) return;
+    const causes = [];
+    if (this.setup?.simulated && STALLED.includes(code)) causes.push(ofSimulation(state.simulator));
+    if (state.cause && CAUSED.includes(code)) causes.push(causeText(state.cause));
+    if (!causes[0] || code !== "motor_silent") causes.push(t(has(`fault.${code}`) ? `fault.${code}` : "fault.unknown")); // no cable is simulated
+    write(box.querySelector("p"), causes.join(" ").trim());
   }
 
   showJoints(joints, bridge) {
@@ -164,17 +206,38 @@ export class ArmCard {
     });
   }
 
+  isOver(support) {
+    return this.limit !== null && support > this.limit;
+  }
+
+  // The support for a wearer's new data: 0 for the first ones; never more than rated torque allows a heavier arm.
+  supportFor(mass, sex, lengths) {
+    const now = this.setup?.settings ?? {};
+    if (!now["wearer.body_mass"] || this.limit === null) return 0;
+    const shares = lengths.map((length, n) => (length ? now["wearer.segment_length"][n] / length : 1));
+    const share = Math.min(1, ...shares) * (sex === now["wearer.sex"] ? 1 : 0.84); // a man's forearm is the heavier one
+    const limit = (this.limit * share * now["wearer.body_mass"]) / mass;
+    return Math.min(this.support, Math.floor(200 * limit) / 200);
+  }
+
   get isCarried() {
     return CARRIED.includes(this.state);
   }
 }
 
-// What the arm does while its load changes; '' while it does not. Gravity moves it where the motors' torque opposes that.
-function motion(state) {
-  if ((state.compensator?.["changing load"] ?? "none") === "none") return "";
-  const joints = state.joints ?? [];
-  if (!joints.some((joint) => Math.abs(joint.velocity) > STILL)) return "changing";
-  return joints.reduce((sum, joint) => sum + joint.effort * joint.velocity, 0) < 0 ? "sinking" : "moving";
+const changes = (state) => (state.compensator?.["changing load"] ?? "none") !== "none";
+
+// The change of load that came shortly before a fault.
+function causeText({ what, from, to }) {
+  if (what === "support") return t("cause.support", number(100 * from, 1), number(100 * to, 1));
+  return what === "mode" ? t("cause.mode", from === "zero_g" ? "Zero-G" : "One-G", to === "zero_g" ? "Zero-G" : "One-G") : t("cause.wearer");
+}
+
+// Why a simulated motor seems silent, unless a simulated fault silences it.
+function ofSimulation(simulator) {
+  if (!simulator) return t("fault.simulator_gone");
+  const longest = Math.max(finite(simulator["longest stall (ms)"]), finite(simulator["longest silence (ms)"])); // since the motors are on
+  return longest > STALL && simulator.disconnected === "no" ? t("fault.stalled", number(longest, 0)) : "";
 }
 
 function newRow(body) {

@@ -65,7 +65,8 @@ const actions = {
   send,
   down,
   async enable(card) {
-    const text = `${t("enable_ask")} ${t(`enable_mode.${card.mode}`, percent(card))}`;
+    const over = card.mode === "zero_g" && card.isOver(card.support) ? t("support_over") : "";
+    const text = `${t("enable_ask")} ${t(`enable_mode.${card.mode}`, percent(card))} ${over}`;
     if (await ask(t("enable_arm", card.armText()), text, t("enable"))) send({ do: "enable", arm: card.name });
   },
   async mode(card, mode) {
@@ -76,7 +77,7 @@ const actions = {
   },
   // Returns whether the support was taken.
   async support(card, support) {
-    const over = card.limit !== null && support > card.limit && support > card.support;
+    const over = card.isOver(support) && support > card.support;
     const far = card.isCarried && card.mode === "zero_g" && Math.abs(support - card.support) > ASKED;
     const text = `${t("support_ask", percent(card), number(100 * support, 1))} ${over ? t("support_over") : ""}`;
     if ((over || far) && !(await ask(t("support_title"), text, t("change")))) return false;
@@ -133,6 +134,7 @@ function showBar() {
   while (chips.children.length < cards.size) chips.append(Object.assign(document.createElement("li"), { className: "badge" }));
   [...cards.values()].forEach((card, n) => {
     chips.children[n].dataset.state = card.state;
+    chips.children[n].toggleAttribute("data-moves", card.moves);
     write(chips.children[n], card.summary());
   });
   const off = link.alive && cards.size > 0 && [...cards.values()].every((card) => card.state === "disabled");

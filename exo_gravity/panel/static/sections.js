@@ -44,12 +44,15 @@ export class Sections {
     };
     const acts = [...this.cards.values()].some((card) => card.isCarried && card.mode === "zero_g");
     if (acts && !(await ask(t("wearer"), t("wearer_ask"), t("change")))) return;
+    const lowered = [];
     for (const [arm, card] of this.cards) {
-      const isFirst = !card.setup?.settings?.["wearer.body_mass"]; // the support starts at 0
-      if (!(await this.send({ do: "set", arm, values: isFirst ? { ...values, support: 0 } : values }))) return;
+      const support = card.supportFor(...Object.values(values));
+      const isLess = !(support >= card.support);
+      if (isLess) lowered.push(t("applied_lower", card.armText(), number(100 * support, 1)));
+      if (!(await this.send({ do: "set", arm, values: isLess ? { ...values, support } : values }))) return;
     }
     this.edited = false;
-    write(byId("message"), t("applied"));
+    write(byId("message"), [t("applied"), ...lowered].join(" "));
   }
 
   show(state, operates) {

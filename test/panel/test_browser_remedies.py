@@ -1,0 +1,74 @@
+"""What the page tells its operator to do, in a real browser: what a check waits for, what caused a fault."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("playwright", reason="no browser driver: install the extra test")
+
+from exo_gravity.core.safety.gate import missing_for_a_start
+from exo_gravity.core.safety.limits import JointSample, Limits
+
+from ..support.panel_browser import IN_BROWSER, wait_for_state
+from ..support.panel_stage import LEAVES
+
+pytestmark = IN_BROWSER
+
+
+def test_a_check_that_waits_says_in_degrees_which_joint_to_turn_and_a_simulated_arm_is_put_back(visit, stage):
+    limits = Limits(tuple(f"right_{leaf}" for leaf in LEAVES))
+    hanging = JointSample(0.0, 0.0, 0.0, 30, 0, 0.0)
+    astray = hanging._replace(position=limits.position_max[3] + 1e-6)
+    waits = f"waiting for {missing_for_a_start(limits, [hanging] * 3 + [astray], None, False)}"
+    stage.arms.states["right"], stage.arms.messages["right"] = "checking", f"checking: {waits}"
+    page = visit()
+    sentence = '[data-arm="right"] .sentence'
+    page.wait_for_selector(f"{sentence}:has-text('Elbow flexion: turn it back by 0.1°.')")
+    page.select_option("#language", "de")
+    page.wait_for_selector(f"{sentence}:has-text('Ellenbogen Beugung: um 0,1° zurückdrehen.')")
+    page.select_option("#language", "en")
+    page.click('[data-arm="right"] .home')
+    stage.arms.states["right"], stage.arms.messages["right"] = "disabled", f"disabled: not enabled within 10 s: {waits}"
+    page.wait_for_selector(f"{sentence}:has-text('The motors stayed off. Elbow flexion')")
+    stage.arms.messages.clear()
+    stage.arms.states["right"] = "active"
+    wait_for_state(page, "active")
+    assert stage.arms.calls == [("bring_home", "right")]
+    assert page.is_disabled('[data-arm="right"] .home')
+
+
+def test_a_fault_after_a_change_of_load_names_the_change_also_after_a_reload(visit, stage):
+    stage.arms.states["right"] = "active"
+    stage.arms.settings["right"].update({"mode": "zero_g", "support": 0.05})
+    page = visit()
+    wait_for_state(page, "active")
+    for support in (0.3, 0.65):  # a slider on its way
+        stage.arms.settings["right"]["support"] = support
+        page.wait_for_timeout(300)
+    stage.arms.fail("right", "over_speed")
+    remedy = '[data-arm="right"] .remedy'
+    named = f"{remedy}:has-text('the support was changed from 5.0 % to 65.0 %')"
+    page.wait_for_selector(named)
+    assert "A joint moved too fast" in page.inner_text(remedy)
+    page.reload()
+    page.wait_for_selector(named)
+    stage.arms.fail("right", "over_temperature")
+    page.wait_for_selector(f"{remedy}:has-text('too hot')")
+    assert "changed" not in page.inner_text(remedy)
+
+
+def test_a_silent_motor_of_a_simulated_arm_is_the_computers_fault(visit, stage):
+    page = visit()
+    remedy = '[data-arm="right"] .remedy'
+    stage.arms.fail("right", "motor_silent")
+    page.wait_for_selector(f"{remedy}:has-text('CAN cable')")
+    stage.arms.simulator = {"longest stall (ms)": "8", "longest silence (ms)": "212", "disconnected": "no"}
+    page.wait_for_selector(f"{remedy}:has-text('This computer was too busy')")
+    assert "212 ms" in page.inner_text(remedy) and "CAN cable" not in page.inner_text(remedy)
+    stage.arms.fail("right", "wrong_sign")
+    page.wait_for_selector(f"{remedy}:has-text('212 ms'):has-text('wrong way')")
+    stage.arms.fail("right", "motor_silent")
+    stage.arms.simulator = {**stage.arms.simulator, "disconnected": "yes"}  # a fault that is simulated
+    page.wait_for_selector(f"{remedy}:has-text('CAN cable')")
+    stage.arms.simulator = None
+    page.wait_for_selector(f"{remedy}:has-text('The simulator does not report')")

@@ -1,0 +1,88 @@
+"""Which change of load the panel names after a fault."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from exo_gravity.panel.view import CAUSE, LATE, LoadChanges
+
+
+class Told:
+    """The panel's look at one arm ten times a second; `cause` is what it names."""
+
+    def __init__(self) -> None:
+        self.changes, self.now, self.cause = LoadChanges(), 0.0, None
+        self.load: dict[str, Any] = {"mode": "zero_g", "support": 0.1, "wearer.body_mass": 75.0}
+        self.fault, self.changing = "none", "none"
+        self.go(1.0)
+
+    def go(self, seconds: float, **load: Any) -> Any:
+        self.load = {**self.load, **load}
+        for _ in range(round(10 * seconds)):
+            self.now += 0.1
+            state = {"bridge": {"fault": self.fault}, "compensator": {"changing load": self.changing}}
+            self.cause = self.changes.told({"right": state}, {"right": ({}, self.load)}, self.now)["right"]["cause"]
+        return self.cause
+
+    def fail(self, seconds: float = 0.1) -> Any:
+        self.fault = "over_speed"
+        return self.go(seconds)
+
+
+@pytest.mark.parametrize(
+    ("load", "cause"),
+    [
+        ({"support": 0.6}, {"what": "support", "from": 0.1, "to": 0.6}),
+        ({"mode": "one_g", "support": 0.0}, {"what": "mode", "from": "zero_g", "to": "one_g"}),
+        ({"wearer.body_mass": 90.0, "support": 0.0}, {"what": "wearer"}),
+    ],
+)
+def test_a_change_of_load_shortly_before_a_fault_is_named_and_never_the_wearers_data(load, cause):
+    told = Told()
+    assert told.go(2.0, **load) is None
+    assert told.fail() == cause
+    assert told.go(LATE) == cause
+    assert told.go(60.0, support=0.3) == cause  # set while the arm is off
+    told.fault = "none"
+    assert told.go(10.0) is None
+    assert told.fail() is None
+
+
+def test_a_change_long_before_is_not_the_cause_unless_the_load_still_changes():
+    told = Told()
+    told.go(CAUSE + 1.0, support=0.6)
+    assert told.fail() is None
+    told = Told()
+    told.changing = "right_elbow_flexion, 2.1 Nm to go"
+    told.go(CAUSE + 1.0, support=0.6)
+    assert told.fail() == {"what": "support", "from": 0.1, "to": 0.6}
+
+
+def test_a_slider_on_its_way_is_one_change():
+    told = Told()
+    for support in (0.2, 0.3, 0.4):
+        told.go(0.5, support=support)
+    assert told.fail() == {"what": "support", "from": 0.1, "to": 0.4}
+
+
+def test_a_change_of_which_the_panel_learns_after_the_fault_is_the_cause_and_a_later_one_is_not():
+    told = Told()
+    told.fail(LATE - 0.5)
+    assert told.go(0.1, support=0.6) == {"what": "support", "from": 0.1, "to": 0.6}
+    told = Told()
+    told.fail(LATE + 0.5)
+    assert told.go(0.1, support=0.6) is None
+
+
+def test_support_that_does_not_act_and_parameters_that_are_not_known_are_no_change():
+    told = Told()
+    told.go(CAUSE + 1.0, mode="one_g")
+    told.go(1.0, support=0.6)
+    assert told.fail() is None
+    told = Told()
+    known, told.load = told.load, {}
+    told.go(1.0)
+    told.go(1.0, **known)
+    assert told.fail() is None
