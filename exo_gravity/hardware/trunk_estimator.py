@@ -69,6 +69,13 @@ class TrunkEstimator:
     _agreement, _clock = imu_checks.Agreement(), imu_checks.ClockCheck()
     _is_fused: bool | None = None  # None before the first sample
     _time = -math.inf
+    _quaternion: Quaternion | None  # of the IMU by the last sample, world from IMU
+    _force: Floats3 | None  # m/s^2, of the last sample
+    _rates: list[Floats3]  # rad/s, since the last judgement and at it
+    _total: Floats3  # m/s^2, of the forces since then, and
+    _count: int  # how many they are
+    _judged: float  # s, of the sample of the last judgement
+    _speed: float  # rad/s, the highest in the last second
 
     def __init__(
         self,
@@ -194,11 +201,9 @@ class TrunkEstimator:
         self._uncertainty = TiltUncertainty(self._period)
         self._agreement = imu_checks.Agreement(is_suspect or self._agreement.is_suspect)
         self._why = why  # there is no orientation yet
-        self._quaternion: Quaternion | None = None  # of the IMU by the last sample, world from IMU
-        self._force: Floats3 | None = None  # m/s^2, of the last sample
-        self._judged, self._speed = self._time, 0.0  # s, of the last judgement; rad/s, the highest in the last second
-        self._rates: list[Floats3] = []  # rad/s, since the last judgement and at it
-        self._total, self._count = (0.0, 0.0, 0.0), 0  # m/s^2, sum and number of the forces since then
+        self._quaternion = self._force = None
+        self._judged, self._speed = self._time, 0.0
+        self._rates, self._total, self._count = [], (0.0, 0.0, 0.0), 0
 
 
 class VqfFusion:
