@@ -9,6 +9,7 @@ more than 3 degrees there is no output: the output never jumps.
 """
 
 import math
+import struct
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -16,12 +17,12 @@ import numpy as np
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.rotation import ZERO, Floats3, Quaternion, plus, product, unit_quaternion, up_in_body
+from exo_gravity.core.model.rotation import Floats3, Quaternion, plus, product, unit_quaternion, up_in_body
 from exo_gravity.core.model.tilt import angle_between, pitch_roll, rotation_matrix
 from exo_gravity.core.numbers import one_float
 from exo_gravity.core.trunk import imu_checks
-from exo_gravity.core.trunk.imu_checks import Contradiction, ImuSample, in_range, three_floats
-from exo_gravity.core.trunk.uncertainty import GAP, JUMP, MAX_SIGMA, TiltUncertainty
+from exo_gravity.core.trunk.imu_checks import Contradiction, ImuSample, in_range
+from exo_gravity.core.trunk.uncertainty import MAX_SIGMA, TiltUncertainty
 
 try:
     from vqf import VQF
@@ -33,9 +34,11 @@ __all__ = ["ImuSample", "TrunkEstimator", "TrunkOrientation"]
 MAX_GAP = 0.1  # s between two samples, after which the estimate begins anew
 MAX_REPORTED_RATE = 15.0  # rad/s; a reported orientation that turns faster has jumped: no trunk turns so fast
 MAX_JUMP = 0.01  # rad by which rounding may turn a reported orientation
-CHECK_PERIOD = 0.0195  # s between two judgements
+CHECK_PERIOD, FAST_PERIOD = 0.0195, 0.0095  # s between two judgements: usually, and
+FAST = 3.0  # rad/s: while the IMU turns faster
 OVERSHOOT = 0.25  # share of the range by which the true rate exceeds it
 BIAS_INTERVAL = 10  # samples; the bias changes slowly
+PACK = struct.Struct("6d").pack_into
 
 
 class TrunkOrientation(NamedTuple):
@@ -69,7 +72,8 @@ class TrunkEstimator:
     _quaternion: Quaternion | None  # of the IMU by the last sample, world from IMU
     _force: Floats3 | None  # m/s^2, of the last sample
     _rates: list[Floats3]  # rad/s, since the last judgement and at it
-    _forces: list[Floats3]  # m/s^2, since then
+    _total: Floats3  # m/s^2, of the forces since then, and
+    _count: int  # how many they are
     _judged: float  # s, of the sample of the last judgement
     _speed: float  # rad/s, the highest in the last second
 
@@ -91,9 +95,8 @@ class TrunkEstimator:
         self._imu_from_trunk = (-x, -y, -z, w)
         self._period = 1.0 / one_float("rate", rate, 2.0 / MAX_GAP, 10_000.0, "Hz")
         self._fastest = one_float("gyroscope_range", gyroscope_range, *imu_checks.GYROSCOPE_RANGES, "rad/s")
-        self._strongest = one_float(
-            "accelerometer_range", accelerometer_range, *imu_checks.ACCELEROMETER_RANGES, "m/s^2"
-        )
+        ranges = imu_checks.ACCELEROMETER_RANGES
+        self._strongest = one_float("accelerometer_range", accelerometer_range, *ranges, "m/s^2")
         self._fusion = VqfFusion(self._period) if VQF else None
         self._equal = imu_checks.EqualValues()
         self._restart("no sample yet")
@@ -101,7 +104,7 @@ class TrunkEstimator:
     @property
     def gyroscope_bias(self) -> np.ndarray:
         """The gyroscope bias that the fusion estimates and subtracts, (3,) rad/s in the IMU's axes."""
-        return np.array(self._fusion.bias if self._fusion else ZERO)
+        return self._fusion.bias if self._fusion else np.zeros(3)
 
     @property
     def settling(self) -> str:
@@ -124,19 +127,20 @@ class TrunkEstimator:
         except Contradiction as error:
             self._restart(f"{error.name} must be {error.expected}", is_suspect=True)
             raise
-        self._quaternion, sigma = quaternion, self._uncertainty.sigma
-        if sigma > MAX_SIGMA or self._agreement.is_suspect:
-            return None
-        return TrunkOrientation(product(quaternion, self._imu_from_trunk), sigma)
+        sigma = self._uncertainty.sigma
+        is_sure = sigma <= MAX_SIGMA and not self._agreement.is_suspect
+        return TrunkOrientation(product(quaternion, self._imu_from_trunk), sigma) if is_sure else None
 
     def _reported(self, sample: ImuSample) -> Quaternion:
         """Return the orientation that the IMU reports, world from IMU."""
         quaternion, last = unit_quaternion("orientation", sample.orientation), self._quaternion
-        turning, force = (ZERO if given is None else given for given in sample[1:3])
-        rate, force = three_floats("angular_velocity", turning), three_floats("linear_acceleration", force)
+        turning, force = ((0.0, 0.0, 0.0) if given is None else given for given in sample[1:3])
+        rate, _ = in_range("angular_velocity", turning, math.inf)
+        force, _ = in_range("linear_acceleration", force, math.inf)
         dt, up = self._step(sample, rate + force, None), up_in_body(quaternion)
         if last and angle_between(up, up_in_body(last)) > MAX_REPORTED_RATE * max(dt, self._period) + MAX_JUMP:
             self._restart("orientation jumped")
+        self._quaternion = quaternion
         self._uncertainty.report(dt)
         self._agreement.check_reported(dt, up, force)
         return quaternion
@@ -150,34 +154,31 @@ class TrunkEstimator:
         imu_checks.check_living(force, self._force)
         dt = self._step(sample, rate + force, None if is_saturated or is_cut else self._quaternion)
         last = self._rates[-1] if self._rates else rate
-        change, repeated, uncertainty = math.dist(rate, last), self._equal.duration, self._uncertainty
-        if is_saturated or repeated or change * dt > JUMP or uncertainty.run or dt > GAP * uncertainty.period:
-            unknown = OVERSHOOT * self._fastest if is_saturated else 0.0
-            if uncertainty.miss(dt, change, unknown, repeated):
-                self._restart("too much rotation was not measured")
-        quaternion = self._fusion.advance(dt, rate, last, None if is_cut else force)
-        self._rates.append(rate)
+        unknown = OVERSHOOT * self._fastest if is_saturated else 0.0
+        if self._uncertainty.miss(dt, math.dist(rate, last), unknown, self._equal.duration):
+            self._restart("too much rotation was not measured")
         self._force = None if is_cut else force
+        quaternion = self._quaternion = self._fusion.advance(dt, rate, last, self._force)
+        self._rates.append(rate)
         if not is_cut:
-            self._forces.append(force)
-        if self._time - self._judged >= CHECK_PERIOD:
-            self._judge(quaternion, self._fusion.bias_sigma)
+            self._total, self._count = plus(self._total, force), self._count + 1
+        if self._time - self._judged >= (CHECK_PERIOD if math.hypot(*rate) < FAST else FAST_PERIOD):
+            self._judge(quaternion, force, self._fusion.bias_sigma)
         return quaternion
 
-    def _judge(self, quaternion: Quaternion, bias_sigma: float) -> None:
+    def _judge(self, quaternion: Quaternion, force: Floats3, bias_sigma: float) -> None:
         """Judge what the samples since the last judgement tell together."""
         dt, rates, agreement = self._time - self._judged, self._rates, self._agreement
-        first, middle, rate, count = rates[0], rates[len(rates) // 2], rates[-1], len(self._forces)
-        spin_up, speed = (math.dist(first, middle) + math.dist(middle, rate)) / dt, math.dist(rate, ZERO)
-        if count:
-            x, y, z = map(sum, zip(*self._forces, strict=True))
-            one = count * STANDARD_GRAVITY
-            last = math.dist(self._forces[-1], ZERO) / STANDARD_GRAVITY
-            agreement.check(dt, quaternion, (x / one, y / one, z / one), last, spin_up + speed * speed)
+        first, middle, rate = rates[0], rates[len(rates) // 2], rates[-1]
+        spin_up, speed = (math.dist(first, middle) + math.dist(middle, rate)) / dt, math.hypot(*rate)
+        if self._count:
+            share, length = 1.0 / (self._count * STANDARD_GRAVITY), math.hypot(*force) / STANDARD_GRAVITY
+            x, y, z = self._total
+            agreement.check(dt, quaternion, (share * x, share * y, share * z), length, spin_up + speed * speed)
         self._speed = max(sum(map(abs, rate)), self._speed * (1.0 - dt))
         contradiction = agreement.contradiction + self._speed * self._clock.offset
         self._uncertainty.advance(dt, len(rates) - 1, spin_up, bias_sigma, agreement.square, contradiction)
-        self._judged, self._rates, self._forces = self._time, [rate], []
+        self._judged, self._rates, self._total, self._count = self._time, [rate], (0.0, 0.0, 0.0), 0
 
     def _step(self, sample: ImuSample, values: tuple[float, ...], quaternion: Quaternion | None) -> float:
         """Return the time in s since the last sample, 0 if the estimate begins with this one; check both."""
@@ -201,7 +202,8 @@ class TrunkEstimator:
         self._agreement = imu_checks.Agreement(is_suspect or self._agreement.is_suspect)
         self._why = why  # there is no orientation yet
         self._quaternion = self._force = None
-        self._rates, self._forces, self._judged, self._speed = [], [], self._time, 0.0
+        self._judged, self._speed = self._time, 0.0
+        self._rates, self._total, self._count = [], (0.0, 0.0, 0.0), 0
 
 
 class VqfFusion:
@@ -216,15 +218,16 @@ class VqfFusion:
     def __init__(self, period: float) -> None:
         """Create a fusion for samples that are usually `period` s apart."""
         self._period = self._due = period  # s; for which the accelerometer has not been passed on
-        self._vqf = VQF(period)
-        self._rate, self._force = np.zeros(3), np.zeros(3)  # reused
-        self._count = 0
-        self._read_bias()
+        self._vqf, self._count = VQF(period), 0
+        self._values = np.zeros(6)  # of gyroscope and accelerometer, reused
+        self._rate, self._force = self._values[:3], self._values[3:]
+        self.bias = np.zeros(3)  #: rad/s
 
     def restart(self) -> None:
         """Forget the orientation, keep the bias."""
+        bias, sigma = self._vqf.getBiasEstimate()
         self._vqf.resetState()
-        self._vqf.setBiasEstimate(np.array(self.bias), self.bias_sigma)
+        self._vqf.setBiasEstimate(bias, sigma)
         self._due = self._period
 
     def advance(self, dt: float, rate: Floats3, last_rate: Floats3, acceleration: Floats3 | None) -> Quaternion:
@@ -233,27 +236,24 @@ class VqfFusion:
         rate, last_rate: of this sample and the last one, each of the period that it ends; over several periods those
         between the two are interpolated. acceleration: None if it is not known.
         """
-        vqf, periods, scaled, force = self._vqf, dt / self._period, self._rate, self._force
-        (x, y, z), (a, b, c) = rate, self.bias
+        vqf, period = self._vqf, self._period
+        if not self._count % BIAS_INTERVAL:
+            self.bias, self.bias_sigma = vqf.getBiasEstimate()
+            self._bias = self.bias.tolist()
+        self._count += 1
+        periods = dt / period
+        (x, y, z), (a, b, c) = rate, self._bias
         if periods > 1.001:
             x, y, z = plus(rate, plus(last_rate, rate, -1.0), 0.5 - 0.5 / periods)
-        scaled[0], scaled[1], scaled[2] = a + periods * (x - a), b + periods * (y - b), c + periods * (z - c)
-        count = round((self._due + dt) / self._period)
-        self._due += dt - count * self._period
+        turn = a + periods * (x - a), b + periods * (y - b), c + periods * (z - c)
+        PACK(self._values, 0, *turn, *(acceleration or turn))
+        count = round((self._due + dt) / period)
+        self._due += dt - count * period
         if acceleration and count:
-            force[0], force[1], force[2] = acceleration
-            vqf.update(scaled, force)
+            vqf.update(self._rate, self._force)
             for _ in range(1, count):
-                vqf.updateAcc(force)
+                vqf.updateAcc(self._force)
         else:
-            vqf.updateGyr(scaled)
-        self._count += 1
-        if self._count % BIAS_INTERVAL == 0:
-            self._read_bias()
+            vqf.updateGyr(self._rate)
         w, x, y, z = vqf.getQuat6D().tolist()
         return x, y, z, w
-
-    def _read_bias(self) -> None:
-        """Read the gyroscope's bias, (3,) rad/s, and its standard deviation."""
-        bias, self.bias_sigma = self._vqf.getBiasEstimate()
-        self.bias: Floats3 = tuple(bias.tolist())

@@ -6,11 +6,13 @@ motion; every published tilt is judged by the true one.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from bench.imu_trials import read_trials
 from exo_gravity.core.errors import ParameterError
@@ -21,6 +23,7 @@ from ..support.imu_faults import (
     G,
     Motion,
     bowing_and_walking,
+    bowing_trunk,
     follow,
     lost,
     second_publisher,
@@ -58,11 +61,13 @@ FAULTS = {
 # in s for which a wrong tilt is published until the fault has been told from movement.
 TOLD_BY_MOTION = {
     "gyroscope reversed": (values(np.negative), 0.05),
-    "gyroscope x reversed": (values(lambda w: w * (-1, 1, 1)), 0.2),
+    "gyroscope x reversed": (values(lambda w: w * (-1, 1, 1)), 0.1),
     "gyroscope y reversed": (values(lambda w: w * (1, -1, 1)), 0.05),
     "gyroscope x and y swapped": (values(lambda w: w[:, [1, 0, 2]]), 1.0),
     "gyroscope y and z swapped": (values(lambda w: w[:, [0, 2, 1]]), 2.0),
-    "gyroscope x and z swapped": (values(lambda w: w[:, [2, 1, 0]]), 2.6),
+    "gyroscope x and z swapped": (values(lambda w: w[:, [2, 1, 0]]), 2.2),
+    "gyroscope of half the scale": (values(lambda w: 0.5 * w), 0.7),
+    "gyroscope of twice the scale": (values(lambda w: 2.0 * w), 0.8),
 }
 
 
@@ -95,6 +100,22 @@ def test_a_wrong_axis_or_sign_is_named_within_a_few_bows(fault):
     assert motion.times[named[0]] < STILL_TIME + 4.0
     assert wrong_time(motion, outcome) <= longest
     assert np.isfinite(outcome.errors[motion.times > STILL_TIME]).mean() < 0.35
+
+
+def test_a_gyroscope_that_turns_to_degrees_amid_the_motion_is_named_within_the_next_samples():
+    for start in (600, 900):
+        outcome = follow(values(np.degrees)(MOTION, start))
+        assert any(outcome.refusals[start : start + 7])
+
+
+@pytest.mark.parametrize("turn", [30.0, 90.0, 180.0])
+def test_a_wrong_reported_orientation_is_never_used_also_while_the_trunk_moves(turn):
+    estimator = TrunkEstimator((0.0, 0.0, 0.0, 1.0))
+    reported = Rotation.from_euler("xyz", bowing_trunk(MOTION.times)) * Rotation.from_euler("y", turn, degrees=True)
+    rows = (MOTION.times, MOTION.gyroscope, MOTION.accelerometer, reported.as_quat())
+    for row in zip(*(column.tolist() for column in rows), strict=True):
+        with contextlib.suppress(ParameterError):
+            assert estimator.update(ImuSample(*row)) is None
 
 
 def test_3_percent_of_the_samples_lost_cost_nothing():

@@ -14,6 +14,17 @@ Quaternion = tuple[float, float, float, float]
 ZERO: Floats3 = (0.0, 0.0, 0.0)
 
 
+def three_floats(name: str, values: Vector | None) -> Floats3:
+    """Return `values` as 3 finite floats, or raise ParameterError that names them."""
+    try:
+        x, y, z = map(float, values)  # type: ignore[arg-type]  # None is one of the wrong values
+        if -math.inf < x + y + z < math.inf:
+            return x, y, z
+    except (TypeError, ValueError):
+        pass
+    raise ParameterError(name, values, "3 finite numbers")
+
+
 def unit_quaternion(name: str, values: Vector | None) -> Quaternion:
     """Return `values` as a unit quaternion.
 

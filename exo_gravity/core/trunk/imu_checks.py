@@ -1,19 +1,17 @@
 """What no working IMU does: exceed its ranges, repeat values, contradict gravity or itself, run by a wrong clock.
 
-A value at the end of the sensor's range is saturated: the true one is not known, only its sign. One beyond the range
-cannot come from the sensor: a unit or a parameter is wrong. While a person moves, the accelerometer also measures the
-movement. So each check against it waits until a movement cannot be the reason. The limits were set on the trials of
-docs/imu.md.
+A value at the end of the sensor's range is saturated: only its sign is known. One beyond the range cannot come from
+the sensor: a unit or a parameter is wrong. While a person moves, the accelerometer also measures the movement, so each
+check against it waits until a movement cannot be the reason. The limits were set on the trials of docs/imu.md.
 """
 
 import math
 from collections.abc import Sequence
-from operator import eq
 from typing import NamedTuple
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.rotation import ZERO, Floats3, Quaternion, dot, plus, rotated, up_in_body
+from exo_gravity.core.model.rotation import ZERO, Floats3, Quaternion, dot, plus, rotated, three_floats, up_in_body
 
 # The usual widest ranges of a MEMS sensor, and those that any sensor may have.
 GYROSCOPE_RANGE, GYROSCOPE_RANGES = 34.9, (1.0, 200.0)  # rad/s; 2000 deg/s
@@ -36,17 +34,17 @@ CONTRADICTION_TIME = 0.5  # s; less than the time to settle, so that a wrong ori
 TURN_TIME = 1.0  # s over which the two turns are compared
 CLEAR_TURN = 0.04  # of a unit vector: 2.3 degrees
 CLEAR = 6.0  # times the deviation from 1 g, that a turn must also exceed
-UNLIKE, ALIKE = 0.6, 0.3  # share of the gyroscope's turn by which the two differ, with other axes or sign, or without
-LEVER, MOST = 0.38 / STANDARD_GRAVITY, 0.3  # s^2: m from the axis of a turn to the IMU, per 1 g; 1 g, at most
-PATIENCE = 0.0095  # s 1 g: the velocity that a movement may add beyond this; 0.009 in ordinary motion
-NOTICE = 0.0006  # s 1 g, by which the two differ fully
+UNLIKE, ALIKE = 0.55, 0.3  # share of the gyroscope's turn by which the two differ, with other axes or sign, or without
+LEVER, MOST = 0.42 / STANDARD_GRAVITY, 0.3  # s^2: m from the axis of a turn to the IMU, per 1 g; 1 g, at most
+PATIENCE = 0.009  # s 1 g: the velocity that a movement may add beyond this; at most 0.0082 in 30 of 32 random days
+NOTICE = 0.0003  # s 1 g, by which the two differ fully
 FORGET_TIME = 2.0  # s
 AGREEMENT_TIME = 0.6  # s of like turns
 AT_REST, REST_TIME = 0.03, 3.0  # share of 1 g; s: at rest the estimate is right whatever the gyroscope measures
 
 AVERAGE_TIME, LEAST_TIME = 2.0, 0.5  # s of samples whose mean is gravity; fewer are not judged
 OFFSET = 0.04  # share of 1 g: bias and scale of an accelerometer that was never calibrated
-WALK = 0.75 / STANDARD_GRAVITY  # s: m/s, per 1 g; 0.45 m/s is needed for an IMU swung in a circle by hand
+WALK = 0.67 / STANDARD_GRAVITY  # s: m/s, per 1 g; 0.45 m/s is needed for an IMU swung in a circle by hand
 DIRECTION_TIME = 0.3  # s for which a movement keeps its direction
 UPWARD = (0.0, 0.0, 1.0)
 
@@ -67,31 +65,22 @@ class Contradiction(ParameterError):
     """The samples contradict each other: the estimate begins anew once gyroscope and accelerometer agree on a turn."""
 
 
-def three_floats(name: str, values: Sequence[float] | None) -> Floats3:
-    """Return `values` as 3 finite floats, or raise ParameterError that names them."""
-    try:
-        x, y, z = map(float, values)  # type: ignore[arg-type]  # None is one of the wrong values
-        if -math.inf < x + y + z < math.inf:
-            return x, y, z
-    except (TypeError, ValueError):
-        pass
-    raise ParameterError(name, values, "3 finite numbers")
-
-
 def in_range(name: str, values: Sequence[float] | None, limit: float) -> tuple[Floats3, bool]:
     """Return `values` as 3 floats, and whether one is saturated; raise ParameterError if one is beyond `limit`."""
     vector = x, y, z = three_floats(name, values)
-    largest = max(abs(x), abs(y), abs(z))
-    if largest > BEYOND * limit:
+    end = SATURATED * limit
+    if -end < x < end and -end < y < end and -end < z < end:
+        return vector, False
+    if max(map(abs, vector)) > BEYOND * limit:
         raise ParameterError(name, vector, f"at most {RANGES[name]} = {limit:.4g} (is its unit right?)")
-    return vector, largest >= SATURATED * limit
+    return vector, True
 
 
 def check_living(acceleration: Floats3, last: Floats3 | None) -> None:
     """Raise ParameterError for an accelerometer that is dead, or in g; last: the acceleration before, None at first."""
     if math.dist(acceleration, ZERO) < ALMOST_NOTHING:
-        in_si = [STANDARD_GRAVITY * value for value in acceleration]
-        if max(map(abs, acceleration)) < DEAD or (last and math.dist(in_si, last) < SAME * STANDARD_GRAVITY):
+        is_dead, in_si = max(map(abs, acceleration)) < DEAD, plus(ZERO, acceleration, STANDARD_GRAVITY)
+        if is_dead or (last and math.dist(in_si, last) < SAME * STANDARD_GRAVITY):
             raise ParameterError("linear_acceleration", acceleration, "in m/s^2, not in g, and not dead")
 
 
@@ -114,29 +103,32 @@ class EqualValues:
         quaternion: the estimate at the last sample, world from IMU; None if an axis cannot be judged by it.
         """
         last, self._values = self._values, values
-        if not any(map(eq, values, last)):
+        u, v, w, x, y, z = values
+        if u != last[0] and v != last[1] and w != last[2] and x != last[3] and y != last[4] and z != last[5]:
             self._since, self.duration, self._repeats = time, 0.0, NO_REPEATS
             return
-        counts = zip(map(eq, values, last), self._repeats, strict=True)
-        repeats = self._repeats = tuple([same * (count + 1) for same, count in counts])
-        least, axis = min(repeats), repeats.index(max(repeats))
-        self._since = self._since if least else time
-        self.duration = time - self._since
-        if least + 1 >= FROZEN_SAMPLES and self.duration >= FROZEN_TIME and any(values):
-            expected = "different from sample to sample, as noise makes them: the IMU or its driver is frozen"
-            raise ParameterError("angular_velocity and linear_acceleration", list(values), expected)
-        if least or repeats[axis] < STUCK_SAMPLES or not quaternion:
+        counts = zip(values, last, self._repeats, strict=True)
+        repeats = self._repeats = tuple([count + 1 if value == before else 0 for value, before, count in counts])
+        if all(repeats):
+            self.duration = time - self._since
+            if min(repeats) + 1 >= FROZEN_SAMPLES and self.duration >= FROZEN_TIME and any(values):
+                expected = "different from sample to sample, as noise makes them: the IMU or its driver is frozen"
+                raise ParameterError("angular_velocity and linear_acceleration", list(values), expected)
             return
-        up, (x, y, z) = up_in_body(quaternion), [value / STANDARD_GRAVITY for value in values[3:]]
-        norm = math.hypot(x, y, z)
-        if axis >= 3:
-            name, is_stuck = "linear_acceleration", abs((x, y, z)[axis - 3] - up[axis - 3]) > STUCK_TURN
-        else:
-            turn = math.dist(up, (x / norm, y / norm, z / norm))
-            name, is_stuck = "angular_velocity", turn > TURN and abs(norm - 1.0) < NEAR_GRAVITY
-        if is_stuck:
+        self._since, self.duration, axis = time, 0.0, repeats.index(max(repeats))
+        if repeats[axis] >= STUCK_SAMPLES and quaternion and _turned(axis, up_in_body(quaternion), (x, y, z)):
+            name, shown = ("angular_velocity", values[:3]) if axis < 3 else ("linear_acceleration", values[3:])
             expected = f"different from sample to sample while the trunk turns: the {'xyz'[axis % 3]} axis is stuck"
-            raise Contradiction(name, values[axis // 3 * 3 :][:3], expected)
+            raise Contradiction(name, shown, expected)
+
+
+def _turned(axis: int, up: Floats3, acceleration: Floats3) -> bool:
+    """Return whether the accelerometer shows another gravity than the estimate: in one of its own axes, or at all."""
+    if axis >= 3:
+        return abs(acceleration[axis - 3] / STANDARD_GRAVITY - up[axis - 3]) > STUCK_TURN
+    norm = math.hypot(*acceleration)
+    apart = math.dist(up, plus(ZERO, acceleration, 1.0 / norm))
+    return apart > TURN and abs(norm / STANDARD_GRAVITY - 1.0) < NEAR_GRAVITY
 
 
 class Agreement:
@@ -153,7 +145,7 @@ class Agreement:
     contradiction = 0.0  #: rad by which the two turns differ, while they clearly do
     square = 0.0  #: of the acceleration's deviation from its mean, in shares of 1 g
     _deviation = 0.0  # of the acceleration's length from 1 g, mean over QUIET_TIME, as a share
-    _means: tuple[float, ...] = ()  # over TURN_TIME, of gravity's direction by the estimate and of the acceleration's
+    _up = _apart = ZERO  # means over TURN_TIME: gravity's direction by the estimate, and less the accelerometer's
     _unlike = 0.0  # s 1 g, by which the turns have differed
     _agreed = _rest = _contradicted = _age = 0.0  # s
     _mean = ZERO  # acceleration in the world, in 1 g
@@ -184,35 +176,30 @@ class Agreement:
         """
         self._age += dt
         self._deviation += (abs(last - 1.0) - self._deviation) * min(1.0, dt / QUIET_TIME)
-        self._check_turns(dt, up_in_body(quaternion), acceleration, swing)
         self._check_mean(dt, rotated(quaternion, acceleration))
-
-    def _check_turns(self, dt: float, up: Floats3, acceleration: Floats3, swing: float) -> None:
-        norm, share = math.hypot(*acceleration), dt / TURN_TIME
-        x, y, z = up
-        a, b, c = acceleration[0] / norm, acceleration[1] / norm, acceleration[2] / norm
-        mean_x, mean_y, mean_z, mean_a, mean_b, mean_c = self._means or (x, y, z, a, b, c)
-        x, y, z, a, b, c = x - mean_x, y - mean_y, z - mean_z, a - mean_a, b - mean_b, c - mean_c
-        mean_x, mean_y, mean_z = mean_x + share * x, mean_y + share * y, mean_z + share * z
-        self._means = mean_x, mean_y, mean_z, mean_a + share * a, mean_b + share * b, mean_c + share * c
-        turned = x, y, z
-        size, difference = math.dist(turned, ZERO), math.dist(turned, (a, b, c))
-        self.contradiction = 0.0
+        up, share = up_in_body(quaternion), dt / TURN_TIME
+        apart = plus(up, acceleration, -1.0 / math.hypot(*acceleration))
+        if self._age == dt:
+            self._up, self._apart = up, apart
+        turned, unlike = plus(up, self._up, -1.0), plus(apart, self._apart, -1.0)
+        self._up, self._apart = plus(self._up, turned, share), plus(self._apart, unlike, share)
         self._unlike -= self._unlike * dt / FORGET_TIME
-        if size <= CLEAR_TURN:
-            self._rest = self._rest + dt if self._deviation < AT_REST else 0.0
-            self.is_suspect = self.is_suspect and self._rest < REST_TIME
-            return
-        self._rest = 0.0
-        if size <= CLEAR * self._deviation:
-            return
+        self.contradiction = 0.0
+        size, difference = math.hypot(*turned), math.hypot(*unlike)
+        self._rest = self._rest + dt if size <= CLEAR_TURN and self._deviation < AT_REST else 0.0
+        if size > max(CLEAR_TURN, CLEAR * self._deviation):
+            self._compare(dt, turned, size, difference, swing)
+        if self._agreed >= AGREEMENT_TIME or self._rest >= REST_TIME:
+            self.is_suspect = False
+
+    def _compare(self, dt: float, turned: Floats3, size: float, difference: float, swing: float) -> None:
+        """Compare a clear turn, `size` of `turned`, with the accelerometer's, which differs by `difference`."""
         # Before and just after the first tilt nothing is lost by a refusal.
         explained = min(MOST, LEVER * swing) if self._age > AVERAGE_TIME else 0.0
         excess = difference - UNLIKE * size - explained
         if difference < ALIKE * size:
             self._agreed += dt
             self._unlike = max(0.0, self._unlike - 2.0 * dt * size)
-            self.is_suspect = self.is_suspect and self._agreed < AGREEMENT_TIME
         elif excess > 0.0:
             self._unlike += dt * excess
             self.contradiction = difference * self._unlike / NOTICE
@@ -227,10 +214,8 @@ class Agreement:
         self._mean = plus(self._mean, change, share)
         self.square += share * ((1.0 - share) * dot(change, change) - self.square)
         shift = math.dist(self._mean, UPWARD)
-        if shift < OFFSET or self._age < LEAST_TIME:
-            return
         limit = OFFSET + (WALK + DIRECTION_TIME * math.sqrt(self.square)) / span
-        if shift > limit:
+        if shift > limit and self._age >= LEAST_TIME:
             mean = [round(STANDARD_GRAVITY * component, 2) for component in self._mean]
             expected = f"within {STANDARD_GRAVITY * limit:.2f} m/s^2 of gravity upwards: check units, axes and signs"
             raise Contradiction("mean linear_acceleration in the world", mean, expected)

@@ -19,10 +19,9 @@ import numpy as np
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.rotation import ZERO, Floats3, acceleration_of, plus
+from exo_gravity.core.model.rotation import ZERO, Floats3, acceleration_of, plus, three_floats
 from exo_gravity.core.model.tilt import Tilt, angle_between, gravity_in_trunk
 from exo_gravity.core.numbers import Vector
-from exo_gravity.core.trunk.imu_checks import three_floats
 
 TILT_SPEED = 5.0  # rad/s, faster than a trunk can tilt
 TILT_JUMP = 0.1  # rad, by which two tilts may differ however close in time

@@ -1,12 +1,7 @@
 """The parameters of `imu`."""
 
 from exo_gravity.core.params import Param
-from exo_gravity.core.trunk.imu_checks import (
-    ACCELEROMETER_RANGE,
-    ACCELEROMETER_RANGES,
-    GYROSCOPE_RANGE,
-    GYROSCOPE_RANGES,
-)
+from exo_gravity.core.trunk import imu_checks
 
 # fmt: off
 IMU_SOURCES = ("topic", "mpu6050", "icm20948", "lsm6dsox", "witmotion", "bno085")
@@ -22,10 +17,10 @@ IMU = (
     Param("rotation_trunk_from_imu", [0.0] * 4, "mounting of the IMU, unit quaternion x, y, z, w; required",
           (-1.0, 1.0), fixed=True),
     Param("rate", 100.0, "nominal sample rate of the IMU", (20.0, 2000.0), "Hz", fixed=True),
-    Param("gyroscope_range", GYROSCOPE_RANGE, "rate at which the gyroscope saturates", GYROSCOPE_RANGES, "rad/s",
-          fixed=True),
-    Param("accelerometer_range", ACCELEROMETER_RANGE, "acceleration at which the accelerometer saturates",
-          ACCELEROMETER_RANGES, "m/s^2", fixed=True),
+    Param("gyroscope_range", imu_checks.GYROSCOPE_RANGE, "rate at which the gyroscope saturates",
+          imu_checks.GYROSCOPE_RANGES, "rad/s", fixed=True),
+    Param("accelerometer_range", imu_checks.ACCELEROMETER_RANGE, "acceleration at which the accelerometer saturates",
+          imu_checks.ACCELEROMETER_RANGES, "m/s^2", fixed=True),
     Param("timeout", 0.1, "time without IMU data that is an error", (0.02, 1.0), "s", fixed=True),
 )
 # fmt: on

@@ -25,29 +25,32 @@ USUAL_SHARE = 0.02  # by which one interval changes the usual one
 class TiltUncertainty:
     """Follows one estimate from its start, when nothing is known but the accelerometer."""
 
+    sigma = math.inf  #: of the tilt, rad
+    run = 0.0  #: rad lost in the present run of samples that did not show the rotation: their angles add up
+    _age = 0.0  # s since the start
+    _start, _rest = math.pi, math.inf  # rad, error of the start; rad^2, of all that does not add up
+    _square = 0.0  # of the angular acceleration, (rad/s^2)^2, mean over ACCELERATION_TIME
+    _lost = 0.0  # rad^2, of gaps and earlier runs
+
     def __init__(self, period: float) -> None:
         """Create it for samples that are usually `period` s apart."""
         self.period = period  #: s
-        self.sigma = math.inf  #: of the tilt, rad
-        self._age = 0.0  # s since the start
-        self._start = math.pi  # rad, error of the start
-        self._rest = math.inf  # rad^2, of what does not add up
-        self._square = 0.0  # of the angular acceleration, (rad/s^2)^2, mean over ACCELERATION_TIME
-        self._lost = 0.0  # rad^2, of gaps and of runs of samples that did not show the rotation
-        self.run = 0.0  #: rad lost in the present run, whose angles have one direction
 
     def miss(self, dt: float, change: float, unknown: float, repeated: float) -> bool:
         """Add the rotation that was not measured in `dt` s; return whether the estimate must begin anew.
 
         change: of the rate, rad/s. unknown: rad/s that the rate may have been off. repeated: s of equal samples.
         """
+        is_gap, turn = dt > GAP * self.period, change * dt
+        if not (unknown or repeated or is_gap or self.run or turn > JUMP):
+            return False
         usual, lost = math.sqrt(self._square), unknown * dt
         if repeated:
             lost = 0.5 * usual * (2.0 * repeated - dt) * dt
-        if dt > GAP * self.period:
+        if is_gap:
             self._lost += (GAP_SHARE * max(LEAST_ACCELERATION, usual) * (dt - self.period) ** 2) ** 2
-        elif change * dt > JUMP and change > UNUSUAL * usual * max(dt, 0.5 * self.period):
-            lost += change * dt
+        elif turn > JUMP and change > UNUSUAL * usual * max(dt, 0.5 * self.period):
+            lost += turn
         self.run += lost
         if not lost:
             self._lost, self.run = self._lost + self.run * self.run, 0.0
