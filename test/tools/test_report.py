@@ -372,6 +372,13 @@ def test_the_page_begins_with_verdict_subject_settings_and_criteria(changed, tmp
     assert "no joint moves more than 0.5 degrees, 2 after a push" in text
 
 
+def test_a_support_that_one_g_does_not_use_is_not_shown(held):
+    given = COMPENSATOR.replace("zero_g", "one_g")
+    assert "right: One-G, support none in One-G" in printed(
+        told(*held.bag.recordings, parameters={"/right/compensator": given})
+    )
+
+
 def fall(end, **more):
     """Return a trial of which the arm was let down at `end` s, and fell."""
     whole = made.trial(made.POSES, hold=6.0, fall_after=end)

@@ -77,12 +77,13 @@ def columns(bag: Bag, trial: str, arm: str) -> Callable[[float], dict[str, str]]
 
 def lines(bag: Bag) -> list[tuple[str, ...]]:
     """Return arm, mode, support and wearer of each arm, as text."""
-    of_arms = [(recording.name, Conditions.of(bag, recording.name)) for recording in bag.recordings]
-    percent: Callable[[Any], str] = lambda share: f"{100.0 * share:g} %"  # noqa: E731
-    return [
-        (arm, c.history("mode", lambda mode: MODES.get(mode, mode)), c.history("support", percent), c.wearer)
-        for arm, c in of_arms
-    ]
+    found: list[tuple[str, ...]] = []
+    for arm in (recording.name for recording in bag.recordings):
+        of_arm = Conditions.of(bag, arm)
+        mode = of_arm.history("mode", lambda mode: MODES.get(mode, mode))
+        support = of_arm.history("support", lambda share: f"{100.0 * share:g} %")
+        found.append((arm, mode, "none in One-G" if mode == "One-G" else support, of_arm.wearer))
+    return found
 
 
 def section(bag: Bag, criteria: HoldCriteria) -> Iterator[str]:
@@ -151,7 +152,7 @@ def _strays(recording: Recording, analysis: TrialAnalysis, criteria: HoldCriteri
         else:
             code = math.degrees(np.max(hold.drift_rate_uncertainty) * hold.duration)
             size = f" ({code:.3f} degrees)" if math.isfinite(code) else ""
-            yield False, 0.0, f"{recording.name}: in hold {number} no joint moved by one position code{size}"
+            yield False, 0.0, f"{recording.name}: no joint moved by one position code{size} in a hold"
 
 
 def _event(recording: Recording, what: str, angle: np.ndarray, speed: np.ndarray | None, bad: bool) -> Worst:
