@@ -417,6 +417,12 @@ def test_a_trial_that_ended_early_says_why(held):
     assert report.verdict[0].startswith("It held until the trial ended early: stopped by the operator. Worst: right: ")
 
 
+def test_a_trial_that_ended_before_its_first_hold_says_why_too():
+    moving = made.bag_of(made.trial(made.POSES[:1], hold=0.5))
+    text, good = analyse(moving, trouble="stopped by the operator").verdict
+    assert not good and "It did not hold. The trial ended early: stopped by the operator." in text
+
+
 def test_where_nothing_moved_the_resolution_is_stated():
     whole = made.trial(made.POSES, hold=6.0)
     codes = np.round(whole.position / made.POSITION_CODE)

@@ -56,7 +56,8 @@ class Report:
     def verdict(self) -> tuple[str, bool]:
         """The first sentences of the report, and whether they are good news: a bad event comes first."""
         event, bad = conditions.worst(self.bag, self.arms, self.criteria)
-        held = "It did not hold." if self.failures else self.held
+        early = f" The trial ended early: {self.trouble}." if self.trouble else ""
+        held = f"It did not hold.{early}" if self.failures else self.held
         otherwise = held if self.failures else f"Otherwise it {held.removeprefix('It ')}"
         text = f"{event[:1].upper()}{event[1:]}. {otherwise}" if bad else f"{held} Worst: {event}." if event else held
         return text, not (bad or self.failures)
