@@ -11,3 +11,13 @@ def packaged(name: str) -> Path | None:
     shares = (Path(prefix, "share/exo_gravity") for prefix in (*prefixes, sys.prefix))
     roots = (Path(__file__).parents[1], *shares)
     return next((path for root in roots if (path := root / "config" / name).exists()), None)
+
+
+def version() -> str:
+    """Return the version of the installed package, '' if it is not installed."""
+    from importlib import metadata  # slow to import
+
+    try:
+        return metadata.version("exo_gravity")
+    except metadata.PackageNotFoundError:
+        return ""

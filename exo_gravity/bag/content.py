@@ -1,14 +1,15 @@
 """What a recording holds: its topics, and what the reader makes of them, as plain data that needs no bag library."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.params import Param
+from exo_gravity.core.params import Param, params_of
 from exo_gravity.core.trial.recording import Recording
+from exo_gravity.core.trial.session import Session
 
 if TYPE_CHECKING:
     import pandas
@@ -18,9 +19,9 @@ STRING = "std_msgs/msg/String"
 # Of each arm, in its namespace
 STATES, COMMANDS, STEPS, ASSIST = "joint_states", "effort_commands", "wearer_step", "assist_efforts"
 # Of all
-DIAGNOSTICS, PARAMETER_EVENTS = "/diagnostics", "/parameter_events"
+DIAGNOSTICS, PARAMETER_EVENTS, MARKERS = "/diagnostics", "/parameter_events", "/event_marker"
 # Of the recorder, in the recording alone
-PARAMETERS, LOSSES = "/recorder/parameters", "/recorder/losses"
+PARAMETERS, LOSSES, SESSION = "/recorder/parameters", "/recorder/losses", "/recorder/session"
 READ = {  # type of each topic, or last part of its name, that the reader decodes
     STATES: JOINT_STATE,
     COMMANDS: JOINT_STATE,
@@ -29,6 +30,8 @@ READ = {  # type of each topic, or last part of its name, that the reader decode
     PARAMETER_EVENTS: "rcl_interfaces/msg/ParameterEvent",
     PARAMETERS: STRING,
     LOSSES: STRING,
+    SESSION: STRING,
+    MARKERS: STRING,
 }
 
 
@@ -48,10 +51,11 @@ def is_wanted(topic: str, msgtype: str) -> bool:
 
 
 class Event(NamedTuple):
-    """A fault, a warning or a changed parameter."""
+    """A marker, a fault, a warning or a changed parameter."""
 
     time: float  #: s since the start of the recording
     text: str
+    setting: tuple[str, str, Any] | None = None  #: node, name and new value of a changed parameter
 
 
 @dataclass(frozen=True)
@@ -66,6 +70,8 @@ class Bag:
     notes: tuple[str, ...]  #: missing parts that do no harm
     problems: tuple[str, ...]  #: unreadable parts, one sentence each
     is_partial: bool = False  #: whether it was cut short, or ends before its arms were down
+    session: Session = field(default_factory=Session)  #: of whom, and what for
+    markers: tuple[Event, ...] = ()  #: set by the operator or by a node
 
     def columns(self) -> dict[str, np.ndarray]:
         """Return the time series, a row for each arm, sample and joint: columns of equal length by their names.
@@ -111,4 +117,5 @@ def _columns(recording: Recording) -> dict[str, np.ndarray]:
 RECORDER = (
     Param("output", "", "new folder for the recording", fixed=True, required=True),
     Param("live", False, "print the latest state as one line of JSON, ten times a second", fixed=True),
+    *params_of(Session, fixed=True),
 )

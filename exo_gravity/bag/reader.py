@@ -20,9 +20,10 @@ from exo_gravity.bag import content
 from exo_gravity.bag.content import COMMANDS, JOINT_STATE, STATES, STEPS, Bag, Event, arm_of, leaf
 from exo_gravity.bag.joints import FIELDS, TYPES, JointArrays
 from exo_gravity.bag.storage import Storage
-from exo_gravity.core.errors import DataError
+from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trial.recording import CARRIED, Recording, ScriptedStep, Span
+from exo_gravity.core.trial.session import Session
 
 BATCH_SIZE = 5_000  # messages that are decoded at once
 MAX_COMMAND_AGE = 200_000_000  # ns; an older command is no longer in force
@@ -59,9 +60,13 @@ def read_bag(path: str | Path) -> Bag:
         raise DataError(f"{path}: {'; '.join(contents.problems)}")
     if contents.losses:
         contents.notes.append(f"the recorder lost messages: {contents.losses}")
-    events = tuple(Event((stamp - start) / 1e9, text) for stamp, text in sorted(contents.events))
+    events, markers = (
+        tuple(Event((stamp - start) / 1e9, *what) for stamp, *what in sorted(found, key=itemgetter(0, 1)))
+        for found in (contents.events, contents.markers)
+    )
     notes, problems = tuple(contents.notes), tuple(contents.problems)
-    return Bag(Path(path), start, recordings, events, contents.parameters, notes, problems, contents.is_partial)
+    of_whom = contents.is_partial, contents.session, markers
+    return Bag(Path(path), start, recordings, events, contents.parameters, notes, problems, *of_whom)
 
 
 class _Contents:
@@ -71,7 +76,9 @@ class _Contents:
         self.joints: dict[str, JointArrays] = {}
         self.parameters: dict[str, str] = {}
         self.losses = ""
-        self.events: list[tuple[int, str]] = []  # stamp and text of faults and changed parameters
+        self.session = Session()
+        self.events: list[tuple[Any, ...]] = []  # stamp, text and setting of faults and changed parameters
+        self.markers: list[tuple[int, str]] = []  # stamp and text
         self.notes: list[str] = []
         self.problems: list[str] = []
         self.is_cut = False  # the file was cut short
@@ -111,9 +118,17 @@ class _Contents:
                 self._add_status(stamp, status)
         elif topic == content.PARAMETER_EVENTS:
             for parameter in message.changed_parameters:
-                self.events.append((stamp, f"{message.node}: {parameter.name} = {_value(parameter.value)}"))
+                name, value = parameter.name, _value(parameter.value)
+                self.events.append((stamp, f"{message.node}: {name} = {value}", (message.node, name, value)))
         elif topic == content.LOSSES:
             self.losses = message.data
+        elif topic == content.MARKERS:
+            self.markers.append((stamp, message.data))
+        elif topic == content.SESSION:
+            try:
+                self.session = Session(**json.loads(message.data))
+            except (ValueError, TypeError, ParameterError):
+                raise DataError(f"{topic}: invalid session") from None
         else:
             node, _, text = message.data.partition(":")
             self.parameters[node.strip()] = f"{node}:{text}"

@@ -17,6 +17,8 @@ no page, no panel, no lease. The requests:
 {"do": "release"}                                    control
 {"do": "record"}, {"do": "stop_recording"}, {"do": "save"}
 {"do": "trial", "name": "demo"}, {"do": "stop_trial"}
+{"do": "session", "subject": "P01", "protocol": "", "note": ""}, {"do": "keep_wearer"}
+{"do": "marker", "text": "cramp"}                    every page may
 """
 
 import asyncio
@@ -27,15 +29,18 @@ from dataclasses import dataclass
 from typing import Any
 
 from exo_gravity.core.errors import ExoGravityError, ParameterError
-from exo_gravity.panel.view import SETTABLE
+from exo_gravity.panel.view import OF_SUBJECT, SETTABLE
 
 # The kinds of requests, and the keys that each has besides "do".
 KEYS: Mapping[str, frozenset[str]] = {
-    **dict.fromkeys(("take", "release", "record", "stop_recording", "save", "stop_trial"), frozenset()),
+    **dict.fromkeys(("take", "release", "record", "stop_recording", "save", "stop_trial", "keep_wearer"), frozenset()),
     **dict.fromkeys(("let_down", "enable", "clear_fault", "resume", "bring_home"), frozenset({"arm"})),
     "set": frozenset({"arm", "values"}),
     "trial": frozenset({"name"}),
+    "session": frozenset({"subject", "protocol", "note"}),
+    "marker": frozenset({"text"}),
 }
+CHANGEABLE = {**SETTABLE, **OF_SUBJECT}
 GONE = 2.0  # s without a confirmation; longer than a lease lasts, so that the next page finds the arm let down
 MAX_PAGES = 32
 BURST, REFILL = 20.0, 10.0  # requests that a page may send at once, and per second
@@ -57,9 +62,9 @@ def parse(body: Any, arms: Collection[str], trials: Collection[str]) -> dict[str
     if kind != "set":
         return dict(body)
     values = body.get("values") if isinstance(body.get("values"), dict) else {}
-    if not values or not values.keys() <= SETTABLE.keys():  # the error has no values: they may be the wearer's
-        raise ParameterError("values", list(values), f"an object with some of {', '.join(SETTABLE)}")
-    return {**body, "values": {key: SETTABLE[key].check(value) for key, value in values.items()}}
+    if not values or not values.keys() <= CHANGEABLE.keys():  # the error has no values: they may be the wearer's
+        raise ParameterError("values", list(values), f"an object with some of {', '.join(CHANGEABLE)}")
+    return {**body, "values": {key: CHANGEABLE[key].check(value) for key, value in values.items()}}
 
 
 def sentence(request: Mapping[str, Any]) -> str:
@@ -156,7 +161,7 @@ class Control:
                 return (403, "unknown page: reload it")
             if not self._spend(page):
                 return (429, "too many requests: wait a moment")
-            if kind != "take" and page is not self.holder:
+            if kind not in ("take", "marker") and page is not self.holder:
                 return self._refused(page, 403, f"{text}: another page holds control")
             if arm and (other := self.arms.other_holder(arm, str(page))):
                 return self._refused(page, 403, f"{text}: {other} holds control of this arm")
@@ -180,7 +185,7 @@ class Control:
             return ""
         if arm:
             return str(await self.arms.ask(kind, arm, request.get("values", {})))
-        return str(await getattr(self.files, kind)(*filter(None, (request.get("name"),))))
+        return str(await getattr(self.files, kind)(**{key: request.get(key, "") for key in KEYS[kind]}))
 
     async def _let_down(self, arms: Collection[str]) -> str:
         """Let the arms down all at once: none waits for another."""

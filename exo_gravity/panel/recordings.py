@@ -1,4 +1,4 @@
-"""Recordings, trials and saved parameters, each in a new folder below `output`.
+"""Recordings, trials and saved parameters, each in a new folder below `output`, of the present session.
 
 A recording is made by the package's `recorder`, a trial by its command `trial --attach`: processes, which this module
 starts, follows and ends. A simulated device's virtual wearer or a person performs the script of a trial. It starts with
@@ -22,16 +22,18 @@ import yaml
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.panel.sessions import Sessions
 
 STOP_TIMEOUT = 10.0  # s for a recorder to end
 
 
-class Recordings:
+class Recordings(Sessions):
     """`files` of `exo_gravity.panel.control.Control`.
 
     device: the arms. It has `parameters()` of every node by full name, `states()` of each arm (None if its bridge is
-    silent), and a coroutine function `perform(path)` that lets the virtual wearers perform a script, and returns '' or
-    why not. note: called with a sentence for the log. clock: monotonic s.
+    silent), `mark(text)`, which publishes a marker, and a coroutine function `perform(path)` that lets the virtual
+    wearers perform a script, '' for none; both return '' or why not. note: called with a sentence for the log. clock:
+    monotonic s.
     """
 
     def __init__(
@@ -39,8 +41,7 @@ class Recordings:
     ) -> None:
         #: the scripts to choose from, by name
         self.trials = {path.stem: path for path in sorted(scripts.glob("*.yaml"))} if scripts else {}
-        self._output = Path(output).expanduser().resolve()
-        self._device = device
+        super().__init__(output, device)
         self._note = note
         self._clock = clock
         self._recorder: asyncio.subprocess.Process | None = None
@@ -49,7 +50,6 @@ class Recordings:
         self._trial: asyncio.subprocess.Process | None = None
         self._following: asyncio.Task[None] | None = None
         self._progress: dict[str, Any] = {"phase": "none"}
-        self._reports: dict[str, Path] = {}
         self._saved = ""
 
     def state(self) -> dict[str, Any]:
@@ -61,12 +61,7 @@ class Recordings:
             "folder": str(self._folder or "") if is_on else "",
             "seconds": round(self._clock() - self._began) if is_on else 0,
         }
-        return {"recording": recording, "trial": self._progress, "saved": self._saved}
-
-    def report(self, name: str) -> Path | None:
-        """Return the report of a trial of this session."""
-        path = self._reports.get(name)
-        return path if path and path.is_file() else None
+        return {"recording": recording, "trial": self._progress, "saved": self._saved, "session": self.shown()}
 
     def close(self) -> None:
         """End the recording and the trial."""
@@ -81,10 +76,12 @@ class Recordings:
         try:
             folder = self._new_folder("recording")
             log = (folder / "recorder.log").open("wb")
+            values = {"output": str(folder / "bag"), **self.present}
+            (folder / "params.yaml").write_text(yaml.safe_dump({"/recorder": {"ros__parameters": values}}), "utf-8")
         except OSError as error:
-            return f"{self._output}: {error.strerror}"
+            return f"{self.output}: {error.strerror}"
         remaps = ("-r", "__node:=recorder", "-r", "__ns:=/", "--enclave", "/recorder")
-        words = command("nodes.recorder.node", "--ros-args", *remaps, "-p", f"output:={folder / 'bag'}")
+        words = command("nodes.recorder.node", "--ros-args", *remaps, "--params-file", str(folder / "params.yaml"))
         # It watches its standard input, and ends the recording well if the panel dies.
         environment = {**os.environ, "EXO_GRAVITY_SUPERVISED": "1"}
         with log:
@@ -121,7 +118,7 @@ class Recordings:
             folder = self._new_folder("parameters")
             (folder / "params.yaml").write_text(text, encoding="utf-8")
         except OSError as error:
-            return f"{self._output}: {error.strerror}"
+            return f"{self.output}: {error.strerror}"
         self._saved = str(folder / "params.yaml")
         return ""
 
@@ -140,8 +137,8 @@ class Recordings:
         if problem := self._occupied():
             return problem
         guided = not any(node.endswith("/simulator") for node in self._device.parameters())
-        attach = ("--attach", "guided" if guided else "simulated", "--output", str(self._output))
-        words = command("tools.trial", str(path), *attach)
+        attach = ("--attach", "guided" if guided else "simulated", "--output", str(self.output))
+        words = command("tools.trial", str(path), *attach, *(f"--{key}={text}" for key, text in self.present.items()))
         self._trial = await asyncio.create_subprocess_exec(
             *words, stdin=DEVNULL, stdout=PIPE, stderr=PIPE, start_new_session=True
         )
@@ -159,10 +156,10 @@ class Recordings:
         return ""
 
     async def _follow(self, trial: asyncio.subprocess.Process, script: str) -> None:
-        """Follow the trial's lines to its report; the virtual wearers perform `script`, '' for none."""
+        """Follow the trial's lines to its report; the virtual wearers perform `script`, '' for none, until it ends."""
         assert trial.stdout and trial.stderr
         errors = asyncio.create_task(trial.stderr.read())
-        refused = ""
+        refused, performs = "", False
         async for line in trial.stdout:
             news = json.loads(line)
             self._progress = {**self._progress, **news}
@@ -171,15 +168,19 @@ class Recordings:
             elif script and "step" in news:  # the recorder records
                 if refused := await self._device.perform(script):
                     trial.terminate()
-                script = ""
+                script, performs = "", True
+            elif performs and ("phase" in news or set(self._device.states().values()) != {State.ACTIVE.value}):
+                await self._device.perform("")
+                performs = False
+        if performs:  # the trial was killed
+            await self._device.perform("")
         lines = (await errors).decode(errors="replace").strip().splitlines()
         failed = await trial.wait() not in (0, 1)
         name, problem = self._progress["name"], refused or self._progress.get("problem", "")
         problem = problem or (lines[-1] if failed and lines else "")
         key = ""
         if self._folder and (self._folder / "report.html").is_file():
-            key = self._folder.name
-            self._reports[key] = self._folder / "report.html"
+            key = self._folder.relative_to(self.output).as_posix()
         self._progress = {"phase": "done", "name": name, "problem": problem, "report": key}
         self._note(f"trial {name} has ended: {problem or 'done'}")
 
@@ -199,7 +200,7 @@ class Recordings:
         """Create and return a folder with a new name. Raises OSError."""
         stem = f"{name}_{datetime.now():%Y%m%d_%H%M%S}"
         for number in itertools.count(1):
-            folder = self._output / (stem if number == 1 else f"{stem}_{number}")
+            folder = self.folder / (stem if number == 1 else f"{stem}_{number}")
             with contextlib.suppress(FileExistsError):
                 folder.mkdir(parents=True)
                 break

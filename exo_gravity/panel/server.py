@@ -4,7 +4,7 @@ It runs uvicorn on a separate thread. A page that is slow or asleep gets the new
 up.
 
     GET  /               the page            GET /static/...   its files       GET /strings     its texts
-    GET  /parameters     those in force
+    GET  /parameters     those in force    GET /sessions       subjects, and past recordings
     POST /action         `control.py`        GET /report/NAME  a trial's report
     WS   /live           from the page: {"page": secret, or ""}, then {"seen": number of a state} for every few states
                          to the page: {"type": "page"}, {"type": "setup"}, {"type": "state"}
@@ -49,7 +49,8 @@ class PanelServer:
             Route("/", lambda request: FileResponse(FOLDER / "static" / "index.html")),
             Route("/strings", lambda request: FileResponse(FOLDER / "strings.json")),
             Route("/action", self._on_action, methods=["POST"]),
-            Route("/report/{name}", self._on_report),
+            Route("/report/{name:path}", self._on_report),
+            Route("/sessions", lambda request: JSONResponse(control.files.past())),
             Route("/parameters", lambda request: JSONResponse(control.arms.parameters())),
             WebSocketRoute("/live", self._on_live),
             Route("/login", self._on_login, methods=["GET", "POST"]),

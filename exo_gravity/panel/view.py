@@ -27,6 +27,8 @@ PANEL = (
 # What the page may change on a compensator. Every limit stays with the compensator and the bridge.
 LOAD = ("mode", "wearer.body_mass", "wearer.sex", "wearer.segment_length", "support")
 SETTABLE = {param.name: param for param in COMPENSATOR if param.name in LOAD}
+# What belongs to a subject: in the wearer's file, and set by the page together with the wearer's data.
+OF_SUBJECT = {p.name: p for p in COMPENSATOR if p.name in (*LOAD[1:4], "limits.range")}
 
 Values = Mapping[str, Any]
 NUMBERS = ("position", "velocity", "effort")

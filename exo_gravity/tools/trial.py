@@ -18,15 +18,19 @@ import math
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import yaml
 
+from exo_gravity import version
 from exo_gravity.core.errors import DataError, ExoGravityError, ParameterError
+from exo_gravity.core.params import params_of
 from exo_gravity.core.trial.analysis import MIN_HOLD, HoldCriteria
 from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.core.trial.session import Session
 from exo_gravity.tools.cli import extras
 from exo_gravity.tools.inputs.parameter_file import packaged_config
 from exo_gravity.tools.launcher import Stopping, stop_on_signals
@@ -103,8 +107,9 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
     from exo_gravity.tools.trials.run import ADVICE, BUSY_CODE, TrialEnd, is_guided, prepare, run_attempts
 
     path, script = read_script(options.name)
+    session, now = Session(options.subject, options.protocol, options.note), datetime.now()
     stopped = stop_on_signals()
-    folder = Path(options.output).resolve() / f"{script.name}_{datetime.now():%Y%m%d_%H%M%S}"
+    folder = Path(options.output).resolve() / session.folder(now) / f"{script.name}_{now:%Y%m%d_%H%M%S}"
     guided = options.attach == "guided" if options.attach else is_guided(params)
     bag: Bag | None = None
     if options.offline:
@@ -113,13 +118,14 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
         with extras("trial", "sim"):
             from exo_gravity.tools.trials.offline import run_offline, simulated_trials
         trials = simulated_trials(params, script)
-        bag, trouble = run_offline(trials, prepare(params, path, folder, recorded=False), console, stopped.is_set)
+        bag, trouble = run_offline(trials, prepare(params, path, folder, None), console, stopped.is_set)
+        bag = replace(bag, session=replace(session, version=version()))
         end = TrialEnd(trouble, int(bool(trouble)))
     else:
         if options.attach:
-            end = _attached(guided, path, script, folder, console, stopped)
+            end = _attached(guided, path, script, folder, session, console, stopped)
         else:
-            end = run_attempts(params, path, script, folder, console, stopped)
+            end = run_attempts(params, path, script, folder, session, console, stopped)
         try:
             bag = read_bag(folder / "bag")
         except DataError:
@@ -127,7 +133,7 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
                 raise
     trouble, code = end.trouble, end.code
     if bag is not None:
-        report = trial_report.analyse(bag, criteria_for(script), shortest_hold(script, guided))
+        report = trial_report.analyse(bag, criteria_for(script), shortest_hold(script, guided), trouble)
         if guided and not trouble:
             trouble = missing_holds(script, report)
             code = int(bool(trouble))
@@ -137,6 +143,8 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
         code = code or report.exit_code
         if clip:
             video.write(bag, clip, console)
+    else:
+        trial_report.write_empty(folder, script.name, trouble)
     contents = "Report and parameters" if options.offline else "Report, recording, log and parameters"
     console.print(f"{contents}: {folder}", markup=False, soft_wrap=True)
     if end.trouble and end.busy and code != 2:
@@ -149,13 +157,19 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
 
 
 def _attached(
-    guided: bool, path: Path, script: TrialScript, folder: Path, console: "Console", stopped: Stopping
+    guided: bool,
+    path: Path,
+    script: TrialScript,
+    folder: Path,
+    session: Session,
+    console: "Console",
+    stopped: Stopping,
 ) -> "TrialEnd":
     """Run the script on arms that are carried already; a fault is then never excused by a busy computer."""
     from exo_gravity.tools.trials.run import TrialEnd, prepare, run_nodes
     from exo_gravity.tools.trials.screen import LEAD, TrialScreen
 
-    params = prepare(None, path, folder, recorded=True)
+    params = prepare(None, path, folder, session)
     _print_json(folder=str(folder))
     # The clock leads, because a simulator's newest step may be that of an earlier trial.
     screen = TrialScreen(
@@ -168,7 +182,10 @@ def _attached(
 
 
 def _print_json(**values: object) -> None:
-    print(json.dumps(values), flush=True)
+    try:
+        print(json.dumps(values), flush=True)
+    except BrokenPipeError:  # the panel has died: the trial goes on, and is reported
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
@@ -179,6 +196,8 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     option("--output", metavar="DIR", default="trials", help="where to create the trial's folder (%(default)s)")
     option("--offline", action="store_true", help="on the simulated device, without ROS and faster than real time")
     attach = "on arms that are carried already, a person or a simulator moving them; prints JSON"
+    for param in params_of(Session):
+        option(f"--{param.name}", metavar="TEXT", default="", help=param.description)
     option("--attach", choices=("guided", "simulated"), help=attach)
     video.add_arguments(parser)
     return parser.parse_args(args)

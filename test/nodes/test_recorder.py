@@ -24,7 +24,9 @@ from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
+from exo_gravity import version
 from exo_gravity.bag.reader import read_bag
+from exo_gravity.core.trial.session import Session
 from exo_gravity.nodes.recorder.node import LiveLine
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 
@@ -57,6 +59,7 @@ class PublishingArm:
         self.imu = create(Imu, "/imu/data_raw", qos_profile_sensor_data)
         self.faults = create(DiagnosticArray, "/diagnostics", 10)
         self.steps = create(String, "wearer_step", LATCHED)
+        self.markers = create(String, "/event_marker", 10)
         self.other = create(String, "chatter", 10)
 
     def close(self):
@@ -73,7 +76,7 @@ class PublishingArm:
 
     def is_recorded(self):
         """Return whether every topic that is to be recorded has a subscriber."""
-        publishers = (self.states, self.efforts, self.assist, self.imu, self.faults, self.steps)
+        publishers = (self.states, self.efforts, self.assist, self.imu, self.faults, self.steps, self.markers)
         return all(publisher.get_subscription_count() for publisher in publishers)
 
     def publish(self, k):
@@ -103,13 +106,15 @@ def session(tmp_path_factory):
     path = tmp_path_factory.mktemp("recorder") / "bag"
     arm = PublishingArm()
     arm.steps.publish(String(data=json.dumps({"step": 0, "action": "hold", "duration": 9.0})))
-    process = start(path, "-p", "live:=true")
+    of_whom = ("-p", "subject:=P01", "-p", "protocol:=pilot", "-p", "note:='second: visit'")
+    process = start(path, "-p", "live:=true", *of_whom)
     try:
         arm.wait_until(arm.is_recorded)
         known = arm.node.get_publishers_info_by_topic("/right/joint_states")[0]
         for k in range(COUNT):
             arm.publish(k)
         status = DiagnosticStatus(level=DiagnosticStatus.ERROR, name="right/bridge", message="motor 2 is silent")
+        arm.markers.publish(String(data="cramp"))
         arm.faults.publish(DiagnosticArray(status=[status]))
         arm.node.set_parameters([Parameter("support", value=0.5)])
         lines = []
@@ -178,6 +183,19 @@ def test_the_initial_parameters_are_recorded_as_a_parameter_file(session):
 
 def test_a_parameter_change_is_recorded_as_an_event(session):
     assert "/right/bridge: support = 0.5" in [event.text for event in read_bag(session[0]).events]
+
+
+def test_the_session_and_the_markers_are_messages_of_the_recording(session):
+    bag = read_bag(session[0])
+    assert bag.session == Session("P01", "pilot", "second: visit", version())
+    assert [marker.text for marker in bag.markers] == ["cramp"]
+    assert 0.0 < bag.markers[0].time <= bag.recordings[0].time[-1] + 1.0
+
+
+def test_a_name_as_the_subjects_code_ends_the_recorder_with_2(tmp_path):
+    process = start(tmp_path / "bag", "-p", "subject:='Anna Meier'")
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 2 and "must be a code" in errors and not (tmp_path / "bag").exists()
 
 
 def test_a_live_line_has_joints_step_and_faults(session):

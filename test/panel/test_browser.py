@@ -275,3 +275,71 @@ def test_recording_trial_wearer_and_parameters_are_asked_for(visit, stage):
     assert stage.files.calls == ["record", "stop_recording", "trial two_poses", "save"]
     assert [stage.arms.settings[arm]["wearer.body_mass"] for arm in ("right", "left")] == [62.0, 62.0]
     assert not any("62" in note for note in stage.notes)
+
+
+# Sessions
+
+FILE = {
+    "wearer.body_mass": 61.5,
+    "wearer.sex": "female",
+    "wearer.segment_length": [0.3, 0.25, 0.08],
+    "limits.range": [-0.5, 0.5, -0.2, 1.5, -0.2, 1.5, 0.0, 2.0],
+}
+
+
+def test_a_subject_is_chosen_with_its_wearer_and_the_past_sessions_have_their_reports(visit, stage, tmp_path):
+    report = tmp_path / "report.html"
+    report.write_text("<h1>demo of P01</h1>")
+    name = "P01/2026-03-14/demo_20260314_120000"
+    entry = {"subject": "P01", "trial": "demo", "when": "2026-03-14 12:00:00", "report": name}
+    stage.files.recorded, stage.files.reports, stage.files.wearers = [entry], {name: report}, {"P01": FILE}
+    page = visit()
+    page.click("#session summary")
+    assert page.inner_text("#past tr").split("\t")[:3] == ["2026-03-14 12:00:00", "P01", "demo"]
+    with page.context.expect_page() as opened:
+        page.click("#past a")
+    assert opened.value.inner_text("h1") == "demo of P01"
+
+    page.fill("#session [name=subject]", "Anna Meier")
+    page.click("#session button:not([type])")
+    assert stage.files.calls == []  # the browser refuses what is no code
+    page.fill("#session [name=subject]", "P01")
+    page.click("#session [name=note]")
+    page.keyboard.type("second visit")  # a space while all motors are off
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#session-text:has-text('P01')")
+    assert stage.files.calls == ["session P01, , second visit"] and stage.arms.calls == []
+    assert "delete that folder" in page.inner_text("#session-text")
+    assert page.input_value("#wearer [name=body_mass]") == "61.5"
+    page.click("#wearer button")
+    wait_until(page, lambda: len(stage.arms.calls) == 2)
+    for arm, settings in stage.arms.settings.items():
+        assert {key: settings[key] for key in FILE} == FILE, arm
+
+
+def test_the_key_m_sets_a_marker_while_it_is_recorded(visit, stage):
+    page = visit()
+    page.fill("#session [name=marker_text]", "cramp")
+    page.click("#plots-head")
+    page.keyboard.press("m")
+    page.click("#record")
+    page.wait_for_selector("#marker:enabled")
+    page.keyboard.press("m")
+    page.wait_for_selector("#message:has-text('marker')")
+    page.click("#marker")
+    watching = visit()
+    watching.wait_for_selector("#marker:enabled")
+    watching.click("#marker")
+    watching.wait_for_selector("#message:has-text('marker')")
+    assert stage.files.calls == ["record", "marker cramp", "marker cramp", "marker "]
+
+
+def test_while_an_arm_is_carried_no_text_field_takes_the_space_bar(visit, stage):
+    page = visit()
+    page.focus("#session [name=note]")
+    stage.arms.states["right"] = "active"
+    wait_for_state(page, "active")
+    page.wait_for_selector("#session [name=note]:disabled")
+    page.keyboard.press("Space")
+    wait_for_state(page, "letting down")
+    assert stage.arms.calls == BOTH_DOWN

@@ -11,6 +11,7 @@ import yaml
 from rcl_interfaces.srv import ListParameters
 from rosbags.typesys import Stores, get_typestore
 
+from exo_gravity.bag.reader import read_bag
 from exo_gravity.bag.storage import Storage
 
 from ..support.launched_nodes import LaunchedNodes
@@ -176,3 +177,32 @@ def test_a_trial_is_followed_recorded_and_reported_and_the_death_of_the_panel_ch
         probe.close()
         nodes.stop()
         print("\n".join(nodes.log))
+
+
+def test_a_trial_that_is_stopped_ends_its_wearer_and_is_reported_with_subject_and_marker(clinic):
+    page, out = clinic.page, clinic.folder / "out"
+    wait_for_state(page, "active")
+    page.keyboard.press("Space")
+    wait_for_state(page, "disabled")
+    page.fill("#session [name=subject]", "P01")
+    page.click("#session button:not([type])")
+    page.wait_for_selector("#session-text:has-text('P01')")
+    enable(page)
+    wait_for_state(page, "active")
+    page.select_option("#trials", "demo")
+    page.click("#trial-start")
+    page.wait_for_selector("#trial-step:has-text('Hands off')")
+    page.focus("#plots-head")
+    page.keyboard.press("m")
+    page.wait_for_selector("#message:has-text('marker')")
+    page.click("#trial-stop")
+    page.wait_for_selector("#trial-report:visible")
+    (trial,) = out.glob("P01/*-*-*/demo_*")
+    bag = read_bag(trial / "bag")
+    assert bag.session.subject == "P01" and [marker.text for marker in bag.markers] == ["marker"]
+    report = (trial / "report.html").read_text(encoding="utf-8")
+    assert "stopped by the operator" in report and "Subject: P01" in report
+    assert any("wearer: done" in line for line in clinic.nodes.log)
+    page.reload()
+    page.click("#session summary")
+    page.wait_for_selector("#past tr:has-text('demo')")

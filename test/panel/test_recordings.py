@@ -14,12 +14,22 @@ SCRIPT = {"name": "short", "steps": [{"hold": 4.0}]}
 # Stands for `trial --attach`: prints what it prints, and writes a report.
 TRIAL = """
 import json, pathlib, sys
-folder = pathlib.Path(sys.argv[sys.argv.index("--output") + 1], "short_1")
+given = [word for word in sys.argv if word.startswith("--subject=")][0].partition("=")[2]
+output = sys.argv[sys.argv.index("--output") + 1]
+folder = pathlib.Path(output, given, "2026-03-14" if given else "", "short_20260314_120000")
 folder.mkdir(parents=True)
 (folder / "report.html").touch()
 for line in ({"folder": str(folder)}, {"step": 0, "left": 4.0}, {"phase": "reporting"}, {"problem": PROBLEM}):
     print(json.dumps(line), flush=True)
 """
+
+
+WEARER = {
+    "wearer.body_mass": 75.0,
+    "wearer.sex": "female",
+    "wearer.segment_length": [0.3, 0.25, 0.08],
+    "limits.range": [-0.5, 0.5, -0.2, 1.5, -0.2, 1.5, 0.0, 2.0],
+}
 
 
 class Device:
@@ -29,10 +39,15 @@ class Device:
         self.state, self.performed = state, []
 
     def parameters(self):
-        return {"/right/compensator": {"mode": "one_g", "robot.mass": [0.5] * 4, "anfis": []}, "/right/simulator": {}}
+        compensator = {"mode": "one_g", "robot.mass": [0.5] * 4, "anfis": [], **WEARER}
+        return {"/right/compensator": compensator, "/right/simulator": {}}
 
     def states(self):
         return {"right": self.state}
+
+    def mark(self, text):
+        self.marked = text
+        return ""
 
     async def perform(self, script):
         self.performed.append(script)
@@ -53,8 +68,9 @@ def test_parameters_saved_twice_within_a_second_are_two_files(made):
         assert asyncio.run(made[1].save()) == ""
         paths.append(made[1].state()["saved"])
     assert len(set(paths)) == 3
-    expected = {"/right/compensator": {"ros__parameters": {"mode": "one_g", "robot": {"mass": [0.5] * 4}}}}
-    assert [yaml.safe_load(Path(path).read_text()) for path in paths] == [expected] * 3
+    for path in paths:
+        saved = yaml.safe_load(Path(path).read_text())["/right/compensator"]["ros__parameters"]
+        assert saved["mode"] == "one_g" and saved["robot"] == {"mass": [0.5] * 4} and "anfis" not in saved
 
 
 def test_a_folder_that_cannot_be_made_is_named(made, tmp_path):
@@ -83,9 +99,10 @@ def test_a_trial_is_followed_to_its_report(made, monkeypatch, tmp_path, problem)
     shown = asyncio.run(followed(files))
     first, last = shown[0], shown[-1]
     assert first["recording"]["on"] and (first["trial"]["phase"], first["trial"]["step"]) == ("running", -1)
-    assert not first["trial"]["guided"] and device.performed == [str(tmp_path / "short.yaml")]
-    assert last["trial"] == {"phase": "done", "name": "short", "problem": problem, "report": "short_1"}
-    assert not last["recording"]["on"] and files.report("short_1") == tmp_path / "out" / "short_1" / "report.html"
+    assert not first["trial"]["guided"] and device.performed == [str(tmp_path / "short.yaml"), ""]
+    name = "short_20260314_120000"
+    assert last["trial"] == {"phase": "done", "name": "short", "problem": problem, "report": name}
+    assert not last["recording"]["on"] and files.report(name) == tmp_path / "out" / name / "report.html"
 
 
 def test_a_trial_that_cannot_start_says_why(made, monkeypatch):
@@ -97,3 +114,69 @@ def test_a_trial_that_cannot_start_says_why(made, monkeypatch):
 def test_a_trial_needs_every_arm_active(made):
     made[0].state = "disabled"
     assert asyncio.run(made[1].trial("short")) == "a trial starts when every arm is active"
+
+
+def test_the_virtual_wearer_ends_with_a_trial_that_an_arm_ended(made, monkeypatch):
+    device, files = made
+    code = TRIAL.replace("PROBLEM", "''").replace('{"phase": "reporting"}', '{"step": 0, "left": 3.0}')
+    monkeypatch.setattr(recordings, "command", lambda module, *args: [sys.executable, "-c", code, *args])
+    asyncio.run(followed(files))
+    assert device.performed[-1] == ""
+
+
+# Sessions
+
+
+def begin(files, subject, protocol="", note=""):
+    return asyncio.run(files.session(subject=subject, protocol=protocol, note=note))
+
+
+def test_a_trial_of_a_subject_is_in_the_list_with_its_report_after_a_restart(made, monkeypatch, tmp_path):
+    device, files = made
+    code = TRIAL.replace("PROBLEM", "''")
+    monkeypatch.setattr(recordings, "command", lambda module, *args: [sys.executable, "-c", code, *args])
+    assert begin(files, "P01") == ""
+    asyncio.run(followed(files))
+    restarted = Recordings(str(tmp_path / "out"), tmp_path, device, print, lambda: 0.0)
+    name = "P01/2026-03-14/short_20260314_120000"
+    entry = {"subject": "P01", "trial": "short", "when": "2026-03-14 12:00:00", "report": name}
+    assert restarted.past() == {"subjects": ["P01"], "past": [entry]}
+    assert restarted.report(name) == tmp_path / "out" / name / "report.html"
+    assert restarted.state()["session"]["subject"] == ""
+
+
+def test_no_other_file_is_served_as_a_report(made, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "report.html").touch()
+    assert made[1].report("..") is None and made[1].report(str(tmp_path)) is None
+
+
+def test_a_name_is_refused_as_a_code_and_does_not_reach_the_log(made):
+    problem = begin(made[1], "Anna Meier")
+    assert "must be a code" in problem and "Anna" not in problem
+    assert made[1].state()["session"]["subject"] == ""
+    assert "must be a text" in begin(made[1], "P01", note="x" * 1001)
+
+
+def test_what_belongs_to_the_wearer_is_kept_in_a_file_and_read_again_with_the_subject(made):
+    files = made[1]
+    assert asyncio.run(files.keep_wearer()) == "no subject is chosen"
+    begin(files, "P01")
+    assert files.state()["session"]["wearer"] == {} and asyncio.run(files.keep_wearer()) == ""
+    begin(files, "P02")
+    assert files.state()["session"]["wearer"] == {}
+    begin(files, "P01")
+    assert files.state()["session"]["wearer"] == WEARER
+    assert files.past()["subjects"] == ["P01"]
+
+
+@pytest.mark.parametrize("text", ["wearer.body_mass: 7000.0", "robot.mass: 1.0", "- 1", "{"])
+def test_a_wrong_wearers_file_is_refused(made, tmp_path, text):
+    (tmp_path / "out" / "P01").mkdir(parents=True)
+    (tmp_path / "out" / "P01" / "wearer.yaml").write_text(text)
+    assert "must be" in begin(made[1], "P01") and made[1].state()["session"]["subject"] == ""
+
+
+def test_a_marker_without_a_text_is_called_marker(made):
+    assert asyncio.run(made[1].marker("")) == "" and made[0].marked == "marker"
+    assert "must be a text" in asyncio.run(made[1].marker(["a"]))

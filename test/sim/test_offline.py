@@ -42,13 +42,13 @@ class FrameRecorder:
         return self._exchange(can_id, data)
 
 
-def make(links=DEFAULT_LINKS, tilt=(0.1, -0.06), ids=(1, 2, 3, 4)):
+def make(links=DEFAULT_LINKS, tilt=(0.1, -0.06), ids=(1, 2, 3, 4), script=SCRIPT):
     """Return a trial of a simulated arm whose controller assumes `links`."""
     device = SimulatedDevice(SimulatedArm(ArmConfig()), [SimulatedMotor(motor) for motor in MOTORS_AS_MOUNTED])
     device.pitch, device.roll = 0.1, -0.06
     assumed = [replace(motor, can_id=can_id) for motor, can_id in zip(MOTORS_AS_MOUNTED, ids, strict=True)]
     arm = ArmSetup("right", device, assumed, LIMITS, Settings("right", links), 250.0, tilt and resting(*tilt))
-    return OfflineTrial(arm, SCRIPT, 6.0)
+    return OfflineTrial(arm, script, 6.0)
 
 
 @pytest.fixture(scope="module")
@@ -119,6 +119,14 @@ def test_a_stop_lets_the_arm_down_and_keeps_the_recording_which_is_the_same_unti
     assert end == pytest.approx(10.0, abs=0.01)
     assert end + 2.0 < recording.time[-1] < 36.0  # of letting down
     assert not any(motor.entered for motor in trial.arm.device.motors)
+
+
+def test_the_virtual_wearer_ends_with_a_trial_that_is_stopped():
+    steps = [{"move": [0.0, 0.5, 0.6, 0.5], "over": 2.0}, {"move": [0.0, 1.2, 1.2, 1.2], "over": 40.0}]
+    trial = make(script=TrialScript.parse({"name": "lifting", "steps": steps}))
+    recording = trial.run(lambda now: now >= 20.0)
+    stopped = recording.position[np.searchsorted(recording.time, recording.carried[0][1])]
+    assert np.all(stopped[1:] > 0.5) and np.all(recording.position[-1, 1:3] < 0.3)  # no hand holds it up
 
 
 def test_without_a_tilt_the_arm_is_never_carried_and_the_reason_is_given():

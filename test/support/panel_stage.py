@@ -106,11 +106,14 @@ class PlayedFiles:
     trials: tuple[str, ...] = ("demo", "two_poses")
     calls: list[str] = field(default_factory=list)
     reports: dict[str, Path] = field(default_factory=dict)  #: of trials, by name
+    recorded: list[dict[str, str]] = field(default_factory=list)  #: the past recordings
+    wearers: dict[str, Any] = field(default_factory=dict)  #: the content of each subject's file
     content: dict[str, Any] = field(
         default_factory=lambda: {
             "recording": {"on": False, "foreign": False, "folder": "", "seconds": 0},
             "trial": {"phase": "none"},
             "saved": "",
+            "session": {"subject": "", "protocol": "", "note": "", "folder": "/data", "wearer": {}},
         }
     )
 
@@ -130,6 +133,20 @@ class PlayedFiles:
 
     async def stop_trial(self) -> str:
         return self._noted("stop_trial")
+
+    def past(self) -> dict[str, Any]:
+        return {"subjects": sorted(self.wearers), "past": self.recorded}
+
+    async def session(self, subject: str, protocol: str, note: str) -> str:
+        present = {"subject": subject, "protocol": protocol, "note": note, "folder": f"/data/{subject}"}
+        self.content["session"] = {**present, "wearer": self.wearers.get(subject, {})}
+        return self._noted(f"session {subject}, {protocol}, {note}")
+
+    async def keep_wearer(self) -> str:
+        return self._noted("keep_wearer")
+
+    async def marker(self, text: str) -> str:
+        return self._noted(f"marker {text}")
 
     async def save(self) -> str:
         return self._noted("save")

@@ -20,9 +20,10 @@ from rich.console import Console
 from exo_gravity.bag.content import Event
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.core.errors import DataError
+from exo_gravity.core.trial.session import Session
 from exo_gravity.tools.report import main
 from exo_gravity.tools.reporting import figures
-from exo_gravity.tools.reporting.trial_report import analyse, print_report, write
+from exo_gravity.tools.reporting.trial_report import analyse, print_report, write, write_empty
 
 from ..support import csv_rows
 from ..support import synthetic_bags as made
@@ -328,3 +329,127 @@ def test_without_the_bag_library_the_missing_extra_is_named_and_help_still_works
     with pytest.raises(SystemExit) as ended:
         main(["--help"])
     assert ended.value.code == 0
+
+
+# What stands on top
+
+COMPENSATOR = """/right/compensator:
+  ros__parameters: {side: right, mode: zero_g, support: 0.3, wearer.body_mass: 75.0, wearer.sex: female}
+"""
+SESSION = Session("P01", "pilot", "first visit", "1.2.3")
+FAULT = "right/can_bridge: letting down: over_speed: right_elbow_flexion turns too fast"
+
+
+def told(recording, *events, **more):
+    """Return the report of a recording with the compensator's parameters and the session."""
+    more = {"parameters": {"/right/compensator": COMPENSATOR}, "session": SESSION, **more}
+    return analyse(made.bag_of(recording, events=events, **more))
+
+
+@pytest.fixture(scope="module")
+def changed():
+    """A trial in Zero-G that goes on in One-G from 9 s on."""
+    setting = ("/right/compensator", "mode", "one_g")
+    return told(made.trial(made.POSES, hold=6.0), Event(9.0, "/right/compensator: mode = one_g", setting))
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_every_row_says_of_whom_and_under_what_settings_it_is(changed, tmp_path):
+    write(changed, tmp_path)
+    rows = csv_rows(tmp_path / "holds.csv")
+    shared = {"trial": "demo", "subject": "P01", "arm": "right", "side": "right", "support": "0.3", "version": "1.2.3"}
+    assert all(row.items() >= shared.items() for row in rows)
+    assert [row["mode"] for row in rows] == ["zero_g"] * 4 + ["one_g"] * 4
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_the_page_begins_with_verdict_subject_settings_and_criteria(changed, tmp_path):
+    write(changed, tmp_path)
+    text = Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
+    told = ("It held.", "P01", "pilot", "first visit", "Zero-G, One-G from 9.0 s", "30 %", "75 kg, female", "Criteria:")
+    places = [text.index(part) for part in (*told, "1.2.3", "Arm: right")]
+    assert places == sorted(places)
+    assert "no joint moves more than 0.5 degrees, 2 after a push" in text
+
+
+def test_a_support_that_one_g_does_not_use_is_not_shown(held):
+    given = COMPENSATOR.replace("zero_g", "one_g")
+    assert "right: One-G, support none in One-G" in printed(
+        told(*held.bag.recordings, parameters={"/right/compensator": given})
+    )
+
+
+def fall(end, **more):
+    """Return a trial of which the arm was let down at `end` s, and fell."""
+    whole = made.trial(made.POSES, hold=6.0, fall_after=end)
+    return dataclasses.replace(whole, carried=((0.0, end),), **more)
+
+
+def test_the_report_leads_with_a_fall_and_the_fault_that_caused_it():
+    report = told(fall(12.5), Event(12.6, FAULT))
+    text, good = report.verdict
+    lowest = np.abs(np.degrees(made.POSES[1])).max()  # rotates back to 0
+    moved = re.search(r"joint 4 moved ([\d.]+) degrees, at up to (\d+) deg/s", text)
+    assert not good and text.startswith("Right: let down at 12.5 s (over_speed: right_elbow_flexion turns too fast)")
+    assert float(moved[1]) == pytest.approx(lowest, rel=0.01) and int(moved[2]) > 50
+    assert text.endswith("Otherwise it held.") and report.exit_code == 0
+
+
+def test_a_planned_let_down_is_not_the_worst_event():
+    whole = made.trial(made.POSES, hold=6.0)
+    held = dataclasses.replace(whole, carried=((0.0, whole.steps[-1].end),))
+    assert told(held).verdict[1] and "let down" not in told(held).verdict[0]
+    unscripted = dataclasses.replace(fall(12.5), steps=())
+    assert (
+        "let down" not in told(unscripted).verdict[0] and "let down" in told(unscripted, Event(12.5, FAULT)).verdict[0]
+    )
+
+
+def test_a_motion_after_a_change_of_load_names_the_change():
+    setting = ("/right/compensator", "mode", "one_g")
+    fell = dataclasses.replace(made.trial(made.POSES, hold=6.0), steps=())
+    text, good = told(fell, Event(7.5, "/right/compensator: mode = one_g", setting)).verdict
+    assert not good and re.match(r"Right: moved at 8.0 s after mode = one_g: joint 2 moved 22\.\d\d degrees", text)
+
+
+def test_a_trial_that_ended_early_says_why(held):
+    report = analyse(held.bag, trouble="stopped by the operator")
+    assert report.verdict[0].startswith("It held until the trial ended early: stopped by the operator. Worst: right: ")
+
+
+def test_a_trial_that_ended_before_its_first_hold_says_why_too():
+    moving = made.bag_of(made.trial(made.POSES[:1], hold=0.5))
+    text, good = analyse(moving, trouble="stopped by the operator").verdict
+    assert not good and "It did not hold. The trial ended early: stopped by the operator." in text
+
+
+def test_where_nothing_moved_the_resolution_is_stated():
+    whole = made.trial(made.POSES, hold=6.0)
+    codes = np.round(whole.position / made.POSITION_CODE)
+    for step in whole.steps:
+        within = (whole.time >= step.start) & (whole.time < step.end)
+        codes[within] = codes[within][-1] if step.action == "hold" else codes[within]
+    report = told(dataclasses.replace(whole, position=codes * made.POSITION_CODE))
+    code = math.degrees(made.POSITION_CODE)
+    assert f"no joint moved by one position code ({code:.3f} degrees)" in report.verdict[0]
+    bound = f"<{60.0 * code / report.arms[0][1].holds[0].duration:.2f}"
+    assert " ".join([bound] * 4) in printed(report)
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_lines_of_the_start_are_left_out_and_markers_are_listed(tmp_path):
+    whole = dataclasses.replace(made.trial(made.POSES, hold=6.0), carried=((1.0, 16.0),))
+    starting = [Event(0.1 * n, f"right/can_bridge: checking: waiting for {n}") for n in range(5)]
+    starting += [Event(0.6, "right/can_bridge: OK, active"), Event(0.7, "imu: WARN that lasts")]
+    report = told(whole, *starting, Event(3.0, FAULT), markers=(Event(2.0, "cramp"),))
+    write(report, tmp_path)
+    text = Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
+    listed = re.findall(r"\d\.\d s  [^\n]*", text[text.index("Markers, faults") :])
+    assert "checking" not in text and "OK, active" not in text
+    assert text.index("WARN that lasts") < text.index("2.0 s  marker: cramp") < text.index(f"3.0 s  {FAULT}"), listed
+
+
+def test_a_trial_of_which_nothing_was_recorded_has_a_report_too(tmp_path):
+    write_empty(tmp_path, "demo", "stopped by the operator")
+    text = Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
+    assert "demo" in text and "Nothing was recorded: stopped by the operator." in text

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from subprocess import PIPE
 from typing import Any, Protocol
 
 import numpy as np
@@ -89,6 +92,34 @@ def test_an_offline_trial_ends_with_a_report(run, capsys):
     assert "times real time" in text and "It held." in text
     pose = [float(row["pose_deg"]) for row in holds(folder)]
     np.testing.assert_allclose(pose, np.degrees(SHORT["steps"][0]["move"]), atol=2.0)
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_a_trial_of_a_subject_is_in_the_folder_of_the_subject_and_the_day(run):
+    code, folder = run("--offline", "--subject", "P01", "--protocol", "pilot", "--note=- stiff")
+    (trial,) = folder.glob("*-*-*/short_*")
+    assert code == 0 and folder.name == "P01"
+    assert {(row["subject"], row["trial"], row["mode"]) for row in holds(trial)} == {("P01", trial.name, "one_g")}
+    page = (trial / "report.html").read_text(encoding="utf-8")
+    assert "Protocol: pilot" in page and "Note: - stiff" in page
+
+
+def test_a_name_is_refused_as_a_subjects_code(run, capsys):
+    code, folder = run("--offline", "--subject", "Anna Meier")
+    assert code == 2 and "must be a code" in capsys.readouterr().err
+    assert not list(folder.glob("Anna*"))
+
+
+def test_progress_that_no_one_reads_any_more_ends_nothing():
+    code = "import sys; from exo_gravity.tools.trial import _print_json as p; p(step=0); input(); p(step=1); p(step=2)"
+    process = subprocess.Popen([sys.executable, "-c", code], stdin=PIPE, stdout=PIPE, stderr=PIPE, text=True)
+    assert process.stdin and process.stdout and process.stderr
+    assert process.stdout.readline() == '{"step": 0}\n'
+    process.stdout.close()
+    process.stdin.write("\n")
+    process.stdin.close()
+    assert process.wait(60) == 0 and process.stderr.read() == ""
+    process.stderr.close()
 
 
 def thirteen(hold: float, poses: int = 13) -> dict[str, Any]:

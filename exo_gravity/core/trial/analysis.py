@@ -39,7 +39,7 @@ class Hold:
     pose: np.ndarray  #: (4,) rad, mean
     drift: np.ndarray  #: (4,) rad, from the first part of the hold to its last
     drift_rate: np.ndarray  #: (4,) rad/s
-    drift_rate_uncertainty: np.ndarray  #: (4,) rad/s, standard uncertainty
+    drift_rate_uncertainty: np.ndarray  #: (4,) rad/s, standard uncertainty; NaN if the joint never changed its code
     stray: np.ndarray  #: (4,) rad, largest range within any 10 s
     velocity_rms: np.ndarray  #: (4,) rad/s as measured: half a velocity code for a motor at rest
     torque_rms: np.ndarray  #: (4,) Nm, measured
@@ -113,7 +113,8 @@ def _last_motions(recording: Recording, blocks: Blocks, last: Span) -> Iterator[
     if end - last[1] > MIN_HOLD:
         yield _motion(recording, blocks, last, (end, end))
     # A virtual wearer continues with the next step even if the arm is not carried. That is not part of the let-down.
-    down = min([recorded, *(step.start for step in recording.steps if step.start > released)])
+    going_on = (step.start for step in recording.steps if step.start > released and step.action != "done")
+    down = min([recorded, *going_on])
     if down - released > blocks.length:
         yield _motion(recording, blocks, (last[0], released), (down, down))
 
@@ -134,7 +135,7 @@ def _hold(recording: Recording, blocks: Blocks, resolution: np.ndarray, span: Sp
         pose=mean.mean(axis=0),
         drift=part_mean[-1] - part_mean[0],
         drift_rate=rate,
-        drift_rate_uncertainty=np.hypot(scatter, resolution / (span[1] - span[0])),
+        drift_rate_uncertainty=np.where(resolution, np.hypot(scatter, resolution / (span[1] - span[0])), math.nan),
         stray=(windows.max(axis=-1) - windows.min(axis=-1)).max(axis=0),
         velocity_rms=_rms(recording.velocity[samples]),
         torque_rms=_rms(effort),

@@ -97,3 +97,6 @@ class TrialScript:
     @cached_property
     def _ends(self) -> tuple[float, ...]:
         return tuple(accumulate(step.duration for step in self.steps))
+
+
+NOTHING = TrialScript("nothing", ())  #: whose wearer leaves the arm alone

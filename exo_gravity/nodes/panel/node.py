@@ -23,9 +23,11 @@ from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity import packaged
+from exo_gravity.bag.content import MARKERS
 from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics, Newest, status_values
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
@@ -90,6 +92,7 @@ class Arms:
         self._lessee = f"panel {os.getpid()}, " if has_lease else ""
         self._parameters: dict[str, NodeParameters] = {}  # by full name, also of nodes that ended
         self._wearers: dict[str, Client] = {}  # the virtual ones, by their simulator's name
+        self._markers = node.create_publisher(String, MARKERS, 10)
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
         node.create_subscription(ParameterEvent, "/parameter_events", self._on_parameter_event, 50)
 
@@ -134,12 +137,19 @@ class Arms:
         return {name: client.report().get("state") for name, client in self.clients.items()}
 
     async def perform(self, script: str) -> str:
-        """Let the virtual wearers perform the script at this path; return '' or why not."""
+        """Let the virtual wearers perform the script at this path, '' for none; return '' or why not."""
         problems = []
         for name, client in sorted(self._wearers.items()):
             problem = await call(client, parameter_request({"trial": script}))
             problems += [f"{name}: {problem}"] if problem else []
         return "; ".join(problems)
+
+    def mark(self, text: str) -> str:
+        """Publish a marker; return '' or why not."""
+        if not self._markers.get_subscription_count():
+            return "nothing is being recorded yet"
+        self._markers.publish(String(data=text))
+        return ""
 
     # For the pages (`Control`); called on the web server's thread; each coroutine returns '' or why it failed
 

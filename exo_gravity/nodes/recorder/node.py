@@ -1,9 +1,10 @@
 """recorder: writes a trial to a standard rosbag2 recording (MCAP), with the parameters of every node.
 
 Twice a second it looks for new topics, and records those of all arms, the IMU, diagnostics and parameter changes, each
-with the quality of service that its publisher offers and its time of arrival. Two topics exist in the recording only,
-both std_msgs/String: `/recorder/parameters`, ROS 2 parameter YAML of each node at the start, and `/recorder/losses`,
-how many messages were lost, if any were. A topic that fails is reported, and the others are recorded.
+with the quality of service that its publisher offers and its time of arrival. Three topics exist in the recording only,
+all std_msgs/String: `/recorder/session`, JSON of subject, protocol, note and version; `/recorder/parameters`, ROS 2
+parameter YAML of each node at the start; and `/recorder/losses`, how many messages were lost, if any were. A topic that
+fails is reported, and the others are recorded.
 """
 
 import contextlib
@@ -25,10 +26,12 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
+from exo_gravity import version
 from exo_gravity.bag import content
 from exo_gravity.bag.content import PARAMETERS, STATES, arm_of, leaf
 from exo_gravity.bag.writer import BagWriter, offered_qos
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
+from exo_gravity.core.trial.session import Session
 from exo_gravity.nodes.ros.messages import status_values
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
@@ -36,6 +39,7 @@ from exo_gravity.nodes.ros.subscriptions import HotPath, Publishers
 
 SHARED_TOPICS = {"/imu/pitch_yaw": Vector3Stamped, "/imu/data": Imu, "/imu/data_raw": Imu}
 SHARED_TOPICS |= {content.DIAGNOSTICS: DiagnosticArray, content.PARAMETER_EVENTS: ParameterEvent}
+SHARED_TOPICS |= {content.MARKERS: String}
 ARM_TOPICS = {STATES: JointState, content.COMMANDS: JointState, content.STEPS: String}  # in the live line
 OF_ARMS = {**ARM_TOPICS, content.ASSIST: JointState}
 REPEATER = "robot_model"  # its joint states are those of the arms once more
@@ -55,8 +59,12 @@ class Recorder(Node):
         super().__init__("recorder", automatically_declare_parameters_from_overrides=True)
         values = declare(self, content.RECORDER)
         self.failure: Exception | None = None  # ends the node, see run()
+        session = {name: values[name] for name in ("subject", "protocol", "note")} | {"version": version()}
+        Session(**session)
         self._writer = BagWriter(values["output"])
-        self._writer.add_topic(PARAMETERS, "std_msgs/msg/String", offered_qos(True, True, 1))
+        for topic in (PARAMETERS, content.SESSION):
+            self._writer.add_topic(topic, content.STRING, offered_qos(True, True, 1))
+        self._write_text(content.SESSION, json.dumps(session))
         self._failed: set[str] = set()  # topics and nodes whose failure was reported
         self._last_states, self._orphaned = -math.inf, math.inf  # monotonic s
         self._reported = (0, 0)  # lost messages
@@ -86,7 +94,7 @@ class Recorder(Node):
             self._report_losses()
             if any(self._reported):
                 missed, unwritten = self._reported
-                self._writer.add_topic(content.LOSSES, "std_msgs/msg/String", offered_qos(True, True, 1))
+                self._writer.add_topic(content.LOSSES, content.STRING, offered_qos(True, True, 1))
                 self._write_text(content.LOSSES, f"{missed} did not arrive, {unwritten} were not written")
         finally:
             self._writer.close()

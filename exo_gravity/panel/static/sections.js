@@ -1,4 +1,4 @@
-// Wearer, trial, recording and parameters.
+// Wearer, session, trial, recording and parameters.
 
 import { ask } from "./ask.js";
 import { degrees, number, t, write } from "./texts.js";
@@ -12,6 +12,8 @@ export class Sections {
     this.cards = cards;
     this.form = byId("wearer");
     this.edited = false;
+    this.workspace = {}; // of the subject, sent with the wearer's data
+    this.session = new Session(send, this);
     this.form.addEventListener("input", () => (this.edited = true));
     this.form.addEventListener("submit", (event) => this.apply(event));
     byId("trial-start").addEventListener("click", () => send({ do: "trial", name: byId("trials").value }));
@@ -26,12 +28,14 @@ export class Sections {
     const select = byId("trials");
     if (!select.options.length) for (const name of setup.trials ?? []) select.add(new Option(name, name));
     const settings = Object.values(setup.arms ?? {})[0]?.settings;
-    const lengths = settings?.["wearer.segment_length"];
-    if (this.edited || !lengths) return;
+    if (!this.edited && settings?.["wearer.segment_length"]) this.fill(settings);
+  }
+
+  fill(settings) {
     const fields = this.form.elements;
     fields.body_mass.value = settings["wearer.body_mass"];
     fields.sex.value = settings["wearer.sex"];
-    LENGTHS.forEach((name, n) => (fields[name].value = Math.round(1000 * lengths[n]) / 10));
+    LENGTHS.forEach((name, n) => (fields[name].value = Math.round(1000 * settings["wearer.segment_length"][n]) / 10));
   }
 
   async apply(event) {
@@ -41,6 +45,7 @@ export class Sections {
       "wearer.body_mass": Number(fields.body_mass.value),
       "wearer.sex": fields.sex.value,
       "wearer.segment_length": LENGTHS.map((name) => Number(fields[name].value) / 100),
+      ...this.workspace,
     };
     const acts = [...this.cards.values()].some((card) => card.isCarried && card.mode === "zero_g");
     if (acts && !(await ask(t("wearer"), t("wearer_ask"), t("change")))) return;
@@ -66,6 +71,7 @@ export class Sections {
     write(byId("recording-text"), recordingText(state.recording));
     write(byId("saved"), state.saved ? t("saved", state.saved) : "");
     this.showTrial(state.trial);
+    if (state.session) this.session.show(state, operates);
   }
 
   showTrial(trial) {
@@ -74,7 +80,7 @@ export class Sections {
     write(byId("trial-step"), trial.phase === "running" && step ? stepText(step) : "");
     const report = byId("trial-report");
     report.hidden = !trial.report;
-    if (trial.report) report.href = `/report/${encodeURIComponent(trial.report)}`;
+    if (trial.report) report.href = reportAt(trial.report);
   }
 
   async showParameters() {
@@ -84,6 +90,84 @@ export class Sections {
       .map(([node, values]) => `${node}\n${Object.entries(values).map(([name, value]) => `  ${name}: ${JSON.stringify(value)}`).join("\n")}`)
       .join("\n\n");
     place.hidden = false;
+  }
+}
+
+const FREE = Array.from({ length: 8 }, (_, n) => (n % 2 ? 3.15 : -3.15)); // rad, a workspace without edges
+const OFF = ["disabled", "fault"];
+const reportAt = (name) => `/report/${name.split("/").map(encodeURIComponent).join("/")}`;
+
+// The subject, the marker and the list of past recordings.
+//
+// Texts can be written only while the motors of all arms are off: otherwise the space bar lets down.
+class Session {
+  constructor(send, sections) {
+    this.send = send;
+    this.sections = sections;
+    this.form = byId("session").querySelector("form");
+    this.present = ""; // as it was last shown
+    this.ended = ""; // the trial and the recording, likewise
+    this.form.addEventListener("submit", (event) => this.use(event));
+    byId("keep-wearer").addEventListener("click", () => send({ do: "keep_wearer" }));
+    byId("marker").addEventListener("click", () => this.mark());
+    window.addEventListener("keydown", (event) => this.key(event), true);
+  }
+
+  key(event) {
+    const writes = event.target.matches?.("input, select");
+    if (event.code === "Space" && event.target.matches?.('#session input[type="text"]:enabled')) event.stopPropagation();
+    const isPlain = !(event.ctrlKey || event.metaKey || event.altKey || event.repeat);
+    if (event.code === "KeyM" && isPlain && !writes && !byId("marker").disabled) this.mark();
+  }
+
+  use(event) {
+    event.preventDefault();
+    const { subject, protocol, note } = this.form.elements;
+    this.send({ do: "session", subject: subject.value, protocol: protocol.value, note: note.value });
+  }
+
+  async mark() {
+    if (await this.send({ do: "marker", text: this.form.elements.marker_text.value })) write(byId("message"), t("marker_set"));
+  }
+
+  show(state, operates) {
+    const { recording, session, trial } = state;
+    const off = [...this.sections.cards.values()].every((card) => OFF.includes(card.state));
+    for (const control of this.form.elements) control.disabled = !operates || !off;
+    byId("keep-wearer").disabled = !operates || !session.subject;
+    byId("marker").disabled = !(recording.on || recording.foreign);
+    const present = JSON.stringify(session);
+    if (present !== this.present) this.showPresent(session, this.present === "");
+    this.present = present;
+    const ended = `${trial.phase} ${trial.report} ${recording.on}`;
+    if (ended !== this.ended) this.list();
+    this.ended = ended;
+    const known = Object.keys(session.wearer).length ? t("session.wearer") : t("session.no_wearer");
+    write(byId("session-text"), session.subject ? `${t("session.of", session.subject, session.folder)} ${known}` : t("session.none", session.folder));
+  }
+
+  showPresent(session, isFirst) {
+    for (const name of ["subject", "protocol", "note"]) this.form.elements[name].value = session[name];
+    const wearer = session.wearer;
+    if (isFirst && !session.subject) return;
+    this.sections.workspace = { "limits.range": wearer["limits.range"] ?? FREE };
+    if (!wearer["wearer.segment_length"]) return;
+    this.sections.fill(wearer);
+    this.sections.edited = true; // until it is applied
+  }
+
+  async list() {
+    const { subjects, past } = await (await fetch("/sessions")).json();
+    byId("subjects").replaceChildren(...subjects.map((code) => new Option(code, code)));
+    byId("past").replaceChildren(
+      ...past.map((entry) => {
+        const row = document.createElement("tr");
+        for (const text of [entry.when, entry.subject, entry.trial, ""]) row.insertCell().textContent = text;
+        const link = Object.assign(document.createElement("a"), { href: reportAt(entry.report), target: "_blank", rel: "noopener" });
+        if (entry.report) row.lastElementChild.append(Object.assign(link, { textContent: t("trial_report") }));
+        return row;
+      }),
+    );
   }
 }
 

@@ -65,7 +65,12 @@ def heading(text: str, level: int = 3) -> str:
 
 def bullets(title: str, lines: Iterable[str]) -> str:
     """Return a heading and a list, or '' if there are no lines."""
-    return (items := _items(lines)) and heading(title) + items
+    return (items := _items(lines)) and (heading(title) if title else "") + items
+
+
+def paragraph(text: str) -> str:
+    """Return a paragraph."""
+    return f"<p>{escape(text)}</p>"
 
 
 def make_plain(axis: "Axes") -> None:

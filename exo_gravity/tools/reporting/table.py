@@ -16,6 +16,7 @@ from exo_gravity.core.trial.recording import Recording
 from exo_gravity.tools.reporting import html
 
 ROWS = 100_000  # of a time series, that are written at once
+UNMOVED = 1e-9  # rad; the means of equal positions differ by less
 
 
 def per_minute(values: Any) -> Any:
@@ -32,11 +33,20 @@ class Column(NamedTuple):
     of: Callable[[Any], np.ndarray]  #: Hold or Motion -> (4,)
     largest: bool = False  #: the terminal shows the largest of the four only
     spare: int = 0  #: a narrow terminal drops these, from the largest number on
+    below: bool = False  #: a joint that read one position throughout a hold has "<" and its uncertainty
+
+    def texts(self, one: Any) -> list[str]:
+        """Return the numbers of a hold or motion as text."""
+        texts = [shown(value, self.digits) for value in self.of(one)]
+        if not self.below:
+            return texts
+        bounds = zip(texts, per_minute(one.drift_rate_uncertainty), one.stray < UNMOVED, strict=True)
+        return [f"<{shown(bound, self.digits)}" if unmoved else text for text, bound, unmoved in bounds]
 
 
 HOLDS = (
     Column("pose_deg", "Pose\ndeg", 1, lambda hold: np.degrees(hold.pose)),
-    Column("drift_deg_per_min", "Drift\ndeg/min", 2, lambda hold: per_minute(hold.drift_rate)),
+    Column("drift_deg_per_min", "Drift\ndeg/min", 2, lambda hold: per_minute(hold.drift_rate), below=True),
     Column(
         "drift_uncertainty_deg_per_min", "±\ndeg/min", 2, lambda hold: per_minute(hold.drift_rate_uncertainty), True
     ),
@@ -54,7 +64,7 @@ MOTIONS = (
 # What the columns mean
 TERMS = {
     "Drift": "is the slope of a robust line (Huber) through the hold. Its uncertainty is at least one position code "
-    "over the length of the hold.",
+    "over the length of the hold. A joint that read one code throughout drifts less than that.",
     "Within 10 s": "is the widest range of a joint in any 10 s.",
     "RMS velocity": "is as the motors report it: at rest half a velocity code, 0.6 to 0.7 deg/s, since no code stands "
     "for zero.",
@@ -76,10 +86,15 @@ def shown(value: float, digits: int) -> str:
     return f"{round(float(value), digits) + 0.0:.{digits}f}" if math.isfinite(value) else "–"
 
 
-def write_csv(path: Path, arms: Iterable[tuple[Recording, TrialAnalysis]]) -> None:
+def write_csv(
+    path: Path,
+    arms: Iterable[tuple[Recording, TrialAnalysis]],
+    columns: Mapping[str, Callable[[float], Mapping[str, str]]],
+) -> None:
     """Write holds.csv or motions.csv, a row for each joint; an unknown number is an empty cell.
 
-    Without holds or motions no file is written.
+    columns: by arm, a function from a time in s to the first columns of a row. Without holds or motions no file is
+    written.
     """
     rows: list[dict[str, str]] = []
     for recording, analysis in arms:
@@ -90,7 +105,7 @@ def write_csv(path: Path, arms: Iterable[tuple[Recording, TrialAnalysis]]) -> No
                 shared = {"motion": number, "kind": one.kind, "start_s": one.start, "until_still_s": one.until_still}
             numbers = {column.key: column.of(one) for column in (HOLDS if isinstance(one, Hold) else MOTIONS)}
             for joint, name in enumerate(recording.joint_names):
-                row = {"arm": recording.name, **shared, "joint": name}
+                row = {**columns[recording.name](one.start), **shared, "joint": name}
                 row |= {key: values[joint] for key, values in numbers.items()}
                 rows.append({key: _csv_value(value) for key, value in row.items()})
     if rows:
@@ -146,7 +161,7 @@ def arm_section(recording: Recording, analysis: TrialAnalysis, figures: Iterable
     for title, found, heads, columns in _tables(analysis):
         groups = []
         for number, one in enumerate(found, 1):
-            cells = [[shown(value, column.digits) for value in column.of(one)] for column in columns]
+            cells = [column.texts(one) for column in columns]
             groups.append((_shared(number, one), list(zip(joint_labels(recording), *cells, strict=True))))
         if groups:
             yield html.heading(title)
@@ -165,7 +180,7 @@ def print_tables(console: Console, recording: Recording, analysis: TrialAnalysis
             continue
         shared = zip(*(_shared(number, one) for number, one in enumerate(rows, 1)), strict=True)
         cells = {head: list(column) for head, column in zip(heads, shared, strict=True)}
-        cells |= {column.heading: _cells([column.of(one) for one in rows], column) for column in columns}
+        cells |= {column.heading: _cells(rows, column) for column in columns}
         for column in sorted(columns, key=lambda column: -column.spare):
             used = sum(2 + max(map(len, (*head.split("\n"), *texts))) for head, texts in cells.items())
             if used > console.width and column.spare:
@@ -178,10 +193,11 @@ def print_tables(console: Console, recording: Recording, analysis: TrialAnalysis
         console.print(table)
 
 
-def _cells(rows: Sequence[np.ndarray], column: Column) -> list[str]:
+def _cells(rows: Sequence[Hold | Motion], column: Column) -> list[str]:
     """Return one cell per row: its largest number, or its four numbers, aligned with those of the other rows."""
     if column.largest:
-        return [shown(row.max(), column.digits) for row in rows]
-    texts = [[shown(value, column.digits) for value in row] for row in rows]
+        known = ([value for value in column.of(row) if math.isfinite(value)] for row in rows)
+        return [shown(max(values, default=math.nan), column.digits) for values in known]
+    texts = [column.texts(row) for row in rows]
     width = max(len(text) for row in texts for text in row)
     return [" ".join(text.rjust(width) for text in row) for row in texts]

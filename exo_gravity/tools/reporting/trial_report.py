@@ -15,11 +15,11 @@ from exo_gravity.core.errors import DataError
 from exo_gravity.core.trial.analysis import MIN_HOLD, HoldCriteria, TrialAnalysis, failures
 from exo_gravity.core.trial.analysis import analyse as analyse_arm
 from exo_gravity.core.trial.recording import Recording
-from exo_gravity.tools.reporting import figures, html, table
+from exo_gravity.tools.reporting import conditions, figures, html, table
+from exo_gravity.tools.reporting.conditions import EARLY
 
 MAX_EVENTS = 200
 WRITTEN = (".csv", ".png", ".html", ".pdf", ".svg")
-EARLY = 0.2  # s; can_bridge publishes its state every 0.1 s, so a shorter gap to the script's end means nothing
 TIMESTAMP = re.compile(r"_\d{8}_\d{6}$")  # which `trial` adds to the script's name
 CAPTIONS = {
     "overview": "Positions, velocities and torques over time. Holds are shaded and numbered; dashes show the command.",
@@ -36,6 +36,7 @@ class Report:
     arms: tuple[tuple[Recording, TrialAnalysis], ...]
     failures: tuple[str, ...]  #: one sentence for each way in which an arm did not hold
     notes: tuple[str, ...]  #: what limits the trust in the verdict
+    trouble: str = ""  #: why the trial ended before its script, or ''
 
     @property
     def exit_code(self) -> int:
@@ -47,14 +48,30 @@ class Report:
         """The verdict on arms that held, which covers no more than was recorded."""
         if self.bag.problems:
             return "It held, as far as the recording could be read."
+        if self.trouble:
+            return f"It held until the trial ended early: {self.trouble}."
         return "It held, as far as it was recorded." if self.bag.is_partial else "It held."
+
+    @property
+    def verdict(self) -> tuple[str, bool]:
+        """The first sentences of the report, and whether they are good news: a bad event comes first."""
+        event, bad = conditions.worst(self.bag, self.arms, self.criteria)
+        early = f" The trial ended early: {self.trouble}." if self.trouble else ""
+        held = f"It did not hold.{early}" if self.failures else self.held
+        otherwise = held if self.failures else f"Otherwise it {held.removeprefix('It ')}"
+        text = f"{event[:1].upper()}{event[1:]}. {otherwise}" if bad else f"{held} Worst: {event}." if event else held
+        return text, not (bad or self.failures)
+
+    @property
+    def trial(self) -> str:
+        """The name of the trial's folder: `trial` records into NAME_DATE_TIME/bag."""
+        path = self.bag.path.resolve()
+        return path.parent.name if path.stem == "bag" else path.stem
 
     @property
     def title(self) -> str:
         """Name of the trial, arms and date: 'demo, right arm, 2026-03-14'."""
-        path = self.bag.path.resolve()
-        # `trial` records into NAME_DATE_TIME/bag.
-        name = TIMESTAMP.sub("", path.parent.name if path.stem == "bag" else path.stem)
+        name = TIMESTAMP.sub("", self.trial)
         sides = " and ".join(recording.name for recording in self.bag.recordings)
         arms = sides if sides == "arm" else f"{sides} arm{'s' if len(self.bag.recordings) > 1 else ''}"
         return f"{name.replace('_', ' ')}, {arms}, {self.start:%Y-%m-%d}"
@@ -65,12 +82,15 @@ class Report:
         return datetime.fromtimestamp(self.bag.start / 1e9, timezone.utc).astimezone()
 
 
-def analyse(bag: Bag, criteria: HoldCriteria | None = None, min_hold: float = MIN_HOLD) -> Report:
-    """Return the report of a recording: holds of at least `min_hold` s, judged by `criteria`."""
+def analyse(bag: Bag, criteria: HoldCriteria | None = None, min_hold: float = MIN_HOLD, trouble: str = "") -> Report:
+    """Return the report of a recording: holds of at least `min_hold` s, judged by `criteria`.
+
+    trouble: why the trial ended early, or ''.
+    """
     criteria = criteria or HoldCriteria()
     arms = tuple((recording, analyse_arm(recording, min_hold)) for recording in bag.recordings)
     found = tuple(sentence for recording, analysis in arms for sentence in failures(recording, analysis, criteria))
-    return Report(bag, criteria, arms, found, (*bag.notes, *_reservations(bag)))
+    return Report(bag, criteria, arms, found, (*bag.notes, *_reservations(bag)), trouble)
 
 
 def _reservations(bag: Bag) -> Iterator[str]:
@@ -98,10 +118,12 @@ def write(
     """
     folder = Path(folder)
     sections: list[str] = []
+    names = [recording.name for recording in report.bag.recordings]
+    columns = {name: conditions.columns(report.bag, report.trial, name) for name in names}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name in ("holds.csv", "motions.csv"):
-            table.write_csv(folder / name, report.arms)
+            table.write_csv(folder / name, report.arms, columns)
         if with_time_series:
             table.write_time_series(folder / "time_series.csv", report.bag.columns())
         for recording, analysis in report.arms:
@@ -123,6 +145,13 @@ def write(
     return sorted(path for path in folder.iterdir() if path.suffix in WRITTEN)
 
 
+def write_empty(folder: Path, name: str, trouble: str) -> None:
+    """Write the report of a trial that ended before anything was recorded."""
+    sentence = html.verdict(f"Nothing was recorded: {trouble}.", good=False)
+    page = html.document(name, f"{datetime.now():%Y-%m-%d %H:%M:%S}", [sentence])
+    (folder / "report.html").write_text(page, encoding="utf-8")
+
+
 def print_report(report: Report, console: Console | None = None) -> None:
     """Print the tables, the notes and the verdict; in a log or a pipe, wide enough for the tables."""
     console = console or Console(highlight=False, width=None if Console().is_terminal else 140)
@@ -134,22 +163,26 @@ def print_report(report: Report, console: Console | None = None) -> None:
         console.print(f"[red]Not reported:[/] {marked(problem)}.")
     for sentence in report.failures:
         console.print(f"[red]{marked(sentence)}.[/]")
-    console.print("[red bold]It did not hold.[/]" if report.failures else f"[green bold]{report.held}[/]")
+    for arm, mode, support, wearer in conditions.lines(report.bag):
+        console.print(f"{marked(arm)}: {mode}, support {support}, wearer: {wearer}")
+    text, good = report.verdict
+    console.print(f"[{'green' if good else 'red'} bold]{marked(text)}[/]")
 
 
 def _page(report: Report, sections: Sequence[str]) -> str:
     bag = report.bag
     length = max(float(recording.time[-1]) for recording in bag.recordings)
-    events = [f"{table.shown(event.time, 1)} s  {event.text}" for event in bag.events]
+    events = [f"{table.shown(event.time, 1)} s  {event.text}" for event in conditions.after_start(bag)]
     more = [f"and {len(events) - MAX_EVENTS} more"] if len(events) > MAX_EVENTS else []
     parameters = "\n".join(bag.parameters[node].rstrip() for node in sorted(bag.parameters))
     ending = [
         f"<footer><p>{' '.join(f'<b>{term}</b> {meaning}' for term, meaning in table.TERMS.items())}</p></footer>",
         html.bullets("Notes", [*bag.problems, *report.notes]),
-        html.bullets("Faults and changed parameters", events[:MAX_EVENTS] + more),
+        html.bullets("Markers, faults and changed parameters", events[:MAX_EVENTS] + more),
     ]
     if parameters:
         ending.append(f"<details><summary>Parameters at the start</summary><pre>{escape(parameters)}</pre></details>")
-    held = html.verdict("It did not hold." if report.failures else report.held, report.failures, not report.failures)
-    when = f"{report.start:%Y-%m-%d %H:%M:%S}, {length:.0f} s, {bag.path}"
-    return html.document(report.title, when, [held, *sections, *ending])
+    text, good = report.verdict
+    head = [html.verdict(text, report.failures, good), *conditions.section(bag, report.criteria)]
+    when = f"{report.start:%Y-%m-%d %H:%M:%S}, {length:.0f} s, {'/'.join(bag.path.parts[-2:])}"
+    return html.document(report.title, when, [*head, *sections, *ending])

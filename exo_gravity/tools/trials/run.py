@@ -10,7 +10,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,10 @@ import yaml
 from rich.console import Console
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.safety.drive import FaultCode
+from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
+from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.core.trial.session import Session
 from exo_gravity.tools.inputs.parameter_file import load
 from exo_gravity.tools.launcher import Launcher, Stopping
 from exo_gravity.tools.trials.screen import LEAD, TrialScreen
@@ -60,17 +62,19 @@ def is_guided(params: Path) -> bool:
     return not any(node.endswith("/simulator") for node in load(params))
 
 
-def prepare(params: Path | None, script: Path, folder: Path, recorded: bool) -> Path:
+def prepare(params: Path | None, script: Path, folder: Path, session: Session | None) -> Path:
     """Write the parameter file of one trial into the new `folder`, and return its path.
 
-    It is `params` with the script for each simulator and, if `recorded`, a recorder. Raises ParameterError.
+    It is `params` with the script for each simulator and a recorder of `session`, None for no recorder. Raises
+    ParameterError.
     """
     content: dict[str, Any] = yaml.safe_load(params.read_text(encoding="utf-8")) if params else {}
     for node, entry in content.items():
         if node.endswith("/simulator"):
             entry["ros__parameters"]["trial"] = str(script)
-    if recorded:
-        content[RECORDER] = {"ros__parameters": {"output": str(folder / "bag"), "live": True}}
+    if session:
+        of_whom = {name: text for name, text in asdict(session).items() if name != "version"}
+        content[RECORDER] = {"ros__parameters": {"output": str(folder / "bag"), "live": True, **of_whom}}
     path = folder / "params.yaml"
     try:
         folder.mkdir(parents=True)
@@ -82,13 +86,13 @@ def prepare(params: Path | None, script: Path, folder: Path, recorded: bool) -> 
 
 
 def run_attempts(
-    params: Path, path: Path, script: TrialScript, folder: Path, console: Console, stopped: Stopping
+    params: Path, path: Path, script: TrialScript, folder: Path, session: Session, console: Console, stopped: Stopping
 ) -> TrialEnd:
     """Run `script`, the file at `path`, on nodes in the new `folder`; repeat it if this computer was too busy."""
     bridges = [node.lstrip("/") for node in load(params) if node.endswith("/can_bridge")]
     guided = is_guided(params)
     for attempt in range(1, ATTEMPTS + 1):
-        trial = prepare(params, path, folder, recorded=True)
+        trial = prepare(params, path, folder, session)
         screen = TrialScreen(script, guided, console, bridges, LEAD if guided else None)
         end = run_nodes(trial, script, folder, screen, stopped)
         if not (end.trouble and end.busy) or end.code == 2 or stopped.is_set() or attempt == ATTEMPTS:
@@ -119,6 +123,9 @@ def run_nodes(params: Path, script: TrialScript, folder: Path, screen: TrialScre
         nodes.start()
         trouble = follow(screen, script, stopped, lambda: launcher.exit_code(RECORDER), nodes)
         recorder_failed = launcher.exit_code(RECORDER) is not None and launcher.dead() is None
+        down_by = time.monotonic() + DESCENT_TIMEOUT
+        while nodes.is_alive() and is_falling(screen.status) and screen.silence < 1.0 and time.monotonic() < down_by:
+            time.sleep(0.05)  # the recording shows how the arm comes down
         if nodes.is_alive():
             screen.end("letting the arm down and closing the recording")
         ending.set()
@@ -160,6 +167,11 @@ def follow(
         if time.monotonic() > deadline:
             return f"the trial did not finish in time: {'; '.join(screen.faults) or 'no node reports a fault'}"
     return "stopped by the operator" if stopped.is_set() else ""
+
+
+def is_falling(status: Status) -> bool:
+    """Return whether an arm is being let down."""
+    return any(values.get("state") == State.LETTING_DOWN.value for values in status.values())
 
 
 def fault_of(status: Status) -> tuple[str, str]:
