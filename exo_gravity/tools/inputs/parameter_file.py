@@ -8,6 +8,7 @@ stops them in order: bridges first, because they need the others while they let 
 """
 
 import os
+import re
 import shutil
 import sys
 import tempfile
@@ -28,6 +29,7 @@ MAX_LIST = 100  # entries; the longest list of any parameter has 4, and ROS's re
 # libyaml is ten times faster; PyYAML is sometimes built without it.
 Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
+OURS = re.compile(rb"exo[-_]gravity")  # in what pip or colcon generates for our entry points
 NODES_PACKAGE = "exo_gravity.nodes."
 WATCHDOG_TIMEOUT = 30.0  # s for the watchdog of a dead bridge to let the arm down
 RECOVERY_TIMEOUT = WATCHDOG_TIMEOUT + DESCENT_TIMEOUT
@@ -101,7 +103,10 @@ def node_names() -> tuple[str, ...]:
 
 
 def executable(node: str) -> str:
-    """Return the path of the executable of `node` ('/right/can_bridge'). Raises ParameterError if there is none."""
+    """Return the path of our executable of `node` ('/right/can_bridge'). Raises ParameterError if there is none.
+
+    python-can installs an executable `can_bridge` of its own, which may lie in the same folder.
+    """
     name, names = node.rpartition("/")[2], node_names()
     if name not in names:
         raise ParameterError("node name", node, f"/namespace/executable, with one of {', '.join(names)}")
@@ -111,11 +116,13 @@ def executable(node: str) -> str:
         Path(sys.executable).parent,
         *(Path(prefix, "lib", "exo_gravity") for prefix in prefixes),
     )
-    path = os.pathsep.join(map(str, folders))
-    found = shutil.which(name, path=path)
-    if found is None:
-        raise ParameterError("node name", node, f"an installed executable: {name} is in none of {path}")
-    return found
+    found = filter(None, (shutil.which(name, path=str(folder)) for folder in folders))
+    ours = next((path for path in found if OURS.search(Path(path).read_bytes())), None)
+    if ours is None:
+        where = ", ".join(map(str, folders))
+        expected = f"an installed executable: exo_gravity's {name} is in none of {where}; reinstall exo_gravity"
+        raise ParameterError("node name", node, expected)
+    return ours
 
 
 def stages(nodes: Iterable[str]) -> tuple[list[str], list[str], list[str]]:
