@@ -181,10 +181,9 @@ def typed(command: str, expected: str) -> str:
     text = ""
     for line in process.stdout:
         text += line
-        if " echo " in command or " pub " in command:
-            if re.search(expected, text):
-                os.killpg(process.pid, signal.SIGINT)
-                break
+        if (" echo " in command or " pub " in command) and re.search(expected, text):
+            os.killpg(process.pid, signal.SIGINT)
+            break
     process.stdout.close()
     process.wait()
     timer.cancel()
