@@ -33,8 +33,8 @@ ROS2 = {
     f'ros2 param set {RIGHT} assist.max_effort "[1.0, 1.0, 1.0, 1.0]"': SUCCESS,
     f'{CALL}/enable std_srvs/srv/SetBool "{{data: false}}"': "success=True, message='the motors are switched off once",
     f'{CALL}/enable std_srvs/srv/SetBool "{{data: true}}"': "success=True, message='torque follows in",
-    'ros2 param set /right/simulator fault.error "[0, 5, 0, 0]"': SUCCESS,
-    'ros2 param set /right/simulator fault.error "[0, 0, 0, 0]"': SUCCESS,
+    'ros2 param set /right/simulator fault.temperature "[30.0, 90.0, 30.0, 30.0]"': SUCCESS,
+    'ros2 param set /right/simulator fault.temperature "[30.0, 30.0, 30.0, 30.0]"': SUCCESS,
     f"{CALL}/clear_fault std_srvs/srv/Trigger": "success=True",
     f'{HOLD} "{{key: anna, value: hold}}"': "publishing #3",
 }
