@@ -5,6 +5,7 @@ test/nodes starts real nodes.
 
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -14,7 +15,7 @@ import pytest
 import yaml
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.tools.inputs.parameter_file import chosen, executable, in_namespace, load, node_names, stages
+from exo_gravity.tools.inputs.parameter_file import chosen, command_of, in_namespace, load, node_names, stages
 from exo_gravity.tools.launcher import Launcher, main, stop_on_signals, stop_with_owner
 
 NODES = Path(__file__).parents[2] / "exo_gravity" / "nodes"
@@ -117,17 +118,15 @@ def test_without_rclpy_one_line_says_how_to_get_it(capsys, monkeypatch):
     assert "exo_gravity[ros]" in error and error.count("\n") == 1
 
 
-def test_python_cans_own_can_bridge_is_not_started_in_place_of_ours(tmp_path, monkeypatch):
-    theirs = tmp_path / "can_bridge"
-    theirs.write_text(f"#!{sys.executable}\nimport sys\nfrom can.bridge import main\nsys.exit(main())\n")
-    theirs.chmod(0o755)
-    monkeypatch.setattr(sys, "argv", [str(tmp_path / "launcher")])  # which lies beside it
-    ours = executable("/right/can_bridge")
-    assert ours != str(theirs) and "exo_gravity" in Path(ours).read_text().replace("-", "_")
-    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
-    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
-    with pytest.raises(ParameterError, match=r"exo_gravity's can_bridge is in none of .*; reinstall"):
-        executable("/right/can_bridge")
+def test_a_node_is_run_from_this_package_whatever_lies_in_the_folders(tmp_path, monkeypatch):
+    for theirs in ("can_bridge", "can.py", "yaml.py"):  # python-can installs a can_bridge of its own
+        (tmp_path / theirs).write_text(f"#!{sys.executable}\nraise SystemExit('another program')\n")
+        (tmp_path / theirs).chmod(0o755)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    command = [*command_of("/right/can_bridge"), "--ros-args", "-r", "__ns:=/right"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert ended.returncode == 2 and "can.interface" in ended.stderr, ended.stderr
 
 
 def test_only_a_part_of_the_nodes_is_started(monkeypatch):
