@@ -40,7 +40,6 @@ ROS2 = {
 }
 ELSEWHERE = {  # by their beginnings: what runs them, or what they need that no test has
     "ros2 launch exo_gravity exo.launch.py": "other tests of `make ros2-launch`",
-    "ros2 run exo_gravity": "the launcher's tests; here only the executable's name",
     "ros2 service call /arm/compensator/clear_fault": "test/nodes/test_compensator_urdf.py, over the service",
     "ros2 launch exo_gravity view.launch.py": "ros-jazzy-rviz2 and ros-jazzy-robot-state-publisher",
     "ros2 security": "ros-jazzy-sros2",
@@ -77,5 +76,5 @@ def commands_of(path: Path) -> list[str]:
 
 
 def words_of(command: str) -> list[str]:
-    """Return the words of a command of ours, without the background's ampersand."""
-    return shlex.split(command.rstrip("& "))
+    """Return the words of a command of ours, without a workspace's prefix and the background's ampersand."""
+    return shlex.split(command.removeprefix("ros2 run exo_gravity ").rstrip("& "))
