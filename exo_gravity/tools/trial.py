@@ -136,8 +136,8 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
         code = code or report.exit_code
         if clip:
             video.write(bag, clip, console)
-    log = "" if options.offline else "log, "
-    console.print(f"Report, recording, {log}and parameters: {folder}", markup=False, soft_wrap=True)
+    log = "" if options.offline else ", log"
+    console.print(f"Report, recording{log} and parameters: {folder}", markup=False, soft_wrap=True)
     if end.trouble and end.busy and code != 2:
         trouble, code = f"this computer was too busy: {end.busy}. {ADVICE}", BUSY_CODE
     if trouble:
