@@ -1,7 +1,7 @@
 # A ROS 2 Jazzy host with this package, for a robot's computer or for trials in simulation.
 #
 #   docker build --tag exo_gravity .
-#   docker run --rm exo_gravity ros2 run exo_gravity trial demo --output /tmp/trials
+#   docker run --rm exo_gravity trial demo --output /tmp/trials
 #   docker run --rm --network host --stop-timeout 120 --cap-add SYS_NICE --ulimit rtprio=98 --ulimit memlock=-1 \
 #       --volume /run/lock:/run/lock --volume "$PWD/my.yaml:/exo.yaml:ro" exo_gravity launcher --params /exo.yaml
 #
@@ -24,11 +24,11 @@ RUN apt-get update \
     && apt-get install --yes --no-install-recommends python3-matplotlib python3-pip python3-scipy \
     && rm -rf /var/lib/apt/lists/*
 
-# From PyPI, because Ubuntu does not have them: the simulator, the reports, orientation filter and I2C. NumPy stays
+# From PyPI: the simulator, the reports, the operator's page, orientation filter and I2C. NumPy stays
 # Ubuntu's, against which ROS's messages are compiled.
 COPY constraints/ros.txt constraints.txt
 RUN python3 -m pip install --no-cache-dir --break-system-packages --constraint constraints.txt \
-    mcap mujoco rich rosbags smbus2 vqf
+    mcap mujoco rich rosbags smbus2 starlette uvicorn vqf websockets
 
 COPY . src/exo_gravity
 RUN source /opt/ros/jazzy/setup.bash && colcon build --packages-select exo_gravity

@@ -15,12 +15,28 @@ tools = ("launcher", "trial", "report", "budget", "validate", "train_anfis", "ca
 
 extras = {
     # Jazzy as wheels, for a machine without ROS. Where ROS 2 is installed, leave this extra out.
-    "ros": ["ros-jazzy-rclpy[fastrtps]==7.1.6", "ros-jazzy-common-interfaces==5.3.6"],
+    "ros": [
+        "msgpack>=1.0",
+        "python-can>=4.3",
+        "PyYAML>=6.0",
+        "ros-jazzy-common-interfaces==5.3.6",
+        "ros-jazzy-rclpy[fastrtps]==7.1.6",
+    ],
     "imu": ["pyserial>=3.5", "smbus2>=0.4.2", "vqf>=2.1"],
-    "sim": ["mujoco>=3.2"],
-    "report": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11", "scipy>=1.11"],
+    "sim": ["msgpack>=1.0", "mujoco>=3.2", "python-can>=4.3", "PyYAML>=6.0"],
+    "bag": ["mcap>=1.2", "rosbags>=0.11"],
+    "report": ["matplotlib>=3.8", "mcap>=1.2", "PyYAML>=6.0", "rich>=13.0", "rosbags>=0.11", "scipy>=1.11"],
     "video": ["imageio[pyav]>=2.31", "mujoco>=3.2", "pillow>=10.1"],
-    "calibrate": ["matplotlib>=3.8", "mcap>=1.2", "rich>=13.0", "rosbags>=0.11", "scipy>=1.11"],
+    "calibrate": [
+        "matplotlib>=3.8",
+        "mcap>=1.2",
+        "msgpack>=1.0",
+        "python-can>=4.3",
+        "PyYAML>=6.0",
+        "rich>=13.0",
+        "rosbags>=0.11",
+        "scipy>=1.11",
+    ],
     "analysis": ["pandas>=2.1"],  # Bag.to_frame
     "panel": ["starlette>=0.40", "uvicorn>=0.30", "websockets>=13.0"],
     "validate": [
@@ -82,7 +98,7 @@ setup(
         (f"share/{package_name}/launch", glob("launch/*.py")),
     ],
     python_requires=">=3.10",
-    install_requires=["msgpack>=1.0", "numpy>=1.26", "python-can>=4.3", "PyYAML>=6.0"],
+    install_requires=["numpy>=1.26"],
     extras_require=extras,
     zip_safe=False,
     maintainer=declared.findtext("maintainer"),

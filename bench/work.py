@@ -75,8 +75,8 @@ def _offline(hold: float) -> tuple[float, float]:
     params = packaged_config("sim.yaml")
     trials = simulated_trials(params, script)
     begin = time.perf_counter()
-    bag, _ = run_offline(trials, params, Console(quiet=True), lambda: False)
-    return float(bag.recordings[0].time[-1]), time.perf_counter() - begin
+    recordings, *_ = run_offline(trials, Console(quiet=True), lambda: False)
+    return float(recordings[0].time[-1]), time.perf_counter() - begin
 
 
 def _recording(path: Path, seconds: int) -> Path:

@@ -22,12 +22,6 @@ def _start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     description = urdf_of(Path(LaunchConfiguration("params").perform(context)), meshes=meshes)
     return [
         Node(
-            package="exo_gravity",
-            executable="robot_model",
-            parameters=[{"meshes": ParameterValue(meshes, value_type=str)}],
-            output="screen",
-        ),
-        Node(
             package="robot_state_publisher",
             executable="robot_state_publisher",
             parameters=[{"robot_description": ParameterValue(description, value_type=str)}],
@@ -38,6 +32,13 @@ def _start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             executable="rviz2",
             arguments=["--display-config", str(packaged_config("rviz/exo.rviz"))],
             condition=IfCondition(LaunchConfiguration("rviz")),
+        ),
+        # Last: where one of the others is not installed, launch fails, and would leave it behind.
+        Node(
+            package="exo_gravity",
+            executable="robot_model",
+            parameters=[{"meshes": ParameterValue(meshes, value_type=str)}],
+            output="screen",
         ),
     ]
 

@@ -1,6 +1,7 @@
 """The documents agree with the code: generated tables, links, paths, and the library example of the README."""
 
 import contextlib
+import importlib
 import io
 import re
 import shutil
@@ -11,10 +12,11 @@ from pathlib import Path
 import pytest
 
 from exo_gravity.core.safety.drive import FaultCode
+from exo_gravity.tools.inputs.parameter_file import node_names
 
-ROOT = Path(__file__).parents[1]
+from .support.document_commands import DOCUMENTS, ELSEWHERE, ROOT, ROS2, commands_of, words_of
+
 TABLES = ROOT / "docs" / "tables.py"
-DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 NODES = ("can_bridge", "compensator", "imu", "simulator", "recorder", "robot_model", "calibrator", "panel")
 EXAMPLE = re.compile(r"```python\n(.*?)```\s*```text\n(.*?)```", re.DOTALL)
 FOLDERS = "bench|config|docs|examples|exo_gravity|launch|test|core|hardware|sim|bag|panel|nodes|tools"
@@ -81,6 +83,32 @@ def test_the_programs_in_a_document_print_what_it_shows(path: Path) -> None:
         with contextlib.redirect_stdout(printed):
             exec(code, names)
         assert printed.getvalue() == shown
+
+
+@pytest.mark.parametrize("path", [path for path in DOCUMENTS if commands_of(path)], ids=name)
+def test_every_command_is_one_that_exists(path: Path) -> None:
+    rules = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE)
+    for command in commands_of(path):
+        if command in ROS2 or command.startswith(tuple(ELSEWHERE)):
+            continue
+        tool, *words = words_of(command)
+        if tool == "make":
+            assert words[0] in rules, command
+        elif tool not in node_names():
+            importlib.import_module(f"exo_gravity.tools.{tool}")._arguments(words)  # SystemExit if it is wrong
+
+
+def test_commands_of_ros2_are_in_the_documents() -> None:
+    shown = {command for path in DOCUMENTS for command in commands_of(path)}
+    assert set(ROS2) <= shown
+
+
+def test_a_command_of_ours_has_no_prefix() -> None:
+    assert not [command for path in DOCUMENTS for command in commands_of(path) if command.startswith(".venv/")]
+    assert {name(path) for path in DOCUMENTS if "ros2 run exo_gravity" in path.read_text("utf-8")} == {
+        "README.md",  # in its example of a workspace
+        "docs/installation.md",  # which states the rule
+    }
 
 
 def test_the_site_has_every_document() -> None:

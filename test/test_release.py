@@ -37,6 +37,7 @@ EXTRAS = {
     "mcap_ros2",
     "mpl_toolkits",
     "mujoco",
+    "pandas",
     "pinocchio",
     "playwright",
     "rich",

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 
 # Ubuntu 24.04 has these as python3-NAME; all others come from PyPI only.
-APT = ("matplotlib", "rich", "scipy", "sklearn", "threadpoolctl")
+APT = ("matplotlib", "rich", "scipy", "sklearn", "threadpoolctl", "yaml")
 
 
 def non_negative(text: str) -> float:

@@ -38,7 +38,7 @@ from exo_gravity.tools.inputs.parameter_file import (
     SUPERVISED,
     check_buses,
     chosen,
-    executable,
+    command_of,
     in_namespace,
     load,
     node_names,
@@ -185,7 +185,7 @@ class Launcher:
         topics = [f"{topic}:={self._namespace}{topic}" for topic in ABSOLUTE_TOPICS if self._namespace]
         remaps = [word for rule in (f"__node:={name}", f"__ns:={namespace or '/'}", *topics) for word in ("-r", rule)]
         options = ("--enclave", node, "--params-file", str(self._path), "--log-level", self._log_level)
-        return [executable(node), "--ros-args", *remaps, *options]
+        return [*command_of(node), "--ros-args", *remaps, *options]
 
     def _read(self, node: str, process: subprocess.Popen[str]) -> None:
         for line in process.stdout or ():

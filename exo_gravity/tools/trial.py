@@ -116,21 +116,20 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
         if clip:
             os.environ["MUJOCO_GL"] = video.backend()  # before the simulated device imports MuJoCo
         with extras("trial", "sim"):
-            from exo_gravity.tools.trials.offline import run_offline, simulated_trials
+            from exo_gravity.tools.trials.offline import record_offline, simulated_trials
         trials = simulated_trials(params, script)
-        bag, trouble = run_offline(trials, prepare(params, path, folder, None), console, stopped.is_set)
-        bag = replace(bag, session=replace(session, version=version()))
+        given = prepare(params, path, folder, None)
+        trouble = record_offline(trials, given, replace(session, version=version()), console, stopped.is_set)
         end = TrialEnd(trouble, int(bool(trouble)))
+    elif options.attach:
+        end = _attached(guided, path, script, folder, session, console, stopped)
     else:
-        if options.attach:
-            end = _attached(guided, path, script, folder, session, console, stopped)
-        else:
-            end = run_attempts(params, path, script, folder, session, console, stopped)
-        try:
-            bag = read_bag(folder / "bag")
-        except DataError:
-            if not end.trouble:
-                raise
+        end = run_attempts(params, path, script, folder, session, console, stopped)
+    try:
+        bag = read_bag(folder / "bag")
+    except DataError:
+        if not end.trouble:
+            raise
     trouble, code = end.trouble, end.code
     if bag is not None:
         report = trial_report.analyse(bag, criteria_for(script), shortest_hold(script, guided), trouble)
@@ -145,8 +144,8 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
             video.write(bag, clip, console)
     else:
         trial_report.write_empty(folder, script.name, trouble)
-    contents = "Report and parameters" if options.offline else "Report, recording, log and parameters"
-    console.print(f"{contents}: {folder}", markup=False, soft_wrap=True)
+    log = "" if options.offline else ", log"
+    console.print(f"Report, recording{log} and parameters: {folder}", markup=False, soft_wrap=True)
     if end.trouble and end.busy and code != 2:
         trouble, code = f"this computer was too busy: {end.busy}. {ADVICE}", BUSY_CODE
     if trouble:

@@ -1,11 +1,13 @@
-"""The launch file under `ros2 launch`, where ROS 2 is installed: `make ros2-launch`. PyPI carries no `launch`.
+"""The launch file under `ros2 launch`, and the documents' commands of `ros2`, where ROS 2 is installed.
 
-Judged by the simulated arm's true motion: the arm is let down before the simulator, and with it the motors, ends.
+`make ros2-launch` runs them; PyPI carries no `launch`. Judged by the simulated arm's true motion: the arm is let down
+before the simulator, and with it the motors, ends.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import threading
@@ -15,11 +17,14 @@ from pathlib import Path
 
 import pytest
 
-from ..support.launched_nodes import LaunchedNodes, children
+from ..support.document_commands import ROS2
+from ..support.launched_nodes import CALM, LaunchedNodes, children, prefer
 from ..support.ros_probe import RosProbe
 from ..support.truth import Truth
 
-LAUNCH_FILE = Path(__file__).parents[2] / "launch" / "exo.launch.py"
+PACKAGE = ("exo_gravity", "exo.launch.py")
+ANSWER_TIMEOUT = 60.0  # s for a command's output
+STARTING = 50  # lines of the log, by which all nodes have started
 STOP_TIMEOUT = 60.0  # s
 LARGEST_SPEED = 1.0  # rad/s of an arm that is let down
 
@@ -30,7 +35,7 @@ class Launched:
     def __init__(self, nodes: LaunchedNodes, *arguments: str) -> None:
         self.truth = Truth(nodes.truth_path())
         self.log: list[str] = []
-        command = ["ros2", "launch", str(LAUNCH_FILE), f"params:={nodes.path}", *arguments]
+        command = ["ros2", "launch", *PACKAGE, f"params:={nodes.path}", *arguments]
         self.process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
         )
@@ -39,6 +44,8 @@ class Launched:
 
     def _read(self) -> None:
         for line in self.process.stdout:
+            if len(self.log) < STARTING:
+                prefer(self.process.pid)
             self.log.append(line.rstrip())
 
     def ctrl_c(self) -> None:
@@ -100,8 +107,17 @@ def test_when_a_node_dies_the_arm_is_let_down_all_stop_and_the_exit_code_is_1(la
     assert any(f"{node} ended with exit code -9; all nodes were stopped" in line for line in launched.log)
 
 
-def test_when_launch_is_killed_its_launcher_lets_the_arm_down(launched):
+def kill(launched):
     os.kill(launched.process.pid, signal.SIGKILL)
+
+
+def close_terminal(launched):
+    os.killpg(launched.process.pid, signal.SIGHUP)
+
+
+@pytest.mark.parametrize("end_launch", [kill, close_terminal])
+def test_when_launch_is_killed_or_its_terminal_closed_its_launcher_lets_the_arm_down(launched, end_launch):
+    end_launch(launched)
     launched.wait()
     end = time.monotonic() + STOP_TIMEOUT
     while not launched.truth.motors_are_off():
@@ -130,3 +146,64 @@ def test_a_namespace_is_in_front_of_every_node_and_of_the_imus_topics(prepare):
         launched.ctrl_c()
         assert launched.wait() == 0
         probe.close()
+
+
+def test_the_panel_starts_alone_by_arguments(prepare):
+    launched = Launched(prepare(), "panel:=true", "only:=/panel")
+    end = time.monotonic() + ANSWER_TIMEOUT
+    while not any("the panel is at http://" in line for line in launched.log):
+        assert time.monotonic() < end, launched.log
+        time.sleep(0.1)
+    launched.ctrl_c()
+    assert launched.wait() == 0
+    assert not any("right/" in line for line in launched.log)
+
+
+@pytest.fixture(scope="module")
+def standing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosProbe]:
+    """A probe beside a simulated arm that is not yet configured, for all commands of `ros2` in their order."""
+    nodes = LaunchedNodes(tmp_path_factory.mktemp("commands"), timing=CALM, can_bridge={"autostart": False})
+    launched, probe = Launched(nodes), RosProbe()
+    probe.wait_until(lambda: probe.status_contains("can_bridge", "inactive"))
+    yield probe
+    launched.ctrl_c()
+    launched.wait()
+    nodes.stop()
+    probe.close()
+    print("\n".join(launched.log))  # pytest shows it if a test failed
+
+
+def typed(command: str, expected: str) -> str:
+    """Return what a command of a document prints: all of it, or until it shows `expected`, if it does not end."""
+    process = subprocess.Popen(
+        ["bash", "-c", f"SHARE=$(ros2 pkg prefix --share exo_gravity); {command}"],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
+    )  # fmt: skip
+    timer = threading.Timer(ANSWER_TIMEOUT, os.killpg, (process.pid, signal.SIGKILL))
+    timer.start()
+    text = ""
+    for line in process.stdout:
+        text += line
+        if (" echo " in command or " pub " in command) and re.search(expected, text):
+            os.killpg(process.pid, signal.SIGINT)
+            break
+    process.stdout.close()
+    process.wait()
+    timer.cancel()
+    return text
+
+
+# What the state of the arm must be before a command, if it does not answer in each.
+BEFORE = {"data: false": "active", "data: true": "disabled", "90.0, 30.0": "active", "clear_fault": "fault"}
+
+
+@pytest.mark.parametrize(("command", "expected"), ROS2.items())
+def test_a_command_of_the_documents_answers(standing, command, expected):
+    for part, state in BEFORE.items():
+        if part in command and state == "active":
+            standing.wait_until_carried()
+        elif part in command:
+            standing.wait_until(lambda state=state: standing.state in (state, "fault"))
+            assert standing.state == state or standing.trigger("clear_fault").success  # of a busy computer
+    said = typed(command, expected)
+    assert re.search(expected, said), said

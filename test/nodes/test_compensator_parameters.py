@@ -6,10 +6,12 @@ import math
 from collections.abc import Iterator
 
 import pytest
+import yaml
 from rcl_interfaces.srv import DescribeParameters, SetParametersAtomically
 
 from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.tools.inputs.parameter_file import load
 
 from ..support.launched_nodes import NO_IMU, LaunchedNodes
 from ..support.random_parameters import parameter_message
@@ -54,6 +56,16 @@ def test_an_invalid_value_is_refused_with_one_sentence_and_changes_nothing(compe
         assert not result.successful
         assert sentence in result.reason
     assert compensator.dump_parameters([NODE]) == before
+
+
+def test_its_own_dump_can_be_loaded_and_a_read_only_parameter_not_changed(compensator, tmp_path):
+    path = tmp_path / "dump.yaml"
+    path.write_text(yaml.safe_dump(compensator.dump_parameters([NODE])), encoding="utf-8")
+    dumped = load(path)[NODE]
+    assert {"link_length", "start_type_description_service"} <= set(dumped)
+    for name, value in dumped.items():
+        assert compensator.set_parameters("compensator", **{name: value}).successful, name
+    assert not compensator.set_parameters("compensator", link_length=[0.05, 0.13, 0.3, 0.31]).successful
 
 
 def test_an_integer_is_accepted_where_a_float_is_declared(compensator):

@@ -5,6 +5,7 @@ test/nodes starts real nodes.
 
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -14,7 +15,7 @@ import pytest
 import yaml
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.tools.inputs.parameter_file import chosen, in_namespace, load, node_names, stages
+from exo_gravity.tools.inputs.parameter_file import chosen, command_of, in_namespace, load, node_names, stages
 from exo_gravity.tools.launcher import Launcher, main, stop_on_signals, stop_with_owner
 
 NODES = Path(__file__).parents[2] / "exo_gravity" / "nodes"
@@ -115,6 +116,17 @@ def test_without_rclpy_one_line_says_how_to_get_it(capsys, monkeypatch):
     error = capsys.readouterr().err
     assert ended.value.code == 2 and error.startswith("launcher: the Python package rclpy is not found: ")
     assert "exo_gravity[ros]" in error and error.count("\n") == 1
+
+
+def test_a_node_is_run_from_this_package_whatever_lies_in_the_folders(tmp_path, monkeypatch):
+    for theirs in ("can_bridge", "can.py", "yaml.py"):  # python-can installs a can_bridge of its own
+        (tmp_path / theirs).write_text(f"#!{sys.executable}\nraise SystemExit('another program')\n")
+        (tmp_path / theirs).chmod(0o755)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    command = [*command_of("/right/can_bridge"), "--ros-args", "-r", "__ns:=/right"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert ended.returncode == 2 and "can.interface" in ended.stderr, ended.stderr
 
 
 def test_only_a_part_of_the_nodes_is_started(monkeypatch):

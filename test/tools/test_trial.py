@@ -15,8 +15,9 @@ from typing import Any, Protocol
 import numpy as np
 import pytest
 import yaml
+from rosbags.rosbag2 import Reader
 
-from exo_gravity.tools import launcher, trial
+from exo_gravity.tools import launcher, report, trial
 from exo_gravity.tools.trial import main
 
 from ..support import csv_rows
@@ -76,7 +77,7 @@ def holds(folder: Path) -> list[dict[str, str]]:
     return csv_rows(folder / "holds.csv")
 
 
-def test_an_offline_trial_ends_with_a_report(run, capsys):
+def test_an_offline_trial_ends_with_a_report_of_its_recording(run, capsys):
     code, folder = run("--offline")
     assert code == 0
     written = {path.name for path in folder.iterdir()}
@@ -87,11 +88,17 @@ def test_an_offline_trial_ends_with_a_report(run, capsys):
         "report.html",
         "right_overview.png",
         "right_drift.png",
+        "bag",
     }
     text = capsys.readouterr().out
     assert "times real time" in text and "It held." in text
     pose = [float(row["pose_deg"]) for row in holds(folder)]
     np.testing.assert_allclose(pose, np.degrees(SHORT["steps"][0]["move"]), atol=2.0)
+    with Reader(folder / "bag") as recorded:  # rosbags' own
+        assert {"/right/joint_states", "/right/effort_commands", "/diagnostics"} <= set(recorded.topics)
+    assert report.main([str(folder / "bag"), "--output", str(folder / "again")]) == 0
+    for table in ("holds.csv", "motions.csv"):
+        assert csv_rows(folder / "again" / table) == csv_rows(folder / table)
 
 
 @pytest.mark.usefixtures("without_pictures")

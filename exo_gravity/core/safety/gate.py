@@ -55,7 +55,7 @@ def missing_for_a_start(
             if not abs(joint.position - home) <= tolerance:
                 reason = (
                     f"{name}: {joint.position:.3f} rad at the start, must be within {tolerance:g} of {home:g}: "
-                    "let the arm hang, or correct the parameter zero"
+                    "bring the joint there by hand, or correct the parameter zero"
                 )
                 return Fault(FaultCode.IMPLAUSIBLE_ZERO, reason)
     return "the arm to be at rest" if any(abs(joint.velocity) > AT_REST for joint in joints) else ""

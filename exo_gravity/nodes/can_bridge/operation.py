@@ -36,6 +36,11 @@ REQUESTS = 32  # of control, that wait for the next look
 WATCH_PERIOD = 0.1  # s between two looks at them
 CALL_TIMEOUT = 2.0  # s that a service waits for the control thread
 
+# What follows a request that was carried out, by the state that it led to.
+FOLLOWS = {
+    State.CHECKING: "torque follows in 3 s, at the first start in 10 s; if not, /diagnostics says what is missing",
+    State.LETTING_DOWN: "the motors are switched off once the arm is down; /diagnostics shows the state",
+}
 UNREACHED = "a motor that was on does not reply and may still be powered, unless its supply is cut: cut it"
 
 
@@ -117,6 +122,8 @@ class BridgeServices:
             future.cancel()
             response.message = "the control thread did not respond"
         response.success = not response.message
+        if response.success:
+            response.message = FOLLOWS.get(loop.safety.state, "")
         return response
 
 

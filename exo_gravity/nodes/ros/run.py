@@ -4,6 +4,7 @@ rclpy's own signal handlers close the context before a node can react. Here a si
 `close` still has a valid context, and its last CAN frames are sent.
 """
 
+import contextlib
 import gc
 import os
 import signal
@@ -70,6 +71,8 @@ def run(make_node: Callable[[], Node], priority: int = 0) -> int:
     if priority:
         favour(priority)
     executable = os.path.basename(sys.argv[0])
+    with contextlib.suppress(OSError):
+        Path("/proc/self/comm").write_text(executable)  # for ps, top and pgrep
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()

@@ -7,8 +7,6 @@ The tools read it to find out which nodes to start and which arms they have; the
 stops them in order: bridges first, because they need the others while they let the arms down, and the recorder last.
 """
 
-import os
-import shutil
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
@@ -29,6 +27,13 @@ MAX_LIST = 100  # entries; the longest list of any parameter has 4, and ROS's re
 Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 NODES_PACKAGE = "exo_gravity.nodes."
+# What the executable does. The folder in which the user stands, '' in the path, is not searched for modules.
+PROGRAM = """import sys
+sys.path = [*filter(None, sys.path)]
+sys.argv[0] = {name!r}
+from {module} import main
+sys.exit(main())
+"""
 WATCHDOG_TIMEOUT = 30.0  # s for the watchdog of a dead bridge to let the arm down
 RECOVERY_TIMEOUT = WATCHDOG_TIMEOUT + DESCENT_TIMEOUT
 STOP_TIMEOUT = 5.0  # s for any other node to end
@@ -91,31 +96,29 @@ def _flat(node: str, prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
     yield prefix, value
 
 
-def node_names() -> tuple[str, ...]:
-    """Return the executables that are nodes, from the entry points of the installed package."""
+def _modules() -> dict[str, str]:
+    """Return the executables that are nodes, each with its module, from the entry points of the installed package."""
     try:
         scripts = distribution("exo_gravity").entry_points.select(group="console_scripts")
     except PackageNotFoundError:
-        return ()
-    return tuple(sorted(script.name for script in scripts if script.value.startswith(NODES_PACKAGE)))
+        return {}
+    return {script.name: script.module for script in sorted(scripts) if script.module.startswith(NODES_PACKAGE)}
 
 
-def executable(node: str) -> str:
-    """Return the path of the executable of `node` ('/right/can_bridge'). Raises ParameterError if there is none."""
-    name, names = node.rpartition("/")[2], node_names()
-    if name not in names:
-        raise ParameterError("node name", node, f"/namespace/executable, with one of {', '.join(names)}")
-    prefixes = filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(":"))
-    folders = (
-        Path(sys.argv[0]).resolve().parent,
-        Path(sys.executable).parent,
-        *(Path(prefix, "lib", "exo_gravity") for prefix in prefixes),
-    )
-    path = os.pathsep.join(map(str, folders))
-    found = shutil.which(name, path=path)
-    if found is None:
-        raise ParameterError("node name", node, f"an installed executable: {name} is in none of {path}")
-    return found
+def node_names() -> tuple[str, ...]:
+    """Return the executables that are nodes."""
+    return tuple(_modules())
+
+
+def command_of(node: str) -> list[str]:
+    """Return the command that runs `node` ('/right/can_bridge') from this package. Raises ParameterError if none does.
+
+    It looks for no file in a folder: python-can installs an executable `can_bridge` too.
+    """
+    name, modules = node.rpartition("/")[2], _modules()
+    if name not in modules:
+        raise ParameterError("node name", node, f"/namespace/executable, with one of {', '.join(modules)}")
+    return [sys.executable, "-c", PROGRAM.format(name=name, module=modules[name])]
 
 
 def stages(nodes: Iterable[str]) -> tuple[list[str], list[str], list[str]]:

@@ -13,9 +13,12 @@ import yaml
 from rich.console import Console
 from rich.progress import Progress, TaskID
 
-from exo_gravity.bag.content import Bag, Event
+from exo_gravity.bag.content import Event
+from exo_gravity.bag.writer import write_recordings
 from exo_gravity.core.errors import ParameterError, named
+from exo_gravity.core.trial.recording import Recording
 from exo_gravity.core.trial.script import TRUNK_ACTIONS, TrialScript
+from exo_gravity.core.trial.session import Session
 from exo_gravity.hardware.trunk_estimator import VQF, ImuSample, TrunkEstimator
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu, measured_tilt
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial, TrunkReading, TrunkSensor, resting
@@ -58,13 +61,12 @@ def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
 
 
 def run_offline(
-    trials: Sequence[OfflineTrial], params: Path, console: Console, should_stop: Callable[[], bool]
-) -> tuple[Bag, str]:
-    """Run the trials; return what a recording of them would hold, and why a trial ended early, or ''.
+    trials: Sequence[OfflineTrial], console: Console, should_stop: Callable[[], bool]
+) -> tuple[list[Recording], list[Event], str]:
+    """Run the trials; return what was recorded, what went wrong, and why a trial ended early, or ''.
 
-    params: parameter file in the folder of the trial. Raises DataError if nothing was recorded.
+    Raises DataError if nothing was recorded.
     """
-    start = time.time_ns()
     recordings = []
     for trial in trials:
         name = trial.arm.name
@@ -81,13 +83,23 @@ def run_offline(
         length = float(recordings[-1].time[-1])
         console.print(f"{name}: {length:.0f} s simulated in {taken:.1f} s, {length / taken:.0f} times real time")
     events = sorted(Event(*event) for trial in trials for event in trial.events)
+    return recordings, events, next((trial.trouble for trial in trials if trial.trouble), "")
+
+
+def record_offline(
+    trials: Sequence[OfflineTrial], params: Path, session: Session, console: Console, should_stop: Callable[[], bool]
+) -> str:
+    """Run the trials and write `bag` beside the parameter file `params`; return why one ended early, or ''.
+
+    Raises DataError if nothing was recorded, or it cannot be written.
+    """
+    recordings, events, trouble = run_offline(trials, console, should_stop)
     texts = {
         node: yaml.safe_dump({node: {"ros__parameters": values}}, default_flow_style=None, width=120)
         for node, values in load(params).items()
     }
-    notes = ("simulated offline: this report has no recording",)
-    trouble = next((trial.trouble for trial in trials if trial.trouble), "")
-    return Bag(params.parent, start, tuple(recordings), tuple(events), texts, notes, ()), trouble
+    write_recordings(params.with_name("bag"), recordings, events, texts, session)
+    return trouble
 
 
 def trunk_imu(config: ImuConfig, rotation_trunk_from_imu: Sequence[float], cycle_rate: float) -> TrunkSensor:

@@ -43,6 +43,7 @@ POSSIBLE = {
     FaultCode.COMMAND_STALE.value: "the efforts came too late",
     FaultCode.COMMAND_WITHDRAWN.value: "",
     FaultCode.SIGN_UNPROVEN.value: "",
+    FaultCode.TORQUE_NOT_DELIVERED.value: "",
 }
 
 Status = Mapping[str, Mapping[str, Any]]  # of each node on /diagnostics, as in the recorder's live lines
