@@ -44,6 +44,7 @@ ELSEWHERE = {  # by their beginnings: what runs them, or what they need that no 
     "ros2 launch exo_gravity view.launch.py": "ros-jazzy-rviz2 and ros-jazzy-robot-state-publisher",
     "ros2 security": "ros-jazzy-sros2",
     "ROS_SECURITY_ENCLAVE_OVERRIDE=": "ros-jazzy-sros2",
+    "ros2 topic pub -w 1 --once /event_marker": "test/nodes/test_recorder.py, over the topic",
     "ros2 bag record": "ros-jazzy-ros2bag; the reader's tests read such recordings",
     "ros2 control": "ros2_control and its hardware",
     "ros2 run diagnostic_aggregator": "ros-jazzy-diagnostic-aggregator",
