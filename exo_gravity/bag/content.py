@@ -71,12 +71,12 @@ class Bag:
     parameters: dict[str, str]  #: YAML text by node
     notes: tuple[str, ...]  #: missing parts that do no harm
     problems: tuple[str, ...]  #: unreadable parts, one sentence each
-    #: the trunk's motion, (n, 7): s since the start, angular velocity (3,) in rad/s, what it feels as gravity (3,) as
-    #: a share of 1 g, in its axes
-    trunk: np.ndarray = field(default_factory=lambda: np.empty((0, 7)))
     is_partial: bool = False  #: whether it was cut short, or ends before its arms were down
     session: Session = field(default_factory=Session)  #: of whom, and what for
     markers: tuple[Event, ...] = ()  #: set by the operator or by a node
+    #: the trunk's motion, (n, 7): s since the start, angular velocity (3,) in rad/s, what it feels as gravity (3,) as
+    #: a share of 1 g, in its axes
+    trunk: np.ndarray = field(default_factory=lambda: np.empty((0, 7)))
 
     def columns(self) -> dict[str, np.ndarray]:
         """Return the time series, a row for each arm, sample and joint: columns of equal length by their names.
