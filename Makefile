@@ -11,6 +11,7 @@
 # make ordinary     ordinary motors, sensors and computers for an hour of virtual time: no alarm; a table, 10 minutes
 # make motion-monitor  which wrong efforts can_bridge sees, and an hour of a fast wearer, whom it must not disturb; 20 minutes
 # make effort-study  how hard the simulated arm is to move, under every setting, 5 minutes; QUICK=1: part of it
+# make wearer-study  the wearer's torque and share as estimated, on 20 calibrated devices, judged by the truth; 8 minutes
 # make baselines    in place of a model: PID, cube map, learned laws, a growing ANFIS, 6 minutes; build/baselines
 # make imu-report   the trunk's inclination error on recorded motion, here and by VQF and imufusion; TRIALS=FOLDER
 # make socketcan    motor bus and nodes on vcan0; RUN=COMMAND runs the tests through COMMAND, in a virtual machine for example
@@ -38,7 +39,7 @@ SETUP := VENV=$(VENV) .ci/setup
 # three times as long to start.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo calibrate-demo calibrate-study test lint docs faults mutations bench motion-monitor ordinary effort-study baselines imu-report \
+.PHONY: demo calibrate-demo calibrate-study test lint docs faults mutations bench motion-monitor ordinary effort-study wearer-study baselines imu-report \
         socketcan pythons constraints clean ros2-launch two-computers dist doctor panel presses release test-all test-long
 
 demo:
@@ -102,6 +103,10 @@ motion-monitor:
 effort-study:
 	@$(SETUP) $(TEST)
 	$(BIN)/python -m bench.effort $(if $(QUICK),--quick)
+
+wearer-study:
+	@$(SETUP) $(TEST) calibrate
+	$(BIN)/python -m bench.wearer
 
 baselines:
 	@$(SETUP) $(TEST)

@@ -38,6 +38,7 @@ FLOORS = (
     "trunk",
     "safety",
     "compensation",
+    "observer",
     "trial",
     "view",
     "calibration",

@@ -18,8 +18,9 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 STRING = "std_msgs/msg/String"
 # Of each arm, in its namespace
 STATES, COMMANDS, STEPS, ASSIST = "joint_states", "effort_commands", "wearer_step", "assist_efforts"
+WEARER = ("wearer_efforts", "wearer_efforts_std")
 # Of all
-DIAGNOSTICS, PARAMETER_EVENTS, MARKERS = "/diagnostics", "/parameter_events", "/event_marker"
+DIAGNOSTICS, PARAMETER_EVENTS, MARKERS, IMU = "/diagnostics", "/parameter_events", "/event_marker", "/imu/data"
 # Of the recorder, in the recording alone
 PARAMETERS, LOSSES, SESSION = "/recorder/parameters", "/recorder/losses", "/recorder/session"
 READ = {  # type of each topic, or last part of its name, that the reader decodes
@@ -28,6 +29,7 @@ READ = {  # type of each topic, or last part of its name, that the reader decode
     STEPS: STRING,
     DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
     PARAMETER_EVENTS: "rcl_interfaces/msg/ParameterEvent",
+    IMU: "sensor_msgs/msg/Imu",
     PARAMETERS: STRING,
     LOSSES: STRING,
     SESSION: STRING,
@@ -72,6 +74,9 @@ class Bag:
     is_partial: bool = False  #: whether it was cut short, or ends before its arms were down
     session: Session = field(default_factory=Session)  #: of whom, and what for
     markers: tuple[Event, ...] = ()  #: set by the operator or by a node
+    #: the trunk's motion, (n, 7): s since the start, angular velocity (3,) in rad/s, what it feels as gravity (3,) as
+    #: a share of 1 g, in its axes
+    trunk: np.ndarray = field(default_factory=lambda: np.empty((0, 7)))
 
     def columns(self) -> dict[str, np.ndarray]:
         """Return the time series, a row for each arm, sample and joint: columns of equal length by their names.

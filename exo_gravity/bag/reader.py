@@ -7,6 +7,7 @@ was carried comes from the key `state` of its can_bridge on /diagnostics, never 
 """
 
 import json
+import math
 from collections.abc import Sequence
 from itertools import groupby, islice
 from operator import itemgetter
@@ -21,6 +22,8 @@ from exo_gravity.bag.content import COMMANDS, JOINT_STATE, STATES, STEPS, Bag, E
 from exo_gravity.bag.joints import FIELDS, TYPES, JointArrays
 from exo_gravity.bag.storage import Storage
 from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.model.arm import STANDARD_GRAVITY
+from exo_gravity.core.model.rotation import up_in_body
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trial.recording import CARRIED, Recording, ScriptedStep, Span
 from exo_gravity.core.trial.session import Session
@@ -28,6 +31,7 @@ from exo_gravity.core.trial.session import Session
 BATCH_SIZE = 5_000  # messages that are decoded at once
 MAX_COMMAND_AGE = 200_000_000  # ns; an older command is no longer in force
 MAX_CLOCK_OFFSET = 1_000_000_000  # ns between stamp and arrival
+NOT_REPORTED = -1.0  # first entry of a covariance (REP-145)
 STATE_GAP = 1.0  # s; can_bridge reports its state twice a second, except while it ends
 TOPIC = itemgetter(0)
 
@@ -65,8 +69,10 @@ def read_bag(path: str | Path) -> Bag:
         for found in (contents.events, contents.markers)
     )
     notes, problems = tuple(contents.notes), tuple(contents.problems)
-    of_whom = contents.is_partial, contents.session, markers
-    return Bag(Path(path), start, recordings, events, contents.parameters, notes, problems, *of_whom)
+    trunk = np.array(sorted(contents.trunk), dtype=float).reshape(-1, 7)
+    trunk[:, 0] = (trunk[:, 0] - start) / 1e9
+    more = contents.is_partial, contents.session, markers, trunk
+    return Bag(Path(path), start, recordings, events, contents.parameters, notes, problems, *more)
 
 
 class _Contents:
@@ -79,6 +85,7 @@ class _Contents:
         self.session = Session()
         self.events: list[tuple[Any, ...]] = []  # stamp, text and setting of faults and changed parameters
         self.markers: list[tuple[int, str]] = []  # stamp and text
+        self.trunk: list[tuple[float, ...]] = []  # rows of Bag.trunk, with stamps in ns
         self.notes: list[str] = []
         self.problems: list[str] = []
         self.is_cut = False  # the file was cut short
@@ -120,6 +127,13 @@ class _Contents:
             for parameter in message.changed_parameters:
                 name, value = parameter.name, _value(parameter.value)
                 self.events.append((stamp, f"{message.node}: {name} = {value}", (message.node, name, value)))
+        elif topic == content.IMU:
+            q, w, a = message.orientation, message.angular_velocity, message.linear_acceleration
+            felt = [component / -STANDARD_GRAVITY for component in (a.x, a.y, a.z)]
+            if message.linear_acceleration_covariance[0] == NOT_REPORTED:
+                felt = [-component for component in up_in_body((q.x, q.y, q.z, q.w))]
+            if all(map(math.isfinite, (*felt, w.x, w.y, w.z))) and any(felt):
+                self.trunk.append((stamp, w.x, w.y, w.z, *felt))
         elif topic == content.LOSSES:
             self.losses = message.data
         elif topic == content.MARKERS:

@@ -1,5 +1,6 @@
 """The settings of the compensator, checked against each other, and the parameters that describe them."""
 
+import itertools
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Protocol
@@ -15,6 +16,7 @@ from exo_gravity.core.model.arm import (
     MAX_MOMENT,
     STANDARD_GRAVITY,
     ArmModel,
+    ModelError,
 )
 from exo_gravity.core.model.gravity import LAWS, NO_TORQUE, Torque
 from exo_gravity.core.model.rotation import Floats3
@@ -55,6 +57,7 @@ class Settings:
     use_imu: bool = True  #: False assumes an upright trunk
     anfis: AnfisLaw | None = None  #: the model for the law 'anfis'
     terms: TermSettings = field(default_factory=TermSettings)
+    model_error: ModelError = field(default_factory=ModelError)  #: for the estimate of the wearer's torque
     robot_by_mass: ArmModel | None = None  #: the robot by its masses, for `terms`; None: `robot`
     #: what is compensated: the robot in One-G, the robot plus `support` times the wearer in Zero-G
     arm: ArmModel = field(init=False)
@@ -177,6 +180,8 @@ COMMAND_PARAMETERS = (
     Param("multi_array.timeout", 0.05, "age of the joint states at which the torque begins to fade", (0.01, 0.15), "s",
           fixed=True, expert=True),
 )
+# What is declared where a file gives one of them, as `calibrate` writes them.
+MODEL_PARAMETERS = tuple(replace(param, name=f"model_error.{param.name}") for param in params_of(ModelError))
 # What the law `urdf` adds.
 URDF = (
     Param("urdf.file", "", "path of the URDF; empty: the topic urdf.topic", fixed=True),
@@ -187,8 +192,8 @@ URDF = (
 
 def compensator_table(given: Collection[str], table: Sequence[Param] = COMPENSATOR) -> tuple[Param, ...]:
     """Return `table` and what is added to it where a file gives the names `given`."""
-    is_command = any(param.name in given for param in COMMAND_PARAMETERS)
-    return (*table, *(COMMAND_PARAMETERS if is_command else ()))
+    groups = [part for part in (COMMAND_PARAMETERS, MODEL_PARAMETERS) if any(param.name in given for param in part)]
+    return (*table, *itertools.chain(*groups))
 
 
 def urdf_table(count: int, given: Collection[str]) -> tuple[Param, ...]:
@@ -235,6 +240,7 @@ def settings_of(values: Mapping[str, Any], read: Callable[[str], str] | None = N
         use_imu=values["use_imu"],
         anfis=anfis,
         terms=term_settings_of(values),
+        model_error=ModelError(*(values.get(param.name, param.default) for param in MODEL_PARAMETERS)),
         robot_by_mass=ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"]),
         **{param.name: values[param.name] for param in params_of(Settings)},
     )

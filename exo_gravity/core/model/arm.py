@@ -5,12 +5,14 @@ Table 1 of the paper (standard Denavit-Hartenberg): a = `length`, alpha = (-pi/2
 vertical, shoulder abduction, shoulder flexion, elbow flexion. At theta = (any, 0, 0, 0) the arm hangs straight down.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 
 import numpy as np
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats, one_float
+from exo_gravity.core.params import check_owned, owned
 
 STANDARD_GRAVITY = 9.80665  # m/s^2, ISO 80000-3; the paper rounds to 9.8
 
@@ -131,6 +133,27 @@ class ArmModel:
         moment = self.mass * self.cog + carried * distance
         combined = np.divide(moment, total, out=self.cog.copy(), where=total > 0)
         return ArmModel(self.length, np.minimum(combined, self.length), total, self.gain, self.gravity, self.off_axis)
+
+
+@dataclass(frozen=True)
+class ModelError:
+    """How exactly an arm's model is known, as standard errors. Raises ParameterError."""
+
+    torque: Sequence[float] = owned(
+        (0.3, 0.3, 0.3, 0.1), "standard error of the robot's torque, by `calibrate`", (0.0, 5.0), "Nm"
+    )
+    scale: Sequence[float] = owned(
+        (0.1,) * JOINT_COUNT,
+        "standard error of torque_scale, as a share of it, by `calibrate`",
+        (0.0, 1.0),
+    )
+    wearer: float = owned(
+        0.15, "standard error of the wearer's arm's weight, as a share of it, by `calibrate`", (0.0, 1.0)
+    )
+    tilt: float = owned(0.0175, "standard error of the trunk's tilt", (0.0, 0.5), "rad")
+
+    def __post_init__(self) -> None:
+        check_owned(self)
 
 
 def moments_along(length: np.ndarray, cog: np.ndarray, mass: np.ndarray) -> np.ndarray:

@@ -75,7 +75,7 @@ class LinkInertia(NamedTuple):
         """Return the inertia of `arm`. Raises ParameterError if it is given by its moments."""
         if arm.by_moments:
             arm.check_masses("terms that depend on the inertia")
-        return _links_of(arm)._replace(rotors=tuple(rotors))
+        return links_of(arm)._replace(rotors=tuple(rotors))
 
     @classmethod
     def of_moments(cls, length: Vector, moment: Vector, load: tuple[float, float] = (0.0, 0.0)) -> "LinkInertia":
@@ -108,6 +108,32 @@ class LinkInertia(NamedTuple):
         rotors = map(operator.mul, self.rotors, acceleration)
         return tuple(map(operator.add, _torque(links, self.weights, second), rotors))
 
+    def momentum(
+        self, theta: Sequence[float], velocity: Sequence[float], turning: Floats3 = ZERO
+    ) -> tuple[Torque, Torque]:
+        """Return the generalized momentum p = M v, (4,) kg m^2/s, and C^T v, (4,) Nm, with M' = C + C^T.
+
+        C^T v is the derivative of the kinetic energy by the angles: p' = tau + C^T v. For j >= k the derivative of x'_j
+        by q_k is z_{k-1} x x'_j + z'_{k-1} x x_j. turning: angular velocity of the base in its own axes, (3,) rad/s,
+        which adds to both.
+        """
+        links = frames(ZEROS, theta)
+        swings, derivatives = [], []  # z'_{k-1}, and x'_j
+        for (_, axis, along), speed in zip(links, velocity, strict=True):
+            swings.append(cross(turning, axis))
+            turning = plus(turning, axis, speed)
+            derivatives.append(cross(turning, along))
+        moment, change, momentum, coriolis = ZERO, ZERO, [], []
+        for n in (3, 2, 1, 0):
+            impulse = ZERO
+            for weight, derivative in zip(self.weights[n], derivatives, strict=True):
+                impulse = plus(impulse, derivative, weight)
+            moment = plus(moment, cross(links[n].along, impulse))
+            change = plus(change, cross(derivatives[n], impulse))
+            momentum.append(dot(links[n].axis, moment) + self.rotors[n] * velocity[n])
+            coriolis.append(dot(links[n].axis, change) + dot(swings[n], moment))
+        return tuple(momentum[::-1]), tuple(coriolis[::-1])
+
     def matrix(self, theta: Sequence[float]) -> np.ndarray:
         """Return the mass matrix (4, 4) in kg m^2 at `theta` (4,) rad."""
         return np.array([self.torque(theta, ZEROS, row) for row in np.eye(JOINT_COUNT).tolist()])
@@ -122,7 +148,8 @@ def least_inertia(links: LinkInertia) -> tuple[float, ...]:
 
 
 @lru_cache(8)
-def _links_of(arm: ArmModel) -> LinkInertia:
+def links_of(arm: ArmModel) -> LinkInertia:
+    """Return the inertia of `arm` with the usual rotors; approximate if it is given by its moments."""
     if arm.by_moments:
         return LinkInertia.of_moments(arm.length, arm.first_moment)
     return _links(arm.length, arm.mass, arm.first_moment, arm.mass * (arm.cog**2 + arm.length**2 / 12.0))
@@ -154,9 +181,13 @@ def turning_torque(arm: ArmModel, side: str, theta: Sequence[float], angular_acc
     neglected (at 1 rad/s it is a tenth of gravity's torque, or less). angular_acceleration: of the trunk, (3,) rad/s^2
     in its own axes.
     """
-    x, y, z = angular_acceleration
-    # In the base frame; a mirror, as the right arm is of the left one, reverses rotations.
-    alpha = (y, x, -z) if side == "left" else (y, -x, z)
+    alpha = turning_in_base(side, angular_acceleration)
     links = frames(ZEROS, theta)
-    torque = _torque(links, _links_of(arm).weights, [cross(alpha, link.along) for link in links])
+    torque = _torque(links, links_of(arm).weights, [cross(alpha, link.along) for link in links])
     return tuple(map(operator.mul, arm.gain.tolist(), torque))
+
+
+def turning_in_base(side: str, vector: Sequence[float]) -> Floats3:
+    """Return an angular velocity or acceleration (3,) of the trunk in the base frame of the `side` arm."""
+    x, y, z = vector
+    return (y, x, -z) if side == "left" else (y, -x, z)  # a mirror, as the right arm is of the left, reverses rotations

@@ -22,6 +22,7 @@ from exo_gravity.core.numbers import Rate
 from exo_gravity.hardware.clock import request_real_time
 from exo_gravity.nodes.compensator.arm import JointStateInterface, MultiArrayInterface, declared, report, sentence
 from exo_gravity.nodes.compensator.budget_watch import BudgetWatch
+from exo_gravity.nodes.compensator.wearer import WearerWatch
 from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import accept_changes
 from exo_gravity.nodes.ros.run import run
@@ -47,6 +48,7 @@ class CompensatorNode(Node):
         settings = read(values)
         self._control = Compensator(settings, self._names)
         self._budget: BudgetWatch | None = None
+        self._wearer: WearerWatch | None = None
         self._threads: list[Repeated] = []
         if self._control.terms:
             self._budget = BudgetWatch(self, self._names)
@@ -54,7 +56,8 @@ class CompensatorNode(Node):
             self._assistant = Publishers()
             self._assistants = 0  # changes whenever a message comes from another publisher than the one before
             path = HotPath(self, JointState, "assist_efforts", self._on_assist_efforts, pause=ASSIST_PAUSE)
-            self._threads.append(path)
+            self._wearer = WearerWatch(self, self._names, self._control)
+            self._threads += [path, self._wearer]
         self._interface: JointStateInterface | MultiArrayInterface
         if values.get("command_interface") == "multi_array":
             self._interface = MultiArrayInterface(self, self._names, values)
@@ -109,6 +112,8 @@ class CompensatorNode(Node):
         if problem := crowded(self._sources):
             answer = Answer(None, problem)
         self._interface.send(now, message, answer)
+        if self._wearer:
+            self._wearer.newest = now, message
         self._answers += answer.effort is not None
         self._rides += bool(answer.held and not self._answer.held)
         changed = answer.reason != self._answer.reason or bool(answer.held) != bool(self._answer.held)
@@ -125,6 +130,8 @@ class CompensatorNode(Node):
             self._assist.receive(now, message.name, message.effort, now - age, self._assistants)
 
     def _on_motion(self, *sample: Any) -> None:
+        if self._wearer:
+            self._wearer.felt = sample
         if self._control.settings.inertial:  # each sample takes a fit, under the lock
             self._control.motion.add(*sample)
 
@@ -151,6 +158,7 @@ class CompensatorNode(Node):
             "effort (Nm)": row(answer.effort) if answer.effort else "none",
             **report(self._control, answer, self._names),
             **({"budget": self._budget.text, "largest support": self._budget.largest_support} if self._budget else {}),
+            **({"wearer (Nm)": self._wearer.report} if self._wearer else {}),
             "last refused message": self._refusal,
         }
 

@@ -22,7 +22,7 @@ from exo_gravity.core.calibration.motion import FrictionCurve, fit_friction
 from exo_gravity.core.calibration.poses import candidates, next_pose
 from exo_gravity.core.compensation.settings import wearer_of
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.model.arm import moments_along
+from exo_gravity.core.model.arm import ModelError, moments_along
 from exo_gravity.core.model.gravity import MOMENTS, gravity_torque, load_moments, moments_of, regressor
 from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS
@@ -114,6 +114,13 @@ def _changes(arm: ConfiguredArm, identified: Identified, scale: list[float]) -> 
         Change(node, "robot.off_axis", moments[4:], f"W Z Y3 Y4 {unit}, +-{_row(error[4:])}"),
         Change(f"{arm.namespace}/can_bridge", "torque_scale", scale, f"+-{_row(identified.scale_error)}"),
     ]
+    if np.all(np.isfinite(identified.held_out).any(axis=0)):
+        left_out = np.sqrt(np.nanmean(identified.held_out**2, axis=0)) * identified.scale
+        changes.append(Change(node, "model_error.torque", left_out.round(3).tolist(), "Nm, of poses left out"))
+    if not identified.relative:
+        known = np.isfinite(identified.scale_error)
+        share = np.where(known, identified.scale_error / identified.scale, ModelError().scale)
+        changes.append(Change(node, "model_error.scale", share.round(4).tolist(), "share of torque_scale"))
     if arm.compensator["law"] != "exact":
         changes.append(Change(node, "law", "exact", "the other laws need masses and centres of gravity"))
     if any(gain != 1.0 for gain in arm.compensator["gain"]):
@@ -193,8 +200,9 @@ def wearer_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Cali
     covariance = np.linalg.pinv(matrix.T @ matrix)
     mass = covariance @ matrix.T @ extra
     remainder = extra - matrix @ mass
-    error = np.sqrt(np.diag(covariance) * max(1.0, float(remainder @ remainder) / (remainder.size - 2)))
-    moments = (per_mass @ mass)[2:]
+    covariance *= max(1.0, float(remainder @ remainder) / (remainder.size - 2))
+    error, moments = np.sqrt(np.diag(covariance)), (per_mass @ mass)[2:]
+    moment_error = np.sqrt(np.diag(per_mass @ covariance @ per_mass.T))[2:]
     lines = []
     for part, own, e, name, moment in zip(WORN, mass, error, ("M3", "M4"), moments, strict=True):
         if not 0.0 < own < MOST:
@@ -208,6 +216,7 @@ def wearer_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Cali
     changes = (
         Change(node, "wearer.mass", [0.0, 0.0, *mass.round(3).tolist()], note),
         Change(node, "wearer.cog", cog.round(4).tolist(), "m, of the body-mass table"),
+        Change(node, "model_error.wearer", round(float((moment_error / moments).max()), 3), "share of M3 and M4"),
     )
     body_mass, (low, high) = arm.compensator["wearer.body_mass"], TABLE_RATIO
     tabled_mass, tabled_cog = map(np.array, _wearer(arm, tabled=True))

@@ -15,7 +15,7 @@ from exo_gravity.core.errors import DataError
 from exo_gravity.core.trial.analysis import MIN_HOLD, HoldCriteria, TrialAnalysis, failures
 from exo_gravity.core.trial.analysis import analyse as analyse_arm
 from exo_gravity.core.trial.recording import Recording
-from exo_gravity.tools.reporting import conditions, figures, html, table
+from exo_gravity.tools.reporting import conditions, figures, html, table, wearer_share
 from exo_gravity.tools.reporting.conditions import EARLY
 
 MAX_EVENTS = 200
@@ -24,6 +24,7 @@ TIMESTAMP = re.compile(r"_\d{8}_\d{6}$")  # which `trial` adds to the script's n
 CAPTIONS = {
     "overview": "Positions, velocities and torques over time. Holds are shaded and numbered; dashes show the command.",
     "drift": "Deviation of each joint from the start of each hold, and the drift of each hold with its uncertainty.",
+    "wearer": wearer_share.CAPTION,
 }
 
 
@@ -35,6 +36,7 @@ class Report:
     criteria: HoldCriteria
     arms: tuple[tuple[Recording, TrialAnalysis], ...]
     failures: tuple[str, ...]  #: one sentence for each way in which an arm did not hold
+    wearers: dict[str, wearer_share.WearerPart]  #: by the arm's name, where what the wearer did is known
     notes: tuple[str, ...]  #: what limits the trust in the verdict
     trouble: str = ""  #: why the trial ended before its script, or ''
 
@@ -90,7 +92,10 @@ def analyse(bag: Bag, criteria: HoldCriteria | None = None, min_hold: float = MI
     criteria = criteria or HoldCriteria()
     arms = tuple((recording, analyse_arm(recording, min_hold)) for recording in bag.recordings)
     found = tuple(sentence for recording, analysis in arms for sentence in failures(recording, analysis, criteria))
-    return Report(bag, criteria, arms, found, (*bag.notes, *_reservations(bag)), trouble)
+    parts = {recording.name: wearer_share.of_arm(bag, recording) for recording in bag.recordings}
+    known = {name: part for name, part in parts.items() if not isinstance(part, str)}
+    unknown = [part for part in parts.values() if part and isinstance(part, str)]
+    return Report(bag, criteria, arms, found, known, (*bag.notes, *_reservations(bag), *unknown), trouble)
 
 
 def _reservations(bag: Bag) -> Iterator[str]:
@@ -130,6 +135,8 @@ def write(
             drawn = {"overview": figures.overview(recording, analysis)}
             if analysis.holds:
                 drawn["drift"] = figures.drift(recording, analysis, report.criteria)
+            if part := report.wearers.get(recording.name):
+                drawn["wearer"] = wearer_share.figure(recording, part)
             pictures = []
             for kind, figure in drawn.items():
                 png = html.png_of(figure)
@@ -138,6 +145,8 @@ def write(
                 for suffix in formats:
                     html.save_vector(figure, path.with_suffix(f".{suffix}"))
                 pictures.append(html.picture(png, CAPTIONS[kind]))
+            if part:
+                pictures.append(html.bullets("Wearer", [wearer_share.sentence(part)]))
             sections += table.arm_section(recording, analysis, pictures)
         (folder / "report.html").write_text(_page(report, sections), encoding="utf-8")
     except OSError as error:
@@ -157,6 +166,8 @@ def print_report(report: Report, console: Console | None = None) -> None:
     console = console or Console(highlight=False, width=None if Console().is_terminal else 140)
     for recording, analysis in report.arms:
         table.print_tables(console, recording, analysis)
+        if part := report.wearers.get(recording.name):
+            console.print(marked(wearer_share.sentence(part)))
     for note in report.notes:
         console.print(f"[yellow]Note:[/] {marked(note)}.")
     for problem in report.bag.problems:

@@ -1,0 +1,70 @@
+"""The study of the wearer's torque: its virtual muscles, its table, and one trial from draw to verdict."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bench.wearer.devices import draw
+from bench.wearer.muscles import ACTIVATION, DELAY, Muscles, Phase, phase_at
+from bench.wearer.report import METHODS, as_markdown, picture, verdict
+from bench.wearer.study import KINDS, judge, play
+from exo_gravity.core import ArmModel, Tilt, gravity_torque
+from exo_gravity.core.model.wearer import Wearer
+from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.sim import STEP
+
+LENGTH = (0.05, 0.13, 0.30, 0.30)
+LOAD = Wearer(75.0).on_links(LENGTH)
+ARM = ArmModel(LENGTH, LOAD.cog, LOAD.mass)
+POSE = (0.2, 0.9, 0.7, 0.6)
+STILL = (0.0,) * 4
+
+
+def torques(phases: tuple[Phase, ...], seconds: float) -> np.ndarray:
+    """Return the torque (n, 4) of a wearer at every step, whose arm does not move from POSE."""
+    script = TrialScript.parse({"name": "still", "steps": [{"hold": seconds}]})
+    muscles = Muscles(script, phases, ARM, lambda: Tilt.of("right"), 1)
+    muscles.torque(-STEP, POSE, STILL)
+    return np.array([muscles.torque(n * STEP, POSE, STILL) for n in range(round(seconds / STEP))])
+
+
+def test_a_commanded_share_of_the_weight_comes_late_and_noisy():
+    torque = torques((Phase(POSE, 1.0, 3.0, (0.5, 0.5)),), 3.0)
+    weight = gravity_torque(ARM, POSE)
+    late = round(DELAY / STEP)
+    assert not np.any(torque[: late - 1])
+    assert torque[late + round(ACTIVATION / STEP), 1] == pytest.approx(0.63 * 0.5 * weight[1], rel=0.15)
+    assert torque[1000:].mean(axis=0) == pytest.approx(0.5 * weight, rel=0.05, abs=0.01)
+    assert 0.01 < torque[1000:, 1].std() / torque[1000:, 1].mean() < 0.06
+
+
+def test_a_wearer_who_rests_gives_nothing_and_one_who_tires_gives_less():
+    assert np.abs(torques((Phase(POSE, 1.0, 3.0, (0.5, 0.5), rests=True),), 3.5)[2500:]).max() < 1e-6
+    tired = torques((Phase(POSE, 1.0, 7.0, (0.6, 0.2)),), 8.5)[:, 1] / gravity_torque(ARM, POSE)[1]
+    assert tired[900:1100].mean() == pytest.approx(0.55, abs=0.05)
+    assert tired[7800:8000].mean() == pytest.approx(0.21, abs=0.03)
+    assert not np.any(tired[8001:])  # after the last phase
+
+
+def test_the_phases_follow_each_other():
+    phases = (Phase(POSE, 1.0, 2.0, (0.5, 0.5)), Phase(POSE, 0.5, 1.0, (0.5, 0.5)))
+    assert phase_at(phases, 2.5) == (0, 2.5)
+    assert phase_at(phases, 3.25) == (1, 0.25)
+    assert phase_at(phases, 9.0) == (1, 6.0)
+
+
+def test_one_device_is_calibrated_played_and_judged(tmp_path):
+    trial = judge(play(draw(0)))
+    rows = verdict([trial])
+    assert all(row.held for row in rows if "share" in row.what or "carried" in row.what)
+    table = as_markdown(rows)
+    assert all(f"{kind}: RMS error, {name}" in table for kind in KINDS for name in METHODS)
+    moved = trial.kind == KINDS.index("reach")
+    rms = np.sqrt(np.mean(trial.error[:, moved] ** 2, axis=(1, 2)))
+    assert rms[0] < 0.6 * rms[1] < 0.6 * rms[2]
+    picture(trial).savefig(tmp_path / "picture.png")
+    narrow = trial.curve._replace(deviation=0.1 * trial.curve.deviation)
+    assert not all(row.held for row in verdict([replace(trial, curve=narrow)]))

@@ -1,0 +1,229 @@
+"""One device and its wearer through one trial, and how far what is estimated is from what his muscles did.
+
+The trial has three parts: he lifts what the device does not, then rests in full support, then tires from 60 to 20 %
+while the support rises as much. His trunk stands, bows and walks meanwhile. The observer and what it is compared with
+get the same recording, through CAN frames and their 12 bits, and the same IMU, once every 10 ms:
+
+    motor - gravity   the motors' torque beyond what the calibrated model needs at rest, with the sign changed
+    first order       a disturbance observer on each joint alone: a constant inertia, gravity, the same bandwidth; no
+                      friction and no coupling (Ohnishi, Shibata and Murakami 1996)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from exo_gravity.core.compensation.compensator import JOINTS, Answer, Compensator
+from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.model.arm import STANDARD_GRAVITY
+from exo_gravity.core.model.gravity import gravity_torque
+from exo_gravity.core.model.kinematics import turning_in_base
+from exo_gravity.core.model.tilt import Tilt, gravity_in_trunk
+from exo_gravity.core.observer.momentum import BANDWIDTH, REFERENCE, MomentumObserver
+from exo_gravity.core.observer.share import Share, WearerCurve, observed, share_of
+from exo_gravity.core.safety.limits import Limits
+from exo_gravity.core.trial.recording import Recording
+from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.sim import SimulatedImu
+from exo_gravity.sim.imu import ImuConfig
+from exo_gravity.sim.offline import ArmSetup, OfflineTrial, TrunkReading
+from exo_gravity.sim.trunk_motion import TrunkState
+
+from .devices import Worn, turned
+from .muscles import Muscles, Phase, phase_at
+
+RATE = 100.0  # Hz, of the control loop and the IMU
+DELAY = 2.0  # s until the wearer begins
+SUPPORT = (0.4, 1.0, (0.4, 0.8))  # while he lifts, rests and tires
+LOW, HIGH = (-0.5, 0.3, 0.1, 0.3), (0.7, 1.2, 1.0, 1.4)  # rad, of the poses
+TRUNK: tuple[dict[str, Any], ...] = (
+    {"hold": 13.0}, {"bow": 0.4, "over": 1.2}, {"hold": 3.0}, {"bow": 0.0, "over": 1.2}, {"hold": 8.0}, {"walk": 8.0},
+    {"hold": 9.6},
+)  # fmt: skip
+TILT_NOISE = math.radians(0.6)  # of the filter, as core/trunk/uncertainty.py has it; it stays for about
+TILT_TIME = 3.0  # s
+METHODS = ("momentum observer", "first order", "motor - gravity")
+KINDS = ("reach", "hold", "rest", "trunk in motion")
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """What one trial left: what was recorded, and what is true.
+
+    trunk: (m, 7), s, angular velocity in rad/s and felt gravity in g as measured, in the trunk's axes. elapsed, torque,
+    weight: every 1 ms from the wearer's start, s, and (k, 4) Nm of his muscles and that carry his arm. trouble: '' if
+    the arm was carried to the end.
+    """
+
+    worn: Worn
+    recording: Recording
+    trunk: np.ndarray
+    elapsed: np.ndarray
+    torque: np.ndarray
+    weight: np.ndarray
+    trouble: str
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """What one trial showed, at n times.
+
+    error: Nm, estimate minus truth of each of METHODS, (3, n, 4). kind: (n,) index in KINDS. share, true_share: over
+    the trial. parts: of lifting, resting and tiring alike: (found, true).
+    """
+
+    seed: int
+    curve: WearerCurve
+    truth: WearerCurve
+    error: np.ndarray
+    kind: np.ndarray
+    share: Share
+    true_share: float
+    parts: tuple[tuple[Share, float], ...]
+    trouble: str
+
+
+class Therapist(Compensator):
+    """A compensator whose support follows the parts of the trial."""
+
+    def __init__(self, settings: Settings, times: Sequence[float]) -> None:
+        self.own = replace(settings, support=SUPPORT[0])
+        super().__init__(self.own)
+        self._times, self._next = times, 0.0
+
+    def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Answer:
+        """Return the answer that the bridge gets."""
+        if now >= self._next:
+            self._next = now + 2.0
+            rests, tires, ends = self._times
+            low, high = SUPPORT[2]
+            risen = low + (high - low) * min(1.0, (now - tires) / (ends - tires))
+            support = SUPPORT[0] if now < rests else SUPPORT[1] if now < tires else risen
+            self.apply(replace(self.own, support=support))
+        return super().step(now, theta, velocity)
+
+
+class WornImu:
+    """The IMU of a trunk: mounted a little wrong, its filter a little off; the accelerometer has noise and bias."""
+
+    def __init__(self, worn: Worn) -> None:
+        self._imu = SimulatedImu(ImuConfig(rate=RATE, seed=worn.seed))
+        self._rng = np.random.default_rng(worn.seed)
+        # Of gravity in the trunk's axes; `mounting` is in the base frame.
+        x, y, z = worn.mounting
+        self._mounting, self._drift = np.array((y, x, z)), np.zeros(3)
+        self.log: list[tuple[float, ...]] = []  # rows of Played.trunk
+
+    def __call__(self, now: float, state: TrunkState) -> TrunkReading:
+        """Return the reading."""
+        share = 1.0 / (RATE * TILT_TIME)
+        self._drift += -share * self._drift + math.sqrt(2.0 * share) * TILT_NOISE * self._rng.standard_normal(3)
+        rate, force = map(np.asarray, self._imu.sample_of(state))
+        force = np.linalg.norm(force) * turned(force / np.linalg.norm(force), self._mounting)
+        gravity = turned(gravity_in_trunk(state.pitch, state.roll), self._mounting + self._drift)
+        self.log.append((now, *rate, *(-force / STANDARD_GRAVITY)))
+        return TrunkReading(gravity.tolist(), force.tolist(), rate.tolist())
+
+
+def phases_of(seed: int) -> tuple[Phase, ...]:
+    """Return the wearer's way: three poses while he lifts, two while he rests, three while he tires."""
+    rng = np.random.default_rng(seed)
+    poses = [tuple(rng.uniform(LOW, HIGH).tolist()) for _ in range(8)]
+    lifts = [Phase(pose, 1.5, 3.0, (1.0 - SUPPORT[0],) * 2) for pose in poses[:3]]
+    rests = [Phase(pose, 2.0, 5.0, (0.0, 0.0), rests=True) for pose in poses[3:5]]
+    share = np.linspace(0.6, 0.2, 4).tolist()
+    tires = [Phase(pose, 1.5, 4.0, (share[n], share[n + 1])) for n, pose in enumerate(poses[5:])]
+    return (*lifts, *rests, *tires)
+
+
+def play(worn: Worn) -> Played:
+    """Play the trial of `worn`."""
+    phases, device, imu = phases_of(worn.seed), worn.device(), WornImu(worn)
+    ends = np.cumsum([phase.move + phase.hold for phase in phases])
+    script = TrialScript.parse({"name": "wearer", "steps": list(TRUNK)})
+
+    def tilt() -> Tilt:
+        return Tilt.of(worn.side, device.trunk.pitch, device.trunk.roll)
+
+    wearer = Muscles(script, phases, worn.wearer, tilt, worn.seed)
+    limits = Limits(JOINTS, max_effort=worn.settings.max_effort, max_velocity=(20.0,) * 4, sign_check_torque=0.0)
+    compensator = Therapist(worn.settings, [DELAY + ends[2], DELAY + ends[4], DELAY + ends[7]])
+    setup = ArmSetup(worn.side, device, worn.motors, limits, compensator.own, RATE, imu)
+    trial = OfflineTrial(setup, script, DELAY, compensator, wearer)
+    recording = trial.run()
+    elapsed, torque, weight = (np.array(column) for column in zip(*wearer.log, strict=True))
+    return Played(worn, recording, np.array(imu.log), elapsed, torque, weight, trial.trouble)
+
+
+def judge(played: Played) -> Trial:
+    """Return what the estimates make of a trial, and how far they are off."""
+    worn, recording = played.worn, played.recording
+    phases, start = phases_of(worn.seed), recording.steps[0].start
+    length = sum(phase.move + phase.hold for phase in phases)
+    keep = (recording.time > start + 1.0) & (recording.time < start + length)
+
+    def trunk_at(now: float) -> tuple[Tilt, tuple[float, float, float]]:
+        row = played.trunk[np.searchsorted(played.trunk[:, 0], now - 0.5 / RATE) - 1, 1:].tolist()  # one cycle late
+        tilt = Tilt.of_gravity(worn.side, row[3:])._replace(magnitude=math.hypot(*row[3:]))
+        return tilt, turning_in_base(worn.side, row[:3])
+
+    joints = (recording.position, recording.velocity, recording.effort)
+    whole = observed(worn.settings, recording.time, joints, trunk_at)
+    others = baselines(worn.settings, recording.time, joints, lambda now: trunk_at(now)[0])
+    index = np.searchsorted(played.elapsed, recording.time[keep] - start).clip(max=len(played.elapsed) - 1)
+    curve = only(whole, keep)
+    truth = WearerCurve(curve.time, played.torque[index], np.zeros_like(curve.torque), played.weight[index])
+    error = np.stack([curve.torque, *(other[keep] for other in others)]) - truth.torque
+    at = [phase_at(phases, now) for now in (curve.time - start).tolist()]
+    kind = np.array([_kind(phases[n], since) for n, since in at])
+    kind[_trunk_moves(curve.time - start)] = KINDS.index("trunk in motion")
+    part = np.searchsorted((3, 5), [n for n, _ in at], side="right")
+    parts = tuple((share_of(only(curve, part == n)), float(share_of(only(truth, part == n)).value)) for n in range(3))
+    return Trial(
+        worn.seed, curve, truth, error, kind, share_of(curve), float(share_of(truth).value), parts, played.trouble
+    )
+
+
+def _kind(phase: Phase, since: float) -> int:
+    if since < phase.move + 0.3:
+        return KINDS.index("reach")
+    if not phase.rests:
+        return KINDS.index("hold")
+    return KINDS.index("rest" if since > phase.move + 1.2 else "reach")
+
+
+def _trunk_moves(elapsed: np.ndarray) -> np.ndarray:
+    """Return whether the trunk moves at each time (n,) s, or moved within the last 0.3 s."""
+    ends = np.cumsum([next(iter(step.values())) if "over" not in step else step["over"] for step in TRUNK])
+    moving = np.array(["hold" not in step for step in (*TRUNK, {"hold": 1.0})])
+    return (
+        moving[np.searchsorted(ends, elapsed, side="right")]
+        | moving[np.searchsorted(ends, elapsed - 0.3, side="right")]
+    )
+
+
+def only(curve: WearerCurve, keep: np.ndarray) -> WearerCurve:
+    """Return the part of a curve where `keep` (n,) is true."""
+    return WearerCurve(*(part[keep] for part in curve))
+
+
+def baselines(settings: Settings, time: np.ndarray, joints: Any, tilt_at: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first-order observer's torque (n, 4), and gravity minus the motors'."""
+    position, velocity, effort = joints
+    arm = settings.robot.with_wearer(settings.wearer_mass, settings.wearer_cog)
+    tilts = [tilt_at(now) for now in time.tolist()]
+    magnitude = np.array([tilt.magnitude for tilt in tilts])[:, None]
+    static = magnitude * gravity_torque(arm, position, np.array([tilt.direction for tilt in tilts])) - effort
+    inertia = np.diag(MomentumObserver(settings)._links.matrix(REFERENCE))
+    residual, inner = static.copy(), BANDWIDTH * inertia * velocity[0] - static[0]
+    for n in range(1, len(time)):
+        share = 1.0 - math.exp(-BANDWIDTH * (time[n] - time[n - 1]))
+        mean = 0.5 * BANDWIDTH * inertia * (velocity[n] + velocity[n - 1])
+        inner = inner + share * (mean - static[n - 1] - inner)
+        residual[n] = BANDWIDTH * inertia * velocity[n] - inner
+    return residual, static

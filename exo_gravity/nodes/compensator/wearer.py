@@ -1,0 +1,106 @@
+"""The wearer's torque, estimated beside the control loop 100 times a second: `wearer_efforts`, `wearer_efforts_std`.
+
+The control loop leaves its newest message here, and does not wait. Neither topic leads back to it.
+"""
+
+import math
+import time
+from collections.abc import Sequence
+
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+
+from exo_gravity.core.compensation.compensator import Compensator
+from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.arm import STANDARD_GRAVITY
+from exo_gravity.core.model.kinematics import turning_in_base
+from exo_gravity.core.model.rotation import ZERO, Floats3
+from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.observer.momentum import COVER, MomentumObserver, WearerEstimate
+from exo_gravity.core.trunk.inputs import FELT_RANGE
+from exo_gravity.nodes.ros.messages import by_name
+from exo_gravity.nodes.ros.subscriptions import Repeated
+
+PERIOD = 0.01  # s
+FRESH = 0.1  # s, age of the trunk's motion that is used
+Sample = tuple[float, Sequence[float], Sequence[float], float]  # monotonic s, m/s^2, rad/s, and age in s
+
+
+class WearerWatch(Repeated):
+    """Publishes the estimate of each new sample, on a thread of its own.
+
+    newest: time in monotonic s and message of the joints; felt: time in monotonic s, specific force (3,) m/s^2,
+    angular velocity (3,) rad/s and age of a sample of the trunk's motion. Both are set by other threads.
+    """
+
+    def __init__(self, node: Node, names: Sequence[str], control: Compensator) -> None:
+        super().__init__("wearer", self._tick, 0.0)
+        self.newest: tuple[float, JointState | None] = (-math.inf, None)
+        self.felt: Sample = (-math.inf, ZERO, ZERO, 0.0)
+        self._names, self._control = names, control
+        self._topics = [node.create_publisher(JointState, f"wearer_efforts{part}", 1) for part in ("", "_std")]
+        self._message = JointState(name=names)  # one message, reused
+        self._observer: MomentumObserver | None = None
+        self._known: object = None  # what the observer depends on
+        self._due = 0.0
+        self._last = -math.inf  # of the samples used
+        self._estimate: WearerEstimate | None = None
+
+    @property
+    def report(self) -> str:
+        """The torque of each joint with its 95 % band, for /diagnostics."""
+        estimate = self._estimate
+        if estimate is None or time.monotonic() - self._last > 1.0:
+            return "unknown"
+        told = [
+            f"{name} {torque:+.1f} +- {COVER * deviation:.1f}"
+            for name, torque, deviation, shown in zip(
+                self._names, estimate.torque, estimate.deviation, estimate.distinguishable, strict=True
+            )
+            if shown
+        ]
+        return ", ".join(told) or "not distinguishable from zero"
+
+    def _tick(self) -> None:
+        now = time.monotonic()
+        self._due = max(self._due + PERIOD, now)
+        time.sleep(self._due - now)
+        taken, message = self.newest
+        settings = self._control.settings
+        if message is None or not isinstance(settings, Settings) or taken <= self._last:
+            return
+        self._last = taken
+        trunk, joints = self._trunk(settings, taken), self._joints(message)
+        if trunk is None or joints is None:
+            self._estimate = None
+            return
+        wearer = tuple(settings.wearer_mass), tuple(settings.wearer_cog)
+        known = settings.robot, wearer, settings.terms.friction, settings.model_error
+        if self._observer is None or known != self._known:
+            self._observer, self._known = MomentumObserver(settings), known
+        self._estimate = estimate = self._observer.update(taken, joints, *trunk)
+        self._message.header.stamp = message.header.stamp
+        for topic, effort in zip(self._topics, (estimate.torque, estimate.deviation), strict=True):
+            self._message.effort = effort
+            topic.publish(self._message)
+
+    def _joints(self, message: JointState) -> list[tuple[float, ...]] | None:
+        """Return positions, velocities and efforts (4,); None if one is missing."""
+        try:
+            return [by_name(message, field, self._names, exact=False) for field in ("position", "velocity", "effort")]
+        except ParameterError:
+            return None
+
+    def _trunk(self, settings: Settings, now: float) -> tuple[Tilt, Floats3] | None:
+        """Return the tilt of what the trunk feels as gravity, and its angular velocity; None if none is fresh."""
+        if not settings.use_imu:
+            return Tilt.of(settings.side), ZERO
+        felt_at, force, rate, _ = self.felt
+        magnitude = math.hypot(*force)
+        if now - felt_at < FRESH and FELT_RANGE[0] < magnitude < FELT_RANGE[1]:
+            tilt = Tilt.of_gravity(settings.side, [-component for component in force])
+            return tilt._replace(magnitude=magnitude / STANDARD_GRAVITY), turning_in_base(settings.side, rate)
+        # Without the lock of the control loop: at worst a tilt is turned on by the angular velocity of the one before.
+        tilt_input = self._control.tilt
+        return None if tilt_input.problem(now) else (tilt_input.at(now), ZERO)

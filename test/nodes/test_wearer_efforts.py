@@ -1,0 +1,79 @@
+"""The wearer's torque of a running compensator, which the test feeds with joint states."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pytest
+from rclpy.node import Node
+from rclpy.time import Time
+from sensor_msgs.msg import JointState
+
+from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core.model.wearer import Wearer
+from exo_gravity.nodes.ros.messages import to_nanoseconds
+
+from ..support.joint_state_feeder import PARTS, POSE
+from ..support.launched_nodes import NO_IMU
+
+OTHER_NODES = ("can_bridge", "simulator", "imu")
+ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
+LOAD = Wearer(75.0).on_links(ROBOT.length)
+NEEDED = gravity_torque(ROBOT.with_wearer(LOAD.mass, LOAD.cog), POSE)
+GIVEN = np.array((0.0, 4.0, 1.5, 0.0))  # Nm, of the wearer
+
+
+class StillArm:
+    """Publishes the joint states of a still arm every 5 ms; `effort` of its motors in Nm. Stamps count them in ns."""
+
+    def __init__(self, node: Node) -> None:
+        self.effort: Sequence[float] = ()
+        self._publisher = node.create_publisher(JointState, "/right/joint_states", 1)
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._publish)
+        self._thread.start()
+
+    def _publish(self) -> None:
+        message, number = JointState(name=[f"right_{part}" for part in PARTS], position=POSE, velocity=[0.0] * 4), 0
+        while not self._stopping.wait(0.005):
+            number += 1
+            message.header.stamp = Time(nanoseconds=number).to_msg()
+            message.effort = self.effort
+            self._publisher.publish(message)
+
+    def close(self) -> None:
+        self._stopping.set()
+        self._thread.join()
+
+
+@pytest.fixture
+def arm(probe) -> Iterator[StillArm]:
+    still = StillArm(probe.node)
+    yield still
+    still.close()
+
+
+def test_what_the_motors_do_not_carry_is_published_as_the_wearers_with_its_deviation(launch, probe, arm):
+    found: dict[str, list[JointState]] = {"": [], "_std": []}
+    for part, messages in found.items():
+        probe.node.create_subscription(JointState, f"/right/wearer_efforts{part}", messages.append, 100)
+    launch(without=OTHER_NODES, compensator={**NO_IMU, "wearer.body_mass": 75.0})
+    commands = probe.effort_commands
+    probe.wait_until(lambda: len(commands) > 50)
+    assert not found[""]  # without the motors' efforts nothing is known of the wearer
+    arm.effort = (NEEDED - GIVEN).tolist()
+    probe.wait_until(lambda: len(found[""]) > 100 and len(found["_std"]) > 100)
+    newest, deviation = found[""][-1], found["_std"][-1]
+    assert list(newest.name) == [f"right_{part}" for part in PARTS]
+    assert newest.effort == pytest.approx(GIVEN, abs=1e-6)
+    assert all(0.05 < value < 2.5 for value in deviation.effort)
+    stamps = [[to_nanoseconds(message.header.stamp) for message in messages[:50]] for messages in found.values()]
+    assert set(stamps[0]) & set(stamps[1])  # a torque and its deviation have the same stamp
+    probe.wait_until(
+        lambda: "right_shoulder_abduction +4.0 +-" in (probe.diagnostic("compensator", "wearer (Nm)") or "")
+    )
+    assert "elbow" not in (probe.diagnostic("compensator", "wearer (Nm)") or "")
+    arm.effort = NEEDED.tolist()
+    probe.wait_until(lambda: probe.diagnostic("compensator", "wearer (Nm)") == "not distinguishable from zero")
