@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.compensation.guidance import FADE_TIME, MAX_FADE_RATE
+from exo_gravity.core.compensation.guidance import FADE_TIME, MAX_FADE_RATE, GuidedChange
 from exo_gravity.core.compensation.limiter import LONGEST_STEP
 from exo_gravity.core.compensation.terms.springs import Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
@@ -229,6 +229,16 @@ def test_a_joint_that_the_change_drives_gets_its_old_torque_back_until_it_is_cal
     assert abs(answer.effort[3]) < abs(before[3])
     assert run.cycle(FADE_TIME + 1.1).remainder == ()
     assert run.efforts[-1] == pytest.approx(gravity_torque(ROBOT, THETA))
+
+
+def test_a_change_during_another_begins_for_each_joint_where_that_joint_is():
+    """A joint that is at the new load and one that is still at the old one: a constant would outlive their pose."""
+    change = GuidedChange(2)
+    light, heavy, middle = (1.0, 1.0), (3.0, 3.0), (2.0, 2.0)
+    assert change.begin((1.0, 3.0), [light, heavy], middle) == [0, 1]
+    for pose in (1.0, 0.1, -1.0):  # of what every load needs, after the joints have turned
+        torque = change.step(0.0, (1.0, 1.0), (pose * 1.0, pose * 3.0), (pose * 2.0, pose * 2.0))
+        assert torque == pytest.approx((pose * 1.0, pose * 3.0))
 
 
 def test_where_the_velocity_is_not_known_a_change_takes_longer():

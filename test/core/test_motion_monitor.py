@@ -9,8 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.motion_monitor import HANGING, caught, flipped, misread, quiet, settings_of
-from exo_gravity.core.compensation.compensator import Compensator
+from bench.motion_monitor import HANGING, bounded, caught, flipped, misread, quiet, settings_of, sound
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.model.tilt import Tilt
@@ -115,7 +114,20 @@ def test_a_wrong_compensator_is_let_down_before_an_arm_that_no_one_holds_is_fast
         assert seen.fault == "unexplained_torque" and seen.time < 0.2 and seen.speed < 0.6, wrong
 
 
-def test_a_fast_wearer_is_not_let_down() -> None:
-    settings = settings_of(75.0)
-    seen = quiet(Compensator(settings), 4.0, 3, settings.arm.first_moment)
-    assert not seen.trouble and seen.speed > 3.0 and seen.share < 0.5
+def test_a_wrong_side_is_let_down_below_the_speed_that_motors_may_cause() -> None:
+    seen = caught(settings_of(side="left"), None, lean=0.3)
+    assert seen.fault == "unexplained_torque" and seen.until < 0.6
+
+
+@pytest.mark.parametrize("case", [1, 3], ids=["zero_g", "terms_and_assistance"])
+def test_a_fast_wearer_is_not_let_down(case: int) -> None:
+    _, compensator, moment, addition = list(sound())[case]
+    seen = quiet(compensator, 4.0, 3, moment, addition)
+    assert not seen.trouble and 3.0 < seen.speed < 5.0 and seen.share < 0.5
+
+
+def test_the_fast_wearer_brakes_what_would_exceed_his_speed_and_stops_at_his_body() -> None:
+    assert bounded(0, 10.0, 0.0, 3.0) == 10.0
+    assert bounded(0, 10.0, 0.0, 4.5) == -12.0 and bounded(0, -10.0, 0.0, -4.5) == 12.0
+    assert bounded(0, -10.0, 0.0, 4.5) == -22.0
+    assert bounded(1, 0.0, -0.1, -2.0) == pytest.approx(30.0)

@@ -63,7 +63,7 @@ class Compensator:
         self._effort = self._nothing  # the last answer's,
         self._last_answer = self._ramp_start = -math.inf  # its time, and that of the first one after a break
         self._change = GuidedChange(len(settings.max_effort))
-        self._origin: Load | None = None  # where the change began; None where no settings say
+        self._origins: list[Load | None] = []  # where each joint's change began; None where no settings say
         self._torque: Torque = self._nothing  # the last, before ramp and rate limit
         self._pending: Settings | UrdfSettings | None = None
         self._fallback = ""  # why the exact law replaces the chosen one
@@ -107,7 +107,7 @@ class Compensator:
         elif before is not None or bool(self._fallback) != replaced:
             self._begin(before, torque, (now, theta, velocity))  # without `before`: a replaced law may not apply here
         if not self._change.is_over:
-            start = self._torque_of(self._origin, (now, theta, velocity)) if self._origin else torque
+            start = self._start(self._origins, torque, (now, theta, velocity))
             torque = self._change.step(dt, velocity, start, torque)
         self._torque, self._last_answer = torque, now
         ramp, step = min(1.0, (now - self._ramp_start) / RAMP_TIME), s.max_effort_rate * min(dt, LONGEST_STEP)
@@ -134,16 +134,19 @@ class Compensator:
             self.terms.apply(settings.terms, settings.moving)
 
     def _begin(self, before: Load | None, torque: Torque, state: State) -> None:
-        """Begin a change to `torque` (n,) Nm, from `before` or from where an unfinished change began.
+        """Begin a change to `torque` (n,) Nm, from `before` or from where a joint's unfinished change began.
 
-        Of the two, the one is chosen that explains the present torque better.
+        Of the two, each joint takes the one that explains its present torque better.
         """
-        ways = []
-        for origin in [before] if self._change.is_over else [self._origin, before]:
-            change = GuidedChange(len(torque))
-            start = self._torque_of(origin, state) if origin else torque
-            ways.append((change.begin(self._torque, start, torque), origin, change))
-        _, self._origin, self._change = min(ways, key=operator.itemgetter(0))
+        ways: list[list[Load | None]] = [] if self._change.is_over else [self._origins]
+        ways.append([before] * len(torque))
+        chosen = self._change.begin(self._torque, [self._start(way, torque, state) for way in ways], torque)
+        self._origins = [ways[index][joint] for joint, index in enumerate(chosen)]
+
+    def _start(self, origins: Sequence[Load | None], torque: Torque, state: State) -> Torque:
+        """Return the torque (n,) in Nm that each joint's load of `origins` would need here, `torque` for None."""
+        needed = {id(load): self._torque_of(load, state) if load else torque for load in origins}
+        return tuple([needed[id(load)][joint] for joint, load in enumerate(origins)])
 
     def _torque_of(self, load: Load, state: State) -> Torque:
         """Return the torque (n,) in Nm that `load` would need here, clamped as it was."""

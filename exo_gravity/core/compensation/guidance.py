@@ -53,21 +53,25 @@ class GuidedChange:
         """Whether the change is large enough for the motors to damp the joints meanwhile."""
         return not self.is_over and self._largest > LARGE
 
-    def begin(self, torque: Torque, before: Torque, after: Torque) -> float:
-        """Begin at the present `torque` the way from `before` to `after`, all (n,) Nm in this pose.
+    def begin(self, torque: Torque, starts: Sequence[Torque], after: Torque) -> list[int]:
+        """Begin at the present `torque` the way to `after` from one of `starts`, all (n,) Nm in this pose.
 
-        Return the sum of the offsets in Nm.
+        Return for each joint the index of its start: of all, the one that leaves the smallest offset.
         """
+        ways = []
+        for now, new, *olds in zip(torque, after, *starts, strict=True):
+            choices = []
+            for index, old in enumerate(olds):
+                part = (now - new) / (old - new) if abs(old - new) > SMALL else 1.0
+                offset = 0.0 if 0.0 <= part < 1.0 else now - old
+                choices.append((abs(offset), index, part if 0.0 <= part <= 1.0 else 1.0, offset, old))
+            ways.append(min(choices))
+        _, chosen, shares, offsets, before = zip(*ways, strict=True)
         if max(abs(a - b) for a, b in zip((*torque, *before), (*after, *after), strict=True)) < SMALL:
             self.stop()
-            return 0.0
-        shares, offsets = [], []
-        for now, old, new in zip(torque, before, after, strict=True):
-            part = (now - new) / (old - new) if abs(old - new) > SMALL else 1.0
-            shares.append(part if 0.0 <= part <= 1.0 else 1.0)
-            offsets.append(0.0 if 0.0 <= part < 1.0 else now - old)
-        self._share, self._offset, self._done = tuple(shares), tuple(offsets), 0.0
-        return sum(map(abs, offsets))
+        else:
+            self._share, self._offset, self._done = shares, offsets, 0.0
+        return list(chosen)
 
     def step(self, dt: float, velocity: Sequence[float] | None, before: Torque, after: Torque) -> Torque:
         """Return the torque (n,) in Nm after `dt` s more; velocity: (n,) rad/s, None if not known."""

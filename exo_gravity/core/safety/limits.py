@@ -89,8 +89,8 @@ class Limits:
     )
     largest_addition: Sequence[float] = owned(
         (0.0,) * 4,
-        "torque that efforts may add to gravity compensation when `largest_moment` is given: the bounds of assistance "
-        "and terms in use, `inertial`, a calibration",
+        "torque that efforts may add to gravity compensation when `largest_moment` is given: the sum of the bounds of "
+        "assistance and terms in use, `inertial`, a calibration",
         (0.0, 10.0),
         "Nm",
     )
