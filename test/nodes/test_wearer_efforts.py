@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator, Sequence
+from typing import cast
 
 import numpy as np
 import pytest
@@ -12,7 +13,10 @@ from rclpy.time import Time
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core.compensation.compensator import Compensator
+from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.model.wearer import Wearer
+from exo_gravity.nodes.compensator.wearer import WearerWatch
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 
 from ..support.joint_state_feeder import PARTS, POSE
@@ -77,3 +81,14 @@ def test_what_the_motors_do_not_carry_is_published_as_the_wearers_with_its_devia
     assert "elbow" not in (probe.diagnostic("compensator", "wearer (Nm)") or "")
     arm.effort = NEEDED.tolist()
     probe.wait_until(lambda: probe.diagnostic("compensator", "wearer (Nm)") == "not distinguishable from zero")
+
+
+def test_an_estimate_that_fails_says_so_in_diagnostics(probe):
+    watch = WearerWatch(
+        probe.node, [f"right_{part}" for part in PARTS], Compensator(Settings("right", ROBOT, use_imu=False))
+    )
+    watch.newest = 1.0, cast("JointState", "no message")
+    watch.start()
+    probe.wait_until(lambda: watch.failure is not None)
+    assert watch.report.startswith("failed: AttributeError: 'str' object has no attribute")
+    watch.stop()

@@ -89,8 +89,11 @@ class CompensatorNode(Node):
 
     @property
     def failure(self) -> Exception | None:
-        """The exception that ended the thread of the joint states, of the assistance, or of a fade."""
-        return next((thread.failure for thread in self._threads if thread.failure), None)
+        """The exception that ended the thread of the joint states, of the assistance, or of a fade.
+
+        The estimate of the wearer's torque may end alone: no arm comes down for it.
+        """
+        return next((each.failure for each in self._threads if each.failure and each is not self._wearer), None)
 
     def close(self) -> None:
         """End the threads."""

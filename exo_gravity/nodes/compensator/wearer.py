@@ -1,6 +1,7 @@
 """The wearer's torque, estimated beside the control loop 100 times a second: `wearer_efforts`, `wearer_efforts_std`.
 
-The control loop leaves its newest message here, and does not wait. Neither topic leads back to it.
+The control loop leaves its newest message here, and does not wait. Neither topic leads back to it. If the estimate
+fails, the control loop goes on, and /diagnostics has the reason.
 """
 
 import math
@@ -51,6 +52,8 @@ class WearerWatch(Repeated):
     def report(self) -> str:
         """The torque of each joint with its 95 % band, for /diagnostics."""
         estimate = self._estimate
+        if self.failure:
+            return f"failed: {type(self.failure).__name__}: {self.failure}"
         if estimate is None or time.monotonic() - self._last > 1.0:
             return "unknown"
         told = [
