@@ -6,19 +6,19 @@ from pathlib import Path
 
 import pytest
 
-from ..support.launched_nodes import SIMULATED
+from ..support.launched_nodes import CALM
 from .arm import PEERS
 from .case import play
 from .network import Wire
 
 pytestmark = [pytest.mark.real_time, pytest.mark.thorough]
 
-TIMEOUT = 1000.0 * SIMULATED["can_bridge"]["command_timeout"]  # ms
+TIMEOUT = 1000.0 * CALM["can_bridge"]["command_timeout"]  # ms
 
 
 def test_an_arm_is_carried_over_a_wire_with_delay_jitter_and_loss(tmp_path: Path):
     wire = Wire(delay=5.0, jitter=2.0, loss=0.02)
-    result = play(wire, tmp_path, hold=2.0, timing=SIMULATED)
+    result = play(wire, tmp_path, hold=2.0, timing=CALM)
     assert result.outcome == "carried"
     assert result.measured is not None
     assert result.measured.drift < 0.5  # deg
@@ -30,6 +30,6 @@ def test_an_arm_is_carried_over_a_wire_with_delay_jitter_and_loss(tmp_path: Path
 
 def test_a_robot_that_names_no_peer_is_not_commanded_by_a_desk_that_names_it(tmp_path: Path):
     peers = {**PEERS, "robot": ""}
-    result = play(Wire(), tmp_path, hold=1.0, timing=SIMULATED, peers=peers, patience=5.0)
+    result = play(Wire(), tmp_path, hold=1.0, timing=CALM, peers=peers, patience=5.0)
     assert result.outcome == "checking: waiting for effort commands"
     assert "other hosts can command" not in (tmp_path / "log.txt").read_text()
