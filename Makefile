@@ -1,7 +1,7 @@
 # make demo         four nodes as processes on the simulated device, about 75 s; a table and figures in trials/
 # make calibrate-demo  a simulated arm with a wrong parameter file, calibrated, 5 minutes; a picture before and after
 # make calibrate-study  20 random simulated devices, calibrated from motors to an arm that holds, offline, 20 minutes
-# make test         the tests, 4 minutes on two cores
+# make test         the tests, 5 minutes on two cores
 # make test-all     the same, then the longer ones (make test-long): studies, browser, 13 poses, video, SROS2
 # make lint         ruff, mypy, ament's flake8 and pep257, shellcheck
 # make docs         these documents as a site, in build/site; a warning is an error
