@@ -76,7 +76,7 @@ lint:
 	@VENV=$(VENV) .ci/lint
 
 docs:
-	@$(SETUP) docs
+	@$(SETUP) bag docs
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --fresh-env --quiet --conf-dir docs . build/site
 	@echo build/site/index.html
 

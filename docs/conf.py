@@ -43,7 +43,6 @@ myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4  # GitHub's anchors
 suppress_warnings = ["myst.header"]  # README begins with level 1, as it must; some tables' documents skip a level
 
-autodoc_mock_imports = ["mcap", "rosbags"]  # of the reader of recordings; the site needs no more than the extra `docs`
 autodoc_typehints = "signature"
 autodoc_member_order = "bysource"
 
