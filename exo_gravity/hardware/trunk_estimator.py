@@ -17,7 +17,16 @@ import numpy as np
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.rotation import Floats3, Quaternion, plus, product, unit_quaternion, up_in_body
+from exo_gravity.core.model.rotation import (
+    ZERO,
+    Floats3,
+    Quaternion,
+    plus,
+    product,
+    three_floats,
+    unit_quaternion,
+    up_in_body,
+)
 from exo_gravity.core.model.tilt import angle_between, pitch_roll, rotation_matrix
 from exo_gravity.core.numbers import one_float
 from exo_gravity.core.trunk import imu_checks
@@ -134,9 +143,8 @@ class TrunkEstimator:
     def _reported(self, sample: ImuSample) -> Quaternion:
         """Return the orientation that the IMU reports, world from IMU."""
         quaternion, last = unit_quaternion("orientation", sample.orientation), self._quaternion
-        turning, force = ((0.0, 0.0, 0.0) if given is None else given for given in sample[1:3])
-        rate, _ = in_range("angular_velocity", turning, math.inf)
-        force, _ = in_range("linear_acceleration", force, math.inf)
+        turning, force = (ZERO if given is None else given for given in sample[1:3])
+        rate, force = three_floats("angular_velocity", turning), three_floats("linear_acceleration", force)
         dt, up = self._step(sample, rate + force, None), up_in_body(quaternion)
         if last and angle_between(up, up_in_body(last)) > MAX_REPORTED_RATE * max(dt, self._period) + MAX_JUMP:
             self._restart("orientation jumped")
@@ -178,7 +186,7 @@ class TrunkEstimator:
         self._speed = max(sum(map(abs, rate)), self._speed * (1.0 - dt))
         contradiction = agreement.contradiction + self._speed * self._clock.offset
         self._uncertainty.advance(dt, len(rates) - 1, spin_up, bias_sigma, agreement.square, contradiction)
-        self._judged, self._rates, self._total, self._count = self._time, [rate], (0.0, 0.0, 0.0), 0
+        self._judged, self._rates, self._total, self._count = self._time, [rate], ZERO, 0
 
     def _step(self, sample: ImuSample, values: tuple[float, ...], quaternion: Quaternion | None) -> float:
         """Return the time in s since the last sample, 0 if the estimate begins with this one; check both."""
@@ -203,7 +211,7 @@ class TrunkEstimator:
         self._why = why  # there is no orientation yet
         self._quaternion = self._force = None
         self._judged, self._speed = self._time, 0.0
-        self._rates, self._total, self._count = [], (0.0, 0.0, 0.0), 0
+        self._rates, self._total, self._count = [], ZERO, 0
 
 
 class VqfFusion:

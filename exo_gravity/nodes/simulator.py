@@ -18,7 +18,7 @@ from std_msgs.msg import String
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS
-from exo_gravity.core.trial.script import NOTHING, Step, TrialScript
+from exo_gravity.core.trial.script import IDLE, Step, TrialScript
 from exo_gravity.core.trunk.imu_checks import ImuSample
 from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.nodes.imu.device import message_of
@@ -156,7 +156,7 @@ class Simulator(Node):
         self._trunk_target = (values["trunk.pitch"], values["trunk.roll"])
         set_faults(self._device, values)
         if "trial" in changed:
-            self._next.append((script or NOTHING, None))
+            self._next.append((script or IDLE, None))
 
 
 def main() -> None:

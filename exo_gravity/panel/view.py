@@ -65,8 +65,10 @@ class LoadChanges:
         self._changes: dict[str, tuple[float, dict[str, Any]]] = {}  # monotonic s of the newest one, and what it was
         self._faults: dict[str, float] = {}  # monotonic s at which the present one was seen first
 
-    def told(self, arms: Mapping[str, Any], nodes: Mapping[str, tuple[Values, Values]], now: float) -> dict[str, Any]:
-        """Return the states of `arms`, each with its `cause`, None if there is none. Call it with every new state.
+    def with_causes(
+        self, arms: Mapping[str, Any], nodes: Mapping[str, tuple[Values, Values]], now: float
+    ) -> dict[str, Any]:
+        """Return the states of `arms`, each with the `cause` of its fault or None. Call it with each new state.
 
         nodes: the parameters of `can_bridge` and `compensator` by arm. now: monotonic s.
         """

@@ -27,7 +27,7 @@ from exo_gravity.core.safety.drive import NO_COMMAND, Drive, EffortCommand, Stat
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trial.recording import CARRIED, Recording, ScriptedStep, Span
-from exo_gravity.core.trial.script import NOTHING, TrialScript
+from exo_gravity.core.trial.script import IDLE, TrialScript
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.sim.virtual_wearer import VirtualWearer
@@ -191,7 +191,7 @@ class OfflineTrial:
         why = f"{why} ({self._reason})" if self._reason else why
         self._note(now, why)
         self.trouble = self.trouble or self.events[-1][1]
-        self.arm.device.start(VirtualWearer(NOTHING))
+        self.arm.device.start(VirtualWearer(IDLE))
         self.safety.disable(now)
 
     def _note(self, now: float, text: str) -> None:

@@ -150,7 +150,7 @@ def of_load(node: str, traffic: Traffic, rate: float) -> Finding:
 def of_interface(
     name: str, is_up: bool | None, queue: int, link: Mapping[str, Any], bitrate: int, frames: int
 ) -> Iterator[Finding]:
-    """Judge a SocketCAN interface. is_up: None if there is none. link: as `ip -json -details link show` gives it.
+    """Judge a SocketCAN interface. is_up: None if it does not exist. link: the output of `ip -json -details link show`.
 
     bitrate: bit/s that the parameter file states. frames: those sent until a silent motor is noticed: a shorter queue
     overflows before, and hides which motor it was.

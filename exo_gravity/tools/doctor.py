@@ -74,7 +74,7 @@ def _limit(which: int) -> str:
 
 
 def measured(period: float, seconds: float, priority: int) -> Wakeups:
-    """Return what `measure` returns in a process of its own; show its progress."""
+    """Run `measure` in a separate process, show its progress, and return its result."""
     from rich.progress import track
 
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
@@ -129,13 +129,13 @@ def multicast_problem() -> str:
 
 
 def link_of(name: str) -> Mapping[str, Any]:
-    """Return what `ip` tells of an interface, empty if it tells nothing."""
+    """Return the description of an interface by `ip`, empty if there is none."""
     try:
         command = ["ip", "-json", "-details", "link", "show", name]
-        told = json.loads(subprocess.run(command, capture_output=True, check=True, timeout=5.0).stdout)
+        links = json.loads(subprocess.run(command, capture_output=True, check=True, timeout=5.0).stdout)
     except (OSError, ValueError, subprocess.SubprocessError):
         return {}
-    return dict(told[0]) if told else {}
+    return dict(links[0]) if links else {}
 
 
 def of_buses(nodes: Nodes, bridges: Mapping[str, Mapping[str, Any]], root: Path) -> Iterator[Finding]:

@@ -161,7 +161,7 @@ def test_the_panel_starts_alone_by_arguments(prepare):
 
 @pytest.fixture(scope="module")
 def standing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosProbe]:
-    """A probe beside a simulated arm that is not yet configured, for all commands of `ros2` in their order."""
+    """A probe, and a simulated arm whose bridge is not yet configured: the commands of `ros2` run on it in order."""
     nodes = LaunchedNodes(tmp_path_factory.mktemp("commands"), timing=CALM, can_bridge={"autostart": False})
     launched, probe = Launched(nodes), RosProbe()
     probe.wait_until(lambda: probe.status_contains("can_bridge", "inactive"))

@@ -23,7 +23,8 @@ class Told:
         for _ in range(round(10 * seconds)):
             self.now += 0.1
             state = {"bridge": {"fault": self.fault}, "compensator": {"changing load": self.changing}}
-            self.cause = self.changes.told({"right": state}, {"right": ({}, self.load)}, self.now)["right"]["cause"]
+            arms = self.changes.with_causes({"right": state}, {"right": ({}, self.load)}, self.now)
+            self.cause = arms["right"]["cause"]
         return self.cause
 
     def fail(self, seconds: float = 0.1) -> Any:

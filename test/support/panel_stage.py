@@ -189,5 +189,5 @@ class Stage:
                 shown = nodes
                 self.server.setup = {**self._own_setup, **setup_of(nodes)}
             now = time.monotonic()
-            arms = changes.told({arm: self.arms.state(arm, now) for arm in self.arms.names}, nodes, now)
+            arms = changes.with_causes({arm: self.arms.state(arm, now) for arm in self.arms.names}, nodes, now)
             self.server.state = {"arms": arms, "tilt": {"pitch": 0.2, "roll": -0.1}, **self.files.content}

@@ -177,8 +177,7 @@ class Compensator:
         if isinstance(settings, Settings) and settings.inertial and settings.use_imu:
             felt = self.motion.at(now, settings.shoulder_from_imu)
         if felt:
-            magnitude = math.hypot(*felt.gravity) / STANDARD_GRAVITY
-            tilt = Tilt.of_gravity(settings.side, felt.gravity)._replace(magnitude=magnitude)
+            tilt = Tilt.of_felt(settings.side, felt.gravity, STANDARD_GRAVITY)
         reason = settings.outside(theta, tilt)
         torque = settings.torque(theta, tilt, exact or bool(reason))
         if felt and isinstance(settings, Settings):

@@ -18,7 +18,7 @@ SIDES = ("left", "right")
 
 
 class Tilt(NamedTuple):
-    """The trunk's tilt in one arm's base frame; create it with `Tilt.of` or `Tilt.of_gravity`."""
+    """The trunk's tilt in one arm's base frame; create it with one of the `of` methods."""
 
     #: the trunk's, rad (REP-103)
     pitch: float
@@ -57,6 +57,14 @@ class Tilt(NamedTuple):
         pitch, roll = pitch_roll((x, y, z))
         norm = math.hypot(x, y, z)
         return cls._of(side, pitch, roll, x / norm, y / norm, z / norm)
+
+    @classmethod
+    def of_felt(cls, side: str, felt: Vector, one_g: float = 1.0) -> "Tilt":
+        """Return `of_gravity` of what the trunk feels as gravity, (3,) in its axes, with its magnitude.
+
+        one_g: 1 g in the unit of `felt`. Raises ParameterError.
+        """
+        return cls.of_gravity(side, felt)._replace(magnitude=math.hypot(*felt) / one_g)
 
     @classmethod
     def _of(cls, side: str, pitch: float, roll: float, x: float, y: float, z: float) -> "Tilt":

@@ -9,8 +9,8 @@ passive arm, so the residual is what his muscles (and the passive tissue of his 
 settings his arm's weight is part of it. One low-pass h lags; the estimate is 2 r - h r, which a torque that changes
 steadily passes without lag.
 
-The standard deviation adds the squares of the errors that `Deviation` names. They are not all random: those of the
-model stay the same in a pose, however long it is held.
+The standard deviation is the root of the summed squares of all known errors. Not all of them are random: an error of
+the model stays the same for as long as a pose is held.
 """
 
 import math

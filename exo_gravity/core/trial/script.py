@@ -99,4 +99,4 @@ class TrialScript:
         return tuple(accumulate(step.duration for step in self.steps))
 
 
-NOTHING = TrialScript("nothing", ())  #: whose wearer leaves the arm alone
+IDLE = TrialScript("nothing", ())  #: its wearer leaves the arm alone

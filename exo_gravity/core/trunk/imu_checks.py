@@ -123,7 +123,7 @@ class EqualValues:
 
 
 def _turned(axis: int, up: Floats3, acceleration: Floats3) -> bool:
-    """Return whether the accelerometer shows another gravity than the estimate: in one of its own axes, or at all."""
+    """Return whether gravity by the accelerometer differs from the estimate: on its own axis, or in direction."""
     if axis >= 3:
         return abs(acceleration[axis - 3] / STANDARD_GRAVITY - up[axis - 3]) > STUCK_TURN
     norm = math.hypot(*acceleration)

@@ -23,6 +23,7 @@ from exo_gravity.core.model.rotation import ZERO, Floats3, acceleration_of, plus
 from exo_gravity.core.model.tilt import Tilt, angle_between, gravity_in_trunk
 from exo_gravity.core.numbers import Vector
 
+NOT_REPORTED = -1.0  # first entry of the covariance of what an IMU does not measure (REP-145)
 TILT_SPEED = 5.0  # rad/s, faster than a trunk can tilt
 TILT_JUMP = 0.1  # rad, by which two tilts may differ however close in time
 MAX_LEAD = 0.05  # s that the stamp of a tilt may be ahead of our clock: /clock comes in steps, hosts differ by ms

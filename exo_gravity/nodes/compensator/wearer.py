@@ -1,4 +1,4 @@
-"""The wearer's torque, estimated beside the control loop 100 times a second: `wearer_efforts`, `wearer_efforts_std`.
+"""Estimates the wearer's torque 100 times a second, outside the control loop: `wearer_efforts`, `wearer_efforts_std`.
 
 The control loop leaves its newest message here, and does not wait. Neither topic leads back to it. If the estimate
 fails, the control loop goes on, and /diagnostics has the reason.
@@ -29,7 +29,7 @@ Sample = tuple[float, Sequence[float], Sequence[float], float]  # monotonic s, m
 
 
 class WearerWatch(Repeated):
-    """Publishes the estimate of each new sample, on a thread of its own.
+    """Publishes an estimate for each new sample, from a separate thread.
 
     newest: time in monotonic s and message of the joints; felt: time in monotonic s, specific force (3,) m/s^2,
     angular velocity (3,) rad/s and age of a sample of the trunk's motion. Both are set by other threads.
@@ -56,14 +56,14 @@ class WearerWatch(Repeated):
             return f"failed: {type(self.failure).__name__}: {self.failure}"
         if estimate is None or time.monotonic() - self._last > 1.0:
             return "unknown"
-        told = [
+        different = [
             f"{name} {torque:+.1f} +- {COVER * deviation:.1f}"
             for name, torque, deviation, shown in zip(
                 self._names, estimate.torque, estimate.deviation, estimate.distinguishable, strict=True
             )
             if shown
         ]
-        return ", ".join(told) or "not distinguishable from zero"
+        return ", ".join(different) or "not distinguishable from zero"
 
     def _tick(self) -> None:
         now = time.monotonic()
@@ -100,10 +100,9 @@ class WearerWatch(Repeated):
         if not settings.use_imu:
             return Tilt.of(settings.side), ZERO
         felt_at, force, rate, _ = self.felt
-        magnitude = math.hypot(*force)
-        if now - felt_at < FRESH and FELT_RANGE[0] < magnitude < FELT_RANGE[1]:
-            tilt = Tilt.of_gravity(settings.side, [-component for component in force])
-            return tilt._replace(magnitude=magnitude / STANDARD_GRAVITY), turning_in_base(settings.side, rate)
+        if now - felt_at < FRESH and FELT_RANGE[0] < math.hypot(*force) < FELT_RANGE[1]:
+            tilt = Tilt.of_felt(settings.side, [-component for component in force], STANDARD_GRAVITY)
+            return tilt, turning_in_base(settings.side, rate)
         # Without the lock of the control loop: at worst a tilt is turned on by the angular velocity of the one before.
         tilt_input = self._control.tilt
         return None if tilt_input.problem(now) else (tilt_input.at(now), ZERO)

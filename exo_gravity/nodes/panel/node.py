@@ -274,7 +274,7 @@ class Panel(Node):
             self._shown = nodes
             self._server.setup = {**self._own_setup, **setup_of(nodes)}
         tilt = self._tilt.within(SILENT)
-        arms = self._changes.told(self._arms.state(), nodes, time.monotonic())
+        arms = self._changes.with_causes(self._arms.state(), nodes, time.monotonic())
         self._server.state = {"arms": arms, "tilt": tilt, **self._recordings.state()}
 
     def _on_tilt(self, message: Vector3Stamped, _info: dict[str, Any]) -> None:

@@ -37,7 +37,7 @@ from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import HotPath, Publishers
 
-SHARED_TOPICS = {"/imu/pitch_yaw": Vector3Stamped, "/imu/data": Imu, "/imu/data_raw": Imu}
+SHARED_TOPICS = {"/imu/pitch_yaw": Vector3Stamped, content.IMU: Imu, "/imu/data_raw": Imu}
 SHARED_TOPICS |= {content.DIAGNOSTICS: DiagnosticArray, content.PARAMETER_EVENTS: ParameterEvent}
 SHARED_TOPICS |= {content.MARKERS: String}
 ARM_TOPICS = {STATES: JointState, content.COMMANDS: JointState, content.STEPS: String}  # in the live line

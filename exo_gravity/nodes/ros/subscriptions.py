@@ -23,17 +23,16 @@ from sensor_msgs.msg import Imu
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.rotation import unit_quaternion, up_in_body
-from exo_gravity.core.trunk.inputs import STILL, TiltInput
+from exo_gravity.core.trunk.inputs import NOT_REPORTED, STILL, TiltInput
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # reliable
 STOP_CHECK_PERIOD = 0.1  # s
 PAUSE = 0.0004  # s, less than the shortest period of a control loop
-MAX_PUBLISHERS = 4  # publishers of one topic that can be told apart
+MAX_PUBLISHERS = 4  # publishers of one topic that a node can distinguish
 DISTRUST = 0.2  # s for which a topic is not trusted after a second publisher was seen
 DATA, PITCH_YAW = "/imu/data", "/imu/pitch_yaw"
-NOT_REPORTED = -1.0  # first entry of a covariance (REP-145)
 
 Callback = Callable[[Any, dict[str, Any]], None]
 
