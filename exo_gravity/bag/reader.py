@@ -27,11 +27,11 @@ from exo_gravity.core.model.rotation import up_in_body
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trial.recording import CARRIED, Recording, ScriptedStep, Span
 from exo_gravity.core.trial.session import Session
+from exo_gravity.core.trunk.inputs import NOT_REPORTED
 
 BATCH_SIZE = 5_000  # messages that are decoded at once
 MAX_COMMAND_AGE = 200_000_000  # ns; an older command is no longer in force
 MAX_CLOCK_OFFSET = 1_000_000_000  # ns between stamp and arrival
-NOT_REPORTED = -1.0  # first entry of a covariance (REP-145)
 STATE_GAP = 1.0  # s; can_bridge reports its state twice a second, except while it ends
 TOPIC = itemgetter(0)
 

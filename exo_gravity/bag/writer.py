@@ -1,4 +1,4 @@
-"""Writes rosbag2 recordings (MCAP): serialised messages, simulated arms, and complete copies of cut recordings.
+"""Writes rosbag2 recordings (MCAP): from serialised messages, in a separate thread, and complete copies of cut ones.
 
 rosbags collects messages in a chunk of up to 1 MiB before it writes them. This writer closes the chunk and hands it to
 the kernel every 0.5 s, so a killed process loses no more than that. The index at the end of the file and metadata.yaml
@@ -7,29 +7,21 @@ delays this thread only: messages that find the queue full are lost and counted.
 """
 
 import contextlib
-import json
 import queue
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
-import numpy as np
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin, Writer, WriterError
 from rosbags.rosbag2.metadata import parse_qos
 from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from exo_gravity.bag import content
-from exo_gravity.bag.content import COMMANDS, JOINT_STATE, PARAMETERS, SESSION, STATES, STEPS, STRING, Event
 from exo_gravity.bag.storage import Storage
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.safety.drive import State
-from exo_gravity.core.trial.recording import Recording
-from exo_gravity.core.trial.session import Session
 
 FLUSH_PERIOD = 0.5  # s
 MAX_WAITING = 2_000  # batches: 100 s at 20 Hz, about 100 MB of two arms at 500 Hz
@@ -138,75 +130,6 @@ class BagWriter:
                 continue
             self._writer.write(connection, stamp, data)
             self.count += 1
-
-
-def write_recordings(
-    path: Path,
-    recordings: Sequence[Recording],
-    events: Iterable[Event],
-    parameters: Mapping[str, str],
-    session: Session,
-) -> None:
-    """Write simulated arms to a new recording `path`, as `recorder` writes real ones; time 0 is now.
-
-    events: what went wrong. parameters: YAML text by node. Raises DataError if it cannot be written.
-    """
-    types, start = get_typestore(Stores.ROS2_JAZZY), time.time_ns()
-    made: dict[str, Any] = types.types
-    messages: list[tuple[str, float, str, object]] = []  # topic, s, type, message
-
-    def header(now: float) -> object:
-        stamp = start + round(now * 1e9)
-        time_of = made["builtin_interfaces/msg/Time"](stamp // 10**9, stamp % 10**9)
-        return made["std_msgs/msg/Header"](time_of, "")
-
-    def joints(topic: str, now: float, names: Sequence[str], *values: np.ndarray) -> None:
-        messages.append((topic, now, JOINT_STATE, made[JOINT_STATE](header(now), list(names), *values)))
-
-    def report(now: float, level: int, name: str, text: str, **values: str) -> None:
-        pairs = [made["diagnostic_msgs/msg/KeyValue"](*pair) for pair in values.items()]
-        status = made["diagnostic_msgs/msg/DiagnosticStatus"](level, name, text, "", pairs)
-        kind = content.READ[content.DIAGNOSTICS]
-        messages.append((content.DIAGNOSTICS, now, kind, made[kind](header(now), [status])))
-
-    for text in parameters.values():
-        messages.append((PARAMETERS, 0.0, STRING, made[STRING](text)))
-    messages.append((SESSION, 0.0, STRING, made[STRING](json.dumps(asdict(session)))))
-    for now, text, _ in events:
-        name, _, what = text.partition(": ")
-        report(now, 1, name, what)
-    none = np.empty(0)
-    for arm in recordings:
-        prefix, names, last = f"/{arm.name}", arm.joint_names, float(arm.time[0])
-        for begin, end in arm.carried or ():
-            for now in (begin, end):
-                report(now, 0, f"{arm.name}/can_bridge", State.ACTIVE.value, state=State.ACTIVE.value)
-        report(float(arm.time[-1]), 0, f"{arm.name}/can_bridge", State.DISABLED.value, state=State.DISABLED.value)
-        for index, step in enumerate(arm.steps):
-            text = json.dumps({"step": index, "action": step.action, "duration": step.end - step.start})
-            messages.append((f"{prefix}/{STEPS}", step.start, STRING, made[STRING](text)))
-        columns = (
-            arm.time.tolist(),
-            *(np.asarray(c, float) for c in (arm.position, arm.velocity, arm.effort, arm.command)),
-        )
-        for now, position, velocity, effort, command in zip(*columns, strict=True):
-            if now > last:  # the command in force answers the joint state before
-                joints(f"{prefix}/{COMMANDS}", last, names, none, none, none if np.isnan(command).any() else command)
-            joints(f"{prefix}/{STATES}", now, names, position, velocity, effort)
-            last = now
-    writer = BagWriter(path)
-    for topic, kind in {topic: kind for topic, _, kind, _ in messages}.items():
-        writer.add_topic(topic, kind, offered_qos(True, topic in (PARAMETERS, SESSION), 1))
-    messages.sort(key=lambda message: message[1])
-    writer.write(
-        [
-            (topic, start + round(now * 1e9), bytes(types.serialize_cdr(message, kind)))
-            for topic, now, kind, message in messages
-        ]
-    )
-    writer.close()
-    if writer.error:
-        raise writer.error
 
 
 def is_complete(path: str | Path) -> bool:

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import Progress, TaskID
 
 from exo_gravity.bag.content import Event
-from exo_gravity.bag.writer import write_recordings
+from exo_gravity.bag.simulated import write_recordings
 from exo_gravity.core.errors import ParameterError, named
 from exo_gravity.core.trial.recording import Recording
 from exo_gravity.core.trial.script import TRUNK_ACTIONS, TrialScript
@@ -89,7 +89,7 @@ def run_offline(
 def record_offline(
     trials: Sequence[OfflineTrial], params: Path, session: Session, console: Console, should_stop: Callable[[], bool]
 ) -> str:
-    """Run the trials and write `bag` beside the parameter file `params`; return why one ended early, or ''.
+    """Run the trials, record them in `bag` beside the parameter file `params`; return why one ended early, or ''.
 
     Raises DataError if nothing was recorded, or it cannot be written.
     """
