@@ -13,7 +13,6 @@ from typing import Any
 import imageio.v3 as iio
 import mujoco
 import numpy as np
-import yaml
 from PIL import Image, ImageDraw, ImageFont
 
 from exo_gravity.bag.content import Bag
@@ -25,6 +24,7 @@ from exo_gravity.core.trial.recording import Recording
 from exo_gravity.core.view.scene import ARROW, LINE, SPHERE, TEXT, ArmView, Shape, arm_shapes
 from exo_gravity.core.view.urdf import COLOURS as MATERIALS
 from exo_gravity.core.view.urdf import ArmDescription, arm_pose, described, joint_names, urdf
+from exo_gravity.tools.inputs.parameter_file import node_of, recorded_of
 
 SIZE, GIF_SIZE = (640, 480), (480, 360)  # pixels
 COLOURS, SAMPLES = 256, 12  # of a GIF, and the frames of which these are
@@ -199,10 +199,10 @@ def _description(parameters: Mapping[str, str], name: str) -> ArmDescription:
     """
     values: list[dict[str, Any]] = []
     for executable, table in (("compensator", COMPENSATOR), ("can_bridge", CAN_BRIDGE)):
-        node = f"/{executable}" if name == "arm" else f"/{name}/{executable}"
-        if node not in parameters:
+        node = node_of(name, executable)
+        given = recorded_of(parameters, node)
+        if given is None:
             raise DataError(f"{name}: the recording has no parameters of {node}, which describe the arm")
-        given = yaml.safe_load(parameters[node])[node]["ros__parameters"]
         values.append({param.name: given.get(param.name, param.default) for param in table})
     try:
         return described(*values)

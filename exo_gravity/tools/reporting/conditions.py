@@ -2,17 +2,18 @@
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import yaml
 
 from exo_gravity.bag.content import Bag, Event
 from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.trial.analysis import HoldCriteria, TrialAnalysis
 from exo_gravity.core.trial.recording import Recording
+from exo_gravity.core.trial.session import Session
+from exo_gravity.tools.inputs.parameter_file import node_of, recorded_of
 from exo_gravity.tools.reporting import html, table
 
 EARLY = 0.2  # s; can_bridge publishes its state every 0.1 s, so a shorter gap to the script's end means nothing
@@ -34,8 +35,8 @@ class Conditions:
     @classmethod
     def of(cls, bag: Bag, arm: str) -> "Conditions":
         """Return the conditions of the arm `arm`; a parameter that was not recorded has its default."""
-        node = f"/{arm}/compensator" if arm != "arm" else "/compensator"
-        recorded = yaml.safe_load(bag.parameters[node])[node]["ros__parameters"] if node in bag.parameters else {}
+        node = node_of(arm, "compensator")
+        recorded = recorded_of(bag.parameters, node)
         start = {**{param.name: param.default for param in COMPENSATOR}, **recorded} if recorded else {}
         settings = ((event.time, *event.setting) for event in bag.events if event.setting)
         return cls(start, tuple((time, name, value) for time, of, name, value in settings if of == node))
@@ -64,34 +65,32 @@ class Conditions:
         return f"{mass:g} kg, {self.start['wearer.sex']}" if mass else "no data"
 
 
-def columns(bag: Bag, trial: str, arm: str) -> Callable[[float], dict[str, str]]:
+def columns(bag: Bag, conditions: Conditions, trial: str, arm: str) -> Callable[[float], dict[str, str]]:
     """Return a function from a time in s to the first columns of a row about the arm at that time."""
-    conditions = Conditions.of(bag, arm)
 
     def at(time: float) -> dict[str, str]:
-        settings = {key: str(conditions.at(time).get(key, "")) for key in ("side", "mode", "support")}
+        in_force = conditions.at(time)
+        settings = {key: str(in_force.get(key, "")) for key in ("side", "mode", "support")}
         return {"trial": trial, "subject": bag.session.subject, "arm": arm, **settings, "version": bag.session.version}
 
     return at
 
 
-def lines(bag: Bag) -> list[tuple[str, ...]]:
+def lines(conditions: Mapping[str, Conditions]) -> list[tuple[str, ...]]:
     """Return arm, mode, support and wearer of each arm, as text."""
     found: list[tuple[str, ...]] = []
-    for arm in (recording.name for recording in bag.recordings):
-        of_arm = Conditions.of(bag, arm)
+    for arm, of_arm in conditions.items():
         mode = of_arm.history("mode", lambda mode: MODES.get(mode, mode))
         support = of_arm.history("support", lambda share: f"{100.0 * share:g} %")
         found.append((arm, mode, "none in One-G" if mode == "One-G" else support, of_arm.wearer))
     return found
 
 
-def section(bag: Bag, criteria: HoldCriteria) -> Iterator[str]:
+def section(session: Session, conditions: Mapping[str, Conditions], criteria: HoldCriteria) -> Iterator[str]:
     """Yield the page's section on the conditions and the criteria."""
-    session = bag.session
     given = {"Subject": session.subject, "Protocol": session.protocol, "Note": session.note}
     yield html.bullets("", [f"{name}: {text}" for name, text in given.items() if text])
-    yield html.table(("Arm", "Mode", "Support", "Wearer"), [((), [line]) for line in lines(bag)])
+    yield html.table(("Arm", "Mode", "Support", "Wearer"), [((), [line]) for line in lines(conditions)])
     recorder = f"Recorded by exo_gravity {session.version}." if session.version else ""
     yield html.paragraph(f"{criteria_text(criteria)} {recorder}")
 
@@ -108,19 +107,37 @@ def criteria_text(criteria: HoldCriteria) -> str:
     )
 
 
-def worst(bag: Bag, arms: Iterable[tuple[Recording, TrialAnalysis]], criteria: HoldCriteria) -> tuple[str, bool]:
+def worst(
+    bag: Bag,
+    arms: Iterable[tuple[Recording, TrialAnalysis]],
+    conditions: Mapping[str, Conditions],
+    criteria: HoldCriteria,
+) -> tuple[str, bool]:
     """Return the worst event as a sentence, and whether it is worse than a small drift; ('', False) for none."""
-    found = [event for arm in arms for event in (*_falls(bag, *arm, criteria), *_strays(*arm, criteria))]
+    found = [
+        event
+        for recording, analysis in arms
+        for event in (
+            *_falls(bag.events, conditions[recording.name], recording, analysis, criteria),
+            *_strays(recording, analysis, criteria),
+        )
+    ]
     bad, _, text = max(found, default=(False, 0.0, ""))
     return text, bad
 
 
-def _falls(bag: Bag, recording: Recording, analysis: TrialAnalysis, criteria: HoldCriteria) -> Iterator[Worst]:
+def _falls(
+    events: Iterable[Event],
+    conditions: Conditions,
+    recording: Recording,
+    analysis: TrialAnalysis,
+    criteria: HoldCriteria,
+) -> Iterator[Worst]:
     """Yield each let-down that was not planned, and each motion that no step of the script explains."""
-    conditions, time = Conditions.of(bag, recording.name), recording.time
+    time = recording.time
     spans, planned = recording.carried or (), recording.steps[-1].end - EARLY if recording.steps else time[-1] - EARLY
     for n, (_, end) in enumerate(spans):
-        fault = fault_near(bag.events, recording.name, end)
+        fault = fault_near(events, recording.name, end)
         again = spans[n + 1][0] if n + 1 < len(spans) else float(time[-1])
         within = (time >= end) & (time <= again)
         is_planned = end >= planned or (not recording.steps and n + 1 == len(spans))

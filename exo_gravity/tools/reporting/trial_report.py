@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
+from functools import cached_property
 from html import escape
 from pathlib import Path
 
@@ -36,6 +37,7 @@ class Report:
     criteria: HoldCriteria
     arms: tuple[tuple[Recording, TrialAnalysis], ...]
     failures: tuple[str, ...]  #: one sentence for each way in which an arm did not hold
+    settings: dict[str, conditions.Conditions]  #: by the arm's name
     wearers: dict[str, wearer_share.WearerPart]  #: by the arm's name, where what the wearer did is known
     notes: tuple[str, ...]  #: what limits the trust in the verdict
     trouble: str = ""  #: why the trial ended before its script, or ''
@@ -54,10 +56,10 @@ class Report:
             return f"It held until the trial ended early: {self.trouble}."
         return "It held, as far as it was recorded." if self.bag.is_partial else "It held."
 
-    @property
+    @cached_property
     def verdict(self) -> tuple[str, bool]:
         """The first sentences of the report, and whether they are good news: a bad event comes first."""
-        event, bad = conditions.worst(self.bag, self.arms, self.criteria)
+        event, bad = conditions.worst(self.bag, self.arms, self.settings, self.criteria)
         early = f" The trial ended early: {self.trouble}." if self.trouble else ""
         held = f"It did not hold.{early}" if self.failures else self.held
         otherwise = held if self.failures else f"Otherwise it {held.removeprefix('It ')}"
@@ -95,7 +97,8 @@ def analyse(bag: Bag, criteria: HoldCriteria | None = None, min_hold: float = MI
     parts = {recording.name: wearer_share.of_arm(bag, recording) for recording in bag.recordings}
     known = {name: part for name, part in parts.items() if not isinstance(part, str)}
     unknown = [part for part in parts.values() if part and isinstance(part, str)]
-    return Report(bag, criteria, arms, found, known, (*bag.notes, *_reservations(bag), *unknown), trouble)
+    settings = {recording.name: conditions.Conditions.of(bag, recording.name) for recording in bag.recordings}
+    return Report(bag, criteria, arms, found, settings, known, (*bag.notes, *_reservations(bag), *unknown), trouble)
 
 
 def _reservations(bag: Bag) -> Iterator[str]:
@@ -123,8 +126,9 @@ def write(
     """
     folder = Path(folder)
     sections: list[str] = []
-    names = [recording.name for recording in report.bag.recordings]
-    columns = {name: conditions.columns(report.bag, report.trial, name) for name in names}
+    columns = {
+        arm: conditions.columns(report.bag, settings, report.trial, arm) for arm, settings in report.settings.items()
+    }
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name in ("holds.csv", "motions.csv"):
@@ -174,7 +178,7 @@ def print_report(report: Report, console: Console | None = None) -> None:
         console.print(f"[red]Not reported:[/] {marked(problem)}.")
     for sentence in report.failures:
         console.print(f"[red]{marked(sentence)}.[/]")
-    for arm, mode, support, wearer in conditions.lines(report.bag):
+    for arm, mode, support, wearer in conditions.lines(report.settings):
         console.print(f"{marked(arm)}: {mode}, support {support}, wearer: {wearer}")
     text, good = report.verdict
     console.print(f"[{'green' if good else 'red'} bold]{marked(text)}[/]")
@@ -194,6 +198,9 @@ def _page(report: Report, sections: Sequence[str]) -> str:
     if parameters:
         ending.append(f"<details><summary>Parameters at the start</summary><pre>{escape(parameters)}</pre></details>")
     text, good = report.verdict
-    head = [html.verdict(text, report.failures, good), *conditions.section(bag, report.criteria)]
+    head = [
+        html.verdict(text, report.failures, good),
+        *conditions.section(bag.session, report.settings, report.criteria),
+    ]
     when = f"{report.start:%Y-%m-%d %H:%M:%S}, {length:.0f} s, {'/'.join(bag.path.parts[-2:])}"
     return html.document(report.title, when, [*head, *sections, *ending])

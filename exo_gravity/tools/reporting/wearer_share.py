@@ -1,15 +1,13 @@
-"""What the wearer did, in a report: his torque and his share, by the observer that also runs beside the compensator.
+"""The wearer's torque and share in a report, by the same observer that runs in the compensator.
 
 It needs the compensator's parameters and, if that used an IMU, `/imu/data`. Parameters that were changed during the
 recording are those of its start.
 """
 
-import math
 from bisect import bisect_left
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 from matplotlib.figure import Figure
 
 from exo_gravity.bag.content import Bag
@@ -19,8 +17,9 @@ from exo_gravity.core.model.kinematics import turning_in_base
 from exo_gravity.core.model.rotation import ZERO, Floats3
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.observer.momentum import COVER
-from exo_gravity.core.observer.share import Share, WearerCurve, observed, share_of, while_between
+from exo_gravity.core.observer.share import WINDOW, Share, WearerCurve, observed, share_of, while_between
 from exo_gravity.core.trial.recording import Recording
+from exo_gravity.tools.inputs.parameter_file import node_of, recorded_of
 from exo_gravity.tools.reporting import html
 from exo_gravity.tools.reporting.figures import WIDTH
 from exo_gravity.tools.reporting.table import joint_labels
@@ -42,11 +41,10 @@ class WearerPart(NamedTuple):
 def of_arm(bag: Bag, recording: Recording) -> WearerPart | str:
     """Return what the wearer of an arm did, or why that is not known: a sentence, '' if no wearer is set."""
     name = recording.name
-    node = "/compensator" if name == "arm" else f"/{name}/compensator"
     unknown = f"{name}: the wearer's torque is not known: "
-    if node not in bag.parameters:
+    given = recorded_of(bag.parameters, node_of(name, "compensator"))
+    if given is None:
         return ""
-    given = yaml.safe_load(bag.parameters[node])[node]["ros__parameters"]
     values: dict[str, Any] = {param.name: given.get(param.name, param.default) for param in compensator_table(given)}
     try:
         settings = settings_of({**values, "law": "exact"})
@@ -62,12 +60,11 @@ def of_arm(bag: Bag, recording: Recording) -> WearerPart | str:
         if not settings.use_imu:
             return upright
         row = rows[min(bisect_left(times, now), len(rows) - 1)]
-        tilt = Tilt.of_gravity(settings.side, row[3:])
-        return tilt._replace(magnitude=math.hypot(*row[3:])), turning_in_base(settings.side, row[:3])
+        return Tilt.of_felt(settings.side, row[3:]), turning_in_base(settings.side, row[:3])
 
     curve = observed(settings, recording.time, (recording.position, recording.velocity, recording.effort), trunk_at)
     curve = while_between(curve, recording.while_carried(-np.inf, np.inf))
-    return WearerPart(curve, share_of(curve, 1.0), share_of(curve)) if len(curve.time) else ""
+    return WearerPart(curve, share_of(curve, WINDOW), share_of(curve)) if len(curve.time) else ""
 
 
 def sentence(part: WearerPart) -> str:
@@ -76,8 +73,9 @@ def sentence(part: WearerPart) -> str:
     if not np.isfinite(share.value):
         return "The wearer's arm hung all the time: there was nothing to carry."
     band = COVER * float(share.deviation)
-    told = f"The wearer carried {100.0 * float(share.value):.0f} % of his arm's weight (95 % band ±{100.0 * band:.0f})"
-    return f"{told}." if abs(share.value) > band else f"{told}: not distinguishable from zero."
+    value = f"{100.0 * float(share.value):.0f} % of his arm's weight (95 % band ±{100.0 * band:.0f})"
+    doubt = "" if abs(share.value) > band else ": not distinguishable from zero"
+    return f"The wearer carried {value}{doubt}."
 
 
 def figure(recording: Recording, part: WearerPart) -> Figure:
