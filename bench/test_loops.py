@@ -79,8 +79,8 @@ def test_what_is_started_while_pinned_runs_on_at_most_two_of_the_permitted_cores
     permitted = os.sched_getaffinity(0)
     with loop._pinned():
         code = "import os; print(sorted(os.sched_getaffinity(0)))"
-        told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-        assert told.strip() == str(sorted(os.sched_getaffinity(0)))
+        printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+        assert printed.strip() == str(sorted(os.sched_getaffinity(0)))
         assert len(os.sched_getaffinity(0)) == min(loop.CORES, len(permitted))
     assert os.sched_getaffinity(0) == permitted
 

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bench.device_study import as_markdown
 from bench.wearer.devices import draw
 from bench.wearer.muscles import ACTIVATION, DELAY, Muscles, Phase, phase_at
-from bench.wearer.report import METHODS, as_markdown, picture, verdict
+from bench.wearer.report import METHODS, picture, verdict
 from bench.wearer.study import KINDS, judge, play
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.model.wearer import Wearer

@@ -6,7 +6,6 @@ per device and a table, writes both as JSON and Markdown, and exits with 1 if a 
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import os
@@ -20,19 +19,15 @@ os.environ["OMP_NUM_THREADS"] = "1"
 
 import numpy as np
 
+from ..device_study import as_markdown, options_of
 from .device import draw
-from .verdict import as_markdown, progress, verdict
+from .verdict import progress, verdict
 from .way import Result, WayError, go
 
 
 def main() -> int:
     """Run the study; return the exit code."""
-    parser = argparse.ArgumentParser(prog="bench.calibration", description="Calibrate random simulated devices.")
-    option = parser.add_argument
-    option("--devices", type=int, default=20, metavar="N", help="how many (default: %(default)s)")
-    option("--first", type=int, default=0, metavar="SEED", help="of the first one (default: %(default)s)")
-    option("--output", type=Path, default=Path("build/calibration"), metavar="FILE", help="(default: %(default)s)")
-    options = parser.parse_args()
+    options = options_of("bench.calibration", "Calibrate random simulated devices.", Path("build/calibration"))
     results: list[Result] = []
     failed: list[str] = []
     begin = time.monotonic()
@@ -46,7 +41,7 @@ def main() -> int:
                 failed.append(f"device {seed}: {error}")
                 print(failed[-1], flush=True)
     rows = verdict(results, failed)
-    text = as_markdown(rows)
+    text = f"{as_markdown(rows)}\n"
     print(text)
     options.output.parent.mkdir(parents=True, exist_ok=True)
     options.output.with_suffix(".md").write_text("\n".join([text, *failed]), encoding="utf-8")

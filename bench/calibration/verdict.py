@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
+from ..device_study import Row
 from .way import Result
 
 NEAR = 0.02  # of the largest moment, by which a moment may be off
@@ -16,15 +16,6 @@ COVERAGE = (0.90, 0.99)  # of +- DEVIATIONS standard errors
 HELD_OUT = 0.02  # of the peak torque
 MAX_POSES, MAX_MINUTES = 12, 4.0
 BEFORE, AFTER = 5.0, 0.2  # deg/min
-
-
-class Row(NamedTuple):
-    """A line of the table: what, shown, limit; held: whether it is within."""
-
-    what: str
-    shown: str
-    limit: str
-    held: bool
 
 
 def verdict(results: Sequence[Result], failed: Sequence[str]) -> list[Row]:
@@ -95,13 +86,6 @@ def _holding(results: Sequence[Result]) -> list[Row]:
         Row("creep before, slowest device", f"{least:.0f} deg/min", f"above {BEFORE:g}", least > BEFORE),
         Row("creep after, fastest device", f"{most:.2f} deg/min", f"below {AFTER:g}", most < AFTER),
     ]
-
-
-def as_markdown(rows: Sequence[Row]) -> str:
-    """Return the table in Markdown."""
-    lines = ["| what | shown | limit | |", "|---|---|---|---|"]
-    marks = {True: "", False: "missed"}
-    return "\n".join([*lines, *(f"| {r.what} | {r.shown} | {r.limit} | {marks[r.held]} |" for r in rows)]) + "\n"
 
 
 def progress(result: Result) -> str:

@@ -6,26 +6,21 @@ a table, writes it and a picture of the first trial, and exits with 1 if a limit
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
+from ..device_study import as_markdown, options_of
 from .devices import draw
-from .report import as_markdown, picture, points, verdict
+from .report import picture, points, verdict
 from .study import Trial, judge, play
 
 
 def main() -> int:
     """Run the study; return the exit code."""
-    parser = argparse.ArgumentParser(prog="bench.wearer", description="Judge the estimate of the wearer's torque.")
-    option = parser.add_argument
-    option("--devices", type=int, default=20, metavar="N", help="how many (default: %(default)s)")
-    option("--first", type=int, default=0, metavar="SEED", help="of the first one (default: %(default)s)")
-    option("--output", type=Path, default=Path("build/wearer"), metavar="FILE", help="(default: %(default)s)")
-    options = parser.parse_args()
+    options = options_of("bench.wearer", "Judge the estimate of the wearer's torque.", Path("build/wearer"))
     trials: list[Trial] = []
     for seed in range(options.first, options.first + options.devices):
         trial = judge(play(draw(seed)))

@@ -3,7 +3,8 @@
 `identify` and `wearer_from` work on what slow tours measure: torques of the true arm with friction of both signs, noise
 and 12-bit codes (test/support/random_device.py), gravity's direction as an IMU gives it that is mounted a degree off,
 and a relaxed person who breathes. The tours themselves are not simulated; `make calibrate-study` does that, and leaves
-errors of the same size. The body-mass table is wrong by UNUSUAL and BESIDE for the person, friction is found to WITHIN.
+errors of the same size. The body-mass table is wrong for the person by MASS_ERROR and COG_ERROR, and
+friction is found to WITHIN.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.calibration.device import COULOMB, CURRENT_NOISE, LARGEST_OFFSET, SPREAD, VISCOUS
 from bench.motion_monitor import MOTOR_NAMES
 from exo_gravity.core.calibration.identification import identify
 from exo_gravity.core.compensation.settings import Settings, settings_of
@@ -33,13 +35,11 @@ from exo_gravity.tools.inputs.arms import configured_arm
 from exo_gravity.tools.inputs.parameter_file import packaged_config
 from test.support.random_device import LEANING, LENGTH, Device, off_axis_of
 
-SPREAD = 0.3  # of masses, centres of gravity and torque scales, as in bench/calibration
-OFFSET = 0.015  # m, beside the link
-COULOMB, VISCOUS, STRIBECK, CURRENT_NOISE = (0.1, 0.4), (0.02, 0.1), 0.05, 0.02
+STRIBECK = 0.05  # Nm
 LEANT = Tilt.of("right", -0.15, 0.22).direction  # the stand while the weight hangs
 MOUNTING = math.radians(1.2)  # of the IMU, before the weight of the arm corrects it
 BODY_MASS = (55.0, 90.0)  # kg
-UNUSUAL, BESIDE = 0.15, 0.03  # share of a segment's mass; m of its centre of gravity along the segment
+MASS_ERROR, COG_ERROR = 0.15, 0.03  # of the body-mass table: share of a segment's mass; m along the segment
 RELAXED = np.array(((0.0, 0.1, 0.1, 0.2), (0.3, 0.9, 0.2, 0.6), (-0.2, 0.6, 1.0, 0.4), (0.4, 1.1, 0.6, 1.4)))  # rad
 BREATHING = 0.1  # Nm
 WITHIN = 0.1  # share of friction
@@ -83,12 +83,12 @@ def draw(seed: int) -> Worn:
     low, high = 1.0 - SPREAD, 1.0 + SPREAD
     mass = DEFAULT_LINKS.mass * rng.uniform(low, high, 4)
     cog = np.minimum(DEFAULT_LINKS.cog * rng.uniform(low, high, 4), LENGTH)
-    y, z = rng.uniform(-OFFSET, OFFSET, (2, 4))
+    y, z = rng.uniform(-LARGEST_OFFSET, LARGEST_OFFSET, (2, 4))
     links = ArmModel(LENGTH, cog, mass, off_axis=off_axis_of(mass, y, z))
     body_mass = float(rng.uniform(*BODY_MASS))
     load = Wearer(body_mass).on_links(LENGTH)
-    worn_mass = load.mass * rng.uniform(1.0 - UNUSUAL, 1.0 + UNUSUAL, 4)
-    worn_cog = np.clip(load.cog + rng.uniform(-BESIDE, BESIDE, 4) * (load.mass > 0), 0.0, LENGTH)
+    worn_mass = load.mass * rng.uniform(1.0 - MASS_ERROR, 1.0 + MASS_ERROR, 4)
+    worn_cog = np.clip(load.cog + rng.uniform(-COG_ERROR, COG_ERROR, 4) * (load.mass > 0), 0.0, LENGTH)
     scale, coulomb, viscous = rng.uniform(low, high, 4), rng.uniform(*COULOMB, 4), rng.uniform(*VISCOUS, 4)
     stribeck = rng.uniform(0.0, STRIBECK, 4)
     columns = {

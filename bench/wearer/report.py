@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,20 +11,12 @@ from exo_gravity.core.observer.momentum import COVER
 from exo_gravity.core.observer.share import WINDOW, share_of
 from exo_gravity.tools.reporting.html import FAINT, INK, JOINT_COLOURS, PUSH_COLOUR, make_plain
 
+from ..device_study import Row
 from .study import KINDS, METHODS, Trial
 
 COVERAGE = (0.92, 0.98)
 SHARE_ERROR = 0.05
 JOINT = 1  # of the picture: shoulder abduction
-
-
-class Row(NamedTuple):
-    """A row of the table; a limit of '' is none."""
-
-    what: str
-    shown: str
-    limit: str
-    held: bool
 
 
 def verdict(trials: Sequence[Trial]) -> list[Row]:
@@ -63,12 +54,6 @@ def covered(trials: Sequence[Trial], kinds: Sequence[int]) -> float:
 def points(share: float) -> str:
     """Return a difference of two shares as text."""
     return f"{100.0 * share:.1f} percentage points"
-
-
-def as_markdown(rows: Sequence[Row]) -> str:
-    """Return the table in Markdown."""
-    lines = ["| what | shown | limit | |", "|---|---|---|---|"]
-    return "\n".join([*lines, *(f"| {r.what} | {r.shown} | {r.limit} | {'' if r.held else 'missed'} |" for r in rows)])
 
 
 def picture(trial: Trial) -> Figure:

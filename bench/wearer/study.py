@@ -169,8 +169,7 @@ def judge(played: Played) -> Trial:
 
     def trunk_at(now: float) -> tuple[Tilt, tuple[float, float, float]]:
         row = played.trunk[np.searchsorted(played.trunk[:, 0], now - 0.5 / RATE) - 1, 1:].tolist()  # one cycle late
-        tilt = Tilt.of_gravity(worn.side, row[3:])._replace(magnitude=math.hypot(*row[3:]))
-        return tilt, turning_in_base(worn.side, row[:3])
+        return Tilt.of_felt(worn.side, row[3:]), turning_in_base(worn.side, row[:3])
 
     joints = (recording.position, recording.velocity, recording.effort)
     whole = observed(worn.settings, recording.time, joints, trunk_at)
