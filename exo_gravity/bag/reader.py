@@ -163,6 +163,10 @@ class _Contents:
         """Return the arm whose joint states are on `topic`; None if it is unreadable, which is a problem."""
         name, names = arm_of(topic), self.joints[topic].names
         arrival, stamp, values = self.joints[topic].arrays()
+        finite = np.isfinite(values[:, FIELDS.index("position")]).all(axis=1)
+        if finite.any() and not finite.all():
+            self.notes.append(f"{name}: joint states left out, a position is NaN or infinite: {np.sum(~finite)}")
+            arrival, stamp, values = arrival[finite], stamp[finite], values[finite]
         stamped = bool(np.all(np.diff(stamp) >= 0) and abs(np.median(arrival - stamp)) < MAX_CLOCK_OFFSET)
         clock, values = _in_order(stamp if stamped else arrival, values)
         command, steps = self._commands(topic, names, clock, stamped), self._script(name, start)

@@ -103,6 +103,16 @@ def test_an_unreadable_arm_is_a_problem_and_the_other_arm_is_still_read(recordin
     assert "left" in read.problems[0] and "must be 4" in read.problems[0]
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_joint_states_without_a_position_are_left_out_with_a_note(recording, content, tmp_path, bad):
+    stamp = content[-1][2] + 10**7
+    state = made.joint_state(stamp, recording.joint_names, np.array([0.0, bad, 0.0, 0.0]), np.zeros(4), np.zeros(4))
+    content = [*content, ("/right/joint_states", made.JOINT_STATE, stamp, state)]
+    read = read_bag(made.write_bag(tmp_path / "bag", content))
+    made.assert_same(read.recordings[0], recording)
+    assert not read.problems and "right: joint states left out, a position is NaN or infinite: 1" in read.notes[0]
+
+
 def test_a_damaged_message_is_named_by_its_topic(content, tmp_path):
     broken = [(topic, kind, stamp, data[:40]) for topic, kind, stamp, data in content if kind == made.JOINT_STATE]
     with pytest.raises(DataError, match=r"/right/joint_states: .* damaged"):
