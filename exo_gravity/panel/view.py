@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from itertools import chain, repeat, zip_longest
 from typing import Any
 
+from exo_gravity.core.compensation.guidance import CAUSE_TIME
 from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.motors.joint_motor import SIMULATED_BUSES
@@ -32,7 +33,6 @@ OF_SUBJECT = {p.name: p for p in COMPENSATOR if p.name in (*LOAD[1:4], "limits.r
 
 Values = Mapping[str, Any]
 NUMBERS = ("position", "velocity", "effort")
-CAUSE = 5.0  # s before a fault within which a change of load may be its cause
 LATE = 1.5  # s after a fault in which the panel may still learn of a change that came before it
 
 
@@ -82,12 +82,12 @@ class LoadChanges:
         new = self._new(arm, compensator) if compensator else None
         at, change = self._changes.get(arm, (-math.inf, {}))
         if new and now - began <= LATE:
-            if now - at <= CAUSE and new["what"] == change["what"] == "support":  # a slider on its way
+            if now - at <= CAUSE_TIME and new["what"] == change["what"] == "support":  # a slider on its way
                 new["from"] = change["from"]
             self._changes[arm] = at, change = now, new
         elif change and not is_faulty and (state["compensator"] or {}).get("changing load", "none") != "none":
             self._changes[arm] = at, change = now, change
-        return change if is_faulty and began - at <= CAUSE else None
+        return change if is_faulty and began - at <= CAUSE_TIME else None
 
     def _new(self, arm: str, compensator: Values) -> dict[str, Any] | None:
         """Return what has changed since the last call, None for nothing; of the wearer's data, only that they have."""

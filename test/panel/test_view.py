@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from exo_gravity.panel.view import CAUSE, LATE, LoadChanges
+from exo_gravity.core.compensation.guidance import CAUSE_TIME
+from exo_gravity.panel.view import LATE, LoadChanges
 
 
 class Told:
@@ -53,11 +54,11 @@ def test_a_change_of_load_shortly_before_a_fault_is_named_and_never_the_wearers_
 
 def test_a_change_long_before_is_not_the_cause_unless_the_load_still_changes():
     told = Told()
-    told.go(CAUSE + 1.0, support=0.6)
+    told.go(CAUSE_TIME + 1.0, support=0.6)
     assert told.fail() is None
     told = Told()
     told.changing = "right_elbow_flexion, 2.1 Nm to go"
-    told.go(CAUSE + 1.0, support=0.6)
+    told.go(CAUSE_TIME + 1.0, support=0.6)
     assert told.fail() == {"what": "support", "from": 0.1, "to": 0.6}
 
 
@@ -79,7 +80,7 @@ def test_a_change_of_which_the_panel_learns_after_the_fault_is_the_cause_and_a_l
 
 def test_support_that_does_not_act_and_parameters_that_are_not_known_are_no_change():
     told = Told()
-    told.go(CAUSE + 1.0, mode="one_g")
+    told.go(CAUSE_TIME + 1.0, mode="one_g")
     told.go(1.0, support=0.6)
     assert told.fail() is None
     told = Told()

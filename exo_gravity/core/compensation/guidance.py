@@ -28,6 +28,7 @@ SPEED_GAIN = 20.0  # Nm/rad
 WATCH = 1.0  # s after the last fade in which a joint that begins to move is still guided
 LARGE = 1.0  # Nm between old and new load; less is slow enough without damping, which a wearer who moves would feel
 SMALL = 0.05  # Nm; a smaller difference is nothing to guide
+CAUSE_TIME = 5.0  # s within which a change of load may be the cause of a fault or a motion
 
 
 class GuidedChange:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.bag.content import Bag, Event
+from exo_gravity.core.compensation.guidance import CAUSE_TIME
 from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.trial.analysis import HoldCriteria, TrialAnalysis
 from exo_gravity.core.trial.recording import Recording
@@ -17,7 +18,6 @@ from exo_gravity.tools.inputs.parameter_file import node_of, recorded_of
 from exo_gravity.tools.reporting import html, table
 
 EARLY = 0.2  # s; can_bridge publishes its state every 0.1 s, so a shorter gap to the script's end means nothing
-CAUSE = 5.0  # s before a motion within which a change of load may have caused it
 NEAR = 1.0  # s between a let-down and the fault that caused it
 LOAD = ("mode", "support", "wearer.")  # beginnings of the parameters that change the load
 MODES = {"one_g": "One-G", "zero_g": "Zero-G"}
@@ -47,7 +47,7 @@ class Conditions:
 
     def change_before(self, time: float) -> str:
         """Return the change of load that may have caused a motion at `time` s, as a clause, or ''."""
-        near = [change for change in self.changes if 0.0 <= time + NEAR - change[0] <= CAUSE + NEAR]
+        near = [change for change in self.changes if 0.0 <= time + NEAR - change[0] <= CAUSE_TIME + NEAR]
         return next((f" after {name} = {value}" for _, name, value in near[::-1] if name.startswith(LOAD)), "")
 
     def history(self, name: str, shown: Callable[[Any], str]) -> str:
