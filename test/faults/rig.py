@@ -21,7 +21,7 @@ import yaml
 from exo_gravity.tools.inputs.parameter_file import load
 
 from ..support.launched_nodes import REAL, SIMULATED, LaunchedNodes, Parameters, children, full_name, prefer
-from ..support.ros_probe import TO_HOME, RosProbe
+from ..support.ros_probe import RosProbe
 from ..support.truth import Truth
 
 RAISED = (0.0, 1.3, 0.0, 0.3)  # rad, nearly horizontal
@@ -48,7 +48,6 @@ class Rig:
     def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
         self.folder, self.shipped_timeouts = folder, shipped_timeouts
         self.script = self.write_script("pose", [{"move": list(self.pose), "over": 1.0}, {"hold": 600.0}])
-        self._home = self.write_script("home", TO_HOME)
         self.probe = RosProbe()
         device = self._device_nodes()
         self.nodes = [*self._make_nodes(device.bus["port"]), device]
@@ -95,16 +94,12 @@ class Rig:
                 self._start_over(stage)
                 return
             while not self.is_at_pose():
-                self.get_carried(self.probe)
+                self.probe.get_carried()
                 self.probe.bring_to(self.script)
                 self._wait_for_states(self.rate / 4)
             if stage == "letting down":
                 assert self.probe.enable(False).success
                 self.probe.wait_until(lambda: abs(self.true_velocity(1)) > 0.2)
-
-    def get_carried(self, probe: RosProbe) -> None:
-        """Wait until the arm of `probe` is carried, with the wearer's help."""
-        probe.get_carried(self._home)
 
     def _wait_for_states(self, count: float) -> None:
         seen = len(self.probe.joint_states)

@@ -123,7 +123,7 @@ class BothArmsRig(Rig):
             newest = self.left_truth.newest()
             if self.left.state != "active" or newest is None or abs(newest["position"][1] - self.pose[1]) > NEAR:
                 self.left.wait_until(lambda: self.left.state)
-                self.get_carried(self.left)
+                self.left.get_carried()
                 self.left.bring_to(self.script)
         super().bring_to(stage)
 

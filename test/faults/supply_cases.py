@@ -33,7 +33,7 @@ def stays_off(records: np.ndarray) -> str:
 
 def carries_again(rig: Rig) -> None:
     """Check that clear and enable, after the release, carry the arm again."""
-    rig.get_carried(rig.probe)
+    rig.probe.get_carried()
     start = time.time()
     rig.probe.wait_until(lambda: time.time() > start + 1.0)
     assert rig.probe.state == "active", f"enabled again, the arm is {rig.probe.state}"

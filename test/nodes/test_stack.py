@@ -16,7 +16,7 @@ from exo_gravity.tools import train_anfis
 
 from ..support import CONFIG
 from ..support.launched_nodes import CALM, NO_IMU, LaunchedNodes
-from ..support.ros_probe import TO_HOME, RosProbe
+from ..support.ros_probe import RosProbe
 
 pytestmark = pytest.mark.real_time
 
@@ -27,12 +27,11 @@ ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585,
 
 
 @pytest.fixture
-def scripts(tmp_path: Path) -> tuple[Path, Path]:
-    """The paths of trial scripts: one moves the arm to `POSE` and lets go, the other moves it home."""
-    to_pose, home = tmp_path / "to_pose.yaml", tmp_path / "home.yaml"
+def to_pose(tmp_path: Path) -> Path:
+    """The path of a trial script that moves the arm to `POSE` and lets go."""
+    to_pose = tmp_path / "to_pose.yaml"
     to_pose.write_text(yaml.safe_dump({"name": "to_pose", "steps": [{"move": POSE, "over": 1.5}, {"hold": 60.0}]}))
-    home.write_text(yaml.safe_dump({"name": "home", "steps": TO_HOME}))
-    return to_pose, home
+    return to_pose
 
 
 def fastest(probe: RosProbe) -> float:
@@ -40,11 +39,10 @@ def fastest(probe: RosProbe) -> float:
     return max(max(map(abs, message.velocity)) for message in probe.joint_states)
 
 
-def while_carried(probe: RosProbe, scripts: tuple[Path, Path], observe: Callable[[], Observed]) -> Observed:
+def while_carried(probe: RosProbe, to_pose: Path, observe: Callable[[], Observed]) -> Observed:
     """Return what `observe` returns of the arm in `POSE`; again if a busy machine let it down meanwhile."""
-    to_pose, home = scripts
     while True:
-        probe.get_carried(home)
+        probe.get_carried()
         probe.bring_to(to_pose)
         probe.states.clear()
         observed = observe()
@@ -53,7 +51,7 @@ def while_carried(probe: RosProbe, scripts: tuple[Path, Path], observe: Callable
 
 
 def test_an_arm_stays_follows_live_changes_and_after_a_fault_is_carried_by_its_operator_alone(
-    launch, probe, scripts, listen
+    launch, probe, to_pose, listen
 ):
     # Under its own launcher, the compensator's death does not stop the other nodes.
     nodes = launch(without=("compensator",), timing=CALM)
@@ -82,7 +80,7 @@ def test_an_arm_stays_follows_live_changes_and_after_a_fault_is_carried_by_its_o
         steps = np.diff([message.effort[1] for message in probe.effort_commands if message.effort])
         return drift, error, np.abs(steps).max(initial=0.0) / abs(target - before[1])
 
-    drift, error, step = while_carried(probe, scripts, hold_and_change)
+    drift, error, step = while_carried(probe, to_pose, hold_and_change)
     assert drift < 0.5 and error < 0.03 and 0.0 < step < 0.5
 
     # No node maps another one's shared memory, on which it could block.
@@ -92,7 +90,7 @@ def test_an_arm_stays_follows_live_changes_and_after_a_fault_is_carried_by_its_o
         assert "fastrtps_port" not in maps
 
     # Without a compensator the arm is let down, and only the operator clears the fault.
-    probe.get_carried(scripts[1])
+    probe.get_carried()
     probe.joint_states.clear()
     compensator.process("compensator").send_signal(signal.SIGKILL)
     probe.wait_until(lambda: probe.state == "fault")
@@ -106,7 +104,7 @@ def test_an_arm_stays_follows_live_changes_and_after_a_fault_is_carried_by_its_o
     assert "refused" in probe.enable(True).message
     assert probe.trigger("clear_fault").success
     probe.wait_until(lambda: probe.state == "disabled")
-    probe.get_carried(scripts[1])
+    probe.get_carried()
 
     # Ctrl-C to the bridge: the arm is let down, then the motors are switched off, then all nodes stop.
     probe.joint_states.clear()

@@ -23,12 +23,13 @@ from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity.nodes.ros.run import keep_to_this_machine
 
+from . import CONFIG
+
 keep_to_this_machine()
 
 InvalidHandle = rclpy_implementation.InvalidHandle
 HOME = [0.0, 0.05, 0.05, 0.05]  # rad, hanging and within the limits
-HELP_TIME = 20.0  # s for which the wearer holds it there: a joint with little friction would swing out of its limits
-TO_HOME: list[dict[str, Any]] = [{"move": HOME, "over": 1.0}, {"move": HOME, "over": HELP_TIME}]  # a script's steps
+HELP_TIME = 20.0  # s for which config/home.yaml holds the arm: a joint with little friction swings out of its limits
 
 
 class Timeout(AssertionError):
@@ -190,17 +191,14 @@ class RosProbe:
             self.wait_for_report()
             self.wait_until(lambda: self.state in ("active", "fault", "disabled"))  # disabled: the enable has expired
 
-    def get_carried(self, home: object) -> None:
-        """Wait until the arm is carried; the wearer moves one that hangs outside its limits or away from home.
-
-        home: path of a script with the steps TO_HOME.
-        """
+    def get_carried(self) -> None:
+        """Wait until the arm is carried; the wearer moves one that hangs outside its limits or away from home."""
         helped = -math.inf
         while self.state != "active":
             misplaced = self.fault == "implausible_zero" or self.status_contains("can_bridge", "to be moved")
             if misplaced and time.monotonic() > helped + HELP_TIME:
                 helped = time.monotonic()
-                self.set_parameters("simulator", trial=str(home))
+                self.set_parameters("simulator", trial=str(CONFIG / "home.yaml"))
             if self.state == "fault":
                 self.trigger("clear_fault")
             elif self.state == "disabled":
