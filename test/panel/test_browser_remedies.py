@@ -37,6 +37,19 @@ def test_a_check_that_waits_says_in_degrees_which_joint_to_turn_and_a_simulated_
     assert page.is_disabled('[data-arm="right"] .home')
 
 
+@pytest.mark.parametrize("width", [390, 1280])
+def test_the_cause_of_a_fault_stands_above_the_buttons_and_moves_none_of_them(visit, stage, width):
+    page = visit()
+    page.set_viewport_size({"width": width, "height": 800})
+    sentence, button = page.locator('[data-arm="right"] .sentence'), page.locator('[data-arm="right"] .clear')
+    before = button.bounding_box()
+    stage.arms.fail("right", "implausible_zero")  # the longest of all
+    page.wait_for_selector("[data-arm=right] .sentence:has-text('did not hang where it should. The arm was let down')")
+    text = sentence.bounding_box()
+    assert button.bounding_box() == before
+    assert text["y"] + text["height"] <= before["y"] < 800.0
+
+
 def test_a_fault_after_a_change_of_load_names_the_change_also_after_a_reload(visit, stage):
     stage.arms.states["right"] = "active"
     stage.arms.settings["right"].update({"mode": "zero_g", "support": 0.05})

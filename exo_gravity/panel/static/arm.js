@@ -140,8 +140,10 @@ export class ArmCard {
     const moving = name === "active" ? this.motion(state) : "";
     badge.toggleAttribute("data-moves", moving !== "");
     write(this.find(".state"), moving ? t(moving) : has(`state.${name}`) ? t(`state.${name}`) : name);
-    write(this.find(".sentence"), this.sentence(name, moving, state, bridge));
-    this.showRemedy(bridge, state);
+    const remedy = this.remedy(bridge, state);
+    write(this.find(".sentence"), this.sentence(name, moving, state, bridge, remedy));
+    this.find(".remedy").hidden = !remedy;
+    write(this.find(".remedy p"), remedy);
     write(this.find(".detail"), bridge?.message ? t("detail", bridge.message) : "");
     const other = alive ? state.compensator : null;
     write(this.find(".compensator"), other ? (other.level ? t("compensator_detail", other.message) : t("carried", number(finite(other["mass carried (kg)"]), 2))) : alive ? t("compensator_silent") : "");
@@ -161,12 +163,13 @@ export class ArmCard {
     write(this.find(".rates"), limits && limits !== "none" ? `${rates} ${t("limits", limits)}` : rates);
   }
 
-  sentence(name, moving, state, bridge) {
+  sentence(name, moving, state, bridge, remedy) {
     if (bridge?.message.includes("may still be powered")) return t("unreached");
     if (moving) return t(changes(state) ? "sentence.changing" : `sentence.${moving}`);
     const outside = ["checking", "disabled"].includes(name) && bridge?.message.match(/(\S+) to be moved by ([-+][\d.]+) degrees/);
     if (outside) return t(`outside.${name}`, jointText(this.name, outside[1]), number(Math.abs(outside[2]), 1));
-    return has(`sentence.${name}`) ? t(`sentence.${name}`) : "";
+    const cause = remedy.match(/^.*?[.](?=\s|$)/)?.[0] ?? ""; // what a remedy begins with
+    return `${cause} ${has(`sentence.${name}`) ? t(`sentence.${name}`) : ""}`.trim();
   }
 
   // What the arm does in place of resting; '' while it rests. Gravity moves it where the motors' torque opposes that.
@@ -182,16 +185,15 @@ export class ArmCard {
     return changes(state) ? "changing" : "";
   }
 
-  showRemedy(bridge, state) {
+  // What a fault is, and what to do about it; '' without one.
+  remedy(bridge, state) {
     const code = bridge?.fault && bridge.fault !== "none" ? bridge.fault : "";
-    const box = this.find(".remedy");
-    box.hidden = !code;
-    if (!code) return;
+    if (!code) return "";
     const causes = [];
     if (this.setup?.simulated && STALLED.includes(code)) causes.push(ofSimulation(state.simulator));
     if (state.cause && CAUSED.includes(code)) causes.push(causeText(state.cause));
     if (!causes[0] || code !== "motor_silent") causes.push(t(has(`fault.${code}`) ? `fault.${code}` : "fault.unknown")); // no cable is simulated
-    write(box.querySelector("p"), causes.join(" ").trim());
+    return causes.join(" ").trim();
   }
 
   showJoints(joints, bridge) {

@@ -163,7 +163,7 @@ function showControl(operates) {
   const holder = state.control;
   const elsewhere = operates && holder.elsewhere;
   const yours = elsewhere ? t("control_elsewhere", elsewhere, link.number) : t("control_yours", link.number);
-  const text = !holder ? t("control_none") : operates ? yours : holder.gone ? t("control_gone", holder.page, holder.address) : t("control_other", holder.page, holder.address, link.number);
+  const text = !link.alive ? "" : !holder ? t("control_none") : operates ? yours : holder.gone ? t("control_gone", holder.page, holder.address) : t("control_other", holder.page, holder.address, link.number);
   write(byId("control-text"), text);
   byId("take").hidden = (operates && !(elsewhere && setup.dead_man)) || !link.alive;
   byId("release").hidden = !operates;
