@@ -3,10 +3,12 @@
 # make calibrate-study  20 random simulated devices, calibrated from motors to an arm that holds, offline, 20 minutes
 # make test         the tests, 5 minutes on two cores
 # make test-all     the same, then the longer ones (make test-long): studies, browser, 13 poses, video, SROS2
+# make coverage     which share of the package the tests of `make test` execute, without those of running arms
 # make lint         ruff, mypy, ament's flake8 and pep257, shellcheck
 # make docs         these documents as a site, in build/site; a warning is an error
 # make faults       the whole fault matrix on the simulated device, 40 minutes; a table and build/faults.json
 # make mutations    deliberate defects, each of which must turn a row of the fault matrix unsafe; 7 minutes
+# make soak         both arms for an hour: live changes, an active wearer, harmless faults; MINUTES=N for less
 # make bench        the laws, the loop and the tools against peers, 12 minutes on a quiet machine; QUICK=1: part of it
 # make ordinary     ordinary motors, sensors and computers for an hour of virtual time: no alarm; a table, 10 minutes
 # make motion-monitor  which wrong efforts can_bridge sees, and an hour of a fast wearer, whom it must not disturb; 20 minutes
@@ -40,7 +42,7 @@ SETUP := VENV=$(VENV) .ci/setup
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo calibrate-demo calibrate-study test lint docs faults mutations bench motion-monitor ordinary effort-study wearer-study baselines imu-report \
-        socketcan pythons constraints clean ros2-launch two-computers dist doctor panel presses release test-all test-long
+        socketcan pythons constraints clean ros2-launch two-computers dist doctor panel presses release test-all test-long soak coverage
 
 demo:
 	@$(SETUP) $(DEMO)
@@ -71,6 +73,11 @@ test-long:
 	$(BIN)/python -m pytest bench test -n auto --dist loadfile -m "(browser or thorough) and not real_time"
 	$(BIN)/python -m pytest test -m "(browser or thorough) and real_time"
 
+coverage:
+	@$(SETUP) $(TEST) dev
+	COVERAGE_CORE=sysmon $(BIN)/python -m pytest test -n auto --dist loadfile -m "not (real_time or browser or thorough)" \
+		--cov --cov-report term:skip-covered
+
 lint:
 	@$(SETUP) $(TEST) dev
 	@VENV=$(VENV) .ci/lint
@@ -87,6 +94,10 @@ faults:
 mutations:
 	@$(SETUP) $(TEST)
 	$(BIN)/python -m test.faults.mutations
+
+soak:
+	@$(SETUP) $(TEST)
+	$(BIN)/python -m test.faults.soak --minutes $(or $(MINUTES),60)
 
 bench:
 	@$(SETUP) $(TEST)

