@@ -81,12 +81,13 @@ class Bag:
     def columns(self) -> dict[str, np.ndarray]:
         """Return the time series, a row for each arm, sample and joint: columns of equal length by their names.
 
-        arm, joint; time_s since the start; step: of the script from 1 on, and its action, 0 and '' outside of it;
-        carried: whether the motors carried the arm; position_rad, velocity_rad_per_s, torque_nm as measured,
-        command_nm as requested, NaN where unknown.
+        subject: the session's code; arm, joint; time_s since the start; step: of the script from 1 on, and its action,
+        0 and '' outside of it; carried: whether the motors carried the arm; position_rad, velocity_rad_per_s,
+        torque_nm as measured, command_nm as requested, NaN where unknown.
         """
         arms = [_columns(recording) for recording in self.recordings]
-        return {name: np.concatenate([arm[name] for arm in arms]) for name in arms[0]}
+        columns = {name: np.concatenate([arm[name] for arm in arms]) for name in arms[0]}
+        return {"subject": np.full(len(columns["arm"]), self.session.subject, object), **columns}
 
     def to_frame(self) -> "pandas.DataFrame":
         """Return `columns` as a table. Raises ModuleNotFoundError, one sentence, without pandas (extra `analysis`)."""

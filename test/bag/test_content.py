@@ -8,6 +8,8 @@ import sys
 import numpy as np
 import pytest
 
+from exo_gravity.core.trial.session import Session
+
 from ..support import synthetic_bags as made
 
 
@@ -17,7 +19,7 @@ def bag():
     middle = float(right.time[len(right.time) // 2])
     right = dataclasses.replace(right, carried=((0.5, middle),), command=np.full_like(right.command, np.nan))
     left = dataclasses.replace(right, name="left", carried=None, position=right.position + 0.25, steps=())
-    return dataclasses.replace(made.bag_of(right), recordings=(right, left))
+    return dataclasses.replace(made.bag_of(right), recordings=(right, left), session=Session(subject="P07"))
 
 
 def test_each_sample_of_each_joint_of_each_arm_is_a_row(bag):
@@ -25,7 +27,8 @@ def test_each_sample_of_each_joint_of_each_arm_is_a_row(bag):
     right, left = bag.recordings
     assert {len(column) for column in columns.values()} == {8 * len(right.time)}
     rows = list(zip(*columns.values(), strict=True))
-    seen = {(row[0], row[1], row[2]): dict(zip(columns, row, strict=True)) for row in rows}
+    assert set(columns["subject"]) == {"P07"}
+    seen = {row[1:4]: dict(zip(columns, row, strict=True)) for row in rows}
     assert len(seen) == len(rows)
     for recording in (right, left):
         for sample in range(0, len(recording.time), 7):

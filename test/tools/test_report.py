@@ -259,7 +259,7 @@ def test_on_request_the_time_series_is_written_with_its_units(short_bag, tmp_pat
     assert main([str(short_bag), "--output", str(tmp_path), "--csv"]) == 0
     rows, (recording,) = csv_rows(tmp_path / "time_series.csv"), read_bag(short_bag).recordings
     assert len(rows) == 4 * len(recording.time)
-    head = "arm joint time_s step action carried position_rad velocity_rad_per_s torque_nm command_nm"
+    head = "subject arm joint time_s step action carried position_rad velocity_rad_per_s torque_nm command_nm"
     assert list(rows[0]) == head.split()
     elbow = [row for row in rows if row["joint"] == recording.joint_names[3]]
     values = (recording.time, recording.position[:, 3], recording.velocity[:, 3], recording.effort[:, 3])
