@@ -9,7 +9,7 @@ may add. What is asked for outside that range, beyond a margin, is unexplained.
 Unexplained torque is summed over time, with both signs as positive, and forgotten over `MEMORY`. The sum is an impulse:
 it bounds the speed that the motors cause and gravity does not, whatever the wearer does meanwhile. A joint of a link
 with moment M has an inertia of about M l, l = 0.3 m: so the impulse that is permitted, `PATIENCE` times the full load
-g M, is a speed of about g PATIENCE / l = 0.5 rad/s.
+g M, is a speed of about g PATIENCE / l = 0.4 rad/s.
 """
 
 import math
@@ -25,7 +25,7 @@ ABSOLUTE = 0.1  # Nm
 RELATIVE = 0.1  # of the full load: 6 degrees of the trunk's tilt
 LATE = 0.02  # s by which a torque that is fresh may answer an old pose
 SLOW = 0.1  # s, time constant; faster than this, torque changes only with the pose
-PATIENCE = 0.015  # s
+PATIENCE = 0.012  # s
 MEMORY = 1.0  # s, time constant
 
 
