@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from .support.launched_nodes import prefer
+from exo_gravity.hardware.clock import favour
 
 os.environ["ROS_DOMAIN_ID"] = str(os.getpid() % 100 + 1)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
@@ -17,7 +17,7 @@ def machine() -> None:
     """The machine for one test of running nodes at a time: nodes let the arm down when they get no processor."""
     if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1:
         pytest.fail("tests marked real_time run alone: use `-m real_time` without -n")
-    prefer(os.getpid())  # to nodes that start
+    favour(5)  # what a test receives is in time
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

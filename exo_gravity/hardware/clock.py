@@ -6,6 +6,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 PR_SET_TIMERSLACK = 29  # prctl(2), in <sys/prctl.h>
 # Flags of mlockall(2), in <sys/mman.h>: pages mapped now, pages mapped later, and only once they are used.
@@ -36,11 +37,14 @@ COMPUTER_CLOCK = Clock()
 def favour(priority: int) -> None:
     """Request nice value -`priority` (1..20) and precise sleeps: by default Linux ends them up to 50 us late.
 
-    This applies to the calling thread and those that it starts later. A nice value that is not permitted is ignored.
+    This applies to the calling thread and those that it starts later. Where Linux groups processes by session
+    (sched(7), autogroup), a nice value acts within the group alone: so the session gets it too. What is not permitted
+    is ignored.
     """
     ctypes.CDLL(None).prctl(PR_SET_TIMERSLACK, 1)  # ns
-    with contextlib.suppress(PermissionError):
+    with contextlib.suppress(OSError):  # not permitted, or no autogroups
         os.setpriority(os.PRIO_PROCESS, 0, -priority)
+        Path("/proc/self/autogroup").write_text(f"{-priority}")
 
 
 def request_real_time(priority: int, log: Callable[[str], object]) -> None:

@@ -18,9 +18,10 @@ from typing import Any, ClassVar
 import numpy as np
 import yaml
 
+from exo_gravity.hardware.clock import favour
 from exo_gravity.tools.inputs.parameter_file import load
 
-from ..support.launched_nodes import REAL, SIMULATED, LaunchedNodes, Parameters, children, full_name, prefer
+from ..support.launched_nodes import REAL, SIMULATED, LaunchedNodes, Parameters, children, full_name
 from ..support.ros_probe import RosProbe
 from ..support.truth import Truth
 
@@ -46,6 +47,7 @@ class Rig:
     simulator: ClassVar[Parameters] = {}
 
     def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
+        favour(5)  # what the probe receives, and a rig may command, is in time
         self.folder, self.shipped_timeouts = folder, shipped_timeouts
         self.script = self.write_script("pose", [{"move": list(self.pose), "over": 1.0}, {"hold": 600.0}])
         self.probe = RosProbe()
@@ -107,11 +109,9 @@ class Rig:
 
     def _wait_for_nodes(self) -> None:
         probe = self.probe
-        prefer(os.getpid())
         probe.wait_until(lambda: self._any_ended or (probe.joint_states and probe.effort_commands))
         assert not self._any_ended, "nodes ended at the start"
         self._bridges.add(self.pid("can_bridge"))
-        prefer(os.getpid())
 
     def is_at_pose(self) -> bool:
         """Return whether the arm is carried in its pose."""

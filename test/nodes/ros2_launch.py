@@ -18,13 +18,12 @@ from pathlib import Path
 import pytest
 
 from ..support.document_commands import ROS2
-from ..support.launched_nodes import CALM, LaunchedNodes, children, prefer
+from ..support.launched_nodes import CALM, LaunchedNodes, children
 from ..support.ros_probe import RosProbe
 from ..support.truth import Truth
 
 PACKAGE = ("exo_gravity", "exo.launch.py")
 ANSWER_TIMEOUT = 60.0  # s for a command's output
-STARTING = 50  # lines of the log, by which all nodes have started
 STOP_TIMEOUT = 60.0  # s
 LARGEST_SPEED = 1.0  # rad/s of an arm that is let down
 
@@ -44,8 +43,6 @@ class Launched:
 
     def _read(self) -> None:
         for line in self.process.stdout:
-            if len(self.log) < STARTING:
-                prefer(self.process.pid)
             self.log.append(line.rstrip())
 
     def ctrl_c(self) -> None:

@@ -25,7 +25,6 @@ Parameters = Mapping[str, Any]
 
 PORTS = own_ports(20_000)
 GROUP = "239.74.163.2"
-AUTOGROUP_NICE = -15
 NO_IMU: Parameters = {"use_imu": False}  # for the compensator, which then starts without waiting for a tilt
 FAST: Parameters = {"sign_check_torque": 0.0}
 # Rate and time-outs of config/sim.yaml, which suit a busy machine, and those of a real device.
@@ -91,7 +90,6 @@ class LaunchedNodes:
         self.path = folder / f"params_{port}_{'_'.join(without)}.yaml"
         self.path.write_text(yaml.safe_dump(content))
         self.log: list[str] = []
-        self._preferred: set[str] = set()
         self.stopping = threading.Event()
         self.ended_node: tuple[str, int] | None = None
         self._thread: threading.Thread | None = None
@@ -108,9 +106,6 @@ class LaunchedNodes:
 
     def _on_line(self, node: str, line: str) -> None:
         self.log.append(f"{node}: {line}")
-        if node not in self._preferred:
-            self._preferred.add(node)
-            prefer(self.pid(node))
 
     def _run(self) -> None:
         self.ended_node = self.launcher.run(self.stopping)
@@ -202,18 +197,6 @@ def full_name(node: str) -> str:
     if node.startswith("/"):
         return node
     return "/imu" if node == "imu" else f"/right/{node}"
-
-
-def prefer(pid: int) -> None:
-    """Let a process and its descendants run before other sessions' processes, if permitted.
-
-    With Linux's autogroups a process's own nice value counts only within its session, and each node is a session.
-    """
-    with contextlib.suppress(OSError):
-        Path(f"/proc/{pid}/autogroup").write_text(str(AUTOGROUP_NICE))
-    with contextlib.suppress(FileNotFoundError):
-        for child in children(pid):
-            prefer(child)
 
 
 def children(pid: int) -> list[int]:

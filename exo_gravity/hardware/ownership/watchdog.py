@@ -28,6 +28,7 @@ from queue import SimpleQueue
 import can
 
 from exo_gravity.core.safety.limits import FROZEN
+from exo_gravity.hardware.clock import favour
 from exo_gravity.hardware.ownership.bus_lock import DriveNotes, is_asked_for, remove_notes
 from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, Silence, let_down
 
@@ -118,8 +119,7 @@ def main() -> None:
     """Entry point of the process; arguments: the bridge's PID, and the descriptors of notes, lock and pipe."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    with contextlib.suppress(PermissionError):
-        os.setpriority(os.PRIO_PROCESS, 0, -20)
+    favour(20)
     bridge, page, lock, receiver = map(int, sys.argv[1:])
     log: SimpleQueue[str] = SimpleQueue()
     writer = threading.Thread(target=write_log, args=(log,), daemon=True)

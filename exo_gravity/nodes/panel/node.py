@@ -284,4 +284,4 @@ class Panel(Node):
 
 def main() -> None:
     """Entry point of the executable `panel`."""
-    raise SystemExit(run(Panel))
+    raise SystemExit(run(Panel, priority=5))  # a press on its page must reach the arm
