@@ -26,6 +26,7 @@
 # make presses      from a press on the operator's page to the torque on the bus; PRESSES=50
 # make pythons      for each supported Python found here: set-up from nothing, a short trial, the nodes
 # make constraints  renews the versions in constraints/
+# make environment  .venv with all that tests and lint need
 # make clean        removes what these made
 #
 # Each first installs what it needs in .venv; PYTHON=... selects the interpreter. Where ROS 2 is sourced its rclpy is
@@ -42,7 +43,7 @@ SETUP := VENV=$(VENV) .ci/setup
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo calibrate-demo calibrate-study test lint docs faults mutations bench motion-monitor ordinary effort-study wearer-study baselines imu-report \
-        socketcan pythons constraints clean ros2-launch two-computers dist doctor panel presses release test-all test-long soak coverage
+        socketcan pythons constraints clean ros2-launch two-computers dist doctor panel presses release test-all test-long soak coverage environment
 
 demo:
 	@$(SETUP) $(DEMO)
@@ -72,6 +73,9 @@ test-long:
 		(apt-get update && apt-get install --yes chromium) >build/chromium.log 2>&1 || true
 	$(BIN)/python -m pytest bench test -n auto --dist loadfile -m "(browser or thorough) and not real_time"
 	$(BIN)/python -m pytest test -m "(browser or thorough) and real_time"
+
+environment:
+	@$(SETUP) $(TEST) dev
 
 coverage:
 	@$(SETUP) $(TEST) dev

@@ -158,4 +158,4 @@ def _vector(message: Vector3) -> tuple[float, float, float]:
 
 def main() -> None:
     """Entry point of the executable `imu`."""
-    raise SystemExit(run(ImuNode, priority=5))
+    raise SystemExit(run(ImuNode, priority=15))
