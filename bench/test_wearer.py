@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 
 from bench.device_study import as_markdown
+from bench.wearer import payload
 from bench.wearer.devices import draw
 from bench.wearer.muscles import ACTIVATION, DELAY, Muscles, Phase, phase_at
+from bench.wearer.payload import Balance
 from bench.wearer.report import METHODS, picture, verdict
 from bench.wearer.study import KINDS, judge, play
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
+from exo_gravity.core.calibration.weighing import Weighed
 from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import STEP
@@ -69,3 +72,21 @@ def test_one_device_is_calibrated_played_and_judged(tmp_path):
     picture(trial).savefig(tmp_path / "picture.png")
     narrow = trial.curve._replace(deviation=0.1 * trial.curve.deviation)
     assert not all(row.held for row in verdict([replace(trial, curve=narrow)]))
+
+
+def test_a_load_that_is_weighed_wrongly_misses_its_limit_and_one_that_is_refused_is_counted():
+    balance = Balance(draw(0).settings)
+    balance.results = [Weighed(mass, 0.0, np.ones(4)) for mass in (0.02, 0.22, 1.1, 2.02)]
+    rows = {row.what: row for row in payload.verdict([(balance, "")])}
+    assert rows["load of 0.2 kg, error"].held and not rows["load of 1 kg, error"].held
+    assert rows["load of 1 kg, error"].shown == "80 g at most; 0 of 1 within, 0 refused"
+    balance.results[1] = None
+    refused = payload.verdict([(balance, "")])[0]
+    assert "1 refused" in refused.shown and not refused.held
+
+
+@pytest.mark.thorough
+def test_a_load_of_a_calibrated_device_is_weighed_within_its_limit():
+    balance, trouble = payload.weigh(draw(3))
+    assert trouble == ""
+    assert all(row.held for row in payload.verdict([(balance, trouble)])), balance.texts

@@ -1,7 +1,8 @@
 """python -m bench.wearer [--devices 20] [--first 0] [--output build/wearer]: the study of `wearer_efforts`.
 
-Random calibrated devices with a virtual wearer go through one trial each, offline and on one core, 20 s each. It prints
-a table, writes it and a picture of the first trial, and exits with 1 if a limit is missed.
+Random calibrated devices with a virtual wearer go through one trial each, and weigh loads in his hand, offline and on
+one core, 20 to 60 s each. It prints a table, writes it and a picture of the first trial, and exits with 1 if a limit is
+missed.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from pathlib import Path
 os.environ["OMP_NUM_THREADS"] = "1"
 
 from ..device_study import as_markdown, options_of
+from . import payload
 from .devices import draw
 from .report import picture, points, verdict
 from .study import Trial, judge, play
@@ -22,14 +24,17 @@ def main() -> int:
     """Run the study; return the exit code."""
     options = options_of("bench.wearer", "Judge the estimate of the wearer's torque.", Path("build/wearer"))
     trials: list[Trial] = []
+    weighed: list[tuple[payload.Balance, str]] = []
     for seed in range(options.first, options.first + options.devices):
-        trial = judge(play(draw(seed)))
+        worn = draw(seed)
+        trial = judge(play(worn))
         trials.append(trial)
+        weighed.append(payload.weigh(worn))
         error = float(trial.share.value) - trial.true_share
         print(
             f"device {seed}: share {float(trial.share.value):.1%}, off by {points(error)} {trial.trouble}", flush=True
         )
-    rows = verdict(trials)
+    rows = [*verdict(trials), *payload.verdict(weighed)]
     text = as_markdown(rows)
     print(text)
     options.output.parent.mkdir(parents=True, exist_ok=True)

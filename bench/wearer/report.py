@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from exo_gravity.core.observer.momentum import COVER
+from exo_gravity.core.observer.contact import ContactWatch
+from exo_gravity.core.observer.momentum import COVER, WearerEstimate
 from exo_gravity.core.observer.share import WINDOW, share_of
 from exo_gravity.tools.reporting.html import FAINT, INK, JOINT_COLOURS, PUSH_COLOUR, make_plain
 
@@ -40,9 +41,19 @@ def verdict(trials: Sequence[Trial]) -> list[Row]:
         inside = sum(abs(float(share.value) - true) < COVER * float(share.deviation) for share, true in found)
         shown = f"{points(largest)}; {inside} of {len(found)} within their band"
         rows.append(Row(f"share while {name}, largest error", shown, "", True))
+    counts, seconds = [contacts(trial) for trial in trials], sum(float(np.ptp(trial.curve.time)) for trial in trials)
+    rows.append(Row("contacts reported, though there are none", f"{sum(counts)} in {seconds / 60.0:.0f} min", "", True))
     carried = sum(not trial.trouble for trial in trials)
     rows.append(Row("arms carried to the end", f"{carried} of {len(trials)}", "all", carried == len(trials)))
     return rows
+
+
+def contacts(trial: Trial) -> int:
+    """Return how many contacts the estimate shows."""
+    watch, curve = ContactWatch(), trial.curve
+    for time, *row in zip(curve.time.tolist(), curve.torque, curve.deviation, curve.weight, strict=True):
+        watch.update(time, WearerEstimate(*(tuple(values.tolist()) for values in row)))
+    return watch.count
 
 
 def covered(trials: Sequence[Trial], kinds: Sequence[int]) -> float:

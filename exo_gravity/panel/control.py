@@ -13,6 +13,7 @@ no page, no panel, no lease. The requests:
 {"do": "clear_fault", "arm": "right"}
 {"do": "resume", "arm": "right"}                     clear and enable, after a fault that was no one's
 {"do": "set", "arm": "right", "values": {"support": 0.3}}
+{"do": "weigh", "arm": "right"}                      what the hand holds; the compensator's diagnostics tell
 {"do": "bring_home", "arm": "right"}                 a simulated arm: its virtual wearer lets it hang
 {"do": "release"}                                    control
 {"do": "record"}, {"do": "stop_recording"}, {"do": "save"}
@@ -34,7 +35,7 @@ from exo_gravity.panel.view import OF_SUBJECT, SETTABLE
 # The kinds of requests, and the keys that each has besides "do".
 KEYS: Mapping[str, frozenset[str]] = {
     **dict.fromkeys(("take", "release", "record", "stop_recording", "save", "stop_trial", "keep_wearer"), frozenset()),
-    **dict.fromkeys(("let_down", "enable", "clear_fault", "resume", "bring_home"), frozenset({"arm"})),
+    **dict.fromkeys(("let_down", "enable", "clear_fault", "resume", "weigh", "bring_home"), frozenset({"arm"})),
     "set": frozenset({"arm", "values"}),
     "trial": frozenset({"name"}),
     "session": frozenset({"subject", "protocol", "note"}),

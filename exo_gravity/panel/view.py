@@ -26,7 +26,7 @@ PANEL = (
 )
 # fmt: on
 # What the page may change on a compensator. Every limit stays with the compensator and the bridge.
-LOAD = ("mode", "wearer.body_mass", "wearer.sex", "wearer.segment_length", "support")
+LOAD = ("mode", "wearer.body_mass", "wearer.sex", "wearer.segment_length", "support", "payload.mass")
 SETTABLE = {param.name: param for param in COMPENSATOR if param.name in LOAD}
 # What belongs to a subject: in the wearer's file, and set by the page together with the wearer's data.
 OF_SUBJECT = {p.name: p for p in COMPENSATOR if p.name in (*LOAD[1:4], "limits.range")}
@@ -95,7 +95,7 @@ class LoadChanges:
         last = self._loads.get(arm, load)
         self._loads[arm] = load
         name = next((name for name in LOAD if load[name] != last[name]), "")
-        if not name or (name != "mode" and load["mode"] == "one_g"):
+        if not name or (name not in ("mode", "payload.mass") and load["mode"] == "one_g"):
             return None
         what = name.partition(".")[0]
         return {"what": what} if what == "wearer" else {"what": what, "from": last[name], "to": load[name]}

@@ -24,7 +24,7 @@ import mujoco
 import numpy as np
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import MAX_LENGTH, MAX_MASS, ArmModel
+from exo_gravity.core.model.arm import MAX_LENGTH, MAX_MASS, NO_PAYLOAD, ArmModel
 from exo_gravity.core.model.gravity import MAX_OFFSET
 from exo_gravity.core.model.tilt import gravity_in_trunk
 from exo_gravity.core.numbers import JOINT_COUNT, four_floats
@@ -125,7 +125,28 @@ class SimulatedArm:
 
     def __init__(self, config: ArmConfig | None = None) -> None:
         self.config = config or ArmConfig()
-        xml = _mjcf(self.config)
+        self._load(NO_PAYLOAD)
+        self._coulomb, self._stribeck, self._speed = map(
+            np.array, (self.config.coulomb_friction, self.config.stribeck_friction, self.config.stribeck_speed)
+        )
+        self.move_base((0.0, 0.0, self.config.links.gravity))
+        self.reset((0.0,) * JOINT_COUNT)
+
+    def carry(self, mass: float, cog: Sequence[float] = _STILL) -> None:
+        """Have a point of `mass` kg in the hand from now on, at `cog` (3,) m in frame 4; 0 for none.
+
+        A joint's motion goes on as it is: what is taken moves along, and what is dropped is gone.
+        """
+        theta, velocity, gravity = self._theta.copy(), self._velocity.copy(), self.model.opt.gravity.copy()
+        motion = self._turning_data.qvel[:3].copy(), self._turning_data.qacc[:3].copy()
+        self._load((mass, *cog))
+        self._theta[:], self._velocity[:] = theta, velocity
+        mujoco.mj_forward(self.model, self.data)
+        self.move_base(gravity.tolist(), *(vector.tolist() for vector in motion))
+
+    def _load(self, payload: Sequence[float]) -> None:
+        """Make MuJoCo's structures for the arm with a load in its hand: kg, and (3,) m in frame 4."""
+        xml = _mjcf(self.config, payload)
         self.model = mujoco.MjModel.from_xml_string(xml)
         self.data = mujoco.MjData(self.model)
         # The same arm on a base that can turn: its torques for a given motion of the base.
@@ -134,11 +155,6 @@ class SimulatedArm:
         self._turning_data = mujoco.MjData(self._turning_model)
         # Views of `data`, whose arrays stay in place: each lookup of an attribute costs as much as its use.
         self._theta, self._velocity, self._torque = self.data.qpos, self.data.qvel, self.data.qfrc_applied
-        self._coulomb, self._stribeck, self._speed = map(
-            np.array, (self.config.coulomb_friction, self.config.stribeck_friction, self.config.stribeck_speed)
-        )
-        self.move_base((0.0, 0.0, self.config.links.gravity))
-        self.reset((0.0,) * JOINT_COUNT)
 
     @property
     def positions(self) -> list[float]:
@@ -196,9 +212,13 @@ class SimulatedArm:
         return bias[3:]
 
 
-def _mjcf(config: ArmConfig) -> str:
+def _mjcf(config: ArmConfig, payload: Sequence[float] = NO_PAYLOAD) -> str:
     """Return the arm as MuJoCo XML. The bodies have no geometry, so they cannot collide."""
     links, body = config.links, ""
+    mass, x, y, z = payload
+    if mass > 0.0:
+        place = f'pos="{links.length[3] + x} {y} {z}" mass="{mass}"'
+        body = f'<body><inertial {place} diaginertia="1e-7 1e-7 1e-7"/></body>'
     for n in reversed(range(JOINT_COUNT)):
         # The frame of joint n on link n - 1: shifted along x by the length, turned about x by alpha, then about z.
         position, alpha = (links.length[n - 1], _ALPHA[n - 1]) if n else (0.0, 0.0)

@@ -194,12 +194,14 @@ class SimulatedDevice:
         return all(motor.steady for motor in self.motors)
 
     def _follow_trunk(self, script: TrialScript, elapsed: float) -> None:
-        """Move the trunk as the wearer's script says, `elapsed` s after its start."""
+        """Move the trunk, and load the hand, as the wearer's script says, `elapsed` s after its start."""
         index, since = script.at(elapsed)
         if elapsed >= 0.0 and index != self._trunk_step:
             self._trunk_step = index
             step = script.steps[index] if index < len(script.steps) else None
             self.trunk_motion = motion_of(step, self.pitch, self.roll) if step else None
+            if step and step.action == "load":
+                self.arm.carry(step.value[0])
         if self.trunk_motion:
             state = self.trunk_motion.at(since)
             self.pitch, self.roll = state.pitch, state.roll

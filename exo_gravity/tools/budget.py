@@ -58,6 +58,7 @@ class ArmBudget:
     name: str  #: of the arm's namespace
     carrying: ArmModel  #: with its share of the wearer's arm
     support: float  #: 0..1, that share
+    payload: float  #: kg in the hand
     motors: Sequence[str]
     bounds: np.ndarray  #: of its workspace, (2, 6) rad
     joints: tuple[JointBudget, ...]
@@ -68,19 +69,22 @@ class ArmBudget:
         return any(joint.torque > joint.rated for joint in self.joints)
 
 
-def arm_budget(configured: ConfiguredArm, wearer: Wearer, support: float, max_tilt: float) -> ArmBudget:
-    """Return the budget of an arm that carries `support` (0..1) of the wearer's arm; max_tilt: of the trunk, rad.
+def arm_budget(
+    configured: ConfiguredArm, wearer: Wearer, support: float, max_tilt: float, payload: float = 0.0
+) -> ArmBudget:
+    """Return the budget of an arm that carries `support` (0..1) of the wearer's arm and `payload` kg in the hand.
 
-    Raises ParameterError if the wearer does not fit the robot.
+    max_tilt: of the trunk, rad. Raises ParameterError if the wearer does not fit the robot.
     """
-    motors, robot = configured.can_bridge["motor"], configured.robot
+    motors = configured.can_bridge["motor"]
+    robot = configured.robot.with_payload(payload, configured.compensator["payload.cog"])
     bounds = workspace(configured.low, configured.high, max_tilt)
     with named(f"{configured.namespace}/compensator "):
         load = wearer.on_links(robot.length)
         torques = motor_torques(motors, configured.can_bridge["torque_scale"])
         joints = budget(robot, load, support, bounds, *torques)
         carrying = robot.with_wearer(*load, support)
-    return ArmBudget(configured.namespace, carrying, support, motors, bounds, joints)
+    return ArmBudget(configured.namespace, carrying, support, payload, motors, bounds, joints)
 
 
 def table_lines(arm: ArmBudget) -> Iterator[str]:
@@ -115,7 +119,8 @@ def _mirrored(arms: Sequence[ArmBudget]) -> list[ArmBudget]:
 def verdict(arm: ArmBudget, wearer: Wearer) -> Iterator[str]:
     """Yield the conclusion: whether it is beyond the motors, which support fits, and can_bridge's parameter for it."""
     support = "Full Zero-G" if arm.support == 1.0 else f"Support {arm.support:g}"
-    what = f"{support} of a wearer of {wearer.body_mass:g} kg"
+    held = f" with {arm.payload:g} kg in the hand" if arm.payload else ""
+    what = f"{support} of a wearer of {wearer.body_mass:g} kg{held}"
     if arm.is_beyond:
         yield f"{what} is beyond the motors of {arm.name}."
         yield "A larger motor is heavier and loads the joints before it: change the masses and run this again."
@@ -184,6 +189,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
         help="segment lengths in m, the hand to the third knuckle (%(default)s)",
     )  # fmt: skip
     option("--support", type=float, default=1.0, metavar="0..1", help="share of the wearer's arm carried (%(default)s)")
+    option("--payload", type=float, default=0.0, metavar="KG", help="load in the hand (%(default)s)")
     tilt = "largest trunk pitch and roll, in either direction (%(default)s)"
     option("--max-tilt", type=float, default=USUAL_TILT, metavar="DEG", help=tilt)
     option("--output", default="budget", metavar="DIR", help="folder for a figure of each joint (%(default)s)")
@@ -197,7 +203,7 @@ def main(args: Sequence[str] | None = None) -> int:
         wearer = Wearer(options.body_mass, options.sex, options.table, options.lengths)
         support = one_float("support", options.support, 0.0, 1.0)
         tilt = math.radians(one_float("max_tilt", options.max_tilt, 0.0, 90.0, "deg"))
-        arms = [arm_budget(arm, wearer, support, tilt) for arm in configured_arms(options.params)]
+        arms = [arm_budget(arm, wearer, support, tilt, options.payload) for arm in configured_arms(options.params)]
         written = _write_figures(arms, Path(options.output))
     except (ExoGravityError, OSError) as error:
         print(f"budget: {error}", file=sys.stderr)

@@ -26,6 +26,11 @@ def test_steps_of_the_trunk_have_an_angle_or_only_a_duration():
     assert parsed == (Step("bow", 3.0, (0.5,)), Step("lean", 2.0, (-0.3,)), Step("walk", 60.0), Step("sit", 2.0))
 
 
+def test_a_step_of_the_hand_has_a_mass():
+    parsed = TrialScript.parse({"name": "load", "steps": [{"load": 2, "over": 1}, {"load": 0, "over": 0.5}]}).steps
+    assert parsed == (Step("load", 1.0, (2.0,)), Step("load", 0.5, (0.0,)))
+
+
 @pytest.mark.parametrize(
     ("content", "name"),
     [
@@ -40,6 +45,7 @@ def test_steps_of_the_trunk_have_an_angle_or_only_a_duration():
         ({"name": "x", "steps": [{"bow": 45, "over": 3}]}, "steps[0].bow"),
         ({"name": "x", "steps": [{"bow": 0.5}]}, "steps[0]"),
         ({"name": "x", "steps": [{"walk": 0.5}]}, "steps[0].walk"),
+        ({"name": "x", "steps": [{"load": 200, "over": 1}]}, "steps[0].load"),
     ],
 )
 def test_an_invalid_entry_is_named(content, name):

@@ -11,6 +11,7 @@ import pytest
 from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.compensation.compensator import Compensator
@@ -25,6 +26,7 @@ from ..support.launched_nodes import NO_IMU
 OTHER_NODES = ("can_bridge", "simulator", "imu")
 ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
 LOAD = Wearer(75.0).on_links(ROBOT.length)
+STRONG = {"max_effort": [9.0, 18.0, 9.0, 9.0]}  # Nm
 NEEDED = gravity_torque(ROBOT.with_wearer(LOAD.mass, LOAD.cog), POSE)
 GIVEN = np.array((0.0, 4.0, 1.5, 0.0))  # Nm, of the wearer
 
@@ -34,6 +36,7 @@ class StillArm:
 
     def __init__(self, node: Node) -> None:
         self.effort: Sequence[float] = ()
+        self.velocity: Sequence[float] = (0.0,) * 4
         self._publisher = node.create_publisher(JointState, "/right/joint_states", 1)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._publish)
@@ -44,7 +47,7 @@ class StillArm:
         while not self._stopping.wait(0.005):
             number += 1
             message.header.stamp = Time(nanoseconds=number).to_msg()
-            message.effort = self.effort
+            message.effort, message.velocity = self.effort, self.velocity
             self._publisher.publish(message)
 
     def close(self) -> None:
@@ -81,6 +84,38 @@ def test_what_the_motors_do_not_carry_is_published_as_the_wearers_with_its_devia
     assert "elbow" not in (probe.diagnostic("compensator", "wearer (Nm)") or "")
     arm.effort = NEEDED.tolist()
     probe.wait_until(lambda: probe.diagnostic("compensator", "wearer (Nm)") == "not distinguishable from zero")
+
+
+def test_a_blow_is_a_contact_in_diagnostics(launch, probe, arm):
+    launch(without=OTHER_NODES, compensator={**NO_IMU, "wearer.body_mass": 75.0})
+    arm.effort = NEEDED.tolist()
+    probe.wait_until(lambda: probe.diagnostic("compensator", "wearer (Nm)") == "not distinguishable from zero")
+    assert probe.diagnostic("compensator", "contact") == "none"
+    arm.effort = np.add(NEEDED, (0.0, 0.0, 0.0, 5.0)).tolist()
+    probe.wait_until(lambda: "right_elbow_flexion -" in (probe.diagnostic("compensator", "contact") or ""))
+    assert "1 in all" in probe.diagnostic("compensator", "contact")
+
+
+def test_a_load_is_weighed_on_request_and_one_that_is_dropped_is_no_longer_a_parameter(launch, probe, arm):
+    launch(without=OTHER_NODES, compensator={**NO_IMU, **STRONG, "wearer.body_mass": 75.0, "support": 0.5})
+    probe.wait_until(lambda: probe.effort_commands)
+
+    def weigh() -> Trigger.Response:
+        return probe.call(Trigger, "/right/compensator/weigh", Trigger.Request())
+
+    refused = weigh()
+    assert not refused.success and "support 1" in refused.message
+    assert probe.set_parameters("compensator", mode="zero_g", support=1.0).successful
+    probe.wait_until(lambda: probe.diagnostic("compensator", "changing load") == "none" and weigh().success)
+    probe.wait_until(lambda: probe.diagnostic("compensator", "weighing") == "relax: the motors take the load over")
+    assert not probe.set_parameters("compensator", payload__mass=6.0).successful
+    assert probe.set_parameters("compensator", payload__mass=2.0).successful
+    settings_changed = "not weighed: the settings changed"
+    probe.wait_until(lambda: probe.diagnostic("compensator", "weighing") == settings_changed)
+    arm.velocity = (0.0, 0.0, 1.5, 2.0)
+    probe.wait_until(lambda: probe.diagnostic("compensator", "payload mass (kg)") == "0.000")
+    values = probe.dump_parameters(["/right/compensator"])["/right/compensator"]
+    assert values["ros__parameters"]["payload"]["mass"] == 0.0
 
 
 def test_an_estimate_that_fails_says_so_in_diagnostics(probe):

@@ -343,3 +343,28 @@ def test_while_an_arm_is_carried_no_text_field_takes_the_space_bar(visit, stage)
     page.keyboard.press("Space")
     wait_for_state(page, "letting down")
     assert stage.arms.calls == BOTH_DOWN
+
+
+def test_a_load_is_weighed_after_a_question_and_carried_after_another(visit, stage):
+    page, weigh, carry = visit(), '.arm[data-arm="right"] .weigh', '.arm[data-arm="right"] .carry'
+    assert page.is_disabled(weigh) and not page.is_visible(carry)
+    enable(page)
+    wait_for_state(page, "active")
+    page.click(weigh)
+    assert "relax within 4 s" in page.inner_text("#ask-text")
+    page.click("#ask-yes")
+    wait_until(page, lambda: ("weigh", "right") in stage.arms.calls)
+    stage.arms.weighing = (
+        "1.050 +- 0.080 kg more than the settings carry; 0.990 +- 0.052 kg more than with an empty hand"
+    )
+    stage.arms.weighing += ": payload.mass = 0.990 carries it"
+    stage.arms.contact = "right_elbow_flexion +4.0 Nm, 1 s ago; 1 in all"
+    page.wait_for_selector(carry, state="visible")
+    assert page.inner_text(carry) == "Carry 0.99 kg (±0.05)"
+    assert "right_elbow_flexion +4.0 Nm" in page.inner_text('.arm[data-arm="right"] .contact')
+    page.click(carry)
+    assert "0.99 kg in the hand instead of 0.00 kg" in page.inner_text("#ask-text")
+    page.click("#ask-yes")
+    wait_until(page, lambda: stage.arms.settings["right"]["payload.mass"] == 0.99)
+    page.wait_for_selector(carry, state="hidden")
+    assert "0.99 kg is carried" in page.inner_text('.arm[data-arm="right"] .payload')

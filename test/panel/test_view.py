@@ -15,7 +15,7 @@ class Told:
 
     def __init__(self) -> None:
         self.changes, self.now, self.cause = LoadChanges(), 0.0, None
-        self.load: dict[str, Any] = {"mode": "zero_g", "support": 0.1, "wearer.body_mass": 75.0}
+        self.load: dict[str, Any] = {"mode": "zero_g", "support": 0.1, "wearer.body_mass": 75.0, "payload.mass": 0.0}
         self.fault, self.changing = "none", "none"
         self.go(1.0)
 
@@ -39,6 +39,7 @@ class Told:
         ({"support": 0.6}, {"what": "support", "from": 0.1, "to": 0.6}),
         ({"mode": "one_g", "support": 0.0}, {"what": "mode", "from": "zero_g", "to": "one_g"}),
         ({"wearer.body_mass": 90.0, "support": 0.0}, {"what": "wearer"}),
+        ({"mode": "zero_g", "payload.mass": 1.5}, {"what": "payload", "from": 0.0, "to": 1.5}),
     ],
 )
 def test_a_change_of_load_shortly_before_a_fault_is_named_and_never_the_wearers_data(load, cause):

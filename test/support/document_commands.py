@@ -30,6 +30,7 @@ ROS2 = {
     f"ros2 param set {RIGHT} wearer.body_mass 75.0": SUCCESS,
     f"ros2 param set {RIGHT} support 0.3": SUCCESS,
     f"ros2 param set {RIGHT} mode zero_g": SUCCESS,
+    f"ros2 param set {RIGHT} payload.mass 0.973": SUCCESS,
     f'ros2 param set {RIGHT} assist.max_effort "[1.0, 1.0, 1.0, 1.0]"': SUCCESS,
     f'{CALL}/enable std_srvs/srv/SetBool "{{data: false}}"': "success=True, message='the motors are switched off once",
     f'{CALL}/enable std_srvs/srv/SetBool "{{data: true}}"': "success=True, message='torque follows in",
@@ -41,6 +42,7 @@ ROS2 = {
 ELSEWHERE = {  # by their beginnings: what runs them, or what they need that no test has
     "ros2 launch exo_gravity exo.launch.py": "other tests of `make ros2-launch`",
     "ros2 service call /arm/compensator/clear_fault": "test/nodes/test_compensator_urdf.py, over the service",
+    "ros2 service call /right/compensator/weigh": "test/nodes/test_wearer_efforts.py, over the service",
     "ros2 launch exo_gravity view.launch.py": "ros-jazzy-rviz2 and ros-jazzy-robot-state-publisher",
     "ros2 security": "ros-jazzy-sros2",
     "ROS_SECURITY_ENCLAVE_OVERRIDE=": "ros-jazzy-sros2",

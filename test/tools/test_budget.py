@@ -1,5 +1,6 @@
 """budget: from a parameter file to a table, a verdict, figures and an exit code."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -52,6 +53,16 @@ def test_full_zero_g_of_75_kg_is_reported_as_beyond_the_papers_motors_and_by_how
 def test_the_support_that_it_recommends_is_within_rated_torque_everywhere(run):
     code, text = run("--body-mass", 75, "--support", 0.068)
     assert code == 0 and "within rated torque everywhere on /right" in text
+
+
+@pytest.mark.usefixtures("plain")
+def test_a_load_in_the_hand_is_part_of_the_torques_and_of_the_moments_that_can_bridge_gets(run):
+    _, bare = run("--body-mass", 40, "--support", 0.5)
+    _, loaded = run("--body-mass", 40, "--support", 0.5, "--payload", 1.5)
+    assert "of a wearer of 40 kg with 1.5 kg in the hand is beyond" in loaded
+    moments = [re.search(r"largest_moment: \[(.*?)\]", text)[1].split(", ") for text in (bare, loaded)]
+    added = [float(new) - float(old) for old, new in zip(*moments, strict=True)]
+    assert added == pytest.approx([1.5 * length for length in (0.05, 0.13, 0.30, 0.30)], abs=0.0011)
 
 
 def test_every_joint_gets_a_figure(run, tmp_path):

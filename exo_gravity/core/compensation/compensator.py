@@ -12,15 +12,16 @@ The exoskeleton's own arm (`Settings`) has a wearer and terms on top of gravity 
 import math
 import operator
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from dataclasses import replace
+from typing import NamedTuple, Protocol
 
-from exo_gravity.core.compensation.guidance import GuidedChange
+from exo_gravity.core.compensation.guidance import WATCH, DropWatch, GuidedChange
 from exo_gravity.core.compensation.limiter import BREAK, LONGEST_STEP, RAMP_TIME, limited
 from exo_gravity.core.compensation.settings import Settings, UrdfSettings
 from exo_gravity.core.compensation.terms.terms import Active, Terms
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.gravity import Torque
+from exo_gravity.core.model.gravity import LAWS, Torque
 from exo_gravity.core.model.kinematics import turning_torque
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.trunk.inputs import MAX_TURN, FeltMotion, TiltInput
@@ -40,6 +41,24 @@ class Answer(NamedTuple):
     remainder: Torque = ()  #: (n,) Nm by which a change of load is not done yet; () if none is under way
     damped: bool = False  #: whether the motors are to damp the joints meanwhile
     held: str = ""  #: why the last tilt is held on, and the bound of the error in Nm; or ''
+
+
+class Scale(Protocol):
+    """What weighs the load in the hand (core/calibration/weighing.py): for a while it adds to the torque."""
+
+    trouble: str  #: why there is no result, or ''; set, it ends the weighing
+    is_thrown: bool  #: whether the load must have left the hand
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it adds nothing any more."""
+        ...
+
+    def torque(
+        self, dt: float, theta: Sequence[float], velocity: Sequence[float], tilt: Tilt, torque: Torque
+    ) -> Torque:
+        """Return what the arm gets in place of `torque` (4,) Nm, `dt` s after the last call."""
+        ...
 
 
 State = tuple[float, Sequence[float], Sequence[float] | None]  # time in s, joint angles and velocities as in `step`
@@ -66,6 +85,9 @@ class Compensator:
         self._origins: list[Load | None] = []  # where each joint's change began; None where no settings say
         self._torque: Torque = self._nothing  # the last, before ramp and rate limit
         self._pending: Settings | UrdfSettings | None = None
+        self.dropped = 0.0  #: kg, the load that left the hand last; 0 for none
+        self.scale: Scale | None = None  #: of the last weighing
+        self._drop_watch, self._braked_until = DropWatch(), -math.inf  # s
         self._fallback = ""  # why the exact law replaces the chosen one
         self._fallback_until = -math.inf
 
@@ -74,6 +96,15 @@ class Compensator:
         if settings.side != self.settings.side:
             raise ParameterError("side", settings.side, f"{self.settings.side}, because the side cannot change")
         self._pending = settings
+
+    def weigh(self, scale: "Scale") -> str:
+        """Let `scale` carry the load in the hand from the next `step` on, until it is over; return why not, or ''."""
+        if self._is_weighing:
+            return "a weighing is under way"
+        if not self._change.is_over:
+            return "the load is changing: wait for it"
+        self.scale = scale
+        return ""
 
     def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Answer:
         """Return the torque for joint angles `theta` (n,) rad at `now` s on a monotonic clock.
@@ -93,18 +124,26 @@ class Compensator:
         if self._pending is not None:
             before = self.settings, self.terms.now if self.terms else Active()
             self._use(self._pending)
+        self._watch_load(now, theta, velocity)
         replaced = bool(self._fallback)
         gravity = self._law(now, theta)
         if not all(map(math.isfinite, gravity)):
             return Answer(None, f"torque {list(gravity)} Nm from the law is not finite")
         added = self.terms.torque(now, theta, velocity) if velocity and self.terms else self._nothing
         s = self.settings
-        torque = clamped(map(operator.add, gravity, added), s.max_effort)
         dt = now - self._last_answer
+        torque = tuple(map(operator.add, gravity, added))
+        has_weighed = False
+        if self._is_weighing and self.scale and velocity:
+            torque = self.scale.torque(dt, theta, velocity, self.tilt.at(now), torque)
+            has_weighed = not self._is_weighing
+        torque = clamped(torque, s.max_effort)
         if not 0.0 <= dt <= BREAK:  # the torque ramps in from zero
             self._change.stop()
             self._effort, self._ramp_start, dt = self._nothing, now, 0.0
-        elif before is not None or bool(self._fallback) != replaced:
+        elif has_weighed and self.scale and self.scale.is_thrown:
+            self._braked_until = now + WATCH  # a guided change would be too slow
+        elif before is not None or bool(self._fallback) != replaced or has_weighed:
             self._begin(before, torque, (now, theta, velocity))  # without `before`: a replaced law may not apply here
         if not self._change.is_over:
             start = self._start(self._origins, torque, (now, theta, velocity))
@@ -116,7 +155,24 @@ class Compensator:
         over = [joint for joint, most in enumerate(s.max_effort) if not -most <= gravity[joint] <= most]
         change = self._change
         remainder = () if change.is_over else change.remainder
-        return Answer(self._effort, "", tuple(over), self._fallback, remainder, change.is_large, held)
+        damped = change.is_large or now < self._braked_until
+        return Answer(self._effort, "", tuple(over), self._fallback, remainder, damped, held)
+
+    @property
+    def _is_weighing(self) -> bool:
+        return self.scale is not None and not self.scale.is_over
+
+    def _watch_load(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None) -> None:
+        """Withdraw the torque of a load that has left the hand, without a guided change: that would be too slow."""
+        s = self.settings
+        if not isinstance(s, Settings) or not s.payload_mass or not velocity:
+            return
+        per_mass = LAWS["exact"](s.unit_load, theta, self.tilt.at(now))  # the height that each joint gives the hand, m
+        speed = sum(map(operator.mul, per_mass, velocity))
+        if self._drop_watch.step(now - self._last_answer, speed, s.payload_mass):
+            self.dropped, self._braked_until = s.payload_mass, now + WATCH
+            self._use(replace(s, payload_mass=0.0))
+            self._change.stop()
 
     def _largest_torque(self, theta: Sequence[float]) -> float:
         """Return the most in Nm that gravity takes of any joint at `theta` (n,) rad, whatever its direction."""
@@ -129,6 +185,8 @@ class Compensator:
         if settings.law != self.settings.law:
             self._fallback, self._fallback_until = "", -math.inf
         self.settings, self._pending = settings, None
+        if self.scale and self._is_weighing:
+            self.scale.trouble = "the settings changed"
         self.tilt.timeout = settings.tilt_timeout
         if self.terms is not None and isinstance(settings, Settings):
             self.terms.apply(settings.terms, settings.moving)

@@ -13,6 +13,10 @@ two would. A wearer who holds still gets the new load within FADE_TIME; one who 
 
 What the two settings do not explain, because a change follows another or a law does not apply in this pose, is the
 constant offset of the start.
+
+A load that falls out of the hand is a change that nobody asked for: what carried it now throws the arm. `DropWatch`
+sees it by the hand's motion; its torque is then withdrawn at the compensator's rate limit, and the motors brake. A
+person who lifts as fast loses the help for the load, and nothing else.
 """
 
 import math
@@ -29,6 +33,24 @@ WATCH = 1.0  # s after the last fade in which a joint that begins to move is sti
 LARGE = 1.0  # Nm between old and new load; less is slow enough without damping, which a wearer who moves would feel
 SMALL = 0.05  # Nm; a smaller difference is nothing to guide
 CAUSE_TIME = 5.0  # s within which a change of load may be the cause of a fault or a motion
+
+
+DROP_RISE = 0.25  # m/s that the hand gains over its own low-passed speed: 8 m/s^2 for a moment,
+DROP_TIME = 0.03  # s, time constant of that
+DROP_SPEED = 0.8  # m/s upwards, however slowly it was gained: a light load
+LEAST_DROP = 0.1  # kg; less throws no arm
+
+
+class DropWatch:
+    """Whether a load that the motors carry has left the hand."""
+
+    def __init__(self) -> None:
+        self._slow = 0.0  # m/s
+
+    def step(self, dt: float, speed: float, mass: float) -> bool:
+        """Return whether the load of `mass` kg was dropped; speed: m/s of the hand, upwards, `dt` s after the last."""
+        self._slow += min(1.0, dt / DROP_TIME) * (speed - self._slow)
+        return mass > LEAST_DROP and (speed > DROP_SPEED or (speed > 0.0 and speed - self._slow > DROP_RISE))
 
 
 class GuidedChange:

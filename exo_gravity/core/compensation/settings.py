@@ -14,6 +14,8 @@ from exo_gravity.core.model.arm import (
     MAX_LENGTH,
     MAX_MASS,
     MAX_MOMENT,
+    MAX_PAYLOAD,
+    MAX_REACH,
     STANDARD_GRAVITY,
     ArmModel,
     ModelError,
@@ -59,7 +61,13 @@ class Settings:
     terms: TermSettings = field(default_factory=TermSettings)
     model_error: ModelError = field(default_factory=ModelError)  #: for the estimate of the wearer's torque
     robot_by_mass: ArmModel | None = None  #: the robot by its masses, for `terms`; None: `robot`
-    #: what is compensated: the robot in One-G, the robot plus `support` times the wearer in Zero-G
+    payload_mass: float = 0.0  #: kg in the hand
+    payload_cog: Sequence[float] = (0.0, 0.0, 0.0)  #: (3,) m, its centre of gravity in frame 4
+    #: a load of 1 kg in the hand, without an arm, where gravity is 1 m/s^2
+    unit_load: ArmModel = field(init=False)
+    #: the robot with the load in its hand, which is carried in full in both modes, like the robot's own weight
+    loaded: ArmModel = field(init=False)
+    #: what is compensated: `loaded` in One-G, the same plus `support` times the wearer in Zero-G
     arm: ArmModel = field(init=False)
     moving: ArmModel = field(init=False)  #: the same by its masses
 
@@ -69,21 +77,26 @@ class Settings:
         check_owned(self)
         if self.law == "anfis" and self.anfis is None:
             raise ParameterError("law", self.law, "used with anfis_file, a model from train_anfis")
+        loaded = self.robot.with_payload(self.payload_mass, self.payload_cog)
         if self.law != "exact":
-            self.robot.check_masses(f"law {self.law}")
+            loaded.check_masses(f"law {self.law}")
         # Computed in every mode, so that an impossible wearer is refused now and not when the mode becomes zero_g.
-        whole = self.robot.with_wearer(self.wearer_mass, self.wearer_cog, self.support)
+        whole = loaded.with_wearer(self.wearer_mass, self.wearer_cog, self.support)
         if whole.total_mass > MAX_CARRIED:
-            robot, wearer = self.robot.total_mass, whole.total_mass - self.robot.total_mass
-            bound = f"at most {MAX_CARRIED:g} (robot {robot:.2f}, wearer's share {wearer:.2f})"
+            robot, wearer = loaded.total_mass - self.payload_mass, whole.total_mass - loaded.total_mass
+            parts = f"robot {robot:.2f}, wearer's share {wearer:.2f}, payload.mass {self.payload_mass:.2f}"
+            bound = f"at most {MAX_CARRIED:g} ({parts})"
             raise ParameterError("total mass in kg", round(whole.total_mass, 2), bound)
         if max(self.robot.scale) > MAX_SCALE:
             scale = [round(value, 2) for value in self.robot.scale]
             raise ParameterError("gain times gravity", scale, f"at most {MAX_SCALE:g} m/s^2, twice the Earth's gravity")
-        by_mass = self.robot_by_mass or self.robot
+        by_mass = (self.robot_by_mass or self.robot).with_payload(self.payload_mass, self.payload_cog)
         carried = by_mass.with_wearer(self.wearer_mass, self.wearer_cog, self.support)
-        object.__setattr__(self, "terms", self.terms.on_arm(by_mass))
-        object.__setattr__(self, "arm", whole if self.mode == "zero_g" else self.robot)
+        object.__setattr__(self, "terms", self.terms.on_arm(self.robot_by_mass or self.robot))
+        nothing = ArmModel.from_moments(self.robot.length, NO_TORQUE, gravity=1.0)
+        object.__setattr__(self, "unit_load", nothing.with_payload(1.0, self.payload_cog))
+        object.__setattr__(self, "loaded", loaded)
+        object.__setattr__(self, "arm", whole if self.mode == "zero_g" else loaded)
         object.__setattr__(self, "moving", carried if self.mode == "zero_g" else by_mass)
 
     def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = False) -> Torque:
@@ -159,6 +172,10 @@ COMPENSATOR = (
     Param("wearer.body_mass", 0.0, "body mass; computes wearer.mass and wearer.cog if these are 0", (0.0, 300.0), "kg"),
     Param("wearer.sex", "male", "selects the column of the segment table", choices=SEX),
     Param("wearer.segment_length", list(TYPICAL_LENGTH), "upper arm, forearm, hand", (0.0, 0.6), "m"),
+    Param("payload.mass", 0.0, "load in the hand, carried in full in both modes; 0 once it was dropped",
+          (0.0, MAX_PAYLOAD), "kg"),
+    Param("payload.cog", [0.0] * 3, "its centre of gravity in frame 4: from the end of link 4, along x_4, y_4, z_4",
+          (-MAX_REACH, MAX_REACH), "m"),
     param_of(Settings, "max_effort"),
     param_of(Settings, "max_effort_rate"),
     param_of(Settings, "inertial"),
@@ -242,6 +259,8 @@ def settings_of(values: Mapping[str, Any], read: Callable[[str], str] | None = N
         terms=term_settings_of(values),
         model_error=ModelError(*(values.get(param.name, param.default) for param in MODEL_PARAMETERS)),
         robot_by_mass=ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"]),
+        payload_mass=values["payload.mass"],
+        payload_cog=tuple(values["payload.cog"]),
         **{param.name: values[param.name] for param in params_of(Settings)},
     )
 

@@ -6,12 +6,13 @@ vertical, shoulder abduction, shoulder flexion, elbow flexion. At theta = (any, 
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field, fields
 
 import numpy as np
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats, one_float
+from exo_gravity.core.numbers import JOINT_COUNT, Vector, floats, four_floats, one_float
 from exo_gravity.core.params import check_owned, owned
 
 STANDARD_GRAVITY = 9.80665  # m/s^2, ISO 80000-3; the paper rounds to 9.8
@@ -19,12 +20,15 @@ STANDARD_GRAVITY = 9.80665  # m/s^2, ISO 80000-3; the paper rounds to 9.8
 # These bounds catch wrong units (grams for kilograms, millimetres for metres), not unusual designs.
 MAX_LENGTH = 1.0  # m
 MAX_MASS = 20.0  # kg per link; the whole arm of a 150 kg person weighs about 8 kg
+MAX_PAYLOAD = 5.0  # kg in the hand; at 0.7 m from the shoulder it takes 34 Nm, about twice an AK80-9's peak torque
+MAX_REACH = 0.5  # m of its centre of gravity from the hand
 MAX_MOMENT = 10.0  # kg m; it takes 98 Nm to hold, several times a motor's peak torque
 MAX_GAIN = 2.0
 MAX_GRAVITY = 25.0  # m/s^2
 
 ONES = (1.0,) * JOINT_COUNT
 ZEROS = (0.0,) * JOINT_COUNT
+NO_PAYLOAD = (0.0,) * 4
 UNKNOWN = np.full(JOINT_COUNT, np.nan)  # masses and centres of gravity of an arm given by its moments
 
 
@@ -48,6 +52,8 @@ class ArmModel:
     scale: tuple[float, ...] = field(init=False, repr=False)
     #: whether the arm was made by `from_moments`; then `cog` and `mass` are NaN
     by_moments: bool = field(init=False, repr=False)
+    #: load in the hand, by `with_payload`: kg, and its centre of gravity in m in frame 4; the moments contain it
+    payload: tuple[float, float, float, float] = field(init=False, repr=False)
 
     def __init__(
         self,
@@ -73,7 +79,8 @@ class ArmModel:
         gravity = one_float("gravity", gravity, 0.0, MAX_GRAVITY, "m/s^2")
         across = tuple(four_floats("off_axis", off_axis, -MAX_MOMENT, MAX_MOMENT, "kg m").tolist())
         scale = tuple((gains * gravity).tolist())
-        values = (lengths, cogs, masses, gains, gravity, across, tuple(moments.tolist()), scale, masses is UNKNOWN)
+        given = (lengths, cogs, masses, gains, gravity, across, tuple(moments.tolist()), scale, masses is UNKNOWN)
+        values = (*given, NO_PAYLOAD)
         for own_field, value in zip(fields(self), values, strict=True):
             object.__setattr__(self, own_field.name, value)
 
@@ -100,22 +107,39 @@ class ArmModel:
 
     def _key(self) -> tuple[object, ...]:
         arrays = (self.length, self.gain, self.cog, self.mass)
-        return (*(a.tobytes() for a in arrays), self.first_moment, self.off_axis, self.gravity)
+        return (*(a.tobytes() for a in arrays), self.first_moment, self.off_axis, self.gravity, self.payload)
 
     @property
     def total_mass(self) -> float:
-        """Mass of the four links in kg; of an arm given by its moments, the least mass that can have them."""
+        """Mass of links and load in kg; of an arm given by its moments, the least mass that can have them."""
         if not self.by_moments:
-            return float(self.mass.sum())
+            return float(self.mass.sum()) + self.payload[0]
         moment = np.array(self.first_moment)
         return float(np.max(np.divide(moment, self.length, out=np.zeros(JOINT_COUNT), where=self.length > 0)))
 
     def check_masses(self, what: str) -> None:
         """Raise ParameterError unless masses are known and all centres of gravity lie on the links, as `what` needs."""
+        if self.payload[0]:
+            raise ParameterError("payload.mass", self.payload[0], f"0 for {what}, which knows no load in the hand")
         if self.by_moments:
             raise ParameterError("robot.first_moment", self.first_moment, f"0 for {what}, which needs mass and cog")
         if any(self.off_axis):
             raise ParameterError("robot.off_axis", self.off_axis, f"0 for {what}, which knows no moments across links")
+
+    def with_payload(self, mass: float, cog: Vector = ZEROS[:3]) -> "ArmModel":
+        """Return this arm with a load of `mass` kg in its hand, instead of any other.
+
+        cog: (3,) m, its centre of gravity in frame 4 of Table 1: from the end of link 4, along link 4 (x_4), across it
+        in the plane in which the elbow bends (y_4), and along the elbow's axis (z_4). Raises ParameterError.
+        """
+        mass = one_float("payload.mass", mass, 0.0, MAX_PAYLOAD, "kg")
+        loaded, bare = copy(self), _payload_moments(self.length, self.payload)
+        payload = (mass, *floats("payload.cog", cog, 3, -MAX_REACH, MAX_REACH, "m").tolist())
+        change = _payload_moments(self.length, payload) - bare
+        for name, moments in zip(("first_moment", "off_axis"), change, strict=True):
+            object.__setattr__(loaded, name, tuple(np.add(getattr(self, name), moments).tolist()))
+        object.__setattr__(loaded, "payload", payload)
+        return loaded
 
     def with_wearer(self, mass: Vector, cog: Vector, support: float = 1.0) -> "ArmModel":
         """Return this arm plus a share `support` (0..1) of the wearer's arm: 0 is One-G, 1 is full Zero-G.
@@ -126,6 +150,9 @@ class ArmModel:
         distance = four_floats("wearer.cog", cog, 0.0, MAX_LENGTH, "m")
         if np.any(distance > self.length):
             raise ParameterError("wearer.cog", cog, f"within its link, at most length = {self.length.tolist()} m")
+        if any(self.payload):
+            bare = self.with_payload(0.0)
+            return bare.with_wearer(mass, cog, support).with_payload(self.payload[0], self.payload[1:])
         if self.by_moments:
             moment = np.add(self.first_moment, moments_along(self.length, distance, carried))
             return ArmModel.from_moments(self.length, moment, self.off_axis, self.gain, self.gravity)
@@ -154,6 +181,12 @@ class ModelError:
 
     def __post_init__(self) -> None:
         check_owned(self)
+
+
+def _payload_moments(length: np.ndarray, payload: Sequence[float]) -> np.ndarray:
+    """Return what a load in the hand adds to M1..M4 and to W, Z, Y3, Y4, (2, 4) kg m."""
+    mass, x, y, z = payload
+    return mass * np.array(((*length[:3], length[3] + x), (0.0, z, 0.0, y)))
 
 
 def moments_along(length: np.ndarray, cog: np.ndarray, mass: np.ndarray) -> np.ndarray:

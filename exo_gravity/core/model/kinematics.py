@@ -150,9 +150,12 @@ def least_inertia(links: LinkInertia) -> tuple[float, ...]:
 @lru_cache(8)
 def links_of(arm: ArmModel) -> LinkInertia:
     """Return the inertia of `arm` with the usual rotors; approximate if it is given by its moments."""
+    load, lever = arm.payload[0], float(arm.length[3]) + arm.payload[1]  # a point in the hand
     if arm.by_moments:
-        return LinkInertia.of_moments(arm.length, arm.first_moment)
-    return _links(arm.length, arm.mass, arm.first_moment, arm.mass * (arm.cog**2 + arm.length**2 / 12.0))
+        return LinkInertia.of_moments(arm.length, arm.first_moment, (load, lever))
+    second = arm.mass * (arm.cog**2 + arm.length**2 / 12.0)
+    held = np.array((0.0, 0.0, 0.0, load))
+    return _links(arm.length, arm.mass + held, arm.first_moment, second + held * lever**2)
 
 
 def _links(length: np.ndarray, mass: np.ndarray, moment: Vector, second: np.ndarray) -> LinkInertia:

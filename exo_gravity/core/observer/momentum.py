@@ -61,9 +61,9 @@ class MomentumObserver:
     def __init__(self, settings: Settings) -> None:
         s = settings
         self._error = s.model_error
-        self._whole = s.robot.with_wearer(s.wearer_mass, s.wearer_cog)
+        self._whole = s.loaded.with_wearer(s.wearer_mass, s.wearer_cog)
         self._wearer = ArmModel(s.robot.length, s.wearer_cog, s.wearer_mass, s.robot.gain, s.robot.gravity)
-        own, worn = links_of(s.robot), links_of(self._wearer)
+        own, worn = links_of(s.loaded), links_of(self._wearer)
         rows = zip(own.weights, worn.weights, strict=True)
         self._links = LinkInertia(tuple([tuple(map(operator.add, *row)) for row in rows]), ROTORS)
         friction = s.terms.friction

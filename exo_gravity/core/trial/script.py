@@ -9,6 +9,7 @@
       - {lean: 0.3, over: 3.0}                       lean to this roll of the trunk (rad, to the right)
       - {walk: 60.0}                                 walk
       - {sit: 2.0}                                   sit down hard, and wait for the rest of the time
+      - {load: 2.0, over: 1.0}                       take 2 kg into the hand (0: let go of it), and leave the arm alone
 
 A human wearer reads the steps from the screen; the simulator's virtual wearer executes them.
 """
@@ -21,12 +22,14 @@ from itertools import accumulate
 from typing import Any
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.arm import MAX_PAYLOAD
 from exo_gravity.core.numbers import four_floats, one_float
 
 MAX_DURATION = 3600.0  # s
 TIMED = {"hold": 0.1, "walk": 2.0, "sit": 1.0}  # steps that have only a duration, and the shortest of each in s
 TURNS = {"bow": 1.6, "lean": 0.8}  # steps that turn the trunk, and the largest angle of each in rad
 TOUCHES = {"move": (3.5, "rad"), "push": (20.0, "Nm")}  # steps that touch the arm, the largest value and its unit
+HANDS = {"load": MAX_PAYLOAD}  # steps that change what the hand holds, and the most in kg
 TRUNK_ACTIONS = ("bow", "lean", "walk", "sit")
 
 
@@ -34,8 +37,8 @@ TRUNK_ACTIONS = ("bow", "lean", "walk", "sit")
 class Step:
     """One step: an `action` and its `value`.
 
-    'move': the pose (4,) in rad; 'push': the torque (4,) in Nm; 'bow', 'lean': the angle (1,) in rad; 'hold', 'walk',
-    'sit': ().
+    'move': the pose (4,) in rad; 'push': the torque (4,) in Nm; 'bow', 'lean': the angle (1,) in rad; 'load': the mass
+    (1,) in kg; 'hold', 'walk', 'sit': ().
     """
 
     action: str
@@ -50,16 +53,18 @@ class Step:
         name = f"{where}.{action}"
         if action in TIMED and keys == {action}:
             return cls(action, one_float(name, entry[action], TIMED[action], MAX_DURATION, "s"))
-        if keys == {action, "over"} and action in (*TURNS, *TOUCHES):
-            if action in TURNS:
-                value: tuple[float, ...] = (one_float(name, entry[action], -TURNS[action], TURNS[action], "rad"),)
+        if keys == {action, "over"} and action in (*TURNS, *TOUCHES, *HANDS):
+            if action in HANDS:
+                value: tuple[float, ...] = (one_float(name, entry[action], 0.0, HANDS[action], "kg"),)
+            elif action in TURNS:
+                value = (one_float(name, entry[action], -TURNS[action], TURNS[action], "rad"),)
             else:
                 bound, unit = TOUCHES[action]
                 value = tuple(four_floats(name, entry[action], -bound, bound, unit).tolist())
             return cls(action, one_float(f"{where}.over", entry["over"], 0.1, 60.0, "s"), value)
         expected = (
             "{move: [4 rad], over: s}, {hold: s}, {push: [4 Nm], over: s}, {bow: rad, over: s}, {lean: rad, over: s}, "
-            "{walk: s} or {sit: s}"
+            "{walk: s}, {sit: s} or {load: kg, over: s}"
         )
         raise ParameterError(where, entry, expected)
 

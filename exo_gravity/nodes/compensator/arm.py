@@ -79,6 +79,7 @@ def report(control: Compensator, answer: Answer, names: Sequence[str]) -> dict[s
         "robot moments (kg m)": row((*s.robot.first_moment, *s.robot.off_axis)),
         "wearer mass (kg)": row(s.wearer_mass),
         "wearer cog (m)": row(s.wearer_cog),
+        "payload mass (kg)": f"{s.payload_mass:.3f}",
         "mass carried (kg)": f"{s.arm.total_mass:.3f}",
         "max effort (Nm)": row(s.max_effort),
     }

@@ -57,7 +57,7 @@ class BudgetWatch:
             s = settings
             load = tuple(s.wearer_mass), tuple(s.wearer_cog)
             support = s.support if s.mode == "zero_g" else 0.0
-            request = s.robot, load, support, math.radians(USUAL_TILT) if s.use_imu else 0.0
+            request = s.loaded, load, support, math.radians(USUAL_TILT) if s.use_imu else 0.0
             if request != self._request:
                 self._request = request
                 self._job = self._pool.submit(compute, self._names, request, self._bridge.values)

@@ -13,8 +13,11 @@ from collections import deque
 from typing import Any
 
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
 
+from exo_gravity.core.calibration.weighing import Weighing, refusal
 from exo_gravity.core.compensation.compensator import Answer, Compensator
 from exo_gravity.core.compensation.settings import Settings, UrdfSettings
 from exo_gravity.core.errors import ParameterError
@@ -49,6 +52,7 @@ class CompensatorNode(Node):
         self._control = Compensator(settings, self._names)
         self._budget: BudgetWatch | None = None
         self._wearer: WearerWatch | None = None
+        self._weighing: Weighing | None = None
         self._threads: list[Repeated] = []
         if self._control.terms:
             self._budget = BudgetWatch(self, self._names)
@@ -58,6 +62,7 @@ class CompensatorNode(Node):
             path = HotPath(self, JointState, "assist_efforts", self._on_assist_efforts, pause=ASSIST_PAUSE)
             self._wearer = WearerWatch(self, self._names, self._control)
             self._threads += [path, self._wearer]
+            self.create_service(Trigger, "~/weigh", self._weigh)
         self._interface: JointStateInterface | MultiArrayInterface
         if values.get("command_interface") == "multi_array":
             self._interface = MultiArrayInterface(self, self._names, values)
@@ -123,6 +128,7 @@ class CompensatorNode(Node):
         self._answer, self._last_answer = answer, now
         if changed:
             self._changes.append(answer)
+        if changed or self._control.dropped:
             self._changed.trigger()
 
     def _on_assist_efforts(self, message: JointState, info: dict[str, Any]) -> None:
@@ -148,6 +154,18 @@ class CompensatorNode(Node):
             self._control.apply(settings)
         self.get_logger().info(sentence(settings))
 
+    def _weigh(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        settings, terms, last = self._control.settings, self._control.terms, self._weighing
+        assert isinstance(settings, Settings) and terms
+        rate = self._rate.value
+        weighing = Weighing(settings, self._names, rate, last.empty if last else None)
+        with self._lock:
+            problem = refusal(settings, terms.active, rate) or self._control.weigh(weighing)
+        if not problem:
+            self._weighing = weighing
+        response.success, response.message = not problem, problem or "relax: `weighing` in /diagnostics has the result"
+        return response
+
     def _values(self, now: float, answer: Answer) -> dict[str, object]:
         return {
             **self._interface.values,
@@ -161,11 +179,16 @@ class CompensatorNode(Node):
             "effort (Nm)": row(answer.effort) if answer.effort else "none",
             **report(self._control, answer, self._names),
             **({"budget": self._budget.text, "largest support": self._budget.largest_support} if self._budget else {}),
-            **({"wearer (Nm)": self._wearer.report} if self._wearer else {}),
+            **({"wearer (Nm)": self._wearer.report, "contact": self._wearer.contact} if self._wearer else {}),
+            **({"weighing": self._weighing.text if self._weighing else "none"} if self._wearer else {}),
             "last refused message": self._refusal,
         }
 
     def _report_changes(self) -> None:
+        if self._control.dropped:
+            dropped, self._control.dropped = self._control.dropped, 0.0
+            self.get_logger().warning(f"the load of {dropped:g} kg has left the hand: payload.mass is set to 0")
+            self.set_parameters([Parameter("payload.mass", value=0.0)])
         while self._changes:
             self._report(self._changes.popleft())
 

@@ -18,6 +18,7 @@ from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.model.kinematics import turning_in_base
 from exo_gravity.core.model.rotation import ZERO, Floats3
 from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.observer.contact import ContactWatch
 from exo_gravity.core.observer.momentum import COVER, MomentumObserver, WearerEstimate
 from exo_gravity.core.trunk.inputs import FELT_RANGE
 from exo_gravity.nodes.ros.messages import by_name
@@ -43,6 +44,7 @@ class WearerWatch(Repeated):
         self._topics = [node.create_publisher(JointState, f"wearer_efforts{part}", 1) for part in ("", "_std")]
         self._message = JointState(name=names)  # one message, reused
         self._observer: MomentumObserver | None = None
+        self._contact = ContactWatch()
         self._known: object = None  # what the observer depends on
         self._due = 0.0
         self._last = -math.inf  # of the samples used
@@ -65,6 +67,15 @@ class WearerWatch(Repeated):
         ]
         return ", ".join(different) or "not distinguishable from zero"
 
+    @property
+    def contact(self) -> str:
+        """The newest contact and how many there were, for /diagnostics."""
+        if self._contact.last is None:
+            return "none"
+        at, joint, torque = self._contact.last
+        ago = min(99.0, time.monotonic() - at)
+        return f"{self._names[joint]} {torque:+.1f} Nm, {ago:.0f} s ago; {self._contact.count} in all"
+
     def _tick(self) -> None:
         now = time.monotonic()
         self._due = max(self._due + PERIOD, now)
@@ -79,10 +90,11 @@ class WearerWatch(Repeated):
             self._estimate = None
             return
         wearer = tuple(settings.wearer_mass), tuple(settings.wearer_cog)
-        known = settings.robot, wearer, settings.terms.friction, settings.model_error
+        known = settings.loaded, wearer, settings.terms.friction, settings.model_error
         if self._observer is None or known != self._known:
             self._observer, self._known = MomentumObserver(settings), known
         self._estimate = estimate = self._observer.update(taken, joints, *trunk)
+        self._contact.update(taken, estimate)
         self._message.header.stamp = message.header.stamp
         for topic, effort in zip(self._topics, (estimate.torque, estimate.deviation), strict=True):
             self._message.effort = effort

@@ -52,6 +52,7 @@ ASKED = {  # service and request for each request of a page but `set`
     "enable": (SetBool, f"{BRIDGE}/enable", SetBool.Request(data=True)),
     "clear_fault": (Trigger, f"{BRIDGE}/clear_fault", Trigger.Request()),
     "resume": (Trigger, f"{BRIDGE}/resume", Trigger.Request()),
+    "weigh": (Trigger, f"{COMPENSATOR}/weigh", Trigger.Request()),
 }
 
 

@@ -37,6 +37,8 @@ export class ArmCard {
     this.find(".resume").addEventListener("click", () => actions.send({ do: "resume", arm: name }));
     this.find(".home").addEventListener("click", () => actions.send({ do: "bring_home", arm: name }));
     this.find(".down").addEventListener("click", () => actions.down(name));
+    this.find(".weigh").addEventListener("click", () => actions.weigh(this));
+    this.find(".carry").addEventListener("click", () => actions.carry(this, this.weighed));
     for (const button of this.root.querySelectorAll("[data-mode]"))
       button.addEventListener("click", () => actions.mode(this, button.dataset.mode));
     this.slider.addEventListener("input", () => this.slide());
@@ -52,6 +54,7 @@ export class ArmCard {
     this.find(".resume").setAttribute("aria-label", t("resume_arm", arm));
     this.find(".home").setAttribute("aria-label", t("bring_home_arm", arm));
     this.find(".down").setAttribute("aria-label", t("let_down_arm", arm));
+    this.find(".weigh").setAttribute("aria-label", t("weigh_arm", arm));
     write(this.find(".down"), t("let_down_arm", arm));
   }
 
@@ -148,6 +151,7 @@ export class ArmCard {
     const other = alive ? state.compensator : null;
     write(this.find(".compensator"), other ? (other.level ? t("compensator_detail", other.message) : t("carried", number(finite(other["mass carried (kg)"]), 2))) : alive ? t("compensator_silent") : "");
     this.limit = finite(other?.["largest support"]);
+    this.showLoad(other, operates, name === "active");
     this.root.classList.toggle("stale", !alive);
     this.find(".enable").disabled = !operates || name !== "disabled";
     this.find(".clear").disabled = !operates || name !== "fault";
@@ -161,6 +165,25 @@ export class ArmCard {
     const rates = bridge ? `${t("rate")}: ${bridge["rate (Hz)"] ?? ""} Hz. ${t("age")}: ${bridge["age of efforts (ms)"] ?? ""} ms.` : "";
     const limits = bridge?.["limits acting"];
     write(this.find(".rates"), limits && limits !== "none" ? `${rates} ${t("limits", limits)}` : rates);
+  }
+
+  // The load in the hand, the result of the last weighing, and the last contact.
+  showLoad(compensator, operates, active) {
+    const text = compensator?.weighing ?? "none";
+    const found = text.match(/.* \+- ([\d.]+) kg .*payload\.mass = ([\d.]+)/);
+    this.weighed = found ? Number(found[2]) : NaN;
+    this.find(".weigh").disabled = !operates || !active;
+    this.find(".carry").hidden = !found || Math.abs(this.weighed - this.payload) < 0.001;
+    this.find(".carry").disabled = !operates;
+    write(this.find(".carry"), found ? t("carry_load", number(this.weighed, 2), number(Number(found[1]), 2)) : "");
+    write(this.find(".payload"), t("payload_now", number(this.payload, 2)));
+    write(this.find(".weighing"), text === "none" ? "" : text);
+    const contact = compensator?.contact ?? "none";
+    write(this.find(".contact"), contact === "none" ? "" : t("contact", contact));
+  }
+
+  get payload() {
+    return this.setup?.settings?.["payload.mass"] ?? 0;
   }
 
   sentence(name, moving, state, bridge, remedy) {
@@ -231,6 +254,7 @@ const changes = (state) => (state.compensator?.["changing load"] ?? "none") !== 
 
 // The change of load that came shortly before a fault.
 function causeText({ what, from, to }) {
+  if (what === "payload") return t("cause.payload", number(from, 2), number(to, 2));
   if (what === "support") return t("cause.support", number(100 * from, 1), number(100 * to, 1));
   return what === "mode" ? t("cause.mode", from === "zero_g" ? "Zero-G" : "One-G", to === "zero_g" ? "Zero-G" : "One-G") : t("cause.wearer");
 }

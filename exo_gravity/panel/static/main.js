@@ -75,6 +75,14 @@ const actions = {
     if ((mode === "zero_g" || card.isCarried) && !(await ask(t(`mode.${mode}`), text, t(`mode.${mode}`)))) return;
     send({ do: "set", arm: card.name, values: mode === "zero_g" ? { mode, support: 0 } : { mode } });
   },
+  async weigh(card) {
+    if (await ask(t("weigh_arm", card.armText()), t("weigh_ask"), t("weigh"))) send({ do: "weigh", arm: card.name });
+  },
+  async carry(card, mass) {
+    const kilograms = Math.round(1000 * mass) / 1000;
+    const text = t("carry_ask", number(card.payload, 2), number(kilograms, 2));
+    if (await ask(t("payload"), text, t("change"))) send({ do: "set", arm: card.name, values: { "payload.mass": kilograms } });
+  },
   // Returns whether the support was taken.
   async support(card, support) {
     const over = card.isOver(support) && support > card.support;

@@ -184,5 +184,6 @@ function trialText(trial) {
 }
 
 function stepText(step) {
-  return t(`step.${step.action}`, step.value.map((angle) => number(degrees(angle), 0)).join("° "));
+  const kilograms = step.action === "load";
+  return t(`step.${step.action}`, step.value.map((value) => (kilograms ? number(value, 1) : number(degrees(value), 0))).join("° "));
 }

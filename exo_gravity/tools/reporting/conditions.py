@@ -19,7 +19,7 @@ from exo_gravity.tools.reporting import html, table
 
 EARLY = 0.2  # s; can_bridge publishes its state every 0.1 s, so a shorter gap to the script's end means nothing
 NEAR = 1.0  # s between a let-down and the fault that caused it
-LOAD = ("mode", "support", "wearer.")  # beginnings of the parameters that change the load
+LOAD = ("mode", "support", "wearer.", "payload.")  # beginnings of the parameters that change the load
 MODES = {"one_g": "One-G", "zero_g": "Zero-G"}
 
 Worst = tuple[bool, float, str]  # whether it is worse than a small drift; rad; a sentence

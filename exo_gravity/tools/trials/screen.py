@@ -171,6 +171,8 @@ def describe(step: Step, guided: bool) -> str:
         "push": (f"push the arm {pushed}", "the wearer pushes the arm"),
     }
     trunk = {"walk": f"walk {time}", "sit": "sit down hard", "bow": f"bow to {over}", "lean": f"lean to {over}"}
+    if step.action == "load":
+        trunk["load"] = f"take {step.value[0]:g} kg into the hand" if step.value[0] else "let go of the load"
     if step.action in trunk:
         return f"{'' if guided else 'the wearer: '}{trunk[step.action]}, and leave the arm alone"
     return arm[step.action][0 if guided else 1]
