@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from types import SimpleNamespace
 
@@ -22,6 +23,7 @@ from exo_gravity.tools.inputs.parameter_file import load
 from ..hardware.simulated_rig import LIMITS
 from ..hardware.virtual_rig import Carried
 from ..support import CONFIG
+from ..support.launched_nodes import CALM, NO_IMU
 
 PARAMETERS = load(CONFIG / "sim.yaml")["/right/compensator"]
 ROBOT = ArmModel(*(PARAMETERS[name] for name in ("link_length", "robot.cog", "robot.mass")))
@@ -186,3 +188,25 @@ def test_an_exception_of_the_step_ends_the_answers_for_good_and_is_kept(compensa
 def test_efforts_for_an_effort_controller_are_refused(compensator):
     with pytest.raises(ParameterError, match="command_interface = 'multi_array': must be joint_state in one process"):
         compensator("command_interface:=multi_array")
+
+
+@pytest.mark.real_time
+def test_both_nodes_run_under_their_own_names_carry_the_arm_and_let_it_down(launch, probe, listen):
+    nodes = launch(without=("imu",), timing=CALM, compensator=NO_IMU, one_process=True)
+    listener = listen(nodes)
+    probe.wait_until_carried()
+    assert nodes.pid("compensator") == nodes.pid("can_bridge")
+    probe.wait_until(lambda: probe.status_contains("compensator", "compensating"))
+    both = ("/right/can_bridge", "/right/compensator")
+    dumped, given = probe.dump_parameters(both), load(nodes.path)
+    assert [dumped[node]["ros__parameters"]["joint_names"] for node in both] == [NAMES, NAMES]
+    assert dumped[both[1]]["ros__parameters"]["link_length"] == given[both[1]]["link_length"]
+    assert probe.set_parameters("compensator", gain=[1.0, 1.05, 1.0, 1.0]).successful
+    stamps = {(message.header.stamp.sec, message.header.stamp.nanosec) for message in probe.joint_states.copy()}
+    answered = {(message.header.stamp.sec, message.header.stamp.nanosec) for message in probe.effort_commands.copy()}
+    assert len(stamps & answered) > 10  # both topics are published
+    assert any(line.startswith("/right/compensator: INFO compensating") for line in nodes.log)
+    nodes.process("can_bridge").send_signal(signal.SIGINT)
+    probe.wait_until(lambda: nodes.have_ended)
+    assert nodes.ended_node == ("/right/can_bridge", 0)
+    assert listener.motors_are_off()
