@@ -30,15 +30,7 @@ from exo_gravity.nodes.compensator.wearer import WearerWatch
 from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import accept_changes
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import (
-    NEWEST,
-    SEVERAL,
-    HotPath,
-    Publishers,
-    Repeated,
-    TiltSubscription,
-    crowded,
-)
+from exo_gravity.nodes.ros.subscriptions import SEVERAL, HotPath, Publishers, Repeated, TiltSubscription, crowded
 
 SILENCE = 0.5  # s without joint states until diagnostics report it
 REPORT_PERIOD = 0.5  # s
@@ -96,8 +88,11 @@ class CompensatorNode(Node):
         topic = self._interface.topic
         self._source = Publishers()
         self._sources = {topic: self._source}  # of what the torque depends on
-        qos, is_called = (SEVERAL, True) if context else (NEWEST, False)
-        self._joint_states = HotPath(self, JointState, topic, self._on_joint_states, qos, raw=is_called)
+        arrive = self._on_joint_states
+        if context:
+            self._joint_states = HotPath(self, JointState, topic, arrive, SEVERAL, raw=True)  # polled in `answer`
+        else:
+            self._joint_states = HotPath(self, JointState, topic, arrive)
         self._threads.append(self._joint_states)
         if values["use_imu"]:
             tilt = TiltSubscription(self, self._control.tilt, self._lock, self._refused, self._on_motion)
@@ -108,7 +103,7 @@ class CompensatorNode(Node):
         self.create_timer(REPORT_PERIOD, self._report_current)
         self.get_logger().info(sentence(settings))
         for thread in self._threads:
-            if not is_called or thread is not self._joint_states:
+            if not context or thread is not self._joint_states:
                 thread.start()
         request_real_time(values["thread_priority"], self.get_logger().warning)
 
