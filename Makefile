@@ -9,7 +9,7 @@
 # make faults       the whole fault matrix on the simulated device, 40 minutes; a table and build/faults.json
 # make mutations    deliberate defects, each of which must turn a row of the fault matrix unsafe; 7 minutes
 # make soak         both arms for an hour: live changes, an active wearer, harmless faults; MINUTES=N for less
-# make bench        the laws, the loop and the tools against peers, 12 minutes on a quiet machine; QUICK=1: part of it
+# make bench        the laws, the loop and the tools against peers, 15 minutes on a quiet machine; QUICK=1: part of it
 # make ordinary     ordinary motors, sensors and computers for an hour of virtual time: no alarm; a table, 10 minutes
 # make motion-monitor  which wrong efforts can_bridge sees, and an hour of a fast wearer, whom it must not disturb; 20 minutes
 # make effort-study  how hard the simulated arm is to move, under every setting, 5 minutes; QUICK=1: part of it

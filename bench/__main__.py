@@ -1,6 +1,6 @@
 """python -m bench [--quick] [--only law,loop,work] [--output build/bench.json]: print one table and write it as JSON.
 
-It takes 12 minutes on two quiet cores. A disturbed run is repeated once, and then says so.
+It takes 15 minutes on two quiet cores. A disturbed run is repeated once, and then says so.
 """
 
 from __future__ import annotations

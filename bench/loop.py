@@ -1,7 +1,8 @@
 """One run of a loop from bus to bus, timed by an independent listener.
 
-The kinds of loop: the package's nodes, the same nodes with SCHED_FIFO threads, one Python process without ROS, and bare
-rclpy. All run on the same simulated device, which a virtual wearer moves to and fro, with the same law and rate.
+The kinds of loop: the package's nodes, the same nodes with SCHED_FIFO threads, can_bridge and compensator of an arm in
+one process, one Python process without ROS, and bare rclpy. All run on the same simulated device, which a virtual
+wearer moves to and fro, with the same law and rate.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ POSES = [0.5, 1.0, 0.9, 1.0], [-0.3, 0.4, 0.2, 0.3]  # rad; on the way between t
 MOVE = 1.0  # s from one pose to the other
 START_LIMIT = 60.0  # s until the wearer must move
 SETTLING = 0.5  # s of movement before the measurement
-THREAD_PRIORITY = {"nodes": 0, "fifo": 50}  # of the kinds that run the package's nodes
+THREAD_PRIORITY = {"nodes": 0, "fifo": 50, "one process": 0}  # of the kinds that run the package's nodes
 TICKS = os.sysconf("SC_CLK_TCK")
 CORES = 2  # on which everything runs that belongs to a loop, so that loops of every kind have the same
 QUIET = 0.01  # share of these cores that a hypervisor may give to others in a run that counts as quiet
@@ -63,7 +64,7 @@ class LoopRun:
 
 
 def run_loop(kind: str, rate: float, both_arms: bool, seconds: float, watch: Watch | None = None) -> LoopRun:
-    """Run one `kind` of loop: 'nodes', 'fifo', 'python' or 'rclpy'.
+    """Run one `kind` of loop: 'nodes', 'fifo', 'one process', 'python' or 'rclpy'.
 
     watch: called with the process IDs during the measurement, in place of a wait for `seconds`. It may return times
     that are timed separately too. Raises RuntimeError if the arm is not carried to the end.
@@ -79,11 +80,12 @@ def run_loop(kind: str, rate: float, both_arms: bool, seconds: float, watch: Wat
         ]
         log = NodeLog()
         launched = params if kind in THREAD_PRIORITY else simulators
-        launcher = Launcher(launched, log)
+        launcher = Launcher(launched, log, one_process=kind == "one process")
         stack.callback(launcher.stop)
         begin = time.monotonic()
         launcher.start()
-        pids = {node.lstrip("/"): launcher.process(node).pid for node in load(launched)}
+        nodes = [node for node in load(launched) if kind != "one process" or not node.endswith("/compensator")]
+        pids = {node.lstrip("/"): launcher.process(node).pid for node in nodes}
         for namespace in namespaces:
             for part, *command in _peer_commands(kind, params, namespace, rate):
                 pids[f"{namespace[1:]}/{part}"] = stack.enter_context(_process(*command)).pid

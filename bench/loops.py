@@ -16,7 +16,7 @@ RATES = (("one arm", False, 200), ("one arm", False, 500), ("one arm", False, 10
          ("both arms", True, 500))  # fmt: skip
 QUICK_RATES = (RATES[1], RATES[3])
 RAMP = 1.0  # s, can_bridge's RAMP_TIME
-KINDS = ("nodes", "fifo", "python", "rclpy")
+KINDS = ("nodes", "one process", "fifo", "python", "rclpy")
 PEERS = ("python", "Python without ROS"), ("rclpy", "bare rclpy")
 ATTEMPTS = 2
 PARTS = 5  # of a run; the lowest and the highest of their figures are the spread
@@ -38,6 +38,7 @@ def measure_loops(quick: bool, progress: Progress) -> Iterator[Row]:
                 runs[kind] = run
         name = f"loop, {arms}, {rate} Hz"
         yield from _rows(name, rate, runs, "nodes")
+        yield from _rows(f"{name}, one process", rate, runs, "one process")
         if "fifo" in runs:
             yield from _rows(f"{name}, thread_priority {THREAD_PRIORITY['fifo']}", rate, runs, "fifo")
         if "nodes" in runs:
@@ -75,7 +76,8 @@ def _rows(name: str, rate: int, runs: Runs, kind: str) -> Iterator[Row]:
         """Return a row whose second figure is one of the kind `of`."""
         return Row(f"{name}, {what}", figure, other, unit, spread, disturbed=ours.is_disturbed or runs[of].is_disturbed)
 
-    peers = [(peer_kind, peer) for peer_kind, peer in PEERS if peer_kind in runs]
+    others = (*PEERS, ("nodes", "two processes")) if kind == "one process" else PEERS
+    peers = [(peer_kind, peer) for peer_kind, peer in others if peer_kind in runs]
     for share in (50, 99, 99.9):
         figure, spread = _latency(ours, share)
         for of, peer in peers:
@@ -93,12 +95,13 @@ def _rows(name: str, rate: int, runs: Runs, kind: str) -> Iterator[Row]:
             yield row(f"{what}: {peer}", mean, float(np.mean(_percents(runs[of], what))), "%", spread, of)
     yield row("taken by the hypervisor: quiet", 100.0 * ours.stolen, 100.0 * QUIET, "%")
     yield row("taken by other programs: quiet", 100.0 * ours.others, 100.0 * QUIET_OTHERS, "%")
-    counterparts = {"can_bridge": "bridge", "compensator": "compensator"}
+    compensator = ["compensator"]
+    counterparts = {"can_bridge": ["bridge", *compensator * (kind == "one process")], "compensator": compensator}
     for node in sorted({full_name.rpartition("/")[2] for full_name in ours.cpu}):
         shares = _cpu_shares(ours, node)
         total, spread = sum(shares), _range(shares)
         if node in counterparts and "rclpy" in runs:
-            bare = sum(_cpu_shares(runs["rclpy"], counterparts[node]))
+            bare = sum(sum(_cpu_shares(runs["rclpy"], part)) for part in counterparts[node])
             yield row(f"CPU of {node}: bare rclpy", total, bare, "%", spread, "rclpy")
         else:
             yield row(f"CPU of {node}: a core", total, 100.0, "%", spread)

@@ -26,6 +26,7 @@ ARGUMENTS = (  # name, default, description
     ),
     ("namespace", "", "namespace in front of every node of the file, and of the topics /imu/..."),
     ("only", "", "start only the nodes whose full names match one of these shell patterns"),
+    ("one_process", "false", "true: run can_bridge and compensator of an arm in one process"),
     ("panel", "false", "true: also start the operator's panel, where the file has none"),
     ("log_level", "info", "debug, info, warn, error or fatal, for every node"),
 )
@@ -55,6 +56,7 @@ def _start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     words = ["--params", argument("params"), "--log-level", argument("log_level")]
     words += ["--namespace", argument("namespace")] if argument("namespace") else []
     words += ["--only", *argument("only").split()] if argument("only") else []
+    words += ["--one-process"] if argument("one_process") == "true" else []
     words += ["--panel"] if argument("panel") == "true" else []
     process = ExecuteProcess(
         cmd=[sys.executable, "-c", RUN, *words],

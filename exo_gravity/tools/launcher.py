@@ -2,6 +2,8 @@
 
     /right/can_bridge  ->  the executable `can_bridge`, as node `can_bridge` in the namespace /right
 
+With --one-process, can_bridge and compensator of an arm share a process, which counts as that of can_bridge.
+
 It stops the bridges first and waits for them, because they need the other nodes while they let the arms down. If the
 launcher dies, the nodes stop by themselves: each watches its standard input, whose other end the launcher holds.
 
@@ -32,6 +34,7 @@ from exo_gravity.tools.inputs.parameter_file import (
     ABSOLUTE_TOPICS,
     ENDED_WELL,
     OBSERVERS,
+    ONE_PROCESS,
     RECOVERY,
     RECOVERY_TIMEOUT,
     STOP_TIMEOUT,
@@ -39,6 +42,7 @@ from exo_gravity.tools.inputs.parameter_file import (
     check_buses,
     chosen,
     command_of,
+    guests_of,
     in_namespace,
     load,
     node_names,
@@ -64,7 +68,8 @@ class Launcher:
 
     on_line is called with each line that a node prints. only: shell patterns of the nodes to start; () starts all.
     more: nodes to start in addition to those of the file, with their default parameters. namespace: '/lab' in front of
-    every node and of the IMU's topics. log_level: of every node. Raises ParameterError.
+    every node and of the IMU's topics. log_level: of every node. one_process: whether can_bridge and compensator of an
+    arm share one. Raises ParameterError.
     """
 
     def __init__(
@@ -75,12 +80,15 @@ class Launcher:
         more: Sequence[str] = (),
         namespace: str = "",
         log_level: str = "info",
+        one_process: bool = False,
     ) -> None:
         self._path = Path(params).resolve()
         nodes = {**{node: {} for node in more}, **load(self._path)}
         check_buses(nodes)
         self._path, self._namespace, self._log_level = in_namespace(self._path, namespace), namespace, log_level
-        self._commands = {node: self._command(node) for node in chosen(nodes, only)}
+        names = chosen(nodes, only)
+        self._guests = guests_of(names) if one_process else {}
+        self._commands = {node: self._command(node) for node in names if node not in self._guests.values()}
         self._processes: dict[str, subprocess.Popen[str]] = {}
         self._readers: dict[str, threading.Thread] = {}
         self._on_line = on_line
@@ -95,7 +103,8 @@ class Launcher:
         """Start one node with more environment `variables`; return its process and the reader of its log."""
         environment = {**os.environ, **variables}
         environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        environment.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", LOG_FORMAT)
+        log_format = f"{{name}} {LOG_FORMAT}" if node in self._guests else LOG_FORMAT
+        environment.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", log_format)
         process = subprocess.Popen(
             self._commands[node],
             env=environment,
@@ -112,7 +121,8 @@ class Launcher:
 
     def process(self, node: str) -> subprocess.Popen[str]:
         """Return the process of a node by its full name."""
-        return self._processes[node]
+        host = next((host for host, guest in self._guests.items() if guest == node), node)
+        return self._processes[host]
 
     def exit_code(self, node: str) -> int | None:
         """Return the exit code of a node that was started and has ended, else None."""
@@ -180,17 +190,26 @@ class Launcher:
             self.stop()
 
     def _command(self, node: str) -> list[str]:
+        if guest := self._guests.get(node):
+            return [*command_of(node, ONE_PROCESS), *self._words(node), "--", *self._words(guest)]
+        return [*command_of(node), *self._words(node)]
+
+    def _words(self, node: str) -> list[str]:
         node = f"{self._namespace}{node}"
         namespace, name = node.rsplit("/", 1)
         topics = [f"{topic}:={self._namespace}{topic}" for topic in ABSOLUTE_TOPICS if self._namespace]
         remaps = [word for rule in (f"__node:={name}", f"__ns:={namespace or '/'}", *topics) for word in ("-r", rule)]
         options = ("--enclave", node, "--params-file", str(self._path), "--log-level", self._log_level)
-        return [*command_of(node), "--ros-args", *remaps, *options]
+        return ["--ros-args", *remaps, *options]
 
     def _read(self, node: str, process: subprocess.Popen[str]) -> None:
+        names = (node, self._guests[node]) if node in self._guests else ()
+        loggers = {f"{self._namespace}{name}"[1:].replace("/", "."): name for name in names}
         for line in process.stdout or ():
+            logger, _, rest = line.partition(" ")
+            name, text = (loggers[logger], rest) if logger in loggers else (node, line)
             with contextlib.suppress(OSError):  # of a closed terminal: a node whose log is not read would block
-                self._on_line(node, line.rstrip())
+                self._on_line(name, text.rstrip())
 
 
 def stop_on_signals() -> Stopping:
@@ -219,6 +238,8 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--params", metavar="FILE", help="ROS 2 parameter file (default: the packaged sim.yaml)")
     only = "start only the nodes whose full names match a shell pattern: '*/can_bridge' /imu"
     parser.add_argument("--only", metavar="PATTERN", nargs="+", default=(), help=only)
+    share = "run can_bridge and compensator of an arm in one process, see docs/performance.md"
+    parser.add_argument("--one-process", action="store_true", help=share)
     parser.add_argument("--panel", action="store_true", help="also start the operator's panel, where the file has none")
     parser.add_argument("--namespace", metavar="NAME", default="", help="in front of every node and of /imu/...")
     parser.add_argument("--log-level", default="info", choices=LOG_LEVELS, help="of every node (default: info)")
@@ -236,7 +257,7 @@ def main(args: Sequence[str] | None = None) -> None:
         more = ["/panel"] if options.panel else []
         path, space = options.params or packaged_config("sim.yaml"), options.namespace.strip("/")
         namespace = f"/{space}" if space else ""
-        launcher = Launcher(path, print_line, options.only, more, namespace, options.log_level)
+        launcher = Launcher(path, print_line, options.only, more, namespace, options.log_level, options.one_process)
         dead = launcher.run(stopping)
     except ExoGravityError as error:
         print(f"launcher: {error}", file=sys.stderr)

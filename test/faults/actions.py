@@ -65,6 +65,11 @@ def kill_bridge_beside_frozen_watchdog(seconds: float) -> Action:
     return inject
 
 
+def let_step_fail(how: str) -> Action:
+    """Let the compensator's step `sleep` for ever or `raise` an exception: of a FailingStepRig."""
+    return lambda rig: rig.failure.write_text(how)
+
+
 def simulator(**values: Any) -> Action:
     """Set parameters of the simulator."""
 

@@ -36,9 +36,11 @@ class Rig:
     """Nodes that carry the arm in `pose`, with a probe and the arm's true motion. End it with `close`.
 
     shipped_timeouts: whether the nodes have their default time-outs, or longer ones for a busy machine.
-    bridge, compensator, simulator: the nodes' parameters, apart from those of the configuration `base`.
+    bridge, compensator, simulator: the nodes' parameters, apart from those of the configuration `base`. one_process:
+    whether can_bridge and compensator of an arm share a process, in every rig of a run.
     """
 
+    one_process = False
     base = "sim.yaml"
     rate = 250.0  # Hz
     pose: Sequence[float] = RAISED
@@ -83,7 +85,7 @@ class Rig:
         return [self._nodes(without=SIMULATOR, port=port, can_bridge=bridge, compensator=self.compensator)]
 
     def _nodes(self, **options: Any) -> LaunchedNodes:
-        return LaunchedNodes(self.folder, base=self.base, timing=self.timing, **options)
+        return LaunchedNodes(self.folder, base=self.base, timing=self.timing, one_process=self.one_process, **options)
 
     def bring_to(self, stage: str) -> None:
         """Clear what the last fault left and bring the arm to `stage`, a state of the bridge, in several attempts.

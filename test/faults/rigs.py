@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import subprocess
 import time
 from collections.abc import Callable
@@ -31,15 +32,34 @@ ChangeMessage = Callable[[JointState], object]
 
 
 class TwoLaunchersRig(Rig):
-    """The compensator has its own launcher: when it dies, the other nodes run on."""
+    """The compensator has its own launcher: when it dies, the other nodes run on. Not so in one process."""
 
     simulator: ClassVar[Parameters] = UPRIGHT
 
     def _make_nodes(self, port: int) -> list[LaunchedNodes]:
         bridge = {"rate": self.rate}
+        if self.one_process:
+            return [self._nodes(without=("imu", "simulator"), port=port, can_bridge=bridge, compensator=NO_IMU)]
         others = self._nodes(without=("compensator", "imu", "simulator"), port=port, can_bridge=bridge)
         compensator = self._nodes(without=("can_bridge", "simulator", "imu"), port=port, compensator=NO_IMU)
         return [others, compensator]
+
+
+class FailingStepRig(TwoLaunchersRig):
+    """The compensator's step fails once `failure` has a text: `sleep` never returns, any other raises an exception."""
+
+    def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
+        super().__init__(folder, shipped_timeouts)
+        self.failure = folder / "failure"
+
+    def start(self) -> None:
+        paths = (str(Path(__file__).with_name("failing_step")), os.environ.get("PYTHONPATH", ""))
+        os.environ |= {"PYTHONPATH": os.pathsep.join(filter(None, paths)), "EXO_TEST_FAILURE": str(self.failure)}
+        super().start()
+
+    def close(self) -> None:
+        super().close()
+        del os.environ["EXO_TEST_FAILURE"]
 
 
 class CommandedRig(Rig):
@@ -99,7 +119,9 @@ class LauncherRig(Rig):
     """The launcher is a process, as for users; `launcher` is that process."""
 
     def _make_nodes(self, port: int) -> list[LaunchedNodes]:
-        self._launcher = LauncherProcess(self.folder, without=SIMULATOR, port=port, timing=self.timing)
+        self._launcher = LauncherProcess(
+            self.folder, without=SIMULATOR, port=port, timing=self.timing, one_process=self.one_process
+        )
         return [self._launcher]
 
     @property

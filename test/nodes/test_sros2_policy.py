@@ -127,13 +127,13 @@ def nodes_with_recorded_parameters(bag):
     return {text.partition(":")[0].strip() for text in texts}
 
 
-@pytest.fixture(scope="module")
-def session(tmp_path_factory):
+@pytest.fixture(scope="module", params=[False, True], ids=["two processes", "one process"])
+def session(tmp_path_factory, request):
     """The graph of the running nodes, and the nodes whose parameters the recorder has written."""
     folder, ending, context = tmp_path_factory.mktemp("sros2"), threading.Event(), rclpy.Context()
     rclpy.init(context=context)
     observer = rclpy.create_node("observer", context=context)
-    launcher = Launcher(parameter_file(folder), on_line=lambda node, line: None)
+    launcher = Launcher(parameter_file(folder), on_line=lambda node, line: None, one_process=request.param)
     threads = [
         threading.Thread(target=launcher.run, args=(ending,)),
         threading.Thread(target=spin, args=(outer_loops(context), ending)),

@@ -51,7 +51,8 @@ class LaunchedNodes:
     base: the file in config/. without: nodes to leave out, by the last part of their names. port: of the bus, a new one
     by default; the left arm's bus has the next one. timing: rate and time-outs by node, `SIMULATED`, `CALM` or `REAL`.
     changes: of the parameters, by node, for both arms; they come last, after `FAST` for the bridge. truth: whether
-    simulators log the arm's true motion, at `truth_path`. The attribute `ended_node` is what `Launcher.run` returned.
+    simulators log the arm's true motion, at `truth_path`. one_process: of the launcher. The attribute `ended_node` is
+    what `Launcher.run` returned.
 
     Nodes that have started run before other processes, if permitted: others that start would keep them waiting.
     """
@@ -64,6 +65,7 @@ class LaunchedNodes:
         port: int | None = None,
         timing: Mapping[str, Parameters] = SIMULATED,
         truth: bool = False,
+        one_process: bool = False,
         **changes: Parameters,
     ) -> None:
         port = port or next(PORTS)
@@ -89,6 +91,7 @@ class LaunchedNodes:
         }
         self.path = folder / f"params_{port}_{'_'.join(without)}.yaml"
         self.path.write_text(yaml.safe_dump(content))
+        self.one_process = one_process
         self.log: list[str] = []
         self.stopping = threading.Event()
         self.ended_node: tuple[str, int] | None = None
@@ -99,7 +102,7 @@ class LaunchedNodes:
         return self._thread is not None
 
     def start(self) -> LaunchedNodes:
-        self.launcher = Launcher(self.path, on_line=self._on_line)
+        self.launcher = Launcher(self.path, on_line=self._on_line, one_process=self.one_process)
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
         return self
@@ -151,7 +154,7 @@ class LauncherProcess(LaunchedNodes):
 
     def start(self) -> LauncherProcess:
         self.launcher_process = subprocess.Popen(
-            [executable("launcher"), "--params", str(self.path)],
+            [executable("launcher"), "--params", str(self.path), *["--one-process"] * self.one_process],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,

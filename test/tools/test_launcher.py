@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -139,6 +140,33 @@ def test_only_a_part_of_the_nodes_is_started(monkeypatch):
     assert [launcher.process(node) for node in ("/imu", "/right/can_bridge")] == ["/imu", "/right/can_bridge"]
     with pytest.raises(KeyError):
         launcher.process("/right/compensator")
+
+
+def test_in_one_process_the_bridge_has_the_command_of_both_and_its_log_is_told_apart(monkeypatch):
+    def processes(*words):
+        started = []
+        monkeypatch.setattr(Launcher, "run", lambda launcher, stopping: started.append(launcher))
+        main(["--params", str(SIM), "--namespace", "lab", "--one-process", *words])
+        return started[0]
+
+    launcher = processes()
+    assert list(launcher._commands) == ["/imu", "/right/can_bridge", "/right/simulator"]
+    words = launcher._commands["/right/can_bridge"]
+    first, second = words[: words.index("--")], words[words.index("--") + 1 :]
+    assert {"__node:=can_bridge", "/lab/right/can_bridge"} <= set(first) and "can_bridge.one_process" in first[2]
+    assert {"--ros-args", "__node:=compensator", "__ns:=/lab/right", "/lab/right/compensator"} <= set(second)
+
+    lines = []
+    launcher._on_line = lambda *line: lines.append(line)
+    log = ("lab.right.compensator INFO compensating\n", "lab.right.can_bridge WARN late\n", "ERROR of a watchdog\n")
+    launcher._read("/right/can_bridge", SimpleNamespace(stdout=log))
+    assert lines == [
+        ("/right/compensator", "INFO compensating"),
+        ("/right/can_bridge", "WARN late"),
+        ("/right/can_bridge", "ERROR of a watchdog"),
+    ]
+    alone = processes("--only", "*/can_bridge", "/imu")._commands
+    assert "--" not in alone["/right/can_bridge"] and "/right/compensator" not in alone
 
 
 NAMES = ["/recorder", "/imu", "/left/can_bridge", "/left/compensator", "/right/can_bridge"]

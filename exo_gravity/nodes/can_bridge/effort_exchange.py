@@ -3,6 +3,9 @@
 Efforts carry the stamp of the joint state that they answer. The exchange remembers when, on the monotonic clock, each
 stamped state was measured: so the age of an answer does not depend on the wall clock, and an unknown stamp is refused.
 While the load changes, the compensator asks for the motors' damping by velocities of 0. Others are refused.
+
+A compensator in this process is called with each joint state. Its efforts are published too, and noticed there without
+being taken a second time: what is not next in their numbers comes from another commander.
 """
 
 import math
@@ -12,7 +15,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core.errors import ParameterError
@@ -20,23 +22,24 @@ from exo_gravity.core.safety.drive import CARRYING, NO_COMMAND, EffortCommand, F
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, to_nanoseconds
-from exo_gravity.nodes.ros.subscriptions import HotPath, Publishers
+from exo_gravity.nodes.ros.subscriptions import SEVERAL, HotPath, Publishers
 
-# The control thread reads them once a cycle; the depth lets it notice a second commander. Not reliable: an old effort
-# sent again is useless, and acknowledging each one wakes a thread in both nodes (measured: 2 % of a core).
-EFFORTS = QoSProfile(depth=8, reliability=ReliabilityPolicy.BEST_EFFORT)
 REMEMBERED = 256  # stamps of joint states: more than command_timeout covers at any rate
+Answer = Callable[[JointState], JointState | None]  # efforts for a joint state, of a compensator in this process
 
 
 class EffortExchange:
     """The topics `joint_states` and `effort_commands` of `node`, used on the control thread.
 
     get_loop returns the present control loop, None while the node is inactive. refusal: why the last message was
-    refused, or "none".
+    refused, or "none". answer: of a compensator in this process.
     """
 
-    def __init__(self, node: Node, limits: Limits, get_loop: Callable[[], ControlLoop | None]) -> None:
+    def __init__(
+        self, node: Node, limits: Limits, get_loop: Callable[[], ControlLoop | None], answer: Answer | None = None
+    ) -> None:
         self.refusal = "none"
+        self._answer = answer
         self._limits = limits
         self._get_loop = get_loop
         self._clock = node.get_clock()
@@ -45,13 +48,15 @@ class EffortExchange:
         self._published: OrderedDict[int, float] = OrderedDict()
         self._commander = Publishers()
         self._publisher = node.create_publisher(JointState, "joint_states", 1)
-        self._joint_states = JointState(name=list(limits.joint_names))  # one message, reused
-        self._efforts = HotPath(node, JointState, "effort_commands", self._on_efforts, EFFORTS)
+        self._names = list(limits.joint_names)
+        # Not reliable: an old effort sent again is useless, and acknowledging each one wakes a thread in both nodes
+        # (measured: 2 % of a core).
+        self._efforts = HotPath(node, JointState, "effort_commands", self._on_efforts, SEVERAL, raw=answer is not None)
 
     def get_efforts(self, latest: float) -> EffortCommand:
         """Return the newest efforts; wait until `latest` (monotonic s) for the answer to the last joint state."""
         self._efforts.poll()
-        if self.command.answered < self._measured:
+        if self._answer is None and self.command.answered < self._measured:
             self._efforts.poll(latest - time.monotonic())
         return self.command
 
@@ -59,8 +64,8 @@ class EffortExchange:
         """Publish a joint state if every motor has replied recently: an unknown angle is never sent as a number."""
         if any(self._limits.is_silent(now, joint) for joint in joints):
             return
-        message = self._joint_states
-        message.position, message.velocity, message.effort, *_ = zip(*joints, strict=True)
+        position, velocity, effort, *_ = zip(*joints, strict=True)
+        message = JointState(name=self._names, position=position, velocity=velocity, effort=effort)
         message.header.stamp = self._clock.now().to_msg()
         self._measured = min(joint.time for joint in joints)
         # Of states with one stamp, by a clock that stands still, efforts answer the first: they grow old.
@@ -68,18 +73,24 @@ class EffortExchange:
         if len(self._published) > REMEMBERED:
             self._published.popitem(last=False)
         self._publisher.publish(message)
+        if self._answer and (loop := self._get_loop()) and (efforts := self._answer(message)):
+            self._take(loop, efforts)
 
-    def _on_efforts(self, message: JointState, info: dict[str, Any]) -> None:
+    def _on_efforts(self, message: JointState | bytes, info: dict[str, Any]) -> None:
         loop = self._get_loop()
         if loop is None:
             return
-        answered = self._published.get(to_nanoseconds(message.header.stamp))
         if self._commander.is_another(info):
             self.refusal = "a second publisher of effort_commands"
             self.command = EffortCommand(None, time.monotonic())  # fails the start gate
             if loop.safety.state in CARRYING:
                 loop.trip(FaultCode.SECOND_COMMANDER, "more than one publisher of effort_commands")
-        elif answered is None:
+        elif not isinstance(message, bytes):
+            self._take(loop, message)
+
+    def _take(self, loop: ControlLoop, message: JointState) -> None:
+        answered = self._published.get(to_nanoseconds(message.header.stamp))
+        if answered is None:
             self.refusal = f"stamp {to_nanoseconds(message.header.stamp)} ns answers no joint state of this bridge"
         else:
             try:

@@ -32,7 +32,7 @@ from exo_gravity.hardware.clock import request_real_time
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, OwnedBus, Watchdog, take_over
 from exo_gravity.nodes.can_bridge import operation
-from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
+from exo_gravity.nodes.can_bridge.effort_exchange import Answer, EffortExchange
 from exo_gravity.nodes.ros.parameters import bus_of, declare
 from exo_gravity.nodes.ros.run import keep_to_this_machine, run
 from exo_gravity.nodes.ros.subscriptions import TiltSubscription
@@ -82,11 +82,11 @@ def _transition(function: Callable[[Any], None]) -> Callable[..., TransitionCall
 class CanBridge(LifecycleNode):
     """The lifecycle node: configure opens the bus, activate starts the loop and arms, deactivate lets the arm down.
 
-    loop: the control loop while the node is active, else None. Raises BusError if `autostart` is set and the node
-    cannot be configured or activated.
+    loop: the control loop while the node is active, else None. answer: of a compensator in this process. Raises
+    BusError if `autostart` is set and the node cannot be configured or activated.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, answer: Answer | None = None) -> None:
         super().__init__("can_bridge", automatically_declare_parameters_from_overrides=True)
         values, self._arm = _declared(self)
         operation.refuse_simulated_time(self, self._arm.address[0])
@@ -99,7 +99,7 @@ class CanBridge(LifecycleNode):
         self._owned: OwnedBus | None = None  # while configured
         self._bus: MotorBus | None = None  # while inactive
         self.error = ""  #: why the last transition failed
-        self._exchange = EffortExchange(self, limits, lambda: self.loop)
+        self._exchange = EffortExchange(self, limits, lambda: self.loop, answer)
         lease = operation.Operator(self, lambda: self.loop).lease
         self._report = operation.BridgeReport(self, self._arm, traffic, lease)
         operation.BridgeServices(self, lambda: self.loop, motors)
@@ -216,10 +216,10 @@ def _owner(node: Node) -> str:
     return f"{node.get_fully_qualified_name()} (PID {os.getpid()})"
 
 
-def main() -> None:
+def main(make_node: Callable[[], CanBridge] = CanBridge) -> None:
     """Entry point of the executable `can_bridge`; with RECOVER, the exit code is 0 if no motor is on."""
     if not (patience := os.environ.get(RECOVER)):
-        raise SystemExit(run(CanBridge, priority=20))
+        raise SystemExit(run(make_node, priority=20))
     keep_to_this_machine()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("can_bridge", automatically_declare_parameters_from_overrides=True)

@@ -144,13 +144,14 @@ class JointStateInterface:
         """Return positions and velocities of exactly these joints. Raises ParameterError."""
         return by_name(message, "position", self._names), velocity_of(message, self._names)
 
-    def send(self, now: float, message: JointState, answer: Answer) -> None:
-        """Publish the answer to the joint states of `message`."""
+    def send(self, now: float, message: JointState, answer: Answer) -> JointState:
+        """Publish the answer to the joint states of `message`, and return it."""
         self._command.header.stamp = message.header.stamp
         self._command.effort = answer.effort or ()
         self._command.header.frame_id = LATE_TILT if answer.held else ""
         self._command.velocity = self._still if answer.damped else ()  # asks for damping about standstill
         self._publisher.publish(self._command)
+        return self._command
 
 
 class MultiArrayInterface(Repeated):

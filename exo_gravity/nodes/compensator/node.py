@@ -12,6 +12,7 @@ import time
 from collections import deque
 from typing import Any
 
+from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
@@ -29,7 +30,7 @@ from exo_gravity.nodes.compensator.wearer import WearerWatch
 from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import accept_changes
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import NEWEST, HotPath, Publishers, Repeated, TiltSubscription, crowded
+from exo_gravity.nodes.ros.subscriptions import SEVERAL, HotPath, Publishers, Repeated, TiltSubscription, crowded
 
 SILENCE = 0.5  # s without joint states until diagnostics report it
 REPORT_PERIOD = 0.5  # s
@@ -38,12 +39,18 @@ MAX_CHANGES = 16  # answers whose reason is new, waiting for the report
 
 
 class CompensatorNode(Node):
-    """The ROS shell around a compensator."""
+    """The ROS shell around a compensator.
 
-    def __init__(self) -> None:
+    context: of a compensator in can_bridge's process, which calls `answer`. Otherwise joint states come by their topic.
+    """
+
+    def __init__(self, context: Context | None = None) -> None:
         # A parameter that is not in the table is refused by `accept_changes`, which names it: rclpy does not.
         super().__init__(
-            "compensator", automatically_declare_parameters_from_overrides=True, allow_undeclared_parameters=True
+            "compensator",
+            context=context,
+            automatically_declare_parameters_from_overrides=True,
+            allow_undeclared_parameters=True,
         )
         self._lock = threading.Lock()  # guards the control: joint states arrive on another thread
         table, values, read = declared(self)
@@ -65,6 +72,8 @@ class CompensatorNode(Node):
             self.create_service(Trigger, "~/weigh", self._weigh)
         self._interface: JointStateInterface | MultiArrayInterface
         if values.get("command_interface") == "multi_array":
+            if context:
+                raise ParameterError("command_interface", "multi_array", "joint_state in one process with can_bridge")
             self._interface = MultiArrayInterface(self, self._names, values)
             self._threads.append(self._interface)
         else:
@@ -79,7 +88,12 @@ class CompensatorNode(Node):
         topic = self._interface.topic
         self._source = Publishers()
         self._sources = {topic: self._source}  # of what the torque depends on
-        self._threads.append(HotPath(self, JointState, topic, self._on_joint_states, NEWEST))
+        arrive = self._on_joint_states
+        if context:
+            self._joint_states = HotPath(self, JointState, topic, arrive, SEVERAL, raw=True)  # polled in `answer`
+        else:
+            self._joint_states = HotPath(self, JointState, topic, arrive)
+        self._threads.append(self._joint_states)
         if values["use_imu"]:
             tilt = TiltSubscription(self, self._control.tilt, self._lock, self._refused, self._on_motion)
             self._sources |= tilt.senders
@@ -89,7 +103,8 @@ class CompensatorNode(Node):
         self.create_timer(REPORT_PERIOD, self._report_current)
         self.get_logger().info(sentence(settings))
         for thread in self._threads:
-            thread.start()
+            if not context or thread is not self._joint_states:
+                thread.start()
         request_real_time(values["thread_priority"], self.get_logger().warning)
 
     @property
@@ -105,10 +120,27 @@ class CompensatorNode(Node):
         for thread in reversed(self._threads):
             thread.stop()
 
-    def _on_joint_states(self, message: JointState, info: dict[str, Any]) -> None:
+    def answer(self, message: JointState) -> JointState | None:
+        """Return the efforts for a joint state of can_bridge, on its control thread; None once this has failed.
+
+        Of the topic, only other publishers are noticed.
+        """
+        try:
+            if self._joint_states.failure is None:
+                self._joint_states.poll()
+                return self._answer_to(message)
+        except Exception as error:
+            self._joint_states.failure = error
+        return None
+
+    def _on_joint_states(self, message: JointState | bytes, info: dict[str, Any]) -> None:
+        self._source.is_another(info)
+        if not isinstance(message, bytes):
+            self._answer_to(message)
+
+    def _answer_to(self, message: JointState) -> JointState | None:
         now = time.monotonic()
         try:
-            self._source.is_another(info)
             theta, velocity = self._interface.read(message)
             if self._interface.problem:  # no step: the torque must ramp in from zero
                 answer = Answer(None, self._interface.problem)
@@ -119,7 +151,7 @@ class CompensatorNode(Node):
             answer = Answer(None, self._refused(self._interface.topic, error))
         if problem := crowded(self._sources):
             answer = Answer(None, problem)
-        self._interface.send(now, message, answer)
+        efforts = self._interface.send(now, message, answer)
         if self._wearer:
             self._wearer.newest = now, message
         self._answers += answer.effort is not None
@@ -130,6 +162,7 @@ class CompensatorNode(Node):
             self._changes.append(answer)
         if changed or self._control.dropped:
             self._changed.trigger()
+        return efforts
 
     def _on_assist_efforts(self, message: JointState, info: dict[str, Any]) -> None:
         now = time.monotonic()

@@ -27,6 +27,8 @@ from exo_gravity.core.trunk.inputs import NOT_REPORTED, STILL, TiltInput
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+# For who reads between other work: the depth lets it notice a second publisher.
+SEVERAL = QoSProfile(depth=8, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # reliable
 STOP_CHECK_PERIOD = 0.1  # s
 PAUSE = 0.0004  # s, less than the shortest period of a control loop

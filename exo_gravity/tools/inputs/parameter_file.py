@@ -27,6 +27,7 @@ MAX_LIST = 100  # entries; the longest list of any parameter has 4, and ROS's re
 Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 NODES_PACKAGE = "exo_gravity.nodes."
+ONE_PROCESS = f"{NODES_PACKAGE}can_bridge.one_process"  # runs can_bridge and compensator
 # What the executable does. The folder in which the user stands, '' in the path, is not searched for modules.
 PROGRAM = """import sys
 sys.path = [*filter(None, sys.path)]
@@ -120,15 +121,16 @@ def node_names() -> tuple[str, ...]:
     return tuple(_modules())
 
 
-def command_of(node: str) -> list[str]:
+def command_of(node: str, module: str = "") -> list[str]:
     """Return the command that runs `node` ('/right/can_bridge') from this package. Raises ParameterError if none does.
 
-    It looks for no file in a folder: python-can installs an executable `can_bridge` too.
+    module: in place of the node's own. It looks for no file in a folder: python-can installs an executable `can_bridge`
+    too.
     """
     name, modules = node.rpartition("/")[2], _modules()
     if name not in modules:
         raise ParameterError("node name", node, f"/namespace/executable, with one of {', '.join(modules)}")
-    return [sys.executable, "-c", PROGRAM.format(name=name, module=modules[name])]
+    return [sys.executable, "-c", PROGRAM.format(name=name, module=module or modules[name])]
 
 
 def stages(nodes: Iterable[str]) -> tuple[list[str], list[str], list[str]]:
@@ -137,6 +139,12 @@ def stages(nodes: Iterable[str]) -> tuple[list[str], list[str], list[str]]:
     for node in nodes:
         found[0 if node.endswith("/can_bridge") else 2 if node.endswith("/recorder") else 1].append(node)
     return found
+
+
+def guests_of(nodes: Iterable[str]) -> dict[str, str]:
+    """Return the compensator of each can_bridge of `nodes` that has one."""
+    pairs = {node: f"{node.rpartition('/')[0]}/compensator" for node in stages(nodes)[0]}
+    return {bridge: compensator for bridge, compensator in pairs.items() if compensator in nodes}
 
 
 def chosen(nodes: Iterable[str], only: Sequence[str]) -> list[str]:
