@@ -228,7 +228,7 @@ MUTATIONS = (
         "unexplained torque is passed on, and takes ten times as long",
         ("effort of joint 2 with the wrong sign",),
         (Edit(MONITOR, "passed.append(within)", "passed.append(torque)"),
-         Edit(MONITOR, "PATIENCE = 0.015 ", "PATIENCE = 0.15 ")),
+         Edit(MONITOR, "PATIENCE = 0.012 ", "PATIENCE = 0.15 ")),
     ),
 )  # fmt: skip
 
