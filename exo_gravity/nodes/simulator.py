@@ -161,4 +161,4 @@ class Simulator(Node):
 
 def main() -> None:
     """Entry point of the executable `simulator`."""
-    raise SystemExit(run(Simulator, priority=15))
+    raise SystemExit(run(Simulator, priority=20))  # no motor waits for a processor

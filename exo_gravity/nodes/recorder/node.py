@@ -237,4 +237,4 @@ class LiveLine:
 
 def main() -> None:
     """Entry point of the executable `recorder`."""
-    raise SystemExit(run(Recorder))
+    raise SystemExit(run(Recorder, priority=5))  # below the control loop; what arrives is to be written
