@@ -48,7 +48,7 @@ class EffortExchange:
         self._published: OrderedDict[int, float] = OrderedDict()
         self._commander = Publishers()
         self._publisher = node.create_publisher(JointState, "joint_states", 1)
-        self._names = list(limits.joint_names)
+        self._joint_states = JointState(name=list(limits.joint_names))  # one message, reused
         # Not reliable: an old effort sent again is useless, and acknowledging each one wakes a thread in both nodes
         # (measured: 2 % of a core).
         self._efforts = HotPath(node, JointState, "effort_commands", self._on_efforts, SEVERAL, raw=answer is not None)
@@ -65,7 +65,9 @@ class EffortExchange:
         if any(self._limits.is_silent(now, joint) for joint in joints):
             return
         position, velocity, effort, *_ = zip(*joints, strict=True)
-        message = JointState(name=self._names, position=position, velocity=velocity, effort=effort)
+        # A compensator in this process keeps the message.
+        message = JointState(name=self._joint_states.name) if self._answer else self._joint_states
+        message.position, message.velocity, message.effort = position, velocity, effort
         message.header.stamp = self._clock.now().to_msg()
         self._measured = min(joint.time for joint in joints)
         # Of states with one stamp, by a clock that stands still, efforts answer the first: they grow old.

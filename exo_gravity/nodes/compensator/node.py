@@ -10,6 +10,7 @@ import math
 import threading
 import time
 from collections import deque
+from collections.abc import Mapping
 from typing import Any
 
 from rclpy.context import Context
@@ -21,6 +22,7 @@ from std_srvs.srv import Trigger
 from exo_gravity.core.calibration.weighing import Weighing, refusal
 from exo_gravity.core.compensation.compensator import Answer, Compensator
 from exo_gravity.core.compensation.settings import Settings, UrdfSettings
+from exo_gravity.core.compensation.terms.terms import Terms
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Rate
 from exo_gravity.hardware.clock import request_real_time
@@ -30,7 +32,15 @@ from exo_gravity.nodes.compensator.wearer import WearerWatch
 from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import accept_changes
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import SEVERAL, HotPath, Publishers, Repeated, TiltSubscription, crowded
+from exo_gravity.nodes.ros.subscriptions import (
+    NEWEST,
+    SEVERAL,
+    HotPath,
+    Publishers,
+    Repeated,
+    TiltSubscription,
+    crowded,
+)
 
 SILENCE = 0.5  # s without joint states until diagnostics report it
 REPORT_PERIOD = 0.5  # s
@@ -62,22 +72,9 @@ class CompensatorNode(Node):
         self._weighing: Weighing | None = None
         self._threads: list[Repeated] = []
         if self._control.terms:
-            self._budget = BudgetWatch(self, self._names)
-            self._assist = self._control.terms.assist
-            self._assistant = Publishers()
-            self._assistants = 0  # changes whenever a message comes from another publisher than the one before
-            path = HotPath(self, JointState, "assist_efforts", self._on_assist_efforts, pause=ASSIST_PAUSE)
-            self._wearer = WearerWatch(self, self._names, self._control)
-            self._threads += [path, self._wearer]
-            self.create_service(Trigger, "~/weigh", self._weigh)
-        self._interface: JointStateInterface | MultiArrayInterface
-        if values.get("command_interface") == "multi_array":
-            if context:
-                raise ParameterError("command_interface", "multi_array", "joint_state in one process with can_bridge")
-            self._interface = MultiArrayInterface(self, self._names, values)
-            self._threads.append(self._interface)
-        else:
-            self._interface = JointStateInterface(self, self._names)
+            self._serve_wearer(self._control.terms)
+        is_called = context is not None  # by can_bridge: then the topic is polled in `answer`
+        self._interface = self._open_interface(values, is_called)
         self._diagnostics = Diagnostics(self)
         self._answer = Answer(None)
         self._changes: deque[Answer] = deque(maxlen=MAX_CHANGES)
@@ -88,11 +85,8 @@ class CompensatorNode(Node):
         topic = self._interface.topic
         self._source = Publishers()
         self._sources = {topic: self._source}  # of what the torque depends on
-        arrive = self._on_joint_states
-        if context:
-            self._joint_states = HotPath(self, JointState, topic, arrive, SEVERAL, raw=True)  # polled in `answer`
-        else:
-            self._joint_states = HotPath(self, JointState, topic, arrive)
+        quality = SEVERAL if is_called else NEWEST
+        self._joint_states = HotPath(self, JointState, topic, self._on_joint_states, quality, raw=is_called)
         self._threads.append(self._joint_states)
         if values["use_imu"]:
             tilt = TiltSubscription(self, self._control.tilt, self._lock, self._refused, self._on_motion)
@@ -103,9 +97,30 @@ class CompensatorNode(Node):
         self.create_timer(REPORT_PERIOD, self._report_current)
         self.get_logger().info(sentence(settings))
         for thread in self._threads:
-            if not context or thread is not self._joint_states:
+            if not is_called or thread is not self._joint_states:
                 thread.start()
         request_real_time(values["thread_priority"], self.get_logger().warning)
+
+    def _serve_wearer(self, terms: Terms) -> None:
+        """Add what only the exoskeleton's own arm has: budget, assistance, the wearer's torque, weighing."""
+        self._budget = BudgetWatch(self, self._names)
+        self._assist = terms.assist
+        self._assistant = Publishers()
+        self._assistants = 0  # changes whenever a message comes from another publisher than the one before
+        path = HotPath(self, JointState, "assist_efforts", self._on_assist_efforts, pause=ASSIST_PAUSE)
+        self._wearer = WearerWatch(self, self._names, self._control)
+        self._threads += [path, self._wearer]
+        self.create_service(Trigger, "~/weigh", self._weigh)
+
+    def _open_interface(self, values: Mapping[str, Any], is_called: bool) -> JointStateInterface | MultiArrayInterface:
+        """Return the way in and out; is_called: by can_bridge in the same process. Raises ParameterError."""
+        if values.get("command_interface") != "multi_array":
+            return JointStateInterface(self, self._names)
+        if is_called:
+            raise ParameterError("command_interface", "multi_array", "joint_state in one process with can_bridge")
+        interface = MultiArrayInterface(self, self._names, values)
+        self._threads.append(interface)
+        return interface
 
     @property
     def failure(self) -> Exception | None:
