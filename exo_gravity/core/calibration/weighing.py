@@ -4,8 +4,8 @@ For TAKE_OVER s the arm is held where it is, so that the wearer can relax and th
 directions of a sweep is what the settings do not carry, without the joints' friction (`motion.average`). With dz/dq,
 the height that each joint gives the hand, m kg in the hand take the torque m g dz/dq; m is fitted to it.
 
-What is weighed is the load and the error of the model, which the same weighing with an empty hand shows. A load cannot
-be told from muscles: what the wearer carries himself is missing, unless it is torque that no load in the hand can be.
+The result contains the error of the model, which weighing the empty hand in the same pose shows. Muscles look like a
+load: what the wearer carries himself is missing from the result, unless his torque is one that no load can cause.
 """
 
 import math
@@ -21,7 +21,7 @@ from exo_gravity.core.model.arm import MAX_PAYLOAD, ArmModel
 from exo_gravity.core.model.gravity import LAWS, Torque
 from exo_gravity.core.model.kinematics import ROTORS, links_of
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.observer.momentum import AXES
+from exo_gravity.core.observer.momentum import AXES, COVER
 
 TAKE_OVER = 4.0  # s
 CYCLES = 3  # there and back
@@ -39,7 +39,6 @@ LEAST_ERROR = 0.05  # Nm: standard error of a joint's torque at best
 MAX_GAP = 0.1  # s
 SAME_POSE = 0.1  # m, of dz/dq
 EMPTY = 0.15  # kg: a result of less, while no load is configured, is that of an empty hand
-COVER = 1.96  # standard deviations of the 95 % band
 CARRIERS = ("spring", "coupling", "limits", "assist")  # terms that would carry a part
 
 
@@ -95,7 +94,7 @@ class Weighing:
 
     @property
     def empty(self) -> Weighed | None:
-        """The newest result of an empty hand, None if there is none."""
+        """The latest result for an empty hand, or None."""
         result = self.result
         return result if result and abs(result.mass) < EMPTY and not self._settings.payload_mass else self._empty
 
@@ -206,7 +205,7 @@ class Weighing:
         return s.model_error.tilt * math.hypot(*(self._weight @ self._by_tilt)) / s.robot.gravity
 
     def _prepare(self, theta: Sequence[float], tilt: Tilt) -> None:
-        """Find how the torques count: an error of the tilt shows in all of them, and so is told from a load."""
+        """Compute each joint's weight in the fit of the mass: least squares; all joints share one error of the tilt."""
         s = self._settings
         self._lever = np.array(LAWS["exact"](s.unit_load, theta, tilt))
         wearer = ArmModel(s.robot.length, s.wearer_cog, s.wearer_mass, gravity=s.robot.gravity)
@@ -237,7 +236,9 @@ class Weighing:
             if short > 0.0:
                 self.trouble = f"{name} does not follow: is the arm carried, is a hand on it?"
             elif off > 0.0:
-                self.trouble = f"{name}: {off + UNLIKE[0]:.1f} Nm that is no load in the hand: is somebody helping?"
+                self.trouble = (
+                    f"{name}: {off + UNLIKE[0]:.1f} Nm that is no load in the hand: is somebody touching the arm?"
+                )
         if not self.trouble:
             random = math.hypot(*(weight * spread)) / s.robot.gravity
             self.result = Weighed(mass, random, self._lever)

@@ -97,9 +97,9 @@ class Compensator:
             raise ParameterError("side", settings.side, f"{self.settings.side}, because the side cannot change")
         self._pending = settings
 
-    def weigh(self, scale: "Scale") -> str:
+    def weigh(self, scale: Scale) -> str:
         """Let `scale` carry the load in the hand from the next `step` on, until it is over; return why not, or ''."""
-        if self._is_weighing:
+        if self._active_scale:
             return "a weighing is under way"
         if not self._change.is_over:
             return "the load is changing: wait for it"
@@ -133,17 +133,17 @@ class Compensator:
         s = self.settings
         dt = now - self._last_answer
         torque = tuple(map(operator.add, gravity, added))
-        has_weighed = False
-        if self._is_weighing and self.scale and velocity:
-            torque = self.scale.torque(dt, theta, velocity, self.tilt.at(now), torque)
-            has_weighed = not self._is_weighing
+        scale = self._active_scale if velocity else None
+        if scale and velocity:
+            torque = scale.torque(dt, theta, velocity, self.tilt.at(now), torque)
+        ended = scale if scale and scale.is_over else None
         torque = clamped(torque, s.max_effort)
         if not 0.0 <= dt <= BREAK:  # the torque ramps in from zero
             self._change.stop()
             self._effort, self._ramp_start, dt = self._nothing, now, 0.0
-        elif has_weighed and self.scale and self.scale.is_thrown:
+        elif ended and ended.is_thrown:
             self._braked_until = now + WATCH  # a guided change would be too slow
-        elif before is not None or bool(self._fallback) != replaced or has_weighed:
+        elif before is not None or bool(self._fallback) != replaced or ended:
             self._begin(before, torque, (now, theta, velocity))  # without `before`: a replaced law may not apply here
         if not self._change.is_over:
             start = self._start(self._origins, torque, (now, theta, velocity))
@@ -159,8 +159,8 @@ class Compensator:
         return Answer(self._effort, "", tuple(over), self._fallback, remainder, damped, held)
 
     @property
-    def _is_weighing(self) -> bool:
-        return self.scale is not None and not self.scale.is_over
+    def _active_scale(self) -> Scale | None:
+        return self.scale if self.scale and not self.scale.is_over else None
 
     def _watch_load(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None) -> None:
         """Withdraw the torque of a load that has left the hand, without a guided change: that would be too slow."""
@@ -185,8 +185,8 @@ class Compensator:
         if settings.law != self.settings.law:
             self._fallback, self._fallback_until = "", -math.inf
         self.settings, self._pending = settings, None
-        if self.scale and self._is_weighing:
-            self.scale.trouble = "the settings changed"
+        if scale := self._active_scale:
+            scale.trouble = "the settings changed"
         self.tilt.timeout = settings.tilt_timeout
         if self.terms is not None and isinstance(settings, Settings):
             self.terms.apply(settings.terms, settings.moving)
