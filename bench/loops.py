@@ -95,8 +95,8 @@ def _rows(name: str, rate: int, runs: Runs, kind: str) -> Iterator[Row]:
             yield row(f"{what}: {peer}", mean, float(np.mean(_percents(runs[of], what))), "%", spread, of)
     yield row("taken by the hypervisor: quiet", 100.0 * ours.stolen, 100.0 * QUIET, "%")
     yield row("taken by other programs: quiet", 100.0 * ours.others, 100.0 * QUIET_OTHERS, "%")
-    compensator = ["compensator"]
-    counterparts = {"can_bridge": ["bridge", *compensator * (kind == "one process")], "compensator": compensator}
+    bridge = ("bridge", "compensator") if kind == "one process" else ("bridge",)
+    counterparts = {"can_bridge": bridge, "compensator": ("compensator",)}
     for node in sorted({full_name.rpartition("/")[2] for full_name in ours.cpu}):
         shares = _cpu_shares(ours, node)
         total, spread = sum(shares), _range(shares)

@@ -42,7 +42,7 @@ def verdict(trials: Sequence[Trial]) -> list[Row]:
         shown = f"{points(largest)}; {inside} of {len(found)} within their band"
         rows.append(Row(f"share while {name}, largest error", shown, "", True))
     counts, seconds = [contacts(trial) for trial in trials], sum(float(np.ptp(trial.curve.time)) for trial in trials)
-    rows.append(Row("contacts reported, though there are none", f"{sum(counts)} in {seconds / 60.0:.0f} min", "", True))
+    rows.append(Row("false contacts", f"{sum(counts)} in {seconds / 60.0:.0f} min", "", True))
     carried = sum(not trial.trouble for trial in trials)
     rows.append(Row("arms carried to the end", f"{carried} of {len(trials)}", "all", carried == len(trials)))
     return rows

@@ -54,12 +54,14 @@ class FailingStepRig(TwoLaunchersRig):
 
     def start(self) -> None:
         paths = (str(Path(__file__).with_name("failing_step")), os.environ.get("PYTHONPATH", ""))
+        self._environment = dict(os.environ)
         os.environ |= {"PYTHONPATH": os.pathsep.join(filter(None, paths)), "EXO_TEST_FAILURE": str(self.failure)}
         super().start()
 
     def close(self) -> None:
         super().close()
-        del os.environ["EXO_TEST_FAILURE"]
+        os.environ.clear()
+        os.environ.update(self._environment)
 
 
 class CommandedRig(Rig):

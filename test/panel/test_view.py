@@ -10,7 +10,7 @@ from exo_gravity.core.compensation.guidance import CAUSE_TIME
 from exo_gravity.panel.view import LATE, LoadChanges
 
 
-class Told:
+class PanelLook:
     """The panel's look at one arm ten times a second; `cause` is what it names."""
 
     def __init__(self) -> None:
@@ -43,49 +43,49 @@ class Told:
     ],
 )
 def test_a_change_of_load_shortly_before_a_fault_is_named_and_never_the_wearers_data(load, cause):
-    told = Told()
-    assert told.go(2.0, **load) is None
-    assert told.fail() == cause
-    assert told.go(LATE) == cause
-    assert told.go(60.0, support=0.3) == cause  # set while the arm is off
-    told.fault = "none"
-    assert told.go(10.0) is None
-    assert told.fail() is None
+    look = PanelLook()
+    assert look.go(2.0, **load) is None
+    assert look.fail() == cause
+    assert look.go(LATE) == cause
+    assert look.go(60.0, support=0.3) == cause  # set while the arm is off
+    look.fault = "none"
+    assert look.go(10.0) is None
+    assert look.fail() is None
 
 
 def test_a_change_long_before_is_not_the_cause_unless_the_load_still_changes():
-    told = Told()
-    told.go(CAUSE_TIME + 1.0, support=0.6)
-    assert told.fail() is None
-    told = Told()
-    told.changing = "right_elbow_flexion, 2.1 Nm to go"
-    told.go(CAUSE_TIME + 1.0, support=0.6)
-    assert told.fail() == {"what": "support", "from": 0.1, "to": 0.6}
+    look = PanelLook()
+    look.go(CAUSE_TIME + 1.0, support=0.6)
+    assert look.fail() is None
+    look = PanelLook()
+    look.changing = "right_elbow_flexion, 2.1 Nm to go"
+    look.go(CAUSE_TIME + 1.0, support=0.6)
+    assert look.fail() == {"what": "support", "from": 0.1, "to": 0.6}
 
 
 def test_a_slider_on_its_way_is_one_change():
-    told = Told()
+    look = PanelLook()
     for support in (0.2, 0.3, 0.4):
-        told.go(0.5, support=support)
-    assert told.fail() == {"what": "support", "from": 0.1, "to": 0.4}
+        look.go(0.5, support=support)
+    assert look.fail() == {"what": "support", "from": 0.1, "to": 0.4}
 
 
 def test_a_change_of_which_the_panel_learns_after_the_fault_is_the_cause_and_a_later_one_is_not():
-    told = Told()
-    told.fail(LATE - 0.5)
-    assert told.go(0.1, support=0.6) == {"what": "support", "from": 0.1, "to": 0.6}
-    told = Told()
-    told.fail(LATE + 0.5)
-    assert told.go(0.1, support=0.6) is None
+    look = PanelLook()
+    look.fail(LATE - 0.5)
+    assert look.go(0.1, support=0.6) == {"what": "support", "from": 0.1, "to": 0.6}
+    look = PanelLook()
+    look.fail(LATE + 0.5)
+    assert look.go(0.1, support=0.6) is None
 
 
 def test_support_that_does_not_act_and_parameters_that_are_not_known_are_no_change():
-    told = Told()
-    told.go(CAUSE_TIME + 1.0, mode="one_g")
-    told.go(1.0, support=0.6)
-    assert told.fail() is None
-    told = Told()
-    known, told.load = told.load, {}
-    told.go(1.0)
-    told.go(1.0, **known)
-    assert told.fail() is None
+    look = PanelLook()
+    look.go(CAUSE_TIME + 1.0, mode="one_g")
+    look.go(1.0, support=0.6)
+    assert look.fail() is None
+    look = PanelLook()
+    known, look.load = look.load, {}
+    look.go(1.0)
+    look.go(1.0, **known)
+    assert look.fail() is None
