@@ -129,7 +129,7 @@ def multicast_problem() -> str:
 
 
 def link_of(name: str) -> Mapping[str, Any]:
-    """Return the description of an interface by `ip`, empty if there is none."""
+    """Return what `ip` reports about an interface, {} if it reports nothing."""
     try:
         command = ["ip", "-json", "-details", "link", "show", name]
         links = json.loads(subprocess.run(command, capture_output=True, check=True, timeout=5.0).stdout)

@@ -14,9 +14,9 @@ two would. A wearer who holds still gets the new load within FADE_TIME; one who 
 What the two settings do not explain, because a change follows another or a law does not apply in this pose, is the
 constant offset of the start.
 
-A load that falls out of the hand is a change that nobody asked for: what carried it now throws the arm. `DropWatch`
-sees it by the hand's motion; its torque is then withdrawn at the compensator's rate limit, and the motors brake. A
-person who lifts as fast loses the help for the load, and nothing else.
+If a load falls out of the hand, the torque that carried it throws the arm upwards. `DropWatch` detects this from the
+hand's motion. The compensator then withdraws that torque at its rate limit, and the motors brake. A person who lifts
+as fast loses the support for the load, and nothing else.
 """
 
 import math
@@ -33,8 +33,6 @@ WATCH = 1.0  # s after the last fade in which a joint that begins to move is sti
 LARGE = 1.0  # Nm between old and new load; less is slow enough without damping, which a wearer who moves would feel
 SMALL = 0.05  # Nm; a smaller difference is nothing to guide
 CAUSE_TIME = 5.0  # s within which a change of load may be the cause of a fault or a motion
-
-
 DROP_RISE = 0.25  # m/s that the hand gains over its own low-passed speed: 8 m/s^2 for a moment,
 DROP_TIME = 0.03  # s, time constant of that
 DROP_SPEED = 0.8  # m/s upwards, however slowly it was gained: a light load

@@ -1,9 +1,9 @@
 """can_bridge and the compensator of its arm in one process: where the last reply has arrived, its answer is computed.
 
-Both remain nodes: each has its context, with name, parameters and enclave, and its executor on a thread of its own. All
-topics are published as between two processes; only the control path does without them. The control thread calls the
-compensator with each joint state (effort_exchange.py). If that raises an exception, the efforts grow old as those of a
-dead compensator do, and the process ends, which lets the arm down. If it never returns, the watchdog kills both nodes.
+Each node keeps its own context (name, parameters, enclave) and its own executor, on a separate thread. All topics are
+still published, but the control path does not use them: the control thread calls the compensator with each joint state
+(effort_exchange.py). If the call raises an exception, the efforts grow old as those of a dead compensator do, and the
+process ends, which lets the arm down. If the call never returns, the watchdog kills both nodes.
 
 Arguments: those of can_bridge, `--`, those of the compensator.
 """
@@ -21,7 +21,7 @@ from exo_gravity.nodes.ros.subscriptions import STOP_CHECK_PERIOD, Repeated
 
 
 class CompensatedBridge(node.CanBridge):
-    """can_bridge with a compensator, which has the `arguments` of a process of its own."""
+    """can_bridge together with a compensator. arguments: the compensator's command line."""
 
     def __init__(self, arguments: list[str]) -> None:
         context = Context()

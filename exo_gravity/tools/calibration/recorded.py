@@ -75,7 +75,7 @@ def _down(path: Path, arm: ConfiguredArm, times: np.ndarray) -> np.ndarray:
 def messages_of(path: Path, topic: str, msgtype: str, required: bool = True) -> Iterator[tuple[int, Any]]:
     """Yield stamp in ns and message of each message of `topic` in a recording.
 
-    Raises DataError if a message cannot be read, or if there is none and `required` is set.
+    Raises DataError if a message is unreadable, or if a `required` one is missing.
     """
     storage, types = Storage(path), get_typestore(Stores.ROS2_JAZZY)
     found = False

@@ -89,7 +89,7 @@ def run_offline(
 def record_offline(
     trials: Sequence[OfflineTrial], params: Path, session: Session, console: Console, should_stop: Callable[[], bool]
 ) -> str:
-    """Run the trials, record them in `bag` beside the parameter file `params`; return why one ended early, or ''.
+    """Run the trials and record them in the folder `bag` next to `params`. Return why one ended early, or ''.
 
     Raises DataError if nothing was recorded, or it cannot be written.
     """
