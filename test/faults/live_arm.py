@@ -102,8 +102,8 @@ class LiveArm:
         self.last = ""
 
     def live(self, rig: SoakRig, end: float, clock: StallClock) -> None:
-        """Let them do so until `end` (monotonic s), and judge each change and act."""
-        while time.monotonic() < end:
+        """Let them do so until `end` (monotonic s) or until a node has ended, and judge each change and act."""
+        while time.monotonic() < end and not rig.has_lost_a_node:
             rig.bring_to("active")
             arms = (("right", rig.probe, rig.truth), ("left", rig.left, rig.left_truth))
             states, lines, start = [len(probe.states) for _, probe, _ in arms], len(rig.nodes[0].log), time.time()
@@ -181,6 +181,6 @@ def resident(pid: int) -> float:
 
 
 def processor_time() -> tuple[float, float]:
-    """Return for how long the processors were idle, and their whole time, in ticks."""
+    """Return for how long the processors were idle or had a process of low priority, and their whole time, in ticks."""
     ticks = [int(field) for field in Path("/proc/stat").read_text().splitlines()[0].split()[1:9]]
-    return ticks[3] + ticks[4], sum(ticks)
+    return ticks[1] + ticks[3] + ticks[4], sum(ticks)

@@ -111,8 +111,8 @@ class Rig:
 
     def _wait_for_nodes(self) -> None:
         probe = self.probe
-        probe.wait_until(lambda: self._any_ended or (probe.joint_states and probe.effort_commands))
-        assert not self._any_ended, "nodes ended at the start"
+        probe.wait_until(lambda: self.has_lost_a_node or (probe.joint_states and probe.effort_commands))
+        assert not self.has_lost_a_node, "nodes ended at the start"
         self._bridges.add(self.pid("can_bridge"))
 
     def is_at_pose(self) -> bool:
@@ -163,7 +163,8 @@ class Rig:
         return self.nodes[0].have_ended
 
     @property
-    def _any_ended(self) -> bool:
+    def has_lost_a_node(self) -> bool:
+        """Whether a launcher has ended with its nodes, as it does when one of them ends."""
         return any(nodes.have_ended for nodes in self.nodes)
 
     @property
