@@ -6,8 +6,8 @@ arm must be carried again each time. The left arm is carried beside it, and a re
 
 The exit code is 1 if a fault was unsafe, a live change let the motors move an arm faster than MOVED, an arm was let
 down without a cause or not carried again, a change was refused, the recording has losses or ends early, or a node's
-memory grew by more than MAX_GROWTH. It is a cause that the computer stood still for STALL, or that its processors were idle, or busy
-with what has a lower priority, for less than IDLE of the time; nodes that ended then are started again.
+memory grew by more than MAX_GROWTH. It is a cause that the computer stood still for STALL, or that for less than IDLE
+of the time its processors were idle or busy with what has a lower priority. Nodes that ended then are started again.
 """
 
 from __future__ import annotations
