@@ -9,8 +9,9 @@ from pathlib import Path
 
 from exo_gravity.core.model.gravity import LAWS, Torque
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.clock import COMPUTER_CLOCK
+from exo_gravity.hardware.ownership.arm_on_bus import ArmOnBus
 from exo_gravity.tools.inputs.arms import can_options, read_arm
 from exo_gravity.tools.inputs.parameter_file import load
 
@@ -28,6 +29,8 @@ class DirectArm:
         self.motors = arm.motors
         self.interface, self.channel = str(arm.can_bridge["can.interface"]), str(arm.can_bridge["can.channel"])
         self.options = can_options(nodes[f"{namespace}/can_bridge"])
+        address = self.interface, self.channel, self.options
+        self._on_bus = ArmOnBus(address, arm.motors, arm.limits, 1.0 / arm.can_bridge["rate"])
         settings = arm.settings()
         self._model, self._law, self._tilt = settings.arm, LAWS[settings.law], Tilt.of(settings.side)
 
@@ -37,7 +40,7 @@ class DirectArm:
 
     def open(self) -> MotorBus:
         """Open the bus."""
-        return MotorBus(open_bus(self.interface, self.channel, self.options), self.motors)
+        return MotorBus(self._on_bus.ports(COMPUTER_CLOCK), self.motors)
 
 
 def run_paced(period: float, cycle: Callable[[], None], stopping: Sequence[object]) -> None:

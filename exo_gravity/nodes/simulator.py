@@ -17,7 +17,7 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import String
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.joint_motor import OPTIONS
+from exo_gravity.core.motors.joint_motor import OPTIONS, buses_of, channels_of
 from exo_gravity.core.trial.script import IDLE, Step, TrialScript
 from exo_gravity.core.trunk.imu_checks import ImuSample
 from exo_gravity.hardware.can.can_port import open_bus
@@ -71,8 +71,11 @@ class Simulator(Node):
         accept_changes(self, SIMULATOR, lambda values: (values, script_of(values["trial"])), self._apply)
         self.failure: Exception | None = None  # ends the node, see run()
         self._stopping = threading.Event()
-        self._bus = open_bus(*bus_of(self, values))
-        self.get_logger().info(f"simulated {values['side']} arm on {self._bus.channel_info}")
+        interface, channel, options = bus_of(self, values)
+        buses = {name: open_bus(interface, name, own) for name, (_, own) in buses_of(channel, options).items()}
+        self._buses = [buses[name] for name in channels_of(channel)]  # of each motor
+        names = " and ".join(str(bus.channel_info) for bus in buses.values())
+        self.get_logger().info(f"simulated {values['side']} arm on {names}")
         self._thread = threading.Thread(target=self._play, name="device", daemon=True)
         self._thread.start()
 
@@ -82,14 +85,15 @@ class Simulator(Node):
         return self._device.powered
 
     def close(self) -> None:
-        """Stop the device and close its bus."""
+        """Stop the device and close its buses."""
         self._stopping.set()
         self._thread.join()
-        self._bus.shutdown()
+        for bus in set(self._buses):
+            bus.shutdown()
 
     def _play(self) -> None:
         try:
-            self._device.run(self._bus, self._stopping.is_set, self._on_idle)
+            self._device.run(self._buses, self._stopping.is_set, self._on_idle)
         except Exception as error:
             self.failure = error
 

@@ -1,6 +1,6 @@
 """The simulated device: the arm, its four motors and the wearer. CAN frames are its only connection to a controller.
 
-`run` plays it in real time on a python-can bus. `advance` and `exchange` play it without a bus, as fast as possible.
+`run` plays it in real time on python-can buses. `advance` and `exchange` play it without a bus, as fast as possible.
 Physics catches up with the clock in steps of 1 ms before a frame is processed, so a motor always replies with the
 present state of the arm. A reply is sent 200 to 400 us after its command, as measured on AK motors. V3 boards send
 status frames on their own timer, only in `run`.
@@ -13,6 +13,7 @@ import heapq
 import math
 import operator
 import random
+import select
 import time
 from collections.abc import Callable, Sequence
 
@@ -32,6 +33,7 @@ from exo_gravity.sim.virtual_wearer import VirtualWearer
 REPLY_DELAY = (200e-6, 400e-6)  # s
 MAX_CATCH_UP = 0.05  # s of physics simulated at once; after a longer stall the rest of the time is lost
 IDLE_PERIOD = 0.005  # s after which physics advances even without a frame
+TURN = 0.0005  # s for which one of several buses is awaited that cannot be awaited together
 
 
 class SimulatedDevice:
@@ -131,13 +133,19 @@ class SimulatedDevice:
         return motor.status(self.arm.positions[joint] + self.encoder_error[joint], self.arm.velocities[joint])
 
     def run(
-        self, bus: can.BusABC, should_stop: Callable[[], bool], on_idle: Callable[[float], None] = lambda now: None
+        self,
+        bus: can.BusABC | Sequence[can.BusABC],
+        should_stop: Callable[[], bool],
+        on_idle: Callable[[float], None] = lambda now: None,
     ) -> None:
-        """Play the device on `bus` in real time until `should_stop()`. Raises BusError when the bus fails.
+        """Play the device in real time until `should_stop()`. Raises BusError when a bus fails.
 
-        on_idle(now), `now` in monotonic s, is called whenever no reply is due, at the latest 5 ms after the last frame.
+        bus: of all motors, or that of each (4,). on_idle(now), `now` in monotonic s, is called whenever no reply is
+        due, at the latest 5 ms after the last frame.
         """
-        outbox: list[tuple[float, Frame]] = []  # replies by the time at which they are due, a heap
+        bus_of = list(bus) if isinstance(bus, Sequence) else [bus] * JOINT_COUNT
+        buses = list(dict.fromkeys(bus_of))
+        outbox: list[tuple[float, int, Frame]] = []  # a heap of replies: when due, joint, frame
         last = heard = time.monotonic()
         was_on = False
         boards = {joint: motor for joint, motor in enumerate(self.motors) if isinstance(motor, SimulatedV3Motor)}
@@ -145,7 +153,8 @@ class SimulatedDevice:
         reports = {joint: last + self._random.uniform(0.0, period) for joint, period in periods.items()}  # next
         while not should_stop():
             due = min(last + IDLE_PERIOD, *reports.values(), outbox[0][0] if outbox else math.inf)
-            frame, age = self._receive(bus, max(0.0, due - time.monotonic()))
+            source, wait = _next(buses, max(0.0, due - time.monotonic()))
+            frame, age = self._receive(source, wait)
             now = time.monotonic()
             is_on = self.powered
             if is_on and not was_on:
@@ -157,17 +166,19 @@ class SimulatedDevice:
             self.slip += max(0.0, now - last - MAX_CATCH_UP)
             self.advance(min(now - last, MAX_CATCH_UP))
             last = now
-            if frame and (reply := self.exchange(*frame)):
+            joint = self._joint_of_id[frame[0]] if frame else 0
+            if frame and bus_of[joint] is source and (reply := self.exchange(*frame)):
                 delay = self._random.uniform(*REPLY_DELAY) - min(age, REPLY_DELAY[0])
-                heapq.heappush(outbox, (now + delay, reply))
+                heapq.heappush(outbox, (now + delay, joint, reply))
             while outbox and outbox[0][0] <= time.monotonic():
-                _send(bus, heapq.heappop(outbox)[1])
+                _, joint, reply = heapq.heappop(outbox)
+                _send(bus_of[joint], reply)
             for joint, period in periods.items():
                 if reports[joint] <= last:
                     following = reports[joint] + period
                     reports[joint] = following if following > last else last + period  # missed ones are not made up
                     if frame := self.status(joint):
-                        _send(bus, frame)
+                        _send(bus_of[joint], frame)
             if not outbox:
                 on_idle(last)
 
@@ -231,6 +242,21 @@ class SimulatedDevice:
             self.truth.note(self.time, theta, velocity, torque, damping, given, self._frames, number, on)
         self.arm.step(list(map(operator.add, torque, given)), count)
         self._steps += count
+
+
+def _next(buses: list[can.BusABC], timeout: float) -> tuple[can.BusABC, float]:
+    """Return the bus to read next, and the time in s to wait for its frame; every bus has its turn.
+
+    Buses with sockets are awaited together, for at most `timeout` s.
+    """
+    if len(buses) == 1:
+        return buses[0], timeout
+    buses.append(buses.pop(0))
+    try:
+        ready = select.select(buses, (), (), timeout)[0]
+    except (OSError, ValueError, NotImplementedError):  # one has no socket
+        return buses[0], min(timeout, TURN)
+    return (ready or buses)[0], 0.0
 
 
 def _send(bus: can.BusABC, frame: Frame) -> None:

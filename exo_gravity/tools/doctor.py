@@ -144,17 +144,20 @@ def of_buses(nodes: Nodes, bridges: Mapping[str, Mapping[str, Any]], root: Path)
     bridges: the parameter values of each by its full name.
     """
     for node, values in bridges.items():
-        rate, channel, limits = values["rate"], values["can.channel"], limits_of(values)
         with named(f"{node} "):
-            traffic = traffic_of(values, can_options(nodes[node]))
-            check_bridge(rate, motors_of(values), limits, traffic.status_rate)
-        yield diagnosis.of_load(node, traffic, rate)
-        if values["can.interface"] == "socketcan":
-            folder, frames = root / NET / channel, round(len(values["motor"]) * limits.reply_timeout * rate)
-            is_up = bool(int(_text(folder / "flags") or "0", 16) & IFF_UP) if folder.exists() else None
-            queue = int(_text(folder / "tx_queue_len") or 0)
-            yield from diagnosis.of_interface(channel, is_up, queue, link_of(channel), traffic.bitrate, frames)
-    ports = {str(given.get(key, "")) for given in nodes.values() for key in ("can.channel", "serial.port")}
+            rate, limits, buses = values["rate"], limits_of(values), traffic_of(values, can_options(nodes[node]))
+            for bus in buses.values():
+                check_bridge(rate, motors_of(values), limits, bus.status_rate)
+        for channel, bus in buses.items():
+            yield diagnosis.of_load(f"{node} {channel}", bus, rate)
+            if values["can.interface"] == "socketcan":
+                motors = bus.replying + bus.reporting
+                folder, frames = root / NET / channel, round(motors * limits.reply_timeout * rate)
+                is_up = bool(int(_text(folder / "flags") or "0", 16) & IFF_UP) if folder.exists() else None
+                queue = int(_text(folder / "tx_queue_len") or 0)
+                yield from diagnosis.of_interface(channel, is_up, queue, link_of(channel), bus.bitrate, frames)
+    named_ports = (str(given.get(key, "")) for given in nodes.values() for key in ("can.channel", "serial.port"))
+    ports = {port.strip() for names in named_ports for port in names.split(",")}
     for port in sorted(port for port in ports if port.startswith("/dev/")):
         device = (root / port.partition("@")[0].lstrip("/")).resolve()
         folder = Path(USB_SERIAL, device.name)

@@ -15,6 +15,7 @@ from exo_gravity.core.motors.joint_motor import (
     STATUS,
     V3_COMMAND,
     Traffic,
+    buses_of,
     traffic_of,
 )
 from exo_gravity.core.motors.specs import MOTORS, MotorReply, pack_command, pack_reply
@@ -133,9 +134,39 @@ def test_status_frames_load_the_bus_at_their_own_rate_which_is_lower_on_a_slow_b
 
 @pytest.mark.parametrize("interface", ["gs_usb", "slcan"])
 def test_an_adapter_without_a_bit_rate_is_refused(interface):
-    values = {"can.interface": interface, "wire_format": ["mit", "mit", "mit", "mit_v3"]}
+    values = {"can.interface": interface, "can.channel": "c", "wire_format": ["mit", "mit", "mit", "mit_v3"]}
     with pytest.raises(ParameterError, match=rf"can.options.bitrate = None: must be set for {interface}"):
         traffic_of(values, {})
     with pytest.raises(ParameterError, match=r"can.options.bitrate = 5: must be a whole number from 10000"):
         traffic_of(values, {"bitrate": 5})
-    assert traffic_of(values, {"bitrate": 250_000}) == Traffic(3, 1, 250_000)
+    assert traffic_of(values, {"bitrate": 250_000}) == {"c": Traffic(3, 1, 250_000)}
+
+
+@pytest.mark.parametrize("board", ["mit", "mit_v3"])
+def test_each_of_two_buses_has_half_of_the_load_of_one(board):
+    values = {"can.interface": "socketcan", "wire_format": [board] * 4}
+    (one,) = traffic_of({**values, "can.channel": "can0"}, {}).values()
+    two = traffic_of({**values, "can.channel": "can0,can0,can1,can1"}, {})
+    assert list(two) == ["can0", "can1"]
+    for bus in two.values():
+        assert bus.load(1000.0) == pytest.approx(0.5 * one.load(1000.0))
+
+
+def test_motors_that_are_not_shared_evenly_load_their_own_bus():
+    values = {"can.interface": "slcan", "can.channel": "a, b,b, b", "wire_format": ["mit", "mit", "mit_v3", "mit_v3"]}
+    slow_and_fast = {"bitrate": [250_000, 1_000_000, 1_000_000, 1_000_000]}
+    assert traffic_of(values, slow_and_fast) == {"a": Traffic(1, 0, 250_000), "b": Traffic(1, 2, 1_000_000)}
+
+
+@pytest.mark.parametrize(
+    ("channel", "options", "problem"),
+    [
+        ("can0,can1", {}, "can.channel = 'can0,can1': must be one channel for all motors, or 4"),
+        ("can0,can0,,can1", {}, "can.channel"),
+        ("a,a,b,b", {"port": [1, 2]}, "can.options.port = .*one value, or 4"),
+        ("a,a,b,b", {"port": [1, 2, 3, 3]}, "the same for all motors on a"),
+    ],
+)
+def test_channels_and_options_that_are_not_one_per_motor_are_refused(channel, options, problem):
+    with pytest.raises(ParameterError, match=problem):
+        buses_of(channel, options)

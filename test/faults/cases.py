@@ -73,6 +73,7 @@ from .rigs import (
     WearerRig,
 )
 from .supply_cases import SUPPLY
+from .two_bus_cases import TWO_BUSES
 from .v3_cases import V3_BOARDS
 from .wearer_cases import ACTIVE_WEARER
 
@@ -253,5 +254,5 @@ ARMS = (
 # fmt: on
 CASES = (
     *(*HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *OUTER_LOOP, *CLOCK, *ARMS, *V3_BOARDS),
-    *(*RIDES, *OWNERSHIP, *LEASES, *OPERATOR, *ACTIVE_WEARER, *SUPPLY, *MONITOR),
+    *(*RIDES, *OWNERSHIP, *LEASES, *OPERATOR, *ACTIVE_WEARER, *SUPPLY, *MONITOR, *TWO_BUSES),
 )

@@ -37,10 +37,11 @@ class Rig:
 
     shipped_timeouts: whether the nodes have their default time-outs, or longer ones for a busy machine.
     bridge, compensator, simulator: the nodes' parameters, apart from those of the configuration `base`. one_process:
-    whether can_bridge and compensator of an arm share a process, in every rig of a run.
+    whether can_bridge and compensator of an arm share a process, in every rig of a run. two_buses: whether motors 3 and
+    4 are on a second bus.
     """
 
-    one_process = False
+    one_process = two_buses = False
     base = "sim.yaml"
     rate = 250.0  # Hz
     pose: Sequence[float] = RAISED
@@ -85,7 +86,8 @@ class Rig:
         return [self._nodes(without=SIMULATOR, port=port, can_bridge=bridge, compensator=self.compensator)]
 
     def _nodes(self, **options: Any) -> LaunchedNodes:
-        return LaunchedNodes(self.folder, base=self.base, timing=self.timing, one_process=self.one_process, **options)
+        share = {"one_process": self.one_process, "two_buses": self.two_buses}
+        return LaunchedNodes(self.folder, base=self.base, timing=self.timing, **share, **options)
 
     def bring_to(self, stage: str) -> None:
         """Clear what the last fault left and bring the arm to `stage`, a state of the bridge, in several attempts.

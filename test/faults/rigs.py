@@ -193,6 +193,16 @@ class V3Rig(Rig):
     simulator = bridge
 
 
+class TwoBusRig(Rig):
+    """Motors 3 and 4 are on a second bus."""
+
+    two_buses = True
+
+
+class TwoBusV3Rig(TwoBusRig, V3Rig):
+    """The same, with V3 boards."""
+
+
 class WallRig(Rig):
     """The elbow's upper limit is within reach of a push, and far from the mechanical stop."""
 

@@ -14,7 +14,8 @@ from pathlib import Path
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.drive import NOTHING, Drive
 from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, OwnedBus
+from exo_gravity.hardware.ownership.arm_on_bus import ArmOnBus
+from exo_gravity.hardware.ownership.owned_bus import OwnedBus
 
 
 def log(text: str) -> None:
@@ -27,14 +28,14 @@ def main(arm: ArmOnBus, drive: Drive) -> None:
     except BusError as error:
         log(str(error))
         raise SystemExit(1) from None
-    notes = owned.notes
-    bus = MotorBus(arm.open(), arm.motors, powered=True, note=notes.note)  # the rig has switched the motors on
+    ports = arm.ports(owned.lock.clock)
+    bus = MotorBus(ports, arm.motors, powered=True, note=owned.lock.note)  # the rig has switched the motors on
     is_announced = False
     while True:
         end = time.monotonic() + arm.period
         bus.exchange(drive, end)
-        if not is_announced and notes.heartbeat and all(joint.time > 0.0 for joint in bus.samples):
-            print(owned.watchdog.process.pid, flush=True)
+        if not is_announced and not owned.is_starting and all(joint.time > 0.0 for joint in bus.samples):
+            print(owned.watchdogs[0].process.pid, flush=True)
             is_announced = True
         time.sleep(max(0.0, end - time.monotonic()))
 

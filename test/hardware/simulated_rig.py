@@ -11,8 +11,9 @@ from typing import Any
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.motors.wire_formats import MIT, WireFormat
 from exo_gravity.core.safety.limits import Limits
+from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
-from exo_gravity.hardware.ownership.owned_bus import ArmOnBus
+from exo_gravity.hardware.ownership.arm_on_bus import ArmOnBus
 from exo_gravity.sim import ArmConfig
 
 from ..support.ports import own_ports
@@ -86,7 +87,7 @@ class SimulatedRig(Rig):
         super().__init__(friction, pose, carried, COMPUTER_CLOCK)
         self.arm = ArmOnBus((interface, channel, options), MOTORS_OF_ARM, LIMITS, PERIOD)
         self._stop = threading.Event()
-        self._bus = self.arm.open()
+        self._bus = open_bus(*self.arm.address)
         self._thread = threading.Thread(target=self.device.run, args=(self._bus, self._stop.is_set, self.note_speed))
         self._thread.start()
 

@@ -16,8 +16,9 @@ from exo_gravity.core.safety.drive import NOTHING, Drive, EffortCommand, State
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.hardware.ownership.bus_lock import DriveNotes
-from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, let_down
+from exo_gravity.hardware.ownership.arm_on_bus import ArmOnBus
+from exo_gravity.hardware.ownership.bus_lock import Address, DriveNotes
+from exo_gravity.hardware.ownership.owned_bus import let_down
 
 from .simulated_rig import LIMITS, POSE, Rig
 from .virtual_time import Wire
@@ -32,7 +33,7 @@ class VirtualArm(ArmOnBus):
 
     wire: Wire
 
-    def open(self) -> can.BusABC:
+    def open(self, address: Address) -> can.BusABC:
         return self.wire.open()
 
 
@@ -49,8 +50,14 @@ class VirtualRig(Rig):
     ) -> None:
         self.wire = Wire(echoes=echoes)
         super().__init__(friction, pose, carried, self.wire.clock, wire_format)
+        self.connect()
+
+    def connect(self) -> None:
+        """Connect the device to its wire."""
         self.wire.play(self.device, self.note_speed)
-        self.arm = VirtualArm(("wire", f"of process {os.getpid()}", {}), self.motors, LIMITS, CYCLE, self.wire)
+        self.arm: ArmOnBus = VirtualArm(
+            ("wire", f"of process {os.getpid()}", {}), self.motors, LIMITS, CYCLE, self.wire
+        )
 
     @property
     def drive(self) -> Drive:
@@ -88,14 +95,20 @@ class VirtualRig(Rig):
 class Carried:
     """An arm that a control loop carries in `POSE`, ACTIVE; options: those of the loop. drives: all that were noted."""
 
-    def __init__(self, echoes: bool = False, wire_format: WireFormat = MIT, **options: Callable[..., object]) -> None:
-        self.rig = VirtualRig(pose=NOTHING, carried=False, echoes=echoes, wire_format=wire_format)
+    def __init__(
+        self,
+        echoes: bool = False,
+        wire_format: WireFormat = MIT,
+        kind: type[VirtualRig] = VirtualRig,
+        **options: Callable[..., object],
+    ) -> None:
+        self.rig = kind(pose=NOTHING, carried=False, echoes=echoes, wire_format=wire_format)
         self.clock, self.wire = self.rig.clock, self.rig.wire
         self.drives: list[Drive] = []
-        self.motors = MotorBus(
-            self.wire.open(), self.rig.motors, note=self.drives.append, reopen=self.wire.open, clock=self.clock
-        )
-        self.safety = SafetyMachine(QUICK, CYCLE, self.rig.motors)
+        ports = self.rig.arm.ports(self.clock)
+        self.motors = MotorBus(ports, self.rig.motors, note=self.drives.append, clock=self.clock)
+        quick = replace(self.rig.arm.limits, sign_check_torque=0.0)
+        self.safety = SafetyMachine(quick, CYCLE, self.rig.motors)
         self.failure_of_efforts: Exception | None = None
         self._is_raised = False
         self.loop = ControlLoop(self.motors, self.safety, CYCLE, get_efforts=self._get_efforts, **options)

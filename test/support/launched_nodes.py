@@ -24,7 +24,7 @@ from .ports import own_ports
 Parameters = Mapping[str, Any]
 
 PORTS = own_ports(20_000)
-GROUP = "239.74.163.2"
+GROUP, SECOND_GROUP = "239.74.163.2", "239.74.163.3"  # the second is that of an arm's second bus
 NO_IMU: Parameters = {"use_imu": False}  # for the compensator, which then starts without waiting for a tilt
 FAST: Parameters = {"sign_check_torque": 0.0}
 # Rate and time-outs of config/sim.yaml, which suit a busy machine, and those of a real device.
@@ -51,8 +51,8 @@ class LaunchedNodes:
     base: the file in config/. without: nodes to leave out, by the last part of their names. port: of the bus, a new one
     by default; the left arm's bus has the next one. timing: rate and time-outs by node, `SIMULATED`, `CALM` or `REAL`.
     changes: of the parameters, by node, for both arms; they come last, after `FAST` for the bridge. truth: whether
-    simulators log the arm's true motion, at `truth_path`. one_process: of the launcher. The attribute `ended_node` is
-    what `Launcher.run` returned.
+    simulators log the arm's true motion, at `truth_path`. one_process: of the launcher. two_buses: whether motors 3 and
+    4 are on a bus of their own, with the next port. The attribute `ended_node` is what `Launcher.run` returned.
 
     Nodes that have started run before other processes, if permitted: others that start would keep them waiting.
     """
@@ -66,6 +66,7 @@ class LaunchedNodes:
         timing: Mapping[str, Parameters] = SIMULATED,
         truth: bool = False,
         one_process: bool = False,
+        two_buses: bool = False,
         **changes: Parameters,
     ) -> None:
         port = port or next(PORTS)
@@ -76,6 +77,9 @@ class LaunchedNodes:
             node, parameters = name.split("/")[-1], entry["ros__parameters"]
             if "can" in parameters:
                 parameters["can"]["options"]["port"] = port + name.startswith("/left")
+            if "can" in parameters and two_buses:
+                parameters["can"]["channel"] = ",".join((GROUP, GROUP, SECOND_GROUP, SECOND_GROUP))
+                parameters["can"]["options"]["port"] = [port, port, port + 1, port + 1]
             if truth and node == "simulator":
                 parameters["truth"] = str(self.truth_path(name))
             parameters.update(FAST if node == "can_bridge" else {})
@@ -85,7 +89,7 @@ class LaunchedNodes:
         assert not unknown, f"changes of nodes that are left out: {unknown}"
         self.bus: dict[str, Any] = {
             "interface": "udp_multicast",
-            "channel": "239.74.163.2",
+            "channel": GROUP,
             "port": port,
             "hop_limit": 0,
         }
@@ -138,15 +142,17 @@ class LaunchedNodes:
 
     def _end_watchdogs(self) -> None:
         """End watchdogs that retry without end, because their simulated motors are gone, and remove their notes."""
-        bus = f"{self.bus['channel']}_{self.bus['port']}.bus"
+        port = self.bus["port"]
+        own = ((GROUP, port), (SECOND_GROUP, port + 1))
+        names = [f"{group}_{port}.bus" for group, port in own]
         for process in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
                 if b"ownership.watchdog" in (process / "cmdline").read_bytes() and any(
-                    bus in os.readlink(descriptor) for descriptor in (process / "fd").iterdir()
+                    name in os.readlink(descriptor) for descriptor in (process / "fd").iterdir() for name in names
                 ):
                     os.kill(int(process.name), signal.SIGKILL)
-        for port in (self.bus["port"], self.bus["port"] + 1):
-            notes_file((self.bus["interface"], self.bus["channel"], {"port": port})).unlink(missing_ok=True)
+        for group, number in (*own, (GROUP, port + 1)):
+            notes_file((self.bus["interface"], group, {"port": number})).unlink(missing_ok=True)
 
 
 class LauncherProcess(LaunchedNodes):

@@ -11,7 +11,7 @@ from typing import Any
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.specs import MOTORS, WIRE_RANGE_BOUNDS, MotorReply, MotorSpec
 from exo_gravity.core.motors.wire_formats import FORMATS, MIT, Frame, WireFormat
-from exo_gravity.core.numbers import one_float
+from exo_gravity.core.numbers import JOINT_COUNT, one_float
 from exo_gravity.core.params import Param
 
 # In the format `mit` the first byte of a reply is the motor's ID. The position of our commands is 0, unless they hold a
@@ -111,7 +111,8 @@ SIMULATED_BUSES = ("udp_multicast", "virtual")  # interfaces of python-can that 
 # `can_bridge` assumes these properties of its motors; `simulator` builds motors that have them.
 MOTOR_PARAMETERS = (
     Param("can.interface", "", "python-can interface, e.g. socketcan, udp_multicast", fixed=True, required=True),
-    Param("can.channel", "", "python-can channel, e.g. can0", fixed=True, required=True),
+    Param("can.channel", "", "python-can channel, e.g. can0; with two buses one per motor, e.g. can0,can0,can1,can1",
+          fixed=True, required=True),
     Param("motor", ["AK60-6", "AK80-9", "AK60-6", "AK60-6"], "motor types", choices=tuple(MOTORS), fixed=True),
     Param("can_id", [1, 2, 3, 4], "CAN IDs", (1, MAX_CAN_ID), fixed=True),
     Param("direction", [1, 1, 1, 1], "1 or -1: joint angle = direction * (motor angle - zero)", (-1, 1), fixed=True),
@@ -134,6 +135,34 @@ def motors_of(values: Mapping[str, Any]) -> tuple[JointMotor, ...]:
     if len(set(ids)) != len(ids):
         raise ParameterError("can_id", ids, "4 different IDs")
     return tuple(_motor_of({name: values[name][joint] for name in _OF_A_MOTOR}) for joint in range(len(ids)))
+
+
+def channels_of(channel: str) -> list[str]:
+    """Return the channel of each motor (4,) that the value of `can.channel` names. Raises ParameterError."""
+    names = [name.strip() for name in channel.split(",")]
+    if len(names) not in (1, JOINT_COUNT) or not all(names):
+        expected = f"one channel for all motors, or {JOINT_COUNT} with commas between them, one for each motor"
+        raise ParameterError("can.channel", channel, expected)
+    return names * (JOINT_COUNT // len(names))
+
+
+def buses_of(channel: str, options: Mapping[str, Any]) -> dict[str, tuple[list[int], dict[str, Any]]]:
+    """Return the motors (0..3) on each bus, by its channel, and its options for python-can. Raises ParameterError.
+
+    An option that is a list has an entry for each motor.
+    """
+    buses: dict[str, tuple[list[int], dict[str, Any]]] = {}
+    for joint, name in enumerate(channels_of(channel)):
+        own = {}
+        for key, value in options.items():
+            if isinstance(value, list) and len(value) != JOINT_COUNT:
+                raise ParameterError(f"{OPTIONS}.{key}", value, f"one value, or {JOINT_COUNT}, one for each motor")
+            own[key] = value[joint] if isinstance(value, list) else value
+        motors, first = buses.setdefault(name, ([], own))
+        if own != first:
+            raise ParameterError(OPTIONS, dict(options), f"the same for all motors on {name}")
+        motors.append(joint)
+    return buses
 
 
 def _motor_of(given: Mapping[str, Any]) -> JointMotor:
@@ -201,10 +230,17 @@ class Traffic:
             )
 
 
-def traffic_of(values: Mapping[str, Any], options: Mapping[str, Any]) -> Traffic:
-    """Return the traffic on the bus of the four motors; options: those of python-can. Raises ParameterError."""
-    interface, bitrate = values["can.interface"], options.get("bitrate")
-    if bitrate is None and interface in NEED_BITRATE:
-        raise ParameterError(f"{OPTIONS}.bitrate", bitrate, f"set for {interface}, as on the motors, e.g. {BITRATE}")
-    replying = sum(FORMATS[name].replies for name in values["wire_format"])
-    return Traffic(replying, len(values["wire_format"]) - replying, bitrate or BITRATE)
+def traffic_of(values: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Traffic]:
+    """Return the traffic on each bus of the four motors, by its channel; options: of python-can.
+
+    Raises ParameterError.
+    """
+    traffic, interface = {}, values["can.interface"]
+    for name, (motors, own) in buses_of(values["can.channel"], options).items():
+        bitrate = own.get("bitrate")
+        if bitrate is None and interface in NEED_BITRATE:
+            expected = f"set for {interface}, as on the motors, e.g. {BITRATE}"
+            raise ParameterError(f"{OPTIONS}.bitrate", bitrate, expected)
+        replying = sum(FORMATS[values["wire_format"][joint]].replies for joint in motors)
+        traffic[name] = Traffic(replying, len(motors) - replying, bitrate or BITRATE)
+    return traffic

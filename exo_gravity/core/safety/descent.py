@@ -19,12 +19,13 @@ arm comes to rest, and recovers slowly. A joint is down when s is zero and k hol
 something.
 
 A motor that cannot be reached keeps applying its torque, so s and k of a silent joint are held. When it replies again,
-s continues from the torque that it reports.
+and has received these, they go on; else s continues from the torque that it reports.
 """
 
 import math
 from collections.abc import Sequence
 
+from exo_gravity.core.safety.delivery import ABSOLUTE, RELATIVE
 from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE, JointSample
 
 REST_TIME = 2.0  # s at rest with nothing holding the arm, until it is down
@@ -138,7 +139,9 @@ class ArmDescent:
     def step(self, now: float, dt: float, samples: Sequence[JointSample], silent: Sequence[bool]) -> None:
         """Advance by `dt` s to `now` (s) with the newest readings; silent: (4,) whose motor does not reply."""
         for joint, sample, is_silent, was_silent in zip(self._joints, samples, silent, self._silent, strict=True):
-            if was_silent and not is_silent:
+            expected = joint.effort - joint.damping * sample.velocity
+            is_obeying = abs(sample.effort - expected) <= ABSOLUTE + RELATIVE * abs(expected)
+            if was_silent and not is_silent and not is_obeying:
                 joint.restart(sample.effort)
             elif not is_silent:
                 joint.step(dt, sample.velocity)

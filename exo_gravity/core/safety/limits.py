@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import MAX_MOMENT
-from exo_gravity.core.motors.joint_motor import MAX_STATUS_RATE, MOTOR_PARAMETERS, REPLY_SHARE, JointMotor
+from exo_gravity.core.motors.joint_motor import MAX_STATUS_RATE, MOTOR_PARAMETERS, REPLY_SHARE, JointMotor, channels_of
 from exo_gravity.core.motors.specs import MOTOR_ERRORS, MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, check_owned, owned, params_of
@@ -96,6 +96,7 @@ class Limits:
     )
     #: (4,) rad from `home` at the first start; `limits_of` takes it from the motors
     home_tolerance: Sequence[float] = tuple(HOME_TOLERANCE[name] for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6"))
+    channels: Sequence[str] = ("",) * JOINT_COUNT  #: of the motors' buses
     #: (4,) rad, the hanging arm, from which joint angles are measured
     home: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0, 0.0)
 
@@ -194,6 +195,7 @@ CAN_BRIDGE = (
 def limits_of(values: Mapping[str, Any]) -> Limits:
     """Return the limits that `can_bridge`'s parameter values describe, or raise ParameterError."""
     given = {param.name: values[param.name] for param in LIMIT_PARAMETERS}
+    given["channels"] = channels_of(values["can.channel"])
     given["home_tolerance"] = tuple(HOME_TOLERANCE[name] for name in values["motor"])
     given["reply_timeout"] = min(2.0 * REPLY_TIMEOUT, max(REPLY_TIMEOUT, MISSED / values["rate"]))
     return Limits(tuple(values["joint_names"]), **given)

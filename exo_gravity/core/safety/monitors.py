@@ -72,8 +72,11 @@ class Readings:
         asked = zip(joints, self._missed, strict=True)
         self.silent = [missed >= MISSED and limits.is_silent(now, joint) for joint, missed in asked]
         if any(self.silent):
-            name = limits.joint_names[self.silent.index(True)]
+            name, buses = limits.joint_names[self.silent.index(True)], set(limits.channels)
+            replying = {bus for bus, missed in zip(limits.channels, self._missed, strict=True) if missed < MISSED}
             reason = f"{name}: no reply for more than {limits.reply_timeout * 1000:.0f} ms"
+            if len(buses) > 1 and (dead := buses - replying):
+                reason += f"; no motor on {' and '.join(sorted(dead))} replies: the bus is lost, or the supply is cut"
             self.fault = Fault(FaultCode.MOTOR_SILENT, reason)
         self._now = now
 

@@ -45,6 +45,41 @@ class MotorAnswer(NamedTuple):
     wire_format: str = MIT.name  #: Name of the board's format.
 
 
+class ArmScan(contextlib.ExitStack):
+    """The scans of all buses of an arm, as one. addresses: of the buses. Raises BusError like `BusScan`."""
+
+    def __init__(self, addresses: Iterable[Address]) -> None:
+        super().__init__()
+        self.channels: dict[int, str] = {}  #: of each motor that has answered, by ID
+        self._scans: dict[str, BusScan] = {}
+        try:
+            for address in addresses:
+                self._scans[address[1]] = self.enter_context(BusScan(address))
+        except BaseException:
+            self.close()
+            raise
+        self.name = " and ".join(self._scans)
+
+    def scan(self) -> tuple[tuple[MotorAnswer, ...], tuple[str, ...]]:
+        """Ask every ID on each bus; return who answers, by ID, and what is wrong. Raises BusError."""
+        answers: dict[int, MotorAnswer] = {}
+        problems: list[str] = []
+        for channel, scan in self._scans.items():
+            found, own = scan.scan()
+            twice = (answer.can_id for answer in found if answer.can_id in answers)
+            problems += [*own, *(f"ID {can_id}: on two buses; give one motor another ID" for can_id in twice)]
+            answers |= {answer.can_id: answer for answer in found}
+            self.channels |= dict.fromkeys((answer.can_id for answer in found), channel)
+        return tuple(answers[can_id] for can_id in sorted(answers)), tuple(problems)
+
+    def poll(self, can_ids: Iterable[int]) -> dict[int, MotorAnswer]:
+        """Return the newest answer of each of these motors; a silent one is missing. Raises BusError."""
+        wanted, found = list(can_ids), dict[int, MotorAnswer]()
+        for channel, scan in self._scans.items():
+            found |= scan.poll([can_id for can_id in wanted if self.channels[can_id] == channel])
+        return found
+
+
 class BusScan(contextlib.ExitStack):
     """Owns the bus at `address` until `close`, so that no bridge can start meanwhile.
 

@@ -9,8 +9,9 @@ process (Documentation/networking/can.rst of Linux, MSG_DONTROUTE): there it doe
 """
 
 import contextlib
+import select
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from operator import methodcaller
 from typing import Any, TypeVar
@@ -26,6 +27,7 @@ from exo_gravity.hardware.clock import Clock
 REOPEN_AFTER = 0.02  # s of failures in a row after which the bus is opened again
 REOPEN_PERIOD = 0.1  # s between two attempts
 MOST_AWAITED = 512  # echoes; twice the frames that a udp_multicast socket keeps unread
+TURN = 0.0005  # s for which one of several buses is awaited that cannot be awaited together
 MAX_STALE_FRAMES = 256  # the capacity of udp_multicast, more than any cycle produces
 Result = TypeVar("Result")
 
@@ -70,6 +72,10 @@ class CanPort:
     def receive(self, timeout: float) -> can.Message | None:
         """Return the next frame, or None if there is none within `timeout` s. Raises BusError."""
         return self._guarded(lambda bus: bus.recv(timeout))
+
+    def fileno(self) -> int:
+        """Return the descriptor of the bus's socket; -1 if it has none, or keeps frames that it has read."""
+        return self._bus.fileno() if isinstance(self._bus, SocketcanBus | UdpMulticastBus) else -1
 
     def waiting(self) -> Iterator[can.Message]:
         """Yield the frames that have already arrived, but not forever: others may keep sending. Raises BusError.
@@ -133,6 +139,19 @@ class CanPort:
         self._failing_since, self._bus = None, bus
         if self._is_closing:
             _close(bus)
+
+
+def awaited(ports: Sequence[CanPort], timeout: float) -> tuple[Sequence[CanPort], float]:
+    """Return the ports to read next, and the time in s to wait for a frame of each.
+
+    Sockets are awaited together, for at most `timeout` s; other buses in turn.
+    """
+    if len(ports) == 1:
+        return ports, timeout
+    try:
+        return select.select(ports, (), (), timeout)[0], 0.0
+    except (OSError, ValueError):  # one has no socket, or is being opened again
+        return ports, min(timeout, TURN)
 
 
 def _has_lines(bus: can.BusABC) -> bool:

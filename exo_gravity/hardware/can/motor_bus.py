@@ -1,4 +1,7 @@
-"""The AK motors of one arm on one python-can bus, in MIT mode: command all, collect the replies until a deadline.
+"""The AK motors of one arm, in MIT mode: command all, collect the replies until a deadline.
+
+They are on one python-can bus or on several. All buses are sent their commands before the replies of all are awaited.
+One that fails does not keep the others from theirs.
 
 The wire formats of the boards (core/wire_formats) may differ. A motor of V1 and V2 boards replies only when commanded,
 200-400 us later. A V3 board sends status frames on its own timer: the first one after a command is its reply.
@@ -19,17 +22,16 @@ import contextlib
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from itertools import chain
 
 import can
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, REPLY, Frame
+from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, REPLY, Frame, WireFormat
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import OFF, Drive
 from exo_gravity.core.safety.limits import DAMPING, UNKNOWN, JointSample
-from exo_gravity.hardware.can.can_port import CanPort
+from exo_gravity.hardware.can.can_port import CanPort, awaited
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
 EXIT_PERIOD = 0.5  # s between two EXIT frames to motors that are off, in case one was lost,
@@ -44,18 +46,20 @@ HOLD_STIFFNESS = 60.0  # Nm/rad by which a contested motor holds its joint: the 
 HOLD_REACH = 0.15  # rad at most from where the joint is,
 HOLD_SPEED = 0.3  # rad/s with which the held position follows the joint
 FOREIGN_COMMAND = "foreign command"
+HELD_ELSEWHERE = JointSample(0.0, 0.0, 0.0, None, None, -math.inf)  # a joint of which another process takes care
 
 
 class MotorBus:
-    """Four motors with different IDs on one bus. Not thread-safe: one thread owns it.
+    """Four motors with different IDs. Not thread-safe: one thread owns it.
 
-    powered: whether the motors are already on. note: called with each drive before its frames are sent. reopen: opens
-    the bus again after a failure. clock: of all times.
+    bus: of all motors; or the port of each (4,), None if another process takes care of it: such a joint counts as at
+    rest, without torque. powered: whether the motors are already on. note: called with each drive before its frames are
+    sent. reopen: opens `bus` again after a failure. clock: of all times.
     """
 
     def __init__(
         self,
-        bus: can.BusABC,
+        bus: can.BusABC | Sequence[CanPort | None],
         motors: Sequence[JointMotor],
         powered: bool = False,
         note: Callable[[Drive], None] = lambda drive: None,
@@ -69,15 +73,20 @@ class MotorBus:
         self.foreign_command = ""  #: the last of them, in words
         self.clock = clock
         self._now = clock.monotonic
-        self._port = CanPort(bus, clock, reopen)
+        self._ports = [CanPort(bus, clock, reopen)] * JOINT_COUNT if isinstance(bus, can.BusABC) else list(bus)
+        self._buses = list(dict.fromkeys(port for port in self._ports if port))
+        self._failed: dict[CanPort, BusError] = {}  # in this cycle
         self._motors = tuple(motors)
-        boards = {motor.wire_format for motor in motors}
-        self._ids = {board: frozenset(m.can_id for m in motors if m.wire_format == board) for board in boards}
-        self._asked = frozenset(joint for joint, motor in enumerate(motors) if motor.wire_format.replies)
+        self._joints = frozenset(joint for joint, port in enumerate(self._ports) if port)  # on these buses
+        ids: dict[tuple[CanPort | None, WireFormat], list[int]] = {}
+        for port, motor in zip(self._ports, motors, strict=True):
+            ids.setdefault((port, motor.wire_format), []).append(motor.can_id)
+        self._ids = [(port, board, frozenset(can_ids)) for (port, board), can_ids in ids.items()]
+        self._asked = frozenset(joint for joint in self._joints if motors[joint].wire_format.replies)
         self._joint_of = {motor.can_id: joint for joint, motor in enumerate(motors)}
         self._powered = powered
         self._unsure: Sequence[bool] = (False,) * JOINT_COUNT  # of the last powered drive
-        self._unconfirmed = set(range(JOINT_COUNT)) if powered else set()  # not known to be off
+        self._unconfirmed = set(self._joints) if powered else set()  # not known to be off
         self._drive = OFF  # last sent
         self._corrected = [-math.inf] * JOINT_COUNT  # s
         self._contested = [-math.inf] * JOINT_COUNT  # s of the last foreign command to the motor
@@ -99,49 +108,70 @@ class MotorBus:
 
     def listen(self) -> None:
         """Listen before the first frame. Raises BusError if another host commands these motors."""
+        self._failed.clear()
         end = self._now() + LISTEN_TIME
         self.receive_until(end - LISTEN_TIME + SETTLING_TIME)
         self._answered.clear()
         self.foreign_commands = 0
         self.receive_until(end)
+        self._raise_failure()
         replies = self._answered & self._asked
         if self.foreign_commands or replies:
             heard = self.foreign_command or f"motor {self._motors[min(replies)].can_id} replies to another host"
-            raise BusError(f"CAN bus {self._port.name} is in use: {heard}; stop the other commander first")
+            names = " or ".join(port.name for port in self._buses)
+            raise BusError(f"CAN bus {names} is in use: {heard}; stop the other commander first")
 
     def exchange(self, drive: Drive, deadline: float) -> bool:
         """Send every motor its part of `drive`, then collect replies until all arrived or `deadline` (s).
 
         Switches the motors on or off when `drive.powered` changes. Returns whether all motors replied in time. Raises
-        BusError if the bus fails.
+        BusError if a bus fails, once the others have had their part.
         """
+        self._failed.clear()
         if drive.powered:
             self._unsure = drive.unsure
-            self._unconfirmed.update(joint for joint, is_unsure in enumerate(drive.unsure) if not is_unsure)
+            self._unconfirmed.update(joint for joint in self._joints if not drive.unsure[joint])
         self._note(drive._replace(powered=self.may_be_powered))
         self._is_confirming = not self._powered and self._exit_sent > -math.inf
-        for message in self._port.waiting():  # replies that arrived after their cycle are not replies to this one
-            self._take(message)
+        for port in self._buses:  # replies that arrived after their cycle are not replies to this one
+            try:
+                for message in port.waiting():
+                    self._take(port, message)
+            except BusError as error:
+                self._failed[port] = error
         if drive.powered and not self._powered:
             self._powered, self._exit_sent = True, -math.inf
             if not any(drive.unsure):
                 self._send_commands(OFF)
-                for motor in self._motors:
-                    self._port.send(*motor.enter)
+                for joint, motor in enumerate(self._motors):
+                    self._send(joint, *motor.enter)
         self._send_commands(drive)
         if not drive.powered:
             self._switch_off()
         self._answered.clear()
-        self.receive_until(deadline, lambda: len(self._answered) == JOINT_COUNT)
-        self._port.confirm()
-        return len(self._answered) == JOINT_COUNT
+        count = len(self._joints)
+        self.receive_until(deadline, lambda: len(self._answered) == count)
+        for port in self._buses:
+            if port not in self._failed:
+                port.confirm()
+        if count < JOINT_COUNT:
+            elsewhere = HELD_ELSEWHERE._replace(time=max(self.samples[joint].time for joint in self._joints))
+            self.samples[:] = (self.samples[i] if i in self._joints else elsewhere for i in range(JOINT_COUNT))
+        self._raise_failure()
+        return len(self._answered) == count
 
     def receive_until(self, deadline: float, is_done: Callable[[], bool] = lambda: False) -> None:
-        """Receive until `deadline` (s) or `is_done()`, and answer foreign commands. Raises BusError."""
+        """Receive until `deadline` (s) or `is_done()`, and answer foreign commands. Raises BusError if all fail."""
         while not is_done() and (remaining := deadline - self._now()) > 0.0:
-            message = self._port.receive(remaining)
-            if message is not None:
-                self._take(message)
+            if not (working := [port for port in self._buses if port not in self._failed]):
+                self._raise_failure()
+            ports, timeout = awaited(working, remaining)
+            for port in ports:
+                try:
+                    if message := port.receive(timeout):
+                        self._take(port, message)
+                except BusError as error:
+                    self._failed[port] = error
 
     def set_zero(self) -> None:
         """Make the present pose every motor's zero; only while they are off. They are silent for up to 1.5 s."""
@@ -151,7 +181,9 @@ class MotorBus:
         if not all(frames):
             raise BusError(f"set_zero: motor {self._motors[frames.index(())].can_id} has a board without such a frame")
         self._send_commands(OFF)
-        self._port.send(*chain.from_iterable(frames))
+        for joint, own in enumerate(frames):
+            self._send(joint, *own)
+        self._raise_failure()
 
     def stop(self) -> None:
         """Send the last frames, a zero command and EXIT, twice; then close the bus. Never raises.
@@ -163,25 +195,42 @@ class MotorBus:
             self._is_confirming = True
             for joint, motor in enumerate(self._motors):
                 for frame in (*self._zero_command(joint), *motor.exit):
-                    with contextlib.suppress(BusError):
-                        self._port.send(frame)
+                    self._failed.clear()  # each is tried
+                    self._send(joint, frame)
+            self._failed.clear()
             self._powered, self._exit_sent = False, self._now()
             end = self._exit_sent + LAST_REPLIES
             with contextlib.suppress(BusError):
                 self.receive_until(end, lambda: not self._unconfirmed)
         if not self._unconfirmed:
             self._note(OFF)
-        self._port.close()
+        self.close()
 
     def close(self) -> None:
-        """Close the bus without any frame. Never raises."""
-        self._port.close()
+        """Close the buses without any frame. Never raises."""
+        for port in self._buses:
+            port.close()
+
+    def _send(self, joint: int, *frames: Frame) -> None:
+        """Send frames on the bus of a motor, unless that has failed in this cycle."""
+        port = self._ports[joint]
+        if port and port not in self._failed:
+            try:
+                port.send(*frames)
+            except BusError as error:
+                self._failed[port] = error
+
+    def _raise_failure(self) -> None:
+        for error in self._failed.values():
+            raise error
 
     def _switch_off(self) -> None:
         period = UNCONFIRMED_EXIT_PERIOD if self._unconfirmed else EXIT_PERIOD
         if self._powered or self._now() - self._exit_sent > period:
             for joint, motor in enumerate(self._motors):
-                self._port.send(*(() if joint in self._asked else self._zero_command(joint)), *motor.exit)
+                self._send(joint, *(() if joint in self._asked else self._zero_command(joint)), *motor.exit)
+            if self._failed:
+                return  # no reply confirms an EXIT that was not sent
             self._exit_sent = self._now()
         self._powered = False
 
@@ -199,26 +248,28 @@ class MotorBus:
                 continue
             command = self._command(joint, now)
             if drive.enter[joint]:
-                self._port.send(command, *motor.enter)
-            self._port.send(command)
+                self._send(joint, command, *motor.enter)
+            self._send(joint, command)
 
-    def _sort(self, message: can.Message) -> tuple[str, int]:
+    def _sort(self, port: CanPort, message: can.Message) -> tuple[str, int]:
         """Return REPLY or FOREIGN_COMMAND with the motor's ID, or the kind of a frame that does not matter with 0."""
         if message.is_error_frame:
             return "error frame", 0
         if message.is_remote_frame or message.is_fd:
             return "remote or FD frame", 0
         frame_id = message.arbitration_id | EXTENDED if message.is_extended_id else message.arbitration_id
-        for board, can_ids in self._ids.items():
+        for own, board, can_ids in self._ids:
+            if own is not port:
+                continue
             kind, can_id = board.classify(frame_id, message.data, can_ids)
             if kind == REPLY:
                 return kind, can_id
             if kind == COMMAND:
-                return ("echo", 0) if self._port.is_echo(message) else (FOREIGN_COMMAND, can_id)
+                return ("echo", 0) if port.is_echo(message) else (FOREIGN_COMMAND, can_id)
         return "foreign frame", 0
 
-    def _take(self, message: can.Message) -> None:
-        kind, can_id = self._sort(message)
+    def _take(self, port: CanPort, message: can.Message) -> None:
+        kind, can_id = self._sort(port, message)
         if kind != REPLY:
             self.ignored[kind] += 1
             if kind == FOREIGN_COMMAND:
@@ -270,5 +321,5 @@ class MotorBus:
         command = self._command(joint, now)
         is_exit = foreign in [data for _, data in motor.exit]
         if is_exit or now - self._corrected[joint] >= CORRECTION_PERIOD:
-            self._port.send(*((command, *motor.enter) if is_exit else ()), command)
+            self._send(joint, *((command, *motor.enter) if is_exit else ()), command)
             self._corrected[joint] = now

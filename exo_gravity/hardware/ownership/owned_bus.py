@@ -1,4 +1,7 @@
-"""A bus that this process owns: its lock, its watchdog, and what a previous owner left behind.
+"""The bus of an arm, or its buses, that this process owns: locks, watchdogs, and what a previous owner left behind.
+
+Each bus has a lock, notes and a watchdog of its own. If the bridge dies, each watchdog lets down the joints on its bus,
+at the same time; a bus that cannot be opened keeps none of the others waiting.
 
 AK motors keep applying the last command: an arm that another process has left with its motors on is let down. The
 watchdog does it for a bridge that has died, and a new bridge does it if both had died.
@@ -8,22 +11,17 @@ import contextlib
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from multiprocessing import Pipe
 
-import can
-
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.delivery import ABSOLUTE, RELATIVE
-from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.hardware.ownership.bus_lock import ATTEMPT_TIME, Address, BusLock, DriveNotes
+from exo_gravity.hardware.ownership.arm_on_bus import ArmLock, ArmOnBus
+from exo_gravity.hardware.ownership.bus_lock import ATTEMPT_TIME, BusLock, DriveNotes
 
 OPEN_PERIOD = 0.05  # s between two attempts to open the bus
 FIRST_REPLIES = 0.05  # s in which the motors must reply to the first commands
@@ -33,30 +31,18 @@ LONGEST_LOOK = 0.15  # s between two looks of a process that runs
 END_TIME = 2.0  # s for the watchdog to end after `close`
 
 
-@dataclass(frozen=True)
-class ArmOnBus:
-    """An arm that may have to be let down, and how to reach it."""
-
-    address: Address  #: Of its bus.
-    motors: Sequence[JointMotor]  #: From shoulder to elbow.
-    limits: Limits  #: That it must never exceed.
-    period: float  #: s of a control cycle.
-
-    def open(self) -> can.BusABC:
-        """Open the bus. Raises BusError."""
-        return open_bus(*self.address)
-
-
-def let_down(arm: ArmOnBus, notes: DriveNotes, log: Callable[[str], None], is_wanted: Callable[[], bool]) -> bool:
+def let_down(
+    arm: ArmOnBus, notes: DriveNotes | ArmLock, log: Callable[[str], None], is_wanted: Callable[[], bool]
+) -> bool:
     """Let down an arm whose motors apply what is noted; return whether its motors have confirmed that they are off.
 
     log: called with each change worth knowing. is_wanted: whether to give up, because someone else waits for the bus,
     while the bus or a motor cannot be reached.
     """
-    bus, is_logged = None, False
-    while bus is None:
+    ports, is_logged = None, False
+    while ports is None:
         try:
-            bus = arm.open()
+            ports = arm.ports(notes.clock)
         except BusError as error:
             if not is_logged:
                 log(f"{error}; the motors may still be powered")
@@ -65,7 +51,7 @@ def let_down(arm: ArmOnBus, notes: DriveNotes, log: Callable[[str], None], is_wa
                 return False
             notes.clock.sleep(OPEN_PERIOD)
     drive, clock, is_complete = notes.drive, notes.clock, False
-    motors = MotorBus(bus, arm.motors, powered=True, note=notes.note, reopen=arm.open, clock=clock)
+    motors = MotorBus(ports, arm.motors, powered=True, note=notes.note, clock=clock)
     first = drive._replace(powered=True, unsure=(True,) * len(drive.effort))
     end = clock.monotonic() + FIRST_REPLIES
     while not is_complete and clock.monotonic() < end:
@@ -116,7 +102,7 @@ class Silence:
 
 
 class Watchdog:
-    """The bridge's end: the watchdog process of `arm`, on the bus that `lock` holds."""
+    """The bridge's end: the watchdog process of `arm`, or of its part, on the bus that `lock` holds."""
 
     def __init__(self, lock: BusLock, arm: ArmOnBus) -> None:
         self._notes = lock.notes
@@ -170,7 +156,7 @@ class Watchdog:
 
 
 class OwnedBus:
-    """The bus of `arm`, locked for `owner` (shown to others who want the bus) until `close`.
+    """The bus of `arm`, or its buses, locked for `owner` (shown to others who want a bus) until `close`.
 
     If the previous owner and its watchdog ended while the motors were on, that arm is let down first. log: called with
     what happens then. Raises BusError if the bus is held or cannot be opened, or if that arm cannot be let down.
@@ -178,14 +164,14 @@ class OwnedBus:
 
     def __init__(self, arm: ArmOnBus, owner: str, log: Callable[[str], None], clock: Clock = COMPUTER_CLOCK) -> None:
         self._arm = arm
-        self._lock = take_over(arm, owner, log, ATTEMPT_TIME, clock)
-        self.notes = self._lock.notes  #: what the motors receive, for a process that outlives this one
-        self.watchdog = Watchdog(self._lock, arm)
+        #: the locks, and what the motors receive, for processes that outlive this one
+        self.lock = take_over(arm, owner, log, ATTEMPT_TIME, clock)
+        self.watchdogs = _watchdogs(self.lock)
 
     def open(self) -> MotorBus:
         """Open the bus. Raises BusError if it cannot be opened, or if another host commands the motors."""
-        arm = self._arm
-        bus = MotorBus(arm.open(), arm.motors, note=self.notes.note, reopen=arm.open, clock=self.notes.clock)
+        ports = self._arm.ports(self.lock.clock)
+        bus = MotorBus(ports, self._arm.motors, note=self.lock.note, clock=self.lock.clock)
         try:
             bus.listen()
         except BusError:
@@ -193,30 +179,52 @@ class OwnedBus:
             raise
         return bus
 
+    @property
+    def is_starting(self) -> bool:
+        """Whether a watchdog does not watch yet: no motor may be switched on."""
+        return any(watchdog.is_starting for watchdog in self.watchdogs)
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether every watchdog runs. Read it several times a second."""
+        alive = [watchdog.alive for watchdog in self.watchdogs]  # each has to look
+        return all(alive)
+
+    def hand_over(self, reason: str) -> bool:
+        """Request the watchdogs to kill this process and let the arm down; return whether one is alive."""
+        taken = [watchdog.hand_over(reason) for watchdog in self.watchdogs]
+        return any(taken)
+
     def close(self) -> None:
-        """End the watchdog and release the bus, after the motors were switched off."""
-        self.watchdog.close()
-        self._lock.release()
+        """End the watchdogs and release the bus, after the motors were switched off."""
+        for watchdog in self.watchdogs:
+            watchdog.close()
+        self.lock.release()
+
+
+def _watchdogs(lock: ArmLock) -> list[Watchdog]:
+    return [Watchdog(own, part) for own, part in lock.locks]
 
 
 def take_over(
     arm: ArmOnBus, owner: str, log: Callable[[str], None], patience: float = ATTEMPT_TIME, clock: Clock = COMPUTER_CLOCK
-) -> BusLock:
-    """Lock the bus for `owner`, and let down the arm that its last owner left with its motors on.
+) -> ArmLock:
+    """Lock each bus for `owner`, and let down the arm that its last owner left with its motors on.
 
     patience: s for that owner's watchdog to do so first. If the arm cannot be reached, a watchdog stays and keeps
     trying, until the next owner asks for the bus. Raises BusError.
     """
-    lock = BusLock(arm.address, owner, patience, clock, asks=True)
+    lock = ArmLock(arm, owner, patience, clock)
     try:
-        drive = lock.notes.drive
-        if lock.problem:
-            log(f"it is not known what the motors apply, they may be on ({lock.problem}): letting the arm down")
-        elif drive.powered:
+        drive, problems = lock.drive, [own.problem for own, _ in lock.locks if own.problem]
+        for problem in problems:
+            log(f"it is not known what the motors apply, they may be on ({problem}): letting the arm down")
+        if drive.powered and not problems:
             log("the last can_bridge on this bus and its watchdog ended with the motors on: letting the arm down")
         if drive.powered:
-            if not let_down(arm, lock.notes, log, lambda: True):
-                Watchdog(lock, arm).close()
+            if not let_down(arm, lock, log, lambda: True):
+                for watchdog in _watchdogs(lock):
+                    watchdog.close()
                 raise BusError(f"CAN bus {arm.address[1]}: a motor that may be powered does not reply")
             log("the arm is down, its motors are off")
         return lock

@@ -1,4 +1,4 @@
-"""The watchdog: a process that lets the arm down when its bridge dies, freezes or hands it over.
+"""The watchdog: a process that lets the arm down when its bridge dies, freezes or hands it over. One for each bus.
 
 It shares the notes of the bus with the bridge, and a pipe, which breaks when the bridge dies for any reason. It
 inherits the lock of the bus. If the motors were on, it continues from the last noted drive. A bridge that is alive but
@@ -29,8 +29,9 @@ import can
 
 from exo_gravity.core.safety.limits import FROZEN
 from exo_gravity.hardware.clock import favour
+from exo_gravity.hardware.ownership.arm_on_bus import ArmOnBus
 from exo_gravity.hardware.ownership.bus_lock import DriveNotes, is_asked_for, remove_notes
-from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, Silence, let_down
+from exo_gravity.hardware.ownership.owned_bus import Silence, let_down
 
 POLL = 0.01  # s
 LOG_TIME = 1.0  # s for the last lines of the log
@@ -80,9 +81,9 @@ def guard(
         log(f"can_bridge {why}: its motors may still be powered")
         return 1
     notes.owner = f"the watchdog (PID {os.getpid()}) of {notes.owner}; it is letting the arm down, wait until it ends"
-    log(f"can_bridge {why}: letting the arm down")
+    log(f"can_bridge {why}: letting {arm.name} down")
     if let_down(arm, notes, log, is_wanted):
-        log("the arm is down, its motors are off")
+        log(f"{arm.name} is down, its motors are off")
         return 0
     log("the motors may still be powered: the next can_bridge takes the bus over, and lets the arm down")
     return 1
@@ -124,8 +125,13 @@ def main() -> None:
     log: SimpleQueue[str] = SimpleQueue()
     writer = threading.Thread(target=write_log, args=(log,), daemon=True)
     writer.start()
+
+    def kill() -> None:
+        with contextlib.suppress(ProcessLookupError):  # the watchdog of the arm's other bus was first
+            os.kill(bridge, signal.SIGKILL)
+
     code = guard(
-        lambda: os.kill(bridge, signal.SIGKILL),
+        kill,
         DriveNotes.from_buffer(mmap.mmap(page, mmap.PAGESIZE)),
         Connection(receiver, writable=False),
         log.put,

@@ -30,7 +30,8 @@ from exo_gravity.core.trunk.inputs import TiltInput
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import request_real_time
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.hardware.ownership.owned_bus import ArmOnBus, OwnedBus, Watchdog, take_over
+from exo_gravity.hardware.ownership.arm_on_bus import ArmOnBus
+from exo_gravity.hardware.ownership.owned_bus import OwnedBus, take_over
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import Answer, EffortExchange
 from exo_gravity.nodes.ros.parameters import bus_of, declare
@@ -92,8 +93,9 @@ class CanBridge(LifecycleNode):
         operation.refuse_simulated_time(self, self._arm.address[0])
         motors, limits = self._arm.motors, self._arm.limits
         traffic = traffic_of(values, self._arm.address[2])
-        check_bridge(values["rate"], motors, limits, traffic.status_rate)
-        traffic.check(values["rate"])
+        for bus in traffic.values():
+            check_bridge(values["rate"], motors, limits, bus.status_rate)
+            bus.check(values["rate"])
         self.loop: ControlLoop | None = None
         self._thread_priority = values["thread_priority"]
         self._owned: OwnedBus | None = None  # while configured
@@ -136,7 +138,7 @@ class CanBridge(LifecycleNode):
         bus, self._bus = self._bus or self._owned.open(), None
         period = self._arm.period
         safety = SafetyMachine(self._arm.limits, period, self._arm.motors)
-        hand_over = self._owned.watchdog.hand_over
+        hand_over = self._owned.hand_over
         loop = ControlLoop(bus, safety, period, self._exchange.publish, self._exchange.get_efforts, hand_over)
         loop.start()
         try:
@@ -145,7 +147,7 @@ class CanBridge(LifecycleNode):
             loop.stop()
             raise
         self.loop = loop
-        self._look_at(self._owned.watchdog, loop)
+        self._look_at(self._owned, loop)
         loop.call(lambda: safety.enable(time.monotonic()))
 
     @_transition
@@ -192,13 +194,13 @@ class CanBridge(LifecycleNode):
 
     def _on_report(self) -> None:
         if self.loop is not None and self._owned is not None:
-            self._look_at(self._owned.watchdog, self.loop)
+            self._look_at(self._owned, self.loop)
         self._report.send(self.loop, self._exchange.command, self._exchange.refusal)
 
-    def _look_at(self, watchdog: Watchdog, loop: ControlLoop) -> None:
-        """Let no motor be switched on before the watchdog watches, and none stay on without it."""
-        loop.safety.hindrance = "the watchdog to start" if watchdog.is_starting else ""
-        if not watchdog.alive and loop.safety.state is not State.LETTING_DOWN:
+    def _look_at(self, owned: OwnedBus, loop: ControlLoop) -> None:
+        """Let no motor be switched on before the watchdogs watch, and none stay on without one."""
+        loop.safety.hindrance = "the watchdog to start" if owned.is_starting else ""
+        if not owned.is_watched and loop.safety.state is not State.LETTING_DOWN:
             loop.trip(FaultCode.WATCHDOG_DEAD, "the watchdog process has died, is frozen, or did not start")
 
     def _report_descent(self) -> None:

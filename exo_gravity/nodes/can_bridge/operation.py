@@ -4,7 +4,7 @@ Each service runs on the control thread between two cycles. Who holds control is
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent import futures
 from functools import partial
 from typing import Any
@@ -23,7 +23,7 @@ from exo_gravity.core.safety.drive import EffortCommand, FaultCode, State
 from exo_gravity.core.safety.lease import Lease
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.hardware.ownership.owned_bus import ArmOnBus
+from exo_gravity.hardware.ownership.arm_on_bus import ArmOnBus
 from exo_gravity.nodes.ros.messages import ERROR, HELD_BY, NOBODY, OK, WARN, Diagnostics, milliseconds, row
 from exo_gravity.nodes.ros.run import open_to_others
 from exo_gravity.nodes.ros.subscriptions import HotPath
@@ -171,16 +171,17 @@ class Operator:
         self._news = self.lease.request(self._now(), message.key, message.value) or self._news
 
 
-def log_risks(node: Node, traffic: Traffic, rate: float) -> None:
-    """Log the bus load at `rate` (Hz), and whether other hosts can command the arm."""
+def log_risks(node: Node, traffic: Mapping[str, Traffic], rate: float) -> None:
+    """Log the load of each bus at `rate` (Hz), and whether other hosts can command the arm."""
     log = node.get_logger()
-    log.info(
-        f"bus load at {rate:g} Hz: {traffic.load(rate):.0%} of {traffic.bitrate / 1000:g} kbit/s, "
-        f"{traffic.load(rate, worst=True):.0%} at worst; the bus is full at {int(traffic.largest_rate)} Hz"
-    )
-    if traffic.is_crowded(rate):
-        fitting = int(REPLY_SHARE * traffic.largest_rate)
-        log.warning(f"replies may be late at {rate:g} Hz: at most {fitting} Hz leave them time")
+    for name, bus in traffic.items():
+        log.info(
+            f"bus load of {name} at {rate:g} Hz: {bus.load(rate):.0%} of {bus.bitrate / 1000:g} kbit/s, "
+            f"{bus.load(rate, worst=True):.0%} at worst; the bus is full at {int(bus.largest_rate)} Hz"
+        )
+        if bus.is_crowded(rate):
+            fitting = int(REPLY_SHARE * bus.largest_rate)
+            log.warning(f"replies on {name} may be late at {rate:g} Hz: at most {fitting} Hz leave them time")
     if opening := open_to_others():
         log.warning(f"{opening}: other hosts can command this arm; unset it, or enforce SROS2")
 
@@ -188,7 +189,7 @@ def log_risks(node: Node, traffic: Traffic, rate: float) -> None:
 class BridgeReport:
     """The status of one bridge. lease: of control."""
 
-    def __init__(self, node: Node, arm: ArmOnBus, traffic: Traffic, lease: Lease) -> None:
+    def __init__(self, node: Node, arm: ArmOnBus, traffic: Mapping[str, Traffic], lease: Lease) -> None:
         self._diagnostics = Diagnostics(node)
         self._names = arm.limits.joint_names
         self._lease = lease
@@ -215,7 +216,7 @@ class BridgeReport:
             "refusal": safety.refusal or "none",
             "limits acting": acting or "none",
             "rate (Hz)": f"{rate:.1f}",
-            "bus load (%)": f"{100.0 * self._traffic.load(rate):.0f}" if rate else "0",
+            "bus load (%)": row([100.0 * bus.load(rate) if rate else 0.0 for bus in self._traffic.values()], 0),
             "age of efforts (ms)": milliseconds(now - newest.answered),
             "rides": safety.ride.rides,
             "resume": safety.why_not_resumed or "possible",

@@ -73,8 +73,8 @@ def accept_changes(
 
 
 def bus_of(node: Node, values: dict[str, Any]) -> tuple[str, str, dict[str, Any]]:
-    """Return python-can's interface and channel, and its options, that the node's parameters name."""
-    options = {name: parameter.value for name, parameter in node.get_parameters_by_prefix(OPTIONS).items()}
+    """Return python-can's interface, the channel or channels, and the options that the node's parameters name."""
+    options = {name: plain(parameter.value) for name, parameter in node.get_parameters_by_prefix(OPTIONS).items()}
     return values["can.interface"], values["can.channel"], options
 
 

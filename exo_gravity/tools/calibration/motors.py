@@ -12,16 +12,17 @@ import argparse
 import math
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from statistics import fmean
 
 from rich.table import Table
 
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, JointMotor
+from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, OPTIONS, JointMotor, buses_of
 from exo_gravity.core.motors.specs import MOTOR_ERRORS
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.hardware.can.bus_scan import BusScan, MotorAnswer
+from exo_gravity.hardware.can.bus_scan import ArmScan, BusScan, MotorAnswer
 from exo_gravity.tools.calibration.live import Say
 from exo_gravity.tools.calibration.result import CalibrationResult, Change
 from exo_gravity.tools.inputs.arms import ConfiguredArm, can_options
@@ -54,16 +55,28 @@ def calibrate_motors(options: argparse.Namespace, arm: ConfiguredArm, say: Say) 
 
     Raises BusError if the bus cannot be used.
     """
-    bus_options = can_options(load(options.params)[f"{arm.namespace}/can_bridge"])
-    with BusScan((arm.can_bridge["can.interface"], arm.can_bridge["can.channel"], bus_options)) as bus:
+    node, interface = f"{arm.namespace}/can_bridge", arm.can_bridge["can.interface"]
+    bus_options = can_options(load(options.params)[node])
+    own = {name: each for name, (_, each) in buses_of(arm.can_bridge["can.channel"], bus_options).items()}
+    with ArmScan((interface, name, each) for name, each in own.items()) as bus:
         say(f"Asking IDs 1 to {MAX_CAN_ID} on {bus.name}: nothing moves")
-        return MotorSearch(bus, arm, options.wait, say).result(options.pose)
+        search = MotorSearch(bus, arm, options.wait, say)
+        result, ids = search.result(options.pose), search.found
+    if len(own) == 1:
+        return result
+    channels = [bus.channels[can_id] for can_id in ids]
+    changes = [Change(node, "can.channel", ",".join(channels), "of the bus on which each motor answers")]
+    for key in (key for key, value in bus_options.items() if isinstance(value, list)):
+        changes.append(Change(node, f"{OPTIONS}.{key}", [own[name][key] for name in channels], "of these buses"))
+    return replace(result, changes=(*result.changes, *changes))
 
 
 class MotorSearch:
     """Leads the person through the joints of one arm. clock: s."""
 
-    def __init__(self, bus: BusScan, arm: ConfiguredArm, wait: Wait, say: Say, clock: Clock = time.monotonic) -> None:
+    def __init__(
+        self, bus: ArmScan | BusScan, arm: ConfiguredArm, wait: Wait, say: Say, clock: Clock = time.monotonic
+    ) -> None:
         self._bus = bus
         self._arm = arm
         self._wait = wait
@@ -75,6 +88,11 @@ class MotorSearch:
         self._angles: dict[int, list[float]] = {}
         self._answered: dict[int, float] = {}
         self._was_silent: set[int] = set()
+
+    @property
+    def found(self) -> list[int]:
+        """The IDs of the joints' motors, as far as known."""
+        return list(self._found)
 
     def result(self, pose: Sequence[float]) -> CalibrationResult:
         """Return the result; pose: (4,) deg in which `zero` is measured. Raises DataError if a motor is not found."""
@@ -90,7 +108,7 @@ class MotorSearch:
             raise DataError("; ".join(problems))
         for name, motion in zip(arm.joint_names, MOTIONS, strict=True):
             self._watch(f"{name}: {motion}, by 30 degrees or so, and back", partial(self._found_by, name))
-        ids, directions = list(self._found), [direction for _, direction in self._found.values()]
+        ids, directions = self.found, [direction for _, direction in self._found.values()]
         where = f"{' '.join(f'{angle:g}' for angle in pose)} deg" if any(pose) else ""
         rest = f"bring the arm to {where}" if where else "let the arm hang"
         self._watch(f"{rest}, hands off, until it is still", self._unrest)

@@ -18,7 +18,8 @@ from typing import Any
 import yaml
 
 from exo_gravity import packaged
-from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.errors import ParameterError, named
+from exo_gravity.core.motors.joint_motor import OPTIONS, buses_of
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 
 FORM = "/namespace/executable: {ros__parameters: {...}}"
@@ -163,10 +164,15 @@ def check_buses(nodes: Nodes) -> None:
     """Raise ParameterError if two bridges would command motors on the same bus, which has one owner."""
     owner: dict[tuple[tuple[str, str], ...], str] = {}
     for node in stages(nodes)[0]:
-        bus = tuple(sorted((k, str(v)) for k, v in nodes[node].items() if k.startswith("can.")))
-        other = owner.setdefault(bus, node)
-        if other != node:
-            raise ParameterError(f"{node} can", dict(bus), f"different from the bus of {other}: one arm per bus")
+        given = {k: v for k, v in nodes[node].items() if k.startswith("can.")}
+        options = {k: v for k, v in given.items() if k.startswith(OPTIONS)}
+        with named(f"{node} "):
+            buses = buses_of(str(given.get("can.channel", node)), options)
+        for name, (_, own) in buses.items():
+            bus = tuple(sorted((k, str(v)) for k, v in {**given, "can.channel": name, **own}.items()))
+            other = owner.setdefault(bus, node)
+            if other != node:
+                raise ParameterError(f"{node} can", dict(bus), f"different from the bus of {other}: one arm per bus")
 
 
 def in_namespace(params: Path, namespace: str) -> Path:
