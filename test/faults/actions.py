@@ -18,7 +18,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from sensor_msgs.msg import Imu, JointState
 
-from ..support.launched_nodes import children, executable
+from ..support.launched_nodes import executable
 from ..support.load import start_spin
 from .fault_case import Action
 from .rig import Rig
@@ -46,8 +46,7 @@ def signal_watchdog(number: int) -> Action:
 
 def signal_bridge_and_watchdog(number: int) -> Action:
     def inject(rig: Rig) -> None:
-        bridge = rig.pid("can_bridge")
-        for pid in (*children(bridge), bridge):
+        for pid in (rig.watchdog, rig.pid("can_bridge")):
             os.kill(pid, number)
 
     return inject

@@ -86,7 +86,7 @@ class Rig:
         return [self._nodes(without=SIMULATOR, port=port, can_bridge=bridge, compensator=self.compensator)]
 
     def _nodes(self, **options: Any) -> LaunchedNodes:
-        share = {"one_process": self.one_process, "two_buses": self.two_buses}
+        share: dict[str, Any] = {"one_process": self.one_process, "two_buses": self.two_buses}
         return LaunchedNodes(self.folder, base=self.base, timing=self.timing, **share, **options)
 
     def bring_to(self, stage: str) -> None:

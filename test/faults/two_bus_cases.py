@@ -13,7 +13,7 @@ from .supply_cases import CUT, supply_case
 
 DEAD = simulator(fault__cut_off=[False, False, True, True])
 ALIVE = simulator(fault__cut_off=[False] * 4)
-RECOVERY = 6.0  # s in which the launcher brings down an arm that has lost its bridge and its watchdogs
+RECOVERY = 6.0  # s in which the launcher brings down an arm that has lost its bridge and its watchdog
 FAR = (2, 3)
 
 
@@ -30,7 +30,7 @@ TWO_BUSES = (
     FaultCase("two buses: the second dead until the arm is given up", DEAD, TwoBusRig, clear=ALIVE, unreached=FAR,
         outcomes=("motor_silent",)),
     FaultCase("two buses: can_bridge killed", send_signal("can_bridge", signal.SIGKILL), TwoBusRig, PROCESS_REACTION),
-    FaultCase("two buses: can_bridge and watchdogs killed", signal_bridge_and_watchdog(signal.SIGKILL), TwoBusRig,
+    FaultCase("two buses: can_bridge and watchdog killed", signal_bridge_and_watchdog(signal.SIGKILL), TwoBusRig,
         RECOVERY),
     FaultCase("two buses: another can_bridge on the second", start_on_the_second_bus, TwoBusRig, None,
         outcomes=("active",), afterwards=has_refused),

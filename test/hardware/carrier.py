@@ -28,14 +28,15 @@ def main(arm: ArmOnBus, drive: Drive) -> None:
     except BusError as error:
         log(str(error))
         raise SystemExit(1) from None
-    ports = arm.ports(owned.lock.clock)
-    bus = MotorBus(ports, arm.motors, powered=True, note=owned.lock.note)  # the rig has switched the motors on
+    notes = owned.notes
+    ports = arm.ports(notes.clock)
+    bus = MotorBus(ports, arm.motors, powered=True, note=notes.note)  # the rig has switched the motors on
     is_announced = False
     while True:
         end = time.monotonic() + arm.period
         bus.exchange(drive, end)
-        if not is_announced and not owned.is_starting and all(joint.time > 0.0 for joint in bus.samples):
-            print(owned.watchdogs[0].process.pid, flush=True)
+        if not is_announced and notes.heartbeat and all(joint.time > 0.0 for joint in bus.samples):
+            print(owned.watchdog.process.pid, flush=True)
             is_announced = True
         time.sleep(max(0.0, end - time.monotonic()))
 

@@ -1,4 +1,4 @@
-"""An arm whose motors are on two buses: one safety unit; a lock, notes and a watchdog for each. In virtual time."""
+"""An arm whose motors are on two buses: one safety unit, a lock and notes for each bus. In virtual time."""
 
 from __future__ import annotations
 
@@ -7,22 +7,24 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import can
 import pytest
 
 from exo_gravity.core.errors import BusError
+from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.motors.joint_motor import channels_of
 from exo_gravity.core.motors.wire_formats import ID_BITS, MIT, MIT_V3, WireFormat
 from exo_gravity.core.safety.drive import NOTHING, OFF, Drive, FaultCode, State
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.hardware.can.motor_bus import FOREIGN_COMMAND, MotorBus
-from exo_gravity.hardware.ownership import owned_bus
-from exo_gravity.hardware.ownership.arm_on_bus import ArmLock, ArmOnBus
+from exo_gravity.hardware.ownership import arm_on_bus, owned_bus
+from exo_gravity.hardware.ownership.arm_on_bus import ArmLock, ArmNotes, ArmOnBus
 from exo_gravity.hardware.ownership.bus_lock import Address, BusLock, DriveNotes, notes_file
 from exo_gravity.hardware.ownership.owned_bus import OwnedBus, let_down
 
-from .simulated_rig import LIMITS
+from .simulated_rig import LIMITS, SAFE_SPEED
 from .test_watchdog_decisions import LET_DOWN
 from .virtual_rig import CYCLE, Carried, VirtualRig
 from .virtual_time import Played, Responder, VirtualBus, Wire, message_of
@@ -194,34 +196,64 @@ def test_a_command_to_a_motor_that_is_on_the_other_bus_is_no_foreign_command() -
     assert bus.ignored[FOREIGN_COMMAND] == bus.foreign_commands == 1
 
 
-def notes_of(rig: VirtualRig) -> DriveNotes:
-    notes = DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes)))
-    notes.clock = rig.clock
-    notes.note(rig.drive)
-    return notes
+def notes_of(rig: VirtualRig) -> tuple[DriveNotes, DriveNotes]:
+    """Return the notes of both buses of an arm that is carried."""
+    notes = tuple(DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes))) for _ in range(2))
+    for page in notes:
+        page.clock = rig.clock
+        page.note(rig.drive)
+    return notes[0], notes[1]
 
 
 @FORMATS
-def test_each_watchdog_lets_down_the_joints_on_its_bus_and_sends_nothing_to_the_others(
-    wire_format: WireFormat,
+def test_the_watchdog_lets_the_arm_down_as_one(wire_format: WireFormat) -> None:
+    """Motors 3 and 4 hold next to nothing here: they must still be braked while the first bus lowers joint 2."""
+    rig = TwoBusRig(pose=(0.0, 1.3, 0.0, 0.3), carried=False, wire_format=wire_format)
+    carrying = tuple(gravity_torque(rig.links, rig.device.arm.positions).tolist())
+    assert max(map(abs, carrying[2:])) < 0.1 and carrying[1] > 3.0
+    for motor, torque in zip(rig.motors, carrying, strict=True):
+        for frame in ((motor.command_id, motor.command(torque, 0.0)), *motor.enter):
+            rig.device.exchange(*frame)
+    near, far = notes_of(rig)
+    for page in (near, far):
+        page.note(Drive(carrying, NOTHING, True))
+    damped: list[float] = []
+    rig.clock.later(0.15, lambda: damped.extend(rig.damping))
+    on: list[tuple[bool, bool]] = []
+    rig.clock.every(0.1, lambda: on.append((any(rig.motors_on[:2]), any(rig.motors_on[2:]))))
+    assert let_down(rig.arm, ArmNotes([near, near, far, far]), print, lambda: False)
+    assert min(damped) > 1.0
+    assert all(first == second for first, second in on)
+    assert not near.drive.powered and not far.drive.powered
+    assert rig.motors_on == [False] * 4 and rig.top_speed < SAFE_SPEED
+
+
+@FORMATS
+def test_a_bus_that_cannot_be_opened_does_not_keep_the_other_waiting(
+    wire_format: WireFormat, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rig = TwoBusRig(wire_format=wire_format)
-    near, far = rig.arm.parts
-    assert [near.name, far.name] == [f"the part of the arm on {name}" for name in (FIRST, SECOND)]
+    near, far = notes_of(rig)
+    rig.first.refusal = BusError("no such device")
     other = Responder(rig.first)
-    assert let_down(far, notes_of(rig), print, lambda: False)
+    assert not let_down(rig.arm, ArmNotes([near, near, far, far]), print, lambda: True)
+    assert "no such device; the motors may still be powered" in capsys.readouterr().out
     assert rig.motors_on == [True, True, False, False]
+    assert near.drive.powered and not far.drive.powered
     assert all((frame.arbitration_id & ID_BITS) >> 8 == 0x29 for frame in other.received)  # status of V3 boards alone
-    assert let_down(near, notes_of(rig), print, lambda: False)
+    rig.clock.later(30.0, lambda: setattr(rig.first, "refusal", None))
+    assert let_down(rig.arm, ArmNotes([near, near, far, far]), print, lambda: False)
     assert rig.motors_on == [False] * 4
 
 
-def test_the_watchdog_of_a_silent_bus_hands_it_over(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_silent_bus_is_handed_over(capsys: pytest.CaptureFixture[str]) -> None:
     rig = TwoBusRig()
+    near, far = notes_of(rig)
     silence(rig.second)
-    assert not let_down(rig.arm.parts[1], notes_of(rig), print, lambda: True)
+    assert not let_down(rig.arm, ArmNotes([near, near, far, far]), print, lambda: True)
     assert "a motor does not reply" in capsys.readouterr().out
-    assert rig.motors_on == [True] * 4
+    assert rig.damping[:2] < [0.3, 0.3] and rig.motors_on[2:] == [True, True]
+    assert far.drive.powered
 
 
 @pytest.fixture
@@ -244,13 +276,22 @@ def test_an_arm_of_which_one_bus_is_held_is_refused_and_holds_neither(held: str)
 
 
 @pytest.mark.usefixtures("locks")
-def test_the_locks_are_taken_in_one_order_however_the_motors_are_wired() -> None:
-    rig = TwoBusRig(carried=False)
-    for first, second in ((FIRST, SECOND), (SECOND, FIRST)):
-        arm = TwoBusArm(("wire", f"{first},{second},{second},{first}", {}), rig.motors, LIMITS, CYCLE, rig.wires)
-        lock = ArmLock(arm, "a test", 0.1, rig.clock)
-        assert [part.address[1] for _, part in lock.locks] == sorted((FIRST, SECOND))
-        lock.release()
+@pytest.mark.parametrize("order", [(FIRST, SECOND), (SECOND, FIRST)])
+def test_the_locks_are_taken_in_one_order_however_the_motors_are_wired(
+    order: tuple[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[str] = []
+
+    class Noted(BusLock):
+        def __init__(self, address: Address, *others: Any, **options: Any) -> None:
+            taken.append(address[1])
+            super().__init__(address, *others, **options)
+
+    monkeypatch.setattr(arm_on_bus, "BusLock", Noted)
+    rig, (first, second) = TwoBusRig(carried=False), order
+    arm = TwoBusArm(("wire", f"{first},{second},{second},{first}", {}), rig.motors, LIMITS, CYCLE, rig.wires)
+    ArmLock(arm, "a test", 0.1, rig.clock).release()
+    assert taken == [FIRST, SECOND]
 
 
 def leave_on(rig: TwoBusRig) -> None:
@@ -268,21 +309,20 @@ def test_the_next_bridge_lets_the_whole_arm_down_from_the_notes_of_both_buses(wi
     rig, log = TwoBusRig(wire_format=wire_format), list[str]()
     leave_on(rig)
     owned = OwnedBus(rig.arm, "the next bridge", log.append, rig.clock)
-    assert len(owned.watchdogs) == 2
     owned.close()
     assert log[-1] == LET_DOWN[1]
     rig.assert_let_down()
 
 
 @pytest.mark.usefixtures("locks")
-def test_an_arm_with_a_bus_that_cannot_be_opened_gets_a_watchdog_for_each(monkeypatch: pytest.MonkeyPatch) -> None:
-    rig, guarded = TwoBusRig(), list[str]()
+def test_an_arm_with_a_bus_that_cannot_be_opened_gets_a_watchdog_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig, guarded = TwoBusRig(), list[tuple[bool, ...]]()
     leave_on(rig)
     rig.second.refusal = BusError("no such device")
 
     class Noted:
-        def __init__(self, lock: BusLock, arm: ArmOnBus) -> None:
-            guarded.append(arm.name)
+        def __init__(self, lock: ArmLock, arm: ArmOnBus) -> None:
+            guarded.append(tuple(own.notes.drive.powered for own in lock.of_joints))
 
         def close(self) -> None:
             pass
@@ -290,8 +330,9 @@ def test_an_arm_with_a_bus_that_cannot_be_opened_gets_a_watchdog_for_each(monkey
     monkeypatch.setattr(owned_bus, "Watchdog", Noted)
     with pytest.raises(BusError, match="a motor that may be powered does not reply"):
         OwnedBus(rig.arm, "the next bridge", print, rig.clock)
-    assert guarded == [f"the part of the arm on {name}" for name in sorted((FIRST, SECOND))]
-    assert all(BusLock(part.address, "a test").notes.drive.powered for part in rig.arm.parts)
+    assert guarded == [(False, False, True, True)]
+    assert rig.motors_on == [False, False, True, True]
+    assert [BusLock(part.address, "a test").notes.drive.powered for part in rig.arm.parts] == [False, True]
 
 
 def test_an_end_that_was_opened_is_closed_if_the_other_bus_cannot_be() -> None:

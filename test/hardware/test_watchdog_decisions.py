@@ -12,6 +12,7 @@ import pytest
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.drive import OFF
 from exo_gravity.core.safety.limits import FROZEN
+from exo_gravity.hardware.ownership.arm_on_bus import ArmNotes
 from exo_gravity.hardware.ownership.bus_lock import BusLock, DriveNotes
 from exo_gravity.hardware.ownership.owned_bus import HEARTBEAT_TIMEOUT, LONGEST_LOOK, OwnedBus, Silence
 from exo_gravity.hardware.ownership.watchdog import SleepInhibitor, guard
@@ -79,7 +80,7 @@ class Bridge:
     def guard(self, is_wanted: Callable[[], bool] = lambda: False) -> int:
         """Run the watchdog to its end; return its exit code."""
         inhibit = self.inhibited.append
-        return guard(self.kill, self.notes, self.pipe, self.log.append, is_wanted, inhibit)
+        return guard(self.kill, ArmNotes([self.notes] * 4), self.pipe, self.log.append, is_wanted, inhibit)
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from exo_gravity.core.safety.drive import NOTHING, Drive, EffortCommand, State
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.hardware.ownership.arm_on_bus import ArmOnBus
+from exo_gravity.hardware.ownership.arm_on_bus import ArmNotes, ArmOnBus
 from exo_gravity.hardware.ownership.bus_lock import Address, DriveNotes
 from exo_gravity.hardware.ownership.owned_bus import let_down
 
@@ -82,7 +82,7 @@ class VirtualRig(Rig):
         self.notes = DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes)))
         self.notes.clock = self.clock
         self.notes.note(drive or self.drive)
-        return let_down(self.arm, self.notes, log, lambda: is_wanted)
+        return let_down(self.arm, ArmNotes([self.notes] * 4), log, lambda: is_wanted)
 
     def raising(self) -> tuple[float, ...]:
         """Return the torque (4,) in Nm that carries the arm where it is, and moves it to `POSE`."""

@@ -1,7 +1,7 @@
-"""The bus of an arm, or its buses, that this process owns: locks, watchdogs, and what a previous owner left behind.
+"""The bus of an arm, or its buses, that this process owns: locks, watchdog, and what a previous owner left behind.
 
-Each bus has a lock, notes and a watchdog of its own. If the bridge dies, each watchdog lets down the joints on its bus,
-at the same time; a bus that cannot be opened keeps none of the others waiting.
+Each bus has a lock and notes of its own. One watchdog holds them all and lets the arm down as one: a joint that holds
+nothing must still be braked while the joints on the other bus are lowered.
 
 AK motors keep applying the last command: an arm that another process has left with its motors on is let down. The
 watchdog does it for a bridge that has died, and a new bridge does it if both had died.
@@ -12,16 +12,18 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from multiprocessing import Pipe
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.delivery import ABSOLUTE, RELATIVE
 from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.hardware.can.can_port import CanPort
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.hardware.ownership.arm_on_bus import ArmLock, ArmOnBus
-from exo_gravity.hardware.ownership.bus_lock import ATTEMPT_TIME, BusLock, DriveNotes
+from exo_gravity.hardware.ownership.arm_on_bus import ArmLock, ArmNotes, ArmOnBus
+from exo_gravity.hardware.ownership.bus_lock import ATTEMPT_TIME
 
 OPEN_PERIOD = 0.05  # s between two attempts to open the bus
 FIRST_REPLIES = 0.05  # s in which the motors must reply to the first commands
@@ -31,27 +33,28 @@ LONGEST_LOOK = 0.15  # s between two looks of a process that runs
 END_TIME = 2.0  # s for the watchdog to end after `close`
 
 
-def let_down(
-    arm: ArmOnBus, notes: DriveNotes | ArmLock, log: Callable[[str], None], is_wanted: Callable[[], bool]
-) -> bool:
+def let_down(arm: ArmOnBus, notes: ArmNotes, log: Callable[[str], None], is_wanted: Callable[[], bool]) -> bool:
     """Let down an arm whose motors apply what is noted; return whether its motors have confirmed that they are off.
 
     log: called with each change worth knowing. is_wanted: whether to give up, because someone else waits for the bus,
-    while the bus or a motor cannot be reached.
+    while the bus or a motor cannot be reached. The joints on a bus that cannot be opened come after the others.
     """
-    ports, is_logged = None, False
-    while ports is None:
-        try:
-            ports = arm.ports(notes.clock)
-        except BusError as error:
-            if not is_logged:
-                log(f"{error}; the motors may still be powered")
-            is_logged = True
+    ports: list[CanPort | None] = []
+    is_logged = False
+    while not any(ports):
+        failures: list[BusError] = []
+        ports = arm.ports(notes.clock, failures)
+        if failures and not is_logged:
+            log(f"{'; '.join(map(str, failures))}; the motors may still be powered")
+        is_logged = True
+        if not any(ports):
             if is_wanted():
                 return False
             notes.clock.sleep(OPEN_PERIOD)
+    left = [joint for joint in arm.joints if not ports[joint]]
+    own = notes.of([joint for joint in arm.joints if ports[joint]])
     drive, clock, is_complete = notes.drive, notes.clock, False
-    motors = MotorBus(ports, arm.motors, powered=True, note=notes.note, clock=clock)
+    motors = MotorBus(ports, arm.motors, powered=True, note=own.note, clock=clock)
     first = drive._replace(powered=True, unsure=(True,) * len(drive.effort))
     end = clock.monotonic() + FIRST_REPLIES
     while not is_complete and clock.monotonic() < end:
@@ -77,7 +80,9 @@ def let_down(
             motors.close()
             return False
     loop.stop()
-    return not motors.may_be_powered
+    if motors.may_be_powered:
+        return False
+    return not left or let_down(replace(arm, joints=left), notes, log, is_wanted)
 
 
 class Silence:
@@ -102,15 +107,16 @@ class Silence:
 
 
 class Watchdog:
-    """The bridge's end: the watchdog process of `arm`, or of its part, on the bus that `lock` holds."""
+    """The bridge's end: the watchdog process of `arm`, on the buses that `lock` holds."""
 
-    def __init__(self, lock: BusLock, arm: ArmOnBus) -> None:
+    def __init__(self, lock: ArmLock, arm: ArmOnBus) -> None:
         self._notes = lock.notes
         self._now = lock.notes.clock.monotonic
         self._start = self._now()
         self._silence = Silence(self._start, LONGEST_LOOK)
         receiver, self._sender = Pipe(duplex=False)
-        shared = (lock.descriptor, lock.socket.fileno(), receiver.fileno())
+        pages, locks = [own.descriptor for own in lock.of_joints], [own.socket.fileno() for own in lock.locks]
+        shared = (receiver.fileno(), *pages, *locks)
         self.process = subprocess.Popen(
             [sys.executable, "-m", "exo_gravity.hardware.ownership.watchdog", *map(str, (os.getpid(), *shared))],
             pass_fds=shared,
@@ -156,7 +162,7 @@ class Watchdog:
 
 
 class OwnedBus:
-    """The bus of `arm`, or its buses, locked for `owner` (shown to others who want a bus) until `close`.
+    """The bus of `arm`, or its buses, locked for `owner` (shown to others who want one) until `close`.
 
     If the previous owner and its watchdog ended while the motors were on, that arm is let down first. log: called with
     what happens then. Raises BusError if the bus is held or cannot be opened, or if that arm cannot be let down.
@@ -164,14 +170,14 @@ class OwnedBus:
 
     def __init__(self, arm: ArmOnBus, owner: str, log: Callable[[str], None], clock: Clock = COMPUTER_CLOCK) -> None:
         self._arm = arm
-        #: the locks, and what the motors receive, for processes that outlive this one
-        self.lock = take_over(arm, owner, log, ATTEMPT_TIME, clock)
-        self.watchdogs = _watchdogs(self.lock)
+        self._lock = take_over(arm, owner, log, ATTEMPT_TIME, clock)
+        self.notes = self._lock.notes  #: what the motors receive, for a process that outlives this one
+        self.watchdog = Watchdog(self._lock, arm)
 
     def open(self) -> MotorBus:
         """Open the bus. Raises BusError if it cannot be opened, or if another host commands the motors."""
-        ports = self._arm.ports(self.lock.clock)
-        bus = MotorBus(ports, self._arm.motors, note=self.lock.note, clock=self.lock.clock)
+        ports = self._arm.ports(self.notes.clock)
+        bus = MotorBus(ports, self._arm.motors, note=self.notes.note, clock=self.notes.clock)
         try:
             bus.listen()
         except BusError:
@@ -179,31 +185,10 @@ class OwnedBus:
             raise
         return bus
 
-    @property
-    def is_starting(self) -> bool:
-        """Whether a watchdog does not watch yet: no motor may be switched on."""
-        return any(watchdog.is_starting for watchdog in self.watchdogs)
-
-    @property
-    def is_watched(self) -> bool:
-        """Whether every watchdog runs. Read it several times a second."""
-        alive = [watchdog.alive for watchdog in self.watchdogs]  # each has to look
-        return all(alive)
-
-    def hand_over(self, reason: str) -> bool:
-        """Request the watchdogs to kill this process and let the arm down; return whether one is alive."""
-        taken = [watchdog.hand_over(reason) for watchdog in self.watchdogs]
-        return any(taken)
-
     def close(self) -> None:
-        """End the watchdogs and release the bus, after the motors were switched off."""
-        for watchdog in self.watchdogs:
-            watchdog.close()
-        self.lock.release()
-
-
-def _watchdogs(lock: ArmLock) -> list[Watchdog]:
-    return [Watchdog(own, part) for own, part in lock.locks]
+        """End the watchdog and release the bus, after the motors were switched off."""
+        self.watchdog.close()
+        self._lock.release()
 
 
 def take_over(
@@ -216,15 +201,14 @@ def take_over(
     """
     lock = ArmLock(arm, owner, patience, clock)
     try:
-        drive, problems = lock.drive, [own.problem for own, _ in lock.locks if own.problem]
-        for problem in problems:
+        drive = lock.notes.drive
+        if problem := "; ".join(own.problem for own in lock.locks if own.problem):
             log(f"it is not known what the motors apply, they may be on ({problem}): letting the arm down")
-        if drive.powered and not problems:
+        elif drive.powered:
             log("the last can_bridge on this bus and its watchdog ended with the motors on: letting the arm down")
         if drive.powered:
-            if not let_down(arm, lock, log, lambda: True):
-                for watchdog in _watchdogs(lock):
-                    watchdog.close()
+            if not let_down(arm, lock.notes, log, lambda: True):
+                Watchdog(lock, arm).close()
                 raise BusError(f"CAN bus {arm.address[1]}: a motor that may be powered does not reply")
             log("the arm is down, its motors are off")
         return lock

@@ -1,7 +1,7 @@
-"""The watchdog: a process that lets the arm down when its bridge dies, freezes or hands it over. One for each bus.
+"""The watchdog: a process that lets the arm down when its bridge dies, freezes or hands it over.
 
-It shares the notes of the bus with the bridge, and a pipe, which breaks when the bridge dies for any reason. It
-inherits the lock of the bus. If the motors were on, it continues from the last noted drive. A bridge that is alive but
+It shares the notes of each bus with the bridge, and a pipe, which breaks when the bridge dies for any reason. It
+inherits the lock of each bus. If the motors were on, it continues from the last noted drive. A bridge that is alive but
 has noted nothing for `FROZEN` is killed first: two processes must never command one motor. Once a motor has not replied
 for seconds and all others are down, the next bridge may ask for the bus: then the watchdog ends, and its notes stay.
 
@@ -21,15 +21,15 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from functools import partial
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
 
 import can
 
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.limits import FROZEN
 from exo_gravity.hardware.clock import favour
-from exo_gravity.hardware.ownership.arm_on_bus import ArmOnBus
+from exo_gravity.hardware.ownership.arm_on_bus import ArmNotes, ArmOnBus
 from exo_gravity.hardware.ownership.bus_lock import DriveNotes, is_asked_for, remove_notes
 from exo_gravity.hardware.ownership.owned_bus import Silence, let_down
 
@@ -42,7 +42,7 @@ INHIBIT = ("systemd-inhibit", "--what=sleep:handle-lid-switch", "--who=exo_gravi
 
 def guard(
     kill: Callable[[], None],
-    notes: DriveNotes,
+    notes: ArmNotes,
     receiver: Connection,
     log: Callable[[str], None],
     is_wanted: Callable[[], bool],
@@ -81,9 +81,9 @@ def guard(
         log(f"can_bridge {why}: its motors may still be powered")
         return 1
     notes.owner = f"the watchdog (PID {os.getpid()}) of {notes.owner}; it is letting the arm down, wait until it ends"
-    log(f"can_bridge {why}: letting {arm.name} down")
+    log(f"can_bridge {why}: letting the arm down")
     if let_down(arm, notes, log, is_wanted):
-        log(f"{arm.name} is down, its motors are off")
+        log("the arm is down, its motors are off")
         return 0
     log("the motors may still be powered: the next can_bridge takes the bus over, and lets the arm down")
     return 1
@@ -117,29 +117,30 @@ def write_log(lines: SimpleQueue[str]) -> None:
 
 
 def main() -> None:
-    """Entry point of the process; arguments: the bridge's PID, and the descriptors of notes, lock and pipe."""
+    """Entry point of the process; arguments: the bridge's PID, and the descriptors of pipe, notes and locks.
+
+    The notes are those of the bus of each joint's motor, the locks those of the buses.
+    """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     favour(20)
-    bridge, page, lock, receiver = map(int, sys.argv[1:])
+    bridge, receiver, *shared = map(int, sys.argv[1:])
+    pages = {page: DriveNotes.from_buffer(mmap.mmap(page, mmap.PAGESIZE)) for page in shared[:JOINT_COUNT]}
+    locks = [socket.socket(fileno=lock) for lock in shared[JOINT_COUNT:]]
     log: SimpleQueue[str] = SimpleQueue()
     writer = threading.Thread(target=write_log, args=(log,), daemon=True)
     writer.start()
-
-    def kill() -> None:
-        with contextlib.suppress(ProcessLookupError):  # the watchdog of the arm's other bus was first
-            os.kill(bridge, signal.SIGKILL)
-
     code = guard(
-        kill,
-        DriveNotes.from_buffer(mmap.mmap(page, mmap.PAGESIZE)),
+        lambda: os.kill(bridge, signal.SIGKILL),
+        ArmNotes([pages[page] for page in shared[:JOINT_COUNT]]),
         Connection(receiver, writable=False),
         log.put,
-        partial(is_asked_for, socket.socket(fileno=lock)),
+        lambda: any(map(is_asked_for, locks)),
         SleepInhibitor(INHIBIT if os.path.exists(SYSTEM_BUS) else ()).hold,
     )
     if code == 0:
-        remove_notes(page)
+        for page in pages:
+            remove_notes(page)
     log.put("")
     writer.join(LOG_TIME)  # but do not wait for a reader that is frozen
     os._exit(code)  # its thread may be blocked

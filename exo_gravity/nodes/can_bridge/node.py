@@ -31,7 +31,7 @@ from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import request_real_time
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.ownership.arm_on_bus import ArmOnBus
-from exo_gravity.hardware.ownership.owned_bus import OwnedBus, take_over
+from exo_gravity.hardware.ownership.owned_bus import OwnedBus, Watchdog, take_over
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import Answer, EffortExchange
 from exo_gravity.nodes.ros.parameters import bus_of, declare
@@ -138,7 +138,7 @@ class CanBridge(LifecycleNode):
         bus, self._bus = self._bus or self._owned.open(), None
         period = self._arm.period
         safety = SafetyMachine(self._arm.limits, period, self._arm.motors)
-        hand_over = self._owned.hand_over
+        hand_over = self._owned.watchdog.hand_over
         loop = ControlLoop(bus, safety, period, self._exchange.publish, self._exchange.get_efforts, hand_over)
         loop.start()
         try:
@@ -147,7 +147,7 @@ class CanBridge(LifecycleNode):
             loop.stop()
             raise
         self.loop = loop
-        self._look_at(self._owned, loop)
+        self._look_at(self._owned.watchdog, loop)
         loop.call(lambda: safety.enable(time.monotonic()))
 
     @_transition
@@ -194,13 +194,13 @@ class CanBridge(LifecycleNode):
 
     def _on_report(self) -> None:
         if self.loop is not None and self._owned is not None:
-            self._look_at(self._owned, self.loop)
+            self._look_at(self._owned.watchdog, self.loop)
         self._report.send(self.loop, self._exchange.command, self._exchange.refusal)
 
-    def _look_at(self, owned: OwnedBus, loop: ControlLoop) -> None:
-        """Let no motor be switched on before the watchdogs watch, and none stay on without one."""
-        loop.safety.hindrance = "the watchdog to start" if owned.is_starting else ""
-        if not owned.is_watched and loop.safety.state is not State.LETTING_DOWN:
+    def _look_at(self, watchdog: Watchdog, loop: ControlLoop) -> None:
+        """Let no motor be switched on before the watchdog watches, and none stay on without it."""
+        loop.safety.hindrance = "the watchdog to start" if watchdog.is_starting else ""
+        if not watchdog.alive and loop.safety.state is not State.LETTING_DOWN:
             loop.trip(FaultCode.WATCHDOG_DEAD, "the watchdog process has died, is frozen, or did not start")
 
     def _report_descent(self) -> None:
