@@ -16,7 +16,7 @@
 # make wearer-study  the wearer's torque and share as estimated, on 20 calibrated devices, judged by the truth; 20 minutes
 # make baselines    in place of a model: PID, cube map, learned laws, a growing ANFIS, 6 minutes; build/baselines
 # make imu-report   the trunk's inclination error on recorded motion, here and by VQF and imufusion; TRIALS=FOLDER
-# make socketcan    motor bus and nodes on vcan0; RUN=COMMAND runs the tests through COMMAND, in a virtual machine for example
+# make socketcan    motor bus and nodes on vcan0 and vcan1; RUN=COMMAND runs the tests through COMMAND, in a virtual machine for example
 # make ros2-launch  the launch file under `ros2 launch`, where ROS 2 and a build of this package are sourced
 # make two-computers  the arm on two computers over better and worse wires, 6 minutes; a table and build/two_computers.json
 # make dist         wheel and source distribution in dist/, the wheel installed in an empty environment and tried

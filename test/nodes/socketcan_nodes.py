@@ -1,4 +1,4 @@
-"""The nodes as processes on vcan0, where SocketCAN exists: `make socketcan`.
+"""The nodes as processes on vcan0, and on vcan0 and vcan1, where SocketCAN exists: `make socketcan`.
 
 The test observes the frames on the bus and the nodes' log. An emulated machine is 10 to 20 times slower than a real
 one, so the nodes' clock is slowed down in proportion: the limits stay those of a worn arm.
@@ -44,15 +44,21 @@ CHANGES = {
 
 @pytest.fixture
 def frames() -> Iterator[list[can.Message]]:
-    """All frames on vcan0 so far."""
+    """All frames on vcan0 and vcan1 so far."""
     frames: list[can.Message] = []
-    with open_bus(*VCAN, {}) as bus, can.Notifier(bus, [frames.append]):
+    with (
+        open_bus(*VCAN, {}) as bus,
+        open_bus("socketcan", "vcan1", {}) as other,
+        can.Notifier([bus, other], [frames.append]),
+    ):
         yield frames
 
 
-@pytest.fixture
-def nodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Launcher, list[str]]]:
-    """Bridge, compensator and simulator as processes on vcan0 with a slow clock, and their log so far."""
+@pytest.fixture(params=["vcan0", "vcan0,vcan0,vcan1,vcan1"])
+def nodes(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[Launcher, list[str]]]:
+    """Bridge, compensator and simulator as processes on these channels with a slow clock, and their log so far."""
     (tmp_path / "sitecustomize.py").write_text(SITECUSTOMIZE)
     (tmp_path / "trial.yaml").write_text(yaml.safe_dump(TRIAL))
     content = yaml.safe_load(CONFIG.read_text())
@@ -60,7 +66,7 @@ def nodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Lau
     for node, changes in CHANGES.items():
         content[f"/right/{node}"]["ros__parameters"].update(changes)
     for node in ("can_bridge", "simulator"):
-        content[f"/right/{node}"]["ros__parameters"]["can"] = dict(zip(("interface", "channel"), VCAN, strict=True))
+        content[f"/right/{node}"]["ros__parameters"]["can"] = {"interface": VCAN[0], "channel": request.param}
     content["/right/simulator"]["ros__parameters"]["trial"] = str(tmp_path / "trial.yaml")
     params = tmp_path / "params.yaml"
     params.write_text(yaml.safe_dump(content))

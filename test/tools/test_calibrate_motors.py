@@ -6,7 +6,7 @@ import math
 import re
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import can
@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.joint_motor import JointMotor, channels_of
 from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
 from exo_gravity.hardware.can.bus_scan import BusScan, MotorAnswer
 from exo_gravity.hardware.ownership.bus_lock import BusLock
@@ -193,19 +193,39 @@ def test_a_zero_that_survives_a_power_up_is_noted(tmp_path: Path) -> None:
 
 @contextmanager
 def device_on(channel: str, arm: Arm) -> Iterator[SimulatedDevice]:
-    """Serve a device with the motors of `arm`, boards of both wire formats, on a virtual bus."""
+    """Serve a device with the motors of `arm`, boards of both wire formats, on a virtual bus or on one for each."""
     formats = (MIT_V3, MIT, MIT, MIT_V3)
     specs = [each.ranged(spec) for each, spec in zip(formats, SPECS, strict=True)]
     columns = zip(specs, arm.ids, arm.directions, arm.zeros.tolist(), (1.0,) * 4, formats, strict=True)
     boards = [simulated_motor(JointMotor(*column), Firmware(status_rate=100.0)) for column in columns]
     device, stop = SimulatedDevice(SimulatedArm(), boards), threading.Event()
-    with can.Bus(interface="virtual", channel=channel) as bus:
+    with ExitStack() as opened:
+        names = channels_of(channel)
+        buses = {name: opened.enter_context(can.Bus(interface="virtual", channel=name)) for name in set(names)}
         hold = lambda now: device.arm.reset(arm.pose.tolist())  # noqa: E731
-        thread = threading.Thread(target=device.run, args=(bus, stop.is_set, hold))
+        thread = threading.Thread(target=device.run, args=([buses[name] for name in names], stop.is_set, hold))
         thread.start()
         yield device
         stop.set()
         thread.join()
+
+
+def test_motors_on_two_buses_are_found_and_the_channel_of_each_joint_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(BusScan.scan, "__defaults__", (range(1, IDS),))
+    monkeypatch.setattr(motors, "MAX_SILENCE", 10.0)
+    arm = Arm(15)
+    monkeypatch.setattr(Person, "wait", lambda person, request, watch: arm.wait(request, watch))
+    params, output = params_of(tmp_path, "near, far, far, far"), tmp_path / "new.yaml"
+    with device_on("far,near,near,far", arm) as device:
+        assert main(["motors", "--params", str(params), "--output", str(output)]) == 0
+        assert not device.powered
+    assert "on near and far" in capsys.readouterr().out
+    found = configured_arm(output, "right")
+    assert found.can_bridge["can.channel"] == "far,near,near,far"
+    assert [motor.can_id for motor in found.motors] == arm.ids
+    assert [motor.wire_format.name for motor in found.motors] == ["mit_v3", "mit", "mit", "mit_v3"]
 
 
 def test_the_command_line_describes_the_device_in_the_new_file_or_says_why_not(
