@@ -46,15 +46,15 @@ HOLD_STIFFNESS = 60.0  # Nm/rad by which a contested motor holds its joint: the 
 HOLD_REACH = 0.15  # rad at most from where the joint is,
 HOLD_SPEED = 0.3  # rad/s with which the held position follows the joint
 FOREIGN_COMMAND = "foreign command"
-HELD_ELSEWHERE = JointSample(0.0, 0.0, 0.0, None, None, -math.inf)  # a joint of which another process takes care
+UNREACHED = JointSample(0.0, 0.0, 0.0, None, None, -math.inf)  # a joint whose bus is not open
 
 
 class MotorBus:
     """Four motors with different IDs. Not thread-safe: one thread owns it.
 
-    bus: of all motors; or the port of each (4,), None if another process takes care of it: such a joint counts as at
-    rest, without torque. powered: whether the motors are already on. note: called with each drive before its frames are
-    sent. reopen: opens `bus` again after a failure. clock: of all times.
+    bus: of all motors; or the port of each (4,), None if it is not open: such a joint counts as at rest, without
+    torque, and is sent nothing. powered: whether the motors are already on. note: called with each drive before its
+    frames are sent. reopen: opens `bus` again after a failure. clock: of all times.
     """
 
     def __init__(
@@ -155,8 +155,8 @@ class MotorBus:
             if port not in self._failed:
                 port.confirm()
         if count < JOINT_COUNT:
-            elsewhere = HELD_ELSEWHERE._replace(time=max(self.samples[joint].time for joint in self._joints))
-            self.samples[:] = (self.samples[i] if i in self._joints else elsewhere for i in range(JOINT_COUNT))
+            missing = UNREACHED._replace(time=max(self.samples[joint].time for joint in self._joints))
+            self.samples[:] = (self.samples[i] if i in self._joints else missing for i in range(JOINT_COUNT))
         self._raise_failure()
         return len(self._answered) == count
 
