@@ -18,6 +18,8 @@ from pathlib import Path
 import pytest
 
 from exo_gravity.core.errors import BusError
+from exo_gravity.hardware.clock import COMPUTER_CLOCK
+from exo_gravity.hardware.ownership.arm_on_bus import ArmLock
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.hardware.ownership.owned_bus import Watchdog
 
@@ -107,7 +109,7 @@ def test_a_full_pipe_of_the_log_does_not_delay_the_watchdog(rig, carry):
 
 
 def test_a_frozen_watchdog_is_noticed_and_recovers_and_ends_with_its_bridge(rig):
-    lock = BusLock(rig.arm.address, "a test")
+    lock = ArmLock(rig.arm, "a test", 0.0, COMPUTER_CLOCK)
     watchdog = Watchdog(lock, rig.arm)
     wait_until(lambda: lock.notes.heartbeat and watchdog.alive)
     os.kill(watchdog.process.pid, signal.SIGSTOP)
