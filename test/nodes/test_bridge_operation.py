@@ -53,7 +53,7 @@ def sent(node, monkeypatch):
     def sent(loop, count, answered=None):
         motors = tuple(JointMotor(MOTORS["AK60-6"], can_id) for can_id in (1, 2, 3, 4))
         arm = ArmOnBus(("virtual", "arm", {}), motors, Limits(("a", "b", "c", "elbow")), 0.004)
-        report = BridgeReport(node, arm, Traffic(4), Lease())
+        report = BridgeReport(node, arm, {"can0": Traffic(4)}, Lease())
         for n in range(count):
             report.send(loop(n), NO_COMMAND._replace(answered=clock.now if answered is None else answered), "none")
             clock.now += 0.1
