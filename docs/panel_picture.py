@@ -13,7 +13,11 @@ from test.support.panel_browser import chromium, open_page, wait_for_state
 from test.support.panel_stage import Stage
 
 DOCS = Path(__file__).parent
-PAST = (("2026-03-14 10:42:07", "P01", "two_poses"), ("2026-03-14 10:31:50", "P01", "demo"), ("2026-03-11 09:15:22", "P02", "demo"))
+PAST = (
+    ("2026-03-14 10:42:07", "P01", "two_poses"),
+    ("2026-03-14 10:31:50", "P01", "demo"),
+    ("2026-03-11 09:15:22", "P02", "demo"),
+)
 
 
 def main() -> None:
@@ -23,7 +27,12 @@ def main() -> None:
     stage.arms.states["right"] = "active"
     stage.arms.fail("left", "over_temperature")
     wearer = stage.files.wearers["P01"] = {"wearer.body_mass": 75.0}
-    session = {"subject": "P01", "protocol": "reaching, second week", "note": "sleeve size M", "folder": "recordings/P01"}
+    session = {
+        "subject": "P01",
+        "protocol": "reaching, second week",
+        "note": "sleeve size M",
+        "folder": "recordings/P01",
+    }
     stage.files.content["session"] = {**session, "wearer": wearer}
     folder = "recordings/P01/2026-03-14/recording"
     stage.files.content["recording"] = {"on": True, "foreign": False, "folder": folder, "seconds": 84}
