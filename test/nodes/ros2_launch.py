@@ -162,6 +162,9 @@ def standing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosProbe]:
     nodes = LaunchedNodes(tmp_path_factory.mktemp("commands"), timing=CALM, can_bridge={"autostart": False})
     launched, probe = Launched(nodes), RosProbe()
     probe.wait_until(lambda: probe.status_contains("can_bridge", "inactive"))
+    end = time.monotonic() + ANSWER_TIMEOUT
+    while "/right/can_bridge" not in typed("ros2 node list", ""):  # the daemon that the first command starts
+        assert time.monotonic() < end
     yield probe
     launched.ctrl_c()
     launched.wait()

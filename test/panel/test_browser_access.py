@@ -35,6 +35,7 @@ def test_the_page_is_german_when_its_user_wants_it(visit, stage):
     assert page.get_attribute("html", "lang") == "de"
     texts = page.inner_text("body")
     assert not re.search(r"\b(Let down|Enable|Clear fault|Wearer|Recording)\b", texts)
+    assert "Rumpf: 11,5° nach vorn, 5,7° nach links" in texts and "Rate: 250,0 Hz. Alter der Momente: 4,1 ms." in texts
     page.reload()
     page.wait_for_selector("#let-down:has-text('Absenken')")
 

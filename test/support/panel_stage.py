@@ -42,6 +42,7 @@ class PlayedArms:
     changing: str = "none"  #: what a compensator reports of a change of load
     weighing: str = "none"  #: what it reports of the load in the hand,
     contact: str = "none"  #: and of contacts
+    pose: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  #: rad, about which the joints swing
     sinking: float = 0.0  #: rad/s at which the joints give way to gravity
     messages: dict[str, str] = field(default_factory=dict)  #: of the bridges, by arm, if not the usual ones
     #: what the simulators report
@@ -86,7 +87,7 @@ class PlayedArms:
     def state(self, name: str, now: float) -> dict[str, Any]:
         """Return the state of one arm as the node makes it."""
         names = [f"{name}_{leaf}" for leaf in LEAVES]
-        position = [0.3 * math.sin(0.5 * now + n) for n in range(4)]
+        position = [middle + 0.3 * math.sin(0.5 * now + n) for n, middle in enumerate(self.pose)]
         effort = [0.8 * math.sin(0.5 * now + n) for n in range(4)]
         state, fault = self.states[name], self.faults.get(name, "none")
         values = {"state": state, "fault": fault, "rate (Hz)": "250.0", "age of efforts (ms)": "4.1"}

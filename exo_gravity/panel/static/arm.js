@@ -162,7 +162,7 @@ export class ArmCard {
     if (this.setup?.settings) this.follow();
     this.showSupport();
     this.showJoints(alive ? state.joints : null, bridge);
-    const rates = bridge ? `${t("rate")}: ${bridge["rate (Hz)"] ?? ""} Hz. ${t("age")}: ${bridge["age of efforts (ms)"] ?? ""} ms.` : "";
+    const rates = bridge ? `${t("rate")}: ${number(finite(bridge["rate (Hz)"]), 1)} Hz. ${t("age")}: ${number(finite(bridge["age of efforts (ms)"]), 1)} ms.` : "";
     const limits = bridge?.["limits acting"];
     write(this.find(".rates"), limits && limits !== "none" ? `${rates} ${t("limits", limits)}` : rates);
   }

@@ -6,7 +6,7 @@ import { connect, letDown, link, request, watch } from "./link.js";
 import { Plots } from "./plots.js";
 import { Picture } from "./picture.js";
 import { Sections } from "./sections.js";
-import { loadTexts, number, t, write } from "./texts.js";
+import { degrees, loadTexts, number, t, write } from "./texts.js";
 
 const byId = (id) => document.getElementById(id);
 const cards = new Map();
@@ -132,8 +132,10 @@ function show() {
   showControl(operates);
   sections.show(state, operates);
   const tilt = state.tilt;
-  write(byId("tilt"), tilt ? t("tilt", number((tilt.pitch * 180) / Math.PI, 1), number((tilt.roll * 180) / Math.PI, 1)) : t("tilt_none"));
+  write(byId("tilt"), tilt ? t("tilt", lean(tilt.pitch, "tilt.forward", "tilt.back"), lean(tilt.roll, "tilt.right", "tilt.left")) : t("tilt_none"));
 }
+
+const lean = (angle, towards, away) => `${number(Math.abs(degrees(angle)), 1)}° ${t(angle < 0 ? away : towards)}`;
 
 // The bar that stays in sight: each arm in a few words, and whether a recording runs.
 function showBar() {
