@@ -31,7 +31,6 @@ SHARES = (0.6, 0.2)  # of his arm's weight, at the start and the end
 MOVE, RESTED, TIRING, TIRED, RECOVERED = 3.0, 3.0, 60.0, 20.0, 30.0  # s
 SPARE = 0.3  # Nm, with which he guides joints that carry nothing
 FASTEST = 0.3  # rad/s
-NEEDED = 0.1  # of his arm: how far the support may be from what he lacks; friction carries a part
 
 
 class Tiring(Muscles):
@@ -80,10 +79,10 @@ class Adapting(Compensator):
 
 @dataclass(frozen=True, eq=False)
 class Tired:
-    """What became of one wearer. sunk: rad, furthest of any joint from the pose while he was tired.
+    """What became of one wearer. time, support: (n,) s from when he begins to tire, and 0..1.
 
-    time, support: (n,) s from when he begins to tire, and 0..1. speed: rad/s, of the fastest joint. trouble: '' if the
-    arm was carried to the end.
+    speed: rad/s, of the fastest joint until his strength comes back. sunk: rad, furthest of any joint from the pose
+    until then. trouble: '' if the arm was carried to the end.
     """
 
     seed: int
@@ -112,7 +111,8 @@ def tire(worn: Worn, adapts: bool) -> Tired:
     settings = replace(worn.settings, support=SUPPORT, support_adapts=adapts)
     limits = Limits(JOINTS, max_effort=settings.max_effort, max_velocity=(20.0,) * 4, sign_check_torque=0.0)
     compensator = Adapting(settings)
-    trial = OfflineTrial(ArmSetup(worn.side, device, worn.motors, limits, settings, RATE, imu), script, DELAY, compensator, wearer)
+    setup = ArmSetup(worn.side, device, worn.motors, limits, settings, RATE, imu)
+    trial = OfflineTrial(setup, script, DELAY, compensator, wearer)
     compensator.read = lambda: [joint.effort for joint in trial._samples]
     compensator.trunk = lambda: Tilt.of_felt(worn.side, imu.log[-2][4:])
     recording = trial.run()
@@ -122,3 +122,26 @@ def tire(worn: Worn, adapts: bool) -> Tired:
     during = (recording.time > start) & (recording.time < start + TIRING + TIRED)
     sunk = np.abs(recording.position[during] - pose).max(initial=0.0)
     return Tired(worn.seed, time - start, support, float(np.abs(motion[:, 1:]).max()), float(sunk), trial.trouble)
+
+
+def verdict(pairs: Sequence[tuple[Tired, Tired]]) -> list[Row]:
+    """Return the rows of the table. pairs: of each device, with a support that adapts and with a fixed one."""
+    tired = [one.mean(TIRING, TIRING + TIRED) for one, _ in pairs]
+    back = [one.mean(TIRING + TIRED + RECOVERED - 5.0, TIRING + TIRED + RECOVERED) for one, _ in pairs]
+    fastest = max(one.speed for one, _ in pairs)
+    carried = sum(not one.trouble for pair in pairs for one in pair)
+    rows = [
+        Row("tiring from 60 to 20 %: support once he is tired, from 40 %", _percent(tired), "", True),
+        Row("tiring from 60 to 20 %: 30 s after his strength came back", _percent(back), "", True),
+        Row("tiring from 60 to 20 %: fastest joint", f"{fastest:.2f} rad/s", f"{FASTEST} rad/s", fastest < FASTEST),
+    ]
+    for number, name in enumerate(("support that adapts", "fixed support")):
+        sunk = np.degrees([pair[number].sunk for pair in pairs])
+        shown = f"{np.median(sunk):.0f} degrees in the median, {sunk.max():.0f} at most"
+        rows.append(Row(f"tiring from 60 to 20 %: furthest from his pose, {name}", shown, "", True))
+    rows.append(Row("tiring from 60 to 20 %: arms carried to the end", f"{carried} of {2 * len(pairs)}", "all", carried == 2 * len(pairs)))
+    return rows
+
+
+def _percent(shares: Sequence[float]) -> str:
+    return f"{100.0 * np.mean(shares):.0f} %, {100.0 * min(shares):.0f} to {100.0 * max(shares):.0f}"

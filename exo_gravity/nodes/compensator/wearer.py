@@ -87,9 +87,9 @@ class WearerWatch(Repeated):
         s = self._control.settings
         if not isinstance(s, Settings) or s.mode != "zero_g" or not s.support_adapts:
             return "off"
-        risen = f" -> {100.0 * s.support_now:.0f}" if s.raised_support > s.support else ""
         problem = "the estimate failed" if self.failure else self._adaptation.problem
-        return f"{100.0 * s.support:.0f}{risen} %{f', cannot rise: {problem}' if problem else ''}"
+        ends = dict.fromkeys(f"{100.0 * support:.0f}" for support in (s.support, s.support_now))
+        return f"{' -> '.join(ends)} %{f', cannot rise: {problem}' if problem else ''}"
 
     def _tick(self) -> None:
         now = time.monotonic()
