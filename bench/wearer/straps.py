@@ -1,8 +1,9 @@
 """A wearer whose arm is not a part of the robot's: straps that give, and a shoulder that moves.
 
-His arm is a chain of its own beside the robot's, with the same joints, in which his muscles act. At two cuffs it is tied
-to the robot by springs and dampers. Its shoulder moves with the elevation of his upper arm, upwards and to the spine,
-as the scapula turns (scapulo-humeral rhythm). The table says what becomes of the estimate, which knows of neither.
+His arm is a chain of its own beside the robot's, with the same joints, in which his muscles act. At two cuffs it is
+tied to the robot by springs and dampers. Its shoulder moves with the elevation of his upper arm, upwards and to the
+spine, as the scapula turns (scapulo-humeral rhythm). The table says what becomes of the estimate, which knows of
+neither.
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ class StrappedArm(SimulatedArm):
             for axis in ("1 0 0", "0 1 0", "0 0 1")
         )
         girdle = f'<inertial pos="0 0 0" mass="{GIRDLE}" diaginertia="0.01 0.01 0.01"/>'
-        both = f"<body gravcomp=\"1\">{slides}{girdle}{inside}</body></worldbody>"
+        both = f'<body gravcomp="1">{slides}{girdle}{inside}</body></worldbody>'
         self.model = mujoco.MjModel.from_xml_string(robot.replace("</worldbody>", both))
         self.data = mujoco.MjData(self.model)
         self._theta, self._velocity, self._torque = self.data.qpos[:4], self.data.qvel[:4], self.data.qfrc_applied[:4]
@@ -125,7 +126,7 @@ def trials(worn: Worn) -> list[Trial]:
 def table(found: Sequence[Sequence[Trial]]) -> str:
     """Return the table of all devices' `trials`."""
     lines = [
-        "| between his arm and the robot | RMS error, Nm | within the 95 % band | share over a trial, largest error | mean |",
+        "| between his arm and the robot | RMS error, Nm | within the 95 % band | share over a trial, off by | mean |",
         "|---|---|---|---|---|",
     ]
     for name, column in zip(TIED, zip(*found, strict=True), strict=True):
@@ -133,7 +134,9 @@ def table(found: Sequence[Sequence[Trial]]) -> str:
         rms = " ".join(f"{value:.2f}" for value in np.sqrt(np.mean(error**2, axis=0)))
         inside = np.concatenate([np.abs(trial.error[0]) <= COVER * trial.curve.deviation for trial in column]).mean()
         off = np.array([float(trial.share.value) - trial.true_share for trial in column])
-        lines.append(f"| {name} | {rms} | {inside:.1%} | {points(float(np.abs(off).max()))} | {100.0 * off.mean():+.1f} |")
+        lines.append(
+            f"| {name} | {rms} | {inside:.1%} | {points(float(np.abs(off).max()))} | {100.0 * off.mean():+.1f} |"
+        )
     return "\n".join(lines)
 
 

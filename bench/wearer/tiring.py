@@ -1,8 +1,8 @@
 """A wearer who holds a pose and tires, with a support that adapts and with a fixed one.
 
-He means to hold the pose all the time. His muscles give no more than a share of his arm's weight, which falls from 60 to
-20 % within a minute, stays there for 20 s, and comes back at once. Only their damping, with which a muscle
-yields, is beyond that.
+He means to hold the pose all the time. His muscles give no more than a share of his arm's weight, which falls from 60
+to 20 % within a minute, stays there for 20 s, and comes back at once. Only their damping, with which a muscle yields,
+is beyond that.
 """
 
 from __future__ import annotations
@@ -139,7 +139,8 @@ def verdict(pairs: Sequence[tuple[Tired, Tired]]) -> list[Row]:
         sunk = np.degrees([pair[number].sunk for pair in pairs])
         shown = f"{np.median(sunk):.0f} degrees in the median, {sunk.max():.0f} at most"
         rows.append(Row(f"tiring from 60 to 20 %: furthest from his pose, {name}", shown, "", True))
-    rows.append(Row("tiring from 60 to 20 %: arms carried to the end", f"{carried} of {2 * len(pairs)}", "all", carried == 2 * len(pairs)))
+    held = carried == 2 * len(pairs)
+    rows.append(Row("tiring from 60 to 20 %: arms carried to the end", f"{carried} of {2 * len(pairs)}", "all", held))
     return rows
 
 

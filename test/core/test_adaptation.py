@@ -27,7 +27,7 @@ PERIOD, WEIGHT, CODE = 0.01, 8.0, 25.0 / 4095.0  # s, Nm, rad
 
 
 class Arm:
-    """One joint that moves as it is told, and the adaptation. share: of the wearer. supports: 0..1, of each change."""
+    """One joint that moves as it is told, and the adaptation. share: of the wearer. changes: s, of the support."""
 
     def __init__(self, settings: Settings = SETTINGS) -> None:
         self.settings = settings
@@ -64,7 +64,9 @@ def test_the_support_rises_while_the_arm_sinks_and_no_faster_than_one_guided_cha
     arm = Arm()
     assert arm.move(0.0, 5.0) == pytest.approx(0.4, abs=0.02)
     assert arm.move(-0.05, 5.0) == pytest.approx(0.4 + 5.0 * RISE, abs=0.04)
-    assert all(later - earlier >= FADE_TIME - 1e-9 for earlier, later in zip(arm.changes, arm.changes[1:], strict=False))
+    assert all(
+        later - earlier >= FADE_TIME - 1e-9 for earlier, later in zip(arm.changes, arm.changes[1:], strict=False)
+    )
     assert 2 <= len(arm.changes) <= 4
     arm.share = 0.05
     assert arm.move(-0.05, 20.0) == 1.0
