@@ -13,7 +13,7 @@
 # make ordinary     ordinary motors, sensors and computers for an hour of virtual time: no alarm; a table, 10 minutes
 # make motion-monitor  which wrong efforts can_bridge sees, and an hour of a fast wearer, whom it must not disturb; 20 minutes
 # make effort-study  how hard the simulated arm is to move, under every setting, 5 minutes; QUICK=1: part of it
-# make wearer-study  the wearer's torque and share as estimated, on 20 calibrated devices, judged by the truth; 20 minutes
+# make wearer-study  the wearer's torque and share as estimated, on 20 calibrated devices, judged by the truth; an hour
 # make baselines    in place of a model: PID, cube map, learned laws, a growing ANFIS, 6 minutes; build/baselines
 # make imu-report   the trunk's inclination error on recorded motion, here and by VQF and imufusion; TRIALS=FOLDER
 # make socketcan    motor bus and nodes on vcan0 and vcan1; RUN=COMMAND runs the tests through COMMAND, in a virtual machine for example
@@ -122,6 +122,7 @@ effort-study:
 wearer-study:
 	@$(SETUP) $(TEST) calibrate
 	$(BIN)/python -m bench.wearer
+	$(BIN)/python -m bench.wearer.straps
 
 baselines:
 	@$(SETUP) $(TEST)

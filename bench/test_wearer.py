@@ -8,17 +8,20 @@ import numpy as np
 import pytest
 
 from bench.device_study import as_markdown
-from bench.wearer import payload
+from bench.wearer import payload, tiring, ways
 from bench.wearer.devices import draw
 from bench.wearer.muscles import ACTIVATION, DELAY, Muscles, Phase, phase_at
 from bench.wearer.payload import Balance
 from bench.wearer.report import METHODS, picture, verdict
-from bench.wearer.study import KINDS, judge, play
+from bench.wearer.straps import RHYTHM, StrappedArm, table
+from bench.wearer.study import KINDS, Trial, judge, play
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.calibration.weighing import Weighed
 from exo_gravity.core.model.wearer import Wearer
+from exo_gravity.core.observer.share import Share, WearerCurve
 from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.sim import STEP
+from exo_gravity.sim import STEP, ArmConfig
+from exo_gravity.sim.arm import DEFAULT_LINKS
 
 LENGTH = (0.05, 0.13, 0.30, 0.30)
 LOAD = Wearer(75.0).on_links(LENGTH)
@@ -83,6 +86,76 @@ def test_a_load_that_is_weighed_wrongly_misses_its_limit_and_one_that_is_refused
     balance.results[1] = None
     refused = payload.verdict([(balance, "")])[0]
     assert "1 refused" in refused.shown and not refused.held
+
+
+def test_a_wearer_who_tires_has_the_strength_that_the_study_says():
+    script = TrialScript.parse({"name": "still", "steps": [{"hold": 200.0}]})
+    wearer = tiring.Tiring(script, (Phase(POSE, 1.0, 199.0, (0.0, 0.0)),), ARM, lambda: Tilt.of("right"), 1)
+    begin = tiring.MOVE + tiring.RESTED
+    shares = [(wearer.strength_at(begin + since, -5.0) - tiring.SPARE) / 5.0 for since in (0.0, 30.0, 60.0, 79.0, 81.0)]
+    assert shares == pytest.approx([0.6, 0.4, 0.2, 0.2, 0.6])
+    assert wearer.strength_at(begin - 1.0, 5.0) > 20.0
+
+
+def test_a_joint_that_is_too_fast_and_an_arm_that_is_let_down_miss_their_limits():
+    time = np.linspace(0.0, 110.0, 1101)
+    calm = tiring.Tired(0, time, np.where(time < 60.0, 0.4, 0.75), 0.1, 0.2, "")
+    rows = tiring.verdict([(calm, replace(calm, sunk=1.0))])
+    assert all(row.held for row in rows) and rows[0].shown == "75 %, 75 to 75"
+    assert [row.shown.split(" in")[0] for row in rows if "furthest" in row.what] == ["11 degrees", "57 degrees"]
+    missed = tiring.verdict([(replace(calm, speed=0.31), replace(calm, trouble="let down"))])
+    assert [row.what for row in missed if not row.held] == [
+        "tiring from 60 to 20 %: fastest joint", "tiring from 60 to 20 %: arms carried to the end",
+    ]  # fmt: skip
+
+
+def test_torques_measured_in_poses_know_an_arm_better_than_a_table():
+    average, full, equilibrium = ways.left_over(draw(3))
+    assert full < 0.03 < average < 0.2 and full < equilibrium < average
+    assert len(ways.verdict([np.array((0.1, 0.01, 0.03))])) == 3
+
+
+def test_a_strapped_arm_is_held_by_the_torque_of_both_arms_and_its_shoulder_rises_with_it():
+    config = ArmConfig(
+        DEFAULT_LINKS, wearer_mass=LOAD.mass.tolist(), wearer_cog=LOAD.cog.tolist(), coulomb_friction=(0.0,) * 4
+    )
+    torque = gravity_torque(DEFAULT_LINKS.with_wearer(LOAD.mass, LOAD.cog), POSE).tolist()
+    for rhythm, within in ((0.0 * RHYTHM, 0.05), (RHYTHM, 0.15)):
+        arm = StrappedArm(config, rhythm)
+        arm.reset(POSE)
+        arm.step(torque, 250)
+        assert arm.positions[:4] == pytest.approx(POSE, abs=within)
+        assert 0.001 < arm.gap < 0.04
+        at_rest = arm.data.qpos[4:7] - rhythm * (1.0 - np.diff(arm.data.xpos[8:10], axis=0)[0, 2] / LENGTH[2])
+        assert np.abs(at_rest).max() < 0.015
+    arm = StrappedArm(config, 0.0 * RHYTHM)
+    arm.reset(POSE)
+    arm.data.qfrc_applied[7:] = (0.0, 3.0, 0.0, 0.0)  # his muscles lift both arms by the straps
+    arm.step(torque, 250)
+    assert arm.positions[1] > POSE[1] + 0.05
+
+
+def test_the_table_of_straps_has_a_row_for_each_tie():
+    trial = judge_of_constant(0.5)
+    lines = table([[trial, trial, replace(trial, true_share=0.7)]]).splitlines()
+    assert len(lines) == 5 and "0.50 0.50 0.50 0.50" in lines[2]
+    assert "-20.0" in lines[4] and "+0.0" in lines[2]
+
+
+def judge_of_constant(error: float) -> Trial:
+    """Return a trial whose estimate is off by `error` Nm everywhere."""
+    ones = np.ones((10, 4))
+    curve = WearerCurve(np.arange(10.0), ones, ones, ones)
+    share = Share(np.array(0.5), np.array(0.1))
+    return Trial(0, curve, curve, np.full((3, 10, 4), error), np.zeros(10, int), share, 0.5, (), "")
+
+
+@pytest.mark.thorough
+def test_a_wearer_who_tires_is_carried_further_on_a_calibrated_device():
+    adapted = tiring.tire(draw(3), adapts=True)
+    assert adapted.trouble == ""
+    assert adapted.mean(tiring.TIRING, tiring.TIRING + tiring.TIRED) > 0.6
+    assert adapted.speed < tiring.FASTEST
 
 
 @pytest.mark.thorough

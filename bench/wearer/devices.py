@@ -22,7 +22,7 @@ from exo_gravity.core.compensation.settings import Settings, settings_of
 from exo_gravity.core.compensation.terms.friction_inertia import Friction
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.model.gravity import moments_of
+from exo_gravity.core.model.gravity import gravity_torque, moments_of
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.motors.joint_motor import JointMotor
@@ -41,6 +41,7 @@ MOUNTING = math.radians(1.2)  # of the IMU, before the weight of the arm correct
 BODY_MASS = (55.0, 90.0)  # kg
 MASS_ERROR, COG_ERROR = 0.15, 0.03  # of the body-mass table: share of a segment's mass; m along the segment
 RELAXED = np.array(((0.0, 0.1, 0.1, 0.2), (0.3, 0.9, 0.2, 0.6), (-0.2, 0.6, 1.0, 0.4), (0.4, 1.1, 0.6, 1.4)))  # rad
+EQUILIBRIUM = 1  # of them, for the way of that name
 BREATHING = 0.1  # Nm
 WITHIN = 0.1  # share of friction
 MOST = 18.0  # Nm that a joint may be asked for
@@ -51,7 +52,8 @@ HANGING = (0.0, 0.05, 0.05, 0.05)  # rad
 class Worn:
     """A device with a wearer in it. settings, motors: as calibrated; the rest is the truth.
 
-    mounting: (3,) rad, the rotation of gravity that calibration leaves.
+    mounting: (3,) rad, the rotation of gravity that calibration leaves. ways: his arm by each of the three ways of
+    `ways.py`.
     """
 
     seed: int
@@ -61,15 +63,16 @@ class Worn:
     settings: Settings
     motors: tuple[JointMotor, ...]
     mounting: np.ndarray
+    ways: tuple[ArmModel, ArmModel, ArmModel]
 
     @property
     def wearer(self) -> ArmModel:
         """The wearer's true arm."""
         return ArmModel(LENGTH, self.config.wearer_cog, self.config.wearer_mass)
 
-    def device(self) -> SimulatedDevice:
-        """Return the simulated device, whose arm hangs."""
-        arm = SimulatedArm(self.config)
+    def device(self, arm: SimulatedArm | None = None) -> SimulatedDevice:
+        """Return the simulated device, whose arm hangs. arm: another one than that of `config`."""
+        arm = arm or SimulatedArm(self.config)
         arm.reset(HANGING)
         firmware = Firmware(current_noise=CURRENT_NOISE)
         motors = zip(self.motors, self.scale.tolist(), strict=True)
@@ -117,15 +120,25 @@ def draw(seed: int) -> Worn:
     ]
     arm = replace(nominal, robot=settings_of(found).robot, compensator=found)
     found |= {change.name: change.value for change in wearer_from(arm, relaxed).changes}
+    pose = relaxed[EQUILIBRIUM]
+    tabled = gravity_torque(ArmModel(LENGTH, load.cog, load.mass), pose.theta, pose.direction)
+    carried_there = pose.effort - gravity_torque(arm.robot, pose.theta, pose.direction)
+    scaled = load.mass * (tabled @ carried_there) / (tabled @ tabled)
+    full = settings_of(found)
+    ways = (
+        ArmModel(LENGTH, load.cog, load.mass),
+        ArmModel(LENGTH, full.wearer_cog, full.wearer_mass),
+        ArmModel(LENGTH, load.cog, scaled),
+    )
     wrong = rng.uniform(1.0 - WITHIN, 1.0 + WITHIN, (2, 4))
     motors = tuple(
         JointMotor(MOTORS[name], n + 1, torque_scale=values["torque_scale"][n]) for n, name in enumerate(MOTOR_NAMES)
     )
     settings = replace(
-        settings_of(found), max_effort=[min(MOST, motor.peak_effort) for motor in motors],
+        full, max_effort=[min(MOST, motor.peak_effort) for motor in motors],
         terms=TermSettings(friction=Friction(0.0, coulomb * wrong[0], viscous * wrong[1])),
     )  # fmt: skip
-    return Worn(seed, side, config, scale, settings, motors, left)
+    return Worn(seed, side, config, scale, settings, motors, left, ways)
 
 
 def turned(vector: Vector, turn: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -36,6 +36,9 @@ from exo_gravity.sim.trunk_motion import TrunkState
 
 from .devices import Worn, turned
 from .muscles import Muscles, Phase, phase_at
+
+if TYPE_CHECKING:
+    from .straps import StrappedArm
 
 RATE = 100.0  # Hz, of the control loop and the IMU
 DELAY = 2.0  # s until the wearer begins
@@ -141,16 +144,18 @@ def phases_of(seed: int) -> tuple[Phase, ...]:
     return (*lifts, *rests, *tires)
 
 
-def play(worn: Worn) -> Played:
-    """Play the trial of `worn`."""
-    phases, device, imu = phases_of(worn.seed), worn.device(), WornImu(worn)
+def play(worn: Worn, arm: StrappedArm | None = None, trunk: Sequence[dict[str, Any]] = TRUNK) -> Played:
+    """Play the trial of `worn`. arm: in which his arm is strapped to the robot's; None for one that is a part of it."""
+    phases, device, imu = phases_of(worn.seed), worn.device(arm), WornImu(worn)
     ends = np.cumsum([phase.move + phase.hold for phase in phases])
-    script = TrialScript.parse({"name": "wearer", "steps": list(TRUNK)})
+    script = TrialScript.parse({"name": "wearer", "steps": list(trunk)})
 
     def tilt() -> Tilt:
         return Tilt.of(worn.side, device.trunk.pitch, device.trunk.roll)
 
     wearer = Muscles(script, phases, worn.wearer, tilt, worn.seed)
+    if arm:
+        arm.hold(wearer)
     limits = Limits(JOINTS, max_effort=worn.settings.max_effort, max_velocity=(20.0,) * 4, sign_check_torque=0.0)
     compensator = Therapist(worn.settings, [DELAY + ends[2], DELAY + ends[4], DELAY + ends[7]])
     setup = ArmSetup(worn.side, device, worn.motors, limits, compensator.own, RATE, imu)

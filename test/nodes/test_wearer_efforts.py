@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import cast
 
 import numpy as np
@@ -37,6 +38,7 @@ class StillArm:
     def __init__(self, node: Node) -> None:
         self.effort: Sequence[float] = ()
         self.velocity: Sequence[float] = (0.0,) * 4
+        self.sinking = 0.0  # rad every 5 ms, of the abduction
         self._publisher = node.create_publisher(JointState, "/right/joint_states", 1)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._publish)
@@ -48,6 +50,7 @@ class StillArm:
             number += 1
             message.header.stamp = Time(nanoseconds=number).to_msg()
             message.effort, message.velocity = self.effort, self.velocity
+            message.position[1] -= self.sinking
             self._publisher.publish(message)
 
     def close(self) -> None:
@@ -118,10 +121,27 @@ def test_a_load_is_weighed_on_request_and_one_that_is_dropped_is_no_longer_a_par
     assert values["ros__parameters"]["payload"]["mass"] == 0.0
 
 
+def test_the_support_of_a_wearer_whose_arm_sinks_adapts_where_his_share_is_known(launch, probe, arm):
+    worn = {"wearer.body_mass": 75.0, "mode": "zero_g", "support": 0.4, "support_adapts": True}
+    launch(without=OTHER_NODES, compensator={**NO_IMU, **STRONG, **worn, "model_error.wearer": 0.03})
+    carried = gravity_torque(ROBOT.with_wearer(LOAD.mass, LOAD.cog, 0.4), POSE)
+    arm.effort = carried.tolist()
+    adapts = partial(probe.diagnostic, "compensator", "support adapts")
+    probe.wait_until(lambda: adapts() == "40 %")
+    arm.sinking = 0.0002
+    probe.wait_until(lambda: "40 -> " in (adapts() or ""))
+    arm.sinking = 0.0
+    assert float(probe.diagnostic("compensator", "mass carried (kg)")) > ROBOT.total_mass + 0.4 * sum(LOAD.mass) + 0.01
+    assert probe.diagnostic("compensator", "support") == "0.4"
+    assert probe.set_parameters("compensator", model_error__wearer=0.3).successful
+    probe.wait_until(lambda: "40 -> " not in (adapts() or "") and "cannot rise: the wearer's share" in (adapts() or ""))
+    assert probe.set_parameters("compensator", support_adapts=False).successful
+    probe.wait_until(lambda: adapts() == "off")
+
+
 def test_an_estimate_that_fails_says_so_in_diagnostics(probe):
-    watch = WearerWatch(
-        probe.node, [f"right_{part}" for part in PARTS], Compensator(Settings("right", ROBOT, use_imu=False))
-    )
+    control = Compensator(Settings("right", ROBOT, use_imu=False))
+    watch = WearerWatch(probe.node, [f"right_{part}" for part in PARTS], control, threading.Lock())
     watch.newest = 1.0, cast("JointState", "no message")
     watch.start()
     probe.wait_until(lambda: watch.failure is not None)

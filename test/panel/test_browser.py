@@ -362,6 +362,9 @@ def test_a_load_is_weighed_after_a_question_and_carried_after_another(visit, sta
     page.wait_for_selector(carry, state="visible")
     assert page.inner_text(carry) == "Carry 0.99 kg (±0.05)"
     assert "right_elbow_flexion +4.0 Nm" in page.inner_text('.arm[data-arm="right"] .contact')
+    assert "adapts" not in page.inner_text('.arm[data-arm="right"] .limit')
+    stage.arms.adapts = "40 -> 52 %"
+    wait_until(page, lambda: "support adapts: 40 -> 52 %" in page.inner_text('.arm[data-arm="right"] .limit'))
     page.click(carry)
     assert "0.99 kg in the hand instead of 0.00 kg" in page.inner_text("#ask-text")
     page.click("#ask-yes")

@@ -43,6 +43,7 @@ class PlayedArms:
     weighing: str = "none"  #: what it reports of the load in the hand,
     contact: str = "none"  #: and of contacts
     pose: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  #: rad, about which the joints swing
+    adapts: str = "off"  #: from which support to which it adapts
     sinking: float = 0.0  #: rad/s at which the joints give way to gravity
     messages: dict[str, str] = field(default_factory=dict)  #: of the bridges, by arm, if not the usual ones
     #: what the simulators report
@@ -97,6 +98,7 @@ class PlayedArms:
         bridge = {**values, "level": 2 if fault != "none" else 0, "message": self.messages.get(name, message)}
         carried = {"mass carried (kg)": "1.854", "largest support": "0.068", "level": 0, "message": "compensating"}
         carried |= {"changing load": self.changing, "weighing": self.weighing, "contact": self.contact}
+        carried["support adapts"] = self.adapts
         velocity = [-self.sinking * math.copysign(1.0, tau) for tau in effort]
         joints = joint_rows(names, position, velocity, effort)
         return {"bridge": bridge, "compensator": carried, "simulator": self.simulator, "joints": joints}

@@ -95,7 +95,15 @@ class Compensator:
         """Use new settings from the next `step` on; the torque moves to them as a guided motion."""
         if settings.side != self.settings.side:
             raise ParameterError("side", settings.side, f"{self.settings.side}, because the side cannot change")
-        self._pending = settings
+        self._pending, last = settings, self._pending or self.settings
+        if isinstance(settings, Settings) and isinstance(last, Settings) and last.raised_support:
+            self.raise_support(last.raised_support)
+
+    def raise_support(self, support: float) -> None:
+        """Carry `support` (0..1) of the wearer's arm from the next `step` on, if that is more than the settings say."""
+        last = self._pending or self.settings
+        if isinstance(last, Settings) and last.mode == "zero_g" and last.support_adapts:
+            self._pending = replace(last, raised_support=support)
 
     def weigh(self, scale: Scale) -> str:
         """Let `scale` carry the load in the hand from the next `step` on, until it is over; return why not, or ''."""

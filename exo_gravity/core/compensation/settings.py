@@ -47,6 +47,8 @@ class Settings:
     law: str = owned("exact", "law that computes the gravity torque", choices=LAW_NAMES)
     mode: str = owned("one_g", "one_g compensates the robot; zero_g also compensates the wearer's arm", choices=MODES)
     support: float = owned(1.0, "share of the wearer's arm that zero_g compensates", (0.0, 1.0))
+    support_adapts: bool = owned(False, "the support rises above `support` while the wearer's arm sinks")
+    raised_support: float = 0.0  #: to which it has risen
     wearer_mass: Sequence[float] = NO_TORQUE  #: (4,) kg, the wearer's segment on each link
     wearer_cog: Sequence[float] = NO_TORQUE  #: (4,) m from joint n, its centre of gravity
     max_effort: Sequence[float] = owned((3.0, 9.0, 3.0, 3.0), "torque limit per joint", (0.0, MAX_COMMAND), "Nm")
@@ -81,23 +83,29 @@ class Settings:
         if self.law != "exact":
             loaded.check_masses(f"law {self.law}")
         # Computed in every mode, so that an impossible wearer is refused now and not when the mode becomes zero_g.
-        whole = loaded.with_wearer(self.wearer_mass, self.wearer_cog, self.support)
-        if whole.total_mass > MAX_CARRIED:
-            robot, wearer = loaded.total_mass - self.payload_mass, whole.total_mass - loaded.total_mass
+        whole = loaded.with_wearer(self.wearer_mass, self.wearer_cog, self.support_now)
+        wearer = sum(self.wearer_mass) * (1.0 if self.support_adapts else self.support_now)
+        if loaded.total_mass + wearer > MAX_CARRIED:
+            robot = loaded.total_mass - self.payload_mass
             parts = f"robot {robot:.2f}, wearer's share {wearer:.2f}, payload.mass {self.payload_mass:.2f}"
             bound = f"at most {MAX_CARRIED:g} ({parts})"
-            raise ParameterError("total mass in kg", round(whole.total_mass, 2), bound)
+            raise ParameterError("total mass in kg", round(loaded.total_mass + wearer, 2), bound)
         if max(self.robot.scale) > MAX_SCALE:
             scale = [round(value, 2) for value in self.robot.scale]
             raise ParameterError("gain times gravity", scale, f"at most {MAX_SCALE:g} m/s^2, twice the Earth's gravity")
         by_mass = (self.robot_by_mass or self.robot).with_payload(self.payload_mass, self.payload_cog)
-        carried = by_mass.with_wearer(self.wearer_mass, self.wearer_cog, self.support)
+        carried = by_mass.with_wearer(self.wearer_mass, self.wearer_cog, self.support_now)
         object.__setattr__(self, "terms", self.terms.on_arm(self.robot_by_mass or self.robot))
         nothing = ArmModel.from_moments(self.robot.length, NO_TORQUE, gravity=1.0)
         object.__setattr__(self, "unit_load", nothing.with_payload(1.0, self.payload_cog))
         object.__setattr__(self, "loaded", loaded)
         object.__setattr__(self, "arm", whole if self.mode == "zero_g" else loaded)
         object.__setattr__(self, "moving", carried if self.mode == "zero_g" else by_mass)
+
+    @property
+    def support_now(self) -> float:
+        """The share of the wearer's arm that zero_g compensates at present."""
+        return max(self.support, self.raised_support)
 
     def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = False) -> Torque:
         """Return the torque (4,) in Nm that holds the arm at `theta` (4,) rad; exact: by the exact law."""
@@ -159,6 +167,7 @@ COMPENSATOR = (
     Param("anfis_file", "", "model for the law anfis, written by train_anfis", expert=True),
     param_of(Settings, "mode"),
     param_of(Settings, "support"),
+    param_of(Settings, "support_adapts"),
     Param("gain", [1.0, 1.0, 1.0, 1.0], "c_n, scales the torque of joint n", (0.0, MAX_GAIN)),
     Param("gravity", STANDARD_GRAVITY, "g, acceleration of gravity", (0.0, MAX_GRAVITY), "m/s^2"),
     Param("robot.mass", [0.585, 0.468, 0.598, 0.203], "m_n, link masses", (0.0, MAX_MASS), "kg"),

@@ -56,7 +56,7 @@ class BudgetWatch:
         elif self._bridge.values.keys() >= BRIDGE_PARAMETERS:
             s = settings
             load = tuple(s.wearer_mass), tuple(s.wearer_cog)
-            support = s.support if s.mode == "zero_g" else 0.0
+            support = (1.0 if s.support_adapts else s.support) if s.mode == "zero_g" else 0.0
             request = s.loaded, load, support, math.radians(USUAL_TILT) if s.use_imu else 0.0
             if request != self._request:
                 self._request = request

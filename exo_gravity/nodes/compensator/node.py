@@ -108,7 +108,7 @@ class CompensatorNode(Node):
         self._assistant = Publishers()
         self._assistants = 0  # changes whenever a message comes from another publisher than the one before
         path = HotPath(self, JointState, "assist_efforts", self._on_assist_efforts, pause=ASSIST_PAUSE)
-        self._wearer = WearerWatch(self, self._names, self._control)
+        self._wearer = WearerWatch(self, self._names, self._control, self._lock)
         self._threads += [path, self._wearer]
         self.create_service(Trigger, "~/weigh", self._weigh)
 
@@ -228,6 +228,7 @@ class CompensatorNode(Node):
             **report(self._control, answer, self._names),
             **({"budget": self._budget.text, "largest support": self._budget.largest_support} if self._budget else {}),
             **({"wearer (Nm)": self._wearer.report, "contact": self._wearer.contact} if self._wearer else {}),
+            **({"support adapts": self._wearer.adaptation} if self._wearer else {}),
             **({"weighing": self._weighing.text if self._weighing else "none"} if self._wearer else {}),
             "last refused message": self._refusal,
         }
@@ -244,6 +245,9 @@ class CompensatorNode(Node):
         settings = self._control.settings
         if self._budget and isinstance(settings, Settings):
             self._budget.update(settings)
+        if self._wearer and self._wearer.failure and isinstance(settings, Settings) and settings.raised_support:
+            with self._lock:
+                self._control.raise_support(0.0)
         self._report_changes()
         self._report(self._answer)
 

@@ -1,10 +1,12 @@
 """Estimates the wearer's torque 100 times a second, outside the control loop: `wearer_efforts`, `wearer_efforts_std`.
 
-The control loop leaves its newest message here, and does not wait. Neither topic leads back to it. If the estimate
-fails, the control loop goes on, and /diagnostics has the reason.
+The control loop leaves its newest message here, and does not wait. Neither topic leads back to it; with
+`support_adapts` the support follows, as a guided change every 2 s. If the estimate fails, the control loop goes on, and
+/diagnostics has the reason.
 """
 
 import math
+import threading
 import time
 from collections.abc import Sequence
 
@@ -18,6 +20,7 @@ from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.model.kinematics import turning_in_base
 from exo_gravity.core.model.rotation import ZERO, Floats3
 from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.observer.adaptation import SupportAdaptation
 from exo_gravity.core.observer.contact import ContactWatch
 from exo_gravity.core.observer.momentum import COVER, MomentumObserver, WearerEstimate
 from exo_gravity.core.trunk.inputs import FELT_RANGE
@@ -33,18 +36,20 @@ class WearerWatch(Repeated):
     """Publishes an estimate for each new sample, from a separate thread.
 
     newest: time in monotonic s and message of the joints; felt: time in monotonic s, specific force (3,) m/s^2,
-    angular velocity (3,) rad/s and age of a sample of the trunk's motion. Both are set by other threads.
+    angular velocity (3,) rad/s and age of a sample of the trunk's motion. Both are set by other threads. lock: guards
+    `control`.
     """
 
-    def __init__(self, node: Node, names: Sequence[str], control: Compensator) -> None:
+    def __init__(self, node: Node, names: Sequence[str], control: Compensator, lock: threading.Lock) -> None:
         super().__init__("wearer", self._tick, 0.0)
         self.newest: tuple[float, JointState | None] = (-math.inf, None)
         self.felt: Sample = (-math.inf, ZERO, ZERO, 0.0)
-        self._names, self._control = names, control
+        self._names, self._control, self._lock = names, control, lock
         self._topics = [node.create_publisher(JointState, f"wearer_efforts{part}", 1) for part in ("", "_std")]
         self._message = JointState(name=names)  # one message, reused
         self._observer: MomentumObserver | None = None
         self._contact = ContactWatch()
+        self._adaptation = SupportAdaptation()
         self._known: object = None  # what the observer depends on
         self._due = 0.0
         self._last = -math.inf  # of the samples used
@@ -76,6 +81,16 @@ class WearerWatch(Repeated):
         ago = min(99.0, time.monotonic() - at)
         return f"{self._names[joint]} {torque:+.1f} Nm, {ago:.0f} s ago; {self._contact.count} in all"
 
+    @property
+    def adaptation(self) -> str:
+        """From which support to which it adapts, for /diagnostics."""
+        s = self._control.settings
+        if not isinstance(s, Settings) or s.mode != "zero_g" or not s.support_adapts:
+            return "off"
+        problem = "the estimate failed" if self.failure else self._adaptation.problem
+        ends = dict.fromkeys(f"{100.0 * support:.0f}" for support in (s.support, s.support_now))
+        return f"{' -> '.join(ends)} %{f', cannot rise: {problem}' if problem else ''}"
+
     def _tick(self) -> None:
         now = time.monotonic()
         self._due = max(self._due + PERIOD, now)
@@ -86,14 +101,20 @@ class WearerWatch(Repeated):
             return
         self._last = taken
         trunk, joints = self._trunk(settings, taken), self._joints(message)
-        if trunk is None or joints is None:
-            self._estimate = None
+        estimate = None
+        if trunk is not None and joints is not None:
+            s = settings
+            load = *s.wearer_mass, *s.wearer_cog, s.payload_mass, *s.payload_cog
+            known = s.robot, load, s.terms.friction, s.model_error
+            if self._observer is None or known != self._known:
+                self._observer, self._known = MomentumObserver(settings), known
+            estimate = self._observer.update(taken, joints, *trunk)
+        self._estimate = estimate
+        if self._adaptation.update(taken, joints and joints[:2], estimate, settings):
+            with self._lock:
+                self._control.raise_support(self._adaptation.support)
+        if estimate is None:
             return
-        wearer = tuple(settings.wearer_mass), tuple(settings.wearer_cog)
-        known = settings.loaded, wearer, settings.terms.friction, settings.model_error
-        if self._observer is None or known != self._known:
-            self._observer, self._known = MomentumObserver(settings), known
-        self._estimate = estimate = self._observer.update(taken, joints, *trunk)
         self._contact.update(taken, estimate)
         self._message.header.stamp = message.header.stamp
         for topic, effort in zip(self._topics, (estimate.torque, estimate.deviation), strict=True):

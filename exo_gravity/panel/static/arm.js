@@ -19,6 +19,7 @@ export class ArmCard {
     this.name = name;
     this.actions = actions;
     this.setup = null;
+    this.adapts = "off"; // from which support to which
     this.limit = null; // the largest support 0..1 within the motors' rated torque
     this.root = document.getElementById("arm").content.cloneNode(true).firstElementChild;
     this.root.dataset.arm = name;
@@ -130,6 +131,7 @@ export class ArmCard {
     const parts = [known ? t("support_limit", number(Math.floor(1000 * limit) / 10, 1)) : t("support_unknown")];
     if (known && value / 100 > limit) parts.push(t("support_over"));
     if (this.mode === "one_g") parts.push(t("support_unused"));
+    if (this.adapts !== "off") parts.push(t("support_adapts", this.adapts));
     write(this.find(".limit"), parts.join(" "));
   }
 
@@ -151,6 +153,7 @@ export class ArmCard {
     const other = alive ? state.compensator : null;
     write(this.find(".compensator"), other ? (other.level ? t("compensator_detail", other.message) : t("carried", number(finite(other["mass carried (kg)"]), 2))) : alive ? t("compensator_silent") : "");
     this.limit = finite(other?.["largest support"]);
+    this.adapts = other?.["support adapts"] ?? "off";
     this.showLoad(other, operates, name === "active");
     this.root.classList.toggle("stale", !alive);
     this.find(".enable").disabled = !operates || name !== "disabled";

@@ -1,0 +1,157 @@
+"""A wearer whose arm is not a part of the robot's: straps that give, and a shoulder that moves.
+
+His arm is a chain of its own beside the robot's, with the same joints, in which his muscles act. At two cuffs it is
+tied to the robot by springs and dampers. Its shoulder moves with the elevation of his upper arm, upwards and to the
+spine, as the scapula turns (scapulo-humeral rhythm). The table says what becomes of the estimate, which knows of
+neither.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+os.environ["OMP_NUM_THREADS"] = "1"
+
+import mujoco
+import numpy as np
+
+from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.model.gravity import NO_TORQUE, Torque
+from exo_gravity.core.observer.momentum import COVER
+from exo_gravity.sim import ArmConfig, SimulatedArm, VirtualWearer
+from exo_gravity.sim import arm as arms
+
+from ..device_study import options_of
+from .devices import Worn, draw
+from .report import points
+from .study import Trial, judge, play
+
+STRAP, STRAP_DAMPING = 2000.0, 40.0  # N/m and N s/m of each cuff
+CUFFS = (0.2, 0.2)  # m along the upper arm and the forearm
+SHOULDER, SHOULDER_DAMPING, GIRDLE = 5000.0, 200.0, 2.0  # N/m, N s/m and kg
+RHYTHM = np.array((-0.02, 0.0, -0.03))  # m in the base's axes at 90 degrees of elevation: to the spine, and up
+LIGHT = 0.001  # kg; links of his chain in which there is no segment
+INERTIA = (0.002,) * 4  # kg m^2, of flesh about each of his joints
+STILL = ({"hold": 47.0},)  # of the trunk
+TIED = ("none", "straps that give", "straps, and a shoulder that moves")
+
+
+class StrappedArm(SimulatedArm):
+    """The robot's arm with a wearer's strapped to it. rhythm: (3,) m, of the shoulder's centre at 90 degrees.
+
+    gap: m, the largest between the robot and the wearer's arm at a cuff so far.
+    """
+
+    def __init__(self, config: ArmConfig, rhythm: np.ndarray = RHYTHM) -> None:
+        self._worn = replace(
+            config, links=ArmModel(config.links.length, (0.0,) * 4, (LIGHT,) * 4), rotor_inertia=INERTIA,
+            coulomb_friction=NO_TORQUE, viscous_friction=NO_TORQUE, stribeck_friction=NO_TORQUE, cog_y=NO_TORQUE,
+            cog_z=NO_TORQUE,
+        )  # fmt: skip
+        self._rhythm, self.gap = rhythm, 0.0
+        super().__init__(replace(config, wearer_mass=NO_TORQUE))
+
+    def hold(self, wearer: VirtualWearer) -> None:
+        """Let `wearer` act on his own joints from now on, and not on the robot's."""
+        own = wearer.torque
+
+        def torque(elapsed: float, theta: Sequence[float], velocity: Sequence[float]) -> Torque:
+            data = self.data
+            data.qfrc_applied[7:] = own(elapsed, data.qpos[7:].tolist(), data.qvel[7:].tolist())
+            return NO_TORQUE
+
+        wearer.torque = torque  # type: ignore[method-assign]
+
+    def reset(self, theta: Sequence[float]) -> None:
+        """Put both arms at rest at `theta`, (4,) rad."""
+        super().reset(theta)
+        self.data.qpos[7:] = theta
+        mujoco.mj_forward(self.model, self.data)
+
+    def step(self, torque: Sequence[float], count: int = 1) -> None:
+        """Apply `torque` (4,) Nm of the motors for `count` times STEP. The base does not turn."""
+        model, data = self.model, self.data
+        muscles = data.qfrc_applied[7:].copy()
+        for _ in range(count):
+            fading = np.exp(-np.square(self._velocity / self._speed))
+            model.dof_frictionloss[:4] = self._coulomb + self._stribeck * fading
+            mujoco.mj_step1(model, data)
+            data.qfrc_applied[:] = self._tied()
+            data.qfrc_applied[:4] += torque
+            data.qfrc_applied[7:] += muscles
+            mujoco.mj_step2(model, data)
+        data.qfrc_applied[7:] = muscles
+
+    def _load(self, payload: Sequence[float]) -> None:
+        super()._load(payload)
+        robot, worn = (arms._mjcf(config) for config in (self.config, self._worn))
+        inside = worn.partition("<worldbody>")[2].partition("</worldbody>")[0]
+        slides = "".join(
+            f'<joint type="slide" axis="{axis}" stiffness="{SHOULDER}" damping="{SHOULDER_DAMPING}"/>'
+            for axis in ("1 0 0", "0 1 0", "0 0 1")
+        )
+        girdle = f'<inertial pos="0 0 0" mass="{GIRDLE}" diaginertia="0.01 0.01 0.01"/>'
+        both = f'<body gravcomp="1">{slides}{girdle}{inside}</body></worldbody>'
+        self.model = mujoco.MjModel.from_xml_string(robot.replace("</worldbody>", both))
+        self.data = mujoco.MjData(self.model)
+        self._theta, self._velocity, self._torque = self.data.qpos[:4], self.data.qvel[:4], self.data.qfrc_applied[:4]
+
+    def _tied(self) -> np.ndarray:
+        """Return the straps' torques and forces on all joints, (11,); move the shoulder's rest."""
+        model, data = self.model, self.data
+        upper, fore = data.xpos[8], data.xpos[9]
+        along = (fore - upper) / self.config.links.length[2]
+        model.qpos_spring[4:7] = self._rhythm * (1.0 - along[2])  # z points down
+        total, of_robot, of_wearer = np.zeros(11), np.empty((3, 11)), np.empty((3, 11))
+        for robot, wearer, at in ((3, 8, CUFFS[0]), (4, 9, CUFFS[1])):
+            ends = [data.xpos[body] + at * data.xmat[body][::3] for body in (robot, wearer)]
+            mujoco.mj_jac(model, data, of_robot, None, ends[0], robot)
+            mujoco.mj_jac(model, data, of_wearer, None, ends[1], wearer)
+            way, jacobian = ends[1] - ends[0], of_wearer - of_robot
+            self.gap = max(self.gap, float(np.linalg.norm(way)))
+            total -= jacobian.T @ (STRAP * way + STRAP_DAMPING * (jacobian @ data.qvel))
+        return total
+
+
+def trials(worn: Worn) -> list[Trial]:
+    """Play and judge the trial of `worn` with each of TIED, on a trunk at rest."""
+    ties = (None, StrappedArm(worn.config, 0.0 * RHYTHM), StrappedArm(worn.config))
+    return [judge(play(worn, tie, STILL)) for tie in ties]
+
+
+def table(found: Sequence[Sequence[Trial]]) -> str:
+    """Return the table of all devices' `trials`."""
+    lines = [
+        "| between his arm and the robot | RMS error, Nm | within the 95 % band | share over a trial, off by | mean |",
+        "|---|---|---|---|---|",
+    ]
+    for name, column in zip(TIED, zip(*found, strict=True), strict=True):
+        error = np.concatenate([trial.error[0] for trial in column])
+        rms = " ".join(f"{value:.2f}" for value in np.sqrt(np.mean(error**2, axis=0)))
+        inside = np.concatenate([np.abs(trial.error[0]) <= COVER * trial.curve.deviation for trial in column]).mean()
+        off = np.array([float(trial.share.value) - trial.true_share for trial in column])
+        lines.append(
+            f"| {name} | {rms} | {inside:.1%} | {points(float(np.abs(off).max()))} | {100.0 * off.mean():+.1f} |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Run the study; print its table, and write it."""
+    options = options_of("bench.wearer.straps", "What straps and a shoulder that moves do.", Path("build/straps"))
+    found = []
+    for seed in range(options.first, options.first + options.devices):
+        found.append(trials(draw(seed)))
+        print(f"device {seed}: {[trial.trouble for trial in found[-1]]}", flush=True)
+        print(table(found), flush=True)
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    options.output.with_suffix(".md").write_text(f"{table(found)}\n", encoding="utf-8")
+    return int(any(trial.trouble for device in found for trial in device))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

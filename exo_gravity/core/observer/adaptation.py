@@ -1,0 +1,107 @@
+"""Support that adapts: it rises while the arm sinks, and is forgotten.
+
+On a still arm the wearer's share is 1 - support, whoever is tired: that is statics. A loop that holds the measured
+share would even take support away from a wearer who tires. What he can no longer carry nobody carries, and the arm
+sinks; muscles that yield resist, so the torques still balance. So it is the sinking that counts. With w (4,) Nm, the
+torque that carries the wearer's arm,
+
+    speed = sum w . theta' / |w|                   rad/s, upwards, from the joints' angles, low-passed by MEAN
+    support' = - RISE * speed / FULL - (support - `support`) / MEMORY
+
+within `support` and 1, the first part within -LIFT * RISE and RISE. So lifting takes back a part of what sinking gave:
+with a support of at most 1 only a person lifts the arm. What is faster than REACH is a movement, and counts as none.
+Sinking counts only while the wearer's share lies between 0 and what is left to him: a hand that presses the arm down,
+and an arm whose motors are off, are outside. Where the share is not known, the support falls by RISE to `support`.
+
+Assistance as needed with forgetting: Wolbrecht, Chan, Reinkensmeyer and Bobrow, IEEE TNSRE 2008.
+"""
+
+import math
+import operator
+from collections.abc import Sequence
+
+from exo_gravity.core.compensation.guidance import FADE_TIME
+from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.model.gravity import NO_TORQUE
+from exo_gravity.core.observer.momentum import COVER, MAX_GAP, WearerEstimate
+from exo_gravity.core.observer.share import LEAST_WEIGHT
+
+MEAN = 1.0  # s, time constant of the speed and of the share
+RISE, FULL = 0.04, 0.01  # of the wearer's arm per s, while it sinks at this speed in rad/s, or faster,
+LIFT = 0.5  # of that at most, while it is lifted
+MEMORY = 60.0  # s, time constant with which a raised support is forgotten
+REACH = 0.2  # rad/s of any joint
+WIDEST = 0.25  # of the wearer's arm: half the width of the share's 95 % band beyond which it says nothing
+LEAST_CHANGE = 0.005  # of the wearer's arm
+
+
+class SupportAdaptation:
+    """How much of the wearer's arm is to be carried, from one estimate of his torque to the next.
+
+    support: 0..1. problem: why it cannot rise, or ''.
+    """
+
+    def __init__(self) -> None:
+        self.support = 0.0
+        self.problem = ""
+        self._time = self._due = -math.inf  # s
+        self._forget()
+
+    def update(
+        self,
+        now: float,
+        joints: Sequence[Sequence[float]] | None,
+        estimate: WearerEstimate | None,
+        settings: Settings,
+    ) -> bool:
+        """Take an estimate at `now` s; return whether the compensator is to carry `support` from now on.
+
+        joints: angles (4,) rad and velocities (4,) rad/s. estimate: None if there is none. settings: in use.
+        """
+        dt, self._time = now - self._time, now
+        if settings.mode != "zero_g" or not settings.support_adapts or not 0.0 < dt <= MAX_GAP:
+            self._forget()
+            self.support, self.problem = settings.support_now, ""
+            return False
+        sunk = 0.0
+        if joints is None or estimate is None:
+            self._forget()
+            self.problem = "the wearer's torque is not known"
+        else:
+            sunk = self._sunk(dt, joints, estimate, 1.0 - settings.support_now)
+        fall = RISE if self.problem else (self.support - settings.support) / MEMORY
+        self.support = max(settings.support, min(1.0, self.support + dt * (RISE * sunk - fall)))
+        if now < self._due or abs(self.support - settings.support_now) < LEAST_CHANGE:
+            return False
+        self._due = now + FADE_TIME  # one guided change after the other
+        return True
+
+    def _forget(self) -> None:
+        self._theta: Sequence[float] | None = None
+        self._speed = 0.0  # rad/s, upwards
+        self._given = self._carried = 0.0  # Nm^2, the means of the share's sums, as in share.py,
+        self._errors = NO_TORQUE  # and of its deviation's
+
+    def _sunk(self, dt: float, joints: Sequence[Sequence[float]], estimate: WearerEstimate, asked: float) -> float:
+        """Return how fast the arm sinks as a share of FULL, at most 1, and at least -LIFT while it is lifted.
+
+        asked: share of his arm that is left to the wearer.
+        """
+        theta, velocity = joints
+        moved = map(operator.sub, theta, self._theta or theta)
+        self._theta, part, weight = theta, dt / (MEAN + dt), estimate.weight
+        size = math.hypot(*weight)
+        rise = sum(map(operator.mul, weight, moved)) / max(size, LEAST_WEIGHT)
+        self._speed = 0.0 if max(map(abs, velocity)) > REACH else self._speed + part * (rise / dt - self._speed)
+        self._given += part * (sum(map(operator.mul, weight, estimate.torque)) - self._given)
+        self._carried += part * (size**2 - self._carried)
+        columns = zip(self._errors, weight, estimate.deviation, strict=True)
+        self._errors = tuple([old + part * (abs(w) * error - old) for old, w, error in columns])
+        self.problem = ""
+        if self._carried < LEAST_WEIGHT**2:  # the arm hangs
+            return 0.0
+        share, band = self._given / self._carried, COVER * math.hypot(*self._errors) / self._carried
+        if band > WIDEST:
+            self.problem = f"the wearer's share is known to +-{100.0 * band:.0f} % only"
+        sunk = max(-LIFT, min(1.0, -self._speed / FULL))
+        return sunk if sunk < 0.0 or (not self.problem and -band < share < asked + band) else 0.0
