@@ -145,5 +145,5 @@ def test_an_estimate_that_fails_says_so_in_diagnostics(probe):
     watch.newest = 1.0, cast("JointState", "no message")
     watch.start()
     probe.wait_until(lambda: watch.failure is not None)
-    assert watch.report.startswith("failed: AttributeError: 'str' object has no attribute")
+    assert watch.values["wearer (Nm)"].startswith("failed: AttributeError: 'str' object has no attribute")
     watch.stop()

@@ -345,6 +345,20 @@ def test_while_an_arm_is_carried_no_text_field_takes_the_space_bar(visit, stage)
     assert stage.arms.calls == BOTH_DOWN
 
 
+def test_the_share_that_the_wearer_carries_is_a_bar_with_its_band(visit, stage):
+    page = visit()
+    card = '.arm[data-arm="right"]'
+    wait_until(page, lambda: page.inner_text(f"{card} .carries strong") == "–")
+    stage.arms.share = "40 +- 10"
+    wait_until(page, lambda: page.inner_text(f"{card} .carries strong") == "40 % ± 10")
+    boxes = [page.locator(f"{card} .{part}").bounding_box() for part in ("bar", "part", "band")]
+    (start, whole), (_, part), (low, band) = [(box["x"], box["width"]) for box in boxes]
+    assert abs(part / whole - 0.4) < 0.02 and abs(band / whole - 0.2) < 0.02 and abs((low - start) / whole - 0.3) < 0.02
+    stage.arms.share = "-30 +- 10"  # a hand presses the arm down
+    wait_until(page, lambda: page.inner_text(f"{card} .carries strong") == "-30 % ± 10")
+    assert page.locator(f"{card} .part").bounding_box()["width"] == 0.0
+
+
 def test_a_load_is_weighed_after_a_question_and_carried_after_another(visit, stage):
     page, weigh, carry = visit(), '.arm[data-arm="right"] .weigh', '.arm[data-arm="right"] .carry'
     assert page.is_disabled(weigh) and not page.is_visible(carry)

@@ -22,11 +22,10 @@ from collections.abc import Sequence
 
 from exo_gravity.core.compensation.guidance import FADE_TIME
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.model.gravity import NO_TORQUE
 from exo_gravity.core.observer.momentum import COVER, MAX_GAP, WearerEstimate
-from exo_gravity.core.observer.share import LEAST_WEIGHT
+from exo_gravity.core.observer.share import LEAST_WEIGHT, RunningShare
 
-MEAN = 1.0  # s, time constant of the speed and of the share
+MEAN = 1.0  # s, time constant of the speed
 RISE, FULL = 0.04, 0.01  # of the wearer's arm per s, while it sinks at this speed in rad/s, or faster,
 LIFT = 0.5  # of that at most, while it is lifted
 MEMORY = 60.0  # s, time constant with which a raised support is forgotten
@@ -79,8 +78,7 @@ class SupportAdaptation:
     def _forget(self) -> None:
         self._theta: Sequence[float] | None = None
         self._speed = 0.0  # rad/s, upwards
-        self._given = self._carried = 0.0  # Nm^2, the means of the share's sums, as in share.py,
-        self._errors = NO_TORQUE  # and of its deviation's
+        self._share = RunningShare()
 
     def _sunk(self, dt: float, joints: Sequence[Sequence[float]], estimate: WearerEstimate, asked: float) -> float:
         """Return how fast the arm sinks as a share of FULL, at most 1, and at least -LIFT while it is lifted.
@@ -93,14 +91,10 @@ class SupportAdaptation:
         size = math.hypot(*weight)
         rise = sum(map(operator.mul, weight, moved)) / max(size, LEAST_WEIGHT)
         self._speed = 0.0 if max(map(abs, velocity)) > REACH else self._speed + part * (rise / dt - self._speed)
-        self._given += part * (sum(map(operator.mul, weight, estimate.torque)) - self._given)
-        self._carried += part * (size**2 - self._carried)
-        columns = zip(self._errors, weight, estimate.deviation, strict=True)
-        self._errors = tuple([old + part * (abs(w) * error - old) for old, w, error in columns])
         self.problem = ""
-        if self._carried < LEAST_WEIGHT**2:  # the arm hangs
+        if (known := self._share.update(dt, estimate)) is None:  # the arm hangs
             return 0.0
-        share, band = self._given / self._carried, COVER * math.hypot(*self._errors) / self._carried
+        share, band = known[0], COVER * known[1]
         if band > WIDEST:
             self.problem = f"the wearer's share is known to +-{100.0 * band:.0f} % only"
         sunk = max(-LIFT, min(1.0, -self._speed / FULL))

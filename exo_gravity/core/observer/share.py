@@ -12,15 +12,17 @@ band.
 
 import itertools
 import math
+import operator
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
 
 from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.model.gravity import NO_TORQUE
 from exo_gravity.core.model.rotation import Floats3
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.observer.momentum import MomentumObserver
+from exo_gravity.core.observer.momentum import MomentumObserver, WearerEstimate
 
 PERIOD = 0.01  # s between two samples
 WINDOW = 1.0  # s of the sliding share
@@ -41,6 +43,25 @@ class Share(NamedTuple):
 
     value: np.ndarray
     deviation: np.ndarray
+
+
+class RunningShare:
+    """The share of the last `WINDOW` s, from one estimate to the next: an older one weighs exponentially less."""
+
+    def __init__(self) -> None:
+        self._given = self._carried = 0.0  # Nm^2, the means of the two sums,
+        self._errors = NO_TORQUE  # and of its deviation's
+
+    def update(self, dt: float, estimate: WearerEstimate) -> tuple[float, float] | None:
+        """Take an estimate, `dt` s after the last; return the share and its standard deviation, None for no weight."""
+        part, weight = dt / (WINDOW + dt), estimate.weight
+        self._given += part * (sum(map(operator.mul, weight, estimate.torque)) - self._given)
+        self._carried += part * (sum(w * w for w in weight) - self._carried)
+        columns = zip(self._errors, weight, estimate.deviation, strict=True)
+        self._errors = tuple([old + part * (abs(w) * error - old) for old, w, error in columns])
+        if self._carried < LEAST_WEIGHT**2:
+            return None
+        return self._given / self._carried, math.hypot(*self._errors) / self._carried
 
 
 def observed(

@@ -227,8 +227,7 @@ class CompensatorNode(Node):
             "effort (Nm)": row(answer.effort) if answer.effort else "none",
             **report(self._control, answer, self._names),
             **({"budget": self._budget.text, "largest support": self._budget.largest_support} if self._budget else {}),
-            **({"wearer (Nm)": self._wearer.report, "contact": self._wearer.contact} if self._wearer else {}),
-            **({"support adapts": self._wearer.adaptation} if self._wearer else {}),
+            **(self._wearer.values if self._wearer else {}),
             **({"weighing": self._weighing.text if self._weighing else "none"} if self._wearer else {}),
             "last refused message": self._refusal,
         }

@@ -22,7 +22,8 @@ from exo_gravity.core.model.rotation import ZERO, Floats3
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.observer.adaptation import SupportAdaptation
 from exo_gravity.core.observer.contact import ContactWatch
-from exo_gravity.core.observer.momentum import COVER, MomentumObserver, WearerEstimate
+from exo_gravity.core.observer.momentum import COVER, MAX_GAP, MomentumObserver, WearerEstimate
+from exo_gravity.core.observer.share import RunningShare
 from exo_gravity.core.trunk.inputs import FELT_RANGE
 from exo_gravity.nodes.ros.messages import by_name
 from exo_gravity.nodes.ros.subscriptions import Repeated
@@ -50,14 +51,25 @@ class WearerWatch(Repeated):
         self._observer: MomentumObserver | None = None
         self._contact = ContactWatch()
         self._adaptation = SupportAdaptation()
+        self._running = RunningShare()
+        self._share: tuple[float, float] | None = None  # and its standard deviation
         self._known: object = None  # what the observer depends on
         self._due = 0.0
         self._last = -math.inf  # of the samples used
         self._estimate: WearerEstimate | None = None
 
     @property
-    def report(self) -> str:
-        """The torque of each joint with its 95 % band, for /diagnostics."""
+    def values(self) -> dict[str, str]:
+        """What /diagnostics says."""
+        return {
+            "wearer (Nm)": self._report_text(),
+            "share of the wearer (%)": self._share_text(),
+            "contact": self._contact_text(),
+            "support adapts": self._adaptation_text(),
+        }
+
+    def _report_text(self) -> str:
+        """The torque of each joint with its 95 % band."""
         estimate = self._estimate
         if self.failure:
             return f"failed: {type(self.failure).__name__}: {self.failure}"
@@ -72,18 +84,22 @@ class WearerWatch(Repeated):
         ]
         return ", ".join(different) or "not distinguishable from zero"
 
-    @property
-    def contact(self) -> str:
-        """The newest contact and how many there were, for /diagnostics."""
+    def _share_text(self) -> str:
+        """The wearer's share of his arm's weight over the last second, in percent with its 95 % band."""
+        if self._share is None or self._estimate is None or time.monotonic() - self._last > 1.0:
+            return "unknown"
+        return " +- ".join(f"{100.0 * part:.0f}" for part in (self._share[0], COVER * self._share[1]))
+
+    def _contact_text(self) -> str:
+        """The newest contact and how many there were."""
         if self._contact.last is None:
             return "none"
         at, joint, torque = self._contact.last
         ago = min(99.0, time.monotonic() - at)
         return f"{self._names[joint]} {torque:+.1f} Nm, {ago:.0f} s ago; {self._contact.count} in all"
 
-    @property
-    def adaptation(self) -> str:
-        """From which support to which it adapts, for /diagnostics."""
+    def _adaptation_text(self) -> str:
+        """From which support to which it adapts."""
         s = self._control.settings
         if not isinstance(s, Settings) or s.mode != "zero_g" or not s.support_adapts:
             return "off"
@@ -99,7 +115,7 @@ class WearerWatch(Repeated):
         settings = self._control.settings
         if message is None or not isinstance(settings, Settings) or taken <= self._last:
             return
-        self._last = taken
+        dt, self._last = taken - self._last, taken
         trunk, joints = self._trunk(settings, taken), self._joints(message)
         estimate = None
         if trunk is not None and joints is not None:
@@ -113,8 +129,11 @@ class WearerWatch(Repeated):
         if self._adaptation.update(taken, joints and joints[:2], estimate, settings):
             with self._lock:
                 self._control.raise_support(self._adaptation.support)
+        if estimate is None or dt > MAX_GAP:
+            self._running, self._share = RunningShare(), None
         if estimate is None:
             return
+        self._share = self._running.update(min(dt, MAX_GAP), estimate)
         self._contact.update(taken, estimate)
         self._message.header.stamp = message.header.stamp
         for topic, effort in zip(self._topics, (estimate.torque, estimate.deviation), strict=True):

@@ -56,6 +56,7 @@ export class ArmCard {
     this.find(".home").setAttribute("aria-label", t("bring_home_arm", arm));
     this.find(".down").setAttribute("aria-label", t("let_down_arm", arm));
     this.find(".weigh").setAttribute("aria-label", t("weigh_arm", arm));
+    this.find(".bar").setAttribute("aria-label", t("carries_arm", arm));
     write(this.find(".down"), t("let_down_arm", arm));
   }
 
@@ -154,6 +155,7 @@ export class ArmCard {
     write(this.find(".compensator"), other ? (other.level ? t("compensator_detail", other.message) : t("carried", number(finite(other["mass carried (kg)"]), 2))) : alive ? t("compensator_silent") : "");
     this.limit = finite(other?.["largest support"]);
     this.adapts = other?.["support adapts"] ?? "off";
+    this.showShare(other?.["share of the wearer (%)"]);
     this.showLoad(other, operates, name === "active");
     this.root.classList.toggle("stale", !alive);
     this.find(".enable").disabled = !operates || name !== "disabled";
@@ -168,6 +170,21 @@ export class ArmCard {
     const rates = bridge ? `${t("rate")}: ${number(finite(bridge["rate (Hz)"]), 1)} Hz. ${t("age")}: ${number(finite(bridge["age of efforts (ms)"]), 1)} ms.` : "";
     const limits = bridge?.["limits acting"];
     write(this.find(".rates"), limits && limits !== "none" ? `${rates} ${t("limits", limits)}` : rates);
+  }
+
+  // How much of his arm's weight the wearer carries, to be read from two metres: the bar, and its 95 % band.
+  showShare(text) {
+    const [value, width] = text?.match(/^(-?\d+) \+- (\d+)$/)?.slice(1).map(Number) ?? [];
+    const known = value !== undefined;
+    const inside = (percent) => Math.min(100, Math.max(0, percent));
+    const bar = this.find(".bar");
+    const [low, high] = known ? [inside(value - width), inside(value + width)] : [0, 0];
+    write(this.find(".carries strong"), known ? `${number(value, 0)} % ± ${number(width, 0)}` : "–");
+    bar.setAttribute("aria-valuenow", known ? inside(value) : 0);
+    bar.setAttribute("aria-valuetext", known ? `${number(value, 0)} %` : t("carries_unknown"));
+    this.find(".part").style.width = known ? `${inside(value)}%` : 0;
+    this.find(".band").style.left = `${low}%`;
+    this.find(".band").style.width = `${high - low}%`;
   }
 
   // The load in the hand, the result of the last weighing, and the last contact.
