@@ -26,6 +26,7 @@ def main() -> None:
     stage.arms.pose = (0.0, 0.4, 0.5, 0.8)
     stage.arms.states["right"] = "active"
     stage.arms.fail("left", "over_temperature")
+    stage.arms.share = "96 +- 7"
     wearer = stage.files.wearers["P01"] = {"wearer.body_mass": 75.0}
     session = {
         "subject": "P01",

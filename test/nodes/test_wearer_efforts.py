@@ -30,6 +30,7 @@ LOAD = Wearer(75.0).on_links(ROBOT.length)
 STRONG = {"max_effort": [9.0, 18.0, 9.0, 9.0]}  # Nm
 NEEDED = gravity_torque(ROBOT.with_wearer(LOAD.mass, LOAD.cog), POSE)
 GIVEN = np.array((0.0, 4.0, 1.5, 0.0))  # Nm, of the wearer
+WEIGHT = NEEDED - gravity_torque(ROBOT, POSE)  # Nm, that carries the wearer's arm
 
 
 class StillArm:
@@ -85,8 +86,11 @@ def test_what_the_motors_do_not_carry_is_published_as_the_wearers_with_its_devia
         lambda: "right_shoulder_abduction +4.0 +-" in (probe.diagnostic("compensator", "wearer (Nm)") or "")
     )
     assert "elbow" not in (probe.diagnostic("compensator", "wearer (Nm)") or "")
+    share = f"{100.0 * (GIVEN @ WEIGHT) / (WEIGHT @ WEIGHT):.0f} +- "
+    probe.wait_until(lambda: (probe.diagnostic("compensator", "share of the wearer (%)") or "").startswith(share))
     arm.effort = NEEDED.tolist()
     probe.wait_until(lambda: probe.diagnostic("compensator", "wearer (Nm)") == "not distinguishable from zero")
+    probe.wait_until(lambda: (probe.diagnostic("compensator", "share of the wearer (%)") or "").startswith("0 +- "))
 
 
 def test_a_blow_is_a_contact_in_diagnostics(launch, probe, arm):

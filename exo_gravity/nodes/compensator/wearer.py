@@ -69,7 +69,7 @@ class WearerWatch(Repeated):
         }
 
     def _report_text(self) -> str:
-        """The torque of each joint with its 95 % band."""
+        """Return the torque of each joint with its 95 % band."""
         estimate = self._estimate
         if self.failure:
             return f"failed: {type(self.failure).__name__}: {self.failure}"
@@ -85,13 +85,13 @@ class WearerWatch(Repeated):
         return ", ".join(different) or "not distinguishable from zero"
 
     def _share_text(self) -> str:
-        """The wearer's share of his arm's weight over the last second, in percent with its 95 % band."""
+        """Return the wearer's share of his arm's weight over the last second, in percent with its 95 % band."""
         if self._share is None or self._estimate is None or time.monotonic() - self._last > 1.0:
             return "unknown"
-        return " +- ".join(f"{100.0 * part:.0f}" for part in (self._share[0], COVER * self._share[1]))
+        return " +- ".join(str(round(100.0 * part)) for part in (self._share[0], COVER * self._share[1]))
 
     def _contact_text(self) -> str:
-        """The newest contact and how many there were."""
+        """Return the newest contact and how many there were."""
         if self._contact.last is None:
             return "none"
         at, joint, torque = self._contact.last
@@ -99,7 +99,7 @@ class WearerWatch(Repeated):
         return f"{self._names[joint]} {torque:+.1f} Nm, {ago:.0f} s ago; {self._contact.count} in all"
 
     def _adaptation_text(self) -> str:
-        """From which support to which it adapts."""
+        """Return from which support to which it adapts."""
         s = self._control.settings
         if not isinstance(s, Settings) or s.mode != "zero_g" or not s.support_adapts:
             return "off"

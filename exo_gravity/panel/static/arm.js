@@ -179,7 +179,8 @@ export class ArmCard {
     const inside = (percent) => Math.min(100, Math.max(0, percent));
     const bar = this.find(".bar");
     const [low, high] = known ? [inside(value - width), inside(value + width)] : [0, 0];
-    write(this.find(".carries strong"), known ? `${number(value, 0)} % ± ${number(width, 0)}` : "–");
+    write(this.find(".carries strong"), known ? `${number(value, 0)} %` : "–");
+    write(this.find(".width"), known ? `± ${number(width, 0)}` : "");
     bar.setAttribute("aria-valuenow", known ? inside(value) : 0);
     bar.setAttribute("aria-valuetext", known ? `${number(value, 0)} %` : t("carries_unknown"));
     this.find(".part").style.width = known ? `${inside(value)}%` : 0;
