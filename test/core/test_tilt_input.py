@@ -116,3 +116,16 @@ def test_an_impossible_vector_is_refused_and_the_last_tilt_stays(values):
     with pytest.raises(ParameterError):
         tilt.set_gravity(10.01, *values)
     assert tilt.at(10.01) == before and tilt.problem(10.01) == ""
+
+
+def test_a_clock_that_gains_half_a_second_in_a_quarter_of_an_hour_is_followed_and_a_lag_is_still_seen():
+    tilt, gain = TiltInput("right", TIMEOUT), 0.0006
+    for now in np.arange(0.0, 900.0, 0.01):
+        tilt.set_gravity(now, UPRIGHT, age=-gain * now)
+        assert tilt.age(now) == pytest.approx(0.0, abs=1e-3)
+    for now in np.arange(900.0, 901.0, 0.01):
+        tilt.set_gravity(now, UPRIGHT, age=0.2 - gain * now)
+        assert tilt.age(now) == pytest.approx(0.2, abs=5e-3)
+        assert "by its stamp" in tilt.problem(now)
+    with pytest.raises(ParameterError, match="synchronise the clocks"):
+        tilt.set_gravity(901.0, UPRIGHT, age=-gain * 901.0 - 0.06)

@@ -26,7 +26,10 @@ from exo_gravity.core.numbers import Vector
 NOT_REPORTED = -1.0  # first entry of the covariance of what an IMU does not measure (REP-145)
 TILT_SPEED = 5.0  # rad/s, faster than a trunk can tilt
 TILT_JUMP = 0.1  # rad, by which two tilts may differ however close in time
-MAX_LEAD = 0.05  # s that the stamp of a tilt may be ahead of our clock: /clock comes in steps, hosts differ by ms
+# A stamp may be ahead of our clock by MAX_LEAD s: /clock comes in steps, hosts differ by ms. A clock that goes fast
+# gets further ahead, which shows only that: no sample arrives before it was taken. So a lead is added to all ages, and
+# is forgotten by FORGET s a second, faster than a clock gains.
+MAX_LEAD, FORGET = 0.05, 0.002
 MAX_LAG = 1.0  # s that it may be behind; beyond, the stamp comes from another clock
 STILL = ZERO  # rad/s
 # A tilt that is late for a moment is turned on, while the trunk can have turned otherwise by at most MAX_TURN: the
@@ -48,6 +51,7 @@ class TiltInput:
         self._time = -math.inf  # s, when it was measured
         self._in_time = -math.inf  # s, when the newest one that came in time was measured
         self._arrival = -math.inf
+        self._lead = 0.0  # s, of the stamps
         self._vector_arrival = -math.inf  # of a gravity vector, accepted or not
         self._refusal = ""  # why the newest one was refused; contains no measured value
 
@@ -115,19 +119,21 @@ class TiltInput:
             raise
 
     def _accept(self, now: float, tilt: Tilt, angular_velocity: Floats3, age: float) -> None:
-        if not -MAX_LEAD <= age <= MAX_LAG:
+        lead = max(0.0, self._lead - FORGET * (now - self._arrival))
+        if not -MAX_LEAD <= age + lead <= MAX_LAG:
             expected = (
                 f"from {-MAX_LEAD:g} to {MAX_LAG:g} s: synchronise the clocks of the IMU driver and this computer"
             )
-            raise ParameterError("age of the trunk tilt by its stamp", round(age, 3), expected)
-        measured = now - max(0.0, age)
+            raise ParameterError("age of the trunk tilt by its stamp", round(age + lead, 3), expected)
+        lead = max(lead, -age)
+        measured = now - max(0.0, age + lead)
         # Directions are compared, which are continuous where pitch and roll flip, in a bow through 90 degrees.
         reach = TILT_JUMP + TILT_SPEED * max(0.0, measured - self._time)
         if angle_between(tilt.direction, self._tilt.direction) > reach:
             expected = f"within {TILT_JUMP:g} rad plus {TILT_SPEED:g} rad/s of the last tilt"
             raise ParameterError("trunk tilt", [tilt.pitch, tilt.roll], expected)
         self._tilt, self._angular_velocity = tilt, angular_velocity
-        self._time, self._arrival, self._refusal = measured, now, ""
+        self._time, self._arrival, self._lead, self._refusal = measured, now, lead, ""
         if now - measured <= self.timeout:
             self._in_time = measured
 
