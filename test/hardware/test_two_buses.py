@@ -122,7 +122,7 @@ def test_both_buses_are_sent_their_commands_before_the_replies_of_either_are_awa
 
 
 @FORMATS
-@pytest.mark.parametrize("dead", [FIRST, SECOND])
+@pytest.mark.parametrize("dead", [FIRST, SECOND], ids=["first", "second"])
 def test_a_silent_bus_lets_the_whole_arm_down_and_its_motors_once_they_reply(
     wire_format: WireFormat, dead: str
 ) -> None:
@@ -264,7 +264,7 @@ def locks(lock_folder: Path) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("locks")
-@pytest.mark.parametrize("held", [FIRST, SECOND])
+@pytest.mark.parametrize("held", [FIRST, SECOND], ids=["first", "second"])
 def test_an_arm_of_which_one_bus_is_held_is_refused_and_holds_neither(held: str) -> None:
     rig = TwoBusRig(carried=False)
     lock = BusLock(("wire", held, {}), "/left/can_bridge (PID 1)", clock=rig.clock)
