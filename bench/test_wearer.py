@@ -151,14 +151,6 @@ def judge_of_constant(error: float) -> Trial:
 
 
 @pytest.mark.thorough
-def test_a_wearer_who_tires_is_carried_further_on_a_calibrated_device():
-    adapted = tiring.tire(draw(3), adapts=True)
-    assert adapted.trouble == ""
-    assert adapted.mean(tiring.TIRING, tiring.TIRING + tiring.TIRED) > 0.6
-    assert adapted.speed < tiring.FASTEST
-
-
-@pytest.mark.thorough
 def test_a_load_of_a_calibrated_device_is_weighed_within_its_limit():
     balance, trouble = payload.weigh(draw(3))
     assert trouble == ""
