@@ -1,4 +1,4 @@
-# make demo         four nodes as processes on the simulated device, about 75 s; a table and figures in trials/
+# make demo         four nodes as processes on the simulated device, about 90 s; a table and figures in trials/
 # make calibrate-demo  a simulated arm with a wrong parameter file, calibrated, 5 minutes; a picture before and after
 # make calibrate-study  20 random simulated devices, calibrated from motors to an arm that holds, offline, 20 minutes
 # make test         the tests, 5 minutes on two cores

@@ -1,9 +1,8 @@
-"""A wearer whose arm is not a part of the robot's: straps that give, and a shoulder that moves.
+"""A wearer whose arm moves relative to the robot's: straps that give, and a shoulder that moves.
 
-His arm is a chain of its own beside the robot's, with the same joints, in which his muscles act. At two cuffs it is
-tied to the robot by springs and dampers. Its shoulder moves with the elevation of his upper arm, upwards and to the
-spine, as the scapula turns (scapulo-humeral rhythm). The table says what becomes of the estimate, which knows of
-neither.
+The wearer's arm is modelled separately from the robot's, with the same joints, and his muscles act on it. Springs and
+dampers tie it to the robot at two cuffs. His shoulder moves up and towards the spine as he raises the upper arm
+(scapulo-humeral rhythm). The table shows the errors of the estimate, whose model has neither.
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ class Tiring(Muscles):
 
 
 class Adapting(Compensator):
-    """A compensator beside which the wearer's torque is estimated, as in the node.
+    """A compensator with an estimate of the wearer's torque, as in the node.
 
     read: called for the joints' efforts (4,) Nm; trunk: for what the trunk feels. supports: s, and the support.
     """

@@ -27,7 +27,7 @@ PERIOD, WEIGHT, CODE = 0.01, 8.0, 25.0 / 4095.0  # s, Nm, rad
 
 
 class Arm:
-    """One joint that moves as it is told, and the adaptation. share: of the wearer. changes: s, of the support."""
+    """One joint that moves at a given speed, with the adaptation. share: the wearer's. changes: of the support, s."""
 
     def __init__(self, settings: Settings = SETTINGS) -> None:
         self.settings = settings

@@ -295,7 +295,7 @@ def test_the_locks_are_taken_in_one_order_however_the_motors_are_wired(
 
 
 def leave_on(rig: TwoBusRig) -> None:
-    """Leave the notes of a bridge and watchdogs that have all died, each of its own bus."""
+    """Leave the notes of a bridge that died with its watchdog, on both buses."""
     for part in rig.arm.parts:
         lock = BusLock(part.address, "a dead bridge")
         own = [torque if joint in part.joints else 7.0 for joint, torque in enumerate(rig.carrying)]

@@ -236,9 +236,8 @@ class Weighing:
             if short > 0.0:
                 self.trouble = f"{name} does not follow: is the arm carried, is a hand on it?"
             elif off > 0.0:
-                self.trouble = (
-                    f"{name}: {off + UNLIKE[0]:.1f} Nm that is no load in the hand: is somebody touching the arm?"
-                )
+                torque = f"{off + UNLIKE[0]:.1f} Nm"
+                self.trouble = f"{name}: no load in the hand explains {torque}: is somebody touching the arm?"
         if not self.trouble:
             random = math.hypot(*(weight * spread)) / s.robot.gravity
             self.result = Weighed(mass, random, self._lever)

@@ -1,17 +1,17 @@
-"""Support that adapts: it rises while the arm sinks, and is forgotten.
+"""Support that adapts: it rises while the arm sinks, and then decays.
 
-On a still arm the wearer's share is 1 - support, whoever is tired: that is statics. A loop that holds the measured
-share would even take support away from a wearer who tires. What he can no longer carry nobody carries, and the arm
-sinks; muscles that yield resist, so the torques still balance. So it is the sinking that counts. With w (4,) Nm, the
-torque that carries the wearer's arm,
+On a still arm statics alone sets the wearer's share: it is 1 - support, however tired the wearer is. A loop that holds
+the measured share would take support away from a wearer who tires. When he can no longer carry his share, the arm
+sinks, so slowly that the torques still balance. So the support follows the sinking. With w (4,) Nm, the torque that
+carries the wearer's arm,
 
     speed = sum w . theta' / |w|                   rad/s, upwards, from the joints' angles, low-passed by MEAN
     support' = - RISE * speed / FULL - (support - `support`) / MEMORY
 
-within `support` and 1, the first part within -LIFT * RISE and RISE. So lifting takes back a part of what sinking gave:
-with a support of at most 1 only a person lifts the arm. What is faster than REACH is a movement, and counts as none.
-Sinking counts only while the wearer's share lies between 0 and what is left to him: a hand that presses the arm down,
-and an arm whose motors are off, are outside. Where the share is not known, the support falls by RISE to `support`.
+within `support` and 1; the first term stays within -LIFT * RISE and RISE. So lifting takes back part of what sinking
+gave: at a support of at most 1, only a person can lift the arm. A motion faster than REACH is a movement, not sinking.
+Sinking counts only while the wearer's share lies between 0 and what is left to him. That excludes a hand that presses
+the arm down, and motors that are off. While the share is unknown, the support falls to `support`, by RISE per second.
 
 Assistance as needed with forgetting: Wolbrecht, Chan, Reinkensmeyer and Bobrow, IEEE TNSRE 2008.
 """
@@ -92,9 +92,10 @@ class SupportAdaptation:
         rise = sum(map(operator.mul, weight, moved)) / max(size, LEAST_WEIGHT)
         self._speed = 0.0 if max(map(abs, velocity)) > REACH else self._speed + part * (rise / dt - self._speed)
         self.problem = ""
-        if (known := self._share.update(dt, estimate)) is None:  # the arm hangs
+        measured = self._share.update(dt, estimate)
+        if measured is None:  # the arm hangs
             return 0.0
-        share, band = known[0], COVER * known[1]
+        share, band = measured[0], COVER * measured[1]
         if band > WIDEST:
             self.problem = f"the wearer's share is known to +-{100.0 * band:.0f} % only"
         sunk = max(-LIFT, min(1.0, -self._speed / FULL))

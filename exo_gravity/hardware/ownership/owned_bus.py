@@ -1,7 +1,7 @@
 """The bus of an arm, or its buses, that this process owns: locks, watchdog, and what a previous owner left behind.
 
-Each bus has a lock and notes of its own. One watchdog holds them all and lets the arm down as one: a joint that holds
-nothing must still be braked while the joints on the other bus are lowered.
+Each bus has its own lock and notes. One watchdog holds all of them and lets the whole arm down: a joint without load
+must stay damped while the joints on the other bus are lowered.
 
 AK motors keep applying the last command: an arm that another process has left with its motors on is let down. The
 watchdog does it for a bridge that has died, and a new bridge does it if both had died.
