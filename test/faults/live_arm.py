@@ -90,7 +90,8 @@ class LiveArm:
     """An operator who changes the load of the right arm, and a wearer who acts. Both do so by `dice`.
 
     seen: how often each thing happened. trouble: what must not happen. stalls: what happened while the computer stood
-    still. fastest: rad/s that the motors caused. last: change, act, and change meanwhile.
+    still. fastest: rad/s that the motors caused. stall: s for which the computer stood still during the last act. last:
+    change, act, and change meanwhile.
     """
 
     def __init__(self, dice: random.Random) -> None:
@@ -99,6 +100,7 @@ class LiveArm:
         self.trouble: list[str] = []
         self.stalls: list[str] = []
         self.fastest = 0.0
+        self.stall = 0.0
         self.last = ""
 
     def live(self, rig: SoakRig, end: float, clock: StallClock) -> None:
@@ -113,7 +115,7 @@ class LiveArm:
                 found = self._act(rig)
             except AssertionError as error:  # also a Timeout: an arm that was let down ends its change of load
                 found = [str(error).splitlines()[0]]
-            stall, (idle_now, total_now) = clock.longest_gap(), processor_time()
+            self.stall, (idle_now, total_now) = clock.longest_gap(), processor_time()
             idle = (idle_now - idle) / (total_now - total)
             for (arm, probe, truth), known in zip(arms, states, strict=True):
                 response = measure(truth.since(start), start, 1.0 / rig.rate)
@@ -127,8 +129,8 @@ class LiveArm:
                 if response.excess > 0.0:
                     found.append(f"{arm} arm: torque step of {response.largest_step:.2f} Nm")
             found = [f"{self.last}: {what}" for what in found]
-            if stall > STALL or idle < IDLE:
-                why = f"the computer stood still for {stall:.3f} s, and was idle {idle:.0%} of the time"
+            if self.stall > STALL or idle < IDLE:
+                why = f"the computer stood still for {self.stall:.3f} s, and was idle {idle:.0%} of the time"
                 self.stalls += [f"{why}: {what}" for what in found]
             else:
                 self.trouble += found

@@ -21,6 +21,7 @@ import random
 import sys
 import tempfile
 import time
+import traceback
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,7 @@ from .stall_clock import StallClock
 
 WARM_UP = 5  # min until memory counts: caches and buffers fill
 MAX_GROWTH = 5.0  # MB, from then until the end
+LINES = 40  # of the nodes' logs, shown where the soak breaks off
 MAX_GAP = 1.0  # s between two recorded joint states of an arm
 LIVE, LIVE_BEFORE_FAULT = 45.0, 15.0  # s of a minute after which no further change and act begin
 
@@ -87,12 +89,19 @@ class Soak:
         with contextlib.closing(StallClock()) as clock, RigPool(folder, shipped_timeouts=False) as pool:
             start = time.monotonic()
             for minute in range(round(minutes)):
+                rig = None
                 try:
                     rig = self._carrying(pool)
                     self._run_minute(minute, start + minute * MINUTE, rig, pool, clock)
                 except AssertionError as error:  # also a Timeout
-                    self.live.trouble.append(f"{self.live.last}: {error}")
-                    self._print(self.live.trouble[-1])
+                    stall = max(self.live.stall, clock.longest_gap())
+                    if rig and rig.has_lost_a_node and stall > STALL:
+                        self.live.stalls.append(f"the computer stood still for {stall:.3f} s, and a node ended")
+                        self._print(f"      {self.live.stalls[-1]}")
+                        continue
+                    self.live.trouble.append(f"{self.live.last}: {describe(error)}")
+                    log = pool.rig.nodes[0].log[-LINES:] if pool.rig else []
+                    self._print("\n".join([self.live.trouble[-1], *log]))
                     break
                 if pool.rig is rig and not rig.has_lost_a_node:
                     self.memory[-1].append(rig.memory())
@@ -137,6 +146,12 @@ class Soak:
         self._console.print(line, markup=False, soft_wrap=True)
 
 
+def describe(error: AssertionError) -> str:
+    """Return the error and the lines of the tests that led to it."""
+    calls = traceback.extract_tb(error.__traceback__)
+    return f"{error}; in {', '.join(call.line or call.name for call in calls[1:])}"
+
+
 def find_failures(soak: Soak) -> dict[str, Any]:
     """Return what failed, by subject."""
     failed: dict[str, Any] = {r["fault"]: r["unsafe"] for r in soak.results if r["unsafe"]}
@@ -150,8 +165,9 @@ def find_failures(soak: Soak) -> dict[str, Any]:
             }
     for number, recording in enumerate(soak.recordings, 1):
         bag = read_bag(recording)
-        losses = [note for note in (*bag.notes, *bag.problems) if "lost" in note]
-        if bag.is_partial or losses:
+        losses = [note for note in (*bag.notes, *bag.problems) if "lost" in note or "cut short" in note]
+        is_last = number == len(soak.recordings)  # an earlier one ends where a node has ended
+        if losses or (is_last and bag.is_partial):
             failed[f"recording {number}"] = [*bag.notes, *bag.problems]
         for arm in bag.recordings:
             if (gap := float(np.diff(arm.time).max())) > MAX_GAP:
