@@ -127,7 +127,7 @@ class Soak:
         live.live(rig, start + (LIVE_BEFORE_FAULT if fault else LIVE), clock)
         parts = [f"{what} {count}" for what, count in (live.seen - seen).items()]
         lines: list[str] = []
-        if fault and not rig.has_lost_a_node:
+        if fault and len(live.stalls) == news[1] and not rig.has_lost_a_node:  # else an arm may be on its way down
             clock.longest_gap()
             result = pool.run(fault)
             stall = clock.longest_gap()
