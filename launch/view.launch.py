@@ -50,7 +50,7 @@ def generate_launch_description() -> LaunchDescription:
         ("meshes", "", "address of a folder with LINK.stl per link"),
         ("rviz", "true", "whether to start RViz"),
     )
-    reach = EnvironmentVariable("ROS_AUTOMATIC_DISCOVERY_RANGE", default_value="LOCALHOST")
+    reach = EnvironmentVariable("EXO_GRAVITY_DISCOVERY_RANGE", default_value="LOCALHOST")
     return LaunchDescription(
         [
             *(DeclareLaunchArgument(name, default_value=value, description=text) for name, value, text in arguments),

@@ -124,7 +124,7 @@ def of_middleware(middleware: str, reach: str, opening: str) -> Iterator[Finding
     mend = f"export RMW_IMPLEMENTATION={MIDDLEWARE}"
     yield judged("middleware", middleware, MIDDLEWARE, middleware == MIDDLEWARE, Level.WARNING, mend)
     if reach == "OFF":
-        mend = "export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST"
+        mend = "unset EXO_GRAVITY_DISCOVERY_RANGE"
         yield Finding("discovery", reach, "LOCALHOST: the nodes must find each other", Level.FAULT, mend)
     else:
         wanted = "LOCALHOST or SROS2: no other host may command the arm"

@@ -102,7 +102,6 @@ class Launcher:
     def _start(self, node: str, variables: Mapping[str, str]) -> tuple[subprocess.Popen[str], threading.Thread]:
         """Start one node with more environment `variables`; return its process and the reader of its log."""
         environment = {**os.environ, **variables}
-        environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         log_format = f"{{name}} {LOG_FORMAT}" if node in self._guests else LOG_FORMAT
         environment.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", log_format)
         process = subprocess.Popen(

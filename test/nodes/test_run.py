@@ -9,7 +9,8 @@ import pytest
 from exo_gravity.nodes.ros import run
 from exo_gravity.nodes.ros.run import handle_signals, keep_to_this_machine, open_to_others
 
-NAMES = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS", "ROS_DISCOVERY_SERVER")
+RANGE, ROS_RANGE = "EXO_GRAVITY_DISCOVERY_RANGE", "ROS_AUTOMATIC_DISCOVERY_RANGE"
+NAMES = (RANGE, ROS_RANGE, "ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS", "ROS_DISCOVERY_SERVER")
 LOOPBACK = str(Path(run.__file__).with_name("fastdds.xml"))
 SECURITY = {"ROS_SECURITY_ENABLE": "true", "ROS_SECURITY_STRATEGY": "Enforce"}
 
@@ -17,22 +18,26 @@ SECURITY = {"ROS_SECURITY_ENABLE": "true", "ROS_SECURITY_STRATEGY": "Enforce"}
 @pytest.fixture(autouse=True)
 def environment(monkeypatch):
     for name in (*NAMES, *SECURITY, "FASTRTPS_DEFAULT_PROFILES_FILE"):
-        monkeypatch.delenv(name, raising=False)
+        monkeypatch.setenv(name, "")  # so that what the test's subject sets goes after the test
+        monkeypatch.delenv(name)
     return monkeypatch.setenv
 
 
-def test_without_settings_a_node_communicates_on_this_machine_only():
+@pytest.mark.parametrize("exported", ["", "SUBNET"])
+def test_without_its_own_setting_a_node_communicates_on_this_machine_only(environment, exported):
+    environment(ROS_RANGE, exported)  # SUBNET: as ROS's setup.bash exports it
     keep_to_this_machine()
-    assert os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
+    assert os.environ[ROS_RANGE] == "LOCALHOST"
     assert os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("fastdds.xml")
     assert open_to_others() == ""
 
 
-def test_the_users_settings_are_kept(environment):
-    environment("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
+def test_its_own_setting_admits_other_hosts_and_is_named(environment):
+    environment(RANGE, "SUBNET")
     keep_to_this_machine()
-    assert os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "SUBNET"
+    assert os.environ[ROS_RANGE] == "SUBNET"
     assert "FASTRTPS_DEFAULT_PROFILES_FILE" not in os.environ
+    assert open_to_others() == "EXO_GRAVITY_DISCOVERY_RANGE=SUBNET"
 
 
 @pytest.mark.parametrize("exported", ["", LOOPBACK])
@@ -41,7 +46,7 @@ def test_with_a_named_peer_a_node_does_not_keep_to_the_loopback_interface(enviro
     if exported:  # as docs/security.md recommends for other programs
         environment("FASTRTPS_DEFAULT_PROFILES_FILE", exported)
     keep_to_this_machine()
-    assert os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
+    assert os.environ[ROS_RANGE] == "LOCALHOST"
     assert os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("fastdds_peers.xml")
     assert open_to_others() == "ROS_STATIC_PEERS=10.0.0.2"
 
@@ -56,20 +61,17 @@ def test_with_a_named_peer_the_users_own_profile_is_kept(environment):
 @pytest.mark.parametrize(
     ("settings", "named"),
     [
-        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET"),
-        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT"}, "ROS_AUTOMATIC_DISCOVERY_RANGE=SYSTEM_DEFAULT"),
-        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", **SECURITY}, ""),
-        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "ROS_LOCALHOST_ONLY": "1"}, ""),
-        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": "lab-pc"}, "ROS_STATIC_PEERS=lab-pc"),
-        (
-            {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF", "ROS_DISCOVERY_SERVER": "lab:11811"},
-            "ROS_DISCOVERY_SERVER=lab:11811",
-        ),
+        ({RANGE: "SYSTEM_DEFAULT"}, "EXO_GRAVITY_DISCOVERY_RANGE=SYSTEM_DEFAULT"),
+        ({RANGE: "SUBNET", **SECURITY}, ""),
+        ({RANGE: "SUBNET", "ROS_LOCALHOST_ONLY": "1"}, ""),
+        ({"ROS_STATIC_PEERS": "lab-pc"}, "ROS_STATIC_PEERS=lab-pc"),
+        ({RANGE: "OFF", "ROS_DISCOVERY_SERVER": "lab:11811"}, "ROS_DISCOVERY_SERVER=lab:11811"),
     ],
 )
 def test_the_setting_that_admits_other_hosts_is_named(environment, settings, named):
     for name, value in settings.items():
         environment(name, value)
+    keep_to_this_machine()
     assert open_to_others() == named
 
 

@@ -99,7 +99,7 @@ def test_one_cpu_is_too_few_and_isolated_ones_are_named():
     [
         ("rmw_fastrtps_cpp", "LOCALHOST", "", Level.FINE),
         ("rmw_zenoh_cpp", "LOCALHOST", "", Level.WARNING),
-        ("rmw_fastrtps_cpp", "SUBNET", "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET", Level.WARNING),
+        ("rmw_fastrtps_cpp", "SUBNET", "EXO_GRAVITY_DISCOVERY_RANGE=SUBNET", Level.WARNING),
         ("rmw_fastrtps_cpp", "SUBNET", "", Level.FINE),  # SROS2 is enforced
         ("rmw_fastrtps_cpp", "OFF", "", Level.FAULT),
     ],
@@ -179,8 +179,8 @@ def computer(tmp_path, monkeypatch):
     link.parent.mkdir(parents=True)
     link.symlink_to("../../ttyUSB3")
     monkeypatch.setenv("PATH", f"{tmp_path}/bin:/usr/bin:/bin")
-    for name, value in {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "FASTRTPS_DEFAULT_PROFILES_FILE": ""}.items():
-        monkeypatch.setenv(name, value)
+    for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFILES_FILE"):
+        monkeypatch.setenv(name, "")  # set anew, and taken back after the test
     monkeypatch.delenv("RMW_IMPLEMENTATION", raising=False)
     return tmp_path
 

@@ -25,14 +25,19 @@ from exo_gravity.hardware.clock import favour
 
 NEEDED_CHECK_PERIOD = 0.1  # s
 CLOSE_TIMEOUT = 5  # s for the middleware to close
+RANGE, ROS_RANGE = "EXO_GRAVITY_DISCOVERY_RANGE", "ROS_AUTOMATIC_DISCOVERY_RANGE"
 PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
 SWITCH_INTERVAL = 2e-4  # s that a thread may wait for the interpreter's lock; Python's default is 5 ms
 
 
 def keep_to_this_machine() -> None:
-    """Set middleware defaults that the user's environment leaves open; call it before `rclpy.init`."""
-    # With ROS's own default, every host on the subnet could publish torques to a worn robot.
-    reach = os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    """Set which hosts this process communicates with; call it before `rclpy.init`.
+
+    This machine alone, unless EXO_GRAVITY_DISCOVERY_RANGE widens it. ROS's setup.bash exports
+    ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET, with which every host on the subnet could publish torques to a worn robot.
+    Whether a person chose that can't be told, so it does not count.
+    """
+    reach = os.environ[ROS_RANGE] = os.environ.get(RANGE) or "LOCALHOST"
     if reach != "LOCALHOST":
         return
     loopback = str(Path(__file__).with_name("fastdds.xml"))
@@ -48,12 +53,12 @@ def open_to_others() -> str:
         return ""
     if get("ROS_DISCOVERY_SERVER"):
         return f"ROS_DISCOVERY_SERVER={get('ROS_DISCOVERY_SERVER')}"
-    reach = get("ROS_AUTOMATIC_DISCOVERY_RANGE")
+    reach = get(ROS_RANGE)
     if get("ROS_LOCALHOST_ONLY") == "1" or reach == "OFF":  # rcl then ignores the settings below
         return ""
     if get("ROS_STATIC_PEERS"):
         return f"ROS_STATIC_PEERS={get('ROS_STATIC_PEERS')}"
-    return "" if reach == "LOCALHOST" else f"ROS_AUTOMATIC_DISCOVERY_RANGE={reach}"
+    return "" if reach == "LOCALHOST" else f"{RANGE}={reach}"
 
 
 def run(make_node: Callable[[], Node], priority: int = 0) -> int:
