@@ -57,6 +57,9 @@ calibrate-study:
 	@$(SETUP) $(TEST) calibrate
 	$(BIN)/python -m bench.calibration
 
+# The files with longer tests: to read all others first would take half a minute.
+LONG = $(shell grep -rlE 'mark\.thorough|IN_BROWSER' --include='test_*.py' test)
+
 # Tests of running nodes need a machine that keeps up with them: they run alone. The other ones share a module's nodes
 # and simulations: each file runs in one process.
 test:
@@ -71,8 +74,8 @@ test-long:
 	@mkdir -p build
 	@command -v chromium chromium-browser >/dev/null || ! test -w /var/lib/dpkg || \
 		(apt-get update && apt-get install --yes chromium) >build/chromium.log 2>&1 || true
-	$(BIN)/python -m pytest bench test -n auto --dist loadfile -m "(browser or thorough) and not real_time"
-	$(BIN)/python -m pytest test -m "(browser or thorough) and real_time"
+	$(BIN)/python -m pytest bench $(LONG) -n auto --dist loadfile -m "(browser or thorough) and not real_time"
+	$(BIN)/python -m pytest $(LONG) -m "(browser or thorough) and real_time"
 
 environment:
 	@$(SETUP) $(TEST) dev

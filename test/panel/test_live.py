@@ -66,26 +66,37 @@ def panel_diagnostics(bag: Path) -> list[str]:
     return [status.message for array in arrays for status in array.status if status.name == "panel"]
 
 
-@pytest.fixture
-def clinic(tmp_path: Path) -> Iterator[Clinic]:
-    """The right arm, carried, and the open page."""
-    nodes = LaunchedNodes(tmp_path, compensator={"wearer": {"body_mass": 60.0}, "support": 0.0})
-    url = with_panel(nodes)
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Clinic]:
+    """The nodes of the right arm, with two trials, and the open page; one set of them for all tests."""
+    folder = tmp_path_factory.mktemp("clinic")
+    (folder / "scripts").mkdir()
+    for name, seconds in (("short", 2.0), ("long", 120.0)):
+        script = {"name": name, "steps": [{"move": [0.0, 0.3, 0.3, 0.3], "over": 1.0}, {"hold": seconds}]}
+        (folder / "scripts" / f"{name}.yaml").write_text(yaml.safe_dump(script))
+    nodes = LaunchedNodes(folder, compensator={"wearer": {"body_mass": 60.0}, "support": 0.0})
+    url = with_panel(nodes, trials=str(folder / "scripts"))
     nodes.start()
     probe = RosProbe()
     try:
         with chromium(gives_way=True) as browser:
-            page = carried_on_page(nodes, probe, browser, url)
-            yield Clinic(tmp_path, page, nodes, probe)
+            yield Clinic(folder, carried_on_page(nodes, probe, browser, url), nodes, probe)
     finally:
         probe.close()
         nodes.stop()
         print("\n".join(nodes.log))
 
 
+@pytest.fixture
+def clinic(running: Clinic) -> Clinic:
+    """The arm, carried, and the page."""
+    running.probe.wait_until_carried()
+    wait_for_state(running.page, "active")
+    return running
+
+
 def test_a_session_from_support_to_a_fault_and_back_with_a_recording(clinic):
     page, probe = clinic.page, clinic.probe
-    wait_for_state(page, "active")
     page.click("#record")
     page.wait_for_selector("#record-stop:enabled")
     out = clinic.folder / "out"
@@ -148,40 +159,19 @@ def test_an_arm_that_hangs_astray_is_put_back_and_carried(clinic):
     wait_for_state(page, "active")
 
 
-def test_a_trial_is_followed_recorded_and_reported_and_the_death_of_the_panel_changes_nothing(tmp_path: Path):
-    scripts = tmp_path / "scripts"
-    scripts.mkdir()
-    steps = [{"move": [0.0, 0.3, 0.3, 0.3], "over": 1.0}, {"hold": 2.0}]
-    (scripts / "short.yaml").write_text(yaml.safe_dump({"name": "short", "steps": steps}))
-    nodes = LaunchedNodes(tmp_path)
-    url = with_panel(nodes, trials=str(scripts))
-    nodes.start()
-    probe = RosProbe()
-    try:
-        with chromium(gives_way=True) as browser:
-            page = carried_on_page(nodes, probe, browser, url)
-            wait_for_state(page, "active")
-            page.click("#trial-start")
-            page.wait_for_selector("#trial-step:has-text('Hands off')")
-            page.wait_for_selector("#trial-report:visible")
-            assert page.inner_text("#trial-text") == "short is done."
-            address = page.get_attribute("#trial-report", "href")
-            assert "short" in page.request.get(url.rstrip("/") + str(address)).text()
-            nodes.process("/panel").kill()
-            wait_for_state(page, "unseen")
-            seen = len(probe.joint_states)
-            probe.wait_until(lambda: len(probe.joint_states) > seen + 200)  # 2 s
-            assert probe.state == "active"
-            assert not nodes.have_ended
-    finally:
-        probe.close()
-        nodes.stop()
-        print("\n".join(nodes.log))
+def test_a_trial_is_followed_recorded_and_reported(clinic):
+    page = clinic.page
+    page.select_option("#trials", "short")
+    page.click("#trial-start")
+    page.wait_for_selector("#trial-step:has-text('Hands off')")
+    page.wait_for_selector("#trial-report:visible")
+    assert page.inner_text("#trial-text") == "short is done."
+    address = page.evaluate("document.getElementById('trial-report').href")
+    assert "short" in page.request.get(address).text()
 
 
 def test_a_trial_that_is_stopped_ends_its_wearer_and_is_reported_with_subject_and_marker(clinic):
     page, out = clinic.page, clinic.folder / "out"
-    wait_for_state(page, "active")
     page.keyboard.press("Space")
     wait_for_state(page, "disabled")
     page.fill("#session [name=subject]", "P01")
@@ -189,7 +179,7 @@ def test_a_trial_that_is_stopped_ends_its_wearer_and_is_reported_with_subject_an
     page.wait_for_selector("#session-text:has-text('P01')")
     enable(page)
     wait_for_state(page, "active")
-    page.select_option("#trials", "demo")
+    page.select_option("#trials", "long")
     page.click("#trial-start")
     page.wait_for_selector("#trial-step:has-text('Hands off')")
     page.focus("#plots-head")
@@ -197,7 +187,7 @@ def test_a_trial_that_is_stopped_ends_its_wearer_and_is_reported_with_subject_an
     page.wait_for_selector("#message:has-text('marker')")
     page.click("#trial-stop")
     page.wait_for_selector("#trial-report:visible")
-    (trial,) = out.glob("P01/*-*-*/demo_*")
+    (trial,) = out.glob("P01/*-*-*/long_*")
     bag = read_bag(trial / "bag")
     assert bag.session.subject == "P01" and [marker.text for marker in bag.markers] == ["marker"]
     report = (trial / "report.html").read_text(encoding="utf-8")
@@ -205,4 +195,14 @@ def test_a_trial_that_is_stopped_ends_its_wearer_and_is_reported_with_subject_an
     assert any("wearer: done" in line for line in clinic.nodes.log)
     page.reload()
     page.click("#session summary")
-    page.wait_for_selector("#past tr:has-text('demo')")
+    page.wait_for_selector("#past tr:has-text('long')")
+
+
+def test_the_death_of_the_panel_changes_nothing(clinic):  # the last test: the panel does not start again
+    probe = clinic.probe
+    clinic.nodes.process("/panel").kill()
+    wait_for_state(clinic.page, "unseen")
+    seen = len(probe.joint_states)
+    probe.wait_until(lambda: len(probe.joint_states) > seen + 200)  # 2 s
+    assert probe.state == "active"
+    assert not clinic.nodes.have_ended
