@@ -412,6 +412,13 @@ def test_a_motion_after_a_change_of_load_names_the_change():
     assert not good and re.match(r"Right: moved at 8.0 s after mode = one_g: joint 2 moved 22\.\d\d degrees", text)
 
 
+def test_a_parameter_that_is_set_again_to_its_value_is_no_change():
+    setting = ("/right/compensator", "mode", "zero_g")
+    fell = dataclasses.replace(made.trial(made.POSES, hold=6.0), steps=())
+    report = told(fell, Event(7.5, "/right/compensator: mode = zero_g", setting))
+    assert "after mode" not in report.verdict[0] and "right: Zero-G, support 30 %" in printed(report)
+
+
 def test_a_trial_that_ended_early_says_why(held):
     report = analyse(held.bag, trouble="stopped by the operator")
     assert report.verdict[0].startswith("It held until the trial ended early: stopped by the operator. Worst: right: ")

@@ -38,8 +38,13 @@ class Conditions:
         node = node_of(arm, "compensator")
         recorded = recorded_of(bag.parameters, node)
         start = {**{param.name: param.default for param in COMPENSATOR}, **recorded} if recorded else {}
-        settings = ((event.time, *event.setting) for event in bag.events if event.setting)
-        return cls(start, tuple((time, name, value) for time, of, name, value in settings if of == node))
+        in_force, changes = dict(start), []
+        for event in bag.events:
+            of, name, value = event.setting or ("", "", None)
+            if of == node and in_force.get(name) != value:  # what is set again to its value changes nothing
+                in_force[name] = value
+                changes.append((event.time, name, value))
+        return cls(start, tuple(changes))
 
     def at(self, time: float) -> dict[str, Any]:
         """Return the settings in force at `time` s."""
