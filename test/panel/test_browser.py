@@ -75,6 +75,21 @@ def test_a_let_down_that_is_not_confirmed_is_an_alarm(visit, stage):
     assert "can_bridge does not answer" in page.inner_text("#alarm")
 
 
+@pytest.mark.parametrize("width", [390, 768, 1280])
+def test_no_state_moves_the_buttons(visit, stage, width):
+    for arm in ("right", "left"):
+        stage.arms.settings[arm].update(mode="zero_g", support=1.0)
+    page = visit(width=width)
+    page.select_option("#language", "de")
+    places = set()
+    for state in ("disabled", "checking", "active", "letting down"):
+        stage.arms.states = {"right": state, "left": state}
+        wait_for_state(page, state)
+        wait_for_state(page, state, "left")
+        places.add(str(page.locator('[data-arm="right"] .enable').bounding_box()))
+    assert len(places) == 1
+
+
 def test_a_fault_shows_its_remedy_moves_no_button_and_is_cleared(visit, stage):
     page = visit()
     buttons = [page.locator(f'[data-arm="right"] {name}') for name in (".enable", '[data-mode="zero_g"]')]
