@@ -10,7 +10,7 @@ pytest.importorskip("playwright", reason="no browser driver: install the extra t
 
 from playwright.sync_api import Page
 
-from ..support.panel_browser import IN_BROWSER, enable, wait_for_state
+from ..support.panel_browser import IN_BROWSER, PATIENCE, enable, wait_for_state
 
 pytestmark = IN_BROWSER
 BOTH_DOWN = [("let_down", "right"), ("let_down", "left")]
@@ -245,8 +245,11 @@ def test_a_reload_in_the_middle_keeps_control_and_shows_the_state(visit, stage):
     wait_for_state(page, "letting down")
 
 
-def test_the_second_page_watches_lets_down_and_takes_control(visit, stage):
-    first, second = visit(), visit()
+def test_the_second_page_watches_lets_down_and_takes_control(visit, stage, monkeypatch):
+    monkeypatch.setattr("exo_gravity.panel.control.GONE", PATIENCE / 1000)  # a busy machine silences a page for seconds
+    first = visit()
+    first.wait_for_selector("#release:visible")
+    second = visit()
     second.wait_for_selector("#take:visible")
     assert second.is_disabled('[data-arm="right"] .enable')
     enable(first)
