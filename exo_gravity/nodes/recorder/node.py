@@ -43,6 +43,7 @@ SHARED_TOPICS |= {content.MARKERS: String}
 ARM_TOPICS = {STATES: JointState, content.COMMANDS: JointState, content.STEPS: String}  # in the live line
 OF_ARMS = {**ARM_TOPICS, **dict.fromkeys((content.ASSIST, *content.WEARER), JointState)}
 REPEATER = "robot_model"  # its joint states are those of the arms once more
+UNNAMED = "_NODE_NAME_UNKNOWN_"  # what the RMW calls a publisher whose node it has not discovered yet
 DRAIN_PERIOD = 0.05  # s between two writes of what has arrived
 DISCOVERY_PERIOD = 0.5  # s between two searches for new topics and nodes
 LIVE_PERIOD = 0.1  # s between two lines of live state, and two looks for the answers of new nodes
@@ -153,7 +154,7 @@ class Recorder(Node):
 
     def _subscribe(self, topic: str, msgtype: type) -> None:
         found = self.get_publishers_info_by_topic(topic)
-        others = [publisher for publisher in found if publisher.node_name != REPEATER]
+        others = [publisher for publisher in found if publisher.node_name not in (REPEATER, UNNAMED)]
         named = [publisher for publisher in others if leaf(publisher.topic_type) == msgtype.__name__]
         offered = [publisher.qos_profile for publisher in named]
         if not offered:
