@@ -12,7 +12,8 @@ from bench.wearer.devices import draw
 from bench.wearer.muscles import ACTIVATION, DELAY, Muscles, Phase, phase_at
 from bench.wearer.payload import Balance
 from bench.wearer.report import verdict
-from bench.wearer.straps import RHYTHM, StrappedArm, table
+from bench.wearer.strapped_arm import RHYTHM, StrappedArm
+from bench.wearer.straps import table
 from bench.wearer.study import KINDS, Trial
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.calibration.weighing import Weighed

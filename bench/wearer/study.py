@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -36,9 +36,7 @@ from exo_gravity.sim.trunk_motion import TrunkState
 
 from .devices import Worn, turned
 from .muscles import Muscles, Phase, phase_at
-
-if TYPE_CHECKING:
-    from .straps import StrappedArm
+from .strapped_arm import StrappedArm
 
 RATE = 100.0  # Hz, of the control loop and the IMU
 DELAY = 2.0  # s until the wearer begins
