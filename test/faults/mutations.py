@@ -244,7 +244,7 @@ def apply(mutation: Mutation, root: Path) -> None:
 
 
 def unsafe_rows(mutation: Mutation, folder: Path) -> dict[str, str]:
-    """Play the rows of `mutation` in `folder`; return what was unsafe by row. A row that cannot run does not count."""
+    """Play the rows of `mutation` in `folder`; return what was unsafe by row. Raises ValueError if no row could run."""
     for name in COPIED:
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "data"))
     apply(mutation, folder)
@@ -259,7 +259,10 @@ def unsafe_rows(mutation: Mutation, folder: Path) -> dict[str, str]:
         check=False,
     )
     results = json.loads(output.read_text())
-    return {row["fault"]: row["unsafe"] for row in results if row["unsafe"] and row["result"] != "not run"}
+    played = [row for row in results if row["result"] != "not run"]
+    if not played:
+        raise ValueError(f"no row could run: {results}")
+    return {row["fault"]: row["unsafe"] for row in played if row["unsafe"]}
 
 
 def main() -> int:
