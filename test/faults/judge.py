@@ -1,8 +1,9 @@
 """Judges how an arm came down after a fault, by the simulated arm's true motion, not by the frames on its bus.
 
-A wearer may move the arm as fast as he likes. While he touches it, and HAND_OFF s longer, its speed is his. Then only
-the speed that a joint gains counts: what it exceeds the least that it has had since. `driven` is the part of it that a
-motor causes: the largest such speed of a joint in the direction of its motor's torque. A motor that brakes causes none.
+A wearer may move the arm as fast as he likes. While he touches it, its speed is his. Afterwards only the speed that a
+joint gains is judged: what it exceeds the least that it has had since. `driven` is the part of it that a motor causes,
+from the moment of release on: the largest such speed of a joint in the direction of its motor's torque. A motor that
+brakes causes none. Of the fall of an arm whose hand lets go, the first HAND_OFF s are the wearer's.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from exo_gravity.core.motors.specs import MOTORS
 
 MAX_SPEED = 1.0  # rad/s, of every joint
 MAX_EFFORT_RATE = 50.0  # Nm/s
-HAND_OFF = 0.1  # s after the wearer lets go in which the arm still yields to his hand
+HAND_OFF = 0.1  # s after the wearer lets go
 MAX_WORK = 0.3  # J that one motor may put into the arm after a fault
 RESOLUTION = 2 * MOTORS["AK80-9"].torque_range * 2 / 0xFFF  # Nm, two codes of a command
 PEAK_TORQUE = np.array([MOTORS[name].peak_torque for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6")])
@@ -64,9 +65,10 @@ def measure(
     since = records["time"] - fault_time
     after = since >= 0.0
     on = records["on"] & after[:, None]
-    is_free, speed = _gained(records)
-    speed[~after] = 0.0
-    speed[:, list(unpowered)] = 0.0
+    is_free, speed, gained = _gained(records)
+    for of_joints in (speed, gained):
+        of_joints[~after] = 0.0
+        of_joints[:, list(unpowered)] = 0.0
     step, excess = _steps(records, period)
     step, excess = step[since[1:] >= steps_from], excess[since[1:] >= steps_from]
     powered = np.flatnonzero(on.any(axis=1))
@@ -75,7 +77,7 @@ def measure(
     return Response(
         reaction=_reaction(records, since, unreached),
         top_speed=float(speed.max(initial=0.0)),
-        driven=float(speed[records["torque"] * records["velocity"] > 0.0].max(initial=0.0)),
+        driven=float(gained[records["torque"] * records["velocity"] > 0.0].max(initial=0.0)),
         fastest=int(np.argmax(speed.max(axis=0, initial=0.0))) + 1,
         largest_step=float(step.max(initial=0.0)),
         excess=float(excess.max(initial=0.0)),
@@ -86,16 +88,20 @@ def measure(
     )
 
 
-def _gained(records: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return when the arm was free of the wearer's hand (n,), and the speed (n, 4) in rad/s that it gained since."""
-    time, speed = records["time"], np.abs(records["velocity"])
-    touched = np.maximum.accumulate(np.where(records["wearer"].any(axis=1), time, -np.inf))
-    is_free = time - touched > HAND_OFF
+def _gained(records: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return when no hand was on the arm (n,), and the speed (n, 4) in rad/s gained HAND_OFF s after it and at once."""
+    time, touched = records["time"], records["wearer"].any(axis=1)
+    since = time - np.maximum.accumulate(np.where(touched, time, -np.inf))
+    return ~touched, *(_gained_while(records, since > pause) for pause in (HAND_OFF, 0.0))
+
+
+def _gained_while(records: np.ndarray, is_free: np.ndarray) -> np.ndarray:
+    speed = np.abs(records["velocity"])
     speed[~is_free] = 0.0
     released = 1 + np.flatnonzero(is_free[1:] & ~is_free[:-1])
     for part in np.split(speed, released)[1:]:
         part -= np.minimum.accumulate(part)
-    return is_free, speed
+    return speed
 
 
 def _reaction(records: np.ndarray, since: np.ndarray, unreached: Collection[int]) -> float | None:

@@ -200,13 +200,13 @@ MUTATIONS = (
     ),
     Mutation(
         "the brake of the descent grows without a bound",
-        ("compensator frozen while the wearer pushes down",),
+        ("compensator frozen while the wearer presses it down from the horizontal",),
         (Edit(DESCENT, "self._most = max(self._most, abs(effort))", "self._most = 18.0"),
          Edit(DESCENT, "rate = min(BRAKE_GROWTH, BRAKE_GAIN * excess)", "rate = BRAKE_GAIN * excess")),
     ),
     Mutation(
         "the descent drives a joint that the wearer pushed down",
-        ("compensator frozen while the wearer pushes down",),
+        ("compensator frozen while the wearer presses it down from the horizontal",),
         (Edit(DESCENT, "if self.effort * velocity > 0.0 and speed > DRIVEN_SPEED:", "if False:"),),
     ),
     Mutation(

@@ -14,6 +14,7 @@ from .rigs import TwoLaunchersRig
 
 MOVED = 0.6  # rad/s that the motors may cause
 POSE = [0.0, 0.9, 0.3, 0.6]  # rad
+HORIZONTAL = [0.0, 1.5, 0.3, 0.6]
 
 Steps = list[dict[str, Any]]
 
@@ -24,6 +25,12 @@ class WornRig(TwoLaunchersRig):
     pose = POSE
 
 
+class RaisedRig(WornRig):
+    """An arm raised to the horizontal: a hand has a long way to press it down."""
+
+    pose = HORIZONTAL
+
+
 def pushes(*torques: list[float]) -> Steps:
     """Push for a quarter of a second with each of these torques (4,) Nm: two opposite ones shake at 2 Hz."""
     return [{"push": torque, "over": 0.25} for torque in torques]
@@ -31,6 +38,7 @@ def pushes(*torques: list[float]) -> Steps:
 
 LIFT: Steps = [{"move": [0.0, 1.5, 0.3, 1.2], "over": 1.6}]
 PUSH_DOWN: Steps = [{"move": [0.0, 0.3, 0.1, 0.3], "over": 1.0}]
+PRESS_DOWN: Steps = [{"move": [0.0, 0.4, 0.2, 0.4], "over": 1.6}]
 HOLD: Steps = [{"move": POSE, "over": 5.0}]
 SHAKE = pushes(*[[0.0, 2.0, 0.8, 0.3], [0.0, -2.0, -0.8, -0.3]] * 10)
 THROW = pushes([0.0, 2.5, 0.0, 0.2])
@@ -44,7 +52,7 @@ def begin(rig: Rig, steps: Steps) -> None:
     assert result.successful, result.reason
 
 
-def while_wearer(does: str, steps: Steps, after: float, **options: Any) -> FaultCase:
+def while_wearer(does: str, steps: Steps, after: float, rig: type[Rig] = WornRig, **options: Any) -> FaultCase:
     """The compensator freezes `after` s after the wearer began his `steps`, with which he goes on."""
 
     def inject(rig: Rig) -> float:
@@ -57,7 +65,7 @@ def while_wearer(does: str, steps: Steps, after: float, **options: Any) -> Fault
     return FaultCase(
         f"compensator frozen while the wearer {does}",
         inject,
-        WornRig,
+        rig,
         limit=PROCESS_REACTION,
         clear=send_signal("compensator", signal.SIGCONT),
         outcomes=("command_stale",),
@@ -73,4 +81,5 @@ ACTIVE_WEARER = (
     while_wearer("shakes the arm at 2 Hz", SHAKE, 1.0),
     while_wearer("reaches on and on", REACH, 1.0),
     while_wearer("throws the arm", THROW, 0.2),
+    while_wearer("presses it down from the horizontal", PRESS_DOWN, 0.1, RaisedRig),
 )

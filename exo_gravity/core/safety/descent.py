@@ -3,7 +3,7 @@
 Each joint has a torque s, which starts as the last one applied, and a damping k, which the motor itself applies. With v
 the joint's velocity and V the permitted speed:
 
-    |v| <= V:             s fades to zero within FADE_TIME; once s is zero, k fades to zero, too
+    |v| <= V:             s fades to zero within FADE_TIME, the part that has grown as fast as it grew; then k, too
     s v > 0:              the motor drives the joint, or the wearer lifts it: s goes to zero, and never beyond
     |v| > V, sinking:     s grows against the motion, and k grows
     |v| > V, otherwise:   k grows
@@ -96,7 +96,8 @@ class JointDescent:
                 rate = min(BRAKE_GROWTH, BRAKE_GAIN * excess)
                 self._approach(math.copysign(self._most, self._carried), rate, dt)
         else:
-            self._approach(0.0, self._fade_rate, dt)
+            is_beyond = abs(self.effort) > abs(self._carried)
+            self._approach(0.0, max(self._fade_rate, BRAKE_GROWTH) if is_beyond else self._fade_rate, dt)
         self._step_damping(dt, excess)
 
     def _approach(self, effort: float, rate: float, dt: float) -> None:
