@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 
 from exo_gravity.core import ArmModel, Tilt
-from exo_gravity.core.calibration.identification import Observation
+from exo_gravity.core.calibration.motion import Observation
 from exo_gravity.core.calibration.pose_fit import TYPICAL_MOMENTS
 from exo_gravity.core.calibration.poses import next_pose
 from exo_gravity.core.model.gravity import load_moments, moments_of, regressor

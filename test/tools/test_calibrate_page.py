@@ -11,8 +11,8 @@ from html import escape
 import numpy as np
 import pytest
 
-from exo_gravity.core.calibration.identification import Observation, identify
-from exo_gravity.core.calibration.motion import fit_friction
+from exo_gravity.core.calibration.identification import identify
+from exo_gravity.core.calibration.motion import Observation, fit_friction
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import gravity_torque, load_moments, regressor
 from exo_gravity.core.model.tilt import Tilt

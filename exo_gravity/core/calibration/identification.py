@@ -12,10 +12,10 @@ weight; nor can they tell a moment across link 3 or 4 from an error of that join
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
+from exo_gravity.core.calibration.motion import Observation
 from exo_gravity.core.calibration.pose_fit import (
     ANGLE,
     COUNT,
@@ -54,19 +54,6 @@ PER_JOINT = tuple(f"{what} {n + 1}" for what in ("torque scale", "offset") for n
 UNKNOWN = np.eye(COUNT)  # one row for each
 NAMES = (*MOMENTS, *PER_JOINT)
 LEAN = "lean the stand by 10 to 14 degrees to the arm's side, where the arm still hangs close to its home"
-
-
-class Observation(NamedTuple):
-    """One pose, passed in both directions of motion."""
-
-    theta: Vector  #: (4,) rad
-    direction: Vector  #: (3,), gravity's unit vector in the base frame
-    effort: Vector  #: (4,) Nm as commanded, mean of both directions
-    friction: Vector  #: (4,) Nm, half of their difference
-    spread: Vector  #: (4,) Nm, standard error of `effort`
-    load_mass: float = 0.0  #: kg, a weight on link 4; 0 for none
-    load_lever: float = 0.0  #: m, its distance from the elbow
-    speed: float | Vector = 0.0  #: rad/s at which the joints passed the pose, one for all or (4,)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,12 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.numbers import JOINT_COUNT, Vector
 
 MAX_SPEED = 0.3  # rad/s, of any joint
 ACCELERATION = 0.5  # rad/s^2
 AMPLITUDE = 0.06  # rad, of a sweep on each side of its pose
 WINDOW = 0.55  # of a sweep's amplitude: the part on both sides of the pose that is measured
+FOLLOWED = 0.5  # of this part, that each joint must follow in a valid sweep
 LEAD = 0.3  # s at rest before each motion, in which the joints are brought to the edge of moving
 BINS = 4  # of each sweep: neighbouring samples share the slow oscillations of the controller
 RESOLUTION = 0.002  # Nm: standard error that is left of the 12-bit torque command (7.3 mNm per code) after averaging
@@ -28,6 +29,27 @@ STRIBECK_SPEEDS = np.geomspace(0.01, 0.2, 30)  # rad/s
 SIGNIFICANT = 3.0  # standard errors, from which on a Stribeck part is kept
 LEAST_RATIO = 2.0  # of the fastest to the slowest speed
 FRICTION_RESOLUTION = 0.003  # Nm: standard error of a friction that was measured once
+
+
+class Observation(NamedTuple):
+    """One pose, passed in both directions of motion."""
+
+    theta: Vector  #: (4,) rad
+    direction: Vector  #: (3,), gravity's unit vector in the base frame
+    effort: Vector  #: (4,) Nm as commanded, mean of both directions
+    friction: Vector  #: (4,) Nm, half of their difference
+    spread: Vector  #: (4,) Nm, standard error of `effort`
+    load_mass: float = 0.0  #: kg, a weight on link 4; 0 for none
+    load_lever: float = 0.0  #: m, its distance from the elbow
+    speed: float | Vector = 0.0  #: rad/s at which the joints passed the pose, one for all or (4,)
+
+
+class Sweep(NamedTuple):
+    """The n samples of one way through a pose."""
+
+    position: np.ndarray  #: (n, 4) rad
+    effort: np.ndarray  #: (n, 4) Nm; the part beyond what is expected at each angle can be given in its place
+    direction: np.ndarray  #: (n, 3), gravity's unit vectors in the base frame
 
 
 class Station(NamedTuple):
@@ -77,24 +99,37 @@ class Line:
         return is_steady and abs(time - self.duration / 2.0) * self._speed <= WINDOW * self._length / 2.0
 
 
-def average(sweeps: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, ...]:
-    """Return what `sweeps` show at a pose, which alternate between there and back.
+def average(sweeps: Sequence[Sweep]) -> tuple[Observation, np.ndarray]:
+    """Return what `sweeps` show at a pose, and the largest change (4,) in Nm of the effort from one cycle to another.
 
-    These are the angles in rad, and in Nm: the effort, the friction, the standard error of the effort, and its largest
-    change from one cycle to another; (4,) each. A sweep is the position (n, 4) rad and effort (n, 4) Nm of its samples.
-    The effort minus that expected at its angle can be given in its place: it does not change along a sweep (gravity
-    does, and by up to 0.3 % more than in proportion).
+    They alternate between there and back. What is expected at an angle should be subtracted from the effort: the rest
+    does not change along a sweep (gravity does, and by up to 0.3 % more than in proportion).
     """
     bins = np.zeros((len(sweeps), BINS, JOINT_COUNT))  # mean effort in order of the angle
-    for number, (_, effort) in enumerate(sweeps):
-        bins[number] = [part.mean(axis=0) for part in np.array_split(effort[::-1] if number % 2 else effort, BINS)]
+    for number, sweep in enumerate(sweeps):
+        effort = sweep.effort[::-1] if number % 2 else sweep.effort
+        bins[number] = [part.mean(axis=0) for part in np.array_split(effort, BINS)]
     there, back = bins[0::2], bins[1::2]
     gravity = (there + back) / 2.0
     cycles = gravity.mean(axis=1)
     friction = (there - back).mean(axis=(0, 1)) / 2.0
     scatter = gravity.reshape(-1, JOINT_COUNT).std(axis=0, ddof=1) / np.sqrt(max(1.0, gravity[..., 0].size / 2.0))
-    theta = np.mean([position.mean(axis=0) for position, _ in sweeps], axis=0)
-    return theta, cycles.mean(axis=0), friction, np.hypot(scatter, RESOLUTION), np.ptp(cycles, axis=0)
+    theta = np.mean([sweep.position.mean(axis=0) for sweep in sweeps], axis=0)
+    direction = mean_direction(np.concatenate([sweep.direction for sweep in sweeps]))
+    seen = Observation(theta, direction, cycles.mean(axis=0), friction, np.hypot(scatter, RESOLUTION))
+    return seen, np.ptp(cycles, axis=0)
+
+
+def mean_direction(directions: np.ndarray) -> np.ndarray:
+    """Return the mean (3,) of unit vectors (n, 3), of length 1."""
+    mean = directions.mean(axis=0)
+    return np.asarray(mean / np.linalg.norm(mean))
+
+
+def followed(sweeps: Sequence[Sweep], station: Station) -> np.ndarray:
+    """Return the share (4,) of the measured way that each joint went in every one of `sweeps` through `station`."""
+    ways = np.min([np.abs(sweep.position[-1] - sweep.position[0]) for sweep in sweeps], axis=0)
+    return np.asarray(ways / (2.0 * WINDOW * station.amplitude))
 
 
 class FrictionCurve(NamedTuple):
@@ -128,12 +163,10 @@ def fit_friction(speed: np.ndarray, torque: np.ndarray) -> FrictionCurve:
 
 def _fit(speed: np.ndarray, torque: np.ndarray, stribeck_speed: float = 0.0) -> FrictionCurve:
     """Return the fit with this Stribeck speed, 0 for a fit without Stribeck friction."""
-    columns = [np.ones_like(speed), speed, *([np.exp(-((speed / stribeck_speed) ** 2))] if stribeck_speed else [])]
-    matrix = np.stack(columns, axis=1)
-    values, *_ = np.linalg.lstsq(matrix, torque, rcond=None)
+    falling = np.exp(-((speed / stribeck_speed) ** 2)) if stribeck_speed else np.zeros_like(speed)
+    matrix = np.stack((np.ones_like(speed), speed, falling), axis=1)
+    values, _, rank, _ = np.linalg.lstsq(matrix, torque, rcond=None)
     fitted = matrix @ values
-    scatter = float(np.sum((fitted - torque) ** 2)) / max(1, len(speed) - len(columns))
+    scatter = float(np.sum((fitted - torque) ** 2)) / max(1, len(speed) - int(rank))
     errors = np.sqrt(max(scatter, FRICTION_RESOLUTION**2) * np.diag(np.linalg.pinv(matrix.T @ matrix)))
-    coulomb, viscous, stribeck = (*values.tolist(), 0.0)[:3]
-    error = (*errors.tolist(), 0.0)[:3]
-    return FrictionCurve(speed, torque, fitted, coulomb, viscous, stribeck, stribeck_speed, error)
+    return FrictionCurve(speed, torque, fitted, *values.tolist(), stribeck_speed, tuple(errors.tolist()))

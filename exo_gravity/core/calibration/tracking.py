@@ -8,13 +8,14 @@ The controller's output is an acceleration, which the arm's approximate mass mat
 have the same natural frequency, however they are coupled.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Generator, Iterator, Sequence
 
 import numpy as np
 
+from exo_gravity.core.calibration.motion import LEAD, Line, Station, Sweep
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import LAWS, Torque, regressor
-from exo_gravity.core.model.kinematics import ROTORS, LinkInertia
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 
@@ -34,6 +35,7 @@ USUAL_FRICTION = 0.15  # Nm, until it is measured
 FRICTION_RATE = 6.0
 # rad ahead of the reference, and rad/s faster, from which on no more friction is compensated
 AHEAD, FASTER = 0.003, 0.03
+SLOW_ERROR, STOP_ERROR = 0.04, 0.08  # rad behind the reference, from which on it slows down, and at which it waits
 FULL_FRICTION_SPEED = 0.03  # rad/s of the reference, from which on friction is compensated fully
 
 
@@ -90,62 +92,88 @@ class TorqueGuess:
         ]
 
 
-def inertia_of(length: Vector, moment: Vector, load: tuple[float, float] = (0.0, 0.0)) -> LinkInertia:
-    """Return the approximate inertia of an arm that is known by its moments: as `LinkInertia.of_moments`."""
-    return LinkInertia.of_moments(length, moment, load)._replace(rotors=tuple(rotor + ADDED for rotor in ROTORS))
-
-
 class Tracker:
-    """The controller of the four joints.
+    """Moves the four joints along lines, one after the other, and takes the samples of sweeps.
 
-    rate: control cycles per s. max_effort: (4,) Nm. friction: (4,) Nm, compensated in the direction of motion; the
-    owner sets it as it becomes known. saturated: (4,) s for which each joint has wanted more than its `max_effort`.
-    correction: (4,) Nm, what the controller added to gravity and friction in the last step.
+    rate: control cycles per s. max_effort: (4,) Nm. lines: to follow, each taken when it begins; the owner sets them
+    before the first step. friction: (4,) Nm, compensated in the direction of motion, as far as the owner knows it.
+    saturated: (4,) s for which each joint has wanted more than its `max_effort`. error: (4,) rad by which the arm is
+    behind its path. correction: (4,) Nm, what the controller added to gravity and friction in the last step.
     """
 
     def __init__(self, rate: float, max_effort: Sequence[float]) -> None:
         self.friction = np.full(JOINT_COUNT, USUAL_FRICTION)
         self.saturated = np.zeros(JOINT_COUNT)
+        self.error = np.zeros(JOINT_COUNT)
         self.correction = np.zeros(JOINT_COUNT)
         self._frequency = min(MAX_FREQUENCY, FREQUENCY_PER_RATE * rate)
         self._max_effort = np.array(max_effort)
         self._integral = np.zeros(JOINT_COUNT)
         self._slide = np.zeros(JOINT_COUNT)  # Nm that compensate friction
+        self._effort: Torque = (0.0,) * JOINT_COUNT
+        self.lines: Iterator[Line] = iter(())
+        self._line = Line(self.error, self.error)
+        self._time = math.inf  # s, on the present line; it is over
+        self._samples: list[tuple[Vector, np.ndarray, Vector]] | None = None  # of the present sweep
+
+    def sweep(self, station: Station) -> Generator[Line, None, list[Sweep]]:
+        """Yield the ways through `station`, there and back; return their samples, without the expected torque."""
+        sweeps, (low, high) = list[Sweep](), station.ends
+        for ends in ((low, high), (high, low)):
+            self._samples = []
+            yield Line(*ends, station.speed)
+            sweeps.append(Sweep(*map(np.array, zip(*self._samples, strict=True))))
+        self._samples = None
+        return sweeps
 
     def shift(self, change: np.ndarray) -> None:
         """Take over a `change` (4,) Nm of the expected torque, so that the effort does not step."""
         self._integral -= change
 
     def step(
-        self,
-        dt: float,
-        error: np.ndarray,
-        speed_error: np.ndarray,
-        heading: np.ndarray,
-        expected: Sequence[float],
-        matrix: np.ndarray,
+        self, dt: float, position: Vector, velocity: Vector, expected: Torque, direction: Vector, matrix: np.ndarray
     ) -> Torque:
-        """Return the effort (4,) in Nm.
+        """Return the effort (4,) in Nm, `dt` s after the last one.
 
-        error (4,) rad, speed_error (4,) rad/s: reference minus measurement. heading: (4,) rad/s, where the reference
-        goes, also while it waits for the arm. expected: (4,) Nm, gravity's torque. matrix: (4, 4) kg m^2.
+        position, velocity: (4,), rad and rad/s. expected: (4,) Nm, gravity's torque. direction: (3,), of gravity, for
+        the samples. matrix: (4, 4) kg m^2, the approximate mass matrix.
         """
-        frequency = self._frequency
-        stiff = matrix @ error * frequency**2
-        push = stiff + matrix @ speed_error * 2.0 * frequency
-        weakest = float(np.linalg.eigvalsh(matrix)[0])
-        integral = self._integral + INTEGRAL_SHARE * frequency * dt * (stiff + FLOOR * weakest * error * frequency**2)
-        # Friction is compensated by and by, and no further in a joint that is ahead.
-        most = FRICTION_RATE * self.friction * dt
+        if self._time > self._line.duration:
+            self._line, self._time = next(self.lines), -LEAD
+        goal, heading = self._line.at(self._time)
+        self.error = goal - position
+        behind = float(np.abs(self.error).max())
+        pace = max(0.0, min(1.0, (STOP_ERROR - behind) / (STOP_ERROR - SLOW_ERROR)))
+        self._time += pace * dt
+        if self._samples is not None and self._line.is_measured(self._time):
+            # The effort of the last cycle brought the arm here.
+            self._samples.append((position, np.subtract(self._effort, expected), direction))
+        # Friction is compensated before the motion begins: a joint that breaks away late would jump.
+        coming = self._line.at(self._time + LEAD)[1] if self._time < LEAD else heading
+        speed_error = pace * heading - velocity
+        self._compensate_friction(dt, coming, speed_error)
+        self._effort = self._controlled(dt, speed_error, expected, matrix + ADDED * np.eye(JOINT_COUNT))
+        return self._effort
+
+    def _compensate_friction(self, dt: float, heading: np.ndarray, speed_error: np.ndarray) -> None:
+        """Compensate friction by and by towards `heading` (4,) rad/s, and no further in a joint that is ahead."""
+        most, way = FRICTION_RATE * self.friction * dt, np.sign(heading)
         wanted = self.friction * np.clip(heading / FULL_FRICTION_SPEED, -1.0, 1.0)
         change = np.clip(wanted - self._slide, -most, most)
-        way = np.sign(heading)
-        is_ahead = (error * way < -AHEAD) | (speed_error * way < -FASTER)
+        is_ahead = (self.error * way < -AHEAD) | (speed_error * way < -FASTER)
         self._slide += np.where(is_ahead & (change * way > 0.0), 0.0, change)
+
+    def _controlled(self, dt: float, speed_error: np.ndarray, expected: Torque, matrix: np.ndarray) -> Torque:
+        frequency = self._frequency
+        stiff = matrix @ self.error * frequency**2
+        push = stiff + matrix @ speed_error * 2.0 * frequency
+        weakest = float(np.linalg.eigvalsh(matrix)[0])
+        floor = FLOOR * weakest * self.error * frequency**2
+        integral = self._integral + INTEGRAL_SHARE * frequency * dt * (stiff + floor)
         torque = expected + self._slide + push + integral
         is_saturated = np.abs(torque) > self._max_effort
         self.saturated = np.where(is_saturated, self.saturated + dt, 0.0)
         # Without this the integral would wind up.
-        self._integral = np.where(is_saturated & (torque * error > 0.0), self._integral, integral)
+        self._integral = np.where(is_saturated & (torque * self.error > 0.0), self._integral, integral)
         self.correction = push + self._integral
         return tuple(np.clip(torque, -self._max_effort, self._max_effort).tolist())

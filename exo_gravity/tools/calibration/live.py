@@ -23,7 +23,7 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from exo_gravity.core.calibration.identification import Observation
+from exo_gravity.core.calibration.motion import Observation
 from exo_gravity.core.calibration.tour import ARM, BRIDGE
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.gravity import moments_of

@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from exo_gravity.core.calibration.identification import Identified, Observation, columns
-from exo_gravity.core.calibration.motion import FrictionCurve
+from exo_gravity.core.calibration.identification import Identified, columns
+from exo_gravity.core.calibration.motion import FrictionCurve, Observation
 from exo_gravity.core.model.gravity import load_moments, moments_of, regressor
 from exo_gravity.core.numbers import Vector
 from exo_gravity.tools.calibration.result import CalibrationResult, plain, value_text

@@ -17,8 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.bag.storage import Storage
-from exo_gravity.core.calibration.identification import Observation
-from exo_gravity.core.calibration.motion import BINS, average
+from exo_gravity.core.calibration.motion import BINS, Observation, Sweep, average, mean_direction
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.trial.recording import Recording, in_blocks, still_spans
@@ -90,12 +89,6 @@ def messages_of(path: Path, topic: str, msgtype: str, required: bool = True) -> 
         raise DataError(f"{path}: no samples of {topic} ({msgtype}); its topics: {topics}")
 
 
-def _mean_of(down: np.ndarray) -> np.ndarray:
-    """Return the mean (3,) of unit vectors (n, 3), of length 1."""
-    mean = down.mean(axis=0)
-    return np.asarray(mean / np.linalg.norm(mean))
-
-
 def _sweeps(recording: Recording, down: np.ndarray) -> Iterator[Observation]:
     """Yield an observation for every two runs one after the other in which all joints turn to and fro.
 
@@ -120,9 +113,8 @@ def _sweeps(recording: Recording, down: np.ndarray) -> Iterator[Observation]:
             continue
         used, first_last = back.stop, np.array([middle[[0, -1]] for middle in middles])
         speed = np.mean(np.abs(np.diff(position[first_last], axis=1)[:, 0]) / np.diff(time[first_last]), axis=0)
-        theta, effort, friction, spread, _ = average([(position[part], recording.effort[part]) for part in middles])
-        direction = _mean_of(down[there.start : back.stop])
-        yield Observation(theta, direction, effort, np.sign(way) * friction, spread, speed=speed)
+        seen, _ = average([Sweep(position[part], recording.effort[part], down[part]) for part in middles])
+        yield seen._replace(friction=np.sign(way) * seen.friction, speed=speed)
 
 
 def _runs(recording: Recording, start: float, end: float) -> Iterator[slice]:
@@ -148,4 +140,4 @@ def _held(recording: Recording, down: np.ndarray, sweeps: list[Observation]) -> 
             effort = recording.effort[part]
             spread = np.hypot(friction / math.sqrt(3.0), effort.std(axis=0))
             theta = recording.position[part].mean(axis=0)
-            yield Observation(theta, _mean_of(down[part]), effort.mean(axis=0), friction, spread)
+            yield Observation(theta, mean_direction(down[part]), effort.mean(axis=0), friction, spread)

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from exo_gravity.core.calibration.identification import Identified, Observation
-from exo_gravity.core.calibration.motion import FrictionCurve
+from exo_gravity.core.calibration.identification import Identified
+from exo_gravity.core.calibration.motion import FrictionCurve, Observation
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Vector
 from exo_gravity.tools.inputs.arms import ConfiguredArm

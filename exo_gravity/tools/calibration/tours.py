@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.calibration.identification import Identified, Observation, columns, identify
-from exo_gravity.core.calibration.motion import FrictionCurve, fit_friction
+from exo_gravity.core.calibration.identification import Identified, columns, identify
+from exo_gravity.core.calibration.motion import FrictionCurve, Observation, fit_friction
 from exo_gravity.core.calibration.poses import candidates, next_pose
 from exo_gravity.core.compensation.settings import wearer_of
 from exo_gravity.core.errors import DataError, ParameterError

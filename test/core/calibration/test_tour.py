@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.calibration.motion import ACCELERATION, MAX_SPEED, Line, Station, average, fit_friction
+from exo_gravity.core.calibration.motion import ACCELERATION, MAX_SPEED, Line, Station, Sweep, average, fit_friction
 from exo_gravity.core.calibration.poses import BestPoses, FixedStations, candidates, measurable
 from exo_gravity.core.calibration.tour import Tour
-from exo_gravity.core.calibration.tracking import TorqueGuess, inertia_of
+from exo_gravity.core.calibration.tracking import TorqueGuess
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.gravity import load_moments, moments_of
+from exo_gravity.core.model.kinematics import LinkInertia
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.limits import Limits
@@ -189,10 +190,11 @@ def test_the_average_of_sweeps_separates_gravity_and_friction_at_different_angle
         offset = sign * np.linspace(-0.03, 0.03, 60)[:, None] - sign * 0.01  # behind the reference
         position = np.array((0.1, 0.2, 0.3, 0.4)) + offset
         effort = 1.0 + position @ slope.T + sign * friction
-        sweeps.append((position, effort - position @ slope.T))  # minus the expected one
-    _, effort, slide, *_ = average(sweeps)
-    np.testing.assert_allclose(slide, friction, atol=1e-9)
-    np.testing.assert_allclose(effort, 1.0, atol=1e-9)
+        down = np.tile((0.0, 0.0, 1.0), (60, 1))
+        sweeps.append(Sweep(position, effort - position @ slope.T, down))  # minus the expected one
+    seen, _ = average(sweeps)
+    np.testing.assert_allclose(seen.friction, friction, atol=1e-9)
+    np.testing.assert_allclose(seen.effort, 1.0, atol=1e-9)
 
 
 def test_the_expected_torque_learns_scale_and_moments_of_each_joint():
@@ -228,7 +230,7 @@ def test_chosen_poses_are_within_the_limits_and_can_be_held():
 def test_the_mass_matrix_is_close_to_that_of_the_device(mass, lever, tolerance):
     arm = SimulatedArm(ArmConfig(wearer_mass=(0, 0, 0, mass), wearer_cog=(0, 0, 0, lever)))
     moments = moments_of(DEFAULT_LINKS) + load_moments(DEFAULT_LINKS.length.tolist(), mass, lever)
-    assert_close_to_device(inertia_of(DEFAULT_LINKS.length, moments[:4], (mass, lever)), arm, tolerance)
+    assert_close_to_device(LinkInertia.of_moments(DEFAULT_LINKS.length, moments[:4], (mass, lever)), arm, tolerance)
 
 
 def test_the_sweeps_of_a_chosen_pose_and_the_way_home_with_a_weight_need_no_more_than_the_motors_may_give():
