@@ -10,9 +10,8 @@ import mujoco
 import numpy as np
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.calibration.poses import BestPoses, Itinerary
+from exo_gravity.core.calibration.poses import BestPoses, Itinerary, TorqueGuess
 from exo_gravity.core.calibration.tour import Tour
-from exo_gravity.core.calibration.tracking import TorqueGuess
 from exo_gravity.core.model.gravity import Torque, load_moments, moments_of
 from exo_gravity.core.model.kinematics import LinkInertia
 from exo_gravity.core.model.tilt import Tilt

@@ -56,6 +56,7 @@ def test_the_old_torque_scale_and_law_and_gain_of_the_file_are_taken_over():
     )
     assert value(result, "torque_scale")[0] == pytest.approx(0.5 * SCALES[0], rel=0.02)
     assert value(result, "law") == "exact" and value(result, "gain") == [1.0] * 4
+    assert result.lines[-1].startswith("next best pose, if more is wanted: ")
 
 
 def test_an_impossible_torque_scale_is_refused_and_names_the_joint():

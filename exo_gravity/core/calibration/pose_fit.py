@@ -111,9 +111,8 @@ def solve(rows: Rows, start: np.ndarray = START, weight: np.ndarray | float = 1.
         # A scale that jumps by more than a factor of 1.6 in one step has left the range of the linear model.
         unknowns = unknowns + step / max(1.0, 2.0 * float(np.abs(step[SCALE]).max()))
     hidden = 1.0 - np.diag(inverse @ whitened)  # a projection, up to the units
-    singular_values = np.zeros(ANGLE.start)
     size = np.linalg.svd((poses * NATURAL)[:, : ANGLE.start], compute_uv=False)
-    singular_values[: len(size)] = size
+    singular_values = np.pad(size, (0, ANGLE.start - len(size)))
     hat = (poses @ inverse[:, : residual.size]).reshape(2 * residual.shape)
     left_over = 1.0 - np.einsum("njnj->nj", hat)
     freedom = np.maximum(left_over.sum(axis=0), 0.0)

@@ -1,4 +1,9 @@
-"""Which poses the calibration visits: given ones, or the most informative ones that the motors can hold."""
+"""Which poses the calibration visits: given ones, or the most informative ones that the motors can hold.
+
+What holds the arm is expected with a mean and a standard deviation for every pose. Each joint has moments of its own,
+in the Nm that its motor is commanded: its unknown torque scale is then part of them. They start from the parameter
+file's arm with a wide uncertainty, and every measured pose narrows it (a Kalman update).
+"""
 
 import itertools
 import math
@@ -8,12 +13,16 @@ import numpy as np
 
 from exo_gravity.core.calibration.motion import AMPLITUDE, LEAD, MAX_SPEED, Line, Station
 from exo_gravity.core.calibration.pose_fit import COUNT, MOMENT, NATURAL, START, TILT, TYPICAL_MOMENTS, Rows, along_axes
-from exo_gravity.core.calibration.tracking import TorqueGuess
-from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.model.arm import STANDARD_GRAVITY
+from exo_gravity.core.errors import DataError
+from exo_gravity.core.model.arm import STANDARD_GRAVITY, ArmModel
+from exo_gravity.core.model.gravity import LAWS, Torque, regressor
+from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 from exo_gravity.core.safety.limits import WALL_WIDTH, Limits
 
+UNSURE = 0.4  # of a moment: masses and torque scales that are each off by 30 %
+UNSURE_MOMENT = 0.02  # kg m, in addition: off-axis moments of which the file knows nothing
+UNEXPLAINED = 0.05  # Nm: standard deviation of what no moment explains
 CANDIDATES = 800
 MOST_UPWARDS = 0.3  # sine of the largest angle above the horizontal, of links 3 and 4
 SHARE = 0.85  # of max_effort that a pose may need
@@ -31,6 +40,59 @@ NOISE = 0.03  # Nm in any pose
 NOISE_SHARE = 0.02  # of the torque
 # deg of each joint, within the paper's ranges: from these a missing pose is suggested.
 GRID = ((-60, 0, 60), (15, 45, 75, 105, 135), (-30, 0, 30, 60, 90, 120), (0, 30, 60, 90, 120, 150))
+
+
+class TorqueGuess:
+    """The commanded torque that holds the arm, as far as it is known.
+
+    length: (4,) m. moments: (8,) kg m, as in `core.model.gravity`, with the load. tilt: of the trunk or the stand.
+    """
+
+    def __init__(self, length: Vector, moments: Vector, tilt: Tilt, gravity: float) -> None:
+        moments = np.asarray(moments, dtype=float)
+        deviation = UNSURE * np.abs(moments) + UNSURE_MOMENT
+        self.length = np.asarray(length, dtype=float)
+        self.tilt = tilt
+        self.gravity = gravity
+        self._mean = np.tile(moments, (JOINT_COUNT, 1))  # of each joint
+        self._covariance = np.tile(np.diag(deviation**2), (JOINT_COUNT, 1, 1))
+        self._arms = self._as_arms()
+
+    @property
+    def common_moments(self) -> np.ndarray:
+        """The moments (8,) in kg m as the joints show them on average; M_n is that of joint n."""
+        return np.append(np.diag(self._mean[:, :JOINT_COUNT]), self._mean[:, JOINT_COUNT:].mean(axis=0))
+
+    def torque(self, theta: Sequence[float]) -> Torque:
+        """Return the expected torque (4,) in Nm at `theta` (4,) rad, in plain floats for the control loop."""
+        law = LAWS["exact"]
+        return tuple(law(arm, theta, self.tilt)[joint] for joint, arm in enumerate(self._arms))
+
+    def torques(self, theta: np.ndarray, direction: Vector | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the expected torque and its standard deviation, both (n, 4) Nm, at `theta` (n, 4) rad.
+
+        direction: (3,), gravity's unit vector in the base frame; by default as at present.
+        """
+        rows = regressor(theta, self.tilt.direction if direction is None else direction, self.gravity)
+        mean = np.einsum("njk,jk->nj", rows, self._mean)
+        variance = np.einsum("njk,jkl,njl->nj", rows, self._covariance, rows)
+        return mean, np.sqrt(np.maximum(variance, 0.0))
+
+    def learn(self, theta: Vector, effort: Vector, spread: Vector) -> None:
+        """Take a measured torque `effort` (4,) Nm at `theta` (4,) rad, with its standard error `spread` (4,) Nm."""
+        rows = regressor(theta, self.tilt.direction, self.gravity)[0]
+        for joint, (row, torque, error) in enumerate(zip(rows, effort, spread, strict=True)):
+            covariance = self._covariance[joint]
+            gain = covariance @ row / (row @ covariance @ row + error**2 + UNEXPLAINED**2)
+            self._mean[joint] += gain * (torque - row @ self._mean[joint])
+            self._covariance[joint] = covariance - np.outer(gain, row @ covariance)
+        self._arms = self._as_arms()
+
+    def _as_arms(self) -> list[ArmModel]:
+        return [
+            ArmModel.from_moments(self.length, np.maximum(row[:4], 0.0), row[4:], gravity=self.gravity)
+            for row in self._mean
+        ]
 
 
 class FixedStations:
@@ -53,10 +115,8 @@ class BestPoses:
 
     def __init__(self, limits: Limits, count: int, duration: float) -> None:
         self.count = count
-        self._limits = limits
-        self._duration = duration
-        self._first = hanging(limits)
-        self._is_started = False
+        self._limits, self._duration = limits, duration
+        self._first, self._is_started = hanging(limits), False
         self._candidates = candidates(limits)
 
     def next(
@@ -152,10 +212,8 @@ def next_pose(
     """Return the index of the candidate that adds the most information to the poses `taken`, by D-optimality.
 
     taken: (4,) rad each, none at the start. candidates: (n, 4) rad. direction: (3,), gravity's unit vector in the base
-    frame. moments: (8,) kg m, a guess. Raises ParameterError if there is no candidate.
+    frame. moments: (8,) kg m, a guess.
     """
-    if len(candidates) == 0:
-        raise ParameterError("candidates", [], "at least one pose")
     seen = _sensitivity(np.reshape(taken, (-1, JOINT_COUNT)), direction, moments, gravity).reshape(-1, COUNT)
     information = np.diag(NATURAL**-2.0) + seen.T @ seen
     rows = _sensitivity(candidates, direction, moments, gravity)

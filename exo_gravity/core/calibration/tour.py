@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.calibration.motion import FOLLOWED, Line, Observation, Station, Sweep, average, followed
-from exo_gravity.core.calibration.poses import BestPoses, FixedStations, Itinerary, friction_stations
-from exo_gravity.core.calibration.tracking import TorqueGuess, Tracker
+from exo_gravity.core.calibration.motion import FOLLOWED, Line, Observation, Station, Sweep, Tracker, average, followed
+from exo_gravity.core.calibration.poses import BestPoses, FixedStations, Itinerary, TorqueGuess, friction_stations
 from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.model.arm import MAX_LENGTH, MAX_MASS, MAX_MOMENT
@@ -58,11 +57,8 @@ class Tour:
         self.done = False
         self.progress = "waiting for the arm to be carried"
         self.elapsed = 0.0
-        self._limits = limits
-        self._guess = guess
-        self._itinerary = itinerary
-        self._load = load
-        self._most = np.array(limits.max_effort)
+        self._limits, self._most = limits, np.array(limits.max_effort)
+        self._guess, self._itinerary, self._load = guess, itinerary, load
         self._tracker = Tracker(rate, limits.max_effort)
         self._first_tilt = guess.tilt
         self._now = -math.inf

@@ -14,8 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.calibration.motion import FOLLOWED, LEAD, Line, Station, Sweep, average, followed
-from exo_gravity.core.calibration.tracking import Tracker
+from exo_gravity.core.calibration.motion import FOLLOWED, LEAD, Line, Station, Sweep, Tracker, average, followed
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.model.arm import MAX_PAYLOAD, ArmModel
 from exo_gravity.core.model.gravity import LAWS, Torque

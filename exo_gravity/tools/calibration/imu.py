@@ -1,14 +1,9 @@
 """calibrate imu: the mounting of the IMU, from a recording of its samples or from the running driver.
 
-The file's `/imu` names the topic. Live, only the recorder is started, while the user's own IMU driver runs.
-
-Upright, the accelerometer shows the trunk's z axis (up). Between upright and bowed the trunk turns about its y axis, so
-gravity moves in the plane across it: y is along bowed x upright. The gyroscope's axis and angle must agree. Several
-bows average. Posture limits the result: no person stands upright, or bows straight ahead, to better than a degree. The
-arm's weight shows the mounting to a tenth of one (`with_mounting`): from one lean of the stand the rotation that moves
-gravity, from two leans the heading as well.
-
-Six rests of the IMU on different sides show the accelerometer's scale and bias: in each it must show one g.
+docs/calibration.md has the idea: upright, the accelerometer shows the trunk's z axis (up); the trunk bows about its y
+axis, so y is along bowed x upright. Posture limits that: no person stands upright, or bows straight ahead, to better
+than a degree. The arm's weight shows the mounting to a tenth of one (`with_mounting`): from one lean of the stand the
+rotation that moves gravity, from two leans the heading as well.
 """
 
 import argparse
@@ -25,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
+from exo_gravity.core.model.kinematics import turning_in_base
 from exo_gravity.core.model.tilt import angle_between
 from exo_gravity.core.numbers import Vector
 from exo_gravity.core.trunk.params import IMU
@@ -76,8 +72,7 @@ class Phase(NamedTuple):
     """A second or more in which the IMU neither turned nor accelerated."""
 
     samples: slice
-    force: np.ndarray  #: (3,) m/s^2, mean
-    up: np.ndarray  #: (3,), unit vector
+    up: np.ndarray  #: (3,), unit vector of the mean acceleration
 
 
 class Mounting(NamedTuple):
@@ -92,7 +87,8 @@ class Mounting(NamedTuple):
 def calibrate_imu(options: argparse.Namespace, arm: ConfiguredArm | None, say: Say) -> CalibrationResult:
     """Calibrate the IMU of the file options.params from options.bag, or live.
 
-    options.rests: a recording of six rests, None for none. options.wait: waits for the person. Raises DataError.
+    The file's `/imu` names the topic. options.rests: a recording of six rests, None for none. options.wait: waits for
+    the person. Raises DataError.
     """
     topic = node_values(load(options.params), NODE, IMU)["input_topic"]
     found = mounting(read_imu(options.bag or _record(options, say), topic))
@@ -159,15 +155,15 @@ def still_phases(record: ImuRecord) -> list[Phase]:
     edges = np.searchsorted(time, np.append(np.arange(time[0], time[-1], BLOCK), np.inf))
     phases = []
     for still, run in groupby(pairwise(np.unique(edges).tolist()), is_still):
-        (start, stop), *more = run
-        samples = slice(start, more[-1][1] if more else stop)
-        if not still or time[samples][-1] - time[start] < MIN_STILL - BLOCK:
+        blocks = list(run)
+        samples = slice(blocks[0][0], blocks[-1][1])
+        if not still or time[samples][-1] - time[samples][0] < MIN_STILL - BLOCK:
             continue
         mean = force[samples].mean(axis=0)
         share = float(np.linalg.norm(mean)) / STANDARD_GRAVITY
         if not ONE_G[0] <= share <= ONE_G[1]:
             raise DataError(f"at rest the accelerometer shows {share:.2f} g, must be 1: check its unit (m/s^2)")
-        phases.append(Phase(samples, mean, _unit(mean)))
+        phases.append(Phase(samples, _unit(mean)))
     return phases
 
 
@@ -237,7 +233,7 @@ def six_rests(record: ImuRecord) -> tuple[np.ndarray, np.ndarray, float]:
             sides.append(phase)
     if len(sides) < RESTS:
         raise DataError(f"the IMU rested on {len(sides)} different sides, must be {RESTS}: lay it on each for 2 s")
-    shown = np.array([side.force for side in sides]) / STANDARD_GRAVITY
+    shown = np.array([record.acceleration[side.samples].mean(axis=0) for side in sides]) / STANDARD_GRAVITY
     fit, _, rank, _ = np.linalg.lstsq(np.hstack((shown**2, shown)), np.ones(len(shown)), rcond=1e-3)
     square, across = np.split(fit, 2)
     if rank < RESTS or np.any(square <= 0.0):
@@ -275,12 +271,8 @@ def turned(rotation: Vector, turn: np.ndarray) -> np.ndarray:
 
 
 def turn_in_trunk(side: str, turn: np.ndarray) -> np.ndarray:
-    """Return a rotation vector (3,) in an arm's base frame in the trunk's axes.
-
-    The right arm's base frame is the left one's mirror image, so that the sense of rotation changes.
-    """
-    outward, forward, down = turn
-    return np.array((forward, outward, -down) if side == "left" else (-forward, outward, down))
+    """Return a rotation vector (3,) in an arm's base frame in the trunk's axes."""
+    return np.array([turning_in_base(side, axis) for axis in np.eye(3)]) @ turn
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.calibration.motion import ACCELERATION, MAX_SPEED, Line, Station, Sweep, average, fit_friction
-from exo_gravity.core.calibration.poses import BestPoses, FixedStations, candidates, measurable
+from exo_gravity.core.calibration.identification import fit_friction
+from exo_gravity.core.calibration.motion import ACCELERATION, MAX_SPEED, Line, Station, Sweep, average
+from exo_gravity.core.calibration.poses import BestPoses, FixedStations, TorqueGuess, candidates, measurable
 from exo_gravity.core.calibration.tour import Tour
-from exo_gravity.core.calibration.tracking import TorqueGuess
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.gravity import load_moments, moments_of
 from exo_gravity.core.model.kinematics import LinkInertia
