@@ -98,7 +98,7 @@ def _run(options: argparse.Namespace) -> int:
     module = import_module(f"exo_gravity.tools.calibration.{COMMANDS[command][0]}")
     calibrate: Callable[..., CalibrationResult] = getattr(module, f"calibrate_{command}")
     result = with_mounting(calibrate(options, arm, person.say), options.params)
-    for line in result.lines:
+    for line in (*(change.text for change in result.changes), *result.lines):
         person.say(line)
     if result.changes and not result.refusals:
         write_changes(options.params, options.output, result.changes, f"calibrate {command}")

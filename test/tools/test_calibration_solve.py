@@ -73,7 +73,7 @@ def test_friction_of_each_joint_is_fitted_and_noted_in_the_file():
     result = friction_from(ARM, measured)
     assert result.refusals == () and len(result.curves) == 4
     assert [change.name for change in result.changes] == [""] * 4
-    assert "Coulomb 0.400" in result.lines[1] and "viscous 0.050" in result.lines[1]
+    assert "Coulomb 0.400" in result.changes[1].note and "viscous 0.050" in result.changes[1].note
 
 
 def test_the_wearers_masses_are_what_the_robot_alone_does_not_explain():

@@ -32,23 +32,17 @@ from exo_gravity.core.calibration.pose_fit import (
     SCALE,
     START,
     TILT,
-    Rows,
-    Solution,
-    along_axes,
-    final,
+    bounded,
+    rows_of,
     without_each_pose,
     without_outliers,
 )
 from exo_gravity.core.calibration.poses import missing_pose
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.gravity import MOMENTS, load_moments
+from exo_gravity.core.model.gravity import MOMENTS
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 
-LEAST_SPREAD = 0.003  # Nm; about half a code of an AK motor's 12-bit torque
-BESIDE_ERROR = 0.05  # rad, of a weight's place; 3 degrees
-TILT_ERROR = 0.05  # rad about each axis, of gravity's measured direction: an IMU's mounting, mostly its heading
-EXACT = 1e-6  # error of a value that is held
 HIDDEN = 0.1  # share of an unknown, in combinations that are not known, from which it is not known itself
 SCALES = (0.3, 3.0)  # true torque per commanded torque; users report 0.75
 MISFIT = 0.1  # of the peak effort
@@ -60,7 +54,6 @@ LEAST_RATIO = 2.0  # of the fastest to the slowest speed
 FRICTION_RESOLUTION = 0.003  # Nm: standard error of a friction that was measured once
 # Unknowns of joint 1, which carries nothing while its axis is vertical.
 FIRST_JOINT = (0, MOMENTS.index("W"), SCALE.start, OFFSET.start)
-UNKNOWN = np.eye(COUNT)  # one row for each
 NAMES = (*MOMENTS, *(f"{what} {n + 1}" for what in ("torque scale", "offset") for n in range(JOINT_COUNT)))
 LEAN = "lean the stand by 10 to 14 degrees to the arm's side, where the arm still hangs close to its home"
 
@@ -91,9 +84,9 @@ def identify(observations: Sequence[Observation], length: Vector, gravity: float
 
     Raises DataError if the result would be unphysical, naming the missing pose, and if an observation is impossible.
     """
-    rows = _rows(observations, length, gravity)
+    rows = rows_of(observations, length, gravity)
     keep, rejected = without_outliers(rows)
-    used, solution = _bounded(rows.only(keep))
+    used, solution = bounded(rows.only(keep))
     typical, peak = np.median(np.abs(solution.residual), axis=0), np.abs(used.effort).max(axis=0)
     for joint in np.flatnonzero(typical > np.maximum(MISFIT * peak, LEAST_MISFIT)):
         misfit = f"joint {joint + 1} is {typical[joint]:.2f} Nm off in half of the poses"
@@ -109,52 +102,12 @@ def identify(observations: Sequence[Observation], length: Vector, gravity: float
     residual = rows.effort - rows.predicted(solution.unknowns)
     held_out = residual.copy()
     held_out[keep], _ = without_each_pose(solution, used.sigma)
+    friction = np.median([observation.friction for observation in observations], axis=0)
     return Identified(
-        moments,
-        error[MOMENT],
-        scale,
-        scale * error[SCALE],
-        unknowns[OFFSET],
-        np.median([observation.friction for observation in observations], axis=0),
-        residual,
-        held_out,
-        solution.singular_values,
-        tuple(_unknown(unknowns, covariance, hidden, is_relative)),
-        rejected,
-        is_relative,
-        unknowns[TILT],
-        covariance[TILT, TILT],
-    )
-
-
-def _rows(observations: Sequence[Observation], length: Vector, gravity: float) -> Rows:
-    """Return the observations as arrays, with what is held. Raises DataError that names the observation."""
-    if not observations:
-        raise DataError("no pose was observed")
-    theta, direction, effort, spread = found = columns(observations)
-    for name, values in zip(("theta", "direction", "effort", "spread"), found, strict=True):
-        for index in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
-            raise DataError(f"pose {index + 1}: {name} = {values[index].tolist()}: must be finite numbers")
-    load = np.array([load_moments(length, one.load_mass, one.load_lever) for one in observations])
-    product = UNKNOWN[SCALE][1:].sum(axis=0, keepdims=True)  # of the scales of joints 2 to 4: 1 without a weight
-    product *= not np.any(load)
-    anchor = np.vstack((UNKNOWN[ANGLE] / BESIDE_ERROR, UNKNOWN[TILT] / TILT_ERROR, product / EXACT))
-    return Rows(along_axes(theta, gravity), direction, load, effort, np.hypot(spread, LEAST_SPREAD), anchor)
-
-
-def columns(observations: Sequence[Observation]) -> list[np.ndarray]:
-    """Return theta (n, 4) rad, direction (n, 3), effort and spread (n, 4) Nm of the observations."""
-    return [np.array([one[i] for one in observations], dtype=float) for i in (0, 1, 2, 4)]
-
-
-def _bounded(rows: Rows) -> tuple[Rows, Solution]:
-    """Return the solution with M1, the least certain moment, at least 0, and the rows with their estimated errors."""
-    used, solution = final(rows)
-    if solution.unknowns[0] >= 0.0:
-        return used, solution
-    used, bounded = final(rows._replace(anchor=np.vstack((rows.anchor, UNKNOWN[:1] / EXACT))))
-    bounded.unknowns[0], bounded.covariance[0, 0] = 0.0, solution.covariance[0, 0]
-    return used, bounded
+        moments, error[MOMENT], scale, scale * error[SCALE], unknowns[OFFSET], friction, residual, held_out,
+        solution.singular_values, tuple(_unknown(unknowns, covariance, hidden, is_relative)), rejected, is_relative,
+        unknowns[TILT], covariance[TILT, TILT],
+    )  # fmt: skip
 
 
 def _check_known(hidden: np.ndarray, count: int, direction: Vector, gravity: float, is_relative: bool) -> None:

@@ -25,8 +25,7 @@ FOLLOWED = 0.5  # of this part, that each joint must follow in a valid sweep
 LEAD = 0.3  # s at rest before each motion, in which the joints are brought to the edge of moving
 BINS = 4  # of each sweep: neighbouring samples share the slow oscillations of the controller
 RESOLUTION = 0.002  # Nm: standard error that is left of the 12-bit torque command (7.3 mNm per code) after averaging
-# kg m^2 added to each joint: with it a 1 kg weight on link 4 at 100 Hz is carried without sticking (measured).
-ADDED = 0.005
+ADDED = 0.005  # kg m^2 at each joint: with it 1 kg on link 4 at 100 Hz is carried without sticking (measured)
 FREQUENCY_PER_RATE = 0.12  # natural frequency in rad/s per control cycle per s; two cycles of delay cost 27 degrees
 MAX_FREQUENCY = 20.0  # rad/s
 INTEGRAL_SHARE = 0.4  # of the frequency, at which the integral part acts; unstable from 2 on
@@ -34,10 +33,8 @@ INTEGRAL_SHARE = 0.4  # of the frequency, at which the integral part acts; unsta
 # opposite sides of their path would cancel each other's integral where the inertia of both together is small.
 FLOOR = 2.0
 USUAL_FRICTION = 0.15  # Nm, until it is measured
-# Of the friction, per s, by which its compensation changes: a joint that rests anywhere within its friction would jump.
-FRICTION_RATE = 6.0
-# rad ahead of the reference, and rad/s faster, from which on no more friction is compensated
-AHEAD, FASTER = 0.003, 0.03
+FRICTION_RATE = 6.0  # of the friction, per s: at once, a joint that rests anywhere within its friction would jump
+AHEAD, FASTER = 0.003, 0.03  # rad and rad/s ahead of the reference, from which on no more friction is compensated
 SLOW_ERROR, STOP_ERROR = 0.04, 0.08  # rad behind the reference, from which on it slows down, and at which it waits
 FULL_FRICTION_SPEED = 0.03  # rad/s of the reference, from which on friction is compensated fully
 

@@ -14,7 +14,7 @@ import numpy as np
 from exo_gravity.core.calibration.motion import AMPLITUDE, LEAD, MAX_SPEED, Line, Station
 from exo_gravity.core.calibration.pose_fit import COUNT, MOMENT, NATURAL, START, TILT, TYPICAL_MOMENTS, Rows, along_axes
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.arm import STANDARD_GRAVITY, ArmModel
+from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import LAWS, Torque, regressor
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
@@ -203,11 +203,7 @@ def measurable(limits: Limits, amplitude: float) -> tuple[np.ndarray, np.ndarray
 
 
 def next_pose(
-    taken: Sequence[Vector],
-    candidates: np.ndarray,
-    direction: Vector = (0.0, 0.0, 1.0),
-    moments: Vector = TYPICAL_MOMENTS,
-    gravity: float = STANDARD_GRAVITY,
+    taken: Sequence[Vector], candidates: np.ndarray, direction: Vector, moments: Vector, gravity: float
 ) -> int:
     """Return the index of the candidate that adds the most information to the poses `taken`, by D-optimality.
 

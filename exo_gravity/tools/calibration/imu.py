@@ -97,14 +97,12 @@ def calibrate_imu(options: argparse.Namespace, arm: ConfiguredArm | None, say: S
     accuracy = f"±{error} degrees about the trunk's x, y and z, most of which is posture"
     bows = f"from {found.bows} {'bow' if found.bows == 1 else 'bows'} of up to {math.degrees(found.bow):.0f} degrees"
     changes = [Change(NODE, ROTATION, quaternion, f"{accuracy}, {bows}")]
-    lines = [f"{ROTATION}: {' '.join(f'{value:.4f}' for value in quaternion)} (x, y, z, w), {accuracy}", bows]
     if options.rests:
         *rows, remainder = six_rests(read_imu(options.rests, topic))
         scale, bias = (" ".join(f"{value:.4f}" for value in row) for row in rows)
         fit = f"true = scale (shown - bias), scale {scale}, bias {bias} m/s^2, for the driver"
-        lines.append(f"accelerometer: {fit}; {remainder:.3f} m/s^2 remain")
-        changes.append(Change(NODE, "", 0, lines[-1]))
-    return CalibrationResult(tuple(changes), tuple(lines))
+        changes.append(Change(NODE, "", 0, f"accelerometer: {fit}; {remainder:.3f} m/s^2 remain"))
+    return CalibrationResult(tuple(changes))
 
 
 def read_imu(bag: Path, topic: str) -> ImuRecord:
@@ -260,9 +258,9 @@ def with_mounting(result: CalibrationResult, params: Path) -> CalibrationResult:
     heading = f"heading ±{math.degrees(heading_error):.2f}" if is_whole else "heading unchanged"
     accuracy = f"±{math.degrees(error):.2f} degrees, {heading}"
     note = f"{accuracy}, from the arm's weight: {angle:.1f} degrees from the value before"
-    lines = (f"{ROTATION}: corrected by {angle:.1f} degrees, {accuracy}", *(() if is_whole else (NO_HEADING,)))
     change = Change(NODE, ROTATION, quaternion.round(6).tolist(), note)
-    return replace(result, changes=(*result.changes, change), lines=(*result.lines, *lines))
+    lines = result.lines if is_whole else (*result.lines, NO_HEADING)
+    return replace(result, changes=(*result.changes, change), lines=lines)
 
 
 def turned(rotation: Vector, turn: np.ndarray) -> np.ndarray:

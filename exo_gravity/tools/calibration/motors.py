@@ -97,13 +97,12 @@ class MotorSearch:
         unrest = max(max(angles) - min(angles) for angles in at_rest)
         survival, refusals = self._after_power_up(list(map(fmean, at_rest)))
         exactly = f"rad, measured {f'at {where}' if where else 'hanging'}, ±{unrest:.4f} and as exact as that pose"
-        directions, zeros, lines = [], [], []
+        directions, zeros = [], []
         rows = zip(self.found.items(), self._arm.motors, at_rest, pose, strict=True)
         for (can_id, (name, direction)), motor, angles, angle in rows:
             zero = fmean(angles) - direction * math.radians(angle)
             directions.append(direction)
             zeros.append(round(zero, 4))
-            lines.append(f"{name}: motor {can_id}, direction {direction:+d}, zero {zero:.4f} rad")
             try:
                 JointMotor(motor.spec, can_id, direction, zero)
             except ParameterError as error:  # the angle would wrap
@@ -115,7 +114,7 @@ class MotorSearch:
             Change(node, "direction", directions, "found by moving each joint by hand in its positive direction"),
             Change(node, "zero", zeros, f"{exactly}; {survival}"),
         )
-        return CalibrationResult(changes, (*lines, survival), tuple(refusals), self._arm)
+        return CalibrationResult(changes, (survival,), tuple(refusals), self._arm)
 
     def _scan(self) -> None:
         answers, problems = self._bus.scan()

@@ -21,8 +21,9 @@ import yaml
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from exo_gravity.core.calibration.identification import FrictionCurve, Identified, columns
+from exo_gravity.core.calibration.identification import FrictionCurve, Identified
 from exo_gravity.core.calibration.motion import Observation
+from exo_gravity.core.calibration.pose_fit import columns
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.gravity import load_moments, moments_of, regressor
 from exo_gravity.tools.inputs.arms import ConfiguredArm
@@ -47,13 +48,18 @@ class Change(NamedTuple):
     value: Value  #: in Python's own types
     note: str = ""  #: uncertainty and unit, for a comment in the file
 
+    @property
+    def text(self) -> str:
+        """The change as a line."""
+        return f"{self.name}: {value_text(self.value)}, {self.note}" if self.name else self.note
+
 
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
     """The result of one subcommand of `calibrate`."""
 
     changes: tuple[Change, ...] = ()  #: written unless there are `refusals`
-    lines: tuple[str, ...] = ()  #: the result in sentences
+    lines: tuple[str, ...] = ()  #: what else was found, in sentences
     refusals: tuple[str, ...] = ()  #: why it is not calibrated, in sentences
     arm: ConfiguredArm | None = None  #: as configured before
     observations: tuple[Observation, ...] = ()
@@ -182,7 +188,8 @@ def _sections(result: CalibrationResult) -> Iterator[str]:
     yield html.verdict(refused if result.refusals else "Calibrated.", result.refusals, good=not result.refusals)
     found = result.identified
     unknown = found.unknown if found else ()
-    yield html.bullets("Result", [line for line in result.lines if line not in unknown])
+    notes = [change.note for change in result.changes if not change.name]
+    yield html.bullets("Result", [*notes, *(line for line in result.lines if line not in unknown)])
     rows = [(c.node, c.name, value_text(c.value), c.note) for c in result.changes if c.name]
     if rows and not result.refusals:
         yield html.heading("New values")

@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.calibration.identification import Identified, columns, fit_friction, identify
+from exo_gravity.core.calibration.identification import Identified, fit_friction, identify
 from exo_gravity.core.calibration.motion import Observation
+from exo_gravity.core.calibration.pose_fit import columns
 from exo_gravity.core.calibration.poses import candidates, next_pose
 from exo_gravity.core.compensation.settings import wearer_of
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.arm import ModelError, moments_along
-from exo_gravity.core.model.gravity import MOMENTS, gravity_torque, load_moments, moments_of, regressor
+from exo_gravity.core.model.gravity import gravity_torque, load_moments, moments_of, regressor
 from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS
 from exo_gravity.core.numbers import JOINT_COUNT
@@ -95,7 +96,7 @@ def moments_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Cal
     poses, taken = candidates(arm.limits), [one.theta for one in observations]
     best = poses[next_pose(taken, poses, observations[-1].direction, moments_of(robot), robot.gravity)]
     more = f"next best pose, if more is wanted: {' '.join(f'{angle:.0f}' for angle in np.degrees(best))} degrees"
-    changes, lines = _changes(arm, found, scale), (*_lines(arm, found), *found.unknown, more)
+    changes, lines = _changes(arm, found, scale), (*_lines(arm, found), more)
     return CalibrationResult(changes, lines, impossible, arm, tuple(observations), found)
 
 
@@ -124,18 +125,14 @@ def _changes(arm: ConfiguredArm, found: Identified, scale: list[float]) -> tuple
 
 
 def _lines(arm: ConfiguredArm, found: Identified) -> Iterator[str]:
-    """Yield the result in sentences."""
-    for name, old, new, error in zip(MOMENTS, moments_of(arm.robot), found.moments, found.error, strict=True):
-        known = f"{new:.4f} +- {error:.4f} kg m (was {old:.4f})"
-        yield f"{name}: {known if np.isfinite(error) else f'unknown, still {old:.4f}'}"
-    rows = zip(arm.joint_names, found.scale, found.scale_error, found.friction, found.offset, strict=True)
-    for name, new, error, slide, offset in rows:
-        given = f"{new:.3f} +- {error:.3f} Nm per commanded Nm"
-        yield f"{name}: {given}, friction {slide:.2f} Nm, offset {offset:+.3f} Nm"
+    """Yield what the parameter file does not hold, in sentences."""
+    for name, slide, offset in zip(arm.joint_names, found.friction, found.offset, strict=True):
+        yield f"{name}: friction {slide:.2f} Nm, offset {offset:+.3f} Nm"
     worst = float(np.nanmax(np.abs(found.held_out), initial=0.0))
     yield f"largest torque error of a pose that was left out: {worst:.3f} Nm"
     for index, reason in found.rejected:
         yield f"pose {index + 1} was not used: {reason}"
+    yield from found.unknown
 
 
 def _row(values: np.ndarray) -> str:
@@ -151,16 +148,16 @@ def friction_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Ca
     """Return the friction of each joint that `observations` show. Raises DataError as `fit_friction` does."""
     speed = np.array([np.broadcast_to(one.speed, JOINT_COUNT) for one in observations])
     curves = tuple(map(fit_friction, speed.T, np.array([one.friction for one in observations]).T))
-    lines, refusals = [], []
+    changes, refusals = [], []
     for name, fit in zip(arm.joint_names, curves, strict=True):
         coulomb, viscous, stribeck = fit.error
         text = f"Coulomb {fit.coulomb:.3f} +- {coulomb:.3f} Nm, viscous {fit.viscous:.3f} +- {viscous:.3f} Nm s/rad"
         more = f"Stribeck {fit.stribeck:.3f} +- {stribeck:.3f} Nm below {fit.stribeck_speed:.2f} rad/s"
-        lines.append(f"{name}: {text}, {more if fit.stribeck else 'no Stribeck friction'}")
+        note = f"friction of {name}: {text}, {more if fit.stribeck else 'no Stribeck friction'}"
+        changes.append(Change(f"{arm.namespace}/can_bridge", "", 0, note))
         if fit.coulomb <= 0.0:
             refusals.append(f"{name}: friction of {fit.coulomb:.3f} Nm: must be above 0: was the arm touched?")
-    changes = tuple(Change(f"{arm.namespace}/can_bridge", "", 0, f"friction of {line}") for line in lines)
-    return CalibrationResult(changes, tuple(lines), tuple(refusals), arm, tuple(observations), curves=curves)
+    return CalibrationResult(tuple(changes), (), tuple(refusals), arm, tuple(observations), curves=curves)
 
 
 def calibrate_wearer(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
@@ -189,15 +186,12 @@ def wearer_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Cali
     covariance *= max(1.0, float(remainder @ remainder) / (remainder.size - 2))
     error, moments = np.sqrt(np.diag(covariance)), (per_mass @ mass)[2:]
     moment_error = np.sqrt(np.diag(per_mass @ covariance @ per_mass.T))[2:]
-    lines = []
-    for part, own, e, name, moment in zip(WORN, mass, error, ("M3", "M4"), moments, strict=True):
+    for part, own, e in zip(WORN, mass, error, strict=True):
         if not 0.0 < own < MOST:
             relaxed = "is the arm relaxed, the robot calibrated?"
             raise DataError(f"{part}: {own:.2f} kg: must be from 0 to {MOST:g}: {relaxed}")
         if e > LARGEST_ERROR * own:
             raise DataError(f"{part}: {own:.2f} +- {e:.2f} kg: add a pose with the arm further forward")
-        lines.append(f"{part}: {own:.2f} +- {e:.2f} kg, {name} {moment:.3f} kg m")
-    lines.append(f"largest remainder of a pose: {np.abs(remainder / weight).max():.2f} Nm")
     node, note = f"{arm.namespace}/compensator", f"kg, +-{error[0]:.2f} and {error[1]:.2f}"
     changes = (
         Change(node, "wearer.mass", [0.0, 0.0, *mass.round(3).tolist()], note),
@@ -208,13 +202,13 @@ def wearer_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Cali
     tabled_mass, tabled_cog = map(np.array, _wearer(arm, tabled=True))
     ratio = moments / moments_along(length, tabled_cog, tabled_mass)[2:]
     refusals: tuple[str, ...] = ()
-    if not body_mass:
-        lines.append(f"a person of {TYPICAL_BODY_MASS * ratio[0]:.0f} kg has this M3 by the table {Wearer.table}")
-    else:
-        lines.append(f"{ratio[0]:.0%} of M3 and {ratio[1]:.0%} of M4 by the table {Wearer.table} for {body_mass:g} kg")
+    compared = f"a person of {TYPICAL_BODY_MASS * ratio[0]:.0f} kg has this M3 by the table {Wearer.table}"
+    if body_mass:
+        compared = f"{ratio[0]:.0%} of M3 and {ratio[1]:.0%} of M4 by the table {Wearer.table} for {body_mass:g} kg"
         if not np.all((ratio >= low) & (ratio <= high)):
-            refusals = (f"implausible: {lines[-1]}: must be from {low:.0%} to {high:.0%}",)
-    return CalibrationResult(changes, tuple(lines), refusals, arm, tuple(observations))
+            refusals = (f"implausible: {compared}: must be from {low:.0%} to {high:.0%}",)
+    lines = f"largest remainder of a pose: {np.abs(remainder / weight).max():.2f} Nm", compared
+    return CalibrationResult(changes, lines, refusals, arm, tuple(observations))
 
 
 def _wearer(arm: ConfiguredArm, tabled: bool = False) -> tuple[Sequence[float], Sequence[float]]:
