@@ -18,6 +18,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from exo_gravity.core.calibration.motion import mean_direction
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.model.kinematics import turning_in_base
@@ -157,11 +158,10 @@ def still_phases(record: ImuRecord) -> list[Phase]:
         samples = slice(blocks[0][0], blocks[-1][1])
         if not still or time[samples][-1] - time[samples][0] < MIN_STILL - BLOCK:
             continue
-        mean = force[samples].mean(axis=0)
-        share = float(np.linalg.norm(mean)) / STANDARD_GRAVITY
+        share = float(np.linalg.norm(force[samples].mean(axis=0))) / STANDARD_GRAVITY
         if not ONE_G[0] <= share <= ONE_G[1]:
             raise DataError(f"at rest the accelerometer shows {share:.2f} g, must be 1: check its unit (m/s^2)")
-        phases.append(Phase(samples, _unit(mean)))
+        phases.append(Phase(samples, mean_direction(force[samples])))
     return phases
 
 
@@ -182,12 +182,13 @@ def mounting(record: ImuRecord) -> Mounting:
     standing = [index for index, bend in enumerate(bends) if bend < UPRIGHT]
     if standing[-1] < bends.index(bow):
         raise DataError("the record must begin and end upright: stand for 2 s before the bow and after it")
-    upright = [phases[index].up for index in standing]
-    z = _unit(np.mean(upright, axis=0))
+    upright = np.array([phases[index].up for index in standing])
+    z = mean_direction(upright)
     lowest = [(first, max(range(first, last), key=bends.__getitem__)) for first, last in pairwise(standing)]
     bows = [(phases[first], phases[low]) for first, low in lowest if bends[low] >= MIN_BOW]
-    axes = [_unit(np.cross(bowed.up, z)) for _, bowed in bows]
-    y = _unit(np.mean(axes, axis=0))
+    across = np.cross([bowed.up for _, bowed in bows], z)
+    axes = across / np.linalg.norm(across, axis=1, keepdims=True)
+    y = mean_direction(axes)
     bias = np.concatenate([record.angular_velocity[phase.samples] for phase in phases]).mean(axis=0)
     off_axis = [_checked_turn(record, *pair, bias, axis) for pair, axis in zip(bows, axes, strict=True)]
     level = math.hypot(SENSOR, max(POSTURE, *(angle_between(up, z) for up in upright)))
@@ -246,7 +247,7 @@ def with_mounting(result: CalibrationResult, params: Path) -> CalibrationResult:
     """Return `result` with a better mounting of the IMU in the file `params`, if the arm's weight showed one."""
     found, arm = result.identified, result.arm
     rotation = load(params).get(NODE, {}).get(ROTATION)
-    if found is None or arm is None or not result.changes or not rotation or not arm.compensator["use_imu"]:
+    if found is None or arm is None or not rotation or not arm.compensator["use_imu"]:
         return result
     square, axes = np.linalg.eigh(found.tilt_covariance)  # the last is nearly gravity's own axis
     error, heading_error = math.sqrt(max(0.0, square[0] + square[1])), math.sqrt(max(0.0, square[2]))
@@ -271,7 +272,3 @@ def turned(rotation: Vector, turn: np.ndarray) -> np.ndarray:
 def turn_in_trunk(side: str, turn: np.ndarray) -> np.ndarray:
     """Return a rotation vector (3,) in an arm's base frame in the trunk's axes."""
     return np.array([turning_in_base(side, axis) for axis in np.eye(3)]) @ turn
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return np.asarray(vector / np.linalg.norm(vector))
