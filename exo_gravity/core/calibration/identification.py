@@ -196,4 +196,5 @@ def _fit(speed: np.ndarray, torque: np.ndarray, stribeck_speed: float = 0.0) -> 
     fitted = matrix @ values
     scatter = float(np.sum((fitted - torque) ** 2)) / max(1, len(speed) - int(rank))
     errors = np.sqrt(max(scatter, FRICTION_RESOLUTION**2) * np.diag(np.linalg.pinv(matrix.T @ matrix)))
-    return FrictionCurve(speed, torque, fitted, *values.tolist(), stribeck_speed, tuple(errors.tolist()))
+    coulomb, viscous, stribeck = values.tolist()
+    return FrictionCurve(speed, torque, fitted, coulomb, viscous, stribeck, stribeck_speed, tuple(errors.tolist()))

@@ -73,11 +73,6 @@ class Station(NamedTuple):
         """Where the sweep begins and where it turns back, (4,) rad each."""
         return np.array(self.theta) - self.amplitude, np.array(self.theta) + self.amplitude
 
-    @property
-    def duration(self) -> float:
-        """Time in s that the sweeps take."""
-        return 2 * self.cycles * (Line(*self.ends, self.speed).duration + LEAD)
-
 
 class Line:
     """The motion from `start` to `end`, (4,) rad; the joint with the longest way turns at `speed` rad/s at most.

@@ -95,50 +95,36 @@ class TorqueGuess:
         ]
 
 
-class FixedStations:
-    """Visits given stations in order."""
+class Itinerary:
+    """Visits given stations, then others until `count` poses are measured, each the one that shows the most.
 
-    def __init__(self, stations: Sequence[Station]) -> None:
-        self.count = len(stations)
-        self._left = iter(stations)
-
-    def next(self, *_: object) -> Station | None:
-        """Return the next of the given stations."""
-        return next(self._left, None)
-
-
-class BestPoses:
-    """Visits `count` poses, each the one with the most information that is still missing.
-
-    duration: s, of the whole tour, which the choice keeps within.
+    given: by default the hanging arm. duration: s, of the whole tour, which the choice keeps within.
     """
 
-    def __init__(self, limits: Limits, count: int, duration: float) -> None:
-        self.count = count
-        self._limits, self._duration = limits, duration
-        self._first, self._is_started = hanging(limits), False
-        self._candidates = candidates(limits)
+    def __init__(self, limits: Limits, count: int, duration: float, given: Sequence[Station] = ()) -> None:
+        self._limits, self._most, self._duration = limits, count, duration
+        self._home, self._candidates = hanging(limits), candidates(limits)
+        stations = given or [self._home]
+        self.count, self._given = max(count, len(stations)), iter(stations)
 
     def next(
         self, taken: np.ndarray, position: np.ndarray, elapsed: float, guess: TorqueGuess, friction: Vector
     ) -> Station | None:
-        """Return the best of the candidates that can be held and reached; the first is the hanging arm.
+        """Return the next of the given stations, then the best of the candidates that can be held and reached.
 
         taken: (n, 4) rad, the poses measured so far. position: (4,) rad, where the arm is. elapsed: s since the start
         of the tour. friction: (4,) Nm, 0 if unknown. Returns None after the last; raises DataError if no pose can be
         held.
         """
-        if len(taken) >= self.count:
-            return None
-        if not len(taken) and not self._is_started:
-            self._is_started = True
-            return self._first
-        in_time = np.flatnonzero(self._is_in_time(self.count - len(taken), position, elapsed))
+        station = next(self._given, None)
+        if station or len(taken) >= self._most:
+            return station
+        in_time = np.flatnonzero(self._is_in_time(self._most - len(taken), position, elapsed))
         room = self._room(self._candidates[in_time], position, guess, friction)
         if room.max() < 0.0:
             raise DataError("no further pose can be held within max_effort: is it too small for the arm?")
         possible = in_time[room >= min(DEVIATIONS, math.floor(room.max()))]
-        seen, poses = list(taken) or [self._first.theta], self._candidates[possible]
+        seen, poses = list(taken) or [self._home.theta], self._candidates[possible]
         index = possible[next_pose(seen, poses, guess.tilt.direction, guess.common_moments, guess.gravity)]
         pose = self._candidates[index]
         self._candidates = np.delete(self._candidates, index, axis=0)  # chosen once, even if a joint sticks there
@@ -148,10 +134,11 @@ class BestPoses:
         """Return which candidates (n,) leave enough time for the others of the `left` poses and for the way home."""
         home, way = (
             np.array([Line(pose, candidate).duration + LEAD for candidate in self._candidates])
-            for pose in (np.array(self._first.theta), position)
+            for pose in (np.array(self._home.theta), position)
         )
         budget = (self._duration - elapsed - home) / left
-        fits = way + self._first.duration <= budget * (TIME_SHARE if left > 1 else 1.0)
+        sweeps = 2 * self._home.cycles * (Line(*self._home.ends, self._home.speed).duration + LEAD)
+        fits = way + sweeps <= budget * (TIME_SHARE if left > 1 else 1.0)
         return np.asarray(fits if fits.any() else way + home <= (way + home).min() + 1.0)
 
     def _room(self, poses: np.ndarray, start: np.ndarray, guess: TorqueGuess, friction: Vector) -> np.ndarray:
@@ -168,9 +155,6 @@ class BestPoses:
         room = ((most - np.abs(mean)) / np.maximum(deviation, LEAST_DEVIATION)).min(axis=1).reshape(-1, len(poses))
         is_home = np.arange(len(room))[:, None] >= len(room) - len(home)
         return np.asarray(np.where(is_home & (room >= 0.0), np.inf, room).min(axis=0))
-
-
-Itinerary = FixedStations | BestPoses
 
 
 def hanging(limits: Limits, speed: float = 0.1, amplitude: float = AMPLITUDE) -> Station:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.calibration.motion import FOLLOWED, Line, Observation, Station, Sweep, Tracker, average, followed
-from exo_gravity.core.calibration.poses import BestPoses, FixedStations, Itinerary, TorqueGuess, friction_stations
+from exo_gravity.core.calibration.poses import Itinerary, TorqueGuess, friction_stations
 from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.model.arm import MAX_LENGTH, MAX_MASS, MAX_MOMENT
@@ -232,7 +232,6 @@ def tour_of(values: Mapping[str, Any]) -> Tour:
     load = values["tour.load_mass"], values["tour.load_lever"]
     moments = np.array((*values["first_moment"], *values["off_axis"])) + load_moments(values["link_length"], *load)
     guess = TorqueGuess(values["link_length"], moments, Tilt.of(values["side"]), values["gravity"])
-    itinerary: Itinerary = BestPoses(limits, values["tour.poses"], DURATION)
-    if values["tour.friction"]:
-        itinerary = FixedStations(friction_stations(limits))
+    count, given = (0, friction_stations(limits)) if values["tour.friction"] else (values["tour.poses"], ())
+    itinerary = Itinerary(limits, count, DURATION, given)
     return Tour(limits, guess, itinerary, values["rate"], load)

@@ -271,4 +271,4 @@ def turned(rotation: Vector, turn: np.ndarray) -> np.ndarray:
 
 def turn_in_trunk(side: str, turn: np.ndarray) -> np.ndarray:
     """Return a rotation vector (3,) in an arm's base frame in the trunk's axes."""
-    return np.array([turning_in_base(side, axis) for axis in np.eye(3)]) @ turn
+    return np.array([turning_in_base(side, axis) for axis in np.eye(3).tolist()]) @ turn

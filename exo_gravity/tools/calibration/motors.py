@@ -97,24 +97,24 @@ class MotorSearch:
         unrest = max(max(angles) - min(angles) for angles in at_rest)
         survival, refusals = self._after_power_up(list(map(fmean, at_rest)))
         exactly = f"rad, measured {f'at {where}' if where else 'hanging'}, ±{unrest:.4f} and as exact as that pose"
-        directions, zeros = [], []
+        zeros = []
         rows = zip(self.found.items(), self._arm.motors, at_rest, pose, strict=True)
         for (can_id, (name, direction)), motor, angles, angle in rows:
             zero = fmean(angles) - direction * math.radians(angle)
-            directions.append(direction)
             zeros.append(round(zero, 4))
             try:
                 JointMotor(motor.spec, can_id, direction, zero)
             except ParameterError as error:  # the angle would wrap
                 refusals.append(f"{name}: {error}: {SET_ZERO}")
-        node, formats = f"{self._arm.namespace}/can_bridge", [self._last[can_id].wire_format for can_id in self.found]
+        node, directions = f"{self._arm.namespace}/can_bridge", [direction for _, direction in self.found.values()]
+        formats = [self._last[can_id].wire_format for can_id in self.found]
         changes = (
             Change(node, "can_id", list(self.found), "found by moving each joint by hand"),
             Change(node, "wire_format", formats, "as each board answers"),
             Change(node, "direction", directions, "found by moving each joint by hand in its positive direction"),
             Change(node, "zero", zeros, f"{exactly}; {survival}"),
         )
-        return CalibrationResult(changes, (survival,), tuple(refusals), self._arm)
+        return CalibrationResult(changes, (), tuple(refusals), self._arm)
 
     def _scan(self) -> None:
         answers, problems = self._bus.scan()
