@@ -92,17 +92,12 @@ class Tour:
         dt, self._now = now - self._now, now
         self.elapsed += dt
         if now - self._refreshed > REFRESH_PERIOD:
-            self._refresh(position)
+            self._refreshed, moments = now, self._guess.common_moments[:JOINT_COUNT]
+            self._matrix = LinkInertia.of_moments(self._guess.length, moments, self._load).matrix(position)
+            self._uncertain = self._guess.torques(np.array([position]))[1][0]
         effort = self._tracker.step(dt, position, velocity, expected, tilt.direction, self._matrix)
         self.trouble = self.trouble or self._wrong_motion(dt, velocity, tilt) or self._wrong_torque(dt)
         return None if self.trouble else effort
-
-    def _refresh(self, position: Sequence[float]) -> None:
-        """Estimate the mass matrix at `position` (4,) rad, and how uncertain the expected torque is there."""
-        self._refreshed = self._now
-        moments = self._guess.common_moments[:JOINT_COUNT]
-        self._matrix = LinkInertia.of_moments(self._guess.length, moments, self._load).matrix(position)
-        self._uncertain = self._guess.torques(np.array([position]))[1][0]
 
     def _wrong_motion(self, dt: float, velocity: Sequence[float], tilt: Tilt) -> str:
         """Return what is wrong after `dt` s with the motion, or ''; velocity: (4,) rad/s."""
