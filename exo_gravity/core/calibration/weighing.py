@@ -158,8 +158,8 @@ class Weighing:
         for _ in range(round(TAKE_OVER / LEAD)):
             yield Line(here, here)
         yield Line(here, station.ends[0], station.speed)
+        self._is_moving = True
         for _ in range(station.cycles):
-            self._is_moving = True
             sweeps += yield from self._tracker.sweep(station)
         yield Line(station.ends[0], here, station.speed)
         self._finish(sweeps, followed(sweeps, station))

@@ -104,10 +104,11 @@ def _changes(arm: ConfiguredArm, found: Identified, scale: list[float]) -> tuple
     """Return the new values of the parameter file. What is unknown keeps its value."""
     node, error = f"{arm.namespace}/compensator", found.error
     unit = "as commanded; in kg m once a weight was hung" if found.relative else "kg m"
-    moments = np.where(np.isfinite(error), found.moments, moments_of(arm.robot)).round(5).tolist()
+    before = moments_of(arm.robot)
+    moments = np.where(np.isfinite(error), found.moments, before).round(5).tolist()
     changes = [
-        Change(node, "robot.first_moment", moments[:4], f"{unit}, +-{_row(error[:4])}"),
-        Change(node, "robot.off_axis", moments[4:], f"W Z Y3 Y4 {unit}, +-{_row(error[4:])}"),
+        Change(node, "robot.first_moment", moments[:4], f"{unit}, +-{_row(error[:4])}, was {_row(before[:4])}"),
+        Change(node, "robot.off_axis", moments[4:], f"W Z Y3 Y4 {unit}, +-{_row(error[4:])}, was {_row(before[4:])}"),
         Change(f"{arm.namespace}/can_bridge", "torque_scale", scale, f"+-{_row(found.scale_error)}"),
     ]
     if np.all(np.isfinite(found.held_out).any(axis=0)):
@@ -136,7 +137,7 @@ def _lines(arm: ConfiguredArm, found: Identified) -> Iterator[str]:
 
 
 def _row(values: np.ndarray) -> str:
-    return " ".join(f"{value:.2g}" if np.isfinite(value) else "unknown" for value in values)
+    return " ".join(f"{value:.3g}" if np.isfinite(value) else "unknown" for value in values)
 
 
 def calibrate_friction(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
