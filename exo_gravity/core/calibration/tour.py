@@ -55,7 +55,7 @@ class Tour:
         self.measured: list[Observation] = []
         self.trouble = ""
         self.done = False
-        self.progress = "waiting for the arm to be carried"
+        self.progress = "choosing the first pose"
         self.elapsed = 0.0
         self._limits, self._most = limits, np.array(limits.max_effort)
         self._guess, self._itinerary, self._load = guess, itinerary, load
