@@ -24,7 +24,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.inputs import TiltInput
-from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, by_name
+from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, by_name, status_values
 from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import NEWEST, HotPath, Publishers, Repeated, TiltSubscription, crowded
@@ -39,9 +39,8 @@ class CalibratorNode(Node):
     def __init__(self) -> None:
         super().__init__("calibrator", automatically_declare_parameters_from_overrides=True)
         values = declare(self, CALIBRATOR)
-        self._names = values["joint_names"]
+        self._names, self._uses_imu = values["joint_names"], values["use_imu"]
         self._tour = tour_of(values)
-        self._uses_imu = values["use_imu"]
         self._tilt = TiltInput(values["side"], values["tilt_timeout"])
         self._bridge = f"{self.get_namespace().strip('/')}/can_bridge".lstrip("/")
         self._bridge_state, self._bridge_message = "", ""
@@ -55,7 +54,7 @@ class CalibratorNode(Node):
         self._command = JointState(name=self._names)  # one message, reused
         self._lock = threading.Lock()  # guards tilt and state: joint states arrive on another thread
         self._joint_states = HotPath(self, JointState, "joint_states", self._on_joint_states, NEWEST)
-        if values["use_imu"]:
+        if self._uses_imu:
             self._sources |= TiltSubscription(self, self._tilt, self._lock, self._on_refused_tilt).senders
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self.create_timer(REPORT_PERIOD, self._report)
@@ -105,7 +104,7 @@ class CalibratorNode(Node):
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name == self._bridge:
-                values = {pair.key: pair.value for pair in status.values}
+                values = status_values(status)
                 state, has_fault = values.get("state", ""), values.get("fault", "none") != "none"
                 with self._lock:
                     self._bridge_state, self._bridge_message = state, status.message
@@ -114,11 +113,9 @@ class CalibratorNode(Node):
                     self._trouble = status.message if has_fault else f"the bridge stopped carrying: {state}"
 
     def _report(self) -> None:
-        tour, events = self._tour, list[dict[str, Any]]()
-        while self._printed < len(tour.measured):
-            events.append({"observation": tour.measured[self._printed]._asdict()})
-            self._printed += 1
-        trouble = tour.trouble or self._trouble
+        tour, trouble = self._tour, self._tour.trouble or self._trouble
+        events: list[dict[str, Any]] = [{"observation": one._asdict()} for one in tour.measured[self._printed :]]
+        self._printed += len(events)
         progress = tour.progress if self._began else f"waiting for the arm to be carried: {self._bridge_message}"
         reported = {"progress": progress, "trouble": trouble, "done": tour.done}
         events += [{key: value} for key, value in reported.items() if value != self._reported[key]]

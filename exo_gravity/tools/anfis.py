@@ -25,10 +25,9 @@ from exo_gravity.bag.reader import read_bag
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.anfis import INPUTS, UPRIGHT, Anfis, AnfisLaw, grades, scaled
 from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.trial.analysis import analyse
-from exo_gravity.tools.calibration.recorded import TILT_TOPIC, TILT_TYPE, messages_of
+from exo_gravity.tools.calibration.recorded import recording_of, tilts_of
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.inputs.references import gravload
 
@@ -78,24 +77,13 @@ def from_bag(path: str | Path, configured: ConfiguredArm, functions: int) -> Sam
     `functions` membership functions per input.
     """
     bag = read_bag(path)
-    joints = sorted(configured.joint_names)
-    recording = next((r for r in bag.recordings if sorted(r.joint_names) == joints), None)
-    if recording is None:
-        found = "; ".join(", ".join(r.joint_names) for r in bag.recordings)
-        raise DataError(f"{path}: the joints are {found}: must include {', '.join(joints)}")
-    order = [recording.joint_names.index(name) for name in configured.joint_names]
-    tilts = messages_of(Path(path), TILT_TOPIC, TILT_TYPE, required=False)
-    tilted = np.array(
-        [
-            (stamp - bag.start) / 1e9
-            for stamp, message in tilts
-            if not Tilt.of(configured.side, message.vector.y, message.vector.x).axis_angle <= UPRIGHT
-        ]
-    )
+    recording = recording_of(bag, configured)
+    tilts = tilts_of(Path(path), configured.side, required=False)
+    tilted = np.array([stamp - bag.start / 1e9 for stamp, tilt in tilts if not tilt.axis_angle <= UPRIGHT])
     holds = [h for h in analyse(recording).holds if not np.any((tilted >= h.start) & (tilted <= h.end))]
     spans = [(recording.time >= hold.start) & (recording.time <= hold.end) for hold in holds]
-    angle = np.array([hold.pose for hold in holds]).reshape(-1, JOINT_COUNT)[:, order]
-    torque = np.array([recording.effort[span].mean(axis=0) for span in spans]).reshape(-1, JOINT_COUNT)[:, order]
+    angle = np.array([hold.pose for hold in holds]).reshape(-1, JOINT_COUNT)
+    torque = np.array([recording.effort[span].mean(axis=0) for span in spans]).reshape(-1, JOINT_COUNT)
     kept = np.all(np.isfinite(torque) & (angle >= configured.low) & (angle <= configured.high), axis=1)
     angle, torque = angle[kept, 1:], torque[kept, 1:]
     checked = np.arange(len(angle)) % HELD_OUT == HELD_OUT - 1

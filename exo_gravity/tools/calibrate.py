@@ -35,6 +35,7 @@ MAX_POSES = 12
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="calibrate", description="Find what differs between an arm and its file.")
+    parser.set_defaults(bag=None, rests=None)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, (_, description) in COMMANDS.items():
         command = commands.add_parser(name, help=description, description=f"calibrate {name}: {description}.")
@@ -80,26 +81,24 @@ def main(args: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     from exo_gravity.tools.calibration.imu import with_mounting
     from exo_gravity.tools.calibration.live import Person
-    from exo_gravity.tools.calibration.page import page_of
-    from exo_gravity.tools.calibration.result import check_output, write_changes
+    from exo_gravity.tools.calibration.result import check_output, page_of, write_changes
 
     command: str = options.command
     options.record, page = options.output.with_suffix(".jsonl"), options.output.with_suffix(".html")
     for path in (options.output, options.record, page):
         check_output(path)
-    bag = getattr(options, "bag", None)
-    for path in (bag, getattr(options, "rests", None)):
+    for path in (options.bag, options.rests):
         if path is not None and not path.exists():
             raise ParameterError("bag", str(path), "a recording that exists")
     person = Person()
     options.wait = person.wait
     arm = None if command == "imu" else configured_arm(options.params, options.side)
-    if bag is None and command != "motors":
+    if options.bag is None and command != "motors":
         require_ros("calibrate")
     module = import_module(f"exo_gravity.tools.calibration.{COMMANDS[command][0]}")
     calibrate: Callable[..., CalibrationResult] = getattr(module, f"calibrate_{command}")
     result = with_mounting(calibrate(options, arm, person.say), options.params)
-    for line in result.lines:
+    for line in (*(change.text for change in result.changes), *result.lines):
         person.say(line)
     if result.changes and not result.refusals:
         write_changes(options.params, options.output, result.changes, f"calibrate {command}")

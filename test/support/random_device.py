@@ -8,9 +8,10 @@ from functools import cache
 import numpy as np
 
 from exo_gravity.core import ArmModel, Tilt
-from exo_gravity.core.calibration.identification import Observation
+from exo_gravity.core.calibration.motion import Observation
 from exo_gravity.core.calibration.pose_fit import TYPICAL_MOMENTS
 from exo_gravity.core.calibration.poses import next_pose
+from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.model.gravity import load_moments, moments_of, regressor
 from exo_gravity.core.numbers import Vector
 
@@ -83,5 +84,5 @@ def best(direction: Direction, count: int, weight: Weight = NO_WEIGHT) -> tuple[
     moments = np.array(TYPICAL_MOMENTS) + load_moments(LENGTH, *weight)
     taken: list[tuple[float, ...]] = []
     while len(taken) < count:
-        taken.append(tuple(CANDIDATES[next_pose(taken, CANDIDATES, direction, moments)]))
+        taken.append(tuple(CANDIDATES[next_pose(taken, CANDIDATES, direction, moments, STANDARD_GRAVITY)]))
     return tuple(taken)

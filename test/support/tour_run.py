@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.calibration.poses import BestPoses, Itinerary
+from exo_gravity.core.calibration.motion import Station
+from exo_gravity.core.calibration.poses import Itinerary, TorqueGuess
 from exo_gravity.core.calibration.tour import Tour
-from exo_gravity.core.calibration.tracking import TorqueGuess
 from exo_gravity.core.model.gravity import Torque, load_moments, moments_of
 from exo_gravity.core.model.kinematics import LinkInertia
 from exo_gravity.core.model.tilt import Tilt
@@ -80,7 +80,7 @@ class TourRun:
         tilt = Tilt.of("right", *self.tilt)
         moments = moments_of(self.assumed) + load_moments(self.assumed.length.tolist(), *self.load)
         guess = TorqueGuess(self.assumed.length, moments, tilt, self.assumed.gravity)
-        tour = Tour(self.limits, guess, itinerary or BestPoses(self.limits, 12, 230.0), self.rate, self.load)
+        tour = Tour(self.limits, guess, itinerary or Itinerary(self.limits, 12, 230.0), self.rate, self.load)
         safety = SafetyMachine(self.limits, 1.0 / self.rate, MOTORS_AS_MOUNTED)
         safety.enable(0.0)
         samples: list[JointSample] = [UNKNOWN] * 4
@@ -127,6 +127,11 @@ class TourRun:
             if reply:
                 samples[i] = JointSample(*motor.joint_reply(reply[1])[1:], now)
         return drive.powered
+
+
+def fixed(stations: Sequence[Station]) -> Itinerary:
+    """Return the itinerary of `stations` alone."""
+    return Itinerary(Limits(NAMES), 0, 0.0, stations)
 
 
 def assert_close_to_device(inertia: LinkInertia, arm: SimulatedArm, atol: float) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -217,13 +218,14 @@ def test_motors_on_two_buses_are_found_and_the_channel_of_each_joint_is_written(
     monkeypatch.setattr(motors, "MAX_SILENCE", 10.0)
     arm = Arm(15)
     monkeypatch.setattr(Person, "wait", lambda person, request, watch: arm.wait(request, watch))
-    params, output = params_of(tmp_path, "near, far, far, far"), tmp_path / "new.yaml"
-    with device_on("far,near,near,far", arm) as device:
+    near, far = (f"{name}-{os.getpid()}" for name in ("near", "far"))  # the lock of a bus holds on the whole computer
+    params, output = params_of(tmp_path, f"{near}, {far}, {far}, {far}"), tmp_path / "new.yaml"
+    with device_on(f"{far},{near},{near},{far}", arm) as device:
         assert main(["motors", "--params", str(params), "--output", str(output)]) == 0
         assert not device.powered
-    assert "on near and far" in capsys.readouterr().out
+    assert f"on {near} and {far}" in capsys.readouterr().out
     found = configured_arm(output, "right")
-    assert found.can_bridge["can.channel"] == "far,near,near,far"
+    assert found.can_bridge["can.channel"] == f"{far},{near},{near},{far}"
     assert [motor.can_id for motor in found.motors] == arm.ids
     assert [motor.wire_format.name for motor in found.motors] == ["mit_v3", "mit", "mit", "mit_v3"]
 
@@ -233,7 +235,7 @@ def test_the_command_line_describes_the_device_in_the_new_file_or_says_why_not(
 ) -> None:
     monkeypatch.setattr(BusScan.scan, "__defaults__", (range(1, IDS),))  # test_bus_scan.py scans all
     monkeypatch.setattr(motors, "MAX_SILENCE", 10.0)  # of a thread on a busy computer
-    arm, channel = Arm(15), "calibrate-motors"
+    arm, channel = Arm(15), f"calibrate-motors-{os.getpid()}"
     monkeypatch.setattr(Person, "wait", lambda person, request, watch: arm.wait(request, watch))
     params, output = params_of(tmp_path, channel), tmp_path / "new.yaml"
     command = ["motors", "--params", str(params), "--output", str(output)]

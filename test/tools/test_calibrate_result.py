@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from exo_gravity.core.errors import ParameterError
@@ -111,8 +110,8 @@ def test_a_packaged_file_keeps_every_line_and_still_describes_its_arms(tmp_path:
     params, output = packaged_config(name), tmp_path / "new.yaml"
     changes = [
         Change("/right/can_bridge", "can_id", [4, 3, 2, 1]),
-        Change("/right/can_bridge", "zero", [1e-5, -0.4, np.float64(0.1), 1 / 3]),
-        Change("/right/compensator", "robot.mass", np.array([0.5, 0.4, 0.3, 0.2])),  # type: ignore[arg-type]
+        Change("/right/can_bridge", "zero", [1e-5, -0.4, 0.1, 1 / 3]),
+        Change("/right/compensator", "robot.mass", [0.5, 0.4, 0.3, 0.2]),
     ]
     write_changes(params, output, changes, "calibrate motors", DAY)
     old, new = params.read_text("utf-8").splitlines(), output.read_text("utf-8").splitlines()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.calibration.poses import BestPoses, FixedStations, friction_stations
+from exo_gravity.core.calibration.poses import Itinerary, friction_stations
 from exo_gravity.core.trial.recording import Recording
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
@@ -21,7 +21,7 @@ from exo_gravity.tools.inputs.arms import configured_arm
 from exo_gravity.tools.inputs.parameter_file import packaged_config
 
 from ..support.synthetic_bags import START, STORE, messages, write_bag
-from ..support.tour_run import MOTORS_AS_MOUNTED, TourRun
+from ..support.tour_run import MOTORS_AS_MOUNTED, TourRun, fixed
 
 ARM = configured_arm(packaged_config("sim.yaml"))
 MASS = DEFAULT_LINKS.mass * (1.2, 0.8, 1.15, 0.85)
@@ -42,7 +42,7 @@ def tours():
     weight = (0.5, 0.25)
     loaded = ArmConfig(TRUTH, wearer_mass=(0.0, 0.0, 0.0, weight[0]), wearer_cog=(0.0, 0.0, 0.0, weight[1]))
     runs = device(), device(truth=loaded, load=weight)
-    return [(run, run.run(BestPoses(run.limits, 8, 160.0))) for run in runs]
+    return [(run, run.run(Itinerary(run.limits, 8, 160.0))) for run in runs]
 
 
 @pytest.mark.thorough
@@ -125,7 +125,7 @@ def test_recordings_without_and_with_the_weight_give_kilograms_and_true_scales(t
 def test_sweeps_at_five_speeds_give_the_friction_of_each_joint_live_and_recorded(tmp_path):
     truth = ArmConfig(TRUTH, coulomb_friction=(0.25, 0.35, 0.18, 0.22), viscous_friction=(0.1, 0.2, 0.1, 0.1))
     run = TourRun(truth=truth)
-    tour = run.run(FixedStations(friction_stations(run.limits)))
+    tour = run.run(fixed(friction_stations(run.limits)))
     assert tour.trouble == ""
     for measured in (tour.measured, recorded.observations_of(recorded_by(run, tmp_path / "bag"), ARM, with_held=False)):
         result = friction_from(ARM, measured)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.calibration.identification import Observation
+from exo_gravity.core.calibration.motion import Observation
 from exo_gravity.core.calibration.tour import CALIBRATOR, tour_of
 from exo_gravity.core.compensation.settings import wearer_of
 from exo_gravity.core.errors import DataError, ParameterError
@@ -56,6 +56,7 @@ def test_the_old_torque_scale_and_law_and_gain_of_the_file_are_taken_over():
     )
     assert value(result, "torque_scale")[0] == pytest.approx(0.5 * SCALES[0], rel=0.02)
     assert value(result, "law") == "exact" and value(result, "gain") == [1.0] * 4
+    assert result.lines[-1].startswith("next best pose, if more is wanted: ")
 
 
 def test_an_impossible_torque_scale_is_refused_and_names_the_joint():
@@ -72,7 +73,7 @@ def test_friction_of_each_joint_is_fitted_and_noted_in_the_file():
     result = friction_from(ARM, measured)
     assert result.refusals == () and len(result.curves) == 4
     assert [change.name for change in result.changes] == [""] * 4
-    assert "Coulomb 0.400" in result.lines[1] and "viscous 0.050" in result.lines[1]
+    assert "Coulomb 0.400" in result.changes[1].note and "viscous 0.050" in result.changes[1].note
 
 
 def test_the_wearers_masses_are_what_the_robot_alone_does_not_explain():

@@ -7,15 +7,22 @@ The commanded effort that holds the arm in a pose is, without friction, which av
 A pose that does not fit the others (a hand on the arm, a slipping joint) is left out. A result that no arm can have is
 refused, with the pose that is missing. Held poses do not show a common factor of all scales and moments without a known
 weight; nor can they tell a moment across link 3 or 4 from an error of that joint's zero.
+
+Over its speed, a joint's friction is Coulomb, viscous and Stribeck:
+
+    F(v) = coulomb + viscous v + stribeck exp(-(v / v_s)^2)          B. Armstrong-Helouvry et al., Automatica 30 (1994)
+
+For a given Stribeck speed v_s this is linear in the other three, so v_s is searched on a grid.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
+from exo_gravity.core.calibration.motion import Observation
 from exo_gravity.core.calibration.pose_fit import (
     ANGLE,
     COUNT,
@@ -25,48 +32,30 @@ from exo_gravity.core.calibration.pose_fit import (
     SCALE,
     START,
     TILT,
-    Rows,
-    Solution,
-    along_axes,
-    final,
+    bounded,
+    rows_of,
     without_each_pose,
     without_outliers,
 )
 from exo_gravity.core.calibration.poses import missing_pose
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.gravity import MOMENTS, load_moments
+from exo_gravity.core.model.gravity import MOMENTS
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 
-LEAST_SPREAD = 0.003  # Nm; about half a code of an AK motor's 12-bit torque
-BESIDE_ERROR = 0.05  # rad, of a weight's place; 3 degrees
-TILT_ERROR = 0.05  # rad about each axis, of gravity's measured direction: an IMU's mounting, mostly its heading
-EXACT = 1e-6  # error of a value that is held
 HIDDEN = 0.1  # share of an unknown, in combinations that are not known, from which it is not known itself
 SCALES = (0.3, 3.0)  # true torque per commanded torque; users report 0.75
 MISFIT = 0.1  # of the peak effort
 LEAST_MISFIT = 0.1  # Nm
 LEAST_ZERO_ERROR = 0.5  # deg worth a sentence
-LEAST_TILT = 1.0  # deg worth a sentence
+STRIBECK_SPEEDS = np.geomspace(0.01, 0.2, 30)  # rad/s
+SIGNIFICANT = 3.0  # standard errors, from which on a Stribeck part is kept
+LEAST_RATIO = 2.0  # of the fastest to the slowest speed
+FRICTION_RESOLUTION = 0.003  # Nm: standard error of a friction that was measured once
 # Unknowns of joint 1, which carries nothing while its axis is vertical.
 FIRST_JOINT = (0, MOMENTS.index("W"), SCALE.start, OFFSET.start)
-PER_JOINT = tuple(f"{what} {n + 1}" for what in ("torque scale", "offset") for n in range(JOINT_COUNT))
-UNKNOWN = np.eye(COUNT)  # one row for each
-NAMES = (*MOMENTS, *PER_JOINT)
+NAMES = (*MOMENTS, *(f"{what} {n + 1}" for what in ("torque scale", "offset") for n in range(JOINT_COUNT)))
 LEAN = "lean the stand by 10 to 14 degrees to the arm's side, where the arm still hangs close to its home"
-
-
-class Observation(NamedTuple):
-    """One pose, passed in both directions of motion."""
-
-    theta: Vector  #: (4,) rad
-    direction: Vector  #: (3,), gravity's unit vector in the base frame
-    effort: Vector  #: (4,) Nm as commanded, mean of both directions
-    friction: Vector  #: (4,) Nm, half of their difference
-    spread: Vector  #: (4,) Nm, standard error of `effort`
-    load_mass: float = 0.0  #: kg, a weight on link 4; 0 for none
-    load_lever: float = 0.0  #: m, its distance from the elbow
-    speed: float | Vector = 0.0  #: rad/s at which the joints passed the pose, one for all or (4,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,15 +84,14 @@ def identify(observations: Sequence[Observation], length: Vector, gravity: float
 
     Raises DataError if the result would be unphysical, naming the missing pose, and if an observation is impossible.
     """
-    rows = _rows(observations, length, gravity)
+    rows = rows_of(observations, length, gravity)
     keep, rejected = without_outliers(rows)
-    used, solution = _bounded(rows.only(keep))
+    used, solution = bounded(rows.only(keep))
     typical, peak = np.median(np.abs(solution.residual), axis=0), np.abs(used.effort).max(axis=0)
     for joint in np.flatnonzero(typical > np.maximum(MISFIT * peak, LEAST_MISFIT)):
         misfit = f"joint {joint + 1} is {typical[joint]:.2f} Nm off in half of the poses"
         raise DataError(f"the poses do not fit one arm: {misfit}. {DISTURBED}")
-    direction, hidden = np.asarray(observations[-1].direction, dtype=float), solution.hidden > HIDDEN
-    is_relative = not np.any(used.load)
+    direction, hidden, is_relative = observations[-1].direction, solution.hidden > HIDDEN, not np.any(used.load)
     _check_known(hidden, len(observations), direction, gravity, is_relative)
     unknowns = np.where(hidden, START, solution.unknowns)
     # Student's distribution: for few poses two standard errors would cover less than 95 %.
@@ -114,56 +102,15 @@ def identify(observations: Sequence[Observation], length: Vector, gravity: float
     residual = rows.effort - rows.predicted(solution.unknowns)
     held_out = residual.copy()
     held_out[keep], _ = without_each_pose(solution, used.sigma)
+    friction = np.median([observation.friction for observation in observations], axis=0)
     return Identified(
-        moments,
-        error[MOMENT],
-        scale,
-        scale * error[SCALE],
-        unknowns[OFFSET],
-        np.median([observation.friction for observation in observations], axis=0),
-        residual,
-        held_out,
-        solution.singular_values,
-        _unknown(unknowns, covariance, hidden, is_relative),
-        rejected,
-        is_relative,
-        unknowns[TILT],
-        covariance[TILT, TILT],
-    )
+        moments, error[MOMENT], scale, scale * error[SCALE], unknowns[OFFSET], friction, residual, held_out,
+        solution.singular_values, tuple(_unknown(unknowns, covariance, hidden, is_relative)), rejected, is_relative,
+        unknowns[TILT], covariance[TILT, TILT],
+    )  # fmt: skip
 
 
-def _rows(observations: Sequence[Observation], length: Vector, gravity: float) -> Rows:
-    """Return the observations as arrays, with what is held. Raises DataError that names the observation."""
-    if not observations:
-        raise DataError("no pose was observed")
-    theta, direction, effort, spread = found = columns(observations)
-    for name, values in zip(("theta", "direction", "effort", "spread"), found, strict=True):
-        for index in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
-            raise DataError(f"pose {index + 1}: {name} = {values[index].tolist()}: must be finite numbers")
-    load = np.array([load_moments(length, one.load_mass, one.load_lever) for one in observations])
-    product = UNKNOWN[SCALE][1:].sum(axis=0, keepdims=True)  # of the scales of joints 2 to 4: 1 without a weight
-    product *= not np.any(load)
-    anchor = np.vstack((UNKNOWN[ANGLE] / BESIDE_ERROR, UNKNOWN[TILT] / TILT_ERROR, product / EXACT))
-    return Rows(along_axes(theta, gravity), direction, load, effort, np.hypot(spread, LEAST_SPREAD), anchor)
-
-
-def columns(observations: Sequence[Observation]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return theta (n, 4) rad, direction (n, 3), effort and spread (n, 4) Nm of the observations."""
-    theta, direction, effort, spread = (np.array([one[i] for one in observations], dtype=float) for i in (0, 1, 2, 4))
-    return theta, direction, effort, spread
-
-
-def _bounded(rows: Rows) -> tuple[Rows, Solution]:
-    """Return the solution with M1, the least certain moment, at least 0, and the rows with their estimated errors."""
-    used, solution = final(rows)
-    if solution.unknowns[0] >= 0.0:
-        return used, solution
-    used, bounded = final(rows._replace(anchor=np.vstack((rows.anchor, UNKNOWN[:1] / EXACT))))
-    bounded.unknowns[0], bounded.covariance[0, 0] = 0.0, solution.covariance[0, 0]
-    return used, bounded
-
-
-def _check_known(hidden: np.ndarray, count: int, direction: np.ndarray, gravity: float, is_relative: bool) -> None:
+def _check_known(hidden: np.ndarray, count: int, direction: Vector, gravity: float, is_relative: bool) -> None:
     """Raise DataError that names what is missing if `count` poses do not show `hidden` (22,) of joints 2 to 4."""
     missing = hidden.copy()
     missing[list(FIRST_JOINT)] = False
@@ -176,7 +123,7 @@ def _check_known(hidden: np.ndarray, count: int, direction: np.ndarray, gravity:
 
 
 def check_physical(
-    moments: np.ndarray, error: np.ndarray, scale: np.ndarray, direction: np.ndarray, gravity: float
+    moments: np.ndarray, error: np.ndarray, scale: np.ndarray, direction: Vector, gravity: float
 ) -> None:
     """Raise DataError unless an arm can have the moments (8,) kg m and scales (4,), and their `error` (8,) is small."""
     low, high = SCALES
@@ -197,24 +144,57 @@ def check_physical(
             raise DataError(f"{MOMENTS[across]} = {moments[across]:.3f} kg m exceeds {MOMENTS[along]}: {seems}")
 
 
-def _unknown(unknowns: np.ndarray, covariance: np.ndarray, hidden: np.ndarray, relative: bool) -> tuple[str, ...]:
-    """Return what the poses do not show, and what would, in sentences; unknowns and `hidden`: (22,)."""
-    sentences = []
+def _unknown(unknowns: np.ndarray, covariance: np.ndarray, hidden: np.ndarray, relative: bool) -> Iterator[str]:
+    """Yield what the poses do not show, and what would, in sentences; unknowns and `hidden`: (22,)."""
     if relative:
-        sentences.append("A common factor of all torque scales and moments: hang a known weight on link 4.")
-    if np.any(hidden[: ANGLE.start]):
-        names = ", ".join(NAMES[index] for index in np.flatnonzero(hidden[: ANGLE.start]))
-        sentences.append(f"{names}: joint 1 carries nothing while its axis is vertical: {LEAN}.")
+        yield "A common factor of all torque scales and moments: hang a known weight on link 4."
+    if names := ", ".join(NAMES[index] for index in np.flatnonzero(hidden[: ANGLE.start])):
+        yield f"{names}: joint 1 carries nothing while its axis is vertical: {LEAN}."
     for joint, along, across in ((4, 3, 7), (3, 2, 6)):
         angle = math.degrees(math.atan2(unknowns[across], unknowns[along]))
         looks = f"it looks like one of {angle:+.1f} degrees; check the zero with a level or at a stop."
-        sentences.append(f"{MOMENTS[across]} of link {joint} from an error of joint {joint}'s zero: {looks}")
+        yield f"{MOMENTS[across]} of link {joint} from an error of joint {joint}'s zero: {looks}"
     elbow, elbow_error = math.degrees(unknowns[ANGLE][0]), math.degrees(math.sqrt(covariance[ANGLE, ANGLE][0, 0]))
     if elbow and abs(elbow) > max(3.0 * elbow_error, LEAST_ZERO_ERROR):
-        sentences.append(f"The weight shows joint 3's zero {elbow:+.1f} +- {elbow_error:.1f} degrees off.")
-    square, axes = np.linalg.eigh(covariance[TILT, TILT])  # the least known turn, the last, is the one about gravity
-    tilt = math.degrees(float(np.linalg.norm(unknowns[TILT] @ axes[:, :2])))
-    tilt_error = math.degrees(math.sqrt(max(0.0, float(square[:2].sum()))))
-    if tilt > max(3.0 * tilt_error, LEAST_TILT):
-        sentences.append(f"Gravity seems {tilt:.1f} degrees off what the IMU says: check rotation_trunk_from_imu.")
-    return tuple(sentences)
+        yield f"The weight shows joint 3's zero {elbow:+.1f} +- {elbow_error:.1f} degrees off."
+
+
+class FrictionCurve(NamedTuple):
+    """Friction of a joint over its speed."""
+
+    speed: np.ndarray  #: (n,) rad/s
+    torque: np.ndarray  #: (n,) Nm, measured
+    fitted: np.ndarray  #: (n,) Nm
+    coulomb: float  #: Nm
+    viscous: float  #: Nm s/rad
+    stribeck: float  #: Nm, 0 if the data show none
+    stribeck_speed: float  #: rad/s, 0 without Stribeck friction
+    error: tuple[float, ...]  #: (3,), standard errors of coulomb, viscous and stribeck
+
+
+def fit_friction(speed: np.ndarray, torque: np.ndarray) -> FrictionCurve:
+    """Return the friction that fits `torque` (n,) in Nm at `speed` (n,) rad/s.
+
+    Raises DataError for fewer than 3 speeds, or less than a factor of 2 between them.
+    """
+    speeds = len(np.unique(speed))
+    if speeds < 3:
+        raise DataError(f"friction was measured at {speeds} speeds, must be at least 3")
+    if speed.max() < LEAST_RATIO * speed.min():
+        measured = f"from {speed.min():.2f} to {speed.max():.2f} rad/s"
+        raise DataError(f"friction was measured {measured}, the fastest must be {LEAST_RATIO:g} times the slowest")
+    fits = [_fit(speed, torque, own) for own in STRIBECK_SPEEDS.tolist()]
+    best = min(fits, key=lambda fit: float(np.sum((fit.fitted - torque) ** 2)))
+    return best if speeds > 3 and best.stribeck > SIGNIFICANT * best.error[2] else _fit(speed, torque)
+
+
+def _fit(speed: np.ndarray, torque: np.ndarray, stribeck_speed: float = 0.0) -> FrictionCurve:
+    """Return the fit with this Stribeck speed, 0 for a fit without Stribeck friction."""
+    falling = np.exp(-((speed / stribeck_speed) ** 2)) if stribeck_speed else np.zeros_like(speed)
+    matrix = np.stack((np.ones_like(speed), speed, falling), axis=1)
+    values, _, rank, _ = np.linalg.lstsq(matrix, torque, rcond=None)
+    fitted = matrix @ values
+    scatter = float(np.sum((fitted - torque) ** 2)) / max(1, len(speed) - int(rank))
+    errors = np.sqrt(max(scatter, FRICTION_RESOLUTION**2) * np.diag(np.linalg.pinv(matrix.T @ matrix)))
+    coulomb, viscous, stribeck = values.tolist()
+    return FrictionCurve(speed, torque, fitted, coulomb, viscous, stribeck, stribeck_speed, tuple(errors.tolist()))

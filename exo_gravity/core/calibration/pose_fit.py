@@ -11,13 +11,15 @@ Errors are larger in some joints than the observations state (gear friction is n
 joint gets a factor of its own, estimated from its residuals and pooled with the others where poses are few.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from exo_gravity.core.calibration.motion import Observation
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.gravity import MOMENTS, regressor
-from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.model.gravity import MOMENTS, load_moments, regressor
+from exo_gravity.core.numbers import JOINT_COUNT, Vector
 
 MOMENT = slice(0, 8)
 SCALE = slice(8, 12)
@@ -42,6 +44,10 @@ LEAST_OUTLIER = 0.03  # Nm, and this share of the peak effort: a smaller error d
 SHARE_OF_PEAK = 0.01
 DISTURBED = "Was it touched, does a joint slip or touch a stop?"
 COMMON = 0.002  # of torque: error of all sweeps of a joint in one tour, which their scatter does not show
+LEAST_SPREAD = 0.003  # Nm; about half a code of an AK motor's 12-bit torque
+BESIDE_ERROR = 0.05  # rad, of a weight's place; 3 degrees
+TILT_ERROR = 0.05  # rad about each axis, of gravity's measured direction: an IMU's mounting, mostly its heading
+EXACT = 1e-6  # error of a value that is held
 OUTLIER = 32.0  # such a sum from which a pose is left out: of good poses, one in 500,000
 
 
@@ -89,6 +95,26 @@ class Solution(NamedTuple):
     inverse: np.ndarray  #: (22, 4 n + k), change of the unknowns with each effort and condition, divided by its error
 
 
+def rows_of(observations: Sequence[Observation], length: Vector, gravity: float) -> Rows:
+    """Return the observations as arrays, with what is held. Raises DataError that names the observation."""
+    if not observations:
+        raise DataError("no pose was observed")
+    theta, direction, effort, spread = found = columns(observations)
+    for name, values in zip(("theta", "direction", "effort", "spread"), found, strict=True):
+        for index in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
+            raise DataError(f"pose {index + 1}: {name} = {values[index].tolist()}: must be finite numbers")
+    load = np.array([load_moments(length, one.load_mass, one.load_lever) for one in observations])
+    product = np.eye(COUNT)[SCALE][1:].sum(axis=0, keepdims=True)  # of the scales of joints 2 to 4: 1 without a weight
+    product *= not np.any(load)
+    anchor = np.vstack((np.eye(COUNT)[ANGLE] / BESIDE_ERROR, np.eye(COUNT)[TILT] / TILT_ERROR, product / EXACT))
+    return Rows(along_axes(theta, gravity), direction, load, effort, np.hypot(spread, LEAST_SPREAD), anchor)
+
+
+def columns(observations: Sequence[Observation]) -> list[np.ndarray]:
+    """Return theta (n, 4) rad, direction (n, 3), effort and spread (n, 4) Nm of the observations."""
+    return [np.array([one[i] for one in observations], dtype=float) for i in (0, 1, 2, 4)]
+
+
 def along_axes(theta: np.ndarray, gravity: float) -> np.ndarray:
     """Return `Rows.along` of the poses `theta` (n, 4) rad."""
     return np.stack([regressor(theta, axis, gravity) for axis in np.eye(3)], axis=-1)
@@ -111,9 +137,8 @@ def solve(rows: Rows, start: np.ndarray = START, weight: np.ndarray | float = 1.
         # A scale that jumps by more than a factor of 1.6 in one step has left the range of the linear model.
         unknowns = unknowns + step / max(1.0, 2.0 * float(np.abs(step[SCALE]).max()))
     hidden = 1.0 - np.diag(inverse @ whitened)  # a projection, up to the units
-    singular_values = np.zeros(ANGLE.start)
     size = np.linalg.svd((poses * NATURAL)[:, : ANGLE.start], compute_uv=False)
-    singular_values[: len(size)] = size
+    singular_values = np.pad(size, (0, ANGLE.start - len(size)))
     hat = (poses @ inverse[:, : residual.size]).reshape(2 * residual.shape)
     left_over = 1.0 - np.einsum("njnj->nj", hat)
     freedom = np.maximum(left_over.sum(axis=0), 0.0)
@@ -145,6 +170,16 @@ def final(rows: Rows) -> tuple[Rows, Solution]:
         scaled = rows._replace(sigma=rows.sigma * np.sqrt(factor))
         solution = solve(scaled, solution.unknowns)
     return scaled, solution._replace(covariance=solution.covariance + _common_error(scaled, solution))
+
+
+def bounded(rows: Rows) -> tuple[Rows, Solution]:
+    """Return the solution with M1, the least certain moment, at least 0, and the rows with their estimated errors."""
+    used, solution = final(rows)
+    if solution.unknowns[0] >= 0.0:
+        return used, solution
+    used, held = final(rows._replace(anchor=np.vstack((rows.anchor, np.eye(COUNT)[:1] / EXACT))))
+    held.unknowns[0], held.covariance[0, 0] = 0.0, solution.covariance[0, 0]
+    return used, held
 
 
 def _common_error(rows: Rows, solution: Solution) -> np.ndarray:

@@ -1,4 +1,9 @@
-"""Which poses the calibration visits: given ones, or the most informative ones that the motors can hold."""
+"""Which poses the calibration visits: given ones, or the most informative ones that the motors can hold.
+
+What holds the arm is expected with a mean and a standard deviation for every pose. Each joint has moments of its own,
+in the Nm that its motor is commanded: its unknown torque scale is then part of them. They start from the parameter
+file's arm with a wide uncertainty, and every measured pose narrows it (a Kalman update).
+"""
 
 import itertools
 import math
@@ -8,12 +13,16 @@ import numpy as np
 
 from exo_gravity.core.calibration.motion import AMPLITUDE, LEAD, MAX_SPEED, Line, Station
 from exo_gravity.core.calibration.pose_fit import COUNT, MOMENT, NATURAL, START, TILT, TYPICAL_MOMENTS, Rows, along_axes
-from exo_gravity.core.calibration.tracking import TorqueGuess
-from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.model.arm import STANDARD_GRAVITY
+from exo_gravity.core.errors import DataError
+from exo_gravity.core.model.arm import ArmModel
+from exo_gravity.core.model.gravity import LAWS, Torque, regressor
+from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 from exo_gravity.core.safety.limits import WALL_WIDTH, Limits
 
+UNSURE = 0.4  # of a moment: masses and torque scales that are each off by 30 %
+UNSURE_MOMENT = 0.02  # kg m, in addition: off-axis moments of which the file knows nothing
+UNEXPLAINED = 0.05  # Nm: standard deviation of what no moment explains
 CANDIDATES = 800
 MOST_UPWARDS = 0.3  # sine of the largest angle above the horizontal, of links 3 and 4
 SHARE = 0.85  # of max_effort that a pose may need
@@ -33,52 +42,89 @@ NOISE_SHARE = 0.02  # of the torque
 GRID = ((-60, 0, 60), (15, 45, 75, 105, 135), (-30, 0, 30, 60, 90, 120), (0, 30, 60, 90, 120, 150))
 
 
-class FixedStations:
-    """Visits given stations in order."""
+class TorqueGuess:
+    """The commanded torque that holds the arm, as far as it is known.
 
-    def __init__(self, stations: Sequence[Station]) -> None:
-        self.count = len(stations)
-        self._left = iter(stations)
-
-    def next(self, *_: object) -> Station | None:
-        """Return the next of the given stations."""
-        return next(self._left, None)
-
-
-class BestPoses:
-    """Visits `count` poses, each the one with the most information that is still missing.
-
-    duration: s, of the whole tour, which the choice keeps within.
+    length: (4,) m. moments: (8,) kg m, as in `core.model.gravity`, with the load. tilt: of the trunk or the stand.
     """
 
-    def __init__(self, limits: Limits, count: int, duration: float) -> None:
-        self.count = count
-        self._limits = limits
-        self._duration = duration
-        self._first = hanging(limits)
-        self._is_started = False
-        self._candidates = candidates(limits)
+    def __init__(self, length: Vector, moments: Vector, tilt: Tilt, gravity: float) -> None:
+        moments = np.asarray(moments, dtype=float)
+        deviation = UNSURE * np.abs(moments) + UNSURE_MOMENT
+        self.length = np.asarray(length, dtype=float)
+        self.tilt = tilt
+        self.gravity = gravity
+        self._mean = np.tile(moments, (JOINT_COUNT, 1))  # of each joint
+        self._covariance = np.tile(np.diag(deviation**2), (JOINT_COUNT, 1, 1))
+        self._arms = self._as_arms()
+
+    @property
+    def common_moments(self) -> np.ndarray:
+        """The moments (8,) in kg m as the joints show them on average; M_n is that of joint n."""
+        return np.append(np.diag(self._mean[:, :JOINT_COUNT]), self._mean[:, JOINT_COUNT:].mean(axis=0))
+
+    def torque(self, theta: Sequence[float]) -> Torque:
+        """Return the expected torque (4,) in Nm at `theta` (4,) rad, in plain floats for the control loop."""
+        law = LAWS["exact"]
+        return tuple(law(arm, theta, self.tilt)[joint] for joint, arm in enumerate(self._arms))
+
+    def torques(self, theta: np.ndarray, direction: Vector | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the expected torque and its standard deviation, both (n, 4) Nm, at `theta` (n, 4) rad.
+
+        direction: (3,), gravity's unit vector in the base frame; by default as at present.
+        """
+        rows = regressor(theta, self.tilt.direction if direction is None else direction, self.gravity)
+        mean = np.einsum("njk,jk->nj", rows, self._mean)
+        variance = np.einsum("njk,jkl,njl->nj", rows, self._covariance, rows)
+        return mean, np.sqrt(np.maximum(variance, 0.0))
+
+    def learn(self, theta: Vector, effort: Vector, spread: Vector) -> None:
+        """Take a measured torque `effort` (4,) Nm at `theta` (4,) rad, with its standard error `spread` (4,) Nm."""
+        rows = regressor(theta, self.tilt.direction, self.gravity)[0]
+        for joint, (row, torque, error) in enumerate(zip(rows, effort, spread, strict=True)):
+            covariance = self._covariance[joint]
+            gain = covariance @ row / (row @ covariance @ row + error**2 + UNEXPLAINED**2)
+            self._mean[joint] += gain * (torque - row @ self._mean[joint])
+            self._covariance[joint] = covariance - np.outer(gain, row @ covariance)
+        self._arms = self._as_arms()
+
+    def _as_arms(self) -> list[ArmModel]:
+        return [
+            ArmModel.from_moments(self.length, np.maximum(row[:4], 0.0), row[4:], gravity=self.gravity)
+            for row in self._mean
+        ]
+
+
+class Itinerary:
+    """Visits given stations, then others until `count` poses are measured, each the one that shows the most.
+
+    given: by default the hanging arm. duration: s, of the whole tour, which the choice keeps within.
+    """
+
+    def __init__(self, limits: Limits, count: int, duration: float, given: Sequence[Station] = ()) -> None:
+        self._limits, self._most, self._duration = limits, count, duration
+        self._home, self._candidates = hanging(limits), candidates(limits)
+        stations = given or [self._home]
+        self.count, self._given = max(count, len(stations)), iter(stations)
 
     def next(
         self, taken: np.ndarray, position: np.ndarray, elapsed: float, guess: TorqueGuess, friction: Vector
     ) -> Station | None:
-        """Return the best of the candidates that can be held and reached; the first is the hanging arm.
+        """Return the next of the given stations, then the best of the candidates that can be held and reached.
 
         taken: (n, 4) rad, the poses measured so far. position: (4,) rad, where the arm is. elapsed: s since the start
         of the tour. friction: (4,) Nm, 0 if unknown. Returns None after the last; raises DataError if no pose can be
         held.
         """
-        if len(taken) >= self.count:
-            return None
-        if not len(taken) and not self._is_started:
-            self._is_started = True
-            return self._first
-        in_time = np.flatnonzero(self._is_in_time(self.count - len(taken), position, elapsed))
+        station = next(self._given, None)
+        if station or len(taken) >= self._most:
+            return station
+        in_time = np.flatnonzero(self._is_in_time(self._most - len(taken), position, elapsed))
         room = self._room(self._candidates[in_time], position, guess, friction)
         if room.max() < 0.0:
             raise DataError("no further pose can be held within max_effort: is it too small for the arm?")
         possible = in_time[room >= min(DEVIATIONS, math.floor(room.max()))]
-        seen, poses = list(taken) or [self._first.theta], self._candidates[possible]
+        seen, poses = list(taken) or [self._home.theta], self._candidates[possible]
         index = possible[next_pose(seen, poses, guess.tilt.direction, guess.common_moments, guess.gravity)]
         pose = self._candidates[index]
         self._candidates = np.delete(self._candidates, index, axis=0)  # chosen once, even if a joint sticks there
@@ -88,10 +134,11 @@ class BestPoses:
         """Return which candidates (n,) leave enough time for the others of the `left` poses and for the way home."""
         home, way = (
             np.array([Line(pose, candidate).duration + LEAD for candidate in self._candidates])
-            for pose in (np.array(self._first.theta), position)
+            for pose in (np.array(self._home.theta), position)
         )
         budget = (self._duration - elapsed - home) / left
-        fits = way + self._first.duration <= budget * (TIME_SHARE if left > 1 else 1.0)
+        sweeps = 2 * self._home.cycles * (Line(*self._home.ends, self._home.speed).duration + LEAD)
+        fits = way + sweeps <= budget * (TIME_SHARE if left > 1 else 1.0)
         return np.asarray(fits if fits.any() else way + home <= (way + home).min() + 1.0)
 
     def _room(self, poses: np.ndarray, start: np.ndarray, guess: TorqueGuess, friction: Vector) -> np.ndarray:
@@ -108,9 +155,6 @@ class BestPoses:
         room = ((most - np.abs(mean)) / np.maximum(deviation, LEAST_DEVIATION)).min(axis=1).reshape(-1, len(poses))
         is_home = np.arange(len(room))[:, None] >= len(room) - len(home)
         return np.asarray(np.where(is_home & (room >= 0.0), np.inf, room).min(axis=0))
-
-
-Itinerary = FixedStations | BestPoses
 
 
 def hanging(limits: Limits, speed: float = 0.1, amplitude: float = AMPLITUDE) -> Station:
@@ -143,19 +187,13 @@ def measurable(limits: Limits, amplitude: float) -> tuple[np.ndarray, np.ndarray
 
 
 def next_pose(
-    taken: Sequence[Vector],
-    candidates: np.ndarray,
-    direction: Vector = (0.0, 0.0, 1.0),
-    moments: Vector = TYPICAL_MOMENTS,
-    gravity: float = STANDARD_GRAVITY,
+    taken: Sequence[Vector], candidates: np.ndarray, direction: Vector, moments: Vector, gravity: float
 ) -> int:
     """Return the index of the candidate that adds the most information to the poses `taken`, by D-optimality.
 
     taken: (4,) rad each, none at the start. candidates: (n, 4) rad. direction: (3,), gravity's unit vector in the base
-    frame. moments: (8,) kg m, a guess. Raises ParameterError if there is no candidate.
+    frame. moments: (8,) kg m, a guess.
     """
-    if len(candidates) == 0:
-        raise ParameterError("candidates", [], "at least one pose")
     seen = _sensitivity(np.reshape(taken, (-1, JOINT_COUNT)), direction, moments, gravity).reshape(-1, COUNT)
     information = np.diag(NATURAL**-2.0) + seen.T @ seen
     rows = _sensitivity(candidates, direction, moments, gravity)

@@ -13,22 +13,18 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.calibration.identification import Observation
-from exo_gravity.core.calibration.motion import LEAD, WINDOW, Line, Station, average
-from exo_gravity.core.calibration.poses import BestPoses, FixedStations, Itinerary, friction_stations
-from exo_gravity.core.calibration.tracking import TorqueGuess, Tracker, inertia_of
+from exo_gravity.core.calibration.motion import FOLLOWED, Line, Observation, Station, Sweep, Tracker, average, followed
+from exo_gravity.core.calibration.poses import Itinerary, TorqueGuess, friction_stations
 from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.model.arm import MAX_LENGTH, MAX_MASS, MAX_MOMENT
 from exo_gravity.core.model.gravity import Torque, load_moments
+from exo_gravity.core.model.kinematics import LinkInertia
 from exo_gravity.core.model.tilt import Tilt, angle_between
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits
 
-# rad behind the reference, from which on it slows down, and at which it stops and waits for the arm.
-SLOW_ERROR, STOP_ERROR = 0.04, 0.08
-FOLLOWED = 0.5  # of the way of the reference, that each joint must follow in a valid sweep
 MAX_FAILURES = 3  # pairs of sweeps in which a joint may stick: each shows the controller more of its friction
 MAX_SKIPPED = 2  # poses in which a joint may stick
 STEADY_SPEED = 0.05  # rad/s of a sweep, from which on its friction is that of the motion between poses
@@ -59,28 +55,21 @@ class Tour:
         self.measured: list[Observation] = []
         self.trouble = ""
         self.done = False
-        self.progress = "waiting for the arm to be carried"
+        self.progress = "choosing the first pose"
         self.elapsed = 0.0
-        self._limits = limits
-        self._guess = guess
-        self._itinerary = itinerary
-        self._load = load
-        self._most = np.array(limits.max_effort)
+        self._limits, self._most = limits, np.array(limits.max_effort)
+        self._guess, self._itinerary, self._load = guess, itinerary, load
         self._tracker = Tracker(rate, limits.max_effort)
         self._first_tilt = guess.tilt
         self._now = -math.inf
-        self._lines: Iterator[Line] = iter(())
-        self._line = Line(np.zeros(JOINT_COUNT), np.zeros(JOINT_COUNT))
-        self._line_time = math.inf  # s; it is over
+        self._position = np.zeros(JOINT_COUNT)  # rad, at the end of the present line
         self._skipped = 0  # poses
         self._awaits_plan = False
         self._plan: tuple[Station | None, str] = (None, "")  # the next pose, or None to go home, and the trouble
-        self._sweep: list[tuple[Sequence[float], np.ndarray, Sequence[float]]] | None = None  # its samples
         self._friction = np.zeros(JOINT_COUNT)  # Nm, 0 until it is measured
         self._unexplained = np.zeros(JOINT_COUNT)  # s
         self._refreshed = -math.inf
         self._matrix, self._uncertain = np.eye(JOINT_COUNT), np.zeros(JOINT_COUNT)
-        self._effort: Torque = (0.0,) * JOINT_COUNT
 
     def wait(self, position: Sequence[float], tilt: Tilt) -> Torque:
         """Return the expected torque (4,) in Nm at `position` (4,) rad, while the arm is not yet carried."""
@@ -98,44 +87,25 @@ class Tour:
         if self.done:  # the bridge lets the arm down: it is no longer watched
             return tuple(np.clip(expected + self._tracker.correction, -self._most, self._most).tolist())
         if self._now == -math.inf:
-            self._first_tilt, self._now = tilt, now
-            self._lines, self._line = self._way(np.array(position)), Line(np.array(position), np.array(position))
+            self._first_tilt, self._now, self._position = tilt, now, np.array(position)
+            self._tracker.lines = self._way()
         dt, self._now = now - self._now, now
         self.elapsed += dt
-        if self._line_time > self._line.duration and not self._awaits_plan:
-            self._line, self._line_time = next(self._lines), -LEAD
-        goal, heading = self._line.at(self._line_time)
-        error = goal - position
-        pace = max(0.0, min(1.0, (STOP_ERROR - float(np.abs(error).max())) / (STOP_ERROR - SLOW_ERROR)))
-        self._line_time += pace * dt
-        self.trouble = self.trouble or self._wrong_motion(dt, error.tolist(), velocity, tilt)
-        if not self.trouble:
-            if self._sweep is not None and self._line.is_measured(self._line_time):
-                # The effort of the last cycle brought the arm here.
-                self._sweep.append((position, np.subtract(self._effort, expected), tilt.direction))
-            # Friction is compensated before the motion begins: a joint that breaks away late would jump.
-            coming = self._line.at(self._line_time + LEAD)[1] if self._line_time < LEAD else heading
-            if now - self._refreshed > REFRESH_PERIOD:
-                self._refresh(position)
-            speed_error = pace * heading - velocity
-            self._effort = self._tracker.step(dt, error, speed_error, coming, expected, self._matrix)
-            self.trouble = self._wrong_torque(dt)
-        return None if self.trouble else self._effort
+        if now - self._refreshed > REFRESH_PERIOD:
+            self._refreshed, moments = now, self._guess.common_moments[:JOINT_COUNT]
+            self._matrix = LinkInertia.of_moments(self._guess.length, moments, self._load).matrix(position)
+            self._uncertain = self._guess.torques(np.array([position]))[1][0]
+        effort = self._tracker.step(dt, position, velocity, expected, tilt.direction, self._matrix)
+        self.trouble = self.trouble or self._wrong_motion(dt, velocity, tilt) or self._wrong_torque(dt)
+        return None if self.trouble else effort
 
-    def _refresh(self, position: Sequence[float]) -> None:
-        """Estimate the mass matrix at `position` (4,) rad, and how uncertain the expected torque is there."""
-        self._refreshed = self._now
-        moments = self._guess.common_moments[:JOINT_COUNT]
-        self._matrix = inertia_of(self._guess.length, moments, self._load).matrix(position)
-        self._uncertain = self._guess.torques(np.array([position]))[1][0]
-
-    def _wrong_motion(self, dt: float, error: Sequence[float], velocity: Sequence[float], tilt: Tilt) -> str:
-        """Return what is wrong after `dt` s with the motion, or ''; error: (4,) rad, velocity: (4,) rad/s."""
+    def _wrong_motion(self, dt: float, velocity: Sequence[float], tilt: Tilt) -> str:
+        """Return what is wrong after `dt` s with the motion, or ''; velocity: (4,) rad/s."""
         if dt > MAX_GAP:
             return f"no joint states for {dt * 1000:.0f} ms, the limit is {MAX_GAP * 1000:.0f}: is a motor silent?"
         if (moved := angle_between(tilt.direction, self._first_tilt.direction)) > MAX_TILT:
             return f"the trunk tilted by {moved:.2f} rad during the measurement, the limit is {MAX_TILT:g}"
-        for name, behind, speed in zip(self._limits.joint_names, error, velocity, strict=True):
+        for name, behind, speed in zip(self._limits.joint_names, self._tracker.error, velocity, strict=True):
             if not abs(behind) <= MAX_ERROR:
                 reason = "a hand is on the arm, or the joint is blocked"
                 return f"{name}: {abs(behind):.2f} rad off its path, the limit is {MAX_ERROR:g}: {reason}"
@@ -165,77 +135,71 @@ class Tour:
             return
         try:
             taken = np.array([measured.theta for measured in self.measured]).reshape(-1, JOINT_COUNT)
-            position = self._line.at(math.inf)[0]
-            self._plan = self._itinerary.next(taken, position, self.elapsed, self._guess, self._friction), ""
+            self._plan = self._itinerary.next(taken, self._position, self.elapsed, self._guess, self._friction), ""
         except ExoGravityError as error:
             self._plan = (None, str(error))
         except Exception as error:
             self._plan = (None, f"the next pose could not be chosen: {type(error).__name__}: {error}")
         self._awaits_plan = False
 
-    def _way(self, position: np.ndarray) -> Iterator[Line]:
-        """Yield each line of the tour from `position` (4,) rad when it begins; the arm is held until `plan` chose."""
+    def _way(self) -> Iterator[Line]:
+        """Yield each line of the tour when it begins; the arm is held until `plan` chose."""
         home = np.array(self._limits.home)
         while True:
             self._awaits_plan = True
-            yield Line(position, position)
+            while self._awaits_plan:
+                yield Line(self._position, self._position)
             station, self.trouble = self._plan
             if station is None:
                 break
             angles = " ".join(f"{math.degrees(angle):.0f}" for angle in station.theta)
             self.progress = f"pose {len(self.measured) + 1} of {self._itinerary.count}: {angles} deg"
-            yield Line(position, station.ends[0])
+            start, self._position = self._position, station.ends[0]
+            yield Line(start, self._position)
             yield from self._sweeps(station)
-            position = station.ends[0]
         self.progress = "back to the hanging arm"
-        yield Line(position, home)
+        yield Line(self._position, home)
         self.done, self.progress = True, "done"
         yield Line(home, home)
 
     def _sweeps(self, station: Station) -> Iterator[Line]:
         """Yield each sweep until enough were good, or a joint sticks too often; keep what they show."""
-        low, high = station.ends
-        failures, sweeps, directions = 0, list[tuple[np.ndarray, np.ndarray]](), list[Sequence[float]]()
+        failures, sweeps = 0, list[Sweep]()
         while len(sweeps) < 2 * station.cycles:
-            for ends in ((low, high), (high, low)):
-                self._sweep = []
-                yield Line(*ends, station.speed)
-                position, remainder, direction = zip(*self._sweep, strict=True)
-                self._sweep = None
-                sweeps.append((np.array(position), np.array(remainder)))
-                directions += direction
-            ways = np.min([np.abs(position[-1] - position[0]) for position, _ in sweeps[-2:]], axis=0)
-            followed = ways / (2.0 * WINDOW * station.amplitude)
-            was_known, sticks = bool(np.any(self._friction)), bool(np.min(followed) < FOLLOWED)
+            pair = yield from self._tracker.sweep(station)
+            sweeps += pair
+            share, was_known = followed(pair, station), bool(np.any(self._friction))
+            sticks = bool(np.min(share) < FOLLOWED)
             if station.speed >= STEADY_SPEED:
-                self._friction = np.maximum(average(sweeps[-2:])[2], self._friction if sticks else 0.0)
+                self._friction = np.maximum(average(pair)[0].friction, self._friction if sticks else 0.0)
                 self._tracker.friction = self._friction
             # Sweep again what passed without friction, or what a joint did not follow.
             if sticks or not was_known:
-                sweeps, directions = [], []
+                sweeps = []
             failures += sticks
             if failures > MAX_FAILURES:
                 self._skipped += 1
                 if self._skipped > MAX_SKIPPED:
-                    name, share = self._limits.joint_names[int(np.argmin(followed))], float(np.min(followed))
-                    self.trouble = f"{name}: it sticks: it follows {share:.0%} of a slow motion, must be {FOLLOWED:.0%}"
+                    name, least = self._limits.joint_names[int(np.argmin(share))], float(np.min(share))
+                    self.trouble = f"{name}: it sticks: it follows {least:.0%} of a slow motion, must be {FOLLOWED:.0%}"
                 return
-        self._keep(station, sweeps, np.mean(directions, axis=0))
+        self._keep(station, sweeps)
 
-    def _keep(self, station: Station, sweeps: list[tuple[np.ndarray, np.ndarray]], direction: np.ndarray) -> None:
+    def _keep(self, station: Station, sweeps: list[Sweep]) -> None:
         """Keep what the `sweeps` show, and improve the expected torque with it, unless the passes differ."""
-        direction = direction / np.linalg.norm(direction)
-        theta, remainder, friction, spread, unrest = average(sweeps)
-        effort = remainder + self._guess.torques(theta[None], direction)[0][0]
-        allowed = np.dot(MAX_UNREST, (np.ones(JOINT_COUNT), np.abs(friction), np.abs(effort)))
+        seen, unrest = average(sweeps)
+        theta = np.asarray(seen.theta)
+        effort = seen.effort + self._guess.torques(theta[None], seen.direction)[0][0]
+        allowed = np.dot(MAX_UNREST, (np.ones(JOINT_COUNT), np.abs(seen.friction), np.abs(effort)))
         for name, change, limit in zip(self._limits.joint_names, unrest, allowed, strict=True):
             if change > limit:
                 what = f"{change:.2f} Nm between two passes of a pose, the limit is {limit:.2f}"
                 self.trouble = f"{name}: {what}: the arm was touched, or the joint slips"
                 return
-        self.measured.append(Observation(theta, direction, effort, friction, spread, *self._load, station.speed))
+        weight, lever = self._load
+        self.measured.append(seen._replace(effort=effort, load_mass=weight, load_lever=lever, speed=station.speed))
         before = self._guess.torque(theta.tolist())
-        self._guess.learn(theta, effort, spread)
+        self._guess.learn(theta, effort, seen.spread)
         self._tracker.shift(np.subtract(self._guess.torque(theta.tolist()), before))
 
 
@@ -263,7 +227,6 @@ def tour_of(values: Mapping[str, Any]) -> Tour:
     load = values["tour.load_mass"], values["tour.load_lever"]
     moments = np.array((*values["first_moment"], *values["off_axis"])) + load_moments(values["link_length"], *load)
     guess = TorqueGuess(values["link_length"], moments, Tilt.of(values["side"]), values["gravity"])
-    itinerary: Itinerary = BestPoses(limits, values["tour.poses"], DURATION)
-    if values["tour.friction"]:
-        itinerary = FixedStations(friction_stations(limits))
+    count, given = (0, friction_stations(limits)) if values["tour.friction"] else (values["tour.poses"], ())
+    itinerary = Itinerary(limits, count, DURATION, given)
     return Tour(limits, guess, itinerary, values["rate"], load)

@@ -14,12 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.calibration.motion import LEAD, WINDOW, Line, Station, average
-from exo_gravity.core.calibration.tracking import ADDED, Tracker
+from exo_gravity.core.calibration.motion import FOLLOWED, LEAD, Line, Station, Sweep, Tracker, average, followed
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.model.arm import MAX_PAYLOAD, ArmModel
 from exo_gravity.core.model.gravity import LAWS, Torque
-from exo_gravity.core.model.kinematics import ROTORS, links_of
+from exo_gravity.core.model.kinematics import links_of
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.observer.momentum import AXES, COVER
 
@@ -29,7 +28,6 @@ LEAST_LEVER = 0.2  # m, of dz/dq: below, a load needs too little torque
 LEAST_RATE = 80.0  # Hz
 STILL = 0.2  # rad/s of a joint at the start
 LARGEST_ERROR = 0.4  # rad of a joint from its path
-FOLLOWED = 0.5  # of the path, that each joint must follow
 PERSISTENCE = 0.3  # s for which a joint may want more than it may have
 LIFTED = 0.5  # kg less than nothing, and
 FOREIGN = 2.0  # Nm of any joint that is no load's: more is a hand on the arm, and a joint gets no more
@@ -76,16 +74,9 @@ class Weighing:
         self._tracker, friction = Tracker(rate, settings.max_effort), settings.terms.friction
         if any(friction.coulomb):  # less what the term `friction` compensates
             self._tracker.friction = (1.0 - friction.share) * np.array(friction.coulomb)
-        self._lines: Iterator[Line] = iter(())
-        self._time = 0.0  # s, on the present line
-        self._line = Line(np.zeros(4), np.zeros(4))
-        self._sweep: list[tuple[Sequence[float], np.ndarray]] | None = None  # its samples
-        self._sweeps: list[tuple[np.ndarray, np.ndarray]] = []
-        self._lever = self._weight = self._worn = np.zeros(4)  # dz/dq in m; of the torques, in 1/m; Nm
-        self._by_tilt, self._matrix = np.zeros((4, 3)), np.eye(4)
-        self._slide = np.zeros(4)  # Nm that compensate friction
+        self._matrix: np.ndarray | None = None  # kg m^2, of the arm where it is held; None before the first call
+        self._is_moving = False
         self._foreign = 0.0  # s for which a hand has pushed
-        self._has_begun = False
 
     @property
     def is_over(self) -> bool:
@@ -104,16 +95,16 @@ class Weighing:
         if self.trouble:
             return f"not weighed: {self.trouble}"
         if self.result is None:
-            return "the arm moves a little: stay relaxed" if self._sweeps else "relax: the motors take the load over"
+            return "the arm moves a little: stay relaxed" if self._is_moving else "relax: the motors take the load over"
         mass, random, lever = self.result
-        share, model = self._errors()
-        text = f"{mass:.3f} +- {COVER * math.hypot(random, model, share * mass):.3f} kg more than the settings carry"
+        error = COVER * math.hypot(random, self._model, self._share * mass)
+        text = f"{mass:.3f} +- {error:.3f} kg more than the settings carry"
         if self.empty is self.result:
             return f"{text}: the hand is empty"
         more, empty = mass, self._empty
         if empty and math.dist(empty.lever, lever) <= SAME_POSE:
             more -= empty.mass
-            error = COVER * math.hypot(random, empty.deviation, share * more, math.sqrt(2.0) * self._leaning())
+            error = COVER * math.hypot(random, empty.deviation, self._share * more, math.sqrt(2.0) * self._leaning)
             text = f"{text}; {more:.3f} +- {error:.3f} kg more than with an empty hand"
         return f"{text}: payload.mass = {max(0.0, self._settings.payload_mass + more):.3f} carries it"
 
@@ -121,62 +112,67 @@ class Weighing:
         self, dt: float, theta: Sequence[float], velocity: Sequence[float], tilt: Tilt, torque: Torque
     ) -> Torque:
         """Return `torque` (4,) in Nm with what carries the load, `dt` s later; `torque` alone once this is over."""
-        if not self._has_begun:
+        if self._matrix is None:
+            self._matrix, dt = links_of(self._settings.moving).matrix(theta), 0.0
             self._begin(theta, velocity, tilt)
-            dt = 0.0
-        self._time += dt
-        while self._time > self._line.duration + LEAD and not self.is_over:
-            self._line, self._time = next(self._lines), 0.0
-        goal, heading = self._line.at(self._time - LEAD)
-        error = goal - np.array(theta)
-        if self.is_over or self._is_wrong(dt, error):
+        if self.is_over:
             return torque
-        if self._sweep is not None and self._line.is_measured(self._time - LEAD):
-            self._sweep.append((theta, self._tracker.correction + self._slide))
-        coming = self._line.at(LEAD)[1] if self._time < 2.0 * LEAD else heading
-        effort = self._tracker.step(dt, error, heading - np.array(velocity), coming, torque, self._matrix)
-        added = np.subtract(effort, torque)
-        self._slide = added - self._tracker.correction
+        effort = self._tracker.step(dt, theta, velocity, torque, tilt.direction, self._matrix)
+        if self.is_over or self._is_wrong(dt):
+            return torque
         most = FOREIGN + MAX_PAYLOAD * self._settings.robot.gravity * np.abs(self._lever)  # what a load may need
-        return tuple((np.array(torque) + np.clip(added, -most, most)).tolist())
+        return tuple((np.array(torque) + np.clip(np.subtract(effort, torque), -most, most)).tolist())
 
     def _begin(self, theta: Sequence[float], velocity: Sequence[float], tilt: Tilt) -> None:
-        s, self._has_begun = self._settings, True
-        links = links_of(s.moving)
-        self._matrix = links._replace(rotors=tuple(rotor + ADDED for rotor in ROTORS)).matrix(theta)
-        self._prepare(theta, tilt)
+        """Refuse a pose that shows no load, and an arm that moves; compute what depends on the pose alone.
+
+        These are each joint's weight in the fit of the mass, by least squares, where all joints share one error of the
+        tilt; and the standard errors of the result: of the torque's scale, as a share, and in kg of the trunk's tilt,
+        and of the whole model with it.
+        """
+        s, error, gravity = self._settings, self._settings.model_error, self._settings.robot.gravity
+        self._lever = np.array(LAWS["exact"](s.unit_load, theta, tilt))  # dz/dq, m
         fastest = max(map(abs, velocity))
         if np.linalg.norm(self._lever) < LEAST_LEVER:
             pose = "bend the elbow to a right angle, or raise the arm to the side"
             self.trouble = f"the hand hangs below the joints, where a load needs no torque: {pose}"
-        elif fastest > STILL:
+            return
+        if fastest > STILL:
             self.trouble = f"the arm moves at {fastest:.2f} rad/s: hold it still"
-        self._line = Line(np.array(theta), np.array(theta))
-        self._lines = self._way(Station(tuple(theta), cycles=CYCLES))
+        wearer = ArmModel(s.robot.length, s.wearer_cog, s.wearer_mass, gravity=gravity)
+        self._worn = np.array(LAWS["exact"](wearer, theta, tilt))  # Nm
+        by_tilt = np.array([LAWS["exact"](s.arm, theta, axis) for axis in AXES]).T  # (4, 3) Nm/rad
+        covariance = np.diag(np.hypot(error.torque, LEAST_ERROR) ** 2) + error.tilt**2 * by_tilt @ by_tilt.T
+        weight = np.linalg.solve(covariance, self._lever)
+        self._weight = weight / (weight @ self._lever)  # 1/m
+        self._tilted = error.tilt * np.linalg.norm(by_tilt, axis=1)  # Nm
+        self._leaning = error.tilt * math.hypot(*(self._weight @ by_tilt)) / gravity
+        self._share = math.hypot(*(self._weight * self._lever * error.scale))
+        model = math.hypot(*(self._weight * error.torque), error.wearer * float(self._weight @ self._worn))
+        self._model = math.hypot(model / gravity, self._leaning)
+        self._tracker.lines = self._way(Station(tuple(theta), cycles=CYCLES))
 
     def _way(self, station: Station) -> Iterator[Line]:
-        """Yield each line when it begins, and the result after the last one."""
-        here, (low, high) = np.array(station.theta), station.ends
+        """Yield each line when it begins; have the result, or the trouble, after the last one."""
+        here, sweeps = np.array(station.theta), list[Sweep]()
         for _ in range(round(TAKE_OVER / LEAD)):
             yield Line(here, here)
-        yield Line(here, low, station.speed)
-        for ends in ((low, high), (high, low)) * station.cycles:
-            self._sweep = []
-            yield Line(*ends, station.speed)
-            position, remainder = zip(*self._sweep, strict=True)
-            self._sweeps.append((np.array(position), np.array(remainder)))
-        self._sweep = None
-        yield Line(low, here, station.speed)
-        self._finish(2.0 * WINDOW * station.amplitude)
+        yield Line(here, station.ends[0], station.speed)
+        self._is_moving = True
+        for _ in range(station.cycles):
+            sweeps += yield from self._tracker.sweep(station)
+        yield Line(station.ends[0], here, station.speed)
+        self._finish(sweeps, followed(sweeps, station))
         yield Line(here, here)
 
-    def _is_wrong(self, dt: float, error: np.ndarray) -> bool:
-        """Note what is wrong with the motion, `error` (4,) rad from its path; return whether anything is."""
+    def _is_wrong(self, dt: float) -> bool:
+        """Note what is wrong with the motion; return whether anything is."""
+        error, gravity = self._tracker.error, self._settings.robot.gravity
         worst = int(np.argmax(np.abs(error)))
         saturated = [name for name, t in zip(self._names, self._tracker.saturated, strict=True) if t > PERSISTENCE]
-        correction = self._tracker.correction / (self._settings.robot.gain * self._settings.robot.gravity)
+        correction = self._tracker.correction / (self._settings.robot.gain * gravity)
         mass = float(self._weight @ correction)
-        foreign = (np.abs(correction - mass * self._lever) * self._settings.robot.gravity).tolist()
+        foreign = (np.abs(correction - mass * self._lever) * gravity).tolist()
         is_foreign = max(foreign) > FOREIGN or not -LIFTED < mass < MAX_PAYLOAD
         self._foreign = self._foreign + dt if is_foreign else 0.0
         if not dt <= MAX_GAP:
@@ -192,52 +188,24 @@ class Weighing:
             self.trouble = f"{', '.join(saturated)}: {remedy}"
         return bool(self.trouble)
 
-    def _errors(self) -> tuple[float, float]:
-        """Return the standard errors of the torque's scale, as a share, and of the model, in kg."""
-        error, weight = self._settings.model_error, self._weight
-        share = math.hypot(*(weight * self._lever * error.scale))
-        model = math.hypot(*(weight * error.torque), error.wearer * float(weight @ self._worn))
-        return share, math.hypot(model / self._settings.robot.gravity, self._leaning())
-
-    def _leaning(self) -> float:
-        """Return the standard error in kg that is left of the trunk's tilt."""
-        s = self._settings
-        return s.model_error.tilt * math.hypot(*(self._weight @ self._by_tilt)) / s.robot.gravity
-
-    def _prepare(self, theta: Sequence[float], tilt: Tilt) -> None:
-        """Compute each joint's weight in the fit of the mass: least squares; all joints share one error of the tilt."""
-        s = self._settings
-        self._lever = np.array(LAWS["exact"](s.unit_load, theta, tilt))
-        wearer = ArmModel(s.robot.length, s.wearer_cog, s.wearer_mass, gravity=s.robot.gravity)
-        self._worn = np.array(LAWS["exact"](wearer, theta, tilt))
-        self._by_tilt = np.array([LAWS["exact"](s.arm, theta, axis) for axis in AXES]).T
-        own = np.hypot(s.model_error.torque, LEAST_ERROR)
-        covariance = np.diag(own**2) + s.model_error.tilt**2 * self._by_tilt @ self._by_tilt.T
-        weight = np.linalg.solve(covariance, self._lever)
-        self._weight = weight / (weight @ self._lever) if np.any(self._lever) else self._lever
-
-    def _finish(self, way: float) -> None:
-        """Fit the mass to the sweeps, of which each joint must have followed half of `way` rad."""
-        _, remainder, _, spread, unrest = average(self._sweeps)
-        s, weight = self._settings, self._weight
-        scale = s.robot.gain * s.robot.gravity
-        mass = float(weight @ (remainder / scale))
-        ways = np.min([np.abs(position[-1] - position[0]) for position, _ in self._sweeps], axis=0)
-        share, _ = self._errors()
+    def _finish(self, sweeps: Sequence[Sweep], shares: np.ndarray) -> None:
+        """Fit the mass to the sweeps, of whose way each joint must have followed FOLLOWED; shares: (4,)."""
+        seen, unrest = average(sweeps)
+        error, weight, gravity = self._settings.model_error, self._weight, self._settings.robot.gravity
+        scale = self._settings.robot.gain * gravity
+        mass = float(weight @ (seen.effort / scale))
         needed = mass * scale * self._lever
-        tilted = s.model_error.tilt * np.linalg.norm(self._by_tilt, axis=1)
-        parts = (s.model_error.torque, spread, share * needed, s.model_error.wearer * self._worn, tilted)
+        parts = (error.torque, seen.spread, self._share * needed, error.wearer * self._worn, self._tilted)
         known = COVER * np.linalg.norm(np.array(parts), axis=0)
-        unlike = np.abs(remainder - needed) - known - UNLIKE[0] - UNLIKE[1] * np.abs(needed)
-        restless = math.hypot(*(weight * unrest)) / s.robot.gravity
+        unlike = np.abs(seen.effort - needed) - known - UNLIKE[0] - UNLIKE[1] * np.abs(needed)
+        restless = math.hypot(*(weight * unrest)) / gravity
         if restless > UNREST[0] + UNREST[1] * abs(mass):
             self.trouble = f"{restless:.2f} kg between two turns: relax, and touch nothing"
-        for name, short, off in zip(self._names, FOLLOWED * way - ways, unlike, strict=True):
-            if short > 0.0:
+        for name, share, off in zip(self._names, shares, unlike, strict=True):
+            if share < FOLLOWED:
                 self.trouble = f"{name} does not follow: is the arm carried, is a hand on it?"
             elif off > 0.0:
                 torque = f"{off + UNLIKE[0]:.1f} Nm"
                 self.trouble = f"{name}: no load in the hand explains {torque}: is somebody touching the arm?"
         if not self.trouble:
-            random = math.hypot(*(weight * spread)) / s.robot.gravity
-            self.result = Weighed(mass, random, self._lever)
+            self.result = Weighed(mass, math.hypot(*(weight * seen.spread)) / gravity, self._lever)

@@ -1,14 +1,9 @@
 """calibrate imu: the mounting of the IMU, from a recording of its samples or from the running driver.
 
-The file's `/imu` names the topic. Live, only the recorder is started, while the user's own IMU driver runs.
-
-Upright, the accelerometer shows the trunk's z axis (up). Between upright and bowed the trunk turns about its y axis, so
-gravity moves in the plane across it: y is along bowed x upright. The gyroscope's axis and angle must agree. Several
-bows average. Posture limits the result: no person stands upright, or bows straight ahead, to better than a degree. The
-arm's weight shows the mounting to a tenth of one (`with_mounting`): from one lean of the stand the rotation that moves
-gravity, from two leans the heading as well.
-
-Six rests of the IMU on different sides show the accelerometer's scale and bias: in each it must show one g.
+docs/calibration.md has the idea: upright, the accelerometer shows the trunk's z axis (up); the trunk bows about its y
+axis, so y is along bowed x upright. Posture limits that: no person stands upright, or bows straight ahead, to better
+than a degree. The arm's weight shows the mounting to a tenth of one (`with_mounting`): from one lean of the stand the
+rotation that moves gravity, from two leans the heading as well.
 """
 
 import argparse
@@ -23,8 +18,10 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from exo_gravity.core.calibration.motion import mean_direction
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
+from exo_gravity.core.model.kinematics import turning_in_base
 from exo_gravity.core.model.tilt import angle_between
 from exo_gravity.core.numbers import Vector
 from exo_gravity.core.trunk.params import IMU
@@ -76,8 +73,7 @@ class Phase(NamedTuple):
     """A second or more in which the IMU neither turned nor accelerated."""
 
     samples: slice
-    force: np.ndarray  #: (3,) m/s^2, mean
-    up: np.ndarray  #: (3,), unit vector
+    up: np.ndarray  #: (3,), unit vector of the mean acceleration
 
 
 class Mounting(NamedTuple):
@@ -92,7 +88,8 @@ class Mounting(NamedTuple):
 def calibrate_imu(options: argparse.Namespace, arm: ConfiguredArm | None, say: Say) -> CalibrationResult:
     """Calibrate the IMU of the file options.params from options.bag, or live.
 
-    options.rests: a recording of six rests, None for none. options.wait: waits for the person. Raises DataError.
+    The file's `/imu` names the topic. options.rests: a recording of six rests, None for none. options.wait: waits for
+    the person. Raises DataError.
     """
     topic = node_values(load(options.params), NODE, IMU)["input_topic"]
     found = mounting(read_imu(options.bag or _record(options, say), topic))
@@ -101,14 +98,12 @@ def calibrate_imu(options: argparse.Namespace, arm: ConfiguredArm | None, say: S
     accuracy = f"±{error} degrees about the trunk's x, y and z, most of which is posture"
     bows = f"from {found.bows} {'bow' if found.bows == 1 else 'bows'} of up to {math.degrees(found.bow):.0f} degrees"
     changes = [Change(NODE, ROTATION, quaternion, f"{accuracy}, {bows}")]
-    lines = [f"{ROTATION}: {' '.join(f'{value:.4f}' for value in quaternion)} (x, y, z, w), {accuracy}", bows]
     if options.rests:
         *rows, remainder = six_rests(read_imu(options.rests, topic))
         scale, bias = (" ".join(f"{value:.4f}" for value in row) for row in rows)
         fit = f"true = scale (shown - bias), scale {scale}, bias {bias} m/s^2, for the driver"
-        lines.append(f"accelerometer: {fit}; {remainder:.3f} m/s^2 remain")
-        changes.append(Change(NODE, "", 0, lines[-1]))
-    return CalibrationResult(tuple(changes), tuple(lines))
+        changes.append(Change(NODE, "", 0, f"accelerometer: {fit}; {remainder:.3f} m/s^2 remain"))
+    return CalibrationResult(tuple(changes))
 
 
 def read_imu(bag: Path, topic: str) -> ImuRecord:
@@ -159,15 +154,14 @@ def still_phases(record: ImuRecord) -> list[Phase]:
     edges = np.searchsorted(time, np.append(np.arange(time[0], time[-1], BLOCK), np.inf))
     phases = []
     for still, run in groupby(pairwise(np.unique(edges).tolist()), is_still):
-        (start, stop), *more = run
-        samples = slice(start, more[-1][1] if more else stop)
-        if not still or time[samples][-1] - time[start] < MIN_STILL - BLOCK:
+        blocks = list(run)
+        samples = slice(blocks[0][0], blocks[-1][1])
+        if not still or time[samples][-1] - time[samples][0] < MIN_STILL - BLOCK:
             continue
-        mean = force[samples].mean(axis=0)
-        share = float(np.linalg.norm(mean)) / STANDARD_GRAVITY
+        share = float(np.linalg.norm(force[samples].mean(axis=0))) / STANDARD_GRAVITY
         if not ONE_G[0] <= share <= ONE_G[1]:
             raise DataError(f"at rest the accelerometer shows {share:.2f} g, must be 1: check its unit (m/s^2)")
-        phases.append(Phase(samples, mean, _unit(mean)))
+        phases.append(Phase(samples, mean_direction(force[samples])))
     return phases
 
 
@@ -188,12 +182,13 @@ def mounting(record: ImuRecord) -> Mounting:
     standing = [index for index, bend in enumerate(bends) if bend < UPRIGHT]
     if standing[-1] < bends.index(bow):
         raise DataError("the record must begin and end upright: stand for 2 s before the bow and after it")
-    upright = [phases[index].up for index in standing]
-    z = _unit(np.mean(upright, axis=0))
+    upright = np.array([phases[index].up for index in standing])
+    z = mean_direction(upright)
     lowest = [(first, max(range(first, last), key=bends.__getitem__)) for first, last in pairwise(standing)]
     bows = [(phases[first], phases[low]) for first, low in lowest if bends[low] >= MIN_BOW]
-    axes = [_unit(np.cross(bowed.up, z)) for _, bowed in bows]
-    y = _unit(np.mean(axes, axis=0))
+    across = np.cross([bowed.up for _, bowed in bows], z)
+    axes = across / np.linalg.norm(across, axis=1, keepdims=True)
+    y = mean_direction(axes)
     bias = np.concatenate([record.angular_velocity[phase.samples] for phase in phases]).mean(axis=0)
     off_axis = [_checked_turn(record, *pair, bias, axis) for pair, axis in zip(bows, axes, strict=True)]
     level = math.hypot(SENSOR, max(POSTURE, *(angle_between(up, z) for up in upright)))
@@ -237,7 +232,7 @@ def six_rests(record: ImuRecord) -> tuple[np.ndarray, np.ndarray, float]:
             sides.append(phase)
     if len(sides) < RESTS:
         raise DataError(f"the IMU rested on {len(sides)} different sides, must be {RESTS}: lay it on each for 2 s")
-    shown = np.array([side.force for side in sides]) / STANDARD_GRAVITY
+    shown = np.array([record.acceleration[side.samples].mean(axis=0) for side in sides]) / STANDARD_GRAVITY
     fit, _, rank, _ = np.linalg.lstsq(np.hstack((shown**2, shown)), np.ones(len(shown)), rcond=1e-3)
     square, across = np.split(fit, 2)
     if rank < RESTS or np.any(square <= 0.0):
@@ -252,7 +247,7 @@ def with_mounting(result: CalibrationResult, params: Path) -> CalibrationResult:
     """Return `result` with a better mounting of the IMU in the file `params`, if the arm's weight showed one."""
     found, arm = result.identified, result.arm
     rotation = load(params).get(NODE, {}).get(ROTATION)
-    if found is None or arm is None or not result.changes or not rotation or not arm.compensator["use_imu"]:
+    if found is None or arm is None or not rotation or not arm.compensator["use_imu"]:
         return result
     square, axes = np.linalg.eigh(found.tilt_covariance)  # the last is nearly gravity's own axis
     error, heading_error = math.sqrt(max(0.0, square[0] + square[1])), math.sqrt(max(0.0, square[2]))
@@ -264,9 +259,9 @@ def with_mounting(result: CalibrationResult, params: Path) -> CalibrationResult:
     heading = f"heading ±{math.degrees(heading_error):.2f}" if is_whole else "heading unchanged"
     accuracy = f"±{math.degrees(error):.2f} degrees, {heading}"
     note = f"{accuracy}, from the arm's weight: {angle:.1f} degrees from the value before"
-    lines = (f"{ROTATION}: corrected by {angle:.1f} degrees, {accuracy}", *(() if is_whole else (NO_HEADING,)))
     change = Change(NODE, ROTATION, quaternion.round(6).tolist(), note)
-    return replace(result, changes=(*result.changes, change), lines=(*result.lines, *lines))
+    lines = result.lines if is_whole else (*result.lines, NO_HEADING)
+    return replace(result, changes=(*result.changes, change), lines=lines)
 
 
 def turned(rotation: Vector, turn: np.ndarray) -> np.ndarray:
@@ -275,13 +270,5 @@ def turned(rotation: Vector, turn: np.ndarray) -> np.ndarray:
 
 
 def turn_in_trunk(side: str, turn: np.ndarray) -> np.ndarray:
-    """Return a rotation vector (3,) in an arm's base frame in the trunk's axes.
-
-    The right arm's base frame is the left one's mirror image, so that the sense of rotation changes.
-    """
-    outward, forward, down = turn
-    return np.array((forward, outward, -down) if side == "left" else (-forward, outward, down))
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return np.asarray(vector / np.linalg.norm(vector))
+    """Return a rotation vector (3,) in an arm's base frame in the trunk's axes."""
+    return np.array([turning_in_base(side, axis) for axis in np.eye(3).tolist()]) @ turn

@@ -23,7 +23,7 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from exo_gravity.core.calibration.identification import Observation
+from exo_gravity.core.calibration.motion import Observation
 from exo_gravity.core.calibration.tour import ARM, BRIDGE
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.gravity import moments_of
@@ -79,10 +79,9 @@ class LiveTour:
                 self.measured.append(Observation(**event["observation"]))
             elif event.get("progress"):
                 say(event["progress"])
-            elif event.get("trouble") and not self.done:
-                self.trouble = self.trouble or event["trouble"]
-            elif event.get("done"):
-                self.done = True
+            elif not self.done:
+                self.trouble = self.trouble or event.get("trouble", "")
+                self.done = event.get("done", False)
 
     def complete(self, record: Path) -> list[Observation]:
         """Return what was measured. Raises DataError if the tour ended early, with the reason."""
@@ -97,29 +96,24 @@ def tour_parameters(
     """Return the content of a parameter file in which `calibrator` replaces the compensator of `arm`.
 
     changes: parameters of `calibrator` that differ from the arm's. moments: (8,) kg m as far as known, by default those
-    of the robot alone.
+    of the robot alone. Raises ParameterError.
     """
+    bridge, compensator = arm.can_bridge, arm.compensator
+    if list(compensator["joint_names"]) != list(bridge["joint_names"]):
+        raise ParameterError("joint_names", compensator["joint_names"], f"{bridge['joint_names']}")
+    kept = ("/imu", *(f"{arm.namespace}/{name}" for name in KEPT))
     content = yaml.safe_load(params.read_text(encoding="utf-8"))
-    own = [f"{arm.namespace}/{name}" for name in KEPT]
-    nodes = {node: entry for node, entry in content.items() if node == "/imu" or node in own}
-    if list(arm.compensator["joint_names"]) != list(arm.can_bridge["joint_names"]):
-        raise ParameterError("joint_names", arm.compensator["joint_names"], f"{arm.can_bridge['joint_names']}")
-    expected = (moments_of(arm.robot) if moments is None else moments).tolist()
-    most = [min(pair) for pair in zip(arm.can_bridge["max_effort"], arm.compensator["max_effort"], strict=True)]
-    values = {
-        **{name: arm.compensator[name] for name in ARM},
-        **{name: arm.can_bridge[name] for name in BRIDGE},
-        "max_effort": most,
-        "first_moment": expected[:4],
-        "off_axis": expected[4:],
-    }
+    nodes = {node: entry for node, entry in content.items() if node in kept}
     simulator = nodes.get(f"{arm.namespace}/simulator")
     if simulator and (mass := changes.get("tour.load_mass")):
         # The simulated device cannot be reached by hand: it carries the weight as a wearer's forearm would.
         wearer = {"mass": [0.0, 0.0, 0.0, mass], "cog": [0.0, 0.0, 0.0, changes["tour.load_lever"]]}
         simulator["ros__parameters"]["wearer"] = wearer
-    nodes[f"{arm.namespace}/calibrator"] = {"ros__parameters": {**values, **changes}}
-    return nodes
+    expected = (moments_of(arm.robot) if moments is None else moments).tolist()
+    values = {name: compensator[name] for name in ARM} | {name: bridge[name] for name in BRIDGE}
+    values["max_effort"] = np.minimum(bridge["max_effort"], compensator["max_effort"]).tolist()
+    values |= {"first_moment": expected[:4], "off_axis": expected[4:], **changes}
+    return {**nodes, f"{arm.namespace}/calibrator": {"ros__parameters": values}}
 
 
 def run_tour(options: argparse.Namespace, nodes: Mapping[str, Any], say: Say) -> LiveTour:
@@ -128,7 +122,7 @@ def run_tour(options: argparse.Namespace, nodes: Mapping[str, Any], say: Say) ->
     options: output (the log goes into the same folder) and record. Raises ParameterError for a wrong file.
     """
     tour, last_errors = LiveTour(), dict[str, str]()
-    handlers = [(number, signal.getsignal(number)) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     ending = stop_on_signals()
 
     def on_line(node: str, line: str) -> None:
@@ -146,13 +140,13 @@ def run_tour(options: argparse.Namespace, nodes: Mapping[str, Any], say: Say) ->
         path.write_text(yaml.safe_dump(dict(nodes), sort_keys=False), encoding="utf-8")
         launcher = Launcher(path, on_line)
         dead = launcher.run(ending)
-    for number, handler in handlers:
+    for number, handler in handlers.items():
         signal.signal(number, handler)
     if dead:
         node, code = dead
         tour.trouble = f"{node.lstrip('/')} ended with exit code {code}: {last_errors.get(node, 'see the log')}"
-    elif not (tour.done or tour.trouble):
-        tour.trouble = STOPPED
+    elif not tour.done:
+        tour.trouble = tour.trouble or STOPPED
     if launcher.maybe_powered:
         powered = f"the motors of {', '.join(launcher.maybe_powered)} may still be powered: cut their supply"
         tour.trouble = f"{tour.trouble}; {powered}" if tour.trouble else powered

@@ -1,11 +1,7 @@
 """calibrate motors: which motor turns which joint, which way, and at which angle the arm hangs.
 
-The person moves one joint after another by hand, in its positive direction and back, with the motors off. The motor
-that turns most is the joint's; the sign of its turn is `direction`. Then the arm hangs, or is in a jig, and the angles
-that the motors report there become `zero`.
-
-The encoder is on the rotor. After power-up the angle is ambiguous by a turn of the rotor: 60 degrees at the joint on an
-AK60-6, 40 on an AK80-9. Whether `zero` survives is tried by switching the power off and on.
+docs/calibration.md has the steps. The encoder is on the rotor: after power-up the angle is ambiguous by a turn of the
+rotor. Whether `zero` survives is tried by switching the power off and on.
 """
 
 import argparse
@@ -61,10 +57,10 @@ def calibrate_motors(options: argparse.Namespace, arm: ConfiguredArm, say: Say) 
     with ArmScan((interface, name, each) for name, each in own.items()) as bus:
         say(f"Asking IDs 1 to {MAX_CAN_ID} on {bus.name}: nothing moves")
         search = MotorSearch(bus, arm, options.wait, say)
-        result, ids = search.result(options.pose), search.found
+        result = search.result(options.pose)
+        channels = [bus.channels[can_id] for can_id in search.found]
     if len(own) == 1:
         return result
-    channels = [bus.channels[can_id] for can_id in ids]
     changes = [Change(node, "can.channel", ",".join(channels), "of the bus on which each motor answers")]
     for key in (key for key, value in bus_options.items() if isinstance(value, list)):
         changes.append(Change(node, f"{OPTIONS}.{key}", [own[name][key] for name in channels], "of these buses"))
@@ -72,31 +68,55 @@ def calibrate_motors(options: argparse.Namespace, arm: ConfiguredArm, say: Say) 
 
 
 class MotorSearch:
-    """Leads the person through the joints of one arm. clock: s."""
+    """Leads the person through the joints of one arm. clock: s.
+
+    found: name of the joint and direction of each motor, by ID, as far as known.
+    """
 
     def __init__(
         self, bus: ArmScan | BusScan, arm: ConfiguredArm, wait: Wait, say: Say, clock: Clock = time.monotonic
     ) -> None:
-        self._bus = bus
-        self._arm = arm
-        self._wait = wait
-        self._say = say
-        self._clock = clock
-        self._found: dict[int, tuple[str, int]] = {}  # joint and direction of each motor, by ID, as far as known
+        self.found: dict[int, tuple[str, int]] = {}
+        self._bus, self._arm = bus, arm
+        self._wait, self._say, self._clock = wait, say, clock
         self._last: dict[int, MotorAnswer] = {}
         # Since the person was asked: all angles in rad, when each motor answered last in s, and who was ever silent.
         self._angles: dict[int, list[float]] = {}
         self._answered: dict[int, float] = {}
         self._was_silent: set[int] = set()
 
-    @property
-    def found(self) -> list[int]:
-        """The IDs of the joints' motors, as far as known."""
-        return list(self._found)
-
     def result(self, pose: Sequence[float]) -> CalibrationResult:
         """Return the result; pose: (4,) deg in which `zero` is measured. Raises DataError if a motor is not found."""
-        arm = self._arm
+        self._scan()
+        for name, motion in zip(self._arm.joint_names, MOTIONS, strict=True):
+            self._watch(f"{name}: {motion}, by 30 degrees or so, and back", partial(self._found_by, name))
+        where = f"{' '.join(f'{angle:g}' for angle in pose)} deg" if any(pose) else ""
+        rest = f"bring the arm to {where}" if where else "let the arm hang"
+        self._watch(f"{rest}, hands off, until it is still", self._unrest)
+        at_rest = [self._angles[can_id] for can_id in self.found]
+        unrest = max(max(angles) - min(angles) for angles in at_rest)
+        survival, refusals = self._after_power_up(list(map(fmean, at_rest)))
+        exactly = f"rad, measured {f'at {where}' if where else 'hanging'}, ±{unrest:.4f} and as exact as that pose"
+        zeros = []
+        rows = zip(self.found.items(), self._arm.motors, at_rest, pose, strict=True)
+        for (can_id, (name, direction)), motor, angles, angle in rows:
+            zero = fmean(angles) - direction * math.radians(angle)
+            zeros.append(round(zero, 4))
+            try:
+                JointMotor(motor.spec, can_id, direction, zero)
+            except ParameterError as error:  # the angle would wrap
+                refusals.append(f"{name}: {error}: {SET_ZERO}")
+        node, directions = f"{self._arm.namespace}/can_bridge", [direction for _, direction in self.found.values()]
+        formats = [self._last[can_id].wire_format for can_id in self.found]
+        changes = (
+            Change(node, "can_id", list(self.found), "found by moving each joint by hand"),
+            Change(node, "wire_format", formats, "as each board answers"),
+            Change(node, "direction", directions, "found by moving each joint by hand in its positive direction"),
+            Change(node, "zero", zeros, f"{exactly}; {survival}"),
+        )
+        return CalibrationResult(changes, (), tuple(refusals), self._arm)
+
+    def _scan(self) -> None:
         answers, problems = self._bus.scan()
         self._last = {answer.can_id: answer for answer in answers}
         self._say(self._table())
@@ -106,33 +126,6 @@ class MotorSearch:
             problems = (*problems, f"{count}: check power, plugs, terminators and the bit rate")
         if problems:
             raise DataError("; ".join(problems))
-        for name, motion in zip(arm.joint_names, MOTIONS, strict=True):
-            self._watch(f"{name}: {motion}, by 30 degrees or so, and back", partial(self._found_by, name))
-        ids, directions = self.found, [direction for _, direction in self._found.values()]
-        where = f"{' '.join(f'{angle:g}' for angle in pose)} deg" if any(pose) else ""
-        rest = f"bring the arm to {where}" if where else "let the arm hang"
-        self._watch(f"{rest}, hands off, until it is still", self._unrest)
-        angles = [fmean(self._angles[can_id]) for can_id in ids]
-        unrest = max(max(self._angles[can_id]) - min(self._angles[can_id]) for can_id in ids)
-        zeros = [a - d * math.radians(p) for a, d, p in zip(angles, directions, pose, strict=True)]
-        survival, jumps = self._after_power_up(angles)
-        node, formats = f"{arm.namespace}/can_bridge", [self._last[can_id].wire_format for can_id in ids]
-        exactly = f"rad, measured {f'at {where}' if where else 'hanging'}, ±{unrest:.4f} and as exact as that pose"
-        changes = (
-            Change(node, "can_id", ids, "found by moving each joint by hand"),
-            Change(node, "wire_format", formats, "as each board answers"),
-            Change(node, "direction", directions, "found by moving each joint by hand in its positive direction"),
-            Change(node, "zero", [round(zero, 4) for zero in zeros], f"{exactly}; {survival}"),
-        )
-        columns = zip(arm.joint_names, arm.motors, ids, directions, zeros, strict=True)
-        lines, impossible = [], []
-        for name, motor, can_id, direction, zero in columns:
-            lines.append(f"{name}: motor {can_id}, direction {direction:+d}, zero {zero:.4f} rad")
-            try:
-                JointMotor(motor.spec, can_id, direction, zero)
-            except ParameterError as error:  # the angle would wrap
-                impossible.append(f"{name}: {error}: {SET_ZERO}")
-        return CalibrationResult(changes, (*lines, survival), (*impossible, *jumps), arm)
 
     def _watch(self, request: str, unclear: Callable[[], str] = str) -> None:
         """Let the person do what is requested, and keep what all motors answer meanwhile.
@@ -155,24 +148,22 @@ class MotorSearch:
         answers = self._bus.poll(list(self._last))
         self._last |= answers
         self._answered |= dict.fromkeys(answers, self._clock())
-        self._was_silent |= self._silent()
         for can_id, answer in answers.items():
             self._angles[can_id].append(answer.position)
         return self._table()
 
-    def _silent(self) -> set[int]:
-        now = self._clock()
-        return {can_id for can_id, answered in self._answered.items() if now - answered > MAX_SILENCE}
-
     def _table(self) -> Table:
-        """Return what all motors answered last."""
+        """Return what all motors answered last; remember who is silent."""
+        now = self._clock()
+        silent = {can_id for can_id, answered in self._answered.items() if now - answered > MAX_SILENCE}
+        self._was_silent |= silent
         columns = ("ID", "joint", "angle deg", "turned deg", "degC", "error", "reply", "reply ID", "wire format")
-        table, silent = Table(*columns, header_style="bold"), self._silent()
+        table = Table(*columns, header_style="bold")
         for can_id, answer in sorted(self._last.items()):
             angles = self._angles.get(can_id) or [0.0]
             table.add_row(
                 str(can_id),
-                self._found.get(can_id, "?")[0],
+                self.found.get(can_id, "?")[0],
                 "silent" if can_id in silent else f"{math.degrees(answer.position):.1f}",
                 f"{math.degrees(angles[-1] - angles[0]):+.1f}",
                 "-" if answer.temperature is None else str(answer.temperature),
@@ -199,22 +190,23 @@ class MotorSearch:
             return f"{name}: motors {most} and {second} both turned, by {both}: move one joint alone"
         if back > MAX_BACK * abs(turn):
             return f"{name}: motor {most} turned both ways: move the joint in one direction only"
-        if most in self._found:
-            return f"{name}: motor {most} turned, which is that of {self._found[most][0]}"
-        self._found[most] = name, 1 if turn > 0.0 else -1
-        self._say(f"{name}: motor {most}, direction {self._found[most][1]:+d}")
+        if most in self.found:
+            return f"{name}: motor {most} turned, which is that of {self.found[most][0]}"
+        self.found[most] = name, 1 if turn > 0.0 else -1
+        self._say(f"{name}: motor {most}, direction {self.found[most][1]:+d}")
         return ""
 
-    def _sample(self) -> list[list[float]]:
-        """Return the angles of the arm's motors in REST_SAMPLES polls from now on, in rad."""
+    def _sample(self) -> None:
+        """Take the angles of REST_SAMPLES polls from now on."""
         self._angles = {can_id: [] for can_id in self._last}
         for _ in range(REST_SAMPLES):
             self._poll()
-        return [self._angles[can_id] for can_id in self._found]
 
     def _unrest(self) -> str:
         """Sample the arm at rest; return why it is not at rest, or ''."""
-        for (can_id, (name, _)), angles in zip(self._found.items(), self._sample(), strict=True):
+        self._sample()
+        for can_id, (name, _) in self.found.items():
+            angles = self._angles[can_id]
             if len(angles) < REST_SAMPLES // 2:
                 return f"motor {can_id} did not answer: check its plug"
             if (moved := max(angles) - min(angles)) > MAX_UNREST:
@@ -225,18 +217,19 @@ class MotorSearch:
         """Return whether the angles survive a power-up, as a note, and the reasons why not."""
         request = "let the arm hang as before, switch the motors' power off and on, and wait until all answer again"
         self._watch(f"{request} (or go on at once, without this check)")
-        is_checked = set(self._found) <= self._was_silent
+        is_checked = set(self.found) <= self._was_silent
+        self._sample()
         refusals = []
-        rows = zip(self._found.items(), self._arm.motors, before, self._sample(), strict=True)
-        for (can_id, (name, _)), motor, angle, angles in rows:
-            if not angles:
+        for (can_id, (name, _)), motor, angle in zip(self.found.items(), self._arm.motors, before, strict=True):
+            if not self._angles[can_id]:
                 return UNCHECKED, [f"motor {can_id} does not answer after the power-up"]
-            away, turn = angles[-1] - angle, 2.0 * math.pi / motor.spec.gear_ratio
+            away, turn = self._angles[can_id][-1] - angle, 2.0 * math.pi / motor.spec.gear_ratio
             if is_checked and abs(away) > SAME_ANGLE:
                 turns = round(away / turn)
                 is_turn = turns and abs(away - turns * turn) < SAME_ANGLE
                 cause = f"{turns:+d} rotor turns" if is_turn else "no whole number of rotor turns"
-                off = f"{math.degrees(away):+.0f} degrees off after the power-up"
-                refusals.append(f"{name}: {off}, {cause}: {SET_ZERO}")
+                refusals.append(
+                    f"{name}: {math.degrees(away):+.0f} degrees off after the power-up, {cause}: {SET_ZERO}"
+                )
         unchecked = f"{UNCHECKED}: hang the arm each time the motors are switched on"
         return "the same after a power-up with the arm hanging" if is_checked else unchecked, refusals

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_typestore
 
+from exo_gravity.bag.content import Bag
+from exo_gravity.bag.joints import TYPES
 from exo_gravity.bag.reader import read_bag
 from exo_gravity.bag.storage import Storage
-from exo_gravity.core.calibration.identification import Observation
-from exo_gravity.core.calibration.motion import BINS, average
+from exo_gravity.core.calibration.motion import BINS, Observation, Sweep, average, mean_direction
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.trial.recording import Recording, in_blocks, still_spans
@@ -40,16 +40,9 @@ def observations_of(path: Path, arm: ConfiguredArm, with_held: bool = True) -> l
     with_held: False for sweeps alone, which show friction. Raises DataError if there are none.
     """
     bag = read_bag(path)
-    found = {recording.name: recording for recording in bag.recordings}
-    if arm.name not in found:
-        raise DataError(f"{path}: no arm {arm.name}; it has {', '.join(found)}")
-    recording = found[arm.name]
-    if sorted(recording.joint_names) != sorted(arm.joint_names):
-        raise DataError(f"joints = {', '.join(recording.joint_names)}: must be {', '.join(arm.joint_names)}")
-    order = [recording.joint_names.index(name) for name in arm.joint_names]
+    recording = recording_of(bag, arm)
     effort = np.where(np.isfinite(recording.command), recording.command, recording.effort)  # as commanded, where known
-    position = recording.position[:, order].astype(float)
-    recording = replace(recording, joint_names=arm.joint_names, position=position, effort=effort[:, order])
+    recording = replace(recording, position=recording.position.astype(float), effort=effort)
     down = _down(path, arm, recording.time + bag.start / 1e9)
     observations = list(_sweeps(recording, down))
     if with_held:
@@ -60,16 +53,30 @@ def observations_of(path: Path, arm: ConfiguredArm, with_held: bool = True) -> l
     return observations
 
 
+def recording_of(bag: Bag, arm: ConfiguredArm) -> Recording:
+    """Return the recording in `bag` that has the joints of `arm`, with its arrays in their order. Raises DataError."""
+    recording = next((r for r in bag.recordings if sorted(r.joint_names) == sorted(arm.joint_names)), None)
+    if recording is None:
+        found = "; ".join(", ".join(r.joint_names) for r in bag.recordings)
+        raise DataError(f"{bag.path}: the joints are {found}: must include {', '.join(arm.joint_names)}")
+    order = [recording.joint_names.index(name) for name in arm.joint_names]
+    arrays = {name: getattr(recording, name)[:, order] for name in ("position", "velocity", "effort", "command")}
+    return replace(recording, joint_names=arm.joint_names, **arrays)
+
+
 def _down(path: Path, arm: ConfiguredArm, times: np.ndarray) -> np.ndarray:
     """Return gravity's direction (n, 3) in the base frame at `times` (n,) s, from the trunk's tilts if it uses any."""
     if not arm.compensator["use_imu"]:
         return np.tile(Tilt.of(arm.side).direction, (len(times), 1))
-    tilts = [
-        (stamp / 1e9, *Tilt.of(arm.side, message.vector.y, message.vector.x).direction)
-        for stamp, message in messages_of(path, TILT_TOPIC, TILT_TYPE)
-    ]
-    stamps, *components = np.array(tilts).T
+    stamps, tilts = zip(*tilts_of(path, arm.side), strict=True)
+    components = np.array([tilt.direction for tilt in tilts]).T
     return np.stack([np.interp(times, stamps, component) for component in components], axis=1)
+
+
+def tilts_of(path: Path, side: str, required: bool = True) -> Iterator[tuple[float, Tilt]]:
+    """Yield the trunk's tilts in a recording, for the `side` arm, each with its stamp in s. Raises DataError."""
+    for stamp, message in messages_of(path, TILT_TOPIC, TILT_TYPE, required):
+        yield stamp / 1e9, Tilt.of(side, message.vector.y, message.vector.x)
 
 
 def messages_of(path: Path, topic: str, msgtype: str, required: bool = True) -> Iterator[tuple[int, Any]]:
@@ -77,23 +84,16 @@ def messages_of(path: Path, topic: str, msgtype: str, required: bool = True) -> 
 
     Raises DataError if a message is unreadable, or if a `required` one is missing.
     """
-    storage, types = Storage(path), get_typestore(Stores.ROS2_JAZZY)
-    found = False
+    storage, found = Storage(path), False
     for *_, stamp, data in storage.messages(lambda name, kind: (name, kind) == (topic, msgtype)):
         try:
-            yield stamp, types.deserialize_cdr(data, msgtype)
+            yield stamp, TYPES.deserialize_cdr(data, msgtype)
         except (SerdeError, ValueError) as error:
             raise DataError(f"{path}: {topic}: {error}") from None
         found = True
     if required and not found:
         topics = ", ".join(sorted(storage.topics)) or "none"
         raise DataError(f"{path}: no samples of {topic} ({msgtype}); its topics: {topics}")
-
-
-def _mean_of(down: np.ndarray) -> np.ndarray:
-    """Return the mean (3,) of unit vectors (n, 3), of length 1."""
-    mean = down.mean(axis=0)
-    return np.asarray(mean / np.linalg.norm(mean))
 
 
 def _sweeps(recording: Recording, down: np.ndarray) -> Iterator[Observation]:
@@ -118,11 +118,10 @@ def _sweeps(recording: Recording, down: np.ndarray) -> Iterator[Observation]:
             middles.append(np.flatnonzero(np.all(is_inside, axis=1)) + run.start)
         if np.any(high - low < LEAST_WAY) or min(map(len, middles)) < 2 * BINS:
             continue
-        used, first_last = back.stop, np.array([middle[[0, -1]] for middle in middles])
-        speed = np.mean(np.abs(np.diff(position[first_last], axis=1)[:, 0]) / np.diff(time[first_last]), axis=0)
-        theta, effort, friction, spread, _ = average([(position[part], recording.effort[part]) for part in middles])
-        direction = _mean_of(down[there.start : back.stop])
-        yield Observation(theta, direction, effort, np.sign(way) * friction, spread, speed=speed)
+        used = back.stop
+        speeds = [np.ptp(position[part[[0, -1]]], axis=0) / np.ptp(time[part]) for part in middles]
+        seen, _ = average([Sweep(position[part], recording.effort[part], down[part]) for part in middles])
+        yield seen._replace(friction=np.sign(way) * seen.friction, speed=np.mean(speeds, axis=0))
 
 
 def _runs(recording: Recording, start: float, end: float) -> Iterator[slice]:
@@ -148,4 +147,4 @@ def _held(recording: Recording, down: np.ndarray, sweeps: list[Observation]) -> 
             effort = recording.effort[part]
             spread = np.hypot(friction / math.sqrt(3.0), effort.std(axis=0))
             theta = recording.position[part].mean(axis=0)
-            yield Observation(theta, _mean_of(down[part]), effort.mean(axis=0), friction, spread)
+            yield Observation(theta, mean_direction(down[part]), effort.mean(axis=0), friction, spread)

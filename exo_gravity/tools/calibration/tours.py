@@ -1,29 +1,25 @@
 """calibrate gravity, scale, friction and wearer: what slow tours of the arm show, live or from a recording.
 
-gravity    the robot's moments and the ratio of its motors' torque scales
-scale      the real torque per commanded torque of each motor, from a known weight on the last link: two tours, without
-           and with it. It is hung while the arm is down and its motors are off. If the stand then leans otherwise, the
-           IMU's heading shows too. A recording (`--bag`) is one with the weight, of an arm that `calibrate gravity` has
-           calibrated: what it holds without is known.
-friction   Coulomb, viscous and Stribeck friction of each joint, from sweeps at several slow speeds
-wearer     the weight of the wearer's relaxed arm, from supported poses: what the calibrated robot needs beyond its own
-           moments. Two masses explain it, one on link 3 and one on link 4, at the centres of gravity of the body-mass
-           table: torque shows only mass times distance.
+docs/calibration.md describes each. Live, `scale` makes two tours, without the weight and with it. A recording (`--bag`)
+is one with the weight, of an arm that `calibrate gravity` has calibrated: what it holds without is known. `wearer`: two
+masses explain what the arm needs beyond the robot's moments, one on link 3 and one on link 4, at the centres of gravity
+of the body-mass table: torque shows only mass times distance.
 """
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.calibration.identification import Identified, Observation, columns, identify
-from exo_gravity.core.calibration.motion import FrictionCurve, fit_friction
+from exo_gravity.core.calibration.identification import Identified, fit_friction, identify
+from exo_gravity.core.calibration.motion import Observation
+from exo_gravity.core.calibration.pose_fit import columns
 from exo_gravity.core.calibration.poses import candidates, next_pose
 from exo_gravity.core.compensation.settings import wearer_of
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.arm import ModelError, moments_along
-from exo_gravity.core.model.gravity import MOMENTS, gravity_torque, load_moments, moments_of, regressor
+from exo_gravity.core.model.gravity import gravity_torque, load_moments, moments_of, regressor
 from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS
 from exo_gravity.core.numbers import JOINT_COUNT
@@ -88,38 +84,39 @@ def calibrate_scale(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -
 
 def moments_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
     """Return moments and torque scales of `arm` as `observations` show them. Raises DataError as `identify` does."""
-    identified = identify(observations, arm.robot.length, arm.robot.gravity)
-    factor = np.where(np.isfinite(identified.scale_error), identified.scale, 1.0)
+    robot, (low, high) = arm.robot, TORQUE_SCALE_BOUNDS
+    found = identify(observations, robot.length, robot.gravity)
+    factor = np.where(np.isfinite(found.scale_error), found.scale, 1.0)
     scale = np.round(factor * arm.can_bridge["torque_scale"], 4).tolist()
-    low, high = TORQUE_SCALE_BOUNDS
     impossible = tuple(
         f"{name}: torque_scale = {value:g}: must be from {low:g} to {high:g}: check torque_range of its firmware"
         for name, value in zip(arm.joint_names, scale, strict=True)
         if not low <= value <= high
     )
-    poses, robot = candidates(arm.limits), arm.robot
-    taken, direction = [one.theta for one in observations], observations[-1].direction
-    suggestion = poses[next_pose(taken, poses, direction, moments_of(robot), gravity=robot.gravity)]
-    changes, lines = _changes(arm, identified, scale), (*_lines(arm, identified), *identified.unknown)
-    return CalibrationResult(changes, lines, impossible, arm, tuple(observations), identified, suggestion)
+    poses, taken = candidates(arm.limits), [one.theta for one in observations]
+    best = poses[next_pose(taken, poses, observations[-1].direction, moments_of(robot), robot.gravity)]
+    more = f"next best pose, if more is wanted: {' '.join(f'{angle:.0f}' for angle in np.degrees(best))} degrees"
+    changes, lines = _changes(arm, found, scale), (*_lines(arm, found), more)
+    return CalibrationResult(changes, lines, impossible, arm, tuple(observations), found)
 
 
-def _changes(arm: ConfiguredArm, identified: Identified, scale: list[float]) -> tuple[Change, ...]:
+def _changes(arm: ConfiguredArm, found: Identified, scale: list[float]) -> tuple[Change, ...]:
     """Return the new values of the parameter file. What is unknown keeps its value."""
-    node, error = f"{arm.namespace}/compensator", identified.error
-    unit = "as commanded; in kg m once a weight was hung" if identified.relative else "kg m"
-    moments = np.where(np.isfinite(error), identified.moments, moments_of(arm.robot)).round(5).tolist()
+    node, error = f"{arm.namespace}/compensator", found.error
+    unit = "as commanded; in kg m once a weight was hung" if found.relative else "kg m"
+    before = moments_of(arm.robot)
+    moments = np.where(np.isfinite(error), found.moments, before).round(5).tolist()
     changes = [
-        Change(node, "robot.first_moment", moments[:4], f"{unit}, +-{_row(error[:4])}"),
-        Change(node, "robot.off_axis", moments[4:], f"W Z Y3 Y4 {unit}, +-{_row(error[4:])}"),
-        Change(f"{arm.namespace}/can_bridge", "torque_scale", scale, f"+-{_row(identified.scale_error)}"),
+        Change(node, "robot.first_moment", moments[:4], f"{unit}, +-{_row(error[:4])}, was {_row(before[:4])}"),
+        Change(node, "robot.off_axis", moments[4:], f"W Z Y3 Y4 {unit}, +-{_row(error[4:])}, was {_row(before[4:])}"),
+        Change(f"{arm.namespace}/can_bridge", "torque_scale", scale, f"+-{_row(found.scale_error)}"),
     ]
-    if np.all(np.isfinite(identified.held_out).any(axis=0)):
-        left_out = np.sqrt(np.nanmean(identified.held_out**2, axis=0)) * identified.scale
+    if np.all(np.isfinite(found.held_out).any(axis=0)):
+        left_out = np.sqrt(np.nanmean(found.held_out**2, axis=0)) * found.scale
         changes.append(Change(node, "model_error.torque", left_out.round(3).tolist(), "Nm, of poses left out"))
-    if not identified.relative:
-        known = np.isfinite(identified.scale_error)
-        share = np.where(known, identified.scale_error / identified.scale, ModelError().scale)
+    if not found.relative:
+        known = np.isfinite(found.scale_error)
+        share = np.where(known, found.scale_error / found.scale, ModelError().scale)
         changes.append(Change(node, "model_error.scale", share.round(4).tolist(), "share of torque_scale"))
     if arm.compensator["law"] != "exact":
         changes.append(Change(node, "law", "exact", "the other laws need masses and centres of gravity"))
@@ -128,26 +125,19 @@ def _changes(arm: ConfiguredArm, identified: Identified, scale: list[float]) -> 
     return tuple(changes)
 
 
-def _lines(arm: ConfiguredArm, identified: Identified) -> tuple[str, ...]:
-    """Return the result in sentences."""
-    found = identified
-    lines = [
-        f"{name}: {new:.4f} +- {e:.4f} kg m (was {old:.4f})" if np.isfinite(e) else f"{name}: unknown, still {old:.4f}"
-        for name, old, new, e in zip(MOMENTS, moments_of(arm.robot), found.moments, found.error, strict=True)
-    ]
-    rows = zip(arm.joint_names, found.scale, found.scale_error, found.friction, found.offset, strict=True)
-    lines += [
-        f"{name}: {new:.3f} +- {e:.3f} Nm per commanded Nm, friction {slide:.2f} Nm, offset {offset:+.3f} Nm"
-        for name, new, e, slide, offset in rows
-    ]
+def _lines(arm: ConfiguredArm, found: Identified) -> Iterator[str]:
+    """Yield what the parameter file does not hold, in sentences."""
+    for name, slide, offset in zip(arm.joint_names, found.friction, found.offset, strict=True):
+        yield f"{name}: friction {slide:.2f} Nm, offset {offset:+.3f} Nm"
     worst = float(np.nanmax(np.abs(found.held_out), initial=0.0))
-    lines.append(f"largest torque error of a pose that was left out: {worst:.3f} Nm")
-    lines += [f"pose {index + 1} was not used: {reason}" for index, reason in found.rejected]
-    return tuple(lines)
+    yield f"largest torque error of a pose that was left out: {worst:.3f} Nm"
+    for index, reason in found.rejected:
+        yield f"pose {index + 1} was not used: {reason}"
+    yield from found.unknown
 
 
 def _row(values: np.ndarray) -> str:
-    return " ".join(f"{value:.2g}" if np.isfinite(value) else "unknown" for value in values)
+    return " ".join(f"{value:.3g}" if np.isfinite(value) else "unknown" for value in values)
 
 
 def calibrate_friction(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
@@ -159,22 +149,16 @@ def friction_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Ca
     """Return the friction of each joint that `observations` show. Raises DataError as `fit_friction` does."""
     speed = np.array([np.broadcast_to(one.speed, JOINT_COUNT) for one in observations])
     curves = tuple(map(fit_friction, speed.T, np.array([one.friction for one in observations]).T))
-    named = list(zip(arm.joint_names, curves, strict=True))
-    lines = tuple(f"{name}: {_sentence(fit)}" for name, fit in named)
-    changes = tuple(Change(f"{arm.namespace}/can_bridge", "", 0, f"friction of {line}") for line in lines)
-    negative = tuple(
-        f"{name}: friction of {fit.coulomb:.3f} Nm: must be above 0: was the arm touched?"
-        for name, fit in named
-        if fit.coulomb <= 0.0
-    )
-    return CalibrationResult(changes, lines, negative, arm, tuple(observations), curves=curves)
-
-
-def _sentence(fit: FrictionCurve) -> str:
-    coulomb, viscous, stribeck = fit.error
-    text = f"Coulomb {fit.coulomb:.3f} +- {coulomb:.3f} Nm, viscous {fit.viscous:.3f} +- {viscous:.3f} Nm s/rad"
-    more = f"Stribeck {fit.stribeck:.3f} +- {stribeck:.3f} Nm below {fit.stribeck_speed:.2f} rad/s"
-    return f"{text}, {more if fit.stribeck else 'no Stribeck friction'}"
+    changes, refusals = [], []
+    for name, fit in zip(arm.joint_names, curves, strict=True):
+        coulomb, viscous, stribeck = fit.error
+        text = f"Coulomb {fit.coulomb:.3f} +- {coulomb:.3f} Nm, viscous {fit.viscous:.3f} +- {viscous:.3f} Nm s/rad"
+        more = f"Stribeck {fit.stribeck:.3f} +- {stribeck:.3f} Nm below {fit.stribeck_speed:.2f} rad/s"
+        note = f"friction of {name}: {text}, {more if fit.stribeck else 'no Stribeck friction'}"
+        changes.append(Change(f"{arm.namespace}/can_bridge", "", 0, note))
+        if fit.coulomb <= 0.0:
+            refusals.append(f"{name}: friction of {fit.coulomb:.3f} Nm: must be above 0: was the arm touched?")
+    return CalibrationResult(tuple(changes), (), tuple(refusals), arm, tuple(observations), curves=curves)
 
 
 def calibrate_wearer(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
@@ -203,15 +187,12 @@ def wearer_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Cali
     covariance *= max(1.0, float(remainder @ remainder) / (remainder.size - 2))
     error, moments = np.sqrt(np.diag(covariance)), (per_mass @ mass)[2:]
     moment_error = np.sqrt(np.diag(per_mass @ covariance @ per_mass.T))[2:]
-    lines = []
-    for part, own, e, name, moment in zip(WORN, mass, error, ("M3", "M4"), moments, strict=True):
+    for part, own, e in zip(WORN, mass, error, strict=True):
         if not 0.0 < own < MOST:
             relaxed = "is the arm relaxed, the robot calibrated?"
             raise DataError(f"{part}: {own:.2f} kg: must be from 0 to {MOST:g}: {relaxed}")
         if e > LARGEST_ERROR * own:
             raise DataError(f"{part}: {own:.2f} +- {e:.2f} kg: add a pose with the arm further forward")
-        lines.append(f"{part}: {own:.2f} +- {e:.2f} kg, {name} {moment:.3f} kg m")
-    lines.append(f"largest remainder of a pose: {np.abs(remainder / weight).max():.2f} Nm")
     node, note = f"{arm.namespace}/compensator", f"kg, +-{error[0]:.2f} and {error[1]:.2f}"
     changes = (
         Change(node, "wearer.mass", [0.0, 0.0, *mass.round(3).tolist()], note),
@@ -222,13 +203,13 @@ def wearer_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Cali
     tabled_mass, tabled_cog = map(np.array, _wearer(arm, tabled=True))
     ratio = moments / moments_along(length, tabled_cog, tabled_mass)[2:]
     refusals: tuple[str, ...] = ()
-    if not body_mass:
-        lines.append(f"a person of {TYPICAL_BODY_MASS * ratio[0]:.0f} kg has this M3 by the table {Wearer.table}")
-    else:
-        lines.append(f"{ratio[0]:.0%} of M3 and {ratio[1]:.0%} of M4 by the table {Wearer.table} for {body_mass:g} kg")
+    compared = f"a person of {TYPICAL_BODY_MASS * ratio[0]:.0f} kg has this M3 by the table {Wearer.table}"
+    if body_mass:
+        compared = f"{ratio[0]:.0%} of M3 and {ratio[1]:.0%} of M4 by the table {Wearer.table} for {body_mass:g} kg"
         if not np.all((ratio >= low) & (ratio <= high)):
-            refusals = (f"implausible: {lines[-1]}: must be from {low:.0%} to {high:.0%}",)
-    return CalibrationResult(changes, tuple(lines), refusals, arm, tuple(observations))
+            refusals = (f"implausible: {compared}: must be from {low:.0%} to {high:.0%}",)
+    lines = f"largest remainder of a pose: {np.abs(remainder / weight).max():.2f} Nm", compared
+    return CalibrationResult(changes, lines, refusals, arm, tuple(observations))
 
 
 def _wearer(arm: ConfiguredArm, tabled: bool = False) -> tuple[Sequence[float], Sequence[float]]:

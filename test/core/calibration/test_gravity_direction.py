@@ -40,7 +40,6 @@ def test_an_imu_that_is_two_degrees_off_does_no_harm_and_is_found(seed):
     assert np.all(error < np.maximum(3.0 * found.error, 0.01 * device.moments.max()))
     direction = measured + np.cross(found.tilt, measured)
     assert np.linalg.norm(direction / np.linalg.norm(direction) - DOWN) < np.radians(0.3)
-    assert any("off what the IMU says" in sentence for sentence in found.unknown)
 
 
 def test_the_corrected_mounting_is_the_old_one_after_the_turn():

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, Tilt
-from exo_gravity.core.calibration.identification import Observation, identify
+from exo_gravity.core.calibration.identification import identify
+from exo_gravity.core.calibration.motion import Observation
 from exo_gravity.core.calibration.pose_fit import COMMON, TYPICAL_MOMENTS
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.model.gravity import MOMENTS, load_moments, moments_of, regressor

@@ -7,8 +7,8 @@ import pytest
 
 from exo_gravity.core.calibration.identification import check_physical, identify
 from exo_gravity.core.calibration.pose_fit import COUNT
-from exo_gravity.core.calibration.poses import missing_pose, next_pose
-from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.calibration.poses import missing_pose
+from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.gravity import regressor
 
 from ...support.random_device import LEANING, LENGTH, Device, best
@@ -108,8 +108,3 @@ def test_an_impossible_observation_is_refused_by_number_and_name():
         identify(observations, LENGTH)
     with pytest.raises(DataError, match="no pose"):
         identify([], LENGTH)
-
-
-def test_without_a_candidate_there_is_no_next_pose():
-    with pytest.raises(ParameterError, match="at least one pose"):
-        next_pose([], np.zeros((0, 4)))

@@ -9,19 +9,20 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.calibration.motion import ACCELERATION, MAX_SPEED, Line, Station, average, fit_friction
-from exo_gravity.core.calibration.poses import BestPoses, FixedStations, candidates, measurable
+from exo_gravity.core.calibration.identification import fit_friction
+from exo_gravity.core.calibration.motion import ACCELERATION, MAX_SPEED, Line, Station, Sweep, average
+from exo_gravity.core.calibration.poses import Itinerary, TorqueGuess, candidates, measurable
 from exo_gravity.core.calibration.tour import Tour
-from exo_gravity.core.calibration.tracking import TorqueGuess, inertia_of
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.gravity import load_moments, moments_of
+from exo_gravity.core.model.kinematics import LinkInertia
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
-from ...support.tour_run import MOTORS_AS_MOUNTED, NAMES, TourRun, assert_close_to_device
+from ...support.tour_run import MOTORS_AS_MOUNTED, NAMES, TourRun, assert_close_to_device, fixed
 
 LIMITS = Limits(NAMES, sign_check_torque=0.0)
 POSE = Station((0.1, 0.5, 0.6, 0.7))
@@ -47,7 +48,7 @@ def wrong_file():
     truth = ArmModel(links.length, links.cog * 0.9, links.mass * (1.2, 0.8, 1.15, 0.8))
     motors = [replace(motor, torque_scale=scale) for motor, scale in zip(MOTORS_AS_MOUNTED, SCALES, strict=True)]
     run = TourRun(truth=ArmConfig(truth), motors=motors)
-    return run, run.run(BestPoses(LIMITS, 4, 80.0)), truth
+    return run, run.run(Itinerary(LIMITS, 4, 80.0)), truth
 
 
 def test_a_tour_of_four_poses_ends_hanging_in_time(wrong_file):
@@ -103,7 +104,7 @@ class Grip:
 
 def test_a_hand_that_holds_the_arm_stops_the_tour_and_is_named():
     run = TourRun(disturb=Grip(18.0))
-    tour = run.run(FixedStations(TWO))
+    tour = run.run(fixed(TWO))
     assert tour.trouble.startswith("flexion: ") and "a hand" in tour.trouble and "the limit is" in tour.trouble
     assert run.safety.fault.code is FaultCode.COMMAND_WITHDRAWN and not run.device.powered
     assert len(tour.measured) >= 1  # what was measured is kept
@@ -111,7 +112,7 @@ def test_a_hand_that_holds_the_arm_stops_the_tour_and_is_named():
 
 def test_a_saturated_joint_is_named_with_its_limit():
     limits = replace(LIMITS, max_effort=(3.0, 9.0, 1.0, 3.0))
-    tour = TourRun(limits=limits).run(FixedStations([Station((0.0, 0.3, 1.2, 0.2))]))
+    tour = TourRun(limits=limits).run(fixed([Station((0.0, 0.3, 1.2, 0.2))]))
     assert tour.trouble.startswith("flexion: saturated") and "max_effort = 1 Nm" in tour.trouble
     assert tour.elapsed < 15.0
 
@@ -121,7 +122,7 @@ def test_a_silent_motor_ends_the_tour_by_the_bridges_fault_and_keeps_what_was_me
         device.motors[1].unplugged = time > 18.0
 
     run = TourRun(disturb=unplug)
-    tour = run.run(FixedStations(TWO))
+    tour = run.run(fixed(TWO))
     assert run.safety.fault.code is FaultCode.MOTOR_SILENT and "abduction" in run.safety.fault.reason
     assert tour.measured and not tour.done
 
@@ -132,7 +133,7 @@ def test_a_joint_that_slips_between_two_passes_is_named():
     def slip(time, device):
         return 0.0, 0.0, min(0.5, 0.2 * max(0.0, time - 10.0)), 0.0
 
-    tour = TourRun(disturb=slip).run(FixedStations([Station((0.0, 0.3, 0.5, 0.4), cycles=4)]))
+    tour = TourRun(disturb=slip).run(fixed([Station((0.0, 0.3, 0.5, 0.4), cycles=4)]))
     assert tour.trouble.startswith("flexion: ") and "between two passes" in tour.trouble
     assert not tour.measured
 
@@ -141,7 +142,7 @@ def test_joint_states_that_stop_and_a_stand_that_moves_end_the_tour():
     run = TourRun()
     guess = TorqueGuess(DEFAULT_LINKS.length, moments_of(DEFAULT_LINKS), Tilt.of("right"), 9.81)
     for now, tilt, words in ((1.5, (0.0, 0.0), "no joint states for 500 ms"), (1.01, (0.2, 0.0), "tilted by 0.20 rad")):
-        tour = Tour(run.limits, guess, FixedStations([POSE]), 100.0)
+        tour = Tour(run.limits, guess, fixed([POSE]), 100.0)
         assert tour.step(1.0, (0.0,) * 4, (0.0,) * 4, Tilt.of("right")) is not None
         assert tour.step(now, (0.0,) * 4, (0.0,) * 4, Tilt.of("right", *tilt)) is None
         assert words in tour.trouble
@@ -149,7 +150,7 @@ def test_joint_states_that_stop_and_a_stand_that_moves_end_the_tour():
 
 def test_the_arm_is_held_until_the_next_pose_is_chosen():
     guess = TorqueGuess(DEFAULT_LINKS.length, moments_of(DEFAULT_LINKS), Tilt.of("right"), 9.81)
-    tour = Tour(LIMITS, guess, FixedStations([POSE]), 100.0)
+    tour = Tour(LIMITS, guess, fixed([POSE]), 100.0)
     for cycle in range(200):
         assert tour.step(0.01 * cycle, (0.0,) * 4, (0.0,) * 4, Tilt.of("right")) == pytest.approx((0.0,) * 4, abs=0.01)
     tour.plan()
@@ -157,7 +158,7 @@ def test_the_arm_is_held_until_the_next_pose_is_chosen():
     assert efforts[-1][3] > 0.05 and "pose 1 of 1" in tour.progress
 
 
-class Broken(FixedStations):
+class Broken(Itinerary):
     """Pose choice with a defect."""
 
     def next(self, *state):
@@ -166,7 +167,7 @@ class Broken(FixedStations):
 
 def test_an_error_of_any_kind_in_the_choice_of_a_pose_ends_the_tour_with_its_reason():
     guess = TorqueGuess(DEFAULT_LINKS.length, moments_of(DEFAULT_LINKS), Tilt.of("right"), 9.81)
-    tour, step = Tour(LIMITS, guess, Broken([POSE]), 100.0), ((0.0,) * 4, (0.0,) * 4, Tilt.of("right"))
+    tour, step = Tour(LIMITS, guess, Broken(LIMITS, 1, 60.0), 100.0), ((0.0,) * 4, (0.0,) * 4, Tilt.of("right"))
     assert tour.step(0.0, *step) is not None
     tour.plan()
     assert None in [tour.step(0.01 * cycle, *step) for cycle in range(1, 40)]  # withdrawn: the bridge lets the arm down
@@ -189,10 +190,11 @@ def test_the_average_of_sweeps_separates_gravity_and_friction_at_different_angle
         offset = sign * np.linspace(-0.03, 0.03, 60)[:, None] - sign * 0.01  # behind the reference
         position = np.array((0.1, 0.2, 0.3, 0.4)) + offset
         effort = 1.0 + position @ slope.T + sign * friction
-        sweeps.append((position, effort - position @ slope.T))  # minus the expected one
-    _, effort, slide, *_ = average(sweeps)
-    np.testing.assert_allclose(slide, friction, atol=1e-9)
-    np.testing.assert_allclose(effort, 1.0, atol=1e-9)
+        down = np.tile((0.0, 0.0, 1.0), (60, 1))
+        sweeps.append(Sweep(position, effort - position @ slope.T, down))  # minus the expected one
+    seen, _ = average(sweeps)
+    np.testing.assert_allclose(seen.friction, friction, atol=1e-9)
+    np.testing.assert_allclose(seen.effort, 1.0, atol=1e-9)
 
 
 def test_the_expected_torque_learns_scale_and_moments_of_each_joint():
@@ -213,7 +215,7 @@ def test_the_expected_torque_learns_scale_and_moments_of_each_joint():
 def test_chosen_poses_are_within_the_limits_and_can_be_held():
     guess = TorqueGuess(DEFAULT_LINKS.length, moments_of(DEFAULT_LINKS), Tilt.of("right"), 9.81)
     limits = replace(LIMITS, max_effort=(3.0, 4.0, 1.8, 3.0))
-    itinerary = BestPoses(limits, 4, 120.0)
+    itinerary = Itinerary(limits, 4, 120.0)
     low, high = measurable(LIMITS, POSE.amplitude)
     taken = np.empty((0, 4))
     while station := itinerary.next(taken, np.array(LIMITS.home), 10.0 * len(taken), guess, (0.2,) * 4):
@@ -228,12 +230,12 @@ def test_chosen_poses_are_within_the_limits_and_can_be_held():
 def test_the_mass_matrix_is_close_to_that_of_the_device(mass, lever, tolerance):
     arm = SimulatedArm(ArmConfig(wearer_mass=(0, 0, 0, mass), wearer_cog=(0, 0, 0, lever)))
     moments = moments_of(DEFAULT_LINKS) + load_moments(DEFAULT_LINKS.length.tolist(), mass, lever)
-    assert_close_to_device(inertia_of(DEFAULT_LINKS.length, moments[:4], (mass, lever)), arm, tolerance)
+    assert_close_to_device(LinkInertia.of_moments(DEFAULT_LINKS.length, moments[:4], (mass, lever)), arm, tolerance)
 
 
 def test_the_sweeps_of_a_chosen_pose_and_the_way_home_with_a_weight_need_no_more_than_the_motors_may_give():
     guess = TorqueGuess(DEFAULT_LINKS.length, WEIGHED, Tilt.of("right", 0.05, 0.2), 9.81)
-    itinerary, taken = BestPoses(LIMITS, 8, 160.0), np.empty((0, 4))
+    itinerary, taken = Itinerary(LIMITS, 8, 160.0), np.empty((0, 4))
     itinerary.next(taken, np.zeros(4), 0.0, guess, (0.0,) * 4)  # the hanging arm
     while station := itinerary.next(taken, np.zeros(4), 15.0 * len(taken), guess, (0.2,) * 4):
         ways = [*station.ends, *(share * np.array(station.theta) for share in np.linspace(0.0, 1.0, 20))]
@@ -245,8 +247,10 @@ def test_the_sweeps_of_a_chosen_pose_and_the_way_home_with_a_weight_need_no_more
 def test_without_a_pose_that_the_motors_can_hold_the_tour_says_so():
     weak = replace(LIMITS, max_effort=(0.1,) * 4)
     guess = TorqueGuess(DEFAULT_LINKS.length, moments_of(DEFAULT_LINKS), Tilt.of("right"), 9.81)
+    itinerary, state = Itinerary(weak, 4, 120.0), (np.zeros((1, 4)), np.zeros(4), 0.0, guess, (0.0,) * 4)
+    itinerary.next(*state)  # the hanging arm
     with pytest.raises(DataError, match="max_effort"):
-        BestPoses(weak, 4, 120.0).next(np.zeros((1, 4)), np.zeros(4), 0.0, guess, (0.0,) * 4)
+        itinerary.next(*state)
 
 
 def test_friction_over_speed_is_fitted_with_and_without_stribeck():
