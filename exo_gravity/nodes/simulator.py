@@ -120,7 +120,7 @@ class Simulator(Node):
             state = TrunkState(device.pitch, device.roll, *rates)
         if self._imu_publisher:
             time = self.get_clock().now().nanoseconds * 1e-9
-            sample = ImuSample(time, *(vector.tolist() for vector in self._imu.sample_of(state)))
+            sample = ImuSample(time, *(vector.tolist() for vector in self._imu.sample(state)))
             self._imu_publisher.publish(message_of(sample))
 
     def _follow_wearer(self) -> None:

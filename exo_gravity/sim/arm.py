@@ -91,9 +91,8 @@ class ArmConfig:
         if np.any(np.greater(self.wearer_cog, self.links.length)):
             raise ParameterError("wearer_cog", self.wearer_cog, f"at most length = {self.links.length.tolist()} m")
         if np.any(np.greater_equal(self.position_min, self.position_max)):
-            raise ParameterError(
-                "position_min", self.position_min, f"below position_max = {list(self.position_max)} rad"
-            )
+            expected = f"below position_max = {list(self.position_max)} rad"
+            raise ParameterError("position_min", self.position_min, expected)
 
 
 def in_base(side: str, vector: Sequence[float], turning: bool = False) -> Vector:

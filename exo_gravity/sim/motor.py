@@ -43,24 +43,20 @@ class Firmware:
 
 
 class SimulatedMotor:
-    """One motor on one joint.
+    """One motor on one joint. The faults may be set at any time.
 
-    joint: the true mounting and scale of the motor, from which the controller's parameters may differ. Faults that may
-    be set at any time: `unplugged` (no power: no torque, no replies, and only the zero is remembered), `temperature`
-    (degC) and `error` (a code of MOTOR_ERRORS, reported only). entered: whether the motor is on, after ENTER and before
-    EXIT.
+    joint: the true mounting and scale of the motor, from which the controller's parameters may differ.
     """
 
     def __init__(self, joint: JointMotor, firmware: Firmware | None = None) -> None:
         self.joint = joint
         self.firmware = firmware or Firmware()
-        #: Arbitration IDs of the replies, and of the frames that the motor obeys.
-        self.reply_id = MASTER_ID if self.firmware.reply_to_master else joint.can_id
-        self.received_ids: tuple[int, ...] = (joint.can_id,)
-        self.unplugged = False
-        self.temperature = 30.0
-        self.error = 0
-        self.entered = False
+        self.reply_id = MASTER_ID if self.firmware.reply_to_master else joint.can_id  #: arbitration ID of the replies
+        self.received_ids: tuple[int, ...] = (joint.can_id,)  #: arbitration IDs of the frames that the motor obeys
+        self.unplugged = False  #: a fault: no power, no torque, no replies, and only the zero is remembered
+        self.temperature = 30.0  #: degC
+        self.error = 0  #: a code of MOTOR_ERRORS, reported only
+        self.entered = False  #: the motor is on, after ENTER and before EXIT
         self._command, self._data = _NO_COMMAND, b""
         self._silent_until = -math.inf  # s, after SET_ZERO
         self._random = random.Random(joint.can_id)

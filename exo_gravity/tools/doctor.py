@@ -53,7 +53,6 @@ MENDS = {  # the command for each finding about the computer
     "clock source": f"echo tsc | sudo tee /{CLOCKS}/current_clocksource",
     "nice value": f"echo '*  -  nice  -20' | {LIMITS}",
     "CPUs for the nodes": "start the launcher without taskset, or in a container with more CPUs",
-    "isolated CPUs": "remove isolcpus= from the kernel's command line: the nodes run on the other CPUs",
     "real-time limits": rf"printf '* - rtprio 99\n* - memlock unlimited\n' | {LIMITS}",
 }
 
@@ -167,7 +166,7 @@ def of_computer(root: Path, wakeups: Wakeups, period: float, is_late: bool, prio
     waking = {path.name: 1e-6 * float(_text(path / "latency") or 0) for path in permitted}  # s
     deep = [f"/{CPUS}/cpu*/cpuidle/{state}/disable" for state, late in waking.items() if late > SLOW_WAKE * period]
     idle = f"a CPU wakes up within {1e6 * max(waking.values()):.0f} µs" if waking else ""
-    cores, isolated = len(os.sched_getaffinity(0)), _text(cpus / "isolated")
+    cores = len(os.sched_getaffinity(0))
     soft = (resource.getrlimit(which)[0] for which in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK))
     rtprio, memlock = ("unlimited" if limit == resource.RLIM_INFINITY else f"{limit}" for limit in soft)
     required = f"as thread_priority {priority} requires" if priority else "none, thread_priority is 0"
@@ -178,7 +177,6 @@ def of_computer(root: Path, wakeups: Wakeups, period: float, is_late: bool, prio
         ("clock source", clock, "tsc, or a virtual machine's", clock not in SLOW_CLOCKS, delays),
         ("nice value", f"{wakeups.nice}", "-20", wakeups.nice == -20, delays),
         ("CPUs for the nodes", f"{cores}", "2", cores > 1, Level.WARNING),
-        *([("isolated CPUs", isolated, "none", False, Level.NOTE)] if isolated else []),
         ("real-time limits", f"rtprio {rtprio}, memlock {memlock}", required, not wakeups.refused, Level.WARNING),
     ]
     return [judged(*row, MENDS[row[0]].format(deep=" ".join(deep))) for row in rows]

@@ -29,6 +29,7 @@ from datetime import datetime
 from fnmatch import fnmatchcase
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
+from subprocess import PIPE, STDOUT
 
 import yaml
 
@@ -151,19 +152,12 @@ class Launcher:
 
     def _start(self, node: str, variables: Mapping[str, str]) -> tuple[subprocess.Popen[str], threading.Thread]:
         """Start one node with more environment `variables`; return its process and the reader of its log."""
-        environment = {**os.environ, **variables}
         log_format = f"{{name}} {LOG_FORMAT}" if node in self._guests else LOG_FORMAT
-        environment.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", log_format)
+        environment = {"RCUTILS_CONSOLE_OUTPUT_FORMAT": log_format, **os.environ, **variables}
         process = subprocess.Popen(
-            self._commands[node],
-            env=environment,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            errors="replace",
+            self._commands[node], env=environment, stdin=PIPE, stdout=PIPE, stderr=STDOUT, text=True, errors="replace",
             start_new_session=True,  # Ctrl-C in the terminal reaches only the launcher
-        )
+        )  # fmt: skip
         reader = threading.Thread(target=self._read, args=(node, process), daemon=True)
         reader.start()
         return process, reader

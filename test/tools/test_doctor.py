@@ -45,7 +45,6 @@ def computer(tmp_path, monkeypatch):
     files = {
         "proc/version": "Linux version 6.8.1-rt (gcc) #1 SMP PREEMPT_RT",
         "sys/kernel/realtime": "1",
-        f"{CPU}/isolated": "",
         f"{CPU}/cpu0/cpufreq/scaling_governor": "performance",
         f"{CPU}/cpu1/cpufreq/scaling_governor": "performance",
         "sys/devices/system/clocksource/clocksource0/current_clocksource": "tsc",
@@ -132,11 +131,9 @@ def test_limits_matter_only_where_a_thread_priority_is_asked_for(computer):
     assert of_computer(computer, priority=50)["real-time limits"].level is Level.FINE
 
 
-def test_one_cpu_is_too_few_and_isolated_ones_are_named(computer, monkeypatch):
+def test_one_cpu_is_too_few(computer, monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0})
-    (computer / CPU / "isolated").write_text("2-3\n")
-    found = of_computer(computer)
-    assert found["CPUs for the nodes"].level is Level.WARNING and found["isolated CPUs"].found == "2-3"
+    assert of_computer(computer)["CPUs for the nodes"].level is Level.WARNING
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,8 @@ import itertools
 import json
 import math
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -213,13 +214,9 @@ def test_half_a_line_of_a_killed_recorder_is_ignored():
 
 
 @pytest.fixture
-def nodes() -> Iterator[threading.Thread]:
-    """A thread in place of the one that runs the nodes."""
-    ending = threading.Event()
-    thread = threading.Thread(target=ending.wait)
-    thread.start()
-    yield thread
-    ending.set()
+def nodes() -> Future[None]:
+    """Nodes that run."""
+    return Future()
 
 
 def test_a_recorder_that_ends_ends_the_trial(nodes):

@@ -33,10 +33,9 @@ def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
     Raises ParameterError that names the node and the parameter.
     """
     nodes = load(params)
-    namespaces = [node.removesuffix("/simulator") for node in nodes if node.endswith("/simulator")]
-    if not namespaces:
+    simulators = {node: node_values(nodes, node, SIMULATOR) for node in nodes if node.endswith("/simulator")}
+    if not simulators:
         raise ParameterError("params", str(params), "a file with a simulator: --offline runs the simulated device only")
-    simulators = {namespace: node_values(nodes, f"{namespace}/simulator", SIMULATOR) for namespace in namespaces}
     with_imu = next((values for values in simulators.values() if values["imu.topic"] and "/imu" in nodes), None)
     rotation = nodes.get("/imu", {}).get("rotation_trunk_from_imu", [])
     moves = any(step.action in TRUNK_ACTIONS for step in script.steps)
@@ -46,9 +45,9 @@ def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
         with named("/imu "):
             true = with_imu["trunk.pitch"], with_imu["trunk.roll"]
             trunk = resting(*measured_tilt(*true, SimulatedImu(imu_of(with_imu)), rotation))
-    for namespace, simulator in simulators.items():
-        arm = read_arm(nodes, namespace)
-        with named(f"{namespace}/simulator "):
+    for node, simulator in simulators.items():
+        arm = read_arm(nodes, node.removesuffix("/simulator"))
+        with named(f"{node} "):
             device = device_of(simulator)
             set_faults(device, simulator)
         rate = arm.can_bridge["rate"]
@@ -110,7 +109,7 @@ def trunk_imu(config: ImuConfig, rotation_trunk_from_imu: Sequence[float], cycle
     def measure(now: float, state: TrunkState) -> TrunkReading | None:
         if not next(due):
             return None
-        angular_velocity, acceleration = imu.sample_of(state)
+        angular_velocity, acceleration = imu.sample(state)
         try:
             answer = estimator.update(ImuSample(now, angular_velocity.tolist(), acceleration.tolist()))
         except ParameterError:  # refused samples are not published

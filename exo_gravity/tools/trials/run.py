@@ -10,6 +10,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -119,7 +120,7 @@ def run_nodes(trial: Trial, screen: TrialScreen, stopped: Stopping) -> TrialEnd:
     """Run the nodes of a trial until the script is done, a fault latches or `stopped` is set."""
     last_errors: dict[str, str] = {}
     path = trial.folder / "log.txt"
-    with path.open("w", 1, encoding="utf-8") as log, screen.live:
+    with path.open("w", 1, encoding="utf-8") as log, screen.live, ThreadPoolExecutor(1) as pool:
 
         def on_line(node: str, line: str) -> None:
             if node == RECORDER and line.startswith("{"):
@@ -131,23 +132,21 @@ def run_nodes(trial: Trial, screen: TrialScreen, stopped: Stopping) -> TrialEnd:
 
         launcher = Launcher(trial.folder / "params.yaml", on_line)
         ending = threading.Event()
-        dead: list[tuple[str, int] | None] = []
-        nodes = threading.Thread(target=lambda: dead.append(launcher.run(ending)))
-        nodes.start()
+        nodes = pool.submit(launcher.run, ending)
         trouble = follow(screen, stopped, lambda: launcher.exit_code(RECORDER), nodes)
         recorder_failed = launcher.exit_code(RECORDER) is not None and launcher.dead() is None
         down_by = time.monotonic() + DESCENT_TIMEOUT
-        while nodes.is_alive() and is_falling(screen.status) and screen.silence < 1.0 and time.monotonic() < down_by:
+        while is_falling(screen.status) and screen.silence < 1.0 and time.monotonic() < down_by and not nodes.done():
             time.sleep(0.05)  # the recording shows how the arm comes down
-        if nodes.is_alive():
+        if not nodes.done():
             screen.end("letting the arm down and closing the recording")
         ending.set()
-        nodes.join()
+        dead = nodes.result()
     # A fault is excused on a simulated device alone that this trial has started.
     may_be_busy = trial.params and not (stopped.is_set() or recorder_failed)
     busy = too_busy(screen.status) if may_be_busy else ""
-    if dead and dead[0]:
-        node, code = dead[0]
+    if dead:
+        node, code = dead
         trouble = f"{node.lstrip('/')} ended with exit code {code}: {last_errors.get(node, f'see {path}')}"
         # The watchdog kills a bridge that has not run for too long.
         killed = node.endswith("/can_bridge") and code == -signal.SIGKILL
@@ -159,11 +158,11 @@ def run_nodes(trial: Trial, screen: TrialScreen, stopped: Stopping) -> TrialEnd:
 
 
 def follow(
-    screen: TrialScreen, stopped: Stopping, recorder_code: Callable[[], int | None], nodes: threading.Thread
+    screen: TrialScreen, stopped: Stopping, recorder_code: Callable[[], int | None], nodes: "Future[Any]"
 ) -> str:
     """Wait until the script is done; return '' or why the wait ended earlier."""
     deadline = time.monotonic() + START_TIMEOUT + screen.script.duration
-    while not stopped.wait(0.05) and nodes.is_alive():
+    while not stopped.wait(0.05) and not nodes.done():
         if (code := recorder_code()) is not None:
             return f"the recorder ended with exit code {code} before the trial was done"
         if screen.silence > RECORDER_TIMEOUT:
