@@ -60,7 +60,8 @@ class SimulatedDevice:
         self._random = random.Random(0)  # of the delays of replies
         self._steps = 0
         self._clock = 0.0  # s elapsed, of which `time` is the part in whole steps
-        self._wearer, self._script_start = VirtualWearer(IDLE), math.inf  # simulated s
+        self.wearer = VirtualWearer(IDLE)  #: who performs a script, none at first
+        self._script_start = math.inf  # simulated s
         self._trunk_step: int | None = None  # the step that `trunk_motion` belongs to
         self._base = TrunkState()  # the arm's base moves like this
         self._frames = [0] * JOINT_COUNT  # received by each motor
@@ -92,7 +93,7 @@ class SimulatedDevice:
 
     def start(self, wearer: VirtualWearer, delay: float = 0.0) -> None:
         """Let `wearer` start the script in `delay` s; replaces any other wearer."""
-        self._wearer, self._script_start = wearer, self.time + delay
+        self.wearer, self._script_start = wearer, self.time + delay
         self._trunk_step, self.trunk_motion = None, None
 
     def advance(self, duration: float) -> None:
@@ -193,12 +194,12 @@ class SimulatedDevice:
 
     def _steady(self, duration: float) -> bool:
         """Return whether no torque changes for `duration` s, so that MuJoCo can make all of its steps at once."""
-        is_idle = self._wearer.idle(self.time - self._script_start, duration)
+        is_idle = self.wearer.idle(self.time - self._script_start, duration)
         return is_idle and all(motor.steady for motor in self.motors)
 
     def _follow_trunk(self, elapsed: float) -> None:
         """Move the trunk, and load the hand, as the wearer's script says, `elapsed` s after its start."""
-        script = self._wearer.script
+        script = self.wearer.script
         index, since = script.at(elapsed)
         if elapsed >= 0.0 and index != self._trunk_step:
             self._trunk_step = index
@@ -224,11 +225,11 @@ class SimulatedDevice:
         at = zip(self.motors, theta, velocity, strict=True)
         torque = [motor.advance(angle, speed, count * STEP) for motor, angle, speed in at]
         elapsed = self.time - self._script_start
-        given = self._wearer.torque(elapsed, theta, velocity)
+        given = self.wearer.torque(elapsed, theta, velocity)
         self._follow_trunk(elapsed)
         if self.truth:
             damping, on = zip(*((motor.damping, motor.entered) for motor in self.motors), strict=True)
-            step = -1 if self._wearer.step is None else self._wearer.step
+            step = -1 if self.wearer.step is None else self.wearer.step
             self.truth.note(self.time, theta, velocity, torque, damping, given, self._frames, step, on)
         self.arm.step(list(map(operator.add, torque, given)), count)
         self._steps += count
