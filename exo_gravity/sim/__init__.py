@@ -7,7 +7,7 @@ in real time on any python-can bus; examples/simulated_loop.py plays it without 
 from exo_gravity.sim.arm import STEP, ArmConfig, SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu
-from exo_gravity.sim.motor import Firmware, SimulatedMotor, SimulatedV3Motor, simulated_motor
+from exo_gravity.sim.motor import Firmware, SimulatedMotor
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 __all__ = [
@@ -19,7 +19,5 @@ __all__ = [
     "SimulatedDevice",
     "SimulatedImu",
     "SimulatedMotor",
-    "SimulatedV3Motor",
     "VirtualWearer",
-    "simulated_motor",
 ]

@@ -24,7 +24,7 @@ from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, Frame
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.trial.script import IDLE
 from exo_gravity.sim.arm import STEP, SimulatedArm, felt_in_base
-from exo_gravity.sim.motor import SimulatedMotor, SimulatedV3Motor
+from exo_gravity.sim.motor import SimulatedMotor
 from exo_gravity.sim.trunk_motion import TrunkMotion, TrunkState, motion_of
 from exo_gravity.sim.truth import TruthLog
 from exo_gravity.sim.virtual_wearer import VirtualWearer
@@ -121,10 +121,11 @@ class SimulatedDevice:
 
     def status(self, joint: int) -> Frame | None:
         """Return the present status frame of a V3 board; None if it cannot send, and for other boards."""
-        motor = self.motors[joint]
-        if self.bus_silent or self.cut_off[joint] or not isinstance(motor, SimulatedV3Motor):
+        if self.bus_silent or self.cut_off[joint]:
             return None
-        return motor.status(self.arm.positions[joint] + self.encoder_error[joint], self.arm.velocities[joint])
+        return self.motors[joint].status(
+            self.arm.positions[joint] + self.encoder_error[joint], self.arm.velocities[joint]
+        )
 
     def run(
         self,

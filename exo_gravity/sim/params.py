@@ -11,7 +11,7 @@ from exo_gravity.core.params import Param, param_of, params_of
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.imu import ImuConfig
-from exo_gravity.sim.motor import Firmware, simulated_motor
+from exo_gravity.sim.motor import Firmware, SimulatedMotor
 from exo_gravity.sim.truth import TruthLog
 
 # Parameters of the arm by the field of ArmConfig that owns each of them.
@@ -61,7 +61,7 @@ def device_of(values: Mapping[str, Any]) -> SimulatedDevice:
     links = ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"], gravity=values["gravity"])
     arm = ArmConfig(links, **{field: values[name] for field, name in ARM_FIELDS.items()})
     firmware = Firmware(**{param.name: values[param.name] for param in params_of(Firmware)})
-    motors = [simulated_motor(motor, firmware) for motor in motors_of(values)]
+    motors = [SimulatedMotor(motor, firmware) for motor in motors_of(values)]
     device = SimulatedDevice(SimulatedArm(arm), motors, values["side"])
     device.pitch, device.roll = values["trunk.pitch"], values["trunk.roll"]
     if values["truth"]:

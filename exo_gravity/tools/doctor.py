@@ -321,8 +321,9 @@ def examine(nodes: Nodes, seconds: float, root: Path) -> list[Finding]:
 def show(findings: Sequence[Finding], console: "Console") -> None:
     """Print each finding, and below it the command that mends it, unwrapped."""
     heading = Finding("what", "found", "wanted")
-    what, found = (max(len(row[column]) for row in (heading, *findings)) for column in (0, 1))
-    for row in (heading, *findings):
+    rows = (heading, *findings)
+    what, found = max(len(row.what) for row in rows), max(len(row.found) for row in rows)
+    for row in rows:
         level, style = ("", "bold") if row is heading else (row.level.name.lower(), STYLES[row.level])
         line = f"{level:<7}  {row.what:<{what}}  {row.found:<{found}}  {row.wanted}"
         console.print(line, style=style, markup=False, soft_wrap=True)

@@ -157,9 +157,7 @@ def run_nodes(trial: Trial, screen: TrialScreen, stopped: Stopping) -> TrialEnd:
     return TrialEnd(f"{trouble}{recorder}", 1, busy)
 
 
-def follow(
-    screen: TrialScreen, stopped: Stopping, recorder_code: Callable[[], int | None], nodes: "Future[Any]"
-) -> str:
+def follow(screen: TrialScreen, stopped: Stopping, recorder_code: Callable[[], int | None], nodes: Future[Any]) -> str:
     """Wait until the script is done; return '' or why the wait ended earlier."""
     deadline = time.monotonic() + START_TIMEOUT + screen.script.duration
     while not stopped.wait(0.05) and not nodes.done():
