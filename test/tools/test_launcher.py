@@ -119,6 +119,13 @@ def test_two_bridges_on_the_same_bus_are_refused(refused):
     assert "must be different from the bus of /left/can_bridge: one arm per bus" in error
 
 
+def test_an_option_of_the_bus_without_an_entry_for_each_motor_is_named(refused):
+    bus = yaml.safe_load(SIM.read_text())["/right/can_bridge"]["ros__parameters"]["can"]
+    bus["options"]["bitrate"] = [500_000, 1_000_000]
+    error = refused({"/right/can_bridge": {"can": bus}})
+    assert error.startswith("launcher: /right/can_bridge can.options.bitrate = [500000, 1000000]: must be one value")
+
+
 def test_without_rclpy_one_line_says_how_to_get_it(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "rclpy", None)
     with pytest.raises(SystemExit) as ended:

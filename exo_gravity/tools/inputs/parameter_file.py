@@ -82,6 +82,12 @@ def _flat(node: str, prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
     yield prefix, value
 
 
+def can_options(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options for python-can in the parameters of a node."""
+    prefix = f"{OPTIONS}."
+    return {name.removeprefix(prefix): value for name, value in given.items() if name.startswith(prefix)}
+
+
 def stages(nodes: Iterable[str]) -> tuple[list[str], list[str], list[str]]:
     """Return the full names `nodes` in the order in which they stop: bridges, others, recorders."""
     found: tuple[list[str], list[str], list[str]] = [], [], []
@@ -94,12 +100,13 @@ def check_buses(nodes: Nodes) -> None:
     """Raise ParameterError if two bridges would command motors on the same bus, which has one owner."""
     owner: dict[tuple[tuple[str, str], ...], str] = {}
     for node in stages(nodes)[0]:
-        given = {k: v for k, v in nodes[node].items() if k.startswith("can.")}
-        options = {k: v for k, v in given.items() if k.startswith(OPTIONS)}
+        given = nodes[node]
         with named(f"{node} "):
-            buses = buses_of(str(given.get("can.channel", node)), options)
+            buses = buses_of(str(given.get("can.channel", node)), can_options(given))
         for name, (_, own) in buses.items():
-            bus = tuple(sorted((k, str(v)) for k, v in {**given, "can.channel": name, **own}.items()))
+            options = {f"{OPTIONS}.{option}": value for option, value in own.items()}
+            what = {"can.channel": name, "can.interface": given.get("can.interface"), **options}
+            bus = tuple(sorted((key, str(value)) for key, value in what.items()))
             other = owner.setdefault(bus, node)
             if other != node:
                 raise ParameterError(f"{node} can", dict(bus), f"different from the bus of {other}: one arm per bus")
