@@ -37,7 +37,7 @@ from exo_gravity.core.safety.drive import NOTHING, FaultCode
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.motion_monitor import PATIENCE
 from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, VirtualWearer, simulated_motor
+from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial, TrunkReading
 from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.sim.virtual_wearer import path_between
@@ -283,7 +283,7 @@ def arm_of(settings: Any, worn: bool, moment: Sequence[float], addition: Sequenc
     arm = SimulatedArm(ArmConfig(TRUE_ROBOT, **wearer))
     arm.reset(HANGING)
     motors = [JointMotor(MOTORS[name], number + 1) for number, name in enumerate(MOTOR_NAMES)]
-    device = SimulatedDevice(arm, [simulated_motor(motor) for motor in motors])
+    device = SimulatedDevice(arm, [SimulatedMotor(motor) for motor in motors])
     limits = Limits(JOINTS, sign_check_torque=0.0, largest_moment=moment, largest_addition=addition)
     return ArmSetup("right", device, motors, limits, settings, RATE, TrueTrunk())
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from rich.console import Console
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -20,7 +19,7 @@ from exo_gravity.tools.anfis import from_gravload, train_law
 from exo_gravity.tools.inputs.arms import configured_arm
 from exo_gravity.tools.inputs.parameter_file import packaged_config
 from exo_gravity.tools.reporting import trial_report
-from exo_gravity.tools.trials.offline import run_offline, simulated_trials
+from exo_gravity.tools.trials.offline import simulated_trials
 
 from .table import Row
 
@@ -73,10 +72,9 @@ def _offline(hold: float) -> tuple[float, float]:
     steps = [{"move": [0.1, 0.8, 0.7, 0.6], "over": 3.0}, {"hold": hold}]
     script = TrialScript.parse({"name": "bench", "steps": steps})
     params = packaged_config("sim.yaml")
-    trials = simulated_trials(params, script)
+    (trial,) = simulated_trials(params, script)
     begin = time.perf_counter()
-    recordings, *_ = run_offline(trials, Console(quiet=True), lambda: False)
-    return float(recordings[0].time[-1]), time.perf_counter() - begin
+    return float(trial.run().time[-1]), time.perf_counter() - begin
 
 
 def _recording(path: Path, seconds: int) -> Path:

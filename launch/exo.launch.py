@@ -15,15 +15,12 @@ from launch.events.process import ProcessExited, SignalProcess
 from launch.substitutions import LaunchConfiguration
 
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
-from exo_gravity.tools.inputs.parameter_file import RECOVERY_TIMEOUT, STOP_TIMEOUT, SUPERVISED, packaged_config
+from exo_gravity.tools.inputs.parameter_file import packaged_config
+from exo_gravity.tools.launcher import RECOVERY_TIMEOUT, STOP_TIMEOUT, SUPERVISED
 
 LONGEST_STOP = DESCENT_TIMEOUT + RECOVERY_TIMEOUT + 2 * STOP_TIMEOUT  # s, of the launcher
 ARGUMENTS = (  # name, default, description
-    (
-        "params",
-        str(packaged_config("sim.yaml")),
-        "parameter file: one top-level key per node; default: a simulated arm",
-    ),
+    ("params", str(packaged_config("sim.yaml")), "parameter file: a top-level key per node; default: a simulated arm"),
     ("namespace", "", "namespace in front of every node of the file, and of the topics /imu/..."),
     ("only", "", "start only the nodes whose full names match one of these shell patterns"),
     ("one_process", "false", "true: run can_bridge and compensator of an arm in one process"),
@@ -53,11 +50,9 @@ def _start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
 
     if any(word.endswith("exo.launch.py") for word in sys.argv):  # else another launch file includes this one
         _check(context.argv)
-    words = ["--params", argument("params"), "--log-level", argument("log_level")]
-    words += ["--namespace", argument("namespace")] if argument("namespace") else []
+    words = ["--params", argument("params"), "--log-level", argument("log_level"), "--namespace", argument("namespace")]
     words += ["--only", *argument("only").split()] if argument("only") else []
-    words += ["--one-process"] if argument("one_process") == "true" else []
-    words += ["--panel"] if argument("panel") == "true" else []
+    words += [f"--{name.replace('_', '-')}" for name in ("one_process", "panel") if argument(name) == "true"]
     process = ExecuteProcess(
         cmd=[sys.executable, "-c", RUN, *words],
         name="launcher",

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from exo_gravity.core.safety.drive import FaultCode
-from exo_gravity.tools.inputs.parameter_file import node_names
+from exo_gravity.tools.launcher import node_modules
 
 from .support.document_commands import DOCUMENTS, ELSEWHERE, ROOT, ROS2, commands_of, words_of
 
@@ -94,7 +94,7 @@ def test_every_command_is_one_that_exists(path: Path) -> None:
         tool, *words = words_of(command)
         if tool == "make":
             assert words[0] in rules, command
-        elif tool not in node_names():
+        elif tool not in node_modules():
             importlib.import_module(f"exo_gravity.tools.{tool}")._arguments(words)  # SystemExit if it is wrong
 
 

@@ -16,6 +16,7 @@ from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.sim import SimulatedDevice
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu
+from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 
 TURN = (0.45, 0.7)  # rad, by which a joint is moved
@@ -117,7 +118,7 @@ def write_bow(folder: Path, quaternion: np.ndarray, rng: np.random.Generator) ->
     with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connection = writer.add_connection("/imu/data_raw", kind, typestore=types)
         for row in zip(time, pitch, roll, np.gradient(pitch, time), np.gradient(roll, time), strict=True):
-            rate, force = (vector(*map(float, values)) for values in imu.sample(*row[1:]))
+            rate, force = (vector(*map(float, values)) for values in imu.sample(TrunkState(*row[1:])))
             stamp = round(float(row[0]) * 1e9)
             seconds = types.types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
             header = types.types["std_msgs/msg/Header"](stamp=seconds, frame_id="imu")

@@ -195,7 +195,7 @@ class OrdinaryArm:
 
         def take(stamp: float, arrival: float) -> None:
             self._played.catch_up()
-            rate, force = self._imu.sample_of(self.device.trunk)
+            rate, force = self._imu.sample(self.device.trunk)
             sample = ImuSample(begin + stamp, rate.tolist(), force.tolist())
             self.clock.later(begin + arrival - self.clock.monotonic(), lambda: self._arrive(sample))
             take_next()

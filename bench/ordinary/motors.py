@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.sim import SimulatedMotor, SimulatedV3Motor, simulated_motor
+from exo_gravity.sim import SimulatedMotor
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Electronics:
 
 
 class OrdinaryMotor(SimulatedMotor):
-    """A motor with a V1 or V2 board. applied: Nm, that its current loop has reached."""
+    """An ordinary motor. applied: Nm, that its current loop has reached."""
 
     def __init__(self, joint: JointMotor, electronics: Electronics) -> None:
         super().__init__(joint)
@@ -50,12 +50,6 @@ class OrdinaryMotor(SimulatedMotor):
         return super()._state(position, self._speed)
 
 
-class OrdinaryV3Motor(OrdinaryMotor, SimulatedV3Motor):
-    """A motor with a V3 board."""
-
-
 def motor_of(joint: JointMotor, electronics: Electronics | None) -> SimulatedMotor:
     """Return the motor of `joint`, an ideal one without `electronics`."""
-    if electronics is None:
-        return simulated_motor(joint)
-    return (OrdinaryMotor if joint.wire_format.replies else OrdinaryV3Motor)(joint, electronics)
+    return SimulatedMotor(joint) if electronics is None else OrdinaryMotor(joint, electronics)

@@ -28,7 +28,7 @@ from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.numbers import Vector
-from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, simulated_motor
+from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.tools.calibration.tours import moments_from, wearer_from
 from exo_gravity.tools.inputs.arms import configured_arm
@@ -76,7 +76,7 @@ class Worn:
         arm.reset(HANGING)
         firmware = Firmware(current_noise=CURRENT_NOISE)
         motors = zip(self.motors, self.scale.tolist(), strict=True)
-        true = [simulated_motor(replace(motor, torque_scale=scale), firmware) for motor, scale in motors]
+        true = [SimulatedMotor(replace(motor, torque_scale=scale), firmware) for motor, scale in motors]
         return SimulatedDevice(arm, true, self.side)
 
 

@@ -124,7 +124,7 @@ class WornImu:
         """Return the reading."""
         share = 1.0 / (RATE * TILT_TIME)
         self._drift += -share * self._drift + math.sqrt(2.0 * share) * TILT_NOISE * self._rng.standard_normal(3)
-        rate, force = map(np.asarray, self._imu.sample_of(state))
+        rate, force = map(np.asarray, self._imu.sample(state))
         force = np.linalg.norm(force) * turned(force / np.linalg.norm(force), self._mounting)
         gravity = turned(gravity_in_trunk(state.pitch, state.roll), self._mounting + self._drift)
         self.log.append((now, *rate, *(-force / STANDARD_GRAVITY)))

@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -10,100 +10,71 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.bag import content
-from exo_gravity.bag.content import COMMANDS, JOINT_STATE, PARAMETERS, SESSION, STATES, STEPS, STRING, Event
+from exo_gravity.bag.content import JOINT_STATE, STRING, Event
 from exo_gravity.bag.joints import TYPES
 from exo_gravity.bag.writer import BagWriter, Message, offered_qos
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trial.recording import Recording
 from exo_gravity.core.trial.session import Session
 
-
-class _Simulated:
-    """Messages of simulated arms. start: ns since 1970, of their time 0."""
-
-    def __init__(self, start: int) -> None:
-        self._start = start
-        self._made: dict[str, Any] = TYPES.types
-        self._messages: list[tuple[str, float, str, object]] = []  # topic, s, type, message
-
-    def add_text(self, topic: str, now: float, text: str) -> None:
-        """Add a text at `now` s."""
-        self._messages.append((topic, now, STRING, self._made[STRING](text)))
-
-    def add_status(self, now: float, level: int, name: str, text: str, **values: str) -> None:
-        """Add the status of a node at `now` s."""
-        made = self._made
-        pairs = [made["diagnostic_msgs/msg/KeyValue"](*pair) for pair in values.items()]
-        status = made["diagnostic_msgs/msg/DiagnosticStatus"](level, name, text, "", pairs)
-        kind = content.READ[content.DIAGNOSTICS]
-        self._messages.append((content.DIAGNOSTICS, now, kind, made[kind](self._header(now), [status])))
-
-    def add_arm(self, arm: Recording) -> None:
-        """Add the states of an arm and its bridge, the commands, and the steps of the script."""
-        for begin, end in arm.carried or ():
-            for now in (begin, end):
-                self._add_state(arm, now, State.ACTIVE)
-        self._add_state(arm, float(arm.time[-1]), State.DISABLED)
-        for index, step in enumerate(arm.steps):
-            text = json.dumps({"step": index, "action": step.action, "duration": step.end - step.start})
-            self.add_text(f"/{arm.name}/{STEPS}", step.start, text)
-        measured = (np.asarray(column, float) for column in (arm.position, arm.velocity, arm.effort, arm.command))
-        last, none = float(arm.time[0]), np.empty(0)
-        for now, position, velocity, effort, command in zip(arm.time.tolist(), *measured, strict=True):
-            if now > last:  # the command in force answers the joint state before
-                self._add_joints(arm, COMMANDS, last, none, none, none if np.isnan(command).any() else command)
-            self._add_joints(arm, STATES, now, position, velocity, effort)
-            last = now
-
-    def topics(self) -> dict[str, str]:
-        """Return the type of each topic."""
-        return {topic: kind for topic, _, kind, _ in self._messages}
-
-    def serialised(self) -> list[Message]:
-        """Return all messages in the order of their times."""
-        self._messages.sort(key=lambda message: message[1])
-        serialise = TYPES.serialize_cdr
-        return [(topic, self._at(now), bytes(serialise(message, kind))) for topic, now, kind, message in self._messages]
-
-    def _add_state(self, arm: Recording, now: float, state: State) -> None:
-        self.add_status(now, 0, f"{arm.name}/can_bridge", state.value, state=state.value)
-
-    def _add_joints(self, arm: Recording, topic: str, now: float, *values: np.ndarray) -> None:
-        message = self._made[JOINT_STATE](self._header(now), list(arm.joint_names), *values)
-        self._messages.append((f"/{arm.name}/{topic}", now, JOINT_STATE, message))
-
-    def _header(self, now: float) -> object:
-        time_of = self._made["builtin_interfaces/msg/Time"](*divmod(self._at(now), 10**9))
-        return self._made["std_msgs/msg/Header"](time_of, "")
-
-    def _at(self, now: float) -> int:
-        return self._start + round(now * 1e9)
+STATUS = content.READ[content.DIAGNOSTICS]
+Unsent = tuple[str, float, str, tuple[Any, ...]]  # topic, s, type, and the message's fields after its header, if any
 
 
 def write_recordings(
-    path: Path,
-    recordings: Sequence[Recording],
-    events: Iterable[Event],
-    parameters: Mapping[str, str],
-    session: Session,
+    path: Path, arms: Sequence[Recording], events: Iterable[Event], parameters: Mapping[str, str], session: Session
 ) -> None:
     """Write simulated arms to a new recording `path`, as `recorder` writes real ones; time 0 is now.
 
     events: what went wrong. parameters: YAML text by node. Raises DataError if it cannot be written.
     """
-    simulated = _Simulated(time.time_ns())
-    for text in parameters.values():
-        simulated.add_text(PARAMETERS, 0.0, text)
-    simulated.add_text(SESSION, 0.0, json.dumps(asdict(session)))
-    for now, text, _ in events:
-        name, _, what = text.partition(": ")
-        simulated.add_status(now, 1, name, what)
-    for arm in recordings:
-        simulated.add_arm(arm)
+    start = time.time_ns()
+    messages: list[Unsent] = [
+        *((content.PARAMETERS, 0.0, STRING, (text,)) for text in parameters.values()),
+        (content.SESSION, 0.0, STRING, (json.dumps(asdict(session)),)),
+        *(_status(now, 1, *text.split(": ", 1)) for now, text, _ in events),
+        *(message for arm in arms for message in _of_arm(arm)),
+    ]
+    messages.sort(key=lambda message: message[1])
     writer = BagWriter(path)
-    for topic, kind in simulated.topics().items():
-        writer.add_topic(topic, kind, offered_qos(True, topic in (PARAMETERS, SESSION), 1))
-    writer.write(simulated.serialised())
+    for topic, kind in {topic: kind for topic, _, kind, _ in messages}.items():
+        writer.add_topic(topic, kind, offered_qos(True, topic in (content.PARAMETERS, content.SESSION), 1))
+    writer.write([_serialised(start, *message) for message in messages])
     writer.close()
     if writer.error:
         raise writer.error
+
+
+def _of_arm(arm: Recording) -> Iterator[Unsent]:
+    """Yield the states of an arm and its bridge, the commands, and the steps of the script."""
+    carried = [(now, State.ACTIVE) for span in arm.carried or () for now in span]
+    for now, state in (*carried, (float(arm.time[-1]), State.DISABLED)):
+        yield _status(now, 0, f"{arm.name}/can_bridge", state.value, state=state.value)
+    for index, step in enumerate(arm.steps):
+        text = json.dumps({"step": index, "action": step.action, "duration": step.end - step.start})
+        yield f"/{arm.name}/{content.STEPS}", step.start, STRING, (text,)
+    names, none, last = list(arm.joint_names), np.empty(0), float(arm.time[0])
+    measured = (np.asarray(column, float) for column in (arm.position, arm.velocity, arm.effort, arm.command))
+    for now, position, velocity, effort, command in zip(arm.time.tolist(), *measured, strict=True):
+        if now > last:  # the command in force answers the joint state before
+            wanted = none if np.isnan(command).any() else command
+            yield f"/{arm.name}/{content.COMMANDS}", last, JOINT_STATE, (names, none, none, wanted)
+        yield f"/{arm.name}/{content.STATES}", now, JOINT_STATE, (names, position, velocity, effort)
+        last = now
+
+
+def _status(now: float, level: int, name: str, text: str, **values: str) -> Unsent:
+    """Return the status of a node at `now` s."""
+    pairs = [TYPES.types["diagnostic_msgs/msg/KeyValue"](*pair) for pair in values.items()]
+    status = TYPES.types["diagnostic_msgs/msg/DiagnosticStatus"](level, name, text, "", pairs)
+    return content.DIAGNOSTICS, now, STATUS, ([status],)
+
+
+def _serialised(start: int, topic: str, now: float, kind: str, fields: tuple[Any, ...]) -> Message:
+    """Return a message of `now` s with its header. start: ns since 1970, of time 0."""
+    made: dict[str, Any] = TYPES.types
+    at = start + round(now * 1e9)
+    if kind != STRING:
+        stamp = made["builtin_interfaces/msg/Time"](*divmod(at, 10**9))
+        fields = (made["std_msgs/msg/Header"](stamp, ""), *fields)
+    return topic, at, bytes(TYPES.serialize_cdr(made[kind](*fields), kind))

@@ -10,6 +10,7 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
@@ -59,7 +60,6 @@ class Simulator(Node):
         if script := script_of(values["trial"]):
             self._next.append((script, values["trial_delay"]))
         self._trunk_target = (values["trunk.pitch"], values["trunk.roll"])
-        self._wearer: VirtualWearer | None = None
         self._published_step: int | None = None
         self._diagnostics = Diagnostics(self)
         self._step_publisher = self.create_publisher(String, "wearer_step", LATCHED)
@@ -110,17 +110,13 @@ class Simulator(Node):
         if device.trunk_motion:  # by the script: the trunk stays where that leaves it
             self._trunk_target = state.pitch, state.roll
         else:
-            pitch_step, roll_step = (
-                max(-largest, min(largest, target - present))
-                for target, present in zip(self._trunk_target, (device.pitch, device.roll), strict=True)
-            )
-            device.pitch += pitch_step
-            device.roll += roll_step
-            rates = pitch_step / self._trunk_period, roll_step / self._trunk_period
-            state = TrunkState(device.pitch, device.roll, *rates)
+            away = np.subtract(self._trunk_target, (device.pitch, device.roll))
+            bow, lean = np.clip(away, -largest, largest).tolist()
+            device.pitch, device.roll = device.pitch + bow, device.roll + lean
+            state = TrunkState(device.pitch, device.roll, bow / self._trunk_period, lean / self._trunk_period)
         if self._imu_publisher:
             time = self.get_clock().now().nanoseconds * 1e-9
-            sample = ImuSample(time, *(vector.tolist() for vector in self._imu.sample_of(state)))
+            sample = ImuSample(time, *(vector.tolist() for vector in self._imu.sample(state)))
             self._imu_publisher.publish(message_of(sample))
 
     def _follow_wearer(self) -> None:
@@ -128,11 +124,11 @@ class Simulator(Node):
         device = self._device
         while self._next and (self._next[0][1] is None or all(motor.entered for motor in device.motors)):
             script, delay = self._next.popleft()
-            self._wearer, self._published_step = VirtualWearer(script), None
-            device.start(self._wearer, delay or 0.0)
-        if self._wearer is None or self._wearer.step is None or self._wearer.step == self._published_step:
+            device.start(VirtualWearer(script), delay or 0.0)
+            self._published_step = None
+        number, steps = device.wearer.step, device.wearer.script.steps
+        if number is None or number == self._published_step:
             return
-        number, steps = self._wearer.step, self._wearer.script.steps
         self._published_step = number
         step = steps[number] if number < len(steps) else Step("done", 0.0)
         content = {"step": number, "of": len(steps), "action": step.action, "duration": step.duration}

@@ -26,10 +26,11 @@ import numpy as np
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import MAX_LENGTH, MAX_MASS, NO_PAYLOAD, ArmModel
 from exo_gravity.core.model.gravity import MAX_OFFSET
+from exo_gravity.core.model.rotation import ZERO, Floats3
 from exo_gravity.core.model.tilt import gravity_in_trunk
 from exo_gravity.core.numbers import JOINT_COUNT, four_floats
 from exo_gravity.core.params import check_owned, owned
-from exo_gravity.sim.trunk_motion import TrunkState, Vector
+from exo_gravity.sim.trunk_motion import TrunkState
 
 STEP = 0.001  # s
 
@@ -39,8 +40,7 @@ _TUBE_RADIUS = 0.03  # m; each link has the inertia of a thin carbon tube
 _MIN_MASS = 0.001  # kg; MuJoCo cannot simulate a massless link
 _STOPS = (-math.pi, math.pi)  # rad
 _BESIDE = (-MAX_OFFSET, MAX_OFFSET)  # m
-_ZERO = (0.0,) * JOINT_COUNT
-_STILL = (0.0, 0.0, 0.0)
+_ZEROS = (0.0,) * JOINT_COUNT
 
 # The paper's lengths. Each link carries the motor of the next joint at its far end (AK80-9 0.485 kg, AK60-6 0.368 kg,
 # published motor tables) and 0.1 to 0.25 kg of carbon tube, bracket and cuff.
@@ -64,8 +64,8 @@ class ArmConfig:
 
     links: ArmModel = DEFAULT_LINKS
     #: The passive arm of a wearer: the upper arm on link 3, forearm and hand on link 4.
-    wearer_mass: Sequence[float] = owned(_ZERO, "mass of the wearer's passive arm on each link", (0.0, MAX_MASS), "kg")
-    wearer_cog: Sequence[float] = owned(_ZERO, "its centre of gravity from joint n", (0.0, MAX_LENGTH), "m")
+    wearer_mass: Sequence[float] = owned(_ZEROS, "mass of the wearer's passive arm on each link", (0.0, MAX_MASS), "kg")
+    wearer_cog: Sequence[float] = owned(_ZEROS, "its centre of gravity from joint n", (0.0, MAX_LENGTH), "m")
     #: 243.5 and 607 g cm^2 (published motor tables) times the gear ratio squared.
     rotor_inertia: Sequence[float] = owned(
         (8.8e-4, 4.9e-3, 8.8e-4, 8.8e-4), "rotor inertia at the gear's output", (0.0, 1.0), "kg m^2"
@@ -74,11 +74,11 @@ class ArmConfig:
     coulomb_friction: Sequence[float] = owned((0.2, 0.4, 0.2, 0.2), "Coulomb friction", (0.0, 10.0), "Nm")
     viscous_friction: Sequence[float] = owned((0.02, 0.05, 0.02, 0.02), "viscous friction", (0.0, 10.0), "Nm s/rad")
     #: On top at standstill; it fades with speed v as exp(-(v / stribeck_speed)^2).
-    stribeck_friction: Sequence[float] = owned(_ZERO, "friction at standstill beyond Coulomb's", (0.0, 10.0), "Nm")
+    stribeck_friction: Sequence[float] = owned(_ZEROS, "friction at standstill beyond Coulomb's", (0.0, 10.0), "Nm")
     stribeck_speed: Sequence[float] = owned((0.05,) * 4, "speed at which it fades", (0.001, 10.0), "rad/s")
     #: Beside the link in the frames of Table 1.
-    cog_y: Sequence[float] = owned(_ZERO, "true centre of gravity beside link n, along y_n", _BESIDE, "m")
-    cog_z: Sequence[float] = owned(_ZERO, "true centre of gravity beside link n, along z_n", _BESIDE, "m")
+    cog_y: Sequence[float] = owned(_ZEROS, "true centre of gravity beside link n, along y_n", _BESIDE, "m")
+    cog_z: Sequence[float] = owned(_ZEROS, "true centre of gravity beside link n, along z_n", _BESIDE, "m")
     #: The paper's motor mounts turn 190 degrees.
     position_min: Sequence[float] = owned(_radians(-95.0, -10.0, -45.0, -10.0), "lower joint stops", _STOPS, "rad")
     position_max: Sequence[float] = owned(_radians(95.0, 180.0, 145.0, 180.0), "upper joint stops", _STOPS, "rad")
@@ -91,12 +91,11 @@ class ArmConfig:
         if np.any(np.greater(self.wearer_cog, self.links.length)):
             raise ParameterError("wearer_cog", self.wearer_cog, f"at most length = {self.links.length.tolist()} m")
         if np.any(np.greater_equal(self.position_min, self.position_max)):
-            raise ParameterError(
-                "position_min", self.position_min, f"below position_max = {list(self.position_max)} rad"
-            )
+            expected = f"below position_max = {list(self.position_max)} rad"
+            raise ParameterError("position_min", self.position_min, expected)
 
 
-def in_base(side: str, vector: Sequence[float], turning: bool = False) -> Vector:
+def in_base(side: str, vector: Sequence[float], turning: bool = False) -> Floats3:
     """Return a vector (3,) of the trunk's axes in the base frame of the `side` arm, of which the right is a mirror.
 
     turning: whether it is an angular velocity or acceleration, which a mirror reverses.
@@ -107,7 +106,7 @@ def in_base(side: str, vector: Sequence[float], turning: bool = False) -> Vector
     return (y, -x, z) if turning else (-y, x, -z)
 
 
-def felt_in_base(side: str, state: TrunkState, gravity: float) -> tuple[Vector, Vector, Vector]:
+def felt_in_base(side: str, state: TrunkState, gravity: float) -> tuple[Floats3, Floats3, Floats3]:
     """Return what the `side` arm's base feels, each (3,) in its frame, as for `SimulatedArm.move_base`.
 
     Gravity less acceleration in m/s^2, angular velocity in rad/s, angular acceleration in rad/s^2. gravity: m/s^2.
@@ -130,9 +129,9 @@ class SimulatedArm:
             np.array, (self.config.coulomb_friction, self.config.stribeck_friction, self.config.stribeck_speed)
         )
         self.move_base((0.0, 0.0, self.config.links.gravity))
-        self.reset((0.0,) * JOINT_COUNT)
+        self.reset(_ZEROS)
 
-    def carry(self, mass: float, cog: Sequence[float] = _STILL) -> None:
+    def carry(self, mass: float, cog: Sequence[float] = ZERO) -> None:
         """Have a point of `mass` kg in the hand from now on, at `cog` (3,) m in frame 4; 0 for none.
 
         A joint's motion goes on as it is: what is taken moves along, and what is dropped is gone.
@@ -175,8 +174,8 @@ class SimulatedArm:
     def move_base(
         self,
         gravity: Sequence[float],
-        angular_velocity: Sequence[float] = _STILL,
-        angular_acceleration: Sequence[float] = _STILL,
+        angular_velocity: Sequence[float] = ZERO,
+        angular_acceleration: Sequence[float] = ZERO,
     ) -> None:
         """Set how the base moves from now on; every vector is (3,) in the base's own frame.
 

@@ -20,12 +20,11 @@ from collections.abc import Callable, Sequence
 import can
 
 from exo_gravity.core.errors import BusError, ParameterError
-from exo_gravity.core.model.gravity import NO_TORQUE, Torque
 from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, Frame
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.core.trial.script import IDLE
 from exo_gravity.sim.arm import STEP, SimulatedArm, felt_in_base
-from exo_gravity.sim.motor import SimulatedMotor, SimulatedV3Motor
+from exo_gravity.sim.motor import SimulatedMotor
 from exo_gravity.sim.trunk_motion import TrunkMotion, TrunkState, motion_of
 from exo_gravity.sim.truth import TruthLog
 from exo_gravity.sim.virtual_wearer import VirtualWearer
@@ -39,37 +38,31 @@ TURN = 0.0005  # s for which one of several buses is awaited that cannot be awai
 class SimulatedDevice:
     """An arm with four motors, on a trunk that moves, and optionally a wearer who moves both.
 
-    motors: shoulder to elbow, with different CAN IDs. side: 'left' or 'right'.
-
-    May be set from any thread: `pitch` and `roll` of the trunk in rad; `bus_silent` (frames pass in neither direction,
-    and the motors keep their last commands); `cut_off`, the same for each motor (4,); `encoder_error` (4,) rad, added
-    to the angle that a motor reads; and the faults of each motor. truth: receives every physics step, None for no log.
-    To be read: `time`, s simulated; `slip`, s that `run` has lost against real time; and in s since the motors were
-    switched on, `longest_stall` between two passes of `run`, `longest_silence` in which no command arrived.
+    motors: shoulder to elbow, with different CAN IDs. side: 'left' or 'right'. The trunk's tilt and the faults, also
+    those of each motor, may be set from any thread.
     """
 
     def __init__(self, arm: SimulatedArm, motors: Sequence[SimulatedMotor], side: str = "right") -> None:
         ids = [motor.joint.can_id for motor in motors]
         if len(ids) != JOINT_COUNT or len(set(ids)) != JOINT_COUNT:
             raise ParameterError("can_id", ids, f"{JOINT_COUNT} different IDs, one per joint")
-        self.arm = arm
-        self.motors = tuple(motors)
-        self.side = side
-        self.pitch = 0.0
-        self.roll = 0.0
-        self.bus_silent = False
-        self.cut_off: Sequence[bool] = (False,) * JOINT_COUNT
-        self.encoder_error: Sequence[float] = (0.0,) * JOINT_COUNT
-        self.truth: TruthLog | None = None
-        self.slip = 0.0
+        self.arm, self.motors, self.side = arm, tuple(motors), side
+        self.pitch = self.roll = 0.0  #: rad, of the trunk
+        self.bus_silent = False  #: frames pass in neither direction, and the motors keep their last commands
+        self.cut_off: Sequence[bool] = (False,) * JOINT_COUNT  #: the same for each motor
+        self.encoder_error: Sequence[float] = (0.0,) * JOINT_COUNT  #: rad, added to the angle that a motor reads
+        self.truth: TruthLog | None = None  #: receives every physics step
+        self.slip = 0.0  #: s that `run` has lost against real time
+        #: s since the motors were switched on, between two passes of `run`, and in which no command arrived
         self.longest_stall = self.longest_silence = 0.0
+        self.trunk_motion: TrunkMotion | None = None  #: of the wearer's current step; None if that moves no trunk
         self._joint_of_id = {can_id: joint for joint, motor in enumerate(motors) for can_id in motor.received_ids}
         self._random = random.Random(0)  # of the delays of replies
         self._steps = 0
         self._clock = 0.0  # s elapsed, of which `time` is the part in whole steps
-        self._trial: tuple[VirtualWearer, float] | None = None  # the wearer, and the time at which the script starts
-        self.trunk_motion: TrunkMotion | None = None  #: of the wearer's current step; None if that moves no trunk
-        self._trunk_step: int | None = None  # the step that it belongs to
+        self.wearer = VirtualWearer(IDLE)  #: who performs a script, none at first
+        self._script_start = math.inf  # simulated s
+        self._trunk_step: int | None = None  # the step that `trunk_motion` belongs to
         self._base = TrunkState()  # the arm's base moves like this
         self._frames = [0] * JOINT_COUNT  # received by each motor
         self._power_returns = math.inf  # simulated s
@@ -100,7 +93,8 @@ class SimulatedDevice:
 
     def start(self, wearer: VirtualWearer, delay: float = 0.0) -> None:
         """Let `wearer` start the script in `delay` s; replaces any other wearer."""
-        self._trial, self._trunk_step, self.trunk_motion = (wearer, self.time + delay), None, None
+        self.wearer, self._script_start = wearer, self.time + delay
+        self._trunk_step, self.trunk_motion = None, None
 
     def advance(self, duration: float) -> None:
         """Advance by `duration` s in whole steps; a remainder is kept for the next call."""
@@ -127,10 +121,11 @@ class SimulatedDevice:
 
     def status(self, joint: int) -> Frame | None:
         """Return the present status frame of a V3 board; None if it cannot send, and for other boards."""
-        motor = self.motors[joint]
-        if self.bus_silent or self.cut_off[joint] or not isinstance(motor, SimulatedV3Motor):
+        if self.bus_silent or self.cut_off[joint]:
             return None
-        return motor.status(self.arm.positions[joint] + self.encoder_error[joint], self.arm.velocities[joint])
+        return self.motors[joint].status(
+            self.arm.positions[joint] + self.encoder_error[joint], self.arm.velocities[joint]
+        )
 
     def run(
         self,
@@ -148,8 +143,8 @@ class SimulatedDevice:
         outbox: list[tuple[float, int, Frame]] = []  # a heap of replies: when due, joint, frame
         last = heard = time.monotonic()
         was_on = False
-        boards = {joint: motor for joint, motor in enumerate(self.motors) if isinstance(motor, SimulatedV3Motor)}
-        periods = {joint: 1.0 / motor.firmware.status_rate for joint, motor in boards.items()}
+        reporting = [joint for joint, motor in enumerate(self.motors) if not motor.joint.wire_format.replies]
+        periods = {joint: 1.0 / self.motors[joint].firmware.status_rate for joint in reporting}  # of V3 boards, s
         reports = {joint: last + self._random.uniform(0.0, period) for joint, period in periods.items()}  # next
         while not should_stop():
             due = min(last + IDLE_PERIOD, *reports.values(), outbox[0][0] if outbox else math.inf)
@@ -200,12 +195,12 @@ class SimulatedDevice:
 
     def _steady(self, duration: float) -> bool:
         """Return whether no torque changes for `duration` s, so that MuJoCo can make all of its steps at once."""
-        if self._trial is not None and not self._trial[0].idle(self.time - self._trial[1], duration):
-            return False
-        return all(motor.steady for motor in self.motors)
+        is_idle = self.wearer.idle(self.time - self._script_start, duration)
+        return is_idle and all(motor.steady for motor in self.motors)
 
-    def _follow_trunk(self, script: TrialScript, elapsed: float) -> None:
+    def _follow_trunk(self, elapsed: float) -> None:
         """Move the trunk, and load the hand, as the wearer's script says, `elapsed` s after its start."""
+        script = self.wearer.script
         index, since = script.at(elapsed)
         if elapsed >= 0.0 and index != self._trunk_step:
             self._trunk_step = index
@@ -230,16 +225,13 @@ class SimulatedDevice:
                 motor.unplugged = False
         at = zip(self.motors, theta, velocity, strict=True)
         torque = [motor.advance(angle, speed, count * STEP) for motor, angle, speed in at]
-        given: Torque = NO_TORQUE
-        step = None
-        if self._trial is not None:
-            wearer, start = self._trial
-            given, step = wearer.torque(self.time - start, theta, velocity), wearer.step
-            self._follow_trunk(wearer.script, self.time - start)
+        elapsed = self.time - self._script_start
+        given = self.wearer.torque(elapsed, theta, velocity)
+        self._follow_trunk(elapsed)
         if self.truth:
             damping, on = zip(*((motor.damping, motor.entered) for motor in self.motors), strict=True)
-            number = -1 if step is None else step
-            self.truth.note(self.time, theta, velocity, torque, damping, given, self._frames, number, on)
+            step = -1 if self.wearer.step is None else self.wearer.step
+            self.truth.note(self.time, theta, velocity, torque, damping, given, self._frames, step, on)
         self.arm.step(list(map(operator.add, torque, given)), count)
         self._steps += count
 

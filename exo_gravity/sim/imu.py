@@ -70,11 +70,7 @@ class SimulatedImu:
         # True readings, the newest last: as many as the delay spans.
         self._past: deque[np.ndarray] = deque(maxlen=math.ceil(config.delay * config.rate) + 1)
 
-    def sample(self, pitch: float, roll: float, pitch_rate: float = 0.0, roll_rate: float = 0.0) -> Sample:
-        """Return a sample of a trunk that turns steadily: pitch, roll in rad (REP-103), pitch_rate, roll_rate rad/s."""
-        return self.sample_of(TrunkState(pitch, roll, pitch_rate, roll_rate))
-
-    def sample_of(self, state: TrunkState) -> Sample:
+    def sample(self, state: TrunkState) -> Sample:
         """Return angular velocity (3,) in rad/s and acceleration (3,) in m/s^2, both in the IMU's axes."""
         self._past.append(self._readings(state))
         self._bias += self._errors(*self._walk)
@@ -109,5 +105,5 @@ def measured_tilt(
     pitch, roll: the true ones, rad. rotation_trunk_from_imu: the mounting that the controller assumes.
     """
     rotation = rotation_matrix(rotation_trunk_from_imu, "rotation_trunk_from_imu")
-    force = np.mean([imu.sample(pitch, roll)[1] for _ in range(AVERAGED_SAMPLES)], axis=0)
+    force = np.mean([imu.sample(TrunkState(pitch, roll))[1] for _ in range(AVERAGED_SAMPLES)], axis=0)
     return pitch_roll(-rotation @ force)

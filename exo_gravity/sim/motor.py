@@ -43,24 +43,24 @@ class Firmware:
 
 
 class SimulatedMotor:
-    """One motor on one joint.
+    """One motor on one joint, with a board that speaks the joint's wire format. The faults may be set at any time.
 
-    joint: the true mounting and scale of the motor, from which the controller's parameters may differ. Faults that may
-    be set at any time: `unplugged` (no power: no torque, no replies, and only the zero is remembered), `temperature`
-    (degC) and `error` (a code of MOTOR_ERRORS, reported only). entered: whether the motor is on, after ENTER and before
-    EXIT.
+    joint: the true mounting and scale of the motor, from which the controller's parameters may differ.
     """
 
     def __init__(self, joint: JointMotor, firmware: Firmware | None = None) -> None:
         self.joint = joint
         self.firmware = firmware or Firmware()
-        #: Arbitration IDs of the replies, and of the frames that the motor obeys.
+        #: Arbitration IDs of replies or status frames, and of the frames that the motor obeys.
         self.reply_id = MASTER_ID if self.firmware.reply_to_master else joint.can_id
-        self.received_ids: tuple[int, ...] = (joint.can_id,)
-        self.unplugged = False
-        self.temperature = 30.0
-        self.error = 0
-        self.entered = False
+        self.received_ids: tuple[int, ...] = (joint.command_id,)
+        if not joint.wire_format.replies:
+            self.reply_id = MIT_V3.status_id(joint.can_id)
+            self.received_ids = joint.command_id, EXTENDED | MODE_CURRENT << 8 | joint.can_id
+        self.unplugged = False  #: a fault: no power, no torque, no replies, and only the zero is remembered
+        self.temperature = 30.0  #: degC
+        self.error = 0  #: a code of MOTOR_ERRORS, reported only
+        self.entered = False  #: the motor is on, after ENTER and before EXIT
         self._command, self._data = _NO_COMMAND, b""
         self._silent_until = -math.inf  # s, after SET_ZERO
         self._random = random.Random(joint.can_id)
@@ -81,9 +81,14 @@ class SimulatedMotor:
         """Execute the frame `data` and return the bytes of the reply, or None if the motor does not reply.
 
         position, velocity: of the joint, rad and rad/s. now: simulated time in s, for the silence after SET_ZERO.
-        frame_id: arbitration ID, one of `received_ids`.
+        frame_id: arbitration ID, one of `received_ids`; by default that of a command.
         """
-        if self.unplugged or now < self._silent_until or len(data) != 8:
+        if self.unplugged or now < self._silent_until:
+            return None
+        if not self.joint.wire_format.replies:
+            self._receive_v3(data, frame_id)
+            return None
+        if len(data) != 8:
             return None
         if data == SET_ZERO:
             self.joint = replace(self.joint, zero=-self.joint.direction * position)
@@ -96,6 +101,25 @@ class SimulatedMotor:
         elif data != self._data:  # an arm at rest gets the same command in every cycle
             self._command, self._data = unpack_command(self.joint.spec, data), data
         return self._state(position, velocity)
+
+    def _receive_v3(self, data: bytes, frame_id: int | None) -> None:
+        if frame_id == self.received_ids[1]:
+            if len(data) == 4:
+                current = int.from_bytes(data, "big", signed=True) / 1000.0
+                self._command = MotorCommand(0.0, 0.0, 0.0, 0.0, current * self.joint.spec.torque_per_ampere)
+                self.entered = current != 0.0
+        elif len(data) == 8:
+            self._command = MIT_V3.unpack_command(self.joint.spec, data)
+            self.entered = True
+
+    def status(self, position: float, velocity: float) -> Frame | None:
+        """Return the status frame of a V3 board at `position` rad and `velocity` rad/s; None without power.
+
+        None of other boards, which send nothing by themselves.
+        """
+        if self.unplugged or self.joint.wire_format.replies:
+            return None
+        return self.reply_id, self._state(position, velocity)
 
     def advance(self, position: float, velocity: float, dt: float) -> float:
         """Let `dt` s pass for the motor on a joint at `position` rad and `velocity` rad/s; return its torque in Nm."""
@@ -137,39 +161,3 @@ class SimulatedMotor:
 def clamp(value: float, limit: float) -> float:
     """Return `value` within -`limit`..`limit`."""
     return value if -limit <= value <= limit else math.copysign(limit, value)
-
-
-class SimulatedV3Motor(SimulatedMotor):
-    """One motor with a V3 board; attributes and faults like `SimulatedMotor`."""
-
-    def __init__(self, joint: JointMotor, firmware: Firmware | None = None) -> None:
-        super().__init__(joint, firmware)
-        self._current_id = EXTENDED | MODE_CURRENT << 8 | joint.can_id
-        self.received_ids = self.joint.command_id, self._current_id
-
-    def receive(
-        self, data: bytes, position: float, velocity: float, now: float, frame_id: int | None = None
-    ) -> bytes | None:
-        """Execute the frame; frame_id: by default that of a command in MIT mode. Returns None: there is no reply."""
-        if self.unplugged:
-            return None
-        if frame_id == self._current_id:
-            if len(data) == 4:
-                current = int.from_bytes(data, "big", signed=True) / 1000.0
-                self._command = MotorCommand(0.0, 0.0, 0.0, 0.0, current * self.joint.spec.torque_per_ampere)
-                self.entered = current != 0.0
-        elif len(data) == 8:
-            self._command = MIT_V3.unpack_command(self.joint.spec, data)
-            self.entered = True
-        return None
-
-    def status(self, position: float, velocity: float) -> Frame | None:
-        """Return the status frame of the joint at `position` rad and `velocity` rad/s; None without power."""
-        if self.unplugged:
-            return None
-        return MIT_V3.status_id(self.joint.can_id), self._state(position, velocity)
-
-
-def simulated_motor(joint: JointMotor, firmware: Firmware | None = None) -> SimulatedMotor:
-    """Return the motor with the board that speaks the wire format of `joint`."""
-    return (SimulatedMotor if joint.wire_format.replies else SimulatedV3Motor)(joint, firmware)

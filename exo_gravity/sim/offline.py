@@ -70,10 +70,7 @@ class ArmSetup:
 
 
 class OfflineTrial:
-    """One arm, its controller, and a wearer who performs a script once, `delay` s after the motors are switched on.
-
-    events: (s, text) of everything that went wrong. trouble: why the trial ended before the script, or ''.
-    """
+    """One arm, its controller, and a wearer who performs a script once, `delay` s after the motors are switched on."""
 
     def __init__(
         self,
@@ -83,11 +80,9 @@ class OfflineTrial:
         compensator: Compensator | None = None,
         wearer: VirtualWearer | None = None,
     ) -> None:
-        self.arm = arm
-        self.script = script
-        self.events: list[tuple[float, str]] = []
-        self.trouble = ""
-        self.wearer = wearer or VirtualWearer(script)
+        self.arm, self.script, self.wearer = arm, script, wearer or VirtualWearer(script)
+        self.events: list[tuple[float, str]] = []  #: s and text of everything that went wrong
+        self.trouble = ""  #: why the trial ended before the script, or ''
         self._delay = delay
         self._start = math.inf  # s, of the script
         self._carried: tuple[Span, ...] = ()  # from the first to the last time at which the motors carried the arm

@@ -7,11 +7,11 @@ from typing import Any
 from exo_gravity.core.model.arm import MAX_GRAVITY, MAX_LENGTH, MAX_MASS, STANDARD_GRAVITY, ArmModel
 from exo_gravity.core.model.tilt import SIDES
 from exo_gravity.core.motors.joint_motor import MOTOR_PARAMETERS, motors_of
-from exo_gravity.core.params import Param, param_of
+from exo_gravity.core.params import Param, param_of, params_of
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.imu import ImuConfig
-from exo_gravity.sim.motor import Firmware, simulated_motor
+from exo_gravity.sim.motor import Firmware, SimulatedMotor
 from exo_gravity.sim.truth import TruthLog
 
 # Parameters of the arm by the field of ArmConfig that owns each of them.
@@ -33,9 +33,7 @@ _LENGTH, _MASS, _COG = (a.tolist() for a in (DEFAULT_LINKS.length, DEFAULT_LINKS
 SIMULATOR = (
     Param("side", "right", "which arm; the right arm mirrors the left", choices=SIDES, fixed=True),
     *MOTOR_PARAMETERS,
-    param_of(Firmware, "reply_to_master", fixed=True),
-    param_of(Firmware, "reply_length", fixed=True),
-    param_of(Firmware, "current_noise", fixed=True),
+    *params_of(Firmware, fixed=True),
     Param("gravity", STANDARD_GRAVITY, "acceleration of gravity", (0.0, MAX_GRAVITY), "m/s^2", fixed=True),
     Param("link_length", _LENGTH, "true link lengths", (0.0, MAX_LENGTH), "m", fixed=True),
     Param("robot.mass", _MASS, "true link masses", (0.0, MAX_MASS), "kg", fixed=True),
@@ -62,8 +60,8 @@ def device_of(values: Mapping[str, Any]) -> SimulatedDevice:
     """Return the device that parameter values describe, with its trunk tilted. Raises ParameterError."""
     links = ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"], gravity=values["gravity"])
     arm = ArmConfig(links, **{field: values[name] for field, name in ARM_FIELDS.items()})
-    firmware = Firmware(values["reply_to_master"], values["reply_length"], current_noise=values["current_noise"])
-    motors = [simulated_motor(motor, firmware) for motor in motors_of(values)]
+    firmware = Firmware(**{param.name: values[param.name] for param in params_of(Firmware)})
+    motors = [SimulatedMotor(motor, firmware) for motor in motors_of(values)]
     device = SimulatedDevice(SimulatedArm(arm), motors, values["side"])
     device.pitch, device.roll = values["trunk.pitch"], values["trunk.roll"]
     if values["truth"]:

@@ -10,14 +10,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.rotation import acceleration_of
+from exo_gravity.core.model.rotation import ZERO, Floats3, acceleration_of
 from exo_gravity.core.trial.script import Step
 
-Vector = tuple[float, float, float]
-NONE: Vector = (0.0, 0.0, 0.0)
 # Hip to shoulder: 0.288 of the stature (0.818 - 0.530, Drillis and Contini 1966, in Winter, Biomechanics and Motor
 # Control of Human Movement) of 1.75 m. The shoulder's distance from the spine is neglected.
-HIP_TO_SHOULDER: Vector = (0.0, 0.0, 0.5)  # m
+HIP_TO_SHOULDER: Floats3 = (0.0, 0.0, 0.5)  # m
 FADE = 1.0  # s in which walking starts, and stops
 SEAT_SPEED = 0.8  # m/s, of a free fall over the last 3 cm
 # s. The impact is half a period of 5 Hz, at which a seated trunk resonates (Griffin, Handbook of Human Vibration); its
@@ -34,15 +32,15 @@ class TrunkState(NamedTuple):
     roll_rate: float = 0.0
     pitch_acceleration: float = 0.0
     roll_acceleration: float = 0.0
-    acceleration: Vector = NONE  #: of the shoulder without gravity, (3,) m/s^2 in the trunk's axes
+    acceleration: Floats3 = ZERO  #: of the shoulder without gravity, (3,) m/s^2 in the trunk's axes
 
     @property
-    def angular_velocity(self) -> Vector:
+    def angular_velocity(self) -> Floats3:
         """(3,) rad/s in the trunk's axes: (roll', pitch' cos roll, -pitch' sin roll)."""
         return self.roll_rate, self.pitch_rate * math.cos(self.roll), -self.pitch_rate * math.sin(self.roll)
 
     @property
-    def angular_acceleration(self) -> Vector:
+    def angular_acceleration(self) -> Floats3:
         """(3,) rad/s^2 in the trunk's axes, the derivative of `angular_velocity`."""
         cosine, sine, both = math.cos(self.roll), math.sin(self.roll), self.pitch_rate * self.roll_rate
         bow = self.pitch_acceleration
@@ -138,14 +136,14 @@ def motion_of(step: Step, pitch: float, roll: float) -> TrunkMotion | None:
     return SitDown(here) if step.action == "sit" else None
 
 
-def minimum_jerk(share: float) -> Vector:
+def minimum_jerk(share: float) -> Floats3:
     """Return the way from 0 to 1 at a share of its duration, and its first and second derivatives by the share."""
     s = max(0.0, min(1.0, share))
     way = s**3 * (10.0 - 15.0 * s + 6.0 * s * s)
     return way, 30.0 * s * s * (1.0 - s) ** 2, 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s)
 
 
-def _swing(amplitude: float, frequency: float, elapsed: float, envelope: Vector) -> Vector:
+def _swing(amplitude: float, frequency: float, elapsed: float, envelope: Floats3) -> Floats3:
     """Return a sine times its envelope, and the first and second derivatives; frequency: rad/s."""
     size, slope, bend = envelope
     sine, cosine = amplitude * math.sin(frequency * elapsed), amplitude * math.cos(frequency * elapsed)
@@ -153,7 +151,7 @@ def _swing(amplitude: float, frequency: float, elapsed: float, envelope: Vector)
     return size * sine, rate, bend * sine + 2.0 * slope * frequency * cosine - size * frequency**2 * sine
 
 
-def _in_trunk(level: Vector, pitch: float, roll: float) -> Vector:
+def _in_trunk(level: Floats3, pitch: float, roll: float) -> Floats3:
     """Return a vector in the axes of an upright trunk (forward, left, up) in those of one at `pitch` and `roll`."""
     ahead, left, up = level
     x, z = ahead * math.cos(pitch) - up * math.sin(pitch), ahead * math.sin(pitch) + up * math.cos(pitch)

@@ -21,40 +21,89 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime
+from fnmatch import fnmatchcase
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
+from subprocess import PIPE, STDOUT
 
-from exo_gravity.core.errors import ExoGravityError
+import yaml
+
+from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.tools.cli import require_ros
-from exo_gravity.tools.inputs.parameter_file import (
-    ABSOLUTE_TOPICS,
-    ENDED_WELL,
-    OBSERVERS,
-    ONE_PROCESS,
-    RECOVERY,
-    RECOVERY_TIMEOUT,
-    STOP_TIMEOUT,
-    SUPERVISED,
-    check_buses,
-    chosen,
-    command_of,
-    guests_of,
-    in_namespace,
-    load,
-    node_names,
-    packaged_config,
-    stages,
-)
+from exo_gravity.tools.inputs.parameter_file import Loader, check_buses, load, packaged_config, stages
 
+NODES_PACKAGE = "exo_gravity.nodes."
+ONE_PROCESS = f"{NODES_PACKAGE}can_bridge.one_process"  # runs can_bridge and compensator
+# What the executable does. The folder in which the user stands, '' in the path, is not searched for modules.
+PROGRAM = """import sys
+sys.path = [*filter(None, sys.path)]
+sys.argv[0] = {name!r}
+from {module} import main
+sys.exit(main())
+"""
+WATCHDOG_TIMEOUT = 30.0  # s for the watchdog of a dead bridge to let the arm down
+RECOVERY_TIMEOUT = WATCHDOG_TIMEOUT + DESCENT_TIMEOUT
+STOP_TIMEOUT = 5.0  # s for any other node to end
+SUPERVISED = {"EXO_GRAVITY_SUPERVISED": "1", "PYTHONUNBUFFERED": "1"}  # a node then ends with its standard input
+# Starts can_bridge for one purpose: to let down an arm that was left behind, after that time for its watchdog.
+RECOVERY = {"EXO_GRAVITY_RECOVER": f"{WATCHDOG_TIMEOUT:g}"}
+ENDED_WELL = (0, 2)  # exit codes of a node that ended by itself: stopped, or with wrong parameters or no bus
+# A node that may end alone: the arm does not depend on it, and a full disk must not let the arm down.
+OBSERVERS = ("/recorder", "/robot_model", "/panel")
+ABSOLUTE_TOPICS = ("/imu/data", "/imu/data_raw", "/imu/pitch_yaw")  # those that a namespace must be added to
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 LOG_FORMAT = "{severity} {message}"
 
-OnLine = Callable[[str, str], None]  # (node, line of its log)
 Stopping = threading.Event
+
+
+def node_modules() -> dict[str, str]:
+    """Return the executables that are nodes, each with its module, from the entry points of the installed package."""
+    try:
+        scripts = distribution("exo_gravity").entry_points.select(group="console_scripts")
+    except PackageNotFoundError:
+        return {}
+    return {script.name: script.module for script in sorted(scripts) if script.module.startswith(NODES_PACKAGE)}
+
+
+def command_of(node: str, module: str = "") -> list[str]:
+    """Return the command that runs `node` ('/right/can_bridge') from this package. Raises ParameterError if none does.
+
+    module: in place of the node's own. It looks for no file in a folder: python-can installs an executable `can_bridge`
+    too.
+    """
+    name, modules = node.rpartition("/")[2], node_modules()
+    if name not in modules:
+        raise ParameterError("node name", node, f"/namespace/executable, with one of {', '.join(modules)}")
+    return [sys.executable, "-c", PROGRAM.format(name=name, module=module or modules[name])]
+
+
+def chosen(nodes: Iterable[str], only: Sequence[str]) -> list[str]:
+    """Return the `nodes` that match one of the shell patterns `only`; without patterns, all.
+
+    A pattern is compared with the full name: `/right/*`, `*/compensator`. Raises ParameterError if one matches no node.
+    """
+    names = list(nodes)
+    for pattern in only:
+        if not any(fnmatchcase(node, pattern) for node in names):
+            raise ParameterError("only", pattern, f"a pattern that matches one of {', '.join(names)}")
+    return [node for node in names if not only or any(fnmatchcase(node, pattern) for pattern in only)]
+
+
+def in_namespace(params: Path, namespace: str) -> Path:
+    """Return a parameter file whose nodes are in `namespace` ('/lab'): `params` itself if that is ''."""
+    if not namespace:
+        return params
+    content = yaml.load(params.read_text(encoding="utf-8"), Loader)
+    path = Path(tempfile.mkdtemp(prefix="exo_gravity_"), params.name)
+    path.write_text(yaml.safe_dump({f"{namespace}{node}": entry for node, entry in content.items()}), encoding="utf-8")
+    return path
 
 
 def print_line(node: str, line: str) -> None:
@@ -66,16 +115,16 @@ def print_line(node: str, line: str) -> None:
 class Launcher:
     """The processes of one parameter file.
 
-    on_line is called with each line that a node prints. only: shell patterns of the nodes to start; () starts all.
-    more: nodes to start in addition to those of the file, with their default parameters. namespace: '/lab' in front of
-    every node and of the IMU's topics. log_level: of every node. one_process: whether can_bridge and compensator of an
-    arm share one. Raises ParameterError.
+    on_line(node, line) is called with each line that a node prints. only: shell patterns of the nodes to start; ()
+    starts all. more: nodes to start in addition to those of the file, with their default parameters. namespace: '/lab'
+    in front of every node and of the IMU's topics. log_level: of every node. one_process: whether can_bridge and
+    compensator of an arm share one. Raises ParameterError.
     """
 
     def __init__(
         self,
         params: str | Path,
-        on_line: OnLine = print_line,
+        on_line: Callable[[str, str], None] = print_line,
         only: Sequence[str] = (),
         more: Sequence[str] = (),
         namespace: str = "",
@@ -87,7 +136,9 @@ class Launcher:
         check_buses(nodes)
         self._path, self._namespace, self._log_level = in_namespace(self._path, namespace), namespace, log_level
         names = chosen(nodes, only)
-        self._guests = guests_of(names) if one_process else {}
+        pairs = {node: f"{node.rpartition('/')[0]}/compensator" for node in stages(names)[0]}
+        # The compensator that shares the process of its can_bridge
+        self._guests = {bridge: guest for bridge, guest in pairs.items() if one_process and guest in names}
         self._commands = {node: self._command(node) for node in names if node not in self._guests.values()}
         self._processes: dict[str, subprocess.Popen[str]] = {}
         self._readers: dict[str, threading.Thread] = {}
@@ -101,19 +152,12 @@ class Launcher:
 
     def _start(self, node: str, variables: Mapping[str, str]) -> tuple[subprocess.Popen[str], threading.Thread]:
         """Start one node with more environment `variables`; return its process and the reader of its log."""
-        environment = {**os.environ, **variables}
         log_format = f"{{name}} {LOG_FORMAT}" if node in self._guests else LOG_FORMAT
-        environment.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", log_format)
+        environment = {"RCUTILS_CONSOLE_OUTPUT_FORMAT": log_format, **os.environ, **variables}
         process = subprocess.Popen(
-            self._commands[node],
-            env=environment,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            errors="replace",
+            self._commands[node], env=environment, stdin=PIPE, stdout=PIPE, stderr=STDOUT, text=True, errors="replace",
             start_new_session=True,  # Ctrl-C in the terminal reaches only the launcher
-        )
+        )  # fmt: skip
         reader = threading.Thread(target=self._read, args=(node, process), daemon=True)
         reader.start()
         return process, reader
@@ -232,7 +276,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
         prog="launcher",
         description="Start every node of a parameter file, and stop them all when one ends.",
         epilog="Each top-level key of the file is a node to start, /namespace/executable: /right/can_bridge starts the "
-        f"executable can_bridge in the namespace /right, /imu starts imu. Executables: {', '.join(node_names())}.",
+        f"executable can_bridge in the namespace /right, /imu starts imu. Executables: {', '.join(node_modules())}.",
     )
     parser.add_argument("--params", metavar="FILE", help="ROS 2 parameter file (default: the packaged sim.yaml)")
     only = "start only the nodes whose full names match a shell pattern: '*/can_bridge' /imu"

@@ -22,7 +22,7 @@ from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, simulated_motor
+from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial
 
@@ -138,7 +138,7 @@ def drop(mass: float, pose: tuple[float, ...], watched: bool = True) -> tuple[Of
     arm.carry(mass)
     arm.reset((0.0, 0.05, 0.05, 0.05))
     motors = [JointMotor(MOTORS[name], n + 1) for n, name in enumerate(NAMES)]
-    device = SimulatedDevice(arm, [simulated_motor(motor, Firmware()) for motor in motors], "right")
+    device = SimulatedDevice(arm, [SimulatedMotor(motor, Firmware()) for motor in motors], "right")
     settings = settings_with(side="right", robot=DEFAULT_LINKS, mode="zero_g", payload_mass=mass, **WORN)
     steps = [{"move": list(pose), "over": 3.0}, {"hold": 1.0}, {"load": 0.0, "over": 3.0}]
     script = TrialScript.parse({"name": "drop", "steps": steps})

@@ -22,7 +22,7 @@ from visualization_msgs.msg import MarkerArray
 
 from exo_gravity.core.view.urdf import ROOT
 from exo_gravity.tools.inputs.arms import configured_arms
-from exo_gravity.tools.inputs.parameter_file import node_names
+from exo_gravity.tools.launcher import node_modules
 from exo_gravity.tools.urdf import urdf_of
 
 from ..support import CONFIG
@@ -116,7 +116,7 @@ def test_foxglove_places_each_panel_once():
 def test_the_launch_file_names_executables_and_files_that_exist():
     texts = [node.value for node in ast.walk(ast.parse(LAUNCH.read_text(encoding="utf-8"))) if is_text(node)]
     assert {"robot_model", "robot_state_publisher", "rviz2"} <= set(texts)
-    assert "robot_model" in node_names()
+    assert "robot_model" in node_modules()
     for parts in (("sim.yaml",), ("rviz/exo.rviz",)):
         assert set(parts) <= set(texts) and Path(CONFIG, *parts).is_file()
 

@@ -12,7 +12,7 @@ import pytest
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
 from exo_gravity.core.motors.wire_formats import ID_BITS, MIT, MIT_V3
-from exo_gravity.sim import Firmware, SimulatedV3Motor, simulated_motor
+from exo_gravity.sim import Firmware, SimulatedMotor
 from exo_gravity.sim import device as device_module
 
 from ..support.simulated_device import make_device
@@ -22,7 +22,7 @@ JOINT = JointMotor(SPEC, 3, direction=-1, zero=0.2, torque_scale=0.8, wire_forma
 COMMAND_ID, CURRENT_ID = JOINT.command_id, JOINT.exit[0][0]
 
 
-def reported(motor: SimulatedV3Motor, position: float = 0.5, velocity: float = 0.0):
+def reported(motor: SimulatedMotor, position: float = 0.5, velocity: float = 0.0):
     """Return what the joint reads from the status frame; None without one."""
     frame = motor.status(position, velocity)
     assert frame is None or frame[0] == MIT_V3.status_id(3)
@@ -30,8 +30,8 @@ def reported(motor: SimulatedV3Motor, position: float = 0.5, velocity: float = 0
 
 
 def test_the_first_command_switches_it_on_and_its_status_shows_angle_speed_and_torque():
-    motor = simulated_motor(JOINT)
-    assert isinstance(motor, SimulatedV3Motor) and not motor.entered
+    motor = SimulatedMotor(JOINT)
+    assert not motor.entered
     assert motor.receive(JOINT.command(1.5, 0.0), 0.5, 0.0, 0.0, COMMAND_ID) is None
     assert motor.entered and motor.torque(0.5, 0.0) == pytest.approx(1.5, abs=0.01)
     reply = reported(motor, 0.5, 1.0)
@@ -40,7 +40,7 @@ def test_the_first_command_switches_it_on_and_its_status_shows_angle_speed_and_t
 
 
 def test_its_exit_frame_switches_it_off_and_a_current_drives_it():
-    motor = SimulatedV3Motor(JOINT)
+    motor = SimulatedMotor(JOINT)
     motor.receive(JOINT.command(1.5, 5.0), 0.5, 0.0, 0.0, COMMAND_ID)
     for frame_id, data in JOINT.exit:
         motor.receive(data, 0.5, 0.0, 0.0, frame_id)
@@ -51,7 +51,7 @@ def test_its_exit_frame_switches_it_off_and_a_current_drives_it():
 
 
 def test_without_power_it_reports_nothing_and_forgets_its_command():
-    motor = SimulatedV3Motor(JOINT)
+    motor = SimulatedMotor(JOINT)
     motor.receive(JOINT.command(1.5, 0.0), 0.5, 0.0, 0.0, COMMAND_ID)
     motor.unplugged = True
     assert reported(motor) is None and motor.torque(0.5, 0.0) == 0.0

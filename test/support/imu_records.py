@@ -6,6 +6,7 @@ import numpy as np
 
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu
+from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.tools.calibration.imu import ImuRecord
 
 RATE = 100.0  # Hz
@@ -26,7 +27,7 @@ def record(
     pitch, roll = posture[0] + bow * share, posture[1] + lean * share
     imu = SimulatedImu(ImuConfig(tuple(quaternion), RATE, seed=seed))
     rates = np.gradient(pitch, time), np.gradient(roll, time)
-    samples = [imu.sample(*row) for row in zip(pitch, roll, *rates, strict=True)]
+    samples = [imu.sample(TrunkState(*row)) for row in zip(pitch, roll, *rates, strict=True)]
     gyroscope, accelerometer = (np.array(column) for column in zip(*samples, strict=True))
     return ImuRecord(time, gyroscope, accelerometer)
 

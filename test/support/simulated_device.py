@@ -10,7 +10,7 @@ import can
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS, pack_command
 from exo_gravity.core.motors.wire_formats import MIT, WireFormat
-from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, simulated_motor
+from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 
 SPECS = [MOTORS[name] for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6")]
 RAISED = (0.3, 0.8, 0.7, 0.6)  # rad
@@ -23,7 +23,7 @@ def make_device(
     formats: Sequence[WireFormat] = (MIT,) * 4,
 ) -> SimulatedDevice:
     joints = joints_of(formats, ids)
-    return SimulatedDevice(SimulatedArm(config), [simulated_motor(joint, firmware) for joint in joints])
+    return SimulatedDevice(SimulatedArm(config), [SimulatedMotor(joint, firmware) for joint in joints])
 
 
 def joints_of(formats: Sequence[WireFormat], ids: Sequence[int] = (1, 2, 3, 4)) -> tuple[JointMotor, ...]:

@@ -20,7 +20,7 @@ from exo_gravity.core.motors.joint_motor import JointMotor, channels_of
 from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
 from exo_gravity.hardware.can.bus_scan import BusScan, MotorAnswer
 from exo_gravity.hardware.ownership.bus_lock import BusLock
-from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice, simulated_motor
+from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.tools.calibrate import main
 from exo_gravity.tools.calibration import motors
 from exo_gravity.tools.calibration.live import Person
@@ -198,7 +198,7 @@ def device_on(channel: str, arm: Arm) -> Iterator[SimulatedDevice]:
     formats = (MIT_V3, MIT, MIT, MIT_V3)
     specs = [each.ranged(spec) for each, spec in zip(formats, SPECS, strict=True)]
     columns = zip(specs, arm.ids, arm.directions, arm.zeros.tolist(), (1.0,) * 4, formats, strict=True)
-    boards = [simulated_motor(JointMotor(*column), Firmware(status_rate=100.0)) for column in columns]
+    boards = [SimulatedMotor(JointMotor(*column), Firmware(status_rate=100.0)) for column in columns]
     device, stop = SimulatedDevice(SimulatedArm(), boards), threading.Event()
     with ExitStack() as opened:
         names = channels_of(channel)

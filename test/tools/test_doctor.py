@@ -1,7 +1,8 @@
 """doctor: from what a computer states of itself to findings, commands and an exit code."""
 
 import json
-from dataclasses import replace
+import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,30 +10,67 @@ import pytest
 import yaml
 
 from exo_gravity.core.motors.joint_motor import Traffic
-from exo_gravity.tools import diagnosis, doctor
-from exo_gravity.tools.diagnosis import Computer, Finding, Level, Wakeups
+from exo_gravity.tools import doctor
+from exo_gravity.tools.doctor import Finding, Level, Wakeups
 
 CONFIG = Path(__file__).parents[2] / "config"
 IN_TIME = Wakeups(np.full(2500, 1e-4), -20)
-FINE = Computer(
-    "Linux version 6.8.1-rt (gcc) #1 SMP PREEMPT_RT", "1", "performance", {"state0": 0.0}, 4, "", "tsc", "rtprio 0"
-)
+CPU = "sys/devices/system/cpu"
 LINK = {"linkinfo": {"info_kind": "can", "info_data": {
     "state": "ERROR-ACTIVE", "restart_ms": 100, "bittiming": {"bitrate": 1_000_000}}}}  # fmt: skip
 
 
 def wakeups(late: int, by: float) -> Wakeups:
     """10 s at 250 Hz, of which `late` are late by `by` s."""
-    return replace(IN_TIME, lateness=np.r_[np.full(2500 - late, 1e-4), np.full(late, by)])
+    return IN_TIME._replace(lateness=np.r_[np.full(2500 - late, 1e-4), np.full(late, by)])
 
 
-def of_computer(computer: Computer, is_late: bool = False, woken: Wakeups = IN_TIME, priority: int = 0):
-    return {row.what: row for row in diagnosis.of_computer(computer, woken, 0.004, is_late, priority)}
+def of_computer(root: Path, is_late: bool = False, woken: Wakeups = IN_TIME, priority: int = 0):
+    return {row.what: row for row in doctor.of_computer(root, woken, 0.004, is_late, priority)}
 
 
-def of_interface(is_up: bool | None = True, queue: int = 1000, link=LINK, bitrate: int = 1_000_000):
-    rows = list(diagnosis.of_interface("can1", is_up, queue, link, bitrate, 50))
+def tells(root: Path, link: object) -> None:
+    """Have `ip` report this of each interface."""
+    (root / "bin/ip").write_text(f"#!/bin/sh\necho '{json.dumps([link])}'\n")
+
+
+def of_interface(root: Path, bitrate: int = 1_000_000):
+    rows = list(doctor.of_interface("can1", root, bitrate, 50))
     return {row.what: row for row in rows if row.level}, max(row.level for row in rows)
+
+
+@pytest.fixture
+def computer(tmp_path, monkeypatch):
+    """A folder that looks like / on a computer where all is well, with `can0` and `can1`; `ip` tells of both."""
+    files = {
+        "proc/version": "Linux version 6.8.1-rt (gcc) #1 SMP PREEMPT_RT",
+        "sys/kernel/realtime": "1",
+        f"{CPU}/cpu0/cpufreq/scaling_governor": "performance",
+        f"{CPU}/cpu1/cpufreq/scaling_governor": "performance",
+        "sys/devices/system/clocksource/clocksource0/current_clocksource": "tsc",
+        "dev/ttyUSB3": "",
+        "sys/bus/usb-serial/devices/ttyUSB3/latency_timer": "16",
+        "bin/ip": "",
+    }
+    for state, (latency, disabled) in enumerate([("0", "0"), ("50", "0"), ("900", "1")]):
+        files |= {f"{CPU}/cpu0/cpuidle/state{state}/{name}": text for name, text in
+                  {"latency": latency, "disable": disabled}.items()}  # fmt: skip
+    for name in ("can0", "can1"):
+        files |= {f"sys/class/net/{name}/flags": "0x40041", f"sys/class/net/{name}/tx_queue_len": "1000"}
+    for path, content in files.items():
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_text(f"{content}\n")
+    tells(tmp_path, LINK)
+    (tmp_path / "bin/ip").chmod(0o755)
+    link = tmp_path / "dev/serial/by-id/usb-IMU"
+    link.parent.mkdir(parents=True)
+    link.symlink_to("../../ttyUSB3")
+    monkeypatch.setenv("PATH", f"{tmp_path}/bin:/usr/bin:/bin")
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1, 2, 3})
+    for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFILES_FILE"):
+        monkeypatch.setenv(name, "")  # set anew, and taken back after the test
+    monkeypatch.delenv("RMW_IMPLEMENTATION", raising=False)
+    return tmp_path
 
 
 @pytest.mark.parametrize(
@@ -48,50 +86,54 @@ def of_interface(is_up: bool | None = True, queue: int = 1000, link=LINK, bitrat
     ],
 )
 def test_wake_ups_are_judged_by_how_many_are_late_and_by_the_worst(late: int, by: float, level: Level):
-    row = diagnosis.of_wakeups(wakeups(late, by), 0.004, 0.05)
+    row = doctor.of_wakeups(wakeups(late, by), 0.004, 0.05)
     assert row.level is level and bool(row.mend) == bool(level)
 
 
-def test_a_computer_that_could_not_be_better_gets_no_advice():
-    assert {row.level for row in of_computer(FINE).values()} == {Level.FINE}
+def test_a_computer_that_could_not_be_better_gets_no_advice(computer):
+    assert {row.level for row in of_computer(computer).values()} == {Level.FINE}
 
 
 @pytest.mark.parametrize(
     ("what", "change"),
     [
-        ("kernel", {"kernel": "Linux version 6.8.0 (gcc) #1 SMP PREEMPT_DYNAMIC", "real_time": ""}),
-        ("CPU governor", {"governors": "performance, powersave"}),
-        ("idle states", {"idle_states": {"state0": 0.0, "state3": 890e-6}}),
-        ("clock source", {"clock_source": "hpet"}),
+        ("kernel", {"proc/version": "Linux version 6.8.0 (gcc) #1 SMP PREEMPT_DYNAMIC", "sys/kernel/realtime": ""}),
+        ("CPU governor", {f"{CPU}/cpu1/cpufreq/scaling_governor": "powersave"}),
+        ("idle states", {f"{CPU}/cpu0/cpuidle/state2/disable": "0"}),
+        ("clock source", {"sys/devices/system/clocksource/clocksource0/current_clocksource": "hpet"}),
     ],
 )
-def test_what_delays_threads_is_a_warning_only_where_they_were_late(what: str, change: dict[str, object]):
-    levels = [of_computer(replace(FINE, **change), is_late)[what].level for is_late in (False, True)]
+def test_what_delays_threads_is_a_warning_only_where_they_were_late(computer, what: str, change: dict[str, str]):
+    for path, content in change.items():
+        (computer / path).write_text(content)
+    levels = [of_computer(computer, is_late)[what].level for is_late in (False, True)]
     assert levels == [Level.NOTE, Level.WARNING]
 
 
-def test_a_container_that_states_nothing_of_its_cpus_is_not_at_fault():
-    silent = Computer("", "", "", {}, 4, "", "", "rtprio 0, memlock 65536")
-    assert max(row.level for row in of_computer(silent, is_late=True).values()) is Level.UNKNOWN
+def test_a_container_that_states_nothing_of_its_cpus_is_not_at_fault(computer, tmp_path):
+    assert max(row.level for row in of_computer(tmp_path / "empty", is_late=True).values()) is Level.UNKNOWN
 
 
-def test_the_command_for_idle_states_names_those_that_are_too_deep_for_the_rate():
-    states = {"state1": 2e-6, "state2": 390e-6, "state3": 410e-6}
-    mend = of_computer(replace(FINE, idle_states=states))["idle states"].mend
-    assert "cpuidle/state3/disable" in mend and "state2" not in mend
+def test_the_command_for_idle_states_names_those_that_are_too_deep_for_the_rate(computer):
+    for state, latency in enumerate((2, 390, 410)):
+        (computer / f"{CPU}/cpu0/cpuidle/state{state}/latency").write_text(f"{latency}")
+    (computer / f"{CPU}/cpu0/cpuidle/state2/disable").write_text("0")
+    row = of_computer(computer)["idle states"]
+    assert row.found == "a CPU wakes up within 410 µs"
+    assert row.mend == "echo 1 | sudo tee /sys/devices/system/cpu/cpu*/cpuidle/state2/disable"
 
 
-def test_limits_matter_only_where_a_thread_priority_is_asked_for():
-    refused = replace(IN_TIME, refused=("thread_priority 50 is not permitted",))
-    assert of_computer(FINE, woken=refused)["real-time limits"].level is Level.FINE
-    row = of_computer(FINE, woken=refused, priority=50)["real-time limits"]
+def test_limits_matter_only_where_a_thread_priority_is_asked_for(computer):
+    refused = IN_TIME._replace(refused=("thread_priority 50 is not permitted",))
+    assert of_computer(computer)["real-time limits"].level is Level.FINE
+    row = of_computer(computer, woken=refused, priority=50)["real-time limits"]
     assert row.level is Level.WARNING and "rtprio 99" in row.mend
-    assert of_computer(FINE, priority=50)["real-time limits"].level is Level.FINE
+    assert of_computer(computer, priority=50)["real-time limits"].level is Level.FINE
 
 
-def test_one_cpu_is_too_few_and_isolated_ones_are_named():
-    found = of_computer(replace(FINE, cores=1, isolated="2-3"))
-    assert found["CPUs for the nodes"].level is Level.WARNING and found["isolated CPUs"].found == "2-3"
+def test_one_cpu_is_too_few(computer, monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0})
+    assert of_computer(computer)["CPUs for the nodes"].level is Level.WARNING
 
 
 @pytest.mark.parametrize(
@@ -105,23 +147,23 @@ def test_one_cpu_is_too_few_and_isolated_ones_are_named():
     ],
 )
 def test_the_middleware_and_who_may_command_the_arm(middleware: str, reach: str, opening: str, level: Level):
-    assert max(row.level for row in diagnosis.of_middleware(middleware, reach, opening)) is level
+    assert max(row.level for row in doctor.of_middleware(middleware, reach, opening)) is level
 
 
-def test_multicast_is_needed_by_the_simulated_bus_alone():
-    problem = "Network is unreachable"
-    assert diagnosis.of_multicast(problem, True).level is Level.FAULT
-    assert diagnosis.of_multicast(problem, False).level is diagnosis.of_multicast("", True).level is Level.FINE
+def test_multicast_is_needed_by_the_simulated_bus_alone(monkeypatch):
+    assert doctor.of_multicast(True).level is Level.FINE
+    monkeypatch.setattr(doctor, "GROUP", "10.0.0.1")  # no multicast address: refused
+    assert doctor.of_multicast(True).level is Level.FAULT and doctor.of_multicast(False).level is Level.FINE
 
 
 @pytest.mark.parametrize(("rate", "level"), [(250, Level.FINE), (900, Level.WARNING), (1100, Level.FAULT)])
 def test_the_bus_load_at_the_wanted_rate(rate: float, level: Level):
-    row = diagnosis.of_load("/right/can_bridge", Traffic(4), rate)
+    row = doctor.of_load("/right/can_bridge", Traffic(4), rate)
     assert row.level is level and ("826" in row.mend) == bool(level)  # the table of docs/wiring.md
 
 
-def test_an_interface_as_docs_first_arming_sets_it_up_is_fine():
-    assert of_interface() == ({}, Level.FINE)
+def test_an_interface_as_docs_first_arming_sets_it_up_is_fine(computer):
+    assert of_interface(computer) == ({}, Level.FINE)
 
 
 @pytest.mark.parametrize(
@@ -133,56 +175,32 @@ def test_an_interface_as_docs_first_arming_sets_it_up_is_fine():
         ({"restart_ms": 0}, "restart", Level.WARNING, "restart-ms 100"),
     ],
 )
-def test_what_ip_tells_of_an_interface(change, what: str, level: Level, command: str):
-    told = {"linkinfo": {"info_data": {**LINK["linkinfo"]["info_data"], **change}}}
-    bad, worst = of_interface(link=told)
+def test_what_ip_tells_of_an_interface(computer, change, what: str, level: Level, command: str):
+    tells(computer, {"linkinfo": {"info_data": {**LINK["linkinfo"]["info_data"], **change}}})
+    bad, worst = of_interface(computer)
     assert list(bad) == [f"can1: {what}"] and worst is level and command in bad[f"can1: {what}"].mend
 
 
-def test_an_interface_that_is_missing_or_down_and_a_queue_that_overflows_before_the_fault_is_noticed():
-    assert of_interface(is_up=None)[1] is of_interface(is_up=False)[1] is Level.FAULT
-    bad, worst = of_interface(queue=10)
+def test_an_interface_that_is_missing_or_down_and_a_queue_that_overflows_before_the_fault_is_noticed(computer):
+    folder = computer / "sys/class/net/can1"
+    (folder / "tx_queue_len").write_text("10\n")
+    bad, worst = of_interface(computer)
     assert worst is Level.WARNING and bad["can1: txqueuelen"].mend == "sudo ip link set can1 txqueuelen 1000"
+    (folder / "flags").write_text("0x40040\n")
+    assert of_interface(computer)[1] is Level.FAULT
+    shutil.rmtree(folder)
+    bad, worst = of_interface(computer)
+    assert worst is Level.FAULT and bad["can1"].found == "no such interface"
 
 
-def test_without_ip_the_state_is_unknown_and_a_virtual_interface_has_none():
-    assert of_interface(link={})[1] is Level.UNKNOWN
-    virtual = {"linkinfo": {"info_kind": "vcan"}}
-    assert of_interface(queue=0, link=virtual) == ({}, Level.FINE)
-    assert of_interface(is_up=False, link=virtual)[0]["can1: state"].mend == "sudo ip link set can1 up"
-
-
-@pytest.fixture
-def computer(tmp_path, monkeypatch):
-    """A folder that looks like / on a computer where all is well, with `can0` and `can1`; `ip` tells of both."""
-    files = {
-        "proc/version": FINE.kernel,
-        "sys/kernel/realtime": "1",
-        "sys/devices/system/cpu/isolated": "",
-        "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor": "performance",
-        "sys/devices/system/cpu/cpu1/cpufreq/scaling_governor": "performance",
-        "sys/devices/system/clocksource/clocksource0/current_clocksource": "tsc",
-        "dev/ttyUSB3": "",
-        "sys/bus/usb-serial/devices/ttyUSB3/latency_timer": "16",
-        "bin/ip": f"#!/bin/sh\necho '{json.dumps([LINK])}'",
-    }
-    for state, (latency, disabled) in enumerate([("0", "0"), ("50", "0"), ("900", "1")]):
-        folder = f"sys/devices/system/cpu/cpu0/cpuidle/state{state}"
-        files |= {f"{folder}/latency": latency, f"{folder}/disable": disabled}
-    for name in ("can0", "can1"):
-        files |= {f"sys/class/net/{name}/flags": "0x40041", f"sys/class/net/{name}/tx_queue_len": "1000"}
-    for path, content in files.items():
-        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / path).write_text(f"{content}\n")
-    (tmp_path / "bin/ip").chmod(0o755)
-    link = tmp_path / "dev/serial/by-id/usb-IMU"
-    link.parent.mkdir(parents=True)
-    link.symlink_to("../../ttyUSB3")
-    monkeypatch.setenv("PATH", f"{tmp_path}/bin:/usr/bin:/bin")
-    for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFILES_FILE"):
-        monkeypatch.setenv(name, "")  # set anew, and taken back after the test
-    monkeypatch.delenv("RMW_IMPLEMENTATION", raising=False)
-    return tmp_path
+def test_without_ip_the_state_is_unknown_and_a_virtual_interface_has_none(computer):
+    tells(computer, {})
+    assert of_interface(computer)[1] is Level.UNKNOWN
+    tells(computer, {"linkinfo": {"info_kind": "vcan"}})
+    (computer / "sys/class/net/can1/tx_queue_len").write_text("0\n")
+    assert of_interface(computer) == ({}, Level.FINE)
+    (computer / "sys/class/net/can1/flags").write_text("0x40040\n")
+    assert of_interface(computer)[0]["can1: state"].mend == "sudo ip link set can1 up"
 
 
 @pytest.fixture
@@ -196,12 +214,6 @@ def run(computer, monkeypatch, capsys):
         return code, output.out + output.err
 
     return run
-
-
-def test_it_reads_what_a_computer_states_below_proc_and_sys(computer):
-    found = doctor.read_computer(computer)
-    assert found.idle_states == {"state0": 0.0, "state1": pytest.approx(50e-6)}  # state2 is disabled
-    assert replace(found, idle_states=FINE.idle_states, cores=4, limits="rtprio 0") == FINE
 
 
 def test_the_real_device_on_a_computer_where_all_is_well(run):

@@ -10,6 +10,7 @@ import pytest
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.tilt import rotation_matrix
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu
+from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.tools.calibration.imu import ImuRecord, mounting, six_rests
 
 from ..support.imu_records import RATE, record, rests
@@ -80,7 +81,7 @@ def test_a_bow_that_tells_nothing_is_refused(changes: dict[str, object], sentenc
         imu = SimulatedImu(ImuConfig(rate=RATE))
         pitch, roll = 0.5 * then, 0.5 * first
         rates = np.gradient(pitch, time), np.gradient(roll, time)
-        samples = [imu.sample(*row) for row in zip(pitch, roll, *rates, strict=True)]
+        samples = [imu.sample(TrunkState(*row)) for row in zip(pitch, roll, *rates, strict=True)]
         taken = ImuRecord(time, *(np.array(column) for column in zip(*samples, strict=True)))
     else:
         taken = record(np.array((0.0, 0.0, 0.0, 1.0)), **changes)  # type: ignore[arg-type]

@@ -16,8 +16,17 @@ import pytest
 import yaml
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.tools.inputs.parameter_file import chosen, command_of, in_namespace, load, node_names, stages
-from exo_gravity.tools.launcher import Launcher, main, stop_on_signals, stop_with_owner
+from exo_gravity.tools.inputs.parameter_file import load, stages
+from exo_gravity.tools.launcher import (
+    Launcher,
+    chosen,
+    command_of,
+    in_namespace,
+    main,
+    node_modules,
+    stop_on_signals,
+    stop_with_owner,
+)
 
 NODES = Path(__file__).parents[2] / "exo_gravity" / "nodes"
 SIM = Path(__file__).parents[2] / "config" / "sim.yaml"
@@ -79,20 +88,20 @@ def test_the_node_names_are_the_modules_with_an_entry_point():
     files = [*NODES.glob("*.py"), *NODES.glob("*/node.py")]
     with_main = [path for path in files if "\ndef main(" in path.read_text(encoding="utf-8")]
     modules = {path.parent.name if path.stem == "node" else path.stem for path in with_main}
-    assert set(node_names()) == modules >= {"can_bridge", "imu", "compensator", "simulator", "recorder"}
+    assert set(node_modules()) == modules >= {"can_bridge", "imu", "compensator", "simulator", "recorder"}
 
 
 def test_help_lists_the_nodes_and_shows_a_key(capsys):
     with pytest.raises(SystemExit) as ended:
         main(["--help"])
     text = " ".join(capsys.readouterr().out.split())
-    assert ended.value.code == 0 and "/right/can_bridge" in text and ", ".join(node_names()) in text
+    assert ended.value.code == 0 and "/right/can_bridge" in text and ", ".join(node_modules()) in text
 
 
 @pytest.mark.parametrize("key", ["/right/can_brigde", "/right/budget"], ids=["misspelt", "a tool"])
 def test_a_key_that_is_not_a_node_is_refused_with_the_list_of_nodes(refused, key):
     error = refused({key: {}})
-    assert error.startswith(f"launcher: node name = '{key}'") and ", ".join(node_names()) in error
+    assert error.startswith(f"launcher: node name = '{key}'") and ", ".join(node_modules()) in error
 
 
 def test_a_list_of_50_000_numbers_is_refused_at_once_and_named(refused):
@@ -108,6 +117,13 @@ def test_two_bridges_on_the_same_bus_are_refused(refused):
     error = refused({"/left/can_bridge": {"can": bus, "can_id": [9, 8, 7, 5]}})
     assert "/right/can_bridge can = {'can.channel': '239.74.163.2'" in error
     assert "must be different from the bus of /left/can_bridge: one arm per bus" in error
+
+
+def test_an_option_of_the_bus_without_an_entry_for_each_motor_is_named(refused):
+    bus = yaml.safe_load(SIM.read_text())["/right/can_bridge"]["ros__parameters"]["can"]
+    bus["options"]["bitrate"] = [500_000, 1_000_000]
+    error = refused({"/right/can_bridge": {"can": bus}})
+    assert error.startswith("launcher: /right/can_bridge can.options.bitrate = [500000, 1000000]: must be one value")
 
 
 def test_without_rclpy_one_line_says_how_to_get_it(capsys, monkeypatch):

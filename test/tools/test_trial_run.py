@@ -8,7 +8,8 @@ import itertools
 import json
 import math
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,7 @@ from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.trial.script import Step, TrialScript
 from exo_gravity.tools import trial
-from exo_gravity.tools.reporting import trial_report
-from exo_gravity.tools.trial import criteria_for, missing_holds, read_script, shortest_hold
+from exo_gravity.tools.trial import analysed, read_script
 from exo_gravity.tools.trials import run as running
 from exo_gravity.tools.trials.run import TrialEnd, follow, is_guided, too_busy
 from exo_gravity.tools.trials.screen import LEAD, TrialScreen, describe
@@ -69,31 +69,38 @@ def test_an_unknown_name_is_answered_with_the_packaged_trials():
     )
 
 
-def test_only_holds_of_a_minute_are_judged_by_their_rate():
-    _, demo = read_script("demo")
-    _, thirteen_poses = read_script("thirteen_poses")
-    assert criteria_for(demo).max_rate == math.inf
-    assert criteria_for(thirteen_poses).max_rate == pytest.approx(math.radians(0.2) / 60)
-
-
-def report_with(holds: int) -> trial_report.Report:
-    """Return the report of a recording without a script, of one arm with that many holds."""
+def bag_with(holds: int) -> Bag:
+    """Return a recording without a script, of one arm with that many holds of 4 s."""
     recording = made.trial([[0.1 * n] * 4 for n in range(holds)], hold=4.0, rate=100.0)
     unscripted = dataclasses.replace(recording, steps=(), carried=((0.0, recording.time[-1]),))
-    return trial_report.analyse(Bag(Path("bag"), 0, (unscripted,), (), {}, (), ()))
+    return Bag(Path("bag"), 0, (unscripted,), (), {}, (), ())
+
+
+def holding(*durations: float) -> TrialScript:
+    return TrialScript.parse({"name": "holds", "steps": [{"hold": duration} for duration in durations]})
+
+
+def test_only_holds_of_a_minute_are_judged_by_their_rate():
+    rates = [
+        analysed(bag_with(1), read_script(name)[1], False, "")[0].criteria.max_rate
+        for name in ("demo", "thirteen_poses")
+    ]
+    assert rates == [math.inf, pytest.approx(math.radians(0.2) / 60)]
 
 
 def test_a_hold_in_which_a_real_arm_never_came_to_rest_is_missing():
-    steps = [{"move": [0.1, 0.6, 1.2, 0.5], "over": 2.0}, {"hold": 4.0}]
-    script = TrialScript.parse({"name": "two", "steps": steps * 2})
-    assert missing_holds(script, report_with(holds=2)) == ""
-    assert missing_holds(script, report_with(holds=1)) == "right: 1 of 2 holds were found"
+    script = holding(4.0, 4.0)
+    assert analysed(bag_with(2), script, True, "")[1] == ""
+    assert analysed(bag_with(1), script, True, "")[1] == "right: 1 of 2 holds were found"
+    assert analysed(bag_with(1), script, True, "an arm is not active any more")[1] == "an arm is not active any more"
 
 
 def test_a_moment_in_which_a_person_holds_the_arm_still_is_not_a_hold():
-    script = TrialScript.parse({"name": "p", "steps": [{"hold": 60.0}, {"hold": 14.0}]})
-    assert shortest_hold(script, guided=True) == 7.0
-    assert shortest_hold(script, guided=False) == 2.0
+    script = holding(60.0, 14.0)  # of which at least 7 s remain
+    report, trouble = analysed(bag_with(2), script, True, "")
+    assert not report.arms[0][1].holds and trouble == "right: 0 of 2 holds were found"
+    report, trouble = analysed(bag_with(2), script, False, "")
+    assert len(report.arms[0][1].holds) == 2 and trouble == ""
 
 
 def test_a_trial_is_guided_unless_a_simulator_performs_it():
@@ -207,19 +214,15 @@ def test_half_a_line_of_a_killed_recorder_is_ignored():
 
 
 @pytest.fixture
-def nodes() -> Iterator[threading.Thread]:
-    """A thread in place of the one that runs the nodes."""
-    ending = threading.Event()
-    thread = threading.Thread(target=ending.wait)
-    thread.start()
-    yield thread
-    ending.set()
+def nodes() -> Future[None]:
+    """Nodes that run."""
+    return Future()
 
 
 def test_a_recorder_that_ends_ends_the_trial(nodes):
     screen = Screen()
     screen.at(0.0)
-    why = follow(screen.screen, SCRIPT, threading.Event(), lambda: -9, nodes)
+    why = follow(screen.screen, threading.Event(), lambda: -9, nodes)
     assert why == "the recorder ended with exit code -9 before the trial was done"
 
 
@@ -227,7 +230,7 @@ def test_a_recorder_that_prints_nothing_ends_the_trial(nodes):
     screen = Screen()
     screen.at(0.0)
     screen.now = 10.1
-    why = follow(screen.screen, SCRIPT, threading.Event(), lambda: None, nodes)
+    why = follow(screen.screen, threading.Event(), lambda: None, nodes)
     assert why == "the recorder has sent no data for 10 s"
 
 
@@ -235,7 +238,7 @@ def test_a_recorder_that_prints_nothing_ends_the_trial(nodes):
 def test_a_latched_fault_ends_the_trial_with_its_reason(nodes, state):
     screen, message = Screen(), f"{state}: motor_silent: elbow"
     screen.at(0.0, bridge={"level": 2, "message": message, "state": state, "fault": "motor_silent"})
-    why = follow(screen.screen, SCRIPT, threading.Event(), lambda: None, nodes)
+    why = follow(screen.screen, threading.Event(), lambda: None, nodes)
     assert why == f"right/can_bridge: {message}"
 
 
@@ -243,7 +246,7 @@ def test_an_arm_that_is_let_down_ends_a_trial_that_the_clock_leads(nodes):
     screen = Screen()
     screen.at(0.0)
     screen.at(1.0, bridge={"level": 0, "message": "letting down", "state": "letting down", "fault": "none"})
-    why = follow(screen.screen, SCRIPT, threading.Event(), lambda: None, nodes)
+    why = follow(screen.screen, threading.Event(), lambda: None, nodes)
     assert why == "an arm is not active any more"
 
 

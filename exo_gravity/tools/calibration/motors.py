@@ -21,8 +21,8 @@ from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.hardware.can.bus_scan import ArmScan, BusScan, MotorAnswer
 from exo_gravity.tools.calibration.live import Say
 from exo_gravity.tools.calibration.result import CalibrationResult, Change
-from exo_gravity.tools.inputs.arms import ConfiguredArm, can_options
-from exo_gravity.tools.inputs.parameter_file import load
+from exo_gravity.tools.inputs.arms import ConfiguredArm
+from exo_gravity.tools.inputs.parameter_file import can_options, load
 
 Clock = Callable[[], float]
 Wait = Callable[[str, Callable[[], Table]], None]

@@ -94,9 +94,3 @@ def node_values(nodes: Nodes, node: str, table: tuple[Param, ...]) -> dict[str, 
         raise ParameterError("params", sorted(nodes), f"a file with {node}")
     with named(f"{node} "):
         return values_of(table, nodes[node], OPTIONS)
-
-
-def can_options(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options for python-can in the parameters of a node."""
-    prefix = f"{OPTIONS}."
-    return {name.removeprefix(prefix): value for name, value in given.items() if name.startswith(prefix)}

@@ -3,15 +3,10 @@
     /imu: {ros__parameters: {...}}
     /right/can_bridge: {ros__parameters: {can: {interface: socketcan}, ...}}
 
-The tools read it to find out which nodes to start and which arms they have; the nodes read it through ROS. `launcher`
-stops them in order: bridges first, because they need the others while they let the arms down, and the recorder last.
+The tools read it to find out which nodes to start and which arms they have; the nodes read it through ROS.
 """
 
-import sys
-import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from fnmatch import fnmatchcase
-from importlib.metadata import PackageNotFoundError, distribution
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,32 +15,11 @@ import yaml
 from exo_gravity import packaged
 from exo_gravity.core.errors import ParameterError, named
 from exo_gravity.core.motors.joint_motor import OPTIONS, buses_of
-from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 
 FORM = "/namespace/executable: {ros__parameters: {...}}"
 MAX_LIST = 100  # entries; the longest list of any parameter has 4, and ROS's reader takes minutes for 200,000
 # libyaml is ten times faster; PyYAML is sometimes built without it.
 Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
-NODES_PACKAGE = "exo_gravity.nodes."
-ONE_PROCESS = f"{NODES_PACKAGE}can_bridge.one_process"  # runs can_bridge and compensator
-# What the executable does. The folder in which the user stands, '' in the path, is not searched for modules.
-PROGRAM = """import sys
-sys.path = [*filter(None, sys.path)]
-sys.argv[0] = {name!r}
-from {module} import main
-sys.exit(main())
-"""
-WATCHDOG_TIMEOUT = 30.0  # s for the watchdog of a dead bridge to let the arm down
-RECOVERY_TIMEOUT = WATCHDOG_TIMEOUT + DESCENT_TIMEOUT
-STOP_TIMEOUT = 5.0  # s for any other node to end
-SUPERVISED = {"EXO_GRAVITY_SUPERVISED": "1", "PYTHONUNBUFFERED": "1"}  # a node then ends with its standard input
-# Starts can_bridge for one purpose: to let down an arm that was left behind, after that time for its watchdog.
-RECOVERY = {"EXO_GRAVITY_RECOVER": f"{WATCHDOG_TIMEOUT:g}"}
-ENDED_WELL = (0, 2)  # exit codes of a node that ended by itself: stopped, or with wrong parameters or no bus
-# A node that may end alone: the arm does not depend on it, and a full disk must not let the arm down.
-OBSERVERS = ("/recorder", "/robot_model", "/panel")
-ABSOLUTE_TOPICS = ("/imu/data", "/imu/data_raw", "/imu/pitch_yaw")  # those that a namespace must be added to
 
 Nodes = dict[str, dict[str, Any]]  # node name -> dotted parameter name -> value
 
@@ -108,30 +82,10 @@ def _flat(node: str, prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
     yield prefix, value
 
 
-def _modules() -> dict[str, str]:
-    """Return the executables that are nodes, each with its module, from the entry points of the installed package."""
-    try:
-        scripts = distribution("exo_gravity").entry_points.select(group="console_scripts")
-    except PackageNotFoundError:
-        return {}
-    return {script.name: script.module for script in sorted(scripts) if script.module.startswith(NODES_PACKAGE)}
-
-
-def node_names() -> tuple[str, ...]:
-    """Return the executables that are nodes."""
-    return tuple(_modules())
-
-
-def command_of(node: str, module: str = "") -> list[str]:
-    """Return the command that runs `node` ('/right/can_bridge') from this package. Raises ParameterError if none does.
-
-    module: in place of the node's own. It looks for no file in a folder: python-can installs an executable `can_bridge`
-    too.
-    """
-    name, modules = node.rpartition("/")[2], _modules()
-    if name not in modules:
-        raise ParameterError("node name", node, f"/namespace/executable, with one of {', '.join(modules)}")
-    return [sys.executable, "-c", PROGRAM.format(name=name, module=module or modules[name])]
+def can_options(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options for python-can in the parameters of a node."""
+    prefix = f"{OPTIONS}."
+    return {name.removeprefix(prefix): value for name, value in given.items() if name.startswith(prefix)}
 
 
 def stages(nodes: Iterable[str]) -> tuple[list[str], list[str], list[str]]:
@@ -142,44 +96,17 @@ def stages(nodes: Iterable[str]) -> tuple[list[str], list[str], list[str]]:
     return found
 
 
-def guests_of(nodes: Iterable[str]) -> dict[str, str]:
-    """Return the compensator of each can_bridge of `nodes` that has one."""
-    pairs = {node: f"{node.rpartition('/')[0]}/compensator" for node in stages(nodes)[0]}
-    return {bridge: compensator for bridge, compensator in pairs.items() if compensator in nodes}
-
-
-def chosen(nodes: Iterable[str], only: Sequence[str]) -> list[str]:
-    """Return the `nodes` that match one of the shell patterns `only`; without patterns, all.
-
-    A pattern is compared with the full name: `/right/*`, `*/compensator`. Raises ParameterError if one matches no node.
-    """
-    names = list(nodes)
-    for pattern in only:
-        if not any(fnmatchcase(node, pattern) for node in names):
-            raise ParameterError("only", pattern, f"a pattern that matches one of {', '.join(names)}")
-    return [node for node in names if not only or any(fnmatchcase(node, pattern) for pattern in only)]
-
-
 def check_buses(nodes: Nodes) -> None:
     """Raise ParameterError if two bridges would command motors on the same bus, which has one owner."""
     owner: dict[tuple[tuple[str, str], ...], str] = {}
     for node in stages(nodes)[0]:
-        given = {k: v for k, v in nodes[node].items() if k.startswith("can.")}
-        options = {k: v for k, v in given.items() if k.startswith(OPTIONS)}
+        given = nodes[node]
         with named(f"{node} "):
-            buses = buses_of(str(given.get("can.channel", node)), options)
+            buses = buses_of(str(given.get("can.channel", node)), can_options(given))
         for name, (_, own) in buses.items():
-            bus = tuple(sorted((k, str(v)) for k, v in {**given, "can.channel": name, **own}.items()))
+            options = {f"{OPTIONS}.{option}": value for option, value in own.items()}
+            what = {"can.channel": name, "can.interface": given.get("can.interface"), **options}
+            bus = tuple(sorted((key, str(value)) for key, value in what.items()))
             other = owner.setdefault(bus, node)
             if other != node:
                 raise ParameterError(f"{node} can", dict(bus), f"different from the bus of {other}: one arm per bus")
-
-
-def in_namespace(params: Path, namespace: str) -> Path:
-    """Return a parameter file whose nodes are in `namespace` ('/lab'): `params` itself if that is ''."""
-    if not namespace:
-        return params
-    content = yaml.load(params.read_text(encoding="utf-8"), Loader)
-    path = Path(tempfile.mkdtemp(prefix="exo_gravity_"), params.name)
-    path.write_text(yaml.safe_dump({f"{namespace}{node}": entry for node, entry in content.items()}), encoding="utf-8")
-    return path

@@ -16,9 +16,7 @@ from rich.progress import Progress, TaskID
 from exo_gravity.bag.content import Event
 from exo_gravity.bag.simulated import write_recordings
 from exo_gravity.core.errors import ParameterError, named
-from exo_gravity.core.trial.recording import Recording
 from exo_gravity.core.trial.script import TRUNK_ACTIONS, TrialScript
-from exo_gravity.core.trial.session import Session
 from exo_gravity.hardware.trunk_estimator import VQF, ImuSample, TrunkEstimator
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu, measured_tilt
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial, TrunkReading, TrunkSensor, resting
@@ -26,6 +24,7 @@ from exo_gravity.sim.params import SIMULATOR, device_of, imu_of, set_faults
 from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.tools.inputs.arms import node_values, read_arm
 from exo_gravity.tools.inputs.parameter_file import load
+from exo_gravity.tools.trials.run import Trial, TrialEnd
 
 
 def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
@@ -34,10 +33,9 @@ def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
     Raises ParameterError that names the node and the parameter.
     """
     nodes = load(params)
-    namespaces = [node.removesuffix("/simulator") for node in nodes if node.endswith("/simulator")]
-    if not namespaces:
+    simulators = {node: node_values(nodes, node, SIMULATOR) for node in nodes if node.endswith("/simulator")}
+    if not simulators:
         raise ParameterError("params", str(params), "a file with a simulator: --offline runs the simulated device only")
-    simulators = {namespace: node_values(nodes, f"{namespace}/simulator", SIMULATOR) for namespace in namespaces}
     with_imu = next((values for values in simulators.values() if values["imu.topic"] and "/imu" in nodes), None)
     rotation = nodes.get("/imu", {}).get("rotation_trunk_from_imu", [])
     moves = any(step.action in TRUNK_ACTIONS for step in script.steps)
@@ -47,9 +45,9 @@ def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
         with named("/imu "):
             true = with_imu["trunk.pitch"], with_imu["trunk.roll"]
             trunk = resting(*measured_tilt(*true, SimulatedImu(imu_of(with_imu)), rotation))
-    for namespace, simulator in simulators.items():
-        arm = read_arm(nodes, namespace)
-        with named(f"{namespace}/simulator "):
+    for node, simulator in simulators.items():
+        arm = read_arm(nodes, node.removesuffix("/simulator"))
+        with named(f"{node} "):
             device = device_of(simulator)
             set_faults(device, simulator)
         rate = arm.can_bridge["rate"]
@@ -60,46 +58,39 @@ def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
     return trials
 
 
-def run_offline(
-    trials: Sequence[OfflineTrial], console: Console, should_stop: Callable[[], bool]
-) -> tuple[list[Recording], list[Event], str]:
-    """Run the trials; return what was recorded, what went wrong, and why a trial ended early, or ''.
+def record_offline(trial: Trial, console: Console, should_stop: Callable[[], bool]) -> TrialEnd:
+    """Prepare and run a trial on the simulated arms of its parameter file, and record it in the folder `bag`.
 
-    Raises DataError if nothing was recorded.
+    Raises ParameterError for a wrong parameter, DataError if nothing was recorded or it cannot be written.
     """
+    assert trial.params is not None, "arms that are carried already are not simulated here"
+    simulated = simulated_trials(trial.params, trial.script)
+    nodes = load(trial.prepare(with_recorder=False))
     recordings = []
-    for trial in trials:
-        name = trial.arm.name
+    for one in simulated:
+        name = one.arm.name
         with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-            task = progress.add_task(name, total=trial.script.duration)
+            task = progress.add_task(name, total=one.script.duration)
 
             def on_second(now: float, progress: Progress = progress, task: TaskID = task) -> bool:
                 progress.update(task, completed=now)
                 return should_stop()
 
             begin = time.perf_counter()
-            recordings.append(trial.run(on_second))
+            recordings.append(one.run(on_second))
             taken = time.perf_counter() - begin
         length = float(recordings[-1].time[-1])
-        console.print(f"{name}: {length:.0f} s simulated in {taken:.1f} s, {length / taken:.0f} times real time")
-    events = sorted(Event(*event) for trial in trials for event in trial.events)
-    return recordings, events, next((trial.trouble for trial in trials if trial.trouble), "")
-
-
-def record_offline(
-    trials: Sequence[OfflineTrial], params: Path, session: Session, console: Console, should_stop: Callable[[], bool]
-) -> str:
-    """Run the trials and record them in the folder `bag` next to `params`. Return why one ended early, or ''.
-
-    Raises DataError if nothing was recorded, or it cannot be written.
-    """
-    recordings, events, trouble = run_offline(trials, console, should_stop)
+        console.print(
+            f"{one.arm.name}: {length:.0f} s simulated in {taken:.1f} s, {length / taken:.0f} times real time"
+        )
+    events = sorted(Event(*event) for one in simulated for event in one.events)
     texts = {
         node: yaml.safe_dump({node: {"ros__parameters": values}}, default_flow_style=None, width=120)
-        for node, values in load(params).items()
+        for node, values in nodes.items()
     }
-    write_recordings(params.with_name("bag"), recordings, events, texts, session)
-    return trouble
+    write_recordings(trial.folder / "bag", recordings, events, texts, trial.session)
+    trouble = next((one.trouble for one in simulated if one.trouble), "")
+    return TrialEnd(trouble, int(bool(trouble)))
 
 
 def trunk_imu(config: ImuConfig, rotation_trunk_from_imu: Sequence[float], cycle_rate: float) -> TrunkSensor:
@@ -118,7 +109,7 @@ def trunk_imu(config: ImuConfig, rotation_trunk_from_imu: Sequence[float], cycle
     def measure(now: float, state: TrunkState) -> TrunkReading | None:
         if not next(due):
             return None
-        angular_velocity, acceleration = imu.sample_of(state)
+        angular_velocity, acceleration = imu.sample(state)
         try:
             answer = estimator.update(ImuSample(now, angular_velocity.tolist(), acceleration.tolist()))
         except ParameterError:  # refused samples are not published

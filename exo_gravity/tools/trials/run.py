@@ -10,7 +10,8 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -19,15 +20,17 @@ import yaml
 from rich.console import Console
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.params import params_of
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.core.trial.session import Session
-from exo_gravity.tools.inputs.parameter_file import load
+from exo_gravity.tools.inputs.parameter_file import load, stages
 from exo_gravity.tools.launcher import Launcher, Stopping
 from exo_gravity.tools.trials.screen import LEAD, TrialScreen
 
 RECORDER = "/recorder"
+START_TIME = 1.0  # s for a panel to start the virtual wearer, once the recorder runs
 START_TIMEOUT = 60.0  # s until the arm must be carried
 GRACE = 0.5  # s recorded after the last step
 RECORDER_TIMEOUT = 10.0  # s without a line from the recorder
@@ -49,65 +52,75 @@ POSSIBLE = {
 Status = Mapping[str, Mapping[str, Any]]  # of each node on /diagnostics, as in the recorder's live lines
 
 
-@dataclass(frozen=True)
-class TrialEnd:
-    """How a trial ended."""
-
-    trouble: str  #: why it ended before the script, or ''
-    code: int  #: the exit code for that
-    busy: str = ""  #: what was late because this computer was too busy, or ''
-
-
 def is_guided(params: Path) -> bool:
     """Return whether a person performs the script, because the parameter file has no simulator."""
     return not any(node.endswith("/simulator") for node in load(params))
 
 
-def prepare(params: Path | None, script: Path, folder: Path, session: Session | None) -> Path:
-    """Write the parameter file of one trial into the new `folder`, and return its path.
+@dataclass(frozen=True)
+class Trial:
+    """Who performs which script on which nodes, and where that is recorded."""
 
-    It is `params` with the script for each simulator and a recorder of `session`, None for no recorder. Raises
-    ParameterError.
-    """
-    content: dict[str, Any] = yaml.safe_load(params.read_text(encoding="utf-8")) if params else {}
-    for node, entry in content.items():
-        if node.endswith("/simulator"):
-            entry["ros__parameters"]["trial"] = str(script)
-    if session:
-        of_whom = {name: text for name, text in asdict(session).items() if name != "version"}
-        content[RECORDER] = {"ros__parameters": {"output": str(folder / "bag"), "live": True, **of_whom}}
-    path = folder / "params.yaml"
-    try:
-        folder.mkdir(parents=True)
-        text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise ParameterError("output", str(folder.parent), f"a writable folder ({error.strerror})") from None
-    return path
+    path: Path  #: of the script
+    script: TrialScript
+    params: Path | None  #: the parameter file of the nodes; None on arms that are carried already
+    guided: bool  #: whether a person performs the script; otherwise the virtual wearer of a simulator does
+    session: Session
+    folder: Path
+
+    def prepare(self, with_recorder: bool = True) -> Path:
+        """Write the trial's own parameter file into the new folder, and return its path. Raises ParameterError."""
+        content: dict[str, Any] = yaml.safe_load(self.params.read_text(encoding="utf-8")) if self.params else {}
+        for node, entry in content.items():
+            if node.endswith("/simulator"):
+                entry["ros__parameters"]["trial"] = str(self.path)
+        if with_recorder:
+            of_whom = {param.name: getattr(self.session, param.name) for param in params_of(Session)}
+            content[RECORDER] = {"ros__parameters": {"output": str(self.folder / "bag"), "live": True, **of_whom}}
+        path = self.folder / "params.yaml"
+        try:
+            self.folder.mkdir(parents=True)
+            text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
+            path.write_text(text, encoding="utf-8")
+        except OSError as error:
+            expected = f"a writable folder ({error.strerror})"
+            raise ParameterError("output", str(self.folder.parent), expected) from None
+        return path
+
+
+@dataclass(frozen=True)
+class TrialEnd:
+    """How a trial ended."""
+
+    trouble: str = ""  #: why it ended before the script, or ''
+    code: int = 0  #: the exit code for that
+    busy: str = ""  #: what was late because this computer was too busy, which is why it ended, or ''
 
 
 def run_attempts(
-    params: Path, path: Path, script: TrialScript, folder: Path, session: Session, console: Console, stopped: Stopping
+    trial: Trial, console: Console, stopped: Stopping, on_progress: Callable[[int, float], None]
 ) -> TrialEnd:
-    """Run `script`, the file at `path`, on nodes in the new `folder`; repeat it if this computer was too busy."""
-    bridges = [node.lstrip("/") for node in load(params) if node.endswith("/can_bridge")]
-    guided = is_guided(params)
+    """Run a trial that is prepared; repeat it if this computer was too busy. on_progress: as in `TrialScreen`."""
+    # On arms that are carried already the clock leads: a simulator's newest step may be that of an earlier trial.
+    unguided = START_TIME if trial.params is None else None
+    lead = LEAD if trial.guided else unguided
+    bridges = [node.lstrip("/") for node in stages(load(trial.params))[0]] if trial.params else []
     for attempt in range(1, ATTEMPTS + 1):
-        trial = prepare(params, path, folder, session)
-        screen = TrialScreen(script, guided, console, bridges, LEAD if guided else None)
-        end = run_nodes(trial, script, folder, screen, stopped)
-        if not (end.trouble and end.busy) or end.code == 2 or stopped.is_set() or attempt == ATTEMPTS:
+        end = run_nodes(trial, TrialScreen(trial.script, trial.guided, console, bridges, lead, on_progress), stopped)
+        if not end.busy or attempt == ATTEMPTS:
             break
-        folder.rename(f"{folder}_attempt_{attempt}")
+        trial.folder.rename(f"{trial.folder}_attempt_{attempt}")
+        trial.prepare()
         again = f"attempt {attempt + 1} of {ATTEMPTS}"
         console.print(f"this computer was too busy: {end.busy}; {again}", markup=False, soft_wrap=True)
     return end
 
 
-def run_nodes(params: Path, script: TrialScript, folder: Path, screen: TrialScreen, stopped: Stopping) -> TrialEnd:
-    """Run the nodes of `params` until the script is done, a fault latches or `stopped` is set."""
+def run_nodes(trial: Trial, screen: TrialScreen, stopped: Stopping) -> TrialEnd:
+    """Run the nodes of a trial until the script is done, a fault latches or `stopped` is set."""
     last_errors: dict[str, str] = {}
-    with (folder / "log.txt").open("w", 1, encoding="utf-8") as log, screen.live:
+    path = trial.folder / "log.txt"
+    with path.open("w", 1, encoding="utf-8") as log, screen.live, ThreadPoolExecutor(1) as pool:
 
         def on_line(node: str, line: str) -> None:
             if node == RECORDER and line.startswith("{"):
@@ -117,43 +130,37 @@ def run_nodes(params: Path, script: TrialScript, folder: Path, screen: TrialScre
             if line.startswith(("FATAL ", "ERROR ")):
                 last_errors[node] = line.partition(" ")[2]
 
-        launcher = Launcher(params, on_line)
+        launcher = Launcher(trial.folder / "params.yaml", on_line)
         ending = threading.Event()
-        dead: list[tuple[str, int] | None] = []
-        nodes = threading.Thread(target=lambda: dead.append(launcher.run(ending)))
-        nodes.start()
-        trouble = follow(screen, script, stopped, lambda: launcher.exit_code(RECORDER), nodes)
+        nodes = pool.submit(launcher.run, ending)
+        trouble = follow(screen, stopped, lambda: launcher.exit_code(RECORDER), nodes)
         recorder_failed = launcher.exit_code(RECORDER) is not None and launcher.dead() is None
         down_by = time.monotonic() + DESCENT_TIMEOUT
-        while nodes.is_alive() and is_falling(screen.status) and screen.silence < 1.0 and time.monotonic() < down_by:
+        while is_falling(screen.status) and screen.silence < 1.0 and time.monotonic() < down_by and not nodes.done():
             time.sleep(0.05)  # the recording shows how the arm comes down
-        if nodes.is_alive():
+        if not nodes.done():
             screen.end("letting the arm down and closing the recording")
         ending.set()
-        nodes.join()
-    busy = "" if stopped.is_set() or recorder_failed else too_busy(screen.status)
-    if dead and dead[0]:
-        node, code = dead[0]
-        why = last_errors.get(node, f"see {folder / 'log.txt'}")
-        trouble = f"{node.lstrip('/')} ended with exit code {code}: {why}"
+        dead = nodes.result()
+    # A fault is excused on a simulated device alone that this trial has started.
+    may_be_busy = trial.params and not (stopped.is_set() or recorder_failed)
+    busy = too_busy(screen.status) if may_be_busy else ""
+    if dead:
+        node, code = dead
+        trouble = f"{node.lstrip('/')} ended with exit code {code}: {last_errors.get(node, f'see {path}')}"
         # The watchdog kills a bridge that has not run for too long.
-        busy = busy if node.endswith("/can_bridge") and code == -signal.SIGKILL else ""
-        return TrialEnd(trouble, 2 if code == 2 else 1, busy)
-    if RECORDER in last_errors and trouble:
-        trouble += f": {last_errors[RECORDER]}"
-    return TrialEnd(trouble, int(bool(trouble)), busy)
+        killed = node.endswith("/can_bridge") and code == -signal.SIGKILL
+        return TrialEnd(trouble, 2 if code == 2 else 1, busy if killed else "")
+    if not trouble:
+        return TrialEnd()
+    recorder = f": {last_errors[RECORDER]}" if RECORDER in last_errors else ""
+    return TrialEnd(f"{trouble}{recorder}", 1, busy)
 
 
-def follow(
-    screen: TrialScreen,
-    script: TrialScript,
-    stopped: Stopping,
-    recorder_code: Callable[[], int | None],
-    nodes: threading.Thread,
-) -> str:
+def follow(screen: TrialScreen, stopped: Stopping, recorder_code: Callable[[], int | None], nodes: Future[Any]) -> str:
     """Wait until the script is done; return '' or why the wait ended earlier."""
-    deadline = time.monotonic() + START_TIMEOUT + script.duration
-    while not stopped.wait(0.05) and nodes.is_alive():
+    deadline = time.monotonic() + START_TIMEOUT + screen.script.duration
+    while not stopped.wait(0.05) and not nodes.done():
         if (code := recorder_code()) is not None:
             return f"the recorder ended with exit code {code} before the trial was done"
         if screen.silence > RECORDER_TIMEOUT:

@@ -8,6 +8,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from typing import Any
 
 from rich.console import Console, Group
@@ -21,51 +22,40 @@ SETTLING = 0.5  # s between letting go and the position from which drift is meas
 LEAD = 5.0  # s for a person to get ready when the arm is carried
 
 
+@dataclass(eq=False)
 class TrialScreen:
-    """Follows a script through the recorder's lines.
+    """Follows a script through the recorder's lines."""
 
-    guided: a person performs the script. bridges: those that must be active before the clock starts; by default, all
-    that are seen. lead: s from then to the first step, in a script that the clock leads; None if the steps are those of
-    the simulator. on_progress: called with the step and the time left in it, s, once the clock has started. clock:
-    monotonic s.
-    """
+    script: TrialScript
+    guided: bool  #: whether a person performs the script
+    console: Console
+    bridges: Collection[str] = ()  #: that must be active before the clock starts; none: all that are seen
+    #: s from then to the first step, in a script that the clock leads; None if the steps are those of the simulator
+    lead: float | None = LEAD
+    #: called with the step and the time left in it, s, once the clock has started
+    on_progress: Callable[[int, float], None] = lambda step, left: None
+    clock: Callable[[], float] = time.monotonic  #: s
 
-    def __init__(
-        self,
-        script: TrialScript,
-        guided: bool,
-        console: Console,
-        bridges: Collection[str] = (),
-        lead: float | None = LEAD,
-        on_progress: Callable[[int, float], None] = lambda step, left: None,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __post_init__(self) -> None:
         self.done = False  #: the last step has ended
         self.status: dict[str, dict[str, Any]] = {}  #: of each node on /diagnostics
         self.faults: list[str] = []  #: warnings and errors of the nodes
-        self._script = script
-        self._guided = guided
-        self._lead = lead
-        self._bridges = bridges
-        self._console = console
-        self._on_progress = on_progress
-        self._clock = clock
         self._arms: dict[str, dict[str, Any]] = {}
         self._index = -1  # of the current step
-        self._step_start = self._last_line = clock()
+        self._step_start = self._last_line = self.clock()
         self._start = math.inf  # of a script that the clock leads
         self._origin: dict[str, list[float]] = {}  # position of each arm from which drift is measured
         self._ending = ""
         #: shows `screen` on a terminal, and nothing elsewhere
         self.live = Live(
-            console=console, auto_refresh=console.is_terminal, refresh_per_second=10, get_renderable=self.screen,
-            transient=True,
+            console=self.console, auto_refresh=self.console.is_terminal, refresh_per_second=10,
+            get_renderable=self.screen, transient=True,
         )  # fmt: skip
 
     def end(self, text: str) -> None:
         """Print `text`, and stop following the script."""
         self._ending = text
-        self._console.print(text)
+        self.console.print(text)
 
     def take(self, line: str) -> None:
         """Process one line of the recorder's JSON; ignore half a line, which a killed recorder leaves."""
@@ -73,19 +63,19 @@ class TrialScreen:
             content = json.loads(line)
         except json.JSONDecodeError:
             return
-        self._last_line = self._clock()
+        self._last_line = self.clock()
         self.status = content.pop("status", {})
         self.faults = content.pop("faults", [])
         self._arms = {name: arm for name, arm in content.items() if "position" in arm}
         if not self._ending:
             self._follow([arm["step"]["step"] for arm in content.values() if "step" in arm])
             if self._start < math.inf:
-                self._on_progress(self._index, self._left)
+                self.on_progress(self._index, self._left)
 
     @property
     def silence(self) -> float:
         """Time in s since the recorder's last line; 0 before its first."""
-        return self._clock() - self._last_line if self._arms else 0.0
+        return self.clock() - self._last_line if self._arms else 0.0
 
     @property
     def is_let_down(self) -> bool:
@@ -94,38 +84,38 @@ class TrialScreen:
 
     @property
     def _step(self) -> Step | None:
-        return self._script.steps[self._index] if 0 <= self._index < len(self._script.steps) else None
+        return self.script.steps[self._index] if 0 <= self._index < len(self.script.steps) else None
 
     @property
     def _left(self) -> float:
         """Time in s until the next step."""
         due = self._step_start + self._step.duration if self._step else self._start
-        return max(0.0, due - self._clock())
+        return max(0.0, due - self.clock())
 
     @property
     def _all_active(self) -> bool:
         states = {name: values.get("state") for name, values in self.status.items() if name.endswith("can_bridge")}
-        return bool(states) and set(self._bridges) <= set(states) and set(states.values()) == {State.ACTIVE.value}
+        return bool(states) and set(self.bridges) <= set(states) and set(states.values()) == {State.ACTIVE.value}
 
     def _follow(self, simulated_steps: list[int]) -> None:
-        index, now = self._index, self._clock()
-        if self._lead is None:
+        index, now = self._index, self.clock()
+        if self.lead is None:
             index = min(simulated_steps, default=-1)
         elif self._start == math.inf:
             if self._all_active:
-                self._start = now + self._lead
+                self._start = now + self.lead
         elif now >= self._start:
-            index = self._script.at(now - self._start)[0]
+            index = self.script.at(now - self._start)[0]
         if index != self._index:
             if self._origin:
-                self._console.print(f"     drifted {self._drift():.2f} deg")
+                self.console.print(f"     drifted {self._drift():.2f} deg")
             self._index, self._step_start, self._origin = index, now, {}
             if self._step:
-                number = f"{index + 1}/{len(self._script.steps)}"
-                self._console.print(f"{number:<5}{describe(self._step, self._guided)}", soft_wrap=True)
+                number = f"{index + 1}/{len(self.script.steps)}"
+                self.console.print(f"{number:<5}{describe(self._step, self.guided)}", soft_wrap=True)
         elif not self._origin and now - self._step_start > SETTLING and self._step and self._step.action == "hold":
             self._origin = {name: arm["position"] for name, arm in self._arms.items()}
-        self.done = index >= len(self._script.steps)
+        self.done = index >= len(self.script.steps)
 
     def _drift(self) -> float:
         """Return the largest drift of any joint since it was let go, in degrees."""
@@ -147,15 +137,15 @@ class TrialScreen:
         return Group(*lines)
 
     def _headline(self) -> str:
-        steps = self._script.steps
+        steps = self.script.steps
         if self._ending or self._index >= len(steps):
             return ""
         if self._index >= 0:
-            then = describe(steps[self._index + 1], self._guided) if self._index + 1 < len(steps) else "done"
+            then = describe(steps[self._index + 1], self.guided) if self._index + 1 < len(steps) else "done"
             drift = f"drift {self._drift():.2f} deg    " if self._origin else ""
             return f"     {self._left:.0f} s left    {drift}then: {then}"
         if self._start < math.inf:
-            first = describe(steps[0], self._guided)
+            first = describe(steps[0], self.guided)
             return f"     take hold of the arm: in {self._left:.0f} s, {first}"
         return "     waiting for the arm to be carried"
 

@@ -19,7 +19,7 @@ from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, simulated_motor
+from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.offline import ArmSetup, OfflineTrial
 
@@ -63,7 +63,7 @@ def weigh(mass: float, *after: dict[str, Any]) -> tuple[Weighing, str, np.ndarra
     arm.carry(mass)
     arm.reset((0.0, 0.05, 0.05, 0.05))
     motors = [JointMotor(MOTORS[name], n + 1) for n, name in enumerate(NAMES)]
-    device = SimulatedDevice(arm, [simulated_motor(motor, Firmware()) for motor in motors], "right")
+    device = SimulatedDevice(arm, [SimulatedMotor(motor, Firmware()) for motor in motors], "right")
     steps = [{"move": list(POSE), "over": MOVE}, *(after or ({"hold": 20.0},))]
     limits = Limits(JOINTS, max_effort=SETTINGS.max_effort, sign_check_torque=0.0)
     compensator = Balance(SETTINGS, at=HELD)
