@@ -55,7 +55,8 @@ path = [0.0, *poses[0]]  # rows of s and four angles
 path += [number for row, pose in enumerate(poses[::5]) for number in (APPROACH + 0.02 * row, *pose)]
 
 spring = Spring(stiffness=(3.5, 9.0, 6.0, 3.3), pose=path)
-friction = Friction(share=0.8, coulomb=(0.2, 0.4, 0.2, 0.2))  # as identified: else the spring must overcome it
+COULOMB, VISCOUS = (0.2, 0.4, 0.2, 0.2), (0.0, 0.0, 0.0, 0.0)  # as identified: else the spring must overcome it
+friction = Friction(share=0.8, identified=(*COULOMB, *VISCOUS))
 compensator.apply(replace(settings, terms=TermSettings(spring=spring, friction=friction)))
 for _ in range(round(APPROACH / PERIOD)):
     cycle()

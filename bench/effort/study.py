@@ -52,7 +52,7 @@ def settings_by_name(base: Settings, coulomb: Sequence[float], viscous: Sequence
 
     base: of the arm and its wearer. coulomb Nm, viscous Nm s/rad: the friction that the terms know, (4,) each.
     """
-    known = Friction(coulomb=coulomb, viscous=viscous)
+    known = Friction(identified=(*coulomb, *viscous))
     least = least_inertia(LinkInertia.of(base.robot_by_mass or base.robot))
     soft = [min(20.0, SOFT * inertia / (4.0 * DELAY**2)) for inertia in least]  # Nm/rad
     terms = {

@@ -121,10 +121,11 @@ class ArmModel:
         """Raise ParameterError unless masses are known and all centres of gravity lie on the links, as `what` needs."""
         if self.payload[0]:
             raise ParameterError("payload.mass", self.payload[0], f"0 for {what}, which knows no load in the hand")
+        moments = [*(self.first_moment if self.by_moments else ZEROS), *self.off_axis]
         if self.by_moments:
-            raise ParameterError("robot.first_moment", self.first_moment, f"0 for {what}, which needs mass and cog")
+            raise ParameterError("robot.moments", moments, f"0 for {what}, which needs mass and cog")
         if any(self.off_axis):
-            raise ParameterError("robot.off_axis", self.off_axis, f"0 for {what}, which knows no moments across links")
+            raise ParameterError("robot.moments", moments, f"0 for {what}, which knows no moments across links")
 
     def with_payload(self, mass: float, cog: Vector = ZEROS[:3]) -> "ArmModel":
         """Return this arm with a load of `mass` kg in its hand, instead of any other.

@@ -110,8 +110,7 @@ def _changes(arm: ConfiguredArm, identified: Identified, scale: list[float]) -> 
     unit = "as commanded; in kg m once a weight was hung" if identified.relative else "kg m"
     moments = np.where(np.isfinite(error), identified.moments, moments_of(arm.robot)).round(5).tolist()
     changes = [
-        Change(node, "robot.first_moment", moments[:4], f"{unit}, +-{_row(error[:4])}"),
-        Change(node, "robot.off_axis", moments[4:], f"W Z Y3 Y4 {unit}, +-{_row(error[4:])}"),
+        Change(node, "robot.moments", moments, f"{' '.join(MOMENTS)} {unit}, +-{_row(error)}"),
         Change(f"{arm.namespace}/can_bridge", "torque_scale", scale, f"+-{_row(identified.scale_error)}"),
     ]
     if np.all(np.isfinite(identified.held_out).any(axis=0)):

@@ -47,7 +47,7 @@ STATE = TermState(0.002, (0.2, 0.7, 0.6, 0.5), ZERO, ZERO, 0.0)
 EDGES = (-1.5, 1.5, 0.0, 1.6, -0.6, 1.6, 0.0, 2.5)
 four = st.tuples(*[st.floats(-40.0, 40.0)] * 4)
 ALL = TermSettings(
-    friction=Friction(0.7, (0.2, 0.4, 0.2, 0.2), (0.02,) * 4),
+    friction=Friction(0.7, (0.2, 0.4, 0.2, 0.2, 0.02, 0.02, 0.02, 0.02)),
     inertia=Inertia(0.7),
     damping=Damping((0.05, 0.1, 0.05, 0.05)),
     spring=Spring((2.0, 4.0, 2.0, 1.0)),
@@ -59,7 +59,7 @@ ALL = TermSettings(
 @settings(deadline=None)
 @given(four, st.floats(0.0, 0.85))
 def test_friction_is_along_the_motion_and_below_what_the_joint_loses(velocity, share):
-    friction = Friction(share, (0.2, 0.4, 0.2, 0.1), (0.02, 0.05, 0.02, 0.0))
+    friction = Friction(share, (0.2, 0.4, 0.2, 0.1, 0.02, 0.05, 0.02, 0.0))
     for v, tau, coulomb, viscous in zip(
         velocity, friction.torque(STATE._replace(velocity=velocity)), friction.coulomb, friction.viscous, strict=True
     ):
@@ -68,7 +68,7 @@ def test_friction_is_along_the_motion_and_below_what_the_joint_loses(velocity, s
 
 
 def test_friction_is_zero_at_standstill_and_does_not_step():
-    friction = Friction(0.8, (0.2,) * 4)
+    friction = Friction(0.8, (*(0.2,) * 4, *(0.0,) * 4))
     speeds = np.linspace(-2.0 * SLIDING, 2.0 * SLIDING, 400)
     torque = np.array([friction.torque(STATE._replace(velocity=(v, 0.0, 0.0, 0.0)))[0] for v in speeds])
     one_code = 2.0 * 45.0 / 4095.0

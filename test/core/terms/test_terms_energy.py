@@ -42,7 +42,7 @@ class Case:
             viscous_friction=tuple(rng.uniform(0.0, 0.05, 4).tolist()),
             stribeck_friction=tuple((0.2 * np.array(self.friction) * rng.uniform(0.0, 1.0)).tolist()),
         )
-        self.identified = tuple((np.array(self.friction) * rng.uniform(0.8, 1.0)).tolist())
+        self.identified = (*(np.array(self.friction) * rng.uniform(0.8, 1.0)).tolist(), *(0.0,) * 4)
         self.period = float(rng.choice((0.002, 0.004, 0.005)))
         self.delay = float(rng.choice((0.0, 0.005, 0.01)))
 
@@ -66,7 +66,7 @@ def stiffest(links: ArmModel) -> tuple[float, ...]:
 
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_friction_gives_less_than_the_joints_friction_takes(case):
-    run = case.pushed(TermSettings(friction=Friction(0.85, case.identified, tuple(case.config.viscous_friction))))
+    run = case.pushed(TermSettings(friction=Friction(0.85, (*case.identified[:4], *case.config.viscous_friction))))
     assert run.given > 0.3 * run.rubbed  # it does help
     assert run.worst_balance < 0.02
 
@@ -150,7 +150,7 @@ THIRTEEN = [
 def test_friction_and_inertia_let_no_held_pose_creep_or_cycle():
     """Each pose is left at 0.3 rad/s, as a hand that lets go leaves it; 0.2 degrees a minute is the limit."""
     case = Case(1)
-    chosen = TermSettings(inertia=Inertia(0.8), friction=Friction(0.85, case.friction))
+    chosen = TermSettings(inertia=Inertia(0.8), friction=Friction(0.85, (*case.friction, *(0.0,) * 4)))
     for pose in THIRTEEN[::4]:
         run = TermsRun(chosen, case.config, case.links, pose, period=0.004, delay=0.008)
         run.device.arm.data.qvel[:] = 0.3

@@ -10,7 +10,7 @@ Inertia: acceleration that is measured late gives more energy than it takes back
 - The share is below 1 and the low-pass never amplifies, so on a free arm the loop has a gain below 1 (small gain
   theorem) and cannot oscillate, however late it acts. On an elastic arm, such as a wearer's, it can: the tank ends it.
 - An energy tank: the term gives no more than it took, plus TANK, plus a share of what the joints' own friction takes
-  (`friction.coulomb`). What `friction.share` has given back is not spent twice. If the tank is empty, the term fades.
+  (`friction.identified`). What `friction.share` gave back is not spent twice. If the tank is empty, the term fades.
   On simulated arms with torques 10 ms late the excess was 0.76 J at most, with a TANK of 0.5 J.
 At standstill there is no torque: 12-bit velocities alternate between two codes, and the acceleration that this feigns
 moved the shoulder's rotation against its friction, by up to 1 degree a minute.
@@ -25,8 +25,10 @@ from typing import NamedTuple
 from exo_gravity.core.compensation.terms.springs import DELAY, TermParameters, TermState
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.model.kinematics import LinkInertia
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import owned
 
+MAX_FRICTION = 3.0  # Nm, and Nm s/rad
 MAX_FRICTION_SHARE = 0.85  # leaves a friction that is 15 % smaller than identified
 STANDSTILL = 0.03  # rad/s, below which a joint is considered to stand: more than one code of 12-bit velocity
 SLIDING = 0.12  # rad/s, from which on friction is given its full share
@@ -49,8 +51,21 @@ class Friction(TermParameters):
     share: float = owned(
         0.0, "share of the joints' friction that the motors take over; 0: off", (0.0, MAX_FRICTION_SHARE)
     )
-    coulomb: Sequence[float] = owned((0.0,) * 4, "identified Coulomb friction", (0.0, 3.0), "Nm")
-    viscous: Sequence[float] = owned((0.0,) * 4, "identified viscous friction", (0.0, 1.0), "Nm s/rad")
+    identified: Sequence[float] = owned(
+        (0.0,) * 8,
+        "Coulomb friction of the four joints in Nm, then their viscous friction in Nm s/rad, by `calibrate friction`",
+        (0.0, MAX_FRICTION),
+    )
+
+    @property
+    def coulomb(self) -> Sequence[float]:
+        """Coulomb friction (4,) in Nm."""
+        return self.identified[:JOINT_COUNT]
+
+    @property
+    def viscous(self) -> Sequence[float]:
+        """Viscous friction (4,) in Nm s/rad."""
+        return self.identified[JOINT_COUNT:]
 
     def torque(self, state: TermState) -> Torque:
         """Return the torque (4,) in Nm, along the motion."""
