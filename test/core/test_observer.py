@@ -13,7 +13,7 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.friction_inertia import Friction
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.model.arm import ModelError
-from exo_gravity.core.model.kinematics import LinkInertia, turning_in_base
+from exo_gravity.core.model.kinematics import links_of, turning_in_base
 from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.observer.momentum import BANDWIDTH, COVER, MomentumObserver
 from exo_gravity.core.observer.share import PERIOD, WearerCurve, observed, share_of, while_between
@@ -41,7 +41,7 @@ def test_momentum_and_coriolis_torque_agree_with_pinocchio_for_random_arms_and_m
     for _ in range(5):
         arm = random_arm(rng)
         pin, model, data = with_rods(arm)
-        links = LinkInertia.of(arm, NO_ROTORS)
+        links = links_of(arm)._replace(rotors=NO_ROTORS)
         for theta, velocity in rng.uniform(-3.0, 3.0, (20, 2, 4)):
             momentum, coriolis = links.momentum(theta, velocity)
             mass = pin.crba(model, data, theta)
@@ -53,7 +53,7 @@ def test_momentum_and_coriolis_torque_agree_with_pinocchio_for_random_arms_and_m
 
 def test_a_base_that_turns_adds_the_momentum_of_an_arm_that_turns_with_it():
     # About joint 1's own axis the base's turning is that of joint 1, for momentum and kinetic energy alike.
-    links, rng = LinkInertia.of(DEFAULT_LINKS, NO_ROTORS), np.random.default_rng(2)
+    links, rng = links_of(DEFAULT_LINKS)._replace(rotors=NO_ROTORS), np.random.default_rng(2)
     for theta, velocity in rng.uniform(-2.0, 2.0, (20, 2, 4)):
         turned = links.momentum(theta, velocity, (0.0, 0.0, 0.7))
         same = links.momentum(theta, velocity + np.array((0.7, 0.0, 0.0, 0.0)))

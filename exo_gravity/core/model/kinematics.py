@@ -71,13 +71,6 @@ class LinkInertia(NamedTuple):
     rotors: tuple[float, ...] = ROTORS  #: at the joints, (4,) kg m^2
 
     @classmethod
-    def of(cls, arm: ArmModel, rotors: Sequence[float] = ROTORS) -> "LinkInertia":
-        """Return the inertia of `arm`. Raises ParameterError if it is given by its moments."""
-        if arm.by_moments:
-            arm.check_masses("terms that depend on the inertia")
-        return links_of(arm)._replace(rotors=tuple(rotors))
-
-    @classmethod
     def of_moments(cls, length: Vector, moment: Vector, load: tuple[float, float] = (0.0, 0.0)) -> "LinkInertia":
         """Return the approximate inertia of an arm that is known by its moments.
 

@@ -1,7 +1,6 @@
 """Estimates the wearer's torque 100 times a second, outside the control loop: `wearer_efforts`, `wearer_efforts_std`.
 
-The control loop leaves its newest message here, and does not wait. Neither topic leads back to it; with
-`support_adapts` the support follows, as a guided change every 2 s. If the estimate fails, the control loop goes on, and
+The control loop leaves its newest message here, and does not wait. If the estimate fails, the loop goes on, and
 /diagnostics has the reason.
 """
 
@@ -21,9 +20,7 @@ from exo_gravity.core.model.kinematics import turning_in_base
 from exo_gravity.core.model.rotation import ZERO, Floats3
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.observer.adaptation import SupportAdaptation
-from exo_gravity.core.observer.contact import ContactWatch
-from exo_gravity.core.observer.momentum import COVER, MAX_GAP, MomentumObserver, WearerEstimate
-from exo_gravity.core.observer.share import RunningShare
+from exo_gravity.core.observer.momentum import COVER, ContactWatch, MomentumObserver, WearerEstimate
 from exo_gravity.core.trunk.inputs import FELT_RANGE
 from exo_gravity.nodes.ros.messages import by_name
 from exo_gravity.nodes.ros.subscriptions import Repeated
@@ -36,9 +33,8 @@ Sample = tuple[float, Sequence[float], Sequence[float], float]  # monotonic s, m
 class WearerWatch(Repeated):
     """Publishes an estimate for each new sample, from a separate thread.
 
-    newest: time in monotonic s and message of the joints; felt: time in monotonic s, specific force (3,) m/s^2,
-    angular velocity (3,) rad/s and age of a sample of the trunk's motion. Both are set by other threads. lock: guards
-    `control`.
+    newest: time in monotonic s and message of the joints; felt: the same of a sample of the trunk's motion: specific
+    force (3,) m/s^2, angular velocity (3,) rad/s, age in s. Both are set by other threads. lock: guards `control`.
     """
 
     def __init__(self, node: Node, names: Sequence[str], control: Compensator, lock: threading.Lock) -> None:
@@ -51,8 +47,6 @@ class WearerWatch(Repeated):
         self._observer: MomentumObserver | None = None
         self._contact = ContactWatch()
         self._adaptation = SupportAdaptation()
-        self._running = RunningShare()
-        self._share: tuple[float, float] | None = None  # and its standard deviation
         self._known: object = None  # what the observer depends on
         self._due = 0.0
         self._last = -math.inf  # of the samples used
@@ -60,43 +54,30 @@ class WearerWatch(Repeated):
 
     @property
     def values(self) -> dict[str, str]:
-        """What /diagnostics says."""
+        """What /diagnostics says: torques and share with their 95 % bands, the newest contact, the support."""
+        now, estimate, share = time.monotonic(), self._estimate, self._adaptation.share
+        if now - self._last > 1.0:
+            estimate = None
+        torque = shared = "unknown"
+        if self.failure:
+            torque = f"failed: {type(self.failure).__name__}: {self.failure}"
+        elif estimate:
+            columns = zip(self._names, estimate.torque, estimate.deviation, estimate.distinguishable, strict=True)
+            different = [f"{name} {tau:+.1f} +- {COVER * error:.1f}" for name, tau, error, shown in columns if shown]
+            torque = ", ".join(different) or "not distinguishable from zero"
+        if estimate and share:
+            shared = f"{100.0 * share[0]:.0f} +- {100.0 * COVER * share[1]:.0f}"
+        contact = "none"
+        if self._contact.last:
+            at, joint, jump = self._contact.last
+            ago = f"{min(99.0, now - at):.0f} s ago; {self._contact.count} in all"
+            contact = f"{self._names[joint]} {jump:+.1f} Nm, {ago}"
         return {
-            "wearer (Nm)": self._report_text(),
-            "share of the wearer (%)": self._share_text(),
-            "contact": self._contact_text(),
+            "wearer (Nm)": torque,
+            "share of the wearer (%)": shared,
+            "contact": contact,
             "support adapts": self._adaptation_text(),
         }
-
-    def _report_text(self) -> str:
-        """Return the torque of each joint with its 95 % band."""
-        estimate = self._estimate
-        if self.failure:
-            return f"failed: {type(self.failure).__name__}: {self.failure}"
-        if estimate is None or time.monotonic() - self._last > 1.0:
-            return "unknown"
-        different = [
-            f"{name} {torque:+.1f} +- {COVER * deviation:.1f}"
-            for name, torque, deviation, shown in zip(
-                self._names, estimate.torque, estimate.deviation, estimate.distinguishable, strict=True
-            )
-            if shown
-        ]
-        return ", ".join(different) or "not distinguishable from zero"
-
-    def _share_text(self) -> str:
-        """Return the wearer's share of his arm's weight over the last second, in percent with its 95 % band."""
-        if self._share is None or self._estimate is None or time.monotonic() - self._last > 1.0:
-            return "unknown"
-        return " +- ".join(str(round(100.0 * part)) for part in (self._share[0], COVER * self._share[1]))
-
-    def _contact_text(self) -> str:
-        """Return the newest contact and how many there were."""
-        if self._contact.last is None:
-            return "none"
-        at, joint, torque = self._contact.last
-        ago = min(99.0, time.monotonic() - at)
-        return f"{self._names[joint]} {torque:+.1f} Nm, {ago:.0f} s ago; {self._contact.count} in all"
 
     def _adaptation_text(self) -> str:
         """Return from which support to which it adapts."""
@@ -115,7 +96,7 @@ class WearerWatch(Repeated):
         settings = self._control.settings
         if message is None or not isinstance(settings, Settings) or taken <= self._last:
             return
-        dt, self._last = taken - self._last, taken
+        self._last = taken
         trunk, joints = self._trunk(settings, taken), self._joints(message)
         estimate = None
         if trunk is not None and joints is not None:
@@ -129,11 +110,8 @@ class WearerWatch(Repeated):
         if self._adaptation.update(taken, joints and joints[:2], estimate, settings):
             with self._lock:
                 self._control.raise_support(self._adaptation.support)
-        if estimate is None or dt > MAX_GAP:
-            self._running, self._share = RunningShare(), None
         if estimate is None:
             return
-        self._share = self._running.update(min(dt, MAX_GAP), estimate)
         self._contact.update(taken, estimate)
         self._message.header.stamp = message.header.stamp
         for topic, effort in zip(self._topics, (estimate.torque, estimate.deviation), strict=True):

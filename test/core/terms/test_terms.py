@@ -37,7 +37,7 @@ from exo_gravity.core.compensation.terms.terms import (
     term_settings_of,
 )
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.kinematics import LinkInertia, least_inertia
+from exo_gravity.core.model.kinematics import least_inertia, links_of
 from exo_gravity.core.params import values_of
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
@@ -220,7 +220,7 @@ def test_a_spring_or_damper_that_would_be_unstable_when_late_is_refused_with_the
 
 def test_soft_limits_are_no_stiffer_than_the_arm_can_bear():
     stiff = TermSettings(limits=SoftLimits(EDGES)).on_arm(DEFAULT_LINKS).limits.stiffness
-    most = np.array(least_inertia(LinkInertia.of(DEFAULT_LINKS))) / (4.0 * DELAY**2)
+    most = np.array(least_inertia(links_of(DEFAULT_LINKS))) / (4.0 * DELAY**2)
     assert stiff == pytest.approx(np.minimum(10.0, 0.8 * most))
 
 

@@ -16,7 +16,7 @@ from exo_gravity.core import ArmModel
 from exo_gravity.core.compensation.terms.friction_inertia import TANK, Friction, Inertia
 from exo_gravity.core.compensation.terms.springs import DELAY, Coupling, Damping, SoftLimits, Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
-from exo_gravity.core.model.kinematics import LinkInertia, least_inertia
+from exo_gravity.core.model.kinematics import least_inertia, links_of
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
@@ -61,7 +61,7 @@ CASES = [Case(0)]
 
 def stiffest(links: ArmModel) -> tuple[float, ...]:
     """Return the stiffness (4,) in Nm/rad up to which springs are accepted."""
-    return tuple((0.999 * np.array(least_inertia(LinkInertia.of(links))) / (4.0 * DELAY**2)).tolist())
+    return tuple((0.999 * np.array(least_inertia(links_of(links))) / (4.0 * DELAY**2)).tolist())
 
 
 @pytest.mark.parametrize("case", CASES, ids=str)
@@ -95,7 +95,7 @@ def test_inertia_without_an_identified_friction_lives_on_its_tank(case):
 
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_the_strongest_damping_only_takes(case):
-    least = np.array(least_inertia(LinkInertia.of(case.links)))
+    least = np.array(least_inertia(links_of(case.links)))
     run = case.pushed(TermSettings(damping=Damping(tuple((0.999 * least / (2.0 * DELAY)).tolist()))))
     assert run.given < -0.02
     assert run.most_given < 0.01

@@ -5,13 +5,8 @@
     refused    the last ones were wrong; no torque until they have been sound for RECOVERY
     assisting  the efforts are followed: clamped to `max_effort`, limited to MAX_RATE, ramped in over RAMP
 
-Messages may come at 10 to 500 Hz. An effort is valid for 1.5 observed periods after its stamp, and for MIN_VALID at
-least, so that a single late message costs nothing. Then, or at once when a message is wrong, the torque fades in FADE.
-So it is zero 100 ms after the first missing message was due: at 500 Hz 100 ms after the last one, at 10 Hz 200 ms. Only
-the compensator's `max_effort_rate` can make that longer, for an effort above 2.5 Nm at its default.
-
-The input remembers only the torque that it applies. That torque moves towards the newest message and never past it. The
-next sender starts from it, and from zero once it has faded or the compensator has paused.
+An effort is valid for PERIODS observed periods, so that a single late message costs nothing. The input remembers only
+the torque that it applies, which moves towards the newest message and never past it: docs/terms.md.
 """
 
 import math

@@ -1,10 +1,9 @@
 """Friction and inertia: the motors take over a share of what makes the arm hard to move.
 
-Friction, Coulomb and viscous: the term gives at most `share` (below 1) of the friction that takes energy from the same
-motion. So joint and term together always take energy, however late the term acts, and at rest, where it is 0, friction
-holds the arm as before. This is true as long as `coulomb` is not above the joint's real friction: enter what
-`calibrate friction` measured. Motors report speed in codes of 0.022 rad/s (AK60-6) and 0.024 rad/s (AK80-9); standstill
-reads as half a code.
+Friction: the term gives at most `share` (below 1) of the friction that takes energy from the same motion. So joint and
+term together always take energy, however late the term acts, and at rest, where it is 0, friction holds the arm as
+before. This is true as long as `identified` is not above the joint's real friction. Motors report speed in codes of
+0.022 rad/s (AK60-6) and 0.024 rad/s (AK80-9); standstill reads as half a code.
 
 Inertia: acceleration that is measured late gives more energy than it takes back. Two bounds keep that harmless:
 - The share is below 1 and the low-pass never amplifies, so on a free arm the loop has a gain below 1 (small gain
@@ -20,7 +19,6 @@ import math
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from exo_gravity.core.compensation.terms.springs import DELAY, TermParameters, TermState
 from exo_gravity.core.model.gravity import Torque
@@ -46,7 +44,7 @@ BANDWIDTH = 80.0
 
 @dataclass(frozen=True)
 class Friction(TermParameters):
-    """Parameters of the term `friction`. Raises ParameterError."""
+    """The term `friction`. Raises ParameterError."""
 
     share: float = owned(
         0.0, "share of the joints' friction that the motors take over; 0: off", (0.0, MAX_FRICTION_SHARE)
@@ -71,18 +69,14 @@ class Friction(TermParameters):
         """Return the torque (4,) in Nm, along the motion."""
         torque = []
         for v, coulomb, viscous in zip(state.velocity, self.coulomb, self.viscous, strict=True):
-            speed = abs(v)
-            moving = max(0.0, min(1.0, (speed - STANDSTILL) / (SLIDING - STANDSTILL)))
-            whole = self.share * (coulomb + viscous * min(speed, MAX_SPEED))
-            torque.append(math.copysign(moving * whole, v))
+            whole = self.share * (coulomb + viscous * min(abs(v), MAX_SPEED))
+            torque.append(math.copysign(sliding(v) * whole, v))
         return tuple(torque)
 
 
-@dataclass(frozen=True)
-class Inertia(TermParameters):
-    """Parameters of the term `inertia`. Raises ParameterError."""
-
-    share: float = owned(0.0, "share of the arm's inertia that the motors take over; 0: off", (0.0, MAX_INERTIA_SHARE))
+def sliding(speed: float) -> float:
+    """Return the share of its friction that a joint at `speed` rad/s shows: 0 where it stands, 1 where it slides."""
+    return max(0.0, min(1.0, (abs(speed) - STANDSTILL) / (SLIDING - STANDSTILL)))
 
 
 class EnergyTank:
@@ -114,23 +108,24 @@ class EnergyTank:
         return torque
 
 
-class InertiaTerm(NamedTuple):
-    """The term: a share of the inertia of `links`."""
+@dataclass(frozen=True)
+class Inertia(TermParameters):
+    """The term `inertia`. Raises ParameterError."""
 
-    share: float
-    links: LinkInertia
-    coulomb: Sequence[float]  #: (4,) Nm of friction that is left to fill the tank
-    tank: EnergyTank
+    share: float = owned(0.0, "share of the arm's inertia that the motors take over; 0: off", (0.0, MAX_INERTIA_SHARE))
 
-    def torque(self, state: TermState) -> Torque:
-        """Return the torque (4,) in Nm: a share of what accelerates the arm as it is accelerated now."""
+    def torque(self, links: LinkInertia, friction: Sequence[float], tank: EnergyTank, state: TermState) -> Torque:
+        """Return the torque (4,) in Nm: a share of what accelerates `links` as they are accelerated now.
+
+        friction: (4,) Nm of Coulomb friction that is left to fill the `tank`.
+        """
         velocity = state.velocity
         fastest = max(map(abs, velocity))
         fading = min((fastest - STANDSTILL) / (MOVING - STANDSTILL), (TOO_FAST - fastest) / (TOO_FAST - FAST))
         share = self.share * max(0.0, min(1.0, fading))
-        whole = self.links.torque(state.position, velocity, state.acceleration)
-        income = _dot(self.coulomb, map(abs, velocity))
-        return self.tank.pass_on(tuple([share * tau for tau in whole]), velocity, state.dt, income)
+        whole = links.torque(state.position, velocity, state.acceleration)
+        income = _dot(friction, map(abs, velocity))
+        return tank.pass_on(tuple([share * tau for tau in whole]), velocity, state.dt, income)
 
 
 def _dot(a: Iterable[float], b: Iterable[float]) -> float:

@@ -7,7 +7,7 @@ without harm; the tests vary it from 0 to 10 ms. A stiffness or viscosity that t
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,17 +36,9 @@ class TermState(NamedTuple):
     elapsed: float  #: s since the spring's settings
 
 
-class Term(Protocol):
-    """One contribution to the torque on top of gravity compensation; most are `TermParameters`."""
-
-    def torque(self, state: TermState) -> Torque:
-        """Return the torque (4,) in Nm that the motors add."""
-        ...
-
-
 @dataclass(frozen=True)
 class TermParameters:
-    """The parameters of one term, checked; the first one switches it on."""
+    """The parameters of one term, checked; the first one switches it on. `torque` returns the (4,) Nm that it adds."""
 
     #: whether the parameters ask for any torque; by default they do not
     on: bool = field(init=False, repr=False, compare=False)
