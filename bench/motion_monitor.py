@@ -23,8 +23,7 @@ from exo_gravity.core import paper_static_torque
 from exo_gravity.core.compensation.compensator import JOINTS, Answer, Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.assist import Assist
-from exo_gravity.core.compensation.terms.friction_inertia import Friction, Inertia
-from exo_gravity.core.compensation.terms.springs import Spring
+from exo_gravity.core.compensation.terms.catalogue import Friction, Inertia, Spring
 from exo_gravity.core.compensation.terms.terms import MAX_EFFORT, TermSettings
 from exo_gravity.core.model.arm import STANDARD_GRAVITY, ArmModel
 from exo_gravity.core.model.gravity import NO_TORQUE, Torque

@@ -14,8 +14,7 @@ import matplotlib.pyplot as plt
 from exo_gravity.core import ArmModel
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.compensation.terms.friction_inertia import Friction
-from exo_gravity.core.compensation.terms.springs import Spring
+from exo_gravity.core.compensation.terms.catalogue import Friction, Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, MOTORS

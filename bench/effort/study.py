@@ -20,8 +20,15 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.compensation.terms.friction_inertia import Friction, Inertia
-from exo_gravity.core.compensation.terms.springs import DELAY, Coupling, Damping, SoftLimits, Spring
+from exo_gravity.core.compensation.terms.catalogue import (
+    DELAY,
+    Coupling,
+    Damping,
+    Friction,
+    Inertia,
+    SoftLimits,
+    Spring,
+)
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import gravity_torque

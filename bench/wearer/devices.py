@@ -19,7 +19,7 @@ from bench.calibration.device import COULOMB, CURRENT_NOISE, LARGEST_OFFSET, SPR
 from bench.motion_monitor import MOTOR_NAMES
 from exo_gravity.core.calibration.identification import identify
 from exo_gravity.core.compensation.settings import Settings, settings_of
-from exo_gravity.core.compensation.terms.friction_inertia import Friction
+from exo_gravity.core.compensation.terms.catalogue import Friction
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import gravity_torque, moments_of

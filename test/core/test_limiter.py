@@ -2,7 +2,7 @@
 
 import pytest
 
-from exo_gravity.core.compensation.limiter import CommandFade, Output
+from exo_gravity.core.compensation.guidance import CommandFade, Output
 
 EFFORT = (2.0, -4.0)
 NOTHING = (0.0, 0.0)

@@ -10,7 +10,7 @@ import pytest
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.compensation.terms.friction_inertia import Friction
+from exo_gravity.core.compensation.terms.catalogue import Friction
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.model.arm import ModelError
 from exo_gravity.core.model.kinematics import links_of, turning_in_base

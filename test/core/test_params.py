@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.compensation.limiter import LONGEST_STEP
+from exo_gravity.core.compensation.guidance import LONGEST_STEP
 from exo_gravity.core.compensation.settings import COMPENSATOR, settings_of, urdf_table
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import GONE, values_of

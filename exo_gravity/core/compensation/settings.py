@@ -108,15 +108,16 @@ class Settings:
         """The share of the wearer's arm that zero_g compensates at present."""
         return max(self.support, self.raised_support)
 
-    def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = False) -> Torque:
-        """Return the torque (4,) in Nm that holds the arm at `theta` (4,) rad; exact: by the exact law."""
-        if self.law == "anfis" and self.anfis and not exact:
-            return self.anfis.torque(self.arm, theta, tilt)
-        return LAWS["exact" if exact else self.law](self.arm, theta, tilt)
+    def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = False) -> tuple[Torque, str]:
+        """Return the torque (4,) in Nm that holds the arm at `theta` (4,) rad; exact: by the exact law in any case.
 
-    def outside(self, theta: Sequence[float], tilt: Tilt) -> str:
-        """Return why the law does not apply to this pose or tilt, as `AnfisLaw.outside`; '' if it does."""
-        return self.anfis.outside(self.arm, theta, tilt) if self.law == "anfis" and self.anfis else ""
+        And why the chosen law does not apply here, as `AnfisLaw.outside`, or ''. Then the exact law replaces it.
+        """
+        if self.law != "anfis" or not self.anfis:
+            return LAWS["exact" if exact else self.law](self.arm, theta, tilt), ""
+        reason = self.anfis.outside(self.arm, theta, tilt)
+        law = LAWS["exact"] if exact or reason else self.anfis.torque
+        return law(self.arm, theta, tilt), reason
 
 
 class GravityModel(Protocol):
@@ -146,14 +147,10 @@ class UrdfSettings:
     tilt_timeout: float  #: s
     use_imu: bool  #: False assumes that the root link's z axis points up
 
-    def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = True) -> Torque:
-        """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad."""
+    def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = True) -> tuple[Torque, str]:
+        """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad, and '': the law applies everywhere."""
         torque = self.arm.torque(theta, [self.gravity * component for component in tilt.gravity_in_trunk])
-        return tuple([gain * tau for gain, tau in zip(self.gain, torque, strict=True)])
-
-    def outside(self, theta: Sequence[float], tilt: Tilt) -> str:
-        """Return '': the law applies everywhere."""
-        return ""
+        return tuple([gain * tau for gain, tau in zip(self.gain, torque, strict=True)]), ""
 
 
 MAX_JOINTS = 32

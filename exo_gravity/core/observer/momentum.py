@@ -19,12 +19,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.compensation.terms.friction_inertia import sliding
+from exo_gravity.core.compensation.terms.catalogue import sliding
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import LAWS, NO_TORQUE, Torque
 from exo_gravity.core.model.kinematics import ROTORS, LinkInertia, links_of
 from exo_gravity.core.model.rotation import ZERO, Floats3
-from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.model.tilt import AXES, Tilt
 
 BANDWIDTH = 15.0  # rad/s of each of the two low-passes
 COVER = 1.96  # standard deviations of the 95 % band
@@ -42,7 +42,6 @@ REFERENCE = (0.0, 0.7, 0.6, 0.8)  # rad, a usual pose: its inertia weighs the ve
 FOLLOWED_TIME = 0.1  # s, time constant of what a person's torque follows,
 LEAST = (3.0, 5.0, 3.0, 1.5)  # Nm beyond that: 1.3 times the most that `make wearer-study` saw of reaching wearers
 PAUSE = 1.0  # s without another one, after which a contact is a new one
-AXES = tuple(Tilt.of("left")._replace(direction=axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
 
 
 class WearerEstimate(NamedTuple):

@@ -160,8 +160,9 @@ class CompensatorNode(Node):
             if self._interface.problem:  # no step: the torque must ramp in from zero
                 answer = Answer(None, self._interface.problem)
             else:
+                applied = message.effort if message.name == self._names else None
                 with self._lock:
-                    answer = self._control.step(now, theta, velocity)
+                    answer = self._control.step(now, theta, velocity, applied)
         except ParameterError as error:
             answer = Answer(None, self._refused(self._interface.topic, error))
         if problem := crowded(self._sources):

@@ -10,20 +10,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exo_gravity.core.compensation.limiter import LONGEST_STEP
-from exo_gravity.core.compensation.terms.friction_inertia import (
+from exo_gravity.core.compensation.guidance import LONGEST_STEP
+from exo_gravity.core.compensation.terms.catalogue import (
+    DELAY,
     MAX_SPEED,
     SLIDING,
     STANDSTILL,
     TANK,
+    Coupling,
+    Damping,
     EnergyTank,
     Friction,
     Inertia,
-)
-from exo_gravity.core.compensation.terms.springs import (
-    DELAY,
-    Coupling,
-    Damping,
     SoftLimits,
     Spring,
     TermState,

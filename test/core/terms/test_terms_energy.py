@@ -13,8 +13,16 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.compensation.terms.friction_inertia import TANK, Friction, Inertia
-from exo_gravity.core.compensation.terms.springs import DELAY, Coupling, Damping, SoftLimits, Spring
+from exo_gravity.core.compensation.terms.catalogue import (
+    DELAY,
+    TANK,
+    Coupling,
+    Damping,
+    Friction,
+    Inertia,
+    SoftLimits,
+    Spring,
+)
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.model.kinematics import least_inertia, links_of
 from exo_gravity.sim import ArmConfig

@@ -13,8 +13,8 @@ import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
-from exo_gravity.core.compensation.limiter import BREAK
-from exo_gravity.core.compensation.terms.springs import TermParameters, clamp
+from exo_gravity.core.compensation.guidance import BREAK
+from exo_gravity.core.compensation.terms.catalogue import TermParameters, clamp
 from exo_gravity.core.model.gravity import NO_TORQUE, Torque
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import owned

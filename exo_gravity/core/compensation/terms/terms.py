@@ -11,19 +11,17 @@ from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Any, NamedTuple
 
-from exo_gravity.core.compensation.limiter import LONGEST_STEP, limited
+from exo_gravity.core.compensation.guidance import LONGEST_STEP, limited
 from exo_gravity.core.compensation.terms.assist import Assist, AssistInput
-from exo_gravity.core.compensation.terms.friction_inertia import (
+from exo_gravity.core.compensation.terms.catalogue import (
+    DELAY,
     MAX_FRICTION_SHARE,
     AccelerationFilter,
+    Coupling,
+    Damping,
     EnergyTank,
     Friction,
     Inertia,
-)
-from exo_gravity.core.compensation.terms.springs import (
-    DELAY,
-    Coupling,
-    Damping,
     SoftLimits,
     Spring,
     TermState,
