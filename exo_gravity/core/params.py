@@ -1,8 +1,8 @@
 """Parameters: a table for each node, and the check of given values against it.
 
-A name that is not in the table is an error, because a misspelt safety limit must not silently keep its default. If a
-frozen dataclass uses a parameter, the dataclass owns its default, bounds, unit and description (`owned`) and the table
-takes them from there (`param_of`). These dataclasses also check the rules that relate several values.
+A name that is not in the table is an error, because a misspelt safety limit must not silently keep its default. A
+parameter that a frozen dataclass uses is declared there (`owned`), with the rules that relate several values; the table
+takes it from there (`param_of`).
 """
 
 from collections.abc import Mapping, Sequence

@@ -43,12 +43,11 @@ class CompensatorRun:
         theta: Sequence[float] = THETA,
         period: float = PERIOD,
         velocity: Sequence[float] | None = (0.0,) * 4,
-        applied: Sequence[float] | None = None,
     ) -> Answer:
         """Run the compensator for `seconds`, at least one cycle, and return its last answer."""
         for _ in range(max(1, round(seconds / period))):
             self.now += period
-            answer = self.compensator.step(self.now, theta, velocity, applied)
+            answer = self.compensator.step(self.now, theta, velocity)
             self.efforts.append(answer.effort)
         return answer
 

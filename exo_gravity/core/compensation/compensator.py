@@ -25,7 +25,6 @@ from exo_gravity.core.compensation.guidance import (
 )
 from exo_gravity.core.compensation.settings import Settings, UrdfSettings
 from exo_gravity.core.compensation.terms.terms import Active, Terms
-from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.model.gravity import LAWS, Torque
 from exo_gravity.core.model.kinematics import turning_torque
@@ -92,6 +91,7 @@ class Compensator:
         self._origins: list[Load | None] = []  # where each joint's change began; None where no settings say
         self._torque: Torque = self._nothing  # the last, before ramp and rate limit
         self._pending: Settings | UrdfSettings | None = None
+        self.applied: Sequence[float] | None = None  #: (n,) Nm, the motors' measured torque, set by who knows it
         self.dropped = 0.0  #: kg, the load that left the hand last; 0 for none
         self.scale: Scale | None = None  #: of the last weighing
         self._drop_watch, self._braked_until = DropWatch(), -math.inf  # s
@@ -99,9 +99,7 @@ class Compensator:
         self._fallback_until = -math.inf
 
     def apply(self, settings: Settings | UrdfSettings) -> None:
-        """Use new settings from the next `step` on; the torque moves to them as a guided motion."""
-        if settings.side != self.settings.side:
-            raise ParameterError("side", settings.side, f"{self.settings.side}, because the side cannot change")
+        """Use new settings of the same side from the next `step` on; the torque moves to them as a guided motion."""
         self._pending, last = settings, self._pending or self.settings
         if isinstance(settings, Settings) and isinstance(last, Settings) and last.raised_support:
             self.raise_support(last.raised_support)
@@ -121,17 +119,10 @@ class Compensator:
         self.scale = scale
         return ""
 
-    def step(
-        self,
-        now: float,
-        theta: Sequence[float],
-        velocity: Sequence[float] | None = None,
-        applied: Sequence[float] | None = None,
-    ) -> Answer:
+    def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Answer:
         """Return the torque for joint angles `theta` (n,) rad at `now` s on a monotonic clock.
 
-        velocity: (n,) rad/s, None if not known: then the terms add nothing, and changes take longer. applied: (n,) Nm,
-        the motors' measured torque; None if not known: as if they carried the load.
+        velocity: (n,) rad/s, None if not known: then the terms add nothing, and changes take longer.
         """
         count = len(self._nothing)
         if len(theta) != count or not all(-MAX_ANGLE <= angle <= MAX_ANGLE for angle in theta):
@@ -146,7 +137,7 @@ class Compensator:
         if self._pending is not None:
             before = self.settings, self.terms.now if self.terms else Active()
             self._use(self._pending)
-        self._watch_load(now, theta, velocity, applied)
+        self._watch_load(now, theta, velocity)
         replaced = bool(self._fallback)
         gravity = self._law(now, theta)
         if not all(map(math.isfinite, gravity)):
@@ -184,17 +175,15 @@ class Compensator:
     def _active_scale(self) -> Scale | None:
         return self.scale if self.scale and not self.scale.is_over else None
 
-    def _watch_load(
-        self, now: float, theta: Sequence[float], velocity: Sequence[float] | None, applied: Sequence[float] | None
-    ) -> None:
+    def _watch_load(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None) -> None:
         """Withdraw the torque of a load that has left the hand, without a guided change: that would be too slow."""
         s = self.settings
         if not isinstance(s, Settings) or not s.payload_mass or not velocity:
             return
         per_mass = LAWS["exact"](s.unit_load, theta, self.tilt.at(now))  # the height that each joint gives the hand, m
-        if applied:  # motors that do not carry the load cannot throw the arm
+        if self.applied:  # motors that do not carry the load cannot throw the arm
             needed = s.payload_mass * s.robot.gravity * sum(height * height for height in per_mass)
-            if sum(map(operator.mul, per_mass, applied)) < LEAST_CARRIED * needed:
+            if sum(map(operator.mul, per_mass, self.applied)) < LEAST_CARRIED * needed:
                 return
         speed = sum(map(operator.mul, per_mass, velocity))
         if self._drop_watch.step(now - self._last_answer, speed, s.payload_mass):

@@ -14,7 +14,6 @@ because a change follows another or a law does not apply in this pose, is the co
 
 import math
 from collections.abc import Sequence
-from enum import Enum
 
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.safety.limits import GUIDE_SPEED
@@ -127,15 +126,6 @@ class GuidedChange:
         return tuple([new + rest for new, rest in zip(after, remainder, strict=True)])
 
 
-class Output(Enum):
-    """What `CommandFade` sends."""
-
-    WAITING = "waiting"  #: nothing was sent yet
-    ACTIVE = "active"  #: efforts are passed on
-    FADING = "fading"  #: towards zero
-    ZERO = "zero"  #: latched
-
-
 class CommandFade:
     """Effort commands for an effort controller of ros2_control, which keeps its last command for ever.
 
@@ -145,7 +135,7 @@ class CommandFade:
     """
 
     def __init__(self, timeout: float) -> None:
-        self.state = Output.WAITING
+        self.state = "waiting"  #: nothing was sent yet; 'active', 'fading' towards zero, or 'zero', which is latched
         self.reason = ""  #: what began the fade
         self._timeout = timeout
         self._effort: tuple[float, ...] = ()
@@ -154,47 +144,43 @@ class CommandFade:
         self._start = -math.inf  # s, of the first effort
 
     @property
-    def is_open(self) -> bool:
-        """Whether efforts are passed on."""
-        return self.state in (Output.WAITING, Output.ACTIVE)
-
-    @property
     def problem(self) -> str:
         """Why efforts are not passed on; '' if they are."""
-        return "" if self.is_open else f"{self.reason}: {self.state.value}, call clear_fault"
+        is_open = self.state in ("waiting", "active")
+        return "" if is_open else f"{self.reason}: {self.state}, call clear_fault"
 
     def take(self, now: float, effort: Sequence[float], applied: Sequence[float]) -> tuple[float, ...] | None:
         """Return the efforts to send for `effort` (n,) Nm, computed at `now` s; None if none may be sent.
 
         applied: (n,) Nm that the joints apply; only that before the first effort matters.
         """
-        if not self.is_open:
+        if self.problem:
             return None
-        if self.state is Output.WAITING:
-            self.state, self._held, self._start = Output.ACTIVE, tuple(applied), now
+        if self.state == "waiting":
+            self.state, self._held, self._start = "active", tuple(applied), now
         left = max(0.0, 1.0 - (now - self._start) / RAMP_TIME)
         self._effort, self._time = tuple([tau + left * h for tau, h in zip(effort, self._held, strict=True)]), now
         return self._effort
 
     def withdraw(self, now: float, reason: str) -> None:
         """Begin the fade at `now` s, if efforts were sent."""
-        if self.state is Output.ACTIVE:
-            self.state, self.reason, self._time = Output.FADING, reason, now
+        if self.state == "active":
+            self.state, self.reason, self._time = "fading", reason, now
 
     def tick(self, now: float) -> tuple[float, ...] | None:
         """Return the faded effort (n,) Nm to send at `now` s; None while sound efforts arrive, and before the first."""
-        if self.state is Output.ACTIVE and now - self._time > self._timeout:
+        if self.state == "active" and now - self._time > self._timeout:
             self.withdraw(now, f"no joint_states younger than {1000.0 * self._timeout:.0f} ms")
-        if self.is_open:
+        if not self.problem:
             return None
         left = 1.0 - (now - self._time) / LAST_FADE
         if left <= 0.0:
-            self.state = Output.ZERO
+            self.state = "zero"
         return tuple(max(0.0, min(1.0, left)) * effort for effort in self._effort)
 
     def clear(self) -> bool:
         """Pass efforts on again. Return False, and do nothing, unless the torque has faded to zero."""
-        if self.state is not Output.ZERO:
+        if self.state != "zero":
             return False
-        self.state, self.reason = Output.WAITING, ""
+        self.state, self.reason = "waiting", ""
         return True

@@ -151,16 +151,16 @@ class ArmModel:
         distance = four_floats("wearer.cog", cog, 0.0, MAX_LENGTH, "m")
         if np.any(distance > self.length):
             raise ParameterError("wearer.cog", cog, f"within its link, at most length = {self.length.tolist()} m")
-        if any(self.payload):
-            bare = self.with_payload(0.0)
-            return bare.with_wearer(mass, cog, support).with_payload(self.payload[0], self.payload[1:])
+        bare, scale = self.with_payload(0.0), (self.gain, self.gravity)
         if self.by_moments:
-            moment = np.add(self.first_moment, moments_along(self.length, distance, carried))
-            return ArmModel.from_moments(self.length, moment, self.off_axis, self.gain, self.gravity)
-        total = self.mass + carried
-        moment = self.mass * self.cog + carried * distance
-        combined = np.divide(moment, total, out=self.cog.copy(), where=total > 0)
-        return ArmModel(self.length, np.minimum(combined, self.length), total, self.gain, self.gravity, self.off_axis)
+            moment = np.add(bare.first_moment, moments_along(self.length, distance, carried))
+            worn = ArmModel.from_moments(self.length, moment, bare.off_axis, *scale)
+        else:
+            total = self.mass + carried
+            moment = self.mass * self.cog + carried * distance
+            combined = np.divide(moment, total, out=self.cog.copy(), where=total > 0)
+            worn = ArmModel(self.length, np.minimum(combined, self.length), total, *scale, bare.off_axis)
+        return worn.with_payload(self.payload[0], self.payload[1:])
 
 
 @dataclass(frozen=True)

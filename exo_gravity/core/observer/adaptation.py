@@ -1,8 +1,6 @@
-"""Support that adapts: it rises while the arm sinks, and then decays.
+"""Support that adapts: it rises while the arm sinks, and then decays. Why so: docs/wearer_torque.md.
 
-On a still arm statics alone sets the wearer's share: 1 - support, however tired he is. A loop that holds the measured
-share would take support away from him. When he can no longer carry his share, the arm sinks, so slowly that the torques
-still balance. So the support follows the sinking. With w (4,) Nm, the torque that carries the wearer's arm,
+With w (4,) Nm, the torque that carries the wearer's arm,
 
     speed = sum w . theta' / |w|                   rad/s, upwards, from the joints' angles, low-passed by MEAN
     support' = - RISE * speed / FULL - (support - `support`) / MEMORY

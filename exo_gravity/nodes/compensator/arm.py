@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 
 from exo_gravity.core.compensation import settings
 from exo_gravity.core.compensation.compensator import Answer, Compensator
-from exo_gravity.core.compensation.guidance import CommandFade, Output
+from exo_gravity.core.compensation.guidance import CommandFade
 from exo_gravity.core.compensation.settings import URDF_LAW, Settings, UrdfSettings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.gravity import moments_of
@@ -180,7 +180,7 @@ class MultiArrayInterface(Repeated):
     @property
     def values(self) -> dict[str, object]:
         """What is known of the output, for /diagnostics."""
-        return {"output": self._fade.state.value, "output fault": self._fade.reason or "none"}
+        return {"output": self._fade.state, "output fault": self._fade.reason or "none"}
 
     def read(self, message: JointState) -> JointReading:
         """Return positions and velocities of these joints, which may be some of many.
@@ -193,7 +193,7 @@ class MultiArrayInterface(Repeated):
         self._is_late = not -MAX_LEAD <= age <= self._timeout
         if self._is_late:
             raise ParameterError("age by its stamp", round(age, 3), f"from {-MAX_LEAD:g} to {self._timeout:g} s")
-        if self._fade.state is Output.WAITING:
+        if self._fade.state == "waiting":
             self._applied = by_name(message, "effort", self._names, exact=False)
         return by_name(message, "position", self._names, exact=False), velocity_of(message, self._names, exact=False)
 
@@ -211,7 +211,7 @@ class MultiArrayInterface(Repeated):
         """Fade to zero, and end the thread."""
         with self._lock:
             self._fade.withdraw(time.monotonic(), "the node stops")
-        while self._fade.state is Output.FADING and not self.failure:
+        while self._fade.state == "fading" and not self.failure:
             time.sleep(TICK)
         super().stop()
 

@@ -2,8 +2,7 @@
 
 It answers each joint state at once, with the joint state's stamp, so that `can_bridge` can tell how old the reading is.
 Where there is no safe answer it withdraws: it sends a command without efforts, and puts the reason on /diagnostics. To
-`can_bridge` silence means the same, a little later. An effort controller of ros2_control needs more
-(nodes/compensator/arm.py).
+`can_bridge` silence means the same, a little later.
 """
 
 import math
@@ -160,9 +159,9 @@ class CompensatorNode(Node):
             if self._interface.problem:  # no step: the torque must ramp in from zero
                 answer = Answer(None, self._interface.problem)
             else:
-                applied = message.effort if message.name == self._names else None
                 with self._lock:
-                    answer = self._control.step(now, theta, velocity, applied)
+                    self._control.applied = message.effort if message.name == self._names else None
+                    answer = self._control.step(now, theta, velocity)
         except ParameterError as error:
             answer = Answer(None, self._refused(self._interface.topic, error))
         if problem := crowded(self._sources):
