@@ -105,7 +105,6 @@ class CompensatorNode(Node):
         self._budget = BudgetWatch(self, self._names)
         self._assist = terms.assist
         self._assistant = Publishers()
-        self._assistants = 0  # changes whenever a message comes from another publisher than the one before
         path = HotPath(self, JointState, "assist_efforts", self._on_assist_efforts, pause=ASSIST_PAUSE)
         self._wearer = WearerWatch(self, self._names, self._control, self._lock)
         self._threads += [path, self._wearer]
@@ -182,9 +181,9 @@ class CompensatorNode(Node):
     def _on_assist_efforts(self, message: JointState, info: dict[str, Any]) -> None:
         now = time.monotonic()
         age = (self.get_clock().now().nanoseconds - to_nanoseconds(message.header.stamp)) * 1e-9
-        self._assistants += self._assistant.is_another(info)
+        is_another = self._assistant.is_another(info)
         with self._lock:
-            self._assist.receive(now, message.name, message.effort, now - age, self._assistants)
+            self._assist.receive(now, message.name, message.effort, now - age, is_another)
 
     def _on_motion(self, *sample: Any) -> None:
         if self._wearer:

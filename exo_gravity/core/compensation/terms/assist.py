@@ -10,7 +10,7 @@ the torque that it applies, which moves towards the newest message and never pas
 """
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from exo_gravity.core.compensation.guidance import BREAK
@@ -56,7 +56,6 @@ class AssistInput:
         self._period = SLOWEST
         self._stamp = self._arrival = -math.inf
         self._refused = -math.inf
-        self._publisher: Hashable = None
         self._last = -math.inf  # the last call of `torque`
 
     @property
@@ -84,18 +83,16 @@ class AssistInput:
         return max(MIN_VALID, PERIODS * self._period)
 
     def receive(
-        self, now: float, names: Sequence[str], efforts: Sequence[float], stamp: float, publisher: Hashable = None
+        self, now: float, names: Sequence[str], efforts: Sequence[float], stamp: float, is_another: bool = False
     ) -> None:
         """Take a message that arrived at `now`: `efforts` in Nm of the joints `names`, computed at `stamp`.
 
-        publisher: anything that differs from one sender to another.
+        is_another: whether its publisher is another than that of the message before.
         """
         interval, self._arrival = now - self._arrival, now
         if interval < SLOWEST * PERIODS:
             self._period += PERIOD_SMOOTHING * (min(interval, SLOWEST) - self._period)
-        second = publisher != self._publisher and interval < SLOWEST * PERIODS
-        self._publisher = publisher
-        problem = self._problem(now, names, efforts, stamp, second)
+        problem = self._problem(now, names, efforts, stamp, is_another and interval < SLOWEST * PERIODS)
         if problem:
             self._refused, self.reason = now, problem
             return
