@@ -26,8 +26,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Rate
 from exo_gravity.hardware.clock import request_real_time
 from exo_gravity.nodes.compensator.arm import JointStateInterface, MultiArrayInterface, declared, report, sentence
-from exo_gravity.nodes.compensator.budget_watch import BudgetWatch
-from exo_gravity.nodes.compensator.wearer import WearerWatch
+from exo_gravity.nodes.compensator.watches import BudgetWatch, WearerWatch
 from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import accept_changes
 from exo_gravity.nodes.ros.run import run
