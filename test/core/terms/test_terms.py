@@ -104,6 +104,11 @@ def test_a_spring_follows_a_recorded_path_and_stays_at_its_end():
         assert torque == pytest.approx(2.0 * np.array(pose))
 
 
+def test_viscous_friction_in_another_unit_is_refused():
+    with pytest.raises(ParameterError, match=r"^friction.identified = .* at most 1 if viscous"):
+        Friction(0.5, (0.2, 0.4, 0.2, 0.2, 0.02, 0.05, 0.02, 2.0))
+
+
 @pytest.mark.parametrize(
     "rows",
     [(), (0.0,) * 3, (0.0,) * 6, (0.0,) * 10, (1.0, *ZERO), (0.0, 0.0, 0.0, 0.0, math.nan),

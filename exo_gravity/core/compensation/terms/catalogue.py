@@ -41,7 +41,7 @@ EDGE = 0.05  # rad beyond the edge over which the damping rises, so that it does
 FREE = 3.15  # rad: no edge
 MAX_PATH_SPEED = 2.0  # rad/s between two poses of a path
 
-MAX_FRICTION = 3.0  # Nm, and Nm s/rad
+MAX_COULOMB, MAX_VISCOUS = 3.0, 1.0  # Nm, Nm s/rad
 MAX_FRICTION_SHARE = 0.85  # leaves a friction that is 15 % smaller than identified
 STANDSTILL = 0.03  # rad/s, below which a joint is considered to stand: more than one code of 12-bit velocity
 SLIDING = 0.12  # rad/s, from which on friction is given its full share
@@ -223,8 +223,13 @@ class Friction(TermParameters):
     identified: Sequence[float] = owned(
         (0.0,) * 8,
         "Coulomb friction of the four joints in Nm, then their viscous friction in Nm s/rad, by `calibrate friction`",
-        (0.0, MAX_FRICTION),
+        (0.0, MAX_COULOMB),
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if max(self.viscous) > MAX_VISCOUS:
+            raise ParameterError("friction.identified", list(self.identified), f"at most {MAX_VISCOUS:g} if viscous")
 
     @property
     def coulomb(self) -> Sequence[float]:
