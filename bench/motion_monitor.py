@@ -23,8 +23,7 @@ from exo_gravity.core import paper_static_torque
 from exo_gravity.core.compensation.compensator import JOINTS, Answer, Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.assist import Assist
-from exo_gravity.core.compensation.terms.friction_inertia import Friction, Inertia
-from exo_gravity.core.compensation.terms.springs import Spring
+from exo_gravity.core.compensation.terms.catalogue import Friction, Inertia, Spring
 from exo_gravity.core.compensation.terms.terms import MAX_EFFORT, TermSettings
 from exo_gravity.core.model.arm import STANDARD_GRAVITY, ArmModel
 from exo_gravity.core.model.gravity import NO_TORQUE, Torque
@@ -327,7 +326,7 @@ def sound() -> Iterator[tuple[str, Compensator, Sequence[float], Sequence[float]
     """Yield sound compensators: name, compensator, and `largest_moment` and `largest_addition` (4,) that suit it."""
     full, half = settings_of(BODY_MASS), settings_of(BODY_MASS, support=0.5)
     added = TermSettings(
-        friction=Friction(0.8, (0.2, 0.4, 0.2, 0.2), (0.02, 0.05, 0.02, 0.02)),
+        friction=Friction(0.8, (0.2, 0.4, 0.2, 0.2, 0.02, 0.05, 0.02, 0.02)),
         inertia=Inertia(0.6),
         spring=Spring((2.0, 4.0, 2.0, 1.0)),
         assist=Assist((2.0, 4.0, 2.0, 2.0)),

@@ -13,7 +13,7 @@ from bench.effort.exertion import MIDDLE, POSES, RATE, REACH, TASKS, Exertion, S
 from bench.effort.holds import hold, perturbed_arm
 from bench.effort.report import Results, comparisons, figure, tables, write_csv
 from bench.effort.study import NOTHING, ONE_G, ZERO_G, Study
-from exo_gravity.core.model.kinematics import LinkInertia
+from exo_gravity.core.model.kinematics import links_of
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.params import device_of
 
@@ -73,7 +73,7 @@ def test_a_sweep_in_exact_zero_g_feels_the_inertia_and_friction_of_the_simulated
     exact = replace(study.settings[ZERO_G], robot=config.links)
     inertia, coulomb, _ = measure(device_of(true), study.arm.motors, exact, Sweep("sweep", MIDDLE, joint)).felt
     # Two masses on a link have a little more inertia than one at their common centre of gravity.
-    assert 0.97 < inertia / LinkInertia.of(exact.arm).matrix(MIDDLE)[joint, joint] < 1.25
+    assert 0.97 < inertia / links_of(exact.arm).matrix(MIDDLE)[joint, joint] < 1.25
     assert coulomb == pytest.approx(config.coulomb_friction[joint], rel=0.25)
 
 

@@ -51,7 +51,7 @@ def show(what: str, *results: str) -> None:
 
 def main() -> None:
     """Simulate and print all conditions; degrees where no unit is given."""
-    show("inertial false; true", walked(DEFAULT), walked(INERTIAL))
+    show("without inertial; with it", walked(DEFAULT), walked(INERTIAL))
     show("IMU at 250 Hz; 50 Hz", *(walked(INERTIAL, replace(IMU, rate=rate)) for rate in (250.0, 50.0)))
     show("delay of 10 ms", walked(INERTIAL, replace(IMU, delay=0.010)))
     noise = {name: 10.0 * getattr(IMU, name) for name in ("gyroscope_noise", "accelerometer_noise")}
@@ -59,7 +59,7 @@ def main() -> None:
     for name, place in PLACES.items():
         placed = INERTIAL._replace(settings={"inertial": True, "shoulder_from_imu": tuple(-x for x in place)})
         imu = replace(IMU, position=place)
-        show(f"IMU {name}; with shoulder_from_imu", walked(INERTIAL, imu), walked(placed, imu))
+        show(f"IMU {name}, taken to be at joint 1; with its place", walked(INERTIAL, imu), walked(placed, imu))
     for friction in (LOW, USUAL):
         for law in (INERTIAL, DEFAULT):
             results = (shaken(law, frequency, friction) for frequency in VIBRATIONS)
@@ -68,7 +68,7 @@ def main() -> None:
         imu = replace(IMU, seed=seed)
         rest = (simulate(law, {"hold": 20.0}, POSES[0], LOW, imu).text for law in (DEFAULT, INERTIAL))
         walk = simulate(INERTIAL, {"walk": 30.0}, POSES[0], LOW, imu).text
-        show(f"biases {seed}: at rest for 20 s, inertial false; true; walking 30 s, true", *rest, walk)
+        show(f"biases {seed}: at rest for 20 s, without inertial; with it; walking 30 s, with it", *rest, walk)
     for law in (INERTIAL, DEFAULT):
         noise_of = np.std(simulate(law, {"hold": 5.0}, POSES[0], USUAL).command, axis=0)
         show(f"{law.name}, standard deviation of the commanded torque at rest in Nm", str(noise_of.round(4)))

@@ -56,7 +56,7 @@ class Law(NamedTuple):
 
 
 LAWS = (
-    Law("exact law, `inertial: true`", "#0072B2", {"inertial": True}),
+    Law("exact law, `inertial`", "#0072B2", {"inertial": True}),
     Law("exact law (default)", "#009E73", {}),
     Law("EQ1m-EQ4m", "#D55E00", {"law": "paper_mobile"}, True),
     Law("IMU ignored", "#CC79A7", {"use_imu": False}),

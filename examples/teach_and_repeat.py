@@ -14,8 +14,7 @@ import matplotlib.pyplot as plt
 from exo_gravity.core import ArmModel
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.compensation.terms.friction_inertia import Friction
-from exo_gravity.core.compensation.terms.springs import Spring
+from exo_gravity.core.compensation.terms.catalogue import Friction, Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, MOTORS
@@ -55,7 +54,8 @@ path = [0.0, *poses[0]]  # rows of s and four angles
 path += [number for row, pose in enumerate(poses[::5]) for number in (APPROACH + 0.02 * row, *pose)]
 
 spring = Spring(stiffness=(3.5, 9.0, 6.0, 3.3), pose=path)
-friction = Friction(share=0.8, coulomb=(0.2, 0.4, 0.2, 0.2))  # as identified: else the spring must overcome it
+COULOMB, VISCOUS = (0.2, 0.4, 0.2, 0.2), (0.0, 0.0, 0.0, 0.0)  # as identified: else the spring must overcome it
+friction = Friction(share=0.8, identified=(*COULOMB, *VISCOUS))
 compensator.apply(replace(settings, terms=TermSettings(spring=spring, friction=friction)))
 for _ in range(round(APPROACH / PERIOD)):
     cycle()

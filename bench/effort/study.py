@@ -20,12 +20,19 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.compensation.terms.friction_inertia import Friction, Inertia
-from exo_gravity.core.compensation.terms.springs import DELAY, Coupling, Damping, SoftLimits, Spring
+from exo_gravity.core.compensation.terms.catalogue import (
+    DELAY,
+    Coupling,
+    Damping,
+    Friction,
+    Inertia,
+    SoftLimits,
+    Spring,
+)
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import gravity_torque
-from exo_gravity.core.model.kinematics import LinkInertia, least_inertia
+from exo_gravity.core.model.kinematics import least_inertia, links_of
 from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.sim.params import SIMULATOR, device_of
 from exo_gravity.tools.inputs.arms import ConfiguredArm, node_values, read_arm
@@ -52,8 +59,8 @@ def settings_by_name(base: Settings, coulomb: Sequence[float], viscous: Sequence
 
     base: of the arm and its wearer. coulomb Nm, viscous Nm s/rad: the friction that the terms know, (4,) each.
     """
-    known = Friction(coulomb=coulomb, viscous=viscous)
-    least = least_inertia(LinkInertia.of(base.robot_by_mass or base.robot))
+    known = Friction(identified=(*coulomb, *viscous))
+    least = least_inertia(links_of(base.robot_by_mass or base.robot))
     soft = [min(20.0, SOFT * inertia / (4.0 * DELAY**2)) for inertia in least]  # Nm/rad
     terms = {
         "friction": TermSettings(friction=replace(known, share=0.4)),

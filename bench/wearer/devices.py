@@ -19,7 +19,7 @@ from bench.calibration.device import COULOMB, CURRENT_NOISE, LARGEST_OFFSET, SPR
 from bench.motion_monitor import MOTOR_NAMES
 from exo_gravity.core.calibration.identification import identify
 from exo_gravity.core.compensation.settings import Settings, settings_of
-from exo_gravity.core.compensation.terms.friction_inertia import Friction
+from exo_gravity.core.compensation.terms.catalogue import Friction
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import gravity_torque, moments_of
@@ -136,7 +136,7 @@ def draw(seed: int) -> Worn:
     )
     settings = replace(
         full, max_effort=[min(MOST, motor.peak_effort) for motor in motors],
-        terms=TermSettings(friction=Friction(0.0, coulomb * wrong[0], viscous * wrong[1])),
+        terms=TermSettings(friction=Friction(0.0, (*(coulomb * wrong[0]), *(viscous * wrong[1])))),
     )  # fmt: skip
     return Worn(seed, side, config, scale, settings, motors, left, ways)
 

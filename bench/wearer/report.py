@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from exo_gravity.core.observer.contact import ContactWatch
-from exo_gravity.core.observer.momentum import COVER, WearerEstimate
+from exo_gravity.core.observer.momentum import COVER, ContactWatch, WearerEstimate
 from exo_gravity.core.observer.share import WINDOW, share_of
 from exo_gravity.tools.reporting.html import FAINT, INK, JOINT_COLOURS, PUSH_COLOUR, make_plain
 

@@ -1,8 +1,8 @@
 """Parameters: a table for each node, and the check of given values against it.
 
-A name that is not in the table is an error, because a misspelt safety limit must not silently keep its default. If a
-frozen dataclass uses a parameter, the dataclass owns its default, bounds, unit and description (`owned`) and the table
-takes them from there (`param_of`). These dataclasses also check the rules that relate several values.
+A name that is not in the table is an error, because a misspelt safety limit must not silently keep its default. A
+parameter that a frozen dataclass uses is declared there (`owned`), with the rules that relate several values; the table
+takes it from there (`param_of`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -51,6 +51,12 @@ GONE: dict[str, str] = {
     "limits.upper": "limits.range, lower and upper edge of each joint in turn",
     "limits.max_effort": "always 1, 2, 1, 1 Nm",
     "assist.max_effort_rate": "always 10 Nm/s",
+    "friction.coulomb": "the first four entries of friction.identified",
+    "friction.viscous": "the last four entries of friction.identified",
+    "inertial": "inertial.shoulder_from_imu, which switches it on",
+    "shoulder_from_imu": "inertial.shoulder_from_imu, which also compensates the trunk's acceleration",
+    "robot.first_moment": "the first four entries of robot.moments",
+    "robot.off_axis": "the last four entries of robot.moments",
     "multi_array.fade_time": "always 2 s",
     "lock_memory": "thread_priority, which also locks the memory where it is above 0",
 }

@@ -10,9 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.compensation.guidance import FADE_TIME, MAX_FADE_RATE, GuidedChange
-from exo_gravity.core.compensation.limiter import LONGEST_STEP
-from exo_gravity.core.compensation.terms.springs import Spring
+from exo_gravity.core.compensation.guidance import FADE_TIME, LONGEST_STEP, MAX_FADE_RATE, GuidedChange
+from exo_gravity.core.compensation.terms.catalogue import Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.tilt import Tilt, pitch_roll

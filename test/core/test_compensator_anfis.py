@@ -52,7 +52,7 @@ def test_where_the_anfis_was_not_trained_the_exact_law_replaces_it_and_the_reaso
 
 def test_the_anfis_refuses_an_arm_given_by_its_moments():
     arm = ArmModel.from_moments(ROBOT.length, ROBOT.first_moment)
-    with pytest.raises(ParameterError, match=r"robot.first_moment = .*must be 0 for law anfis"):
+    with pytest.raises(ParameterError, match=r"robot.moments = .*must be 0 for law anfis"):
         settings_with(law="anfis", anfis=learned(), robot=arm)
 
 

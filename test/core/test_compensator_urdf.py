@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.compensation.guidance import FADE_TIME
-from exo_gravity.core.compensation.limiter import LONGEST_STEP, RAMP_TIME
+from exo_gravity.core.compensation.guidance import FADE_TIME, LONGEST_STEP, RAMP_TIME
 from exo_gravity.core.compensation.settings import urdf_settings_of, urdf_table
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import values_of

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 
-from exo_gravity.core.observer.contact import LEAST, ContactWatch
-from exo_gravity.core.observer.momentum import WearerEstimate
+from exo_gravity.core.observer.momentum import LEAST, ContactWatch, WearerEstimate
 
 PERIOD, ELBOW = 0.01, 3
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from exo_gravity.core.compensation.limiter import CommandFade, Output
+from exo_gravity.core.compensation.guidance import CommandFade
 
 EFFORT = (2.0, -4.0)
 NOTHING = (0.0, 0.0)
@@ -17,7 +17,7 @@ def active(now: float = 10.0) -> CommandFade:
 def test_nothing_is_sent_before_the_first_effort_nor_while_efforts_arrive():
     fade = CommandFade(0.05)
     fade.withdraw(1.0, "no trunk tilt yet")
-    assert fade.tick(1.0) is None and fade.state is Output.WAITING and not fade.problem
+    assert fade.tick(1.0) is None and fade.state == "waiting" and not fade.problem
     fade.take(10.0, EFFORT, NOTHING)
     assert fade.tick(10.04) is None
 
@@ -44,7 +44,7 @@ def test_an_arm_that_was_let_down_rises_only_after_an_operator_cleared_the_fault
     assert not fade.take(10.1, EFFORT, NOTHING) and not fade.clear()
     assert fade.tick(10.1) < EFFORT
     fade.tick(13.0)
-    assert not fade.take(13.0, EFFORT, NOTHING) and fade.state is Output.ZERO
+    assert not fade.take(13.0, EFFORT, NOTHING) and fade.state == "zero"
     assert fade.clear() and fade.take(13.1, EFFORT, NOTHING)
 
 
@@ -52,7 +52,7 @@ def test_an_arm_that_was_let_down_rises_only_after_an_operator_cleared_the_fault
 def test_no_message_of_a_fade_steps_by_more_than_the_fade_itself(period):
     fade, now = active(), 10.06
     last = fade.tick(now)
-    while fade.state is not Output.ZERO:
+    while fade.state != "zero":
         now += period
         effort = fade.tick(now)
         columns = zip(effort, last, EFFORT, strict=True)

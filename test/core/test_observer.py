@@ -10,10 +10,10 @@ import pytest
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.compensation.terms.friction_inertia import Friction
+from exo_gravity.core.compensation.terms.catalogue import Friction
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.model.arm import ModelError
-from exo_gravity.core.model.kinematics import LinkInertia, turning_in_base
+from exo_gravity.core.model.kinematics import links_of, turning_in_base
 from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.observer.momentum import BANDWIDTH, COVER, MomentumObserver
 from exo_gravity.core.observer.share import PERIOD, WearerCurve, observed, share_of, while_between
@@ -29,7 +29,7 @@ EXACT = ModelError((0.0,) * 4, (0.0,) * 4, 0.0, 0.0)
 COULOMB, VISCOUS = (0.2, 0.4, 0.2, 0.2), (0.02, 0.05, 0.02, 0.02)
 SETTINGS = Settings(
     "right", DEFAULT_LINKS, wearer_mass=tuple(LOAD.mass), wearer_cog=tuple(LOAD.cog), model_error=EXACT,
-    terms=TermSettings(friction=Friction(0.0, COULOMB, VISCOUS)),
+    terms=TermSettings(friction=Friction(0.0, (*COULOMB, *VISCOUS))),
 )  # fmt: skip
 WHOLE = DEFAULT_LINKS.with_wearer(LOAD.mass, LOAD.cog)
 TILT = Tilt.of("right", 0.1, -0.05)
@@ -41,7 +41,7 @@ def test_momentum_and_coriolis_torque_agree_with_pinocchio_for_random_arms_and_m
     for _ in range(5):
         arm = random_arm(rng)
         pin, model, data = with_rods(arm)
-        links = LinkInertia.of(arm, NO_ROTORS)
+        links = links_of(arm)._replace(rotors=NO_ROTORS)
         for theta, velocity in rng.uniform(-3.0, 3.0, (20, 2, 4)):
             momentum, coriolis = links.momentum(theta, velocity)
             mass = pin.crba(model, data, theta)
@@ -53,7 +53,7 @@ def test_momentum_and_coriolis_torque_agree_with_pinocchio_for_random_arms_and_m
 
 def test_a_base_that_turns_adds_the_momentum_of_an_arm_that_turns_with_it():
     # About joint 1's own axis the base's turning is that of joint 1, for momentum and kinetic energy alike.
-    links, rng = LinkInertia.of(DEFAULT_LINKS, NO_ROTORS), np.random.default_rng(2)
+    links, rng = links_of(DEFAULT_LINKS)._replace(rotors=NO_ROTORS), np.random.default_rng(2)
     for theta, velocity in rng.uniform(-2.0, 2.0, (20, 2, 4)):
         turned = links.momentum(theta, velocity, (0.0, 0.0, 0.7))
         same = links.momentum(theta, velocity + np.array((0.7, 0.0, 0.0, 0.0)))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.compensation.limiter import LONGEST_STEP
+from exo_gravity.core.compensation.guidance import LONGEST_STEP
 from exo_gravity.core.compensation.settings import COMPENSATOR, settings_of, urdf_table
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import GONE, values_of
@@ -86,13 +86,13 @@ def test_a_parameter_that_is_gone_is_refused_with_what_replaces_it():
     with pytest.raises(ParameterError, match=r"^limits.lower = .*it is gone: limits.range"):
         values_of(COMPENSATOR, {"limits.lower": [0.0] * 4})
     names = {param.name for param in (*COMPENSATOR, *urdf_table(4, ["command_interface"]))}
-    assert len(COMPENSATOR) <= 38  # 35, the load in the hand, and `support_adapts`: each of the others has users
+    assert len(COMPENSATOR) <= 35  # each of them has users
     assert names & set(GONE) == {"max_effort_rate"}  # gone from can_bridge only
 
 
 def test_first_moments_replace_masses_and_centres_of_gravity():
-    plain = settings_of(values_of(COMPENSATOR, {"robot.off_axis": [0.0, 0.01, 0.0, 0.0]})).robot
-    given = {"robot.first_moment": list(plain.first_moment), "robot.off_axis": [0.0, 0.01, 0.0, 0.0]}
+    plain = settings_of(values_of(COMPENSATOR, {"robot.moments": [0.0] * 5 + [0.01, 0.0, 0.0]})).robot
+    given = {"robot.moments": [*plain.first_moment, 0.0, 0.01, 0.0, 0.0]}
     moments = settings_of(values_of(COMPENSATOR, {**given, "robot.mass": [9.0] * 4})).robot
     assert moments.by_moments and not plain.by_moments
     assert (moments.first_moment, moments.off_axis) == (plain.first_moment, plain.off_axis)
@@ -100,14 +100,14 @@ def test_first_moments_replace_masses_and_centres_of_gravity():
 
 
 @pytest.mark.parametrize("law", ["paper_static", "paper_mobile"])
-@pytest.mark.parametrize("name", ["robot.first_moment", "robot.off_axis"])
-def test_a_law_that_needs_masses_refuses_moments(law, name):
-    values = values_of(COMPENSATOR, {name: [0.1, 0.2, 0.2, 0.03], "law": law})
-    with pytest.raises(ParameterError, match=rf"{name} = .*must be 0 for law {law}"):
+@pytest.mark.parametrize("moments", [(0.1, 0.2, 0.2, 0.03, *[0.0] * 4), (*[0.0] * 4, 0.1, 0.2, 0.2, 0.03)])
+def test_a_law_that_needs_masses_refuses_moments(law, moments):
+    values = values_of(COMPENSATOR, {"robot.moments": list(moments), "law": law})
+    with pytest.raises(ParameterError, match=rf"robot.moments = .*must be 0 for law {law}"):
         settings_of(values)
 
 
 def test_moments_that_only_too_heavy_an_arm_can_have_are_refused():
-    values = values_of(COMPENSATOR, {"robot.first_moment": [0.1, 0.2, 6.0, 0.03]})
+    values = values_of(COMPENSATOR, {"robot.moments": [0.1, 0.2, 6.0, 0.03, *[0.0] * 4]})
     with pytest.raises(ParameterError, match=r"total mass in kg = 20.0: must be at most 10 "):
         settings_of(values)

@@ -9,7 +9,7 @@ import pytest
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.compensation.guidance import MAX_FADE_RATE
-from exo_gravity.core.compensation.terms.springs import Spring
+from exo_gravity.core.compensation.terms.catalogue import Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import GUIDE_BRAKE

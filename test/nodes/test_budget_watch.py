@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from exo_gravity.core import ArmModel
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE
-from exo_gravity.nodes.compensator.budget_watch import BRIDGE_PARAMETERS, WITHIN, compute
+from exo_gravity.nodes.compensator.watches import BRIDGE_PARAMETERS, WITHIN, compute
 
 ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
 BRIDGE = values_of([param for param in CAN_BRIDGE if param.name in BRIDGE_PARAMETERS], {})

@@ -17,7 +17,7 @@ from rclpy.time import Time
 from sensor_msgs.msg import Imu, JointState
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.compensation.limiter import LONGEST_STEP
+from exo_gravity.core.compensation.guidance import LONGEST_STEP
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.safety.limits import CAN_BRIDGE

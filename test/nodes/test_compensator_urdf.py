@@ -20,7 +20,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
-from exo_gravity.core.compensation import compensator, limiter
+from exo_gravity.core.compensation import compensator, guidance
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.nodes.compensator import arm
@@ -137,9 +137,9 @@ class Rig:
 def quick() -> Iterator[None]:
     """Shorter ramps and fades, which test_limiter.py times."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(limiter, "RAMP_TIME", 0.2)
+        patch.setattr(guidance, "RAMP_TIME", 0.2)
         patch.setattr(compensator, "RAMP_TIME", 0.2)
-        patch.setattr(limiter, "FADE_TIME", 0.4)
+        patch.setattr(guidance, "LAST_FADE", 0.4)
         yield
 
 

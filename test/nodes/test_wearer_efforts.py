@@ -18,7 +18,7 @@ from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.model.wearer import Wearer
-from exo_gravity.nodes.compensator.wearer import WearerWatch
+from exo_gravity.nodes.compensator.watches import WearerWatch
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 
 from ..support.joint_state_feeder import PARTS, POSE

@@ -32,6 +32,7 @@ ROS2 = {
     f"ros2 param set {RIGHT} mode zero_g": SUCCESS,
     f"ros2 param set {RIGHT} payload.mass 0.973": SUCCESS,
     f"ros2 param set {RIGHT} support_adapts true": SUCCESS,
+    f'ros2 param set {RIGHT} inertial.shoulder_from_imu "[0.12, -0.2, 0.1]"': SUCCESS,
     f'ros2 param set {RIGHT} assist.max_effort "[1.0, 1.0, 1.0, 1.0]"': SUCCESS,
     f'{CALL}/enable std_srvs/srv/SetBool "{{data: false}}"': "success=True, message='the motors are switched off once",
     f'{CALL}/enable std_srvs/srv/SetBool "{{data: true}}"': "success=True, message='torque follows in",

@@ -74,14 +74,15 @@ def test_the_comments_inside_a_list_stay(tmp_path: Path) -> None:
 def test_a_new_value_joins_the_mapping_that_it_belongs_to(tmp_path: Path) -> None:
     new = written(
         tmp_path,
-        Change("/right/compensator", "robot.first_moment", [0.1, 0.2, 0.3, 0.05], "kg m"),
+        Change("/right/compensator", "robot.moments", [0.1, 0.2, 0.3, 0.05, 0.0, 0.0, 0.0, 0.0], "kg m"),
         Change("/right/compensator", "wearer.cog", [0.0, 0.0, 0.1, 0.1], "m"),
         Change("/right/compensator", "gain", [1.0, 1.0, 1.0, 1.0], "none"),
     )
     added, removed = added_and_removed(new)
     assert added == [
         "    # 2026-11-22 calibrate motors: kg m",
-        "    robot: {mass: [0.5, 0.4, 0.5, 0.2], cog: [0.04, 0.11, 0.23, 0.12], first_moment: [0.1, 0.2, 0.3, 0.05]}",
+        "    robot: {mass: [0.5, 0.4, 0.5, 0.2], cog: [0.04, 0.11, 0.23, 0.12], "
+        "moments: [0.1, 0.2, 0.3, 0.05, 0.0, 0.0, 0.0, 0.0]}",
         "      # 2026-11-22 calibrate motors: m",
         "      cog: [0.0, 0.0, 0.1, 0.1]",
         "    # 2026-11-22 calibrate motors: none",

@@ -19,8 +19,8 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.model.arm import MAX_PAYLOAD, ArmModel
 from exo_gravity.core.model.gravity import LAWS, Torque
 from exo_gravity.core.model.kinematics import links_of
-from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.observer.momentum import AXES, COVER
+from exo_gravity.core.model.tilt import AXES, Tilt
+from exo_gravity.core.observer.momentum import COVER
 
 TAKE_OVER = 4.0  # s
 CYCLES = 3  # there and back

@@ -1,9 +1,8 @@
 """Joint angles and trunk tilt -> step-free torques that hold an arm of n joints, or the reason why there are none.
 
 Each call checks that the input is fresh and finite, evaluates law and terms, clamps their sum, ramps in and limits the
-rate. A change of any setting is a guided motion (`guidance`): the torque moves from the old load's to the new one's
-only as fast as the arm stays calm. Where the chosen law does not apply, the exact law replaces it in the same way, for
-at least `FALLBACK_TIME`.
+rate. A change of any setting is a guided motion (`guidance`). Where the chosen law does not apply, the exact law
+replaces it in the same way, for at least `FALLBACK_TIME`.
 
 The exoskeleton's own arm (`Settings`) has a wearer and terms on top of gravity compensation; any other arm
 (`UrdfSettings`) has the torque of its URDF alone.
@@ -15,19 +14,26 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple, Protocol
 
-from exo_gravity.core.compensation.guidance import WATCH, DropWatch, GuidedChange
-from exo_gravity.core.compensation.limiter import BREAK, LONGEST_STEP, RAMP_TIME, limited
+from exo_gravity.core.compensation.guidance import (
+    BREAK,
+    LONGEST_STEP,
+    RAMP_TIME,
+    WATCH,
+    DropWatch,
+    GuidedChange,
+    limited,
+)
 from exo_gravity.core.compensation.settings import Settings, UrdfSettings
 from exo_gravity.core.compensation.terms.terms import Active, Terms
-from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.model.gravity import LAWS, Torque
 from exo_gravity.core.model.kinematics import turning_torque
-from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.model.tilt import AXES, Tilt
 from exo_gravity.core.trunk.inputs import MAX_TURN, FeltMotion, TiltInput
 
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
 JOINTS = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
+LEAST_CARRIED = 0.5  # of the load's torque, that motors must apply to carry it
 MAX_ANGLE = 26.0  # rad, more than an AK motor can report with any zero
 
 
@@ -44,7 +50,7 @@ class Answer(NamedTuple):
 
 
 class Scale(Protocol):
-    """What weighs the load in the hand (core/calibration/weighing.py): for a while it adds to the torque."""
+    """What weighs the load in the hand for a while: core/calibration/weighing.py."""
 
     trouble: str  #: why there is no result, or ''; set, it ends the weighing
     is_thrown: bool  #: whether the load must have left the hand
@@ -85,6 +91,7 @@ class Compensator:
         self._origins: list[Load | None] = []  # where each joint's change began; None where no settings say
         self._torque: Torque = self._nothing  # the last, before ramp and rate limit
         self._pending: Settings | UrdfSettings | None = None
+        self.applied: Sequence[float] | None = None  #: (n,) Nm, the motors' measured torque, set by who knows it
         self.dropped = 0.0  #: kg, the load that left the hand last; 0 for none
         self.scale: Scale | None = None  #: of the last weighing
         self._drop_watch, self._braked_until = DropWatch(), -math.inf  # s
@@ -92,9 +99,7 @@ class Compensator:
         self._fallback_until = -math.inf
 
     def apply(self, settings: Settings | UrdfSettings) -> None:
-        """Use new settings from the next `step` on; the torque moves to them as a guided motion."""
-        if settings.side != self.settings.side:
-            raise ParameterError("side", settings.side, f"{self.settings.side}, because the side cannot change")
+        """Use new settings of the same side from the next `step` on; the torque moves to them as a guided motion."""
         self._pending, last = settings, self._pending or self.settings
         if isinstance(settings, Settings) and isinstance(last, Settings) and last.raised_support:
             self.raise_support(last.raised_support)
@@ -176,6 +181,10 @@ class Compensator:
         if not isinstance(s, Settings) or not s.payload_mass or not velocity:
             return
         per_mass = LAWS["exact"](s.unit_load, theta, self.tilt.at(now))  # the height that each joint gives the hand, m
+        if self.applied:  # motors that do not carry the load cannot throw the arm
+            needed = s.payload_mass * s.robot.gravity * sum(height * height for height in per_mass)
+            if sum(map(operator.mul, per_mass, self.applied)) < LEAST_CARRIED * needed:
+                return
         speed = sum(map(operator.mul, per_mass, velocity))
         if self._drop_watch.step(now - self._last_answer, speed, s.payload_mass):
             self.dropped, self._braked_until = s.payload_mass, now + WATCH
@@ -184,9 +193,7 @@ class Compensator:
 
     def _largest_torque(self, theta: Sequence[float]) -> float:
         """Return the most in Nm that gravity takes of any joint at `theta` (n,) rad, whatever its direction."""
-        settings = self.settings
-        tilts = [Tilt.of_gravity(settings.side, axis) for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
-        torques = [settings.torque(theta, tilt, exact=True) for tilt in tilts]
+        torques = [self.settings.torque(theta, axis, exact=True)[0] for axis in AXES]
         return max(math.hypot(*components) for components in zip(*torques, strict=True))
 
     def _use(self, settings: Settings | UrdfSettings) -> None:
@@ -239,17 +246,14 @@ class Compensator:
 
         The tilt is that of what the trunk feels as gravity. exact: by the exact law in any case.
         """
-        tilt, felt = self.tilt.at(now), None
         if isinstance(settings, Settings) and settings.inertial and settings.use_imu:
             felt = self.motion.at(now, settings.shoulder_from_imu)
-        if felt:
-            tilt = Tilt.of_felt(settings.side, felt.gravity, STANDARD_GRAVITY)
-        reason = settings.outside(theta, tilt)
-        torque = settings.torque(theta, tilt, exact or bool(reason))
-        if felt and isinstance(settings, Settings):
-            turning = turning_torque(settings.arm, settings.side, theta, felt.angular_acceleration)
-            torque = tuple(map(operator.add, torque, turning))
-        return torque, reason
+            if felt:
+                tilt = Tilt.of_felt(settings.side, felt.gravity, STANDARD_GRAVITY)
+                torque, reason = settings.torque(theta, tilt, exact)
+                turning = turning_torque(settings.arm, settings.side, theta, felt.angular_acceleration)
+                return tuple(map(operator.add, torque, turning)), reason
+        return settings.torque(theta, self.tilt.at(now), exact)
 
 
 def clamped(torque: Iterable[float], limit: Sequence[float]) -> Torque:

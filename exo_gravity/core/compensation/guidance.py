@@ -1,22 +1,15 @@
-"""A change of load as a guided motion: the torque moves to its new value only as fast as the joint stays calm.
+"""What keeps the torque from stepping, for any number of joints: ramp, rate, guided changes of load, and a last fade.
 
-A change of law, mode, masses, gain, `max_effort` or terms makes each joint's torque move from what the settings before
-it would give in this pose to what the new ones give:
+A change of law, mode, masses, gain, `max_effort` or terms is a guided motion: only as fast as the joint stays calm, its
+torque moves from what the settings before it would give in this pose to what the new ones give:
 
     torque = after + share * (before - after + offset)
 
 The share falls from 1 to 0 within FADE_TIME or longer, more slowly the faster the joint moves where the change drives
 it. Beyond GUIDE_SPEED it rises again, at SPEED_GAIN: so an arm that becomes heavy sinks at about that speed until it
 hangs, and a spring that is switched on pulls no faster. The torque always lies between the old load's and the new
-one's in this pose, wherever the arm has moved meanwhile: it cannot wind up, and never works on the arm more than those
-two would. A wearer who holds still gets the new load within FADE_TIME; one who moves gets it when he pauses.
-
-What the two settings do not explain, because a change follows another or a law does not apply in this pose, is the
-constant offset of the start.
-
-If a load falls out of the hand, the torque that carried it throws the arm upwards. `DropWatch` detects this from the
-hand's motion. The compensator then withdraws that torque at its rate limit, and the motors brake. A person who lifts
-as fast loses the support for the load, and nothing else.
+one's in this pose, wherever the arm has moved meanwhile: it cannot wind up. What the two settings do not explain,
+because a change follows another or a law does not apply in this pose, is the constant offset of the start.
 """
 
 import math
@@ -25,6 +18,13 @@ from collections.abc import Sequence
 from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.safety.limits import GUIDE_SPEED
 
+RAMP_TIME = 1.0  # s from zero to full torque, at the start and after a break
+# s without an answer, after which the torque ramps in from zero. This is longer than any command_timeout: the arm is
+# already being let down, so the restart from zero cannot drop it.
+BREAK = 0.2
+LONGEST_STEP = 0.01  # s that the rate limit allows for after a pause, so that the torque does not catch up in one step
+LAST_FADE = 2.0  # s of the last fade; a launcher kills a node 5 s after it asked it to end
+# Of a change of load:
 FADE_TIME = 2.0  # s from the old load to the new one where the joint does not move,
 MAX_FADE_RATE = 4.0  # Nm/s, but no faster than this,
 LONGEST_FADE = 10.0  # s, of larger arms; and always where the velocity is not known
@@ -39,8 +39,17 @@ DROP_SPEED = 0.8  # m/s upwards, however slowly it was gained: a light load
 LEAST_DROP = 0.1  # kg; less throws no arm
 
 
+def limited(wanted: float, last: float, limit: float, step: float) -> float:
+    """Return `wanted` within -limit..limit and within `step` of `last`."""
+    target = limit if wanted > limit else -limit if wanted < -limit else wanted
+    return last + step if target > last + step else last - step if target < last - step else target
+
+
 class DropWatch:
-    """Whether a load that the motors carry has left the hand."""
+    """Whether a load that the motors carry has left the hand: its torque then throws the arm upwards.
+
+    A person who lifts as fast loses the support for the load, and nothing else.
+    """
 
     def __init__(self) -> None:
         self._slow = 0.0  # m/s
@@ -115,3 +124,63 @@ class GuidedChange:
         self._largest = max(ways)
         self._done = 0.0 if any(shares) else self._done + dt
         return tuple([new + rest for new, rest in zip(after, remainder, strict=True)])
+
+
+class CommandFade:
+    """Effort commands for an effort controller of ros2_control, which keeps its last command for ever.
+
+    So the sender lets the arm down: `timeout` s after the last sound effort, or when efforts are withdrawn, the torque
+    fades linearly to zero over LAST_FADE. The fault is latched: zeros follow until an operator clears it, because an
+    arm that was let down must not rise by itself. The next torque ramps in.
+    """
+
+    def __init__(self, timeout: float) -> None:
+        self.state = "waiting"  #: nothing was sent yet; 'active', 'fading' towards zero, or 'zero', which is latched
+        self.reason = ""  #: what began the fade
+        self._timeout = timeout
+        self._effort: tuple[float, ...] = ()
+        self._time = -math.inf  # s, of the last effort; then of the begin of the fade
+        self._held: tuple[float, ...] = ()  # what the joints applied before the first effort
+        self._start = -math.inf  # s, of the first effort
+
+    @property
+    def problem(self) -> str:
+        """Why efforts are not passed on; '' if they are."""
+        is_open = self.state in ("waiting", "active")
+        return "" if is_open else f"{self.reason}: {self.state}, call clear_fault"
+
+    def take(self, now: float, effort: Sequence[float], applied: Sequence[float]) -> tuple[float, ...] | None:
+        """Return the efforts to send for `effort` (n,) Nm, computed at `now` s; None if none may be sent.
+
+        applied: (n,) Nm that the joints apply; only that before the first effort matters.
+        """
+        if self.problem:
+            return None
+        if self.state == "waiting":
+            self.state, self._held, self._start = "active", tuple(applied), now
+        left = max(0.0, 1.0 - (now - self._start) / RAMP_TIME)
+        self._effort, self._time = tuple([tau + left * h for tau, h in zip(effort, self._held, strict=True)]), now
+        return self._effort
+
+    def withdraw(self, now: float, reason: str) -> None:
+        """Begin the fade at `now` s, if efforts were sent."""
+        if self.state == "active":
+            self.state, self.reason, self._time = "fading", reason, now
+
+    def tick(self, now: float) -> tuple[float, ...] | None:
+        """Return the faded effort (n,) Nm to send at `now` s; None while sound efforts arrive, and before the first."""
+        if self.state == "active" and now - self._time > self._timeout:
+            self.withdraw(now, f"no joint_states younger than {1000.0 * self._timeout:.0f} ms")
+        if not self.problem:
+            return None
+        left = 1.0 - (now - self._time) / LAST_FADE
+        if left <= 0.0:
+            self.state = "zero"
+        return tuple(max(0.0, min(1.0, left)) * effort for effort in self._effort)
+
+    def clear(self) -> bool:
+        """Pass efforts on again. Return False, and do nothing, unless the torque has faded to zero."""
+        if self.state != "zero":
+            return False
+        self.state, self.reason = "waiting", ""
+        return True

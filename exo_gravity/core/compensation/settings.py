@@ -24,6 +24,7 @@ from exo_gravity.core.model.gravity import LAWS, NO_TORQUE, Torque
 from exo_gravity.core.model.rotation import Floats3
 from exo_gravity.core.model.tilt import SIDES, Tilt
 from exo_gravity.core.model.wearer import SEX, TYPICAL_LENGTH, Wearer
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, check_owned, owned, param_of, params_of
 from exo_gravity.core.safety.limits import MAX_COMMAND
 
@@ -56,7 +57,7 @@ class Settings:
     tilt_timeout: float = owned(
         0.08, "age of the trunk tilt at which the efforts are withdrawn", (0.01, 0.5), "s", expert=True
     )
-    inertial: bool = owned(False, "also compensate the trunk's acceleration, as its IMU measures it")
+    inertial: bool = False  #: also compensate the trunk's acceleration, as its IMU measures it
     shoulder_from_imu: Floats3 = (0.0, 0.0, 0.0)  #: (3,) m in the trunk's axes, for `inertial`
     use_imu: bool = True  #: False assumes an upright trunk
     anfis: AnfisLaw | None = None  #: the model for the law 'anfis'
@@ -107,15 +108,16 @@ class Settings:
         """The share of the wearer's arm that zero_g compensates at present."""
         return max(self.support, self.raised_support)
 
-    def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = False) -> Torque:
-        """Return the torque (4,) in Nm that holds the arm at `theta` (4,) rad; exact: by the exact law."""
-        if self.law == "anfis" and self.anfis and not exact:
-            return self.anfis.torque(self.arm, theta, tilt)
-        return LAWS["exact" if exact else self.law](self.arm, theta, tilt)
+    def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = False) -> tuple[Torque, str]:
+        """Return the torque (4,) in Nm that holds the arm at `theta` (4,) rad; exact: by the exact law in any case.
 
-    def outside(self, theta: Sequence[float], tilt: Tilt) -> str:
-        """Return why the law does not apply to this pose or tilt, as `AnfisLaw.outside`; '' if it does."""
-        return self.anfis.outside(self.arm, theta, tilt) if self.law == "anfis" and self.anfis else ""
+        And why the chosen law does not apply here, as `AnfisLaw.outside`, or ''. Then the exact law replaces it.
+        """
+        if self.law != "anfis" or not self.anfis:
+            return LAWS["exact" if exact else self.law](self.arm, theta, tilt), ""
+        reason = self.anfis.outside(self.arm, theta, tilt)
+        law = LAWS["exact"] if exact or reason else self.anfis.torque
+        return law(self.arm, theta, tilt), reason
 
 
 class GravityModel(Protocol):
@@ -145,14 +147,10 @@ class UrdfSettings:
     tilt_timeout: float  #: s
     use_imu: bool  #: False assumes that the root link's z axis points up
 
-    def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = True) -> Torque:
-        """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad."""
+    def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = True) -> tuple[Torque, str]:
+        """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad, and '': the law applies everywhere."""
         torque = self.arm.torque(theta, [self.gravity * component for component in tilt.gravity_in_trunk])
-        return tuple([gain * tau for gain, tau in zip(self.gain, torque, strict=True)])
-
-    def outside(self, theta: Sequence[float], tilt: Tilt) -> str:
-        """Return '': the law applies everywhere."""
-        return ""
+        return tuple([gain * tau for gain, tau in zip(self.gain, torque, strict=True)]), ""
 
 
 MAX_JOINTS = 32
@@ -172,10 +170,8 @@ COMPENSATOR = (
     Param("gravity", STANDARD_GRAVITY, "g, acceleration of gravity", (0.0, MAX_GRAVITY), "m/s^2"),
     Param("robot.mass", [0.585, 0.468, 0.598, 0.203], "m_n, link masses", (0.0, MAX_MASS), "kg"),
     Param("robot.cog", [0.046, 0.113, 0.237, 0.128], "d_n, centre of gravity from joint n", (0.0, MAX_LENGTH), "m"),
-    Param("robot.first_moment", [0.0] * 4, "M1 to M4 by `calibrate`, in place of mass and cog; zeros: not given",
-          (0.0, MAX_MOMENT), "kg m", expert=True),
-    Param("robot.off_axis", [0.0] * 4, "W, Z, Y3, Y4 by `calibrate`: moments across the links, for the law exact",
-          (-MAX_MOMENT, MAX_MOMENT), "kg m", expert=True),
+    Param("robot.moments", [0.0] * 8, "M1 to M4, W, Z, Y3, Y4 by `calibrate`, for the law exact; M1 to M4 all 0: by "
+          "mass and cog", (-MAX_MOMENT, MAX_MOMENT), "kg m", expert=True),
     Param("wearer.mass", [0.0, 0.0, 0.0, 0.0], "mass of the wearer's arm on each link", (0.0, MAX_MASS), "kg"),
     Param("wearer.cog", [0.0, 0.0, 0.0, 0.0], "centre of gravity of that mass from joint n", (0.0, MAX_LENGTH), "m"),
     Param("wearer.body_mass", 0.0, "body mass; computes wearer.mass and wearer.cog if these are 0", (0.0, 300.0), "kg"),
@@ -187,9 +183,8 @@ COMPENSATOR = (
           (-MAX_REACH, MAX_REACH), "m"),
     param_of(Settings, "max_effort"),
     param_of(Settings, "max_effort_rate"),
-    param_of(Settings, "inertial"),
-    Param("shoulder_from_imu", [0.0] * 3, "the arm's base from the IMU along the trunk's axes, for inertial",
-          (-1.0, 1.0), "m"),
+    Param("inertial.shoulder_from_imu", [0.0] * 3, "the arm's base from the IMU along the trunk's axes; where it is "
+          "given, the trunk's acceleration is compensated too; zeros: off", (-1.0, 1.0), "m"),
     Param("use_imu", True, "false assumes an upright trunk (the paper's seated wearer)", fixed=True),
     param_of(Settings, "tilt_timeout"),
     *term_parameters(),
@@ -257,12 +252,14 @@ def settings_of(values: Mapping[str, Any], read: Callable[[str], str] | None = N
     except (OSError, UnicodeDecodeError, DataError) as error:
         raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
     mass, cog = wearer_of(values)
+    shoulder = tuple(values["inertial.shoulder_from_imu"])
     return Settings(
         side=values["side"],
         robot=robot_of(values),
         wearer_mass=mass,
         wearer_cog=cog,
-        shoulder_from_imu=tuple(values["shoulder_from_imu"]),
+        inertial=any(shoulder),
+        shoulder_from_imu=shoulder,
         use_imu=values["use_imu"],
         anfis=anfis,
         terms=term_settings_of(values),
@@ -286,12 +283,13 @@ def urdf_settings_of(values: Mapping[str, Any], model: GravityModel) -> UrdfSett
 
 
 def robot_of(values: Mapping[str, Any]) -> ArmModel:
-    """Return the robot's arm, by its moments if robot.first_moment is given, or raise ParameterError."""
-    length, off_axis, rest = values["link_length"], values["robot.off_axis"], (values["gain"], values["gravity"])
+    """Return the robot's arm, by its moments if robot.moments has any along the links, or raise ParameterError."""
+    length, moments, rest = values["link_length"], values["robot.moments"], (values["gain"], values["gravity"])
+    along, across = moments[:JOINT_COUNT], moments[JOINT_COUNT:]
     with named("robot."):
-        if any(values["robot.first_moment"]):
-            return ArmModel.from_moments(length, values["robot.first_moment"], off_axis, *rest)
-        return ArmModel(length, values["robot.cog"], values["robot.mass"], *rest, off_axis)
+        if any(along):
+            return ArmModel.from_moments(length, along, across, *rest)
+        return ArmModel(length, values["robot.cog"], values["robot.mass"], *rest, across)
 
 
 def wearer_of(values: Mapping[str, Any]) -> tuple[Sequence[float], Sequence[float]]:

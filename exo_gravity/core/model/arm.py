@@ -121,10 +121,11 @@ class ArmModel:
         """Raise ParameterError unless masses are known and all centres of gravity lie on the links, as `what` needs."""
         if self.payload[0]:
             raise ParameterError("payload.mass", self.payload[0], f"0 for {what}, which knows no load in the hand")
+        moments = [*(self.first_moment if self.by_moments else ZEROS), *self.off_axis]
         if self.by_moments:
-            raise ParameterError("robot.first_moment", self.first_moment, f"0 for {what}, which needs mass and cog")
+            raise ParameterError("robot.moments", moments, f"0 for {what}, which needs mass and cog")
         if any(self.off_axis):
-            raise ParameterError("robot.off_axis", self.off_axis, f"0 for {what}, which knows no moments across links")
+            raise ParameterError("robot.moments", moments, f"0 for {what}, which knows no moments across links")
 
     def with_payload(self, mass: float, cog: Vector = ZEROS[:3]) -> "ArmModel":
         """Return this arm with a load of `mass` kg in its hand, instead of any other.
@@ -150,16 +151,16 @@ class ArmModel:
         distance = four_floats("wearer.cog", cog, 0.0, MAX_LENGTH, "m")
         if np.any(distance > self.length):
             raise ParameterError("wearer.cog", cog, f"within its link, at most length = {self.length.tolist()} m")
-        if any(self.payload):
-            bare = self.with_payload(0.0)
-            return bare.with_wearer(mass, cog, support).with_payload(self.payload[0], self.payload[1:])
+        bare, scale = self.with_payload(0.0), (self.gain, self.gravity)
         if self.by_moments:
-            moment = np.add(self.first_moment, moments_along(self.length, distance, carried))
-            return ArmModel.from_moments(self.length, moment, self.off_axis, self.gain, self.gravity)
-        total = self.mass + carried
-        moment = self.mass * self.cog + carried * distance
-        combined = np.divide(moment, total, out=self.cog.copy(), where=total > 0)
-        return ArmModel(self.length, np.minimum(combined, self.length), total, self.gain, self.gravity, self.off_axis)
+            moment = np.add(bare.first_moment, moments_along(self.length, distance, carried))
+            worn = ArmModel.from_moments(self.length, moment, bare.off_axis, *scale)
+        else:
+            total = self.mass + carried
+            moment = self.mass * self.cog + carried * distance
+            combined = np.divide(moment, total, out=self.cog.copy(), where=total > 0)
+            worn = ArmModel(self.length, np.minimum(combined, self.length), total, *scale, bare.off_axis)
+        return worn.with_payload(self.payload[0], self.payload[1:])
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,14 @@
 """The gravity laws: joint angles -> the torque that each motor must give to hold the arm against gravity.
 
 `exact` is the closed form of Newton-Euler for gravity alone, valid for any centre of gravity, on its link or beside it,
-and any trunk tilt. `paper_static` is EQ2-EQ5 and `paper_mobile` is EQ1m-EQ4m of the paper, word for word. They agree
-with `exact` only if every centre of gravity is at the far end of its link (d_n = l_n) and the trunk is upright.
+and any trunk tilt: docs/mathematics.md derives it. `paper_static` is EQ2-EQ5 and `paper_mobile` is EQ1m-EQ4m of the
+paper, word for word. They agree with `exact` only if every centre of gravity is at the far end of its link (d_n = l_n)
+and the trunk is upright.
 
 Each formula is written once, for a module `xp`: `math` for one pose in plain floats (control loop), `numpy` for whole
 arrays (analysis). Symbols: t1..t4 joint angles in rad, M1..M4 first moments along the links and W, Z, Y3, Y4 across
-them in kg m (below), g gravity in m/s^2; l, d and m1..m4 as in the paper.
-
-With the frames of Table 1 (joint n turns about z_{n-1}, and z_3 = z_4 = z_2) and gravity's unit vector d in the base
-frame, the torque is a linear function of eight first moments in kg m, everywhere in the order of `MOMENTS`:
+them in kg m, g gravity in m/s^2; l, d and m1..m4 as in the paper. With the frames of Table 1 (joint n turns about
+z_{n-1}, and z_3 = z_4 = z_2) and gravity's unit vector d in the base frame, the torque is linear in the moments:
 
     S4 = M4 x4 + Y4 y4        S2 = S3 + M2 x2 + Z z2
     S3 = S4 + M3 x3 + Y3 y3   S1 = S2 + M1 x1 + W z1        torque n = g z_{n-1} . (d x S_n)

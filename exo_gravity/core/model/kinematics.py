@@ -6,10 +6,10 @@ coefficients:
 
     T = 1/2 sum W_ij x'_i . x'_j     W_ij = W_ji = l_i M_j (i < j)     W_nn = Q_n + l_n^2 (mass beyond link n)
 
-M_j: first moments (moments.py). Q_n: second moment of link n about its joint. Equation of motion, the rest of the
-paper's Equation 1: tau_k = sum W_ij (dx_i/dq_k) . x''_j = z_{k-1} . sum over i >= k of x_i x W_ij x''_j, plus the
-rotor of joint k. Links are thin rods around their centres of gravity, Q_n = m_n (d_n^2 + l_n^2 / 12); where only the
-moments are known, they are points of mass at REACH. Offsets of the centres of gravity across the links are left out.
+M_j: first moments (gravity.py). Q_n: second moment of link n about its joint. The rest of the paper's Equation 1 is
+tau_k = sum W_ij (dx_i/dq_k) . x''_j = z_{k-1} . sum over i >= k of x_i x W_ij x''_j, plus the rotor of joint k. Links
+are thin rods around their centres of gravity, Q_n = m_n (d_n^2 + l_n^2 / 12), or points of mass at REACH where only the
+moments are known. Offsets of the centres of gravity across the links are left out.
 """
 
 import itertools
@@ -69,13 +69,6 @@ class LinkInertia(NamedTuple):
 
     weights: tuple[tuple[float, ...], ...]  #: W, (4, 4) kg m^2
     rotors: tuple[float, ...] = ROTORS  #: at the joints, (4,) kg m^2
-
-    @classmethod
-    def of(cls, arm: ArmModel, rotors: Sequence[float] = ROTORS) -> "LinkInertia":
-        """Return the inertia of `arm`. Raises ParameterError if it is given by its moments."""
-        if arm.by_moments:
-            arm.check_masses("terms that depend on the inertia")
-        return links_of(arm)._replace(rotors=tuple(rotors))
 
     @classmethod
     def of_moments(cls, length: Vector, moment: Vector, load: tuple[float, float] = (0.0, 0.0)) -> "LinkInertia":

@@ -4,6 +4,7 @@ For one at a time this is faster than NumPy.
 """
 
 import math
+from contextlib import suppress
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Vector
@@ -16,12 +17,10 @@ ZERO: Floats3 = (0.0, 0.0, 0.0)
 
 def three_floats(name: str, values: Vector | None) -> Floats3:
     """Return `values` as 3 finite floats, or raise ParameterError that names them."""
-    try:
+    with suppress(TypeError, ValueError):
         x, y, z = map(float, values)  # type: ignore[arg-type]  # None is one of the wrong values
         if -math.inf < x + y + z < math.inf:
             return x, y, z
-    except (TypeError, ValueError):
-        pass
     raise ParameterError(name, values, "3 finite numbers")
 
 
@@ -30,14 +29,12 @@ def unit_quaternion(name: str, values: Vector | None) -> Quaternion:
 
     Raises ParameterError that names `name` unless their norm is within 1 % of 1, which allows for rounding in drivers.
     """
-    try:
+    with suppress(TypeError, ValueError):
         x, y, z, w = map(float, values)  # type: ignore[arg-type]  # None is one of the wrong values
-    except (TypeError, ValueError):
-        raise ParameterError(name, values, "a unit quaternion (x, y, z, w)") from None
-    norm = math.sqrt(x * x + y * y + z * z + w * w)
-    if not abs(norm - 1.0) < 0.01:
-        raise ParameterError(name, values, "a unit quaternion (x, y, z, w)")
-    return x / norm, y / norm, z / norm, w / norm
+        norm = math.sqrt(x * x + y * y + z * z + w * w)
+        if abs(norm - 1.0) < 0.01:
+            return x / norm, y / norm, z / norm, w / norm
+    raise ParameterError(name, values, "a unit quaternion (x, y, z, w)")
 
 
 def up_in_body(q: Quaternion) -> Floats3:

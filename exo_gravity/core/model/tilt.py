@@ -100,3 +100,7 @@ def rotation_matrix(quaternion: Vector | None, name: str = "quaternion") -> np.n
     """
     unit = unit_quaternion(name, quaternion)
     return np.column_stack([rotated(unit, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))])
+
+
+#: gravity along each axis of the base frame, for the exact law
+AXES = tuple(Tilt.of("left")._replace(direction=axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))

@@ -1,9 +1,6 @@
-"""Support that adapts: it rises while the arm sinks, and then decays.
+"""Support that adapts: it rises while the arm sinks, and then decays. Why so: docs/wearer_torque.md.
 
-On a still arm statics alone sets the wearer's share: it is 1 - support, however tired the wearer is. A loop that holds
-the measured share would take support away from a wearer who tires. When he can no longer carry his share, the arm
-sinks, so slowly that the torques still balance. So the support follows the sinking. With w (4,) Nm, the torque that
-carries the wearer's arm,
+With w (4,) Nm, the torque that carries the wearer's arm,
 
     speed = sum w . theta' / |w|                   rad/s, upwards, from the joints' angles, low-passed by MEAN
     support' = - RISE * speed / FULL - (support - `support`) / MEMORY
@@ -22,6 +19,7 @@ from collections.abc import Sequence
 
 from exo_gravity.core.compensation.guidance import FADE_TIME
 from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.observer.momentum import COVER, MAX_GAP, WearerEstimate
 from exo_gravity.core.observer.share import LEAST_WEIGHT, RunningShare
 
@@ -37,14 +35,18 @@ LEAST_CHANGE = 0.005  # of the wearer's arm
 class SupportAdaptation:
     """How much of the wearer's arm is to be carried, from one estimate of his torque to the next.
 
-    support: 0..1. problem: why it cannot rise, or ''.
+    support: 0..1. problem: why it cannot rise, or ''. share: the wearer's share as `RunningShare` returns it, known
+    without an adaptation, too.
     """
 
     def __init__(self) -> None:
         self.support = 0.0
         self.problem = ""
+        self.share: tuple[float, float] | None = None
+        self._running = RunningShare()
         self._time = self._due = -math.inf  # s
-        self._forget()
+        self._theta: Sequence[float] | None = None
+        self._speed = 0.0  # rad/s, upwards
 
     def update(
         self,
@@ -58,16 +60,21 @@ class SupportAdaptation:
         joints: angles (4,) rad and velocities (4,) rad/s. estimate: None if there is none. settings: in use.
         """
         dt, self._time = now - self._time, now
-        if settings.mode != "zero_g" or not settings.support_adapts or not 0.0 < dt <= MAX_GAP:
-            self._forget()
+        is_running = 0.0 < dt <= MAX_GAP
+        if is_running and joints and estimate:
+            self.share = self._running.update(dt, estimate)
+        else:
+            self._running, self.share = RunningShare(), None
+            self._theta, self._speed = None, 0.0
+        if settings.mode != "zero_g" or not settings.support_adapts or not is_running:
+            self._theta, self._speed = None, 0.0
             self.support, self.problem = settings.support_now, ""
             return False
         sunk = 0.0
-        if joints is None or estimate is None:
-            self._forget()
-            self.problem = "the wearer's torque is not known"
+        if joints and estimate:
+            sunk = self._sunk(dt, joints, estimate.weight, 1.0 - settings.support_now)
         else:
-            sunk = self._sunk(dt, joints, estimate, 1.0 - settings.support_now)
+            self.problem = "the wearer's torque is not known"
         fall = RISE if self.problem else (self.support - settings.support) / MEMORY
         self.support = max(settings.support, min(1.0, self.support + dt * (RISE * sunk - fall)))
         if now < self._due or abs(self.support - settings.support_now) < LEAST_CHANGE:
@@ -75,27 +82,21 @@ class SupportAdaptation:
         self._due = now + FADE_TIME  # one guided change after the other
         return True
 
-    def _forget(self) -> None:
-        self._theta: Sequence[float] | None = None
-        self._speed = 0.0  # rad/s, upwards
-        self._share = RunningShare()
-
-    def _sunk(self, dt: float, joints: Sequence[Sequence[float]], estimate: WearerEstimate, asked: float) -> float:
+    def _sunk(self, dt: float, joints: Sequence[Sequence[float]], weight: Torque, asked: float) -> float:
         """Return how fast the arm sinks as a share of FULL, at most 1, and at least -LIFT while it is lifted.
 
         asked: share of his arm that is left to the wearer.
         """
         theta, velocity = joints
         moved = map(operator.sub, theta, self._theta or theta)
-        self._theta, part, weight = theta, dt / (MEAN + dt), estimate.weight
+        self._theta, part = theta, dt / (MEAN + dt)
         size = math.hypot(*weight)
         rise = sum(map(operator.mul, weight, moved)) / max(size, LEAST_WEIGHT)
         self._speed = 0.0 if max(map(abs, velocity)) > REACH else self._speed + part * (rise / dt - self._speed)
         self.problem = ""
-        measured = self._share.update(dt, estimate)
-        if measured is None:  # the arm hangs
+        if self.share is None:  # the arm hangs
             return 0.0
-        share, band = measured[0], COVER * measured[1]
+        share, band = self.share[0], COVER * self.share[1]
         if band > WIDEST:
             self.problem = f"the wearer's share is known to +-{100.0 * band:.0f} % only"
         sunk = max(-LIFT, min(1.0, -self._speed / FULL))

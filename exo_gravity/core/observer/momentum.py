@@ -19,12 +19,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.compensation.terms.friction_inertia import SLIDING, STANDSTILL
+from exo_gravity.core.compensation.terms.catalogue import sliding
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import LAWS, NO_TORQUE, Torque
 from exo_gravity.core.model.kinematics import ROTORS, LinkInertia, links_of
 from exo_gravity.core.model.rotation import ZERO, Floats3
-from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.model.tilt import AXES, Tilt
 
 BANDWIDTH = 15.0  # rad/s of each of the two low-passes
 COVER = 1.96  # standard deviations of the 95 % band
@@ -38,7 +38,10 @@ INERTIA_SHARE = 0.15  # of the torque that accelerates the arm
 LAG_SHARE = 0.4  # of the difference between the two low-passes
 MOTION_SHARE = 0.3  # of what the trunk feels beyond its low-passed mean: samples are late, and taken elsewhere
 REFERENCE = (0.0, 0.7, 0.6, 0.8)  # rad, a usual pose: its inertia weighs the velocity codes
-AXES = tuple(Tilt.of("left")._replace(direction=axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+# Contact: the torque changes faster than a person's does, as at a table's edge.
+FOLLOWED_TIME = 0.1  # s, time constant of what a person's torque follows,
+LEAST = (3.0, 5.0, 3.0, 1.5)  # Nm beyond that: 1.3 times the most that `make wearer-study` saw of reaching wearers
+PAUSE = 1.0  # s without another one, after which a contact is a new one
 
 
 class WearerEstimate(NamedTuple):
@@ -132,12 +135,37 @@ class MomentumObserver:
         """Return the joints' friction (4,) in Nm, against the motion, and its standard deviation."""
         torque, deviation = [], []
         for v, coulomb, viscous in zip(velocity, self._coulomb, self._viscous, strict=True):
-            moving = max(0.0, min(1.0, (abs(v) - STANDSTILL) / (SLIDING - STANDSTILL)))
+            moving = sliding(v)
             whole = moving * (coulomb + viscous * abs(v))
             torque.append(-math.copysign(whole, v) if self._is_known else 0.0)
-            sliding = FRICTION_SHARE * whole if self._is_known else whole
-            deviation.append(math.hypot(sliding, (1.0 - moving) * STICKING_SHARE * coulomb))
+            unsure = FRICTION_SHARE * whole if self._is_known else whole
+            deviation.append(math.hypot(unsure, (1.0 - moving) * STICKING_SHARE * coulomb))
         return torque, deviation
+
+
+class ContactWatch:
+    """Counts the contacts of one arm. last: time in s, joint (0..3) and Nm of the newest, None before the first."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.last: tuple[float, int, float] | None = None
+        self._slow = NO_TORQUE
+        self._time = self._touched = -math.inf  # s
+
+    def update(self, now: float, estimate: WearerEstimate) -> None:
+        """Take the estimate at `now` s."""
+        dt, self._time = now - self._time, now
+        if not 0.0 <= dt <= FOLLOWED_TIME:
+            self._slow, dt = estimate.torque, 0.0
+        self._slow = _followed(self._slow, estimate.torque, dt / FOLLOWED_TIME)
+        jumps = list(map(operator.sub, estimate.torque, self._slow))
+        columns = zip(jumps, LEAST, estimate.distinguishable, strict=True)
+        sizes = [abs(jump) / least if shown else 0.0 for jump, least, shown in columns]
+        joint = max(range(len(sizes)), key=sizes.__getitem__)
+        if sizes[joint] > 1.0:
+            if now - self._touched > PAUSE:
+                self.count, self.last = self.count + 1, (now, joint, jumps[joint])
+            self._touched = now
 
 
 def _followed(value: Torque, target: Sequence[float], share: float) -> Torque:

@@ -4,10 +4,8 @@ With his torque tau and the torque w that carries his arm, both (4,), over any s
 
     share = sum tau . w / sum w . w
 
-100 %: he carries his arm alone. 0: it is carried for him. Below 0 he presses down, above 100 % he also lifts the robot.
-What accelerates the arm and overcomes friction cancels out of the sum over a movement there and back. The errors of
-one joint are taken to be the same over the whole span, as those of a model are, so that a longer span has no narrower
-band.
+What accelerates the arm and overcomes friction cancels out of the sum over a movement there and back. The errors of one
+joint are taken to be the same over the whole span, as those of a model are: a longer span has no narrower band.
 """
 
 import itertools

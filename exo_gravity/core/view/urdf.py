@@ -85,9 +85,9 @@ def described(compensator: Mapping[str, Any], can_bridge: Mapping[str, Any]) -> 
         robot_of(compensator),
         compensator["robot.mass"],
         limits_of(can_bridge),
-        compensator["friction.viscous"],
-        compensator["friction.coulomb"],
-        compensator["shoulder_from_imu"],
+        compensator["friction.identified"][JOINT_COUNT:],
+        compensator["friction.identified"][:JOINT_COUNT],
+        compensator["inertial.shoulder_from_imu"],
     )
 
 

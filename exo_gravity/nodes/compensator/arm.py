@@ -2,10 +2,6 @@
 
 The exoskeleton's own arm has its laws, a wearer, terms, an outer loop and a torque budget. With `law: urdf` it is any
 serial arm, whose URDF comes from a file or from `robot_description`, with gravity compensation alone.
-
-`can_bridge` watches the age of the efforts and lets the arm down. An effort controller of ros2_control keeps its last
-command for ever, so `MultiArrayInterface` watches the age of the joint states itself, on its own thread, and fades the
-torque (core/compensation/limiter.py).
 """
 
 import threading
@@ -22,9 +18,10 @@ from std_srvs.srv import Trigger
 
 from exo_gravity.core.compensation import settings
 from exo_gravity.core.compensation.compensator import Answer, Compensator
-from exo_gravity.core.compensation.limiter import CommandFade, Output
+from exo_gravity.core.compensation.guidance import CommandFade
 from exo_gravity.core.compensation.settings import URDF_LAW, Settings, UrdfSettings
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.model.gravity import moments_of
 from exo_gravity.core.params import Param
 from exo_gravity.core.trunk.inputs import MAX_LEAD
 from exo_gravity.hardware.urdf_arm import UrdfArm
@@ -67,21 +64,20 @@ def report(control: Compensator, answer: Answer, names: Sequence[str]) -> dict[s
     s, terms = control.settings, control.terms
     most, name = max(zip(map(abs, answer.remainder), names, strict=False), default=(0.0, ""))
     values: dict[str, object] = {"law": s.law, "changing load": f"{name}, {most:.1f} Nm to go" if name else "none"}
+    values["max effort (Nm)"] = row(s.max_effort)
     if isinstance(s, UrdfSettings):
-        carried, limits = f"{s.arm.mass:.3f}", row(s.max_effort)
-        return {**values, "mass carried (kg)": carried, "gain": row(s.gain), "max effort (Nm)": limits}
+        return {**values, "mass carried (kg)": f"{s.arm.mass:.3f}", "gain": row(s.gain)}
     values |= {
         "law in use": "exact" if answer.fallback else s.law,
         "mode": s.mode,
         "support": s.support,
         "robot mass (kg)": "not known" if s.robot.by_moments else row(s.robot.mass),
         "robot cog (m)": "not known" if s.robot.by_moments else row(s.robot.cog),
-        "robot moments (kg m)": row((*s.robot.first_moment, *s.robot.off_axis)),
+        "robot moments (kg m)": row(moments_of(s.robot)),
         "wearer mass (kg)": row(s.wearer_mass),
         "wearer cog (m)": row(s.wearer_cog),
         "payload mass (kg)": f"{s.payload_mass:.3f}",
         "mass carried (kg)": f"{s.arm.total_mass:.3f}",
-        "max effort (Nm)": row(s.max_effort),
     }
     if terms:
         values["terms"] = ", ".join(terms.active) or "none"
@@ -157,8 +153,9 @@ class JointStateInterface:
 class MultiArrayInterface(Repeated):
     """Sends Float64MultiArray in the order of `names`; fades to zero when there are no fresh, sound efforts.
 
-    values: the compensator's parameters. After a fade zeros follow, so that a controller that starts late has them too,
-    until the service `~/clear_fault` is called.
+    It watches the age of the joint states itself, on its own thread, because the receiver does not (`CommandFade`).
+    After a fade zeros follow, for a controller that starts late, until the service `~/clear_fault` is called.
+    values: the compensator's parameters.
     """
 
     def __init__(self, node: Node, names: Sequence[str], values: Mapping[str, Any]) -> None:
@@ -183,20 +180,20 @@ class MultiArrayInterface(Repeated):
     @property
     def values(self) -> dict[str, object]:
         """What is known of the output, for /diagnostics."""
-        return {"output": self._fade.state.value, "output fault": self._fade.reason or "none"}
+        return {"output": self._fade.state, "output fault": self._fade.reason or "none"}
 
     def read(self, message: JointState) -> JointReading:
         """Return positions and velocities of these joints, which may be some of many.
 
         Raises ParameterError if one is missing, and if the message is old by its stamp: a driver that lost its hardware
-        may go on publishing. Raises it, too, while nothing was sent and the message lacks the joints' efforts: the
-        controller may hold a torque, from which the next one must begin.
+        may go on publishing. Raises it, too, while nothing was sent and the efforts are missing: the controller may
+        hold a torque, from which the next one must begin.
         """
         age = (self._clock.now().nanoseconds - to_nanoseconds(message.header.stamp)) * 1e-9
         self._is_late = not -MAX_LEAD <= age <= self._timeout
         if self._is_late:
             raise ParameterError("age by its stamp", round(age, 3), f"from {-MAX_LEAD:g} to {self._timeout:g} s")
-        if self._fade.state is Output.WAITING:
+        if self._fade.state == "waiting":
             self._applied = by_name(message, "effort", self._names, exact=False)
         return by_name(message, "position", self._names, exact=False), velocity_of(message, self._names, exact=False)
 
@@ -214,7 +211,7 @@ class MultiArrayInterface(Repeated):
         """Fade to zero, and end the thread."""
         with self._lock:
             self._fade.withdraw(time.monotonic(), "the node stops")
-        while self._fade.state is Output.FADING and not self.failure:
+        while self._fade.state == "fading" and not self.failure:
             time.sleep(TICK)
         super().stop()
 

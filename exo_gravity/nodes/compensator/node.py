@@ -2,8 +2,7 @@
 
 It answers each joint state at once, with the joint state's stamp, so that `can_bridge` can tell how old the reading is.
 Where there is no safe answer it withdraws: it sends a command without efforts, and puts the reason on /diagnostics. To
-`can_bridge` silence means the same, a little later. An effort controller of ros2_control needs more
-(nodes/compensator/arm.py).
+`can_bridge` silence means the same, a little later.
 """
 
 import math
@@ -27,8 +26,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Rate
 from exo_gravity.hardware.clock import request_real_time
 from exo_gravity.nodes.compensator.arm import JointStateInterface, MultiArrayInterface, declared, report, sentence
-from exo_gravity.nodes.compensator.budget_watch import BudgetWatch
-from exo_gravity.nodes.compensator.wearer import WearerWatch
+from exo_gravity.nodes.compensator.watches import BudgetWatch, WearerWatch
 from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import accept_changes
 from exo_gravity.nodes.ros.run import run
@@ -106,7 +104,6 @@ class CompensatorNode(Node):
         self._budget = BudgetWatch(self, self._names)
         self._assist = terms.assist
         self._assistant = Publishers()
-        self._assistants = 0  # changes whenever a message comes from another publisher than the one before
         path = HotPath(self, JointState, "assist_efforts", self._on_assist_efforts, pause=ASSIST_PAUSE)
         self._wearer = WearerWatch(self, self._names, self._control, self._lock)
         self._threads += [path, self._wearer]
@@ -161,6 +158,7 @@ class CompensatorNode(Node):
                 answer = Answer(None, self._interface.problem)
             else:
                 with self._lock:
+                    self._control.applied = message.effort if message.name == self._names else None
                     answer = self._control.step(now, theta, velocity)
         except ParameterError as error:
             answer = Answer(None, self._refused(self._interface.topic, error))
@@ -182,9 +180,9 @@ class CompensatorNode(Node):
     def _on_assist_efforts(self, message: JointState, info: dict[str, Any]) -> None:
         now = time.monotonic()
         age = (self.get_clock().now().nanoseconds - to_nanoseconds(message.header.stamp)) * 1e-9
-        self._assistants += self._assistant.is_another(info)
+        is_another = self._assistant.is_another(info)
         with self._lock:
-            self._assist.receive(now, message.name, message.effort, now - age, self._assistants)
+            self._assist.receive(now, message.name, message.effort, now - age, is_another)
 
     def _on_motion(self, *sample: Any) -> None:
         if self._wearer:

@@ -19,7 +19,7 @@ from exo_gravity.core.calibration.poses import candidates, next_pose
 from exo_gravity.core.compensation.settings import wearer_of
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.model.arm import ModelError, moments_along
-from exo_gravity.core.model.gravity import gravity_torque, load_moments, moments_of, regressor
+from exo_gravity.core.model.gravity import MOMENTS, gravity_torque, load_moments, moments_of, regressor
 from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS
 from exo_gravity.core.numbers import JOINT_COUNT
@@ -107,8 +107,7 @@ def _changes(arm: ConfiguredArm, found: Identified, scale: list[float]) -> tuple
     before = moments_of(arm.robot)
     moments = np.where(np.isfinite(error), found.moments, before).round(5).tolist()
     changes = [
-        Change(node, "robot.first_moment", moments[:4], f"{unit}, +-{_row(error[:4])}, was {_row(before[:4])}"),
-        Change(node, "robot.off_axis", moments[4:], f"W Z Y3 Y4 {unit}, +-{_row(error[4:])}, was {_row(before[4:])}"),
+        Change(node, "robot.moments", moments, f"{' '.join(MOMENTS)} {unit}, +-{_row(error)}, was {_row(before)}"),
         Change(f"{arm.namespace}/can_bridge", "torque_scale", scale, f"+-{_row(found.scale_error)}"),
     ]
     if np.all(np.isfinite(found.held_out).any(axis=0)):

@@ -25,7 +25,7 @@ class OuterLoop:
 
     def __init__(self, rate: float = 100.0, jitter: float = 0.0, lag: float = 0.0) -> None:
         self.input = AssistInput(NAMES, ASSIST)
-        self.now, self.rate, self.lag, self.publisher = 20.0, rate, lag, 1
+        self.now, self.rate, self.lag, self.publisher, self.last = 20.0, rate, lag, 1, 1
         self.names, self.efforts = NAMES, EFFORTS
         self.sending = True
         self.torques: list[tuple[float, ...]] = []
@@ -34,7 +34,8 @@ class OuterLoop:
 
     def send(self, names=None, efforts=None, stamp=None, publisher=None):
         stamp = self.now - self.lag if stamp is None else stamp
-        self.input.receive(self.now, names or self.names, efforts or self.efforts, stamp, publisher or self.publisher)
+        last, self.last = self.last, publisher or self.publisher
+        self.input.receive(self.now, names or self.names, efforts or self.efforts, stamp, self.last != last)
 
     def run(self, seconds: float) -> tuple[float, ...]:
         for _ in range(round(seconds / CYCLE)):

@@ -10,20 +10,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exo_gravity.core.compensation.limiter import LONGEST_STEP
-from exo_gravity.core.compensation.terms.friction_inertia import (
+from exo_gravity.core.compensation.guidance import LONGEST_STEP
+from exo_gravity.core.compensation.terms.catalogue import (
+    DELAY,
     MAX_SPEED,
     SLIDING,
     STANDSTILL,
     TANK,
+    Coupling,
+    Damping,
     EnergyTank,
     Friction,
     Inertia,
-)
-from exo_gravity.core.compensation.terms.springs import (
-    DELAY,
-    Coupling,
-    Damping,
     SoftLimits,
     Spring,
     TermState,
@@ -37,7 +35,7 @@ from exo_gravity.core.compensation.terms.terms import (
     term_settings_of,
 )
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.kinematics import LinkInertia, least_inertia
+from exo_gravity.core.model.kinematics import least_inertia, links_of
 from exo_gravity.core.params import values_of
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
@@ -47,7 +45,7 @@ STATE = TermState(0.002, (0.2, 0.7, 0.6, 0.5), ZERO, ZERO, 0.0)
 EDGES = (-1.5, 1.5, 0.0, 1.6, -0.6, 1.6, 0.0, 2.5)
 four = st.tuples(*[st.floats(-40.0, 40.0)] * 4)
 ALL = TermSettings(
-    friction=Friction(0.7, (0.2, 0.4, 0.2, 0.2), (0.02,) * 4),
+    friction=Friction(0.7, (0.2, 0.4, 0.2, 0.2, 0.02, 0.02, 0.02, 0.02)),
     inertia=Inertia(0.7),
     damping=Damping((0.05, 0.1, 0.05, 0.05)),
     spring=Spring((2.0, 4.0, 2.0, 1.0)),
@@ -59,7 +57,7 @@ ALL = TermSettings(
 @settings(deadline=None)
 @given(four, st.floats(0.0, 0.85))
 def test_friction_is_along_the_motion_and_below_what_the_joint_loses(velocity, share):
-    friction = Friction(share, (0.2, 0.4, 0.2, 0.1), (0.02, 0.05, 0.02, 0.0))
+    friction = Friction(share, (0.2, 0.4, 0.2, 0.1, 0.02, 0.05, 0.02, 0.0))
     for v, tau, coulomb, viscous in zip(
         velocity, friction.torque(STATE._replace(velocity=velocity)), friction.coulomb, friction.viscous, strict=True
     ):
@@ -68,7 +66,7 @@ def test_friction_is_along_the_motion_and_below_what_the_joint_loses(velocity, s
 
 
 def test_friction_is_zero_at_standstill_and_does_not_step():
-    friction = Friction(0.8, (0.2,) * 4)
+    friction = Friction(0.8, (*(0.2,) * 4, *(0.0,) * 4))
     speeds = np.linspace(-2.0 * SLIDING, 2.0 * SLIDING, 400)
     torque = np.array([friction.torque(STATE._replace(velocity=(v, 0.0, 0.0, 0.0)))[0] for v in speeds])
     one_code = 2.0 * 45.0 / 4095.0
@@ -104,6 +102,11 @@ def test_a_spring_follows_a_recorded_path_and_stays_at_its_end():
     for elapsed, pose in halfway.items():
         torque = spring.torque(STATE._replace(position=ZERO, elapsed=elapsed))
         assert torque == pytest.approx(2.0 * np.array(pose))
+
+
+def test_viscous_friction_in_another_unit_is_refused():
+    with pytest.raises(ParameterError, match=r"^friction.identified = .* at most 1 if viscous"):
+        Friction(0.5, (0.2, 0.4, 0.2, 0.2, 0.02, 0.05, 0.02, 2.0))
 
 
 @pytest.mark.parametrize(
@@ -220,7 +223,7 @@ def test_a_spring_or_damper_that_would_be_unstable_when_late_is_refused_with_the
 
 def test_soft_limits_are_no_stiffer_than_the_arm_can_bear():
     stiff = TermSettings(limits=SoftLimits(EDGES)).on_arm(DEFAULT_LINKS).limits.stiffness
-    most = np.array(least_inertia(LinkInertia.of(DEFAULT_LINKS))) / (4.0 * DELAY**2)
+    most = np.array(least_inertia(links_of(DEFAULT_LINKS))) / (4.0 * DELAY**2)
     assert stiff == pytest.approx(np.minimum(10.0, 0.8 * most))
 
 

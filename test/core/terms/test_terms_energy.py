@@ -13,10 +13,18 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.compensation.terms.friction_inertia import TANK, Friction, Inertia
-from exo_gravity.core.compensation.terms.springs import DELAY, Coupling, Damping, SoftLimits, Spring
+from exo_gravity.core.compensation.terms.catalogue import (
+    DELAY,
+    TANK,
+    Coupling,
+    Damping,
+    Friction,
+    Inertia,
+    SoftLimits,
+    Spring,
+)
 from exo_gravity.core.compensation.terms.terms import TermSettings
-from exo_gravity.core.model.kinematics import LinkInertia, least_inertia
+from exo_gravity.core.model.kinematics import least_inertia, links_of
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
@@ -42,7 +50,7 @@ class Case:
             viscous_friction=tuple(rng.uniform(0.0, 0.05, 4).tolist()),
             stribeck_friction=tuple((0.2 * np.array(self.friction) * rng.uniform(0.0, 1.0)).tolist()),
         )
-        self.identified = tuple((np.array(self.friction) * rng.uniform(0.8, 1.0)).tolist())
+        self.identified = (*(np.array(self.friction) * rng.uniform(0.8, 1.0)).tolist(), *(0.0,) * 4)
         self.period = float(rng.choice((0.002, 0.004, 0.005)))
         self.delay = float(rng.choice((0.0, 0.005, 0.01)))
 
@@ -61,12 +69,12 @@ CASES = [Case(0)]
 
 def stiffest(links: ArmModel) -> tuple[float, ...]:
     """Return the stiffness (4,) in Nm/rad up to which springs are accepted."""
-    return tuple((0.999 * np.array(least_inertia(LinkInertia.of(links))) / (4.0 * DELAY**2)).tolist())
+    return tuple((0.999 * np.array(least_inertia(links_of(links))) / (4.0 * DELAY**2)).tolist())
 
 
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_friction_gives_less_than_the_joints_friction_takes(case):
-    run = case.pushed(TermSettings(friction=Friction(0.85, case.identified, tuple(case.config.viscous_friction))))
+    run = case.pushed(TermSettings(friction=Friction(0.85, (*case.identified[:4], *case.config.viscous_friction))))
     assert run.given > 0.3 * run.rubbed  # it does help
     assert run.worst_balance < 0.02
 
@@ -95,7 +103,7 @@ def test_inertia_without_an_identified_friction_lives_on_its_tank(case):
 
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_the_strongest_damping_only_takes(case):
-    least = np.array(least_inertia(LinkInertia.of(case.links)))
+    least = np.array(least_inertia(links_of(case.links)))
     run = case.pushed(TermSettings(damping=Damping(tuple((0.999 * least / (2.0 * DELAY)).tolist()))))
     assert run.given < -0.02
     assert run.most_given < 0.01
@@ -150,7 +158,7 @@ THIRTEEN = [
 def test_friction_and_inertia_let_no_held_pose_creep_or_cycle():
     """Each pose is left at 0.3 rad/s, as a hand that lets go leaves it; 0.2 degrees a minute is the limit."""
     case = Case(1)
-    chosen = TermSettings(inertia=Inertia(0.8), friction=Friction(0.85, case.friction))
+    chosen = TermSettings(inertia=Inertia(0.8), friction=Friction(0.85, (*case.friction, *(0.0,) * 4)))
     for pose in THIRTEEN[::4]:
         run = TermsRun(chosen, case.config, case.links, pose, period=0.004, delay=0.008)
         run.device.arm.data.qvel[:] = 0.3

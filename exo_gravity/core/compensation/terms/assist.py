@@ -5,21 +5,16 @@
     refused    the last ones were wrong; no torque until they have been sound for RECOVERY
     assisting  the efforts are followed: clamped to `max_effort`, limited to MAX_RATE, ramped in over RAMP
 
-Messages may come at 10 to 500 Hz. An effort is valid for 1.5 observed periods after its stamp, and for MIN_VALID at
-least, so that a single late message costs nothing. Then, or at once when a message is wrong, the torque fades in FADE.
-So it is zero 100 ms after the first missing message was due: at 500 Hz 100 ms after the last one, at 10 Hz 200 ms. Only
-the compensator's `max_effort_rate` can make that longer, for an effort above 2.5 Nm at its default.
-
-The input remembers only the torque that it applies. That torque moves towards the newest message and never past it. The
-next sender starts from it, and from zero once it has faded or the compensator has paused.
+An effort is valid for PERIODS observed periods, so that a single late message costs nothing. The input remembers only
+the torque that it applies, which moves towards the newest message and never past it: docs/terms.md.
 """
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from exo_gravity.core.compensation.limiter import BREAK
-from exo_gravity.core.compensation.terms.springs import TermParameters, clamp
+from exo_gravity.core.compensation.guidance import BREAK
+from exo_gravity.core.compensation.terms.catalogue import TermParameters, clamp
 from exo_gravity.core.model.gravity import NO_TORQUE, Torque
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import owned
@@ -61,7 +56,6 @@ class AssistInput:
         self._period = SLOWEST
         self._stamp = self._arrival = -math.inf
         self._refused = -math.inf
-        self._publisher: Hashable = None
         self._last = -math.inf  # the last call of `torque`
 
     @property
@@ -89,18 +83,16 @@ class AssistInput:
         return max(MIN_VALID, PERIODS * self._period)
 
     def receive(
-        self, now: float, names: Sequence[str], efforts: Sequence[float], stamp: float, publisher: Hashable = None
+        self, now: float, names: Sequence[str], efforts: Sequence[float], stamp: float, is_another: bool = False
     ) -> None:
         """Take a message that arrived at `now`: `efforts` in Nm of the joints `names`, computed at `stamp`.
 
-        publisher: anything that differs from one sender to another.
+        is_another: whether its publisher is another than that of the message before.
         """
         interval, self._arrival = now - self._arrival, now
         if interval < SLOWEST * PERIODS:
             self._period += PERIOD_SMOOTHING * (min(interval, SLOWEST) - self._period)
-        second = publisher != self._publisher and interval < SLOWEST * PERIODS
-        self._publisher = publisher
-        problem = self._problem(now, names, efforts, stamp, second)
+        problem = self._problem(now, names, efforts, stamp, is_another and interval < SLOWEST * PERIODS)
         if problem:
             self._refused, self.reason = now, problem
             return

@@ -1,39 +1,36 @@
-"""The terms at work: their parameters, their bounded sum, plus the outer loop's input.
+"""The terms at work: their parameters, and their bounded, rate-limited sum, plus the outer loop's input.
 
-The sum is bounded and rate-limited. The compensator guides a change of parameters. Whatever is wrong with the sum,
-gravity compensation goes on beneath it. A new term is a field of `TermSettings` and an item in `Terms._built`.
+The compensator guides a change of parameters. Whatever is wrong with the sum, gravity compensation goes on beneath it.
+A new term is a field of `TermSettings` and an item in `Terms._built`.
 """
 
 import math
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import Any, NamedTuple
 
-from exo_gravity.core.compensation.limiter import LONGEST_STEP, limited
+from exo_gravity.core.compensation.guidance import LONGEST_STEP, limited
 from exo_gravity.core.compensation.terms.assist import Assist, AssistInput
-from exo_gravity.core.compensation.terms.friction_inertia import (
+from exo_gravity.core.compensation.terms.catalogue import (
+    DELAY,
     MAX_FRICTION_SHARE,
     AccelerationFilter,
+    Coupling,
+    Damping,
     EnergyTank,
     Friction,
     Inertia,
-    InertiaTerm,
-)
-from exo_gravity.core.compensation.terms.springs import (
-    DELAY,
-    Coupling,
-    Damping,
     SoftLimits,
     Spring,
-    Term,
     TermState,
     clamp,
 )
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import NO_TORQUE, Torque
-from exo_gravity.core.model.kinematics import LinkInertia, least_inertia
+from exo_gravity.core.model.kinematics import least_inertia, links_of
 from exo_gravity.core.params import Param, params_of
 
 MAX_GAP = 0.2  # s between two cycles, beyond which the terms begin again from no torque
@@ -61,18 +58,17 @@ class TermSettings:
         """
         if not any(getattr(self, name).on for name in ("damping", "spring", "coupling", "limits", "inertia")):
             return self
-        least = least_inertia(LinkInertia.of(robot))
+        least = least_inertia(links_of(robot))
         # A spring that acts DELAY late gives the energy of a damping of -stiffness * DELAY. Virtual damping acts as
         # late, so inertia / (2 DELAY) is the most that damps: twice what the spring needs.
         dampers = [inertia / (2.0 * DELAY) for inertia in least]
         springs = [most / (2.0 * DELAY) for most in dampers]
-        bounds = [
+        coupled = ([self.coupling.largest], [self.coupling.stable(least)]) if self.coupling.on else ((), ())
+        for name, values, most, unit in (
             ("damping.viscosity", self.damping.viscosity, dampers, "Nm s/rad"),
             ("spring.stiffness", self.spring.stiffness, springs, "Nm/rad"),
-        ]
-        if self.coupling.on:
-            bounds.append(("coupling.stiffness", [self.coupling.largest], [self.coupling.stable(least)], "Nm/rad"))
-        for name, values, most, unit in bounds:
+            ("coupling.stiffness", *coupled, "Nm/rad"),
+        ):
             if any(value > limit for value, limit in zip(values, most, strict=True)):
                 expected = f"at most {[round(limit, 3) for limit in most]} {unit}, which"
                 raise ParameterError(name, list(values), f"{expected} {1000 * DELAY:.0f} ms late is stable")
@@ -102,7 +98,7 @@ def term_settings_of(values: Mapping[str, Any]) -> TermSettings:
 class Active(NamedTuple):
     """The terms of some settings."""
 
-    terms: Sequence[Term] = ()
+    terms: Sequence[Callable[[TermState], Torque]] = ()  #: each returns (4,) Nm that the motors add
     since: float = -math.inf  #: s, when the spring's settings came into force
 
 
@@ -162,7 +158,7 @@ class Terms:
         columns = zip(total, self._output, MAX_EFFORT, strict=True)
         self._output = tuple([limited(wanted, last, limit, step) for wanted, last, limit in columns])
         self._assisted = NO_TORQUE if self.assist.idle else self.assist.torque(now)
-        return self._with_assistance(self._output)
+        return tuple(map(operator.add, self._assisted, self._output))
 
     def torque_of(self, active: Active) -> Torque:
         """Return the torque (4,) in Nm that other terms would give in the state of the last `torque`."""
@@ -170,20 +166,17 @@ class Terms:
         total = _sum(active.terms, state)
         if not math.isfinite(sum(total)):
             total = NO_TORQUE
-        return self._with_assistance([clamp(tau, most) for tau, most in zip(total, MAX_EFFORT, strict=True)])
+        return tuple(map(operator.add, self._assisted, map(clamp, total, MAX_EFFORT)))
 
-    def _with_assistance(self, torque: Sequence[float]) -> Torque:
-        return tuple(map(operator.add, self._assisted, torque))
-
-    def _built(self, s: TermSettings, arm: ArmModel) -> Sequence[Term]:
+    def _built(self, s: TermSettings, arm: ArmModel) -> Sequence[Callable[[TermState], Torque]]:
         """Return the terms that are on."""
-        terms: list[Term] = [term for term in (s.friction, s.damping, s.spring, s.coupling, s.limits) if term.on]
+        terms = [term.torque for term in (s.friction, s.damping, s.spring, s.coupling, s.limits) if term.on]
         if s.inertia.on:
             self._has_inertia = True
             left = [(MAX_FRICTION_SHARE - s.friction.share) * coulomb for coulomb in s.friction.coulomb]
-            terms.append(InertiaTerm(s.inertia.share, LinkInertia.of(arm), left, self.tank))
+            terms.append(partial(s.inertia.torque, links_of(arm), left, self.tank))
         return terms
 
 
-def _sum(terms: Sequence[Term], state: TermState) -> Torque:
-    return tuple(map(sum, zip(NO_TORQUE, *(term.torque(state) for term in terms), strict=True)))
+def _sum(terms: Sequence[Callable[[TermState], Torque]], state: TermState) -> Torque:
+    return tuple(map(sum, zip(NO_TORQUE, *(torque(state) for torque in terms), strict=True)))
