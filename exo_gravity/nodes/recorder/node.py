@@ -33,7 +33,7 @@ from exo_gravity.bag.writer import BagWriter, offered_qos
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.core.trial.session import Session
 from exo_gravity.nodes.ros.messages import status_values
-from exo_gravity.nodes.ros.parameters import NodeParameters, declare
+from exo_gravity.nodes.ros.parameters import OtherNodes, declare
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import HotPath, Publishers
 
@@ -45,8 +45,8 @@ OF_ARMS = {**ARM_TOPICS, **dict.fromkeys((content.ASSIST, *content.WEARER), Join
 REPEATER = "robot_model"  # its joint states are those of the arms once more
 UNNAMED = "_NODE_NAME_UNKNOWN_"  # what the RMW calls a publisher whose node it has not discovered yet
 DRAIN_PERIOD = 0.05  # s between two writes of what has arrived
-DISCOVERY_PERIOD = 0.5  # s between two searches for new topics and nodes
-LIVE_PERIOD = 0.1  # s between two lines of live state, and two looks for the answers of new nodes
+DISCOVERY_PERIOD = 0.5  # s between two searches for new topics
+LIVE_PERIOD = 0.1  # s between two lines of live state, and two searches for new nodes
 DEPTH = 1000  # queued messages per topic: two seconds at 500 Hz
 LOSS_REPORT_PERIOD = 5.0  # s between two warnings of lost messages
 # After the launcher's death a bridge lets its arm down: this is recorded while joint states arrive.
@@ -72,7 +72,7 @@ class Recorder(Node):
         self._topics: dict[str, HotPath] = {}
         self._counted: list[Publishers] = []  # of joints and IMU; other topics have several
         self._taken: list[tuple[str, int, bytes]] = []  # topic, time of arrival in ns since 1970, serialised
-        self._nodes: dict[str, NodeParameters] = {}  # destroyed once their parameters are in the recording
+        self._nodes = OtherNodes(self, on_read=partial(self._guarded, "parameters", self._write_parameters), once=True)
         self._live = LiveLine() if values["live"] else None
         self.create_timer(DRAIN_PERIOD, self._drain)
         self.create_timer(DISCOVERY_PERIOD, self._discover)
@@ -112,24 +112,15 @@ class Recorder(Node):
         self.failure = self._writer.error
 
     def _discover(self) -> None:
-        """Subscribe to new topics, and note new nodes."""
+        """Subscribe to new topics."""
         for topic, _types in self.get_topic_names_and_types():
             msgtype = SHARED_TOPICS.get(topic) or OF_ARMS.get(leaf(topic))
             if msgtype and topic not in self._topics:
                 self._guarded(topic, self._subscribe, topic, msgtype)
-        for name, namespace in self.get_node_names_and_namespaces():
-            node = f"{namespace.rstrip('/')}/{name}"
-            if node not in self._nodes and node != self.get_fully_qualified_name() and not name.startswith("_"):
-                self._guarded(node, self._add_node, node)
-
-    def _add_node(self, node: str) -> None:
-        write = partial(self._guarded, node, self._write_parameters, node)
-        self._nodes[node] = NodeParameters(self, node, write)
 
     def _look(self) -> None:
-        """Ask the nodes whose parameters are not known, and print the live line."""
-        for node, parameters in self._nodes.items():
-            self._guarded(node, parameters.update)
+        """Ask new nodes for their parameters, and print the live line."""
+        self._guarded("parameters", self._nodes.update)
         if self._live:
             counts = {"messages": self._writer.count, "lost": sum(self._losses())}
             self._guarded("live state", self._live.write, counts)
@@ -186,7 +177,6 @@ class Recorder(Node):
         given = {name: value for name, value in values.items() if value != []}
         text = yaml.safe_dump({node: {"ros__parameters": given}}, default_flow_style=None, width=120)
         self._write_text(PARAMETERS, text)
-        self._nodes[node].destroy()
 
     def _write_text(self, topic: str, text: str) -> None:
         now = self.get_clock().now().nanoseconds
