@@ -168,7 +168,12 @@ class Control:
                 return self._refused(page, 403, f"{text}: {other} holds control of this arm")
         if kind in ("enable", "resume"):  # by a page that confirms nothing, the arm is not carried for long
             self.arms.lease(str(page), "hold")
-        problem = await self._carry_out(request, kind, arm, page)
+        try:
+            problem = await self._carry_out(request, kind, arm, page)
+        except ParameterError as error:  # without the value, which the log must not have: it may be a name
+            problem = f"{error.name} must be {error.expected}"
+        except OSError as error:
+            problem = f"{error.filename}: {error.strerror}"
         self._log(f"{page or f'{address} unknown page'}: {text}: {problem or 'done'}")
         return (409 if problem else 200, problem)
 
