@@ -4,22 +4,7 @@ A page is one browser tab. It keeps its secret while it is reloaded, and confirm
 page that confirms nothing for `GONE` seconds is gone: the laptop is closed, or the network lost. One page at a time
 holds control, the others watch. Every page may let the arms down, at any time and without a rate limit. Each
 confirmation of the page that holds control renews its lease at the arms (core/safety/lease.py), if the panel has one:
-no page, no panel, no lease. The requests:
-
-{"do": "let_down"}                                   all arms
-{"do": "let_down", "arm": "right"}                   one arm
-{"do": "take"}                                       control; every page may
-{"do": "enable", "arm": "right"}                     the rest: only the page that holds control
-{"do": "clear_fault", "arm": "right"}
-{"do": "resume", "arm": "right"}                     clear and enable, after a fault that was no one's
-{"do": "set", "arm": "right", "values": {"support": 0.3}}
-{"do": "weigh", "arm": "right"}                      what the hand holds; the compensator's diagnostics tell
-{"do": "bring_home", "arm": "right"}                 a simulated arm: its virtual wearer lets it hang
-{"do": "release"}                                    control
-{"do": "record"}, {"do": "stop_recording"}, {"do": "save"}
-{"do": "trial", "name": "demo"}, {"do": "stop_trial"}
-{"do": "session", "subject": "P01", "protocol": "", "note": ""}, {"do": "keep_wearer"}
-{"do": "marker", "text": "cramp"}                    every page may
+no page, no panel, no lease. A request is an object such as {"do": "set", "arm": "right", "values": {"support": 0.3}}.
 """
 
 import asyncio
@@ -32,15 +17,25 @@ from typing import Any
 from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.panel.view import OF_SUBJECT, SETTABLE
 
-# The kinds of requests, and the keys that each has besides "do".
+# What a page may ask for in "do", and the other keys of each request.
+ARM = frozenset({"arm"})
 KEYS: Mapping[str, frozenset[str]] = {
-    **dict.fromkeys(("take", "release", "record", "stop_recording", "save", "stop_trial", "keep_wearer"), frozenset()),
-    **dict.fromkeys(("let_down", "enable", "clear_fault", "resume", "weigh", "bring_home"), frozenset({"arm"})),
-    "set": frozenset({"arm", "values"}),
+    # of every page
+    "let_down": ARM,  # without it: all arms
+    "take": frozenset(),  # control
+    "marker": frozenset({"text"}),
+    # of the page that holds control
+    "enable": ARM,
+    "clear_fault": ARM,
+    "resume": ARM,  # clear and enable, after a fault that was no one's
+    "set": frozenset({"arm", "values"}),  # parameters of the compensator
+    "weigh": ARM,  # what the hand holds; the compensator's diagnostics tell
+    "bring_home": ARM,  # a simulated arm: its virtual wearer lets it hang
     "trial": frozenset({"name"}),
     "session": frozenset({"subject", "protocol", "note"}),
-    "marker": frozenset({"text"}),
+    **dict.fromkeys(("release", "record", "stop_recording", "save", "stop_trial", "keep_wearer"), frozenset()),
 }
+FOR_ALL = ("let_down", "take", "marker")
 CHANGEABLE = {**SETTABLE, **OF_SUBJECT}
 GONE = 2.0  # s without a confirmation; longer than a lease lasts, so that the next page finds the arm let down
 MAX_PAGES = 32
@@ -162,7 +157,7 @@ class Control:
                 return (403, "unknown page: reload it")
             if not self._spend(page):
                 return (429, "too many requests: wait a moment")
-            if kind not in ("take", "marker") and page is not self.holder:
+            if kind not in FOR_ALL and page is not self.holder:
                 return self._refused(page, 403, f"{text}: another page holds control")
             if arm and (other := self.arms.other_holder(arm, str(page))):
                 return self._refused(page, 403, f"{text}: {other} holds control of this arm")
