@@ -35,13 +35,14 @@ from exo_gravity.core.trial.session import Session
 from exo_gravity.nodes.ros.messages import status_values
 from exo_gravity.nodes.ros.parameters import OtherNodes, declare
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import HotPath, Publishers
+from exo_gravity.nodes.ros.subscriptions import PITCH_YAW, HotPath, Publishers
 
-SHARED_TOPICS = {"/imu/pitch_yaw": Vector3Stamped, content.IMU: Imu, "/imu/data_raw": Imu}
-SHARED_TOPICS |= {content.DIAGNOSTICS: DiagnosticArray, content.PARAMETER_EVENTS: ParameterEvent}
-SHARED_TOPICS |= {content.MARKERS: String}
-ARM_TOPICS = {STATES: JointState, content.COMMANDS: JointState, content.STEPS: String}  # in the live line
-OF_ARMS = {**ARM_TOPICS, **dict.fromkeys((content.ASSIST, *content.WEARER), JointState)}
+TYPES = {  # of each topic that is recorded, or of its last part in an arm's namespace
+    STATES: JointState, content.COMMANDS: JointState, content.ASSIST: JointState, content.STEPS: String,
+    **dict.fromkeys(content.WEARER, JointState),
+    content.IMU: Imu, "/imu/data_raw": Imu, PITCH_YAW: Vector3Stamped, content.DIAGNOSTICS: DiagnosticArray,
+    content.PARAMETER_EVENTS: ParameterEvent, content.MARKERS: String,
+}  # fmt: skip
 REPEATER = "robot_model"  # its joint states are those of the arms once more
 UNNAMED = "_NODE_NAME_UNKNOWN_"  # what the RMW calls a publisher whose node it has not discovered yet
 DRAIN_PERIOD = 0.05  # s between two writes of what has arrived
@@ -114,7 +115,7 @@ class Recorder(Node):
     def _discover(self) -> None:
         """Subscribe to new topics."""
         for topic, _types in self.get_topic_names_and_types():
-            msgtype = SHARED_TOPICS.get(topic) or OF_ARMS.get(leaf(topic))
+            msgtype = TYPES.get(topic) or TYPES.get(leaf(topic))
             if msgtype and topic not in self._topics:
                 self._guarded(topic, self._subscribe, topic, msgtype)
 
@@ -145,11 +146,11 @@ class Recorder(Node):
 
     def _subscribe(self, topic: str, msgtype: type) -> None:
         found = self.get_publishers_info_by_topic(topic)
-        others = [publisher for publisher in found if publisher.node_name not in (REPEATER, UNNAMED)]
-        named = [publisher for publisher in others if leaf(publisher.topic_type) == msgtype.__name__]
-        offered = [publisher.qos_profile for publisher in named]
-        if not offered:
+        named = [publisher for publisher in found if publisher.node_name not in (REPEATER, UNNAMED)]
+        typed = [publisher for publisher in named if leaf(publisher.topic_type) == msgtype.__name__]
+        if not typed:
             return  # a subscriber without a publisher, or a topic of another type; try again later
+        offered = [publisher.qos_profile for publisher in typed]
         reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
         latched = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
         # A recorder must not make the control loops' publishers wait for acknowledgements.
@@ -159,7 +160,7 @@ class Recorder(Node):
             reliability=ReliabilityPolicy.RELIABLE if acknowledged else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
-        self._writer.add_topic(topic, named[0].topic_type, offered_qos(reliable, latched, offered[0].depth or 1))
+        self._writer.add_topic(topic, typed[0].topic_type, offered_qos(reliable, latched, offered[0].depth or 1))
         publishers = Publishers()
         self._counted += [publishers] if msgtype in (JointState, Imu, Vector3Stamped) else []
         self._topics[topic] = HotPath(self, msgtype, topic, partial(self._on_message, topic, publishers), qos, raw=True)
@@ -199,19 +200,18 @@ class LiveLine:
 
     def note(self, topic: str, data: bytes) -> None:
         """Keep the newest message of a topic, and the newest status of each node."""
-        if topic != content.DIAGNOSTICS:
+        if leaf(topic) in (STATES, content.COMMANDS, content.STEPS):
             self._latest[topic] = data
-            return
-        for status in deserialize_message(data, DiagnosticArray).status:
-            self._status[status.name] = status_values(status)
+        elif topic == content.DIAGNOSTICS:
+            for status in deserialize_message(data, DiagnosticArray).status:
+                self._status[status.name] = status_values(status)
 
     def write(self, recorder: dict[str, int]) -> None:
         """Write the line to standard output."""
         line: dict[str, Any] = {}
         for topic, data in self._latest.items():
-            if (name := leaf(topic)) not in ARM_TOPICS:
-                continue
-            arm, message = line.setdefault(arm_of(topic), {}), deserialize_message(data, ARM_TOPICS[name])
+            name, arm = leaf(topic), line.setdefault(arm_of(topic), {})
+            message = deserialize_message(data, TYPES[name])
             if name == content.STEPS:
                 with contextlib.suppress(ValueError):  # the report states it
                     arm["step"] = json.loads(message.data)
