@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from exo_gravity.core.errors import ExoGravityError, ParameterError
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.panel.view import OF_SUBJECT, SETTABLE
 
 # What a page may ask for in "do", and the other keys of each request.
@@ -58,9 +58,14 @@ def parse(body: Any, arms: Collection[str], trials: Collection[str]) -> dict[str
     if kind != "set":
         return dict(body)
     values = body.get("values") if isinstance(body.get("values"), dict) else {}
-    if not values or not values.keys() <= CHANGEABLE.keys():  # the error has no values: they may be the wearer's
+    if not values or not values.keys() <= CHANGEABLE.keys():
         raise ParameterError("values", list(values), f"an object with some of {', '.join(CHANGEABLE)}")
     return {**body, "values": {key: CHANGEABLE[key].check(value) for key, value in values.items()}}
+
+
+def without_value(error: ParameterError) -> str:
+    """Return the error for page and log, which must not have the value: it may be the wearer's, or a name."""
+    return f"{error.name} must be {error.expected}"
 
 
 def sentence(request: Mapping[str, Any]) -> str:
@@ -149,8 +154,8 @@ class Control:
         page = self._pages.get(secret)
         try:
             request = parse(body, self.arms.names, self.files.trials)
-        except ExoGravityError as error:
-            return self._refused(page, 400, str(error))
+        except ParameterError as error:
+            return self._refused(page, 400, without_value(error))
         kind, arm, text = request["do"], request.get("arm", ""), sentence(request)
         if kind != "let_down":
             if page is None:
@@ -165,8 +170,8 @@ class Control:
             self.arms.lease(str(page), "hold")
         try:
             problem = await self._carry_out(request, kind, arm, page)
-        except ParameterError as error:  # without the value, which the log must not have: it may be a name
-            problem = f"{error.name} must be {error.expected}"
+        except ParameterError as error:
+            problem = without_value(error)
         except OSError as error:
             problem = f"{error.filename}: {error.strerror}"
         self._log(f"{page or f'{address} unknown page'}: {text}: {problem or 'done'}")

@@ -202,7 +202,7 @@ class Panel(Node):
         self._arms = Arms(self, values["dead_man"])
         self._tilt = Latest(self, Vector3Stamped, PITCH_YAW, tilt_shown)
         scripts = Path(values["trials"]) if values["trials"] else packaged("trials")
-        if values["trials"] and not os.path.isdir(values["trials"]):
+        if scripts is None or not scripts.is_dir():
             raise ParameterError("trials", values["trials"], "a folder")
         self._recordings = Recordings(values["output"], scripts, self._arms, self._note, time.monotonic)
         own = {name: values[name] for name in ("language", "dead_man")}
