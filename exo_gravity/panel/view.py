@@ -3,7 +3,6 @@
 import math
 from collections import defaultdict, deque
 from collections.abc import Mapping, Sequence
-from itertools import chain, repeat, zip_longest
 from typing import Any
 
 from exo_gravity.core.compensation.guidance import CAUSE_TIME
@@ -33,17 +32,21 @@ SETTABLE = {param.name: param for param in COMPENSATOR if param.name in LOAD}
 OF_SUBJECT = {p.name: p for p in COMPENSATOR if p.name in (*LOAD[1:4], "limits.range")}
 
 Values = Mapping[str, Any]
-NUMBERS = ("position", "velocity", "effort")
+FIELDS = ("position", "velocity", "effort")
 LATE = 1.5  # s after a fault in which the panel may still learn of a change that came before it
 
 
-def joint_rows(
-    names: Sequence[str], position: Sequence[float], velocity: Sequence[float], effort: Sequence[float]
-) -> list[dict[str, Any]]:
-    """Return name, angle in rad, speed in rad/s and torque in Nm of each joint; None for a number that is not known."""
-    rows = zip_longest(position, velocity, effort, fillvalue=math.nan)
-    known = ([round(x, 4) if math.isfinite(x) else None for x in row] for row in chain(rows, repeat((math.nan,) * 3)))
-    return [{"name": name, **dict(zip(NUMBERS, row, strict=True))} for name, row in zip(names, known, strict=False)]
+def joint_rows(states: Any) -> list[dict[str, Any]]:
+    """Return name, angle in rad, speed in rad/s and torque in Nm of each joint; None for a number that is not known.
+
+    states: a sensor_msgs/JointState.
+    """
+
+    def known(values: Sequence[float], n: int) -> float | None:
+        return round(values[n], 4) if n < len(values) and math.isfinite(values[n]) else None
+
+    joints = enumerate(states.name)
+    return [{"name": name, **{field: known(getattr(states, field), n) for field in FIELDS}} for n, name in joints]
 
 
 def setup_of(nodes: Mapping[str, tuple[Values, Values]]) -> dict[str, Any]:

@@ -46,27 +46,25 @@ LOOK_PERIOD = 0.005  # s between two looks for an answer
 BRIDGE, COMPENSATOR = "can_bridge", "compensator"
 SIMULATOR = "simulator"
 SHOWN = {BRIDGE: "bridge", COMPENSATOR: "compensator", SIMULATOR: "simulator"}  # what the page calls the status of each
-ASKED = {  # service and request for each request of a page but `set`
+SET = "set_parameters_atomically"
+ASKED = {  # service and request for each request of a page; None for the parameters that it names
     "let_down": (SetBool, f"{BRIDGE}/enable", SetBool.Request(data=False)),
     "enable": (SetBool, f"{BRIDGE}/enable", SetBool.Request(data=True)),
     "clear_fault": (Trigger, f"{BRIDGE}/clear_fault", Trigger.Request()),
     "resume": (Trigger, f"{BRIDGE}/resume", Trigger.Request()),
     "weigh": (Trigger, f"{COMPENSATOR}/weigh", Trigger.Request()),
+    "set": (SetParametersAtomically, f"{COMPENSATOR}/{SET}", None),
+    "perform": (SetParametersAtomically, f"{SIMULATOR}/{SET}", None),  # of no page
 }
 
 
 class ArmClient:
-    """What one arm, in the namespace `/name`, is asked for, and its joint states."""
+    """The services of one arm, in the namespace `/name`, its joint states, and who controls it."""
 
     def __init__(self, node: Node, name: str) -> None:
         self.services = {kind: node.create_client(srv, f"/{name}/{leaf}") for kind, (srv, leaf, _) in ASKED.items()}
-        for kind, leaf in (("set", COMPENSATOR), ("perform", SIMULATOR)):
-            service = f"/{name}/{leaf}/set_parameters_atomically"
-            self.services[kind] = node.create_client(SetParametersAtomically, service)
         self.control = node.create_publisher(KeyValue, f"/{name}/{BRIDGE}/control", 10)
-        self.joints = Latest(
-            node, JointState, f"/{name}/joint_states", lambda m: joint_rows(m.name, m.position, m.velocity, m.effort)
-        )
+        self.joints = Latest(node, JointState, f"/{name}/joint_states", joint_rows)
 
 
 class Arms:
@@ -154,7 +152,8 @@ class Arms:
             if f"/{arm}/{SIMULATOR}" not in self._others.found:
                 return "the arm is not simulated"
             kind, values = "perform", {"trial": str(packaged("home.yaml"))}
-        request = ASKED[kind][-1] if kind in ASKED else parameters_set(values)
+        given = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        request = ASKED[kind][-1] or SetParametersAtomically.Request(parameters=given)
         return await call(self.clients[arm].services[kind], request)
 
     def _report(self, arm: str) -> dict[str, Any]:
@@ -164,12 +163,6 @@ class Arms:
     def _on_parameter_event(self, event: ParameterEvent) -> None:
         if event.node in self._others.found:
             self._others.found[event.node].refresh()
-
-
-def parameters_set(values: Mapping[str, Any]) -> SetParametersAtomically.Request:
-    """Return the request that sets `values` together."""
-    messages = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
-    return SetParametersAtomically.Request(parameters=messages)
 
 
 async def call(client: Client, request: Any) -> str:
@@ -182,10 +175,11 @@ async def call(client: Client, request: Any) -> str:
             return f"{client.srv_name} does not answer"
         await asyncio.sleep(LOOK_PERIOD)
     response: Any = sent.result()
-    result = getattr(response, "result", response)
-    if getattr(result, "successful", getattr(result, "success", False)):
-        return ""
-    return getattr(result, "reason", getattr(result, "message", "")) or "refused without a reason"
+    if isinstance(response, SetParametersAtomically.Response):
+        is_done, reason = response.result.successful, response.result.reason
+    else:
+        is_done, reason = response.success, response.message
+    return "" if is_done else reason or "refused without a reason"
 
 
 class Panel(Node):
