@@ -33,7 +33,24 @@ def declare(node: Node, table: Sequence[Param], free_prefix: str = "") -> dict[s
         if node.has_parameter(param.name):
             node.undeclare_parameter(param.name)
         node.declare_parameter(param.name, values[param.name], descriptor_of(param), ignore_override=True)
+    _accept_what_is(node)
     return values
+
+
+def _accept_what_is(node: Node) -> None:
+    """Let a read-only parameter be set to the value that it has, so that `ros2 param load` reads a node's own dump."""
+    set_parameters = node.set_parameters_atomically
+
+    def is_same(given: Parameter) -> bool:
+        if not node.has_parameter(given.name) or not node.describe_parameter(given.name).read_only:
+            return False
+        return bool(plain(given.value) == plain(node.get_parameter(given.name).value))
+
+    def set_others(parameters: list[Parameter]) -> SetParametersResult:
+        others = [given for given in parameters if not is_same(given)]
+        return set_parameters(others) if others else SetParametersResult(successful=True)
+
+    node.set_parameters_atomically = set_others  # which rclpy's parameter services call
 
 
 def accept_changes(
