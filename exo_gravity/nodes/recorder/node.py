@@ -69,7 +69,7 @@ class Recorder(Node):
         self._write_text(content.SESSION, json.dumps(session))
         self._failed: set[str] = set()  # topics and nodes whose failure was reported
         self._last_states, self._orphaned = -math.inf, math.inf  # monotonic s
-        self._reported = (0, 0)  # lost messages
+        self._losses = ""  # what was reported of them
         self._topics: dict[str, HotPath] = {}
         self._counted: list[Publishers] = []  # of joints and IMU; other topics have several
         self._taken: list[tuple[str, int, bytes]] = []  # topic, time of arrival in ns since 1970, serialised
@@ -94,10 +94,9 @@ class Recorder(Node):
         try:
             self._drain()
             self._report_losses()
-            if any(self._reported):
-                missed, unwritten = self._reported
+            if self._losses:
                 self._writer.add_topic(content.LOSSES, content.STRING, offered_qos(True, True, 1))
-                self._write_text(content.LOSSES, f"{missed} did not arrive, {unwritten} were not written")
+                self._write_text(content.LOSSES, self._losses)
         finally:
             self._writer.close()
         if self._writer.error:
@@ -123,7 +122,7 @@ class Recorder(Node):
         """Ask new nodes for their parameters, and print the live line."""
         self._guarded("parameters", self._nodes.update)
         if self._live:
-            counts = {"messages": self._writer.count, "lost": sum(self._losses())}
+            counts = {"messages": self._writer.count, "lost": self._missed + self._writer.lost}
             self._guarded("live state", self._live.write, counts)
 
     def _guarded(self, name: str, function: Callable[..., object], *args: Any) -> None:
@@ -135,14 +134,16 @@ class Recorder(Node):
                 self._failed.add(name)
                 self.get_logger().error(f"{name}: {type(error).__name__}: {error}; the rest is recorded")
 
-    def _losses(self) -> tuple[int, int]:
-        """Return how many messages of joints and IMU did not arrive, and how many were not written."""
-        return sum(publishers.missed for publishers in self._counted), self._writer.lost
+    @property
+    def _missed(self) -> int:
+        """How many messages of joints and IMU did not arrive."""
+        return sum(publishers.missed for publishers in self._counted)
 
     def _report_losses(self) -> None:
-        if (lost := self._losses()) != self._reported:
-            self._reported = lost
-            self.get_logger().warning(f"messages lost so far: {lost[0]} did not arrive, {lost[1]} were not written")
+        losses = f"{self._missed} did not arrive, {self._writer.lost} were not written"
+        if self._missed + self._writer.lost and losses != self._losses:
+            self._losses = losses
+            self.get_logger().warning(f"messages lost so far: {losses}")
 
     def _subscribe(self, topic: str, msgtype: type) -> None:
         found = self.get_publishers_info_by_topic(topic)

@@ -102,10 +102,8 @@ class RobotModel(Node):
             return
         groups = [("", gravity_shapes(gravity))]
         groups += [(f"{view.arm.side}/", arm_shapes(view)) for _, view in self._views]
-        markers = [marker(owner, n, shape) for owner, shapes in groups for n, shape in enumerate(shapes)]
         stamp = self.get_clock().now().to_msg()
-        for each in markers:
-            each.header.stamp = stamp
+        markers = [marker(stamp, owner, n, shape) for owner, shapes in groups for n, shape in enumerate(shapes)]
         self._markers.publish(MarkerArray(markers=markers))
 
 
@@ -151,11 +149,11 @@ class ViewedArm:
         return ArmView(self.description, theta, velocity, effort, status.get("state", ""), status.get("message", ""))
 
 
-def marker(owner: str, number: int, shape: Shape) -> Marker:
+def marker(stamp: Time, owner: str, number: int, shape: Shape) -> Marker:
     """Return the marker of a shape; owner: 'left/' or 'right/', or '' for what both arms share."""
     kind = KINDS[shape.kind]
     marker = Marker(ns=f"{owner}{shape.group}", id=number, type=kind, lifetime=LIFETIME, text=shape.text)
-    marker.header.frame_id = ROOT
+    marker.header.frame_id, marker.header.stamp = ROOT, stamp
     marker.color = ColorRGBA(**dict(zip("rgba", shape.colour, strict=True)))
     marker.pose.orientation.w = 1.0
     points = [Point(x=x, y=y, z=z) for x, y, z in shape.points.tolist()]
