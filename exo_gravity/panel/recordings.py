@@ -102,7 +102,8 @@ class Recordings:
         process, self._recorder = self._recorder, None
         if process is None:
             return "nothing is being recorded"
-        process.terminate()
+        if process.returncode is None:
+            process.terminate()
         try:
             code = await asyncio.wait_for(process.wait(), STOP_TIMEOUT)
         except asyncio.TimeoutError:

@@ -91,6 +91,18 @@ def test_a_folder_that_cannot_be_made_is_named(made, tmp_path):
         assert problem.startswith(f"{tmp_path}/out/") and problem.endswith(": Not a directory")
 
 
+def test_a_recorder_that_has_ended_by_itself_is_stopped_with_its_exit_code(made, monkeypatch):
+    monkeypatch.setattr(recordings, "command", lambda *words: [sys.executable, "-c", "raise SystemExit(1)"])
+
+    async def stopped():
+        assert await made[1].record() == ""
+        while made[1].state()["recording"]["on"]:
+            await asyncio.sleep(0.01)
+        return await made[1].stop_recording()
+
+    assert "ended with exit code 1" in asyncio.run(stopped())
+
+
 async def followed(files):
     """Start the trial `short`; return what the page shows at each change until it is done."""
     assert await files.trial("short") == ""
