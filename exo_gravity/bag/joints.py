@@ -26,10 +26,12 @@ class JointArrays:
     def __init__(self, topic: str) -> None:
         self.topic = topic
         self.names: tuple[str, ...] = ()
+        self.first_arrival = 0  #: ns
         self._parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
     def add(self, arrivals: Sequence[int], messages: Sequence[bytes]) -> None:
         """Decode messages that arrived at `arrivals` ns. Raises DataError if joints change or a message is damaged."""
+        self.first_arrival = self.first_arrival or arrivals[0]
         arrived = np.array(arrivals, np.int64)
         lengths = np.fromiter(map(len, messages), np.int64, len(messages))
         for length in dict.fromkeys(lengths.tolist()):  # in order of appearance
@@ -53,11 +55,6 @@ class JointArrays:
             if name in (numbers.dtype.names or ()):
                 values[:, field] = numbers[name][:, order]
         return numbers["sec"].astype(np.int64) * 1_000_000_000 + numbers["nanosec"], values
-
-    @property
-    def first_arrival(self) -> int:
-        """Time of arrival of the first message in ns."""
-        return int(self._parts[0][0][0])
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return times of arrival (n,) in order and stamps (n,) in ns, and the values (n, 3, joints) of `FIELDS`.

@@ -168,7 +168,7 @@ class _Contents:
             self.notes.append(f"{name}: joint states left out, a position is NaN or infinite: {np.sum(~finite)}")
             arrival, stamp, values = arrival[finite], stamp[finite], values[finite]
         stamped = bool(np.all(np.diff(stamp) >= 0) and abs(np.median(arrival - stamp)) < MAX_CLOCK_OFFSET)
-        clock, values = _in_order(stamp if stamped else arrival, values)
+        clock = stamp if stamped else arrival  # either is in order
         command, steps = self._commands(topic, names, clock, stamped), self._script(name, start)
         time = (clock - start) / 1e9
         carried = self._carried(name, start, float(time[-1]))
@@ -192,8 +192,9 @@ class _Contents:
             self.problems.append(f"{topic}: {problem}: the torque error is unknown")
             return result
         arrival, stamp, values = self.joints[topic].arrays()
-        sent, values = _in_order(stamp if stamped else arrival, values)
-        effort = values[:, FIELDS.index("effort"), [given.index(name) for name in names]]
+        sent, effort = stamp if stamped else arrival, values[:, FIELDS.index("effort")]
+        order = np.argsort(sent, kind="stable")
+        sent, effort = sent[order], effort[order][:, [given.index(name) for name in names]]
         last = np.searchsorted(sent, clock, "left") - 1
         known = (last >= 0) & (clock - sent[last] < MAX_COMMAND_AGE)
         result[known] = effort[last[known]]
@@ -228,12 +229,6 @@ class _Contents:
                 self.notes.append(f"{arm}: the recording ends {missing}")
                 self.is_partial = True
         return tuple(spans)
-
-
-def _in_order(clock: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return clock (n,) and values (n, ...) sorted by time."""
-    order = np.argsort(clock, kind="stable")
-    return clock[order], values[order]
 
 
 def _value(value: Any) -> object:

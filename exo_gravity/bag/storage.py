@@ -16,7 +16,6 @@ import struct
 import tempfile
 from collections.abc import Callable, Generator, Iterator
 from io import BytesIO
-from itertools import chain
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 
@@ -68,10 +67,9 @@ class Storage:
             yield from self._by_rosbags(wanted)
             return
         for file in self.files:
-            parts = self._mcap(file, wanted) if file.suffix == ".mcap" else (self._sqlite(file, wanted),)
-            yield from chain.from_iterable(parts)
+            yield from (self._mcap if file.suffix == ".mcap" else self._sqlite)(file, wanted)
 
-    def _mcap(self, file: Path, wanted: Wanted) -> Iterator[list[Message]]:
+    def _mcap(self, file: Path, wanted: Wanted) -> Iterator[Message]:
         with file.open("rb") as stream:
             if stream.read(len(MAGIC)) != MAGIC:
                 raise DataError(f"{file}: not an MCAP file, or empty")
@@ -84,25 +82,22 @@ class Storage:
 
     def _records(
         self, data: bytes | mmap, at: int, wanted: Wanted, schemas: dict[int, Schema], chosen: dict[int, Topic]
-    ) -> Generator[list[Message], None, bool]:
+    ) -> Generator[Message, None, bool]:
         """Yield the messages among the records from `at` on, also those in chunks; return whether all data were read.
 
         schemas: read so far. chosen: the wanted topics by channel. Raises an error at a cut or damage.
         """
-        found: list[Message] = []
         end = len(data)
         while at + RECORD.size <= end:
             if data[at] == MESSAGE_OPCODE and at + MESSAGE.size <= end:
                 _, length, number, _, stamp, _ = MESSAGE.unpack_from(data, at)
                 start, at = at + MESSAGE.size, at + RECORD.size + length
                 if number in chosen and at <= end:
-                    found.append((*chosen[number], stamp, data[start:at]))
+                    yield *chosen[number], stamp, data[start:at]
                 continue
             opcode, length = RECORD.unpack_from(data, at)
             at += RECORD.size + length
             body = ReadDataStream(BytesIO(data[at - length : at]))
-            yield found
-            found = []
             if opcode == Opcode.CHUNK:
                 chunk, size = get_chunk_data_stream(Chunk.read(body))
                 yield from self._records(chunk.read(size), 0, wanted, schemas, chosen)
@@ -121,7 +116,6 @@ class Storage:
                     chosen[channel.id] = channel.topic, msgtype
             elif opcode == Opcode.DATA_END:
                 return True
-        yield found
         if at != end:
             raise EOFError
         return False

@@ -4,22 +4,7 @@ A page is one browser tab. It keeps its secret while it is reloaded, and confirm
 page that confirms nothing for `GONE` seconds is gone: the laptop is closed, or the network lost. One page at a time
 holds control, the others watch. Every page may let the arms down, at any time and without a rate limit. Each
 confirmation of the page that holds control renews its lease at the arms (core/safety/lease.py), if the panel has one:
-no page, no panel, no lease. The requests:
-
-{"do": "let_down"}                                   all arms
-{"do": "let_down", "arm": "right"}                   one arm
-{"do": "take"}                                       control; every page may
-{"do": "enable", "arm": "right"}                     the rest: only the page that holds control
-{"do": "clear_fault", "arm": "right"}
-{"do": "resume", "arm": "right"}                     clear and enable, after a fault that was no one's
-{"do": "set", "arm": "right", "values": {"support": 0.3}}
-{"do": "weigh", "arm": "right"}                      what the hand holds; the compensator's diagnostics tell
-{"do": "bring_home", "arm": "right"}                 a simulated arm: its virtual wearer lets it hang
-{"do": "release"}                                    control
-{"do": "record"}, {"do": "stop_recording"}, {"do": "save"}
-{"do": "trial", "name": "demo"}, {"do": "stop_trial"}
-{"do": "session", "subject": "P01", "protocol": "", "note": ""}, {"do": "keep_wearer"}
-{"do": "marker", "text": "cramp"}                    every page may
+no page, no panel, no lease. A request is an object such as {"do": "set", "arm": "right", "values": {"support": 0.3}}.
 """
 
 import asyncio
@@ -29,18 +14,28 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from exo_gravity.core.errors import ExoGravityError, ParameterError
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.panel.view import OF_SUBJECT, SETTABLE
 
-# The kinds of requests, and the keys that each has besides "do".
+# What a page may ask for in "do", and the other keys of each request.
+ARM = frozenset({"arm"})
 KEYS: Mapping[str, frozenset[str]] = {
-    **dict.fromkeys(("take", "release", "record", "stop_recording", "save", "stop_trial", "keep_wearer"), frozenset()),
-    **dict.fromkeys(("let_down", "enable", "clear_fault", "resume", "weigh", "bring_home"), frozenset({"arm"})),
-    "set": frozenset({"arm", "values"}),
+    # of every page
+    "let_down": ARM,  # without it: all arms
+    "take": frozenset(),  # control
+    "marker": frozenset({"text"}),
+    # of the page that holds control
+    "enable": ARM,
+    "clear_fault": ARM,
+    "resume": ARM,  # clear and enable, after a fault that was no one's
+    "set": frozenset({"arm", "values"}),  # parameters of the compensator
+    "weigh": ARM,  # what the hand holds; the compensator's diagnostics tell
+    "bring_home": ARM,  # a simulated arm: its virtual wearer lets it hang
     "trial": frozenset({"name"}),
     "session": frozenset({"subject", "protocol", "note"}),
-    "marker": frozenset({"text"}),
+    **dict.fromkeys(("release", "record", "stop_recording", "save", "stop_trial", "keep_wearer"), frozenset()),
 }
+FOR_ALL = ("let_down", "take", "marker")
 CHANGEABLE = {**SETTABLE, **OF_SUBJECT}
 GONE = 2.0  # s without a confirmation; longer than a lease lasts, so that the next page finds the arm let down
 MAX_PAGES = 32
@@ -63,9 +58,14 @@ def parse(body: Any, arms: Collection[str], trials: Collection[str]) -> dict[str
     if kind != "set":
         return dict(body)
     values = body.get("values") if isinstance(body.get("values"), dict) else {}
-    if not values or not values.keys() <= CHANGEABLE.keys():  # the error has no values: they may be the wearer's
+    if not values or not values.keys() <= CHANGEABLE.keys():
         raise ParameterError("values", list(values), f"an object with some of {', '.join(CHANGEABLE)}")
     return {**body, "values": {key: CHANGEABLE[key].check(value) for key, value in values.items()}}
+
+
+def without_value(error: ParameterError) -> str:
+    """Return the error for page and log, which must not have the value: it may be the wearer's, or a name."""
+    return f"{error.name} must be {error.expected}"
 
 
 def sentence(request: Mapping[str, Any]) -> str:
@@ -154,21 +154,26 @@ class Control:
         page = self._pages.get(secret)
         try:
             request = parse(body, self.arms.names, self.files.trials)
-        except ExoGravityError as error:
-            return self._refused(page, 400, str(error))
+        except ParameterError as error:
+            return self._refused(page, 400, without_value(error))
         kind, arm, text = request["do"], request.get("arm", ""), sentence(request)
         if kind != "let_down":
             if page is None:
                 return (403, "unknown page: reload it")
             if not self._spend(page):
                 return (429, "too many requests: wait a moment")
-            if kind not in ("take", "marker") and page is not self.holder:
+            if kind not in FOR_ALL and page is not self.holder:
                 return self._refused(page, 403, f"{text}: another page holds control")
             if arm and (other := self.arms.other_holder(arm, str(page))):
                 return self._refused(page, 403, f"{text}: {other} holds control of this arm")
         if kind in ("enable", "resume"):  # by a page that confirms nothing, the arm is not carried for long
             self.arms.lease(str(page), "hold")
-        problem = await self._carry_out(request, kind, arm, page)
+        try:
+            problem = await self._carry_out(request, kind, arm, page)
+        except ParameterError as error:
+            problem = without_value(error)
+        except OSError as error:
+            problem = f"{error.filename}: {error.strerror}"
         self._log(f"{page or f'{address} unknown page'}: {text}: {problem or 'done'}")
         return (409 if problem else 200, problem)
 

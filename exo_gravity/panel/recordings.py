@@ -1,8 +1,9 @@
-"""Recordings, trials and saved parameters, each in a new folder below `output`, of the present session.
+"""Recordings, trials, saved parameters and the subjects: folders below `output`, SUBJECT/DATE/TRIAL.
 
 A recording is made by the package's `recorder`, a trial by its command `trial --attach`: processes, which this module
 starts, follows and ends. A simulated device's virtual wearer or a person performs the script of a trial. It starts with
-every arm active and ends early when one is not.
+every arm active and ends early when one is not. A wearer's file, SUBJECT/wearer.yaml, holds the parameters of
+`compensator` that belong to the subject. Folders of recordings without a subject lie directly below `output`.
 """
 
 import asyncio
@@ -10,6 +11,7 @@ import contextlib
 import itertools
 import json
 import os
+import re
 import sys
 from asyncio.subprocess import DEVNULL, PIPE
 from collections.abc import Callable, Mapping
@@ -22,28 +24,32 @@ import yaml
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.panel.sessions import Sessions
+from exo_gravity.core.trial.session import Session, check_text
+from exo_gravity.panel.view import OF_SUBJECT
 
 STOP_TIMEOUT = 10.0  # s for a recorder to end
+WEARER, REPORT = "wearer.yaml", "report.html"
+FOLDER = re.compile(r"(.+)_(\d{4})(\d\d)(\d\d)_(\d\d)(\d\d)(\d\d)(_\d+)?")  # of a recording or trial
+MOST = 200  # recordings that the page lists
 
 
-class Recordings(Sessions):
-    """`files` of `exo_gravity.panel.control.Control`.
+class Recordings:
+    """`files` of `exo_gravity.panel.control.Control`: a request of a page is a coroutine function of the same name.
 
-    device: the arms. It has `parameters()` of every node by full name, `states()` of each arm (None if its bridge is
-    silent), `mark(text)`, which publishes a marker, and a coroutine function `perform(path)` that lets the virtual
-    wearers perform a script, '' for none; both return '' or why not. note: called with a sentence for the log. clock:
-    monotonic s.
+    Each returns '' or why it was not carried out, or raises ParameterError or OSError. device: the arms. It has
+    `parameters()` of every node by full name, `states()` of each arm (None if its bridge is silent), `mark(text)`,
+    which publishes a marker, and a coroutine function `perform(path)` that lets the virtual wearers perform a script,
+    '' for none; both return '' or why not. note: called with a sentence for the log. clock: monotonic s.
     """
 
     def __init__(
-        self, output: str, scripts: Path | None, device: Any, note: Callable[[str], None], clock: Callable[[], float]
+        self, output: str, scripts: Path, device: Any, note: Callable[[str], None], clock: Callable[[], float]
     ) -> None:
-        #: the scripts to choose from, by name
-        self.trials = {path.stem: path for path in sorted(scripts.glob("*.yaml"))} if scripts else {}
-        super().__init__(output, device)
-        self._note = note
-        self._clock = clock
+        self.trials = {path.stem: path for path in sorted(scripts.glob("*.yaml"))}  #: the scripts, by name
+        self._output = Path(output).expanduser().resolve()
+        self._device, self._note, self._clock = device, note, clock
+        self._present = {"subject": "", "protocol": "", "note": ""}  # `Session` of what is recorded from now on
+        self._wearer: dict[str, Any] = {}  # parameters in the subject's file
         self._recorder: asyncio.subprocess.Process | None = None
         self._folder: Path | None = None
         self._began = 0.0
@@ -61,7 +67,9 @@ class Recordings(Sessions):
             "folder": str(self._folder or "") if is_on else "",
             "seconds": round(self._clock() - self._began) if is_on else 0,
         }
-        return {"recording": recording, "trial": self._progress, "saved": self._saved, "session": self.shown()}
+        folder = str(self._output / self._present["subject"])
+        session = {**self._present, "folder": folder, "wearer": self._wearer}
+        return {"recording": recording, "trial": self._progress, "saved": self._saved, "session": session}
 
     def close(self) -> None:
         """End the recording and the trial."""
@@ -73,18 +81,14 @@ class Recordings(Sessions):
         """Start a recording."""
         if problem := self._occupied():
             return problem
-        try:
-            folder = self._new_folder("recording")
-            log = (folder / "recorder.log").open("wb")
-            values = {"output": str(folder / "bag"), **self.present}
-            (folder / "params.yaml").write_text(yaml.safe_dump({"/recorder": {"ros__parameters": values}}), "utf-8")
-        except OSError as error:
-            return f"{self.output}: {error.strerror}"
+        folder = self._new_folder("recording")
+        values = {"output": str(folder / "bag"), **self._present}
+        write(folder / "params.yaml", {"/recorder": {"ros__parameters": values}})
         remaps = ("-r", "__node:=recorder", "-r", "__ns:=/", "--enclave", "/recorder")
         words = command("nodes.recorder.node", "--ros-args", *remaps, "--params-file", str(folder / "params.yaml"))
         # It watches its standard input, and ends the recording well if the panel dies.
         environment = {**os.environ, "EXO_GRAVITY_SUPERVISED": "1"}
-        with log:
+        with (folder / "recorder.log").open("wb") as log:
             self._recorder = await asyncio.create_subprocess_exec(
                 *words, stdin=PIPE, stdout=log, stderr=log, env=environment, start_new_session=True
             )
@@ -98,7 +102,8 @@ class Recordings(Sessions):
         process, self._recorder = self._recorder, None
         if process is None:
             return "nothing is being recorded"
-        process.terminate()
+        if process.returncode is None:
+            process.terminate()
         try:
             code = await asyncio.wait_for(process.wait(), STOP_TIMEOUT)
         except asyncio.TimeoutError:
@@ -113,13 +118,9 @@ class Recordings(Sessions):
         content = {node: {"ros__parameters": nested(values)} for node, values in given.items()}
         if not content:
             return "no node has been found yet"
-        text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
-        try:
-            folder = self._new_folder("parameters")
-            (folder / "params.yaml").write_text(text, encoding="utf-8")
-        except OSError as error:
-            return f"{self.output}: {error.strerror}"
-        self._saved = str(folder / "params.yaml")
+        path = self._new_folder("parameters") / "params.yaml"
+        write(path, content)
+        self._saved = str(path)
         return ""
 
     async def trial(self, name: str) -> str:
@@ -137,8 +138,8 @@ class Recordings(Sessions):
         if problem := self._occupied():
             return problem
         guided = not any(node.endswith("/simulator") for node in self._device.parameters())
-        attach = ("--attach", "guided" if guided else "simulated", "--output", str(self.output))
-        words = command("tools.trial", str(path), *attach, *(f"--{key}={text}" for key, text in self.present.items()))
+        attach = ("--attach", "guided" if guided else "simulated", "--output", str(self._output))
+        words = command("tools.trial", str(path), *attach, *(f"--{key}={text}" for key, text in self._present.items()))
         self._trial = await asyncio.create_subprocess_exec(
             *words, stdin=DEVNULL, stdout=PIPE, stderr=PIPE, start_new_session=True
         )
@@ -178,11 +179,60 @@ class Recordings(Sessions):
         failed = await trial.wait() not in (0, 1)
         name, problem = self._progress["name"], refused or self._progress.get("problem", "")
         problem = problem or (lines[-1] if failed and lines else "")
-        key = ""
-        if self._folder and (self._folder / "report.html").is_file():
-            key = self._folder.relative_to(self.output).as_posix()
+        key = self._key(self._folder) if self._folder else ""
         self._progress = {"phase": "done", "name": name, "problem": problem, "report": key}
         self._note(f"trial {name} has ended: {problem or 'done'}")
+
+    async def session(self, **present: str) -> str:
+        """Make this subject, protocol and note the present session, and read the wearer's file."""
+        path = self._output / Session(**present).subject / WEARER
+        try:
+            content = yaml.safe_load(path.read_text(encoding="utf-8")) if present["subject"] and path.is_file() else {}
+            self._wearer = {name: OF_SUBJECT[name].check(value) for name, value in content.items()}
+        except (yaml.YAMLError, AttributeError, KeyError) as error:
+            return f"{path} must be a mapping of {', '.join(OF_SUBJECT)} ({' '.join(str(error).split())})"
+        self._present = present
+        return ""
+
+    async def keep_wearer(self) -> str:
+        """Write the wearer's data and workspace in force to the subject's file."""
+        nodes = self._device.parameters().items()
+        in_force: dict[str, Any] = next((values for node, values in nodes if node.endswith("/compensator")), {})
+        if not self._present["subject"] or not in_force:
+            return "no subject is chosen" if in_force else "no arm has been found yet"
+        wearer = {name: in_force[name] for name in OF_SUBJECT if name in in_force}
+        folder = self._output / self._present["subject"]
+        folder.mkdir(parents=True, exist_ok=True)
+        write(folder / WEARER, wearer)
+        self._wearer = wearer
+        return ""
+
+    async def marker(self, text: str) -> str:
+        """Set a marker in the recording."""
+        return str(self._device.mark(check_text("text", text) or "marker"))
+
+    def past(self) -> dict[str, list[Any]]:
+        """Return the codes of all subjects, and the recordings and trials, the newest first."""
+        found = []
+        for path in (*self._output.glob("*_*/"), *self._output.glob("*/*-*-*/*_*/")):
+            key = self._key(path)
+            if (match := FOLDER.fullmatch(path.name)) and (key or (path / "bag").is_dir()):
+                name, year, month, day, hour, minute, second, _ = match.groups()
+                *subject, _ = path.relative_to(self._output).parts
+                when = f"{year}-{month}-{day} {hour}:{minute}:{second}"
+                found.append({"subject": "".join(subject[:1]), "trial": name, "when": when, "report": key})
+        found.sort(key=lambda entry: entry["when"], reverse=True)
+        kept = {path.parent.name for path in self._output.glob(f"*/{WEARER}")}
+        return {"subjects": sorted(kept | {entry["subject"] for entry in found} - {""}), "past": found[:MOST]}
+
+    def report(self, name: str) -> Path | None:
+        """Return the report in the folder `name` below `output`; None without one."""
+        path = (self._output / name / REPORT).resolve()
+        return path if path.is_relative_to(self._output) and path.is_file() else None
+
+    def _key(self, folder: Path) -> str:
+        """Return the `name` of the report in this folder, '' without one."""
+        return folder.relative_to(self._output).as_posix() if (folder / REPORT).is_file() else ""
 
     def _is_recording(self) -> bool:
         return self._recorder is not None and self._recorder.returncode is None
@@ -197,14 +247,20 @@ class Recordings(Sessions):
         return "another recorder is running already" if "/recorder" in self._device.parameters() else ""
 
     def _new_folder(self, name: str) -> Path:
-        """Create and return a folder with a new name. Raises OSError."""
+        """Create and return a folder with a new name, of the present session. Raises OSError."""
+        of_today = self._output / Session(**self._present).folder(datetime.now())
         stem = f"{name}_{datetime.now():%Y%m%d_%H%M%S}"
         for number in itertools.count(1):
-            folder = self.folder / (stem if number == 1 else f"{stem}_{number}")
+            folder = of_today / (stem if number == 1 else f"{stem}_{number}")
             with contextlib.suppress(FileExistsError):
                 folder.mkdir(parents=True)
                 break
         return folder
+
+
+def write(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a parameter file. Raises OSError."""
+    path.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120), "utf-8")
 
 
 def nested(values: Mapping[str, Any]) -> dict[str, Any]:

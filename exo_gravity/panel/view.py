@@ -1,8 +1,8 @@
 """The parameters of `panel`, those of other nodes that its page may change, and what the page shows of the arms."""
 
 import math
+from collections import defaultdict, deque
 from collections.abc import Mapping, Sequence
-from itertools import chain, repeat, zip_longest
 from typing import Any
 
 from exo_gravity.core.compensation.guidance import CAUSE_TIME
@@ -32,17 +32,21 @@ SETTABLE = {param.name: param for param in COMPENSATOR if param.name in LOAD}
 OF_SUBJECT = {p.name: p for p in COMPENSATOR if p.name in (*LOAD[1:4], "limits.range")}
 
 Values = Mapping[str, Any]
-NUMBERS = ("position", "velocity", "effort")
+FIELDS = ("position", "velocity", "effort")
 LATE = 1.5  # s after a fault in which the panel may still learn of a change that came before it
 
 
-def joint_rows(
-    names: Sequence[str], position: Sequence[float], velocity: Sequence[float], effort: Sequence[float]
-) -> list[dict[str, Any]]:
-    """Return name, angle in rad, speed in rad/s and torque in Nm of each joint; None for a number that is not known."""
-    rows = zip_longest(position, velocity, effort, fillvalue=math.nan)
-    known = ([round(x, 4) if math.isfinite(x) else None for x in row] for row in chain(rows, repeat((math.nan,) * 3)))
-    return [{"name": name, **dict(zip(NUMBERS, row, strict=True))} for name, row in zip(names, known, strict=False)]
+def joint_rows(states: Any) -> list[dict[str, Any]]:
+    """Return name, angle in rad, speed in rad/s and torque in Nm of each joint; None for a number that is not known.
+
+    states: a sensor_msgs/JointState.
+    """
+
+    def known(values: Sequence[float], n: int) -> float | None:
+        return round(values[n], 4) if n < len(values) and math.isfinite(values[n]) else None
+
+    joints = enumerate(states.name)
+    return [{"name": name, **{field: known(getattr(states, field), n) for field in FIELDS}} for n, name in joints]
 
 
 def setup_of(nodes: Mapping[str, tuple[Values, Values]]) -> dict[str, Any]:
@@ -61,8 +65,8 @@ class LoadChanges:
     """Names the change of load that came shortly before an arm's fault, and may be its cause."""
 
     def __init__(self) -> None:
-        self._loads: dict[str, Values] = {}  # the newest known, by arm
-        self._changes: dict[str, tuple[float, dict[str, Any]]] = {}  # monotonic s of the newest one, and what it was
+        # By arm: each load that it had lately, and monotonic s at which that was last in force; the present one is last
+        self._loads: dict[str, deque[tuple[Values, float]]] = defaultdict(deque)
         self._faults: dict[str, float] = {}  # monotonic s at which the present one was seen first
 
     def with_causes(
@@ -75,30 +79,30 @@ class LoadChanges:
         return {arm: {**state, "cause": self._cause(arm, state, nodes[arm][1], now)} for arm, state in arms.items()}
 
     def _cause(self, arm: str, state: Mapping[str, Any], compensator: Values, now: float) -> dict[str, Any] | None:
-        is_faulty = (state["bridge"] or {}).get("fault", "none") != "none"
+        loads, is_faulty = self._loads[arm], (state["bridge"] or {}).get("fault", "none") != "none"
         if not is_faulty:
             self._faults.pop(arm, None)
         began = self._faults.setdefault(arm, now) if is_faulty else now
-        new = self._new(arm, compensator) if compensator else None
-        at, change = self._changes.get(arm, (-math.inf, {}))
-        if new and now - began <= LATE:
-            if now - at <= CAUSE_TIME and new["what"] == change["what"] == "support":  # a slider on its way
-                new["from"] = change["from"]
-            self._changes[arm] = at, change = now, new
-        elif change and not is_faulty and (state["compensator"] or {}).get("changing load", "none") != "none":
-            self._changes[arm] = at, change = now, change
-        return change if is_faulty and began - at <= CAUSE_TIME else None
+        if compensator and now - began <= LATE:
+            load = {name: compensator.get(name) for name in LOAD}
+            if loads and loads[-1][0] == load:
+                loads.pop()
+            loads.append((load, now))
+            if not is_faulty and (state["compensator"] or {}).get("changing load", "none") != "none":
+                loads[0] = loads[0][0], now  # the old load still acts
+            while began - loads[0][1] > CAUSE_TIME:
+                loads.popleft()
+        return difference(loads[0][0], loads[-1][0]) if is_faulty and loads else None
 
-    def _new(self, arm: str, compensator: Values) -> dict[str, Any] | None:
-        """Return what has changed since the last call, None for nothing; of the wearer's data, only that they have."""
-        load = {name: compensator.get(name) for name in LOAD}
-        last = self._loads.get(arm, load)
-        self._loads[arm] = load
-        name = next((name for name in LOAD if load[name] != last[name]), "")
-        if not name or (name not in ("mode", "payload.mass") and load["mode"] == "one_g"):
-            return None
-        what = name.partition(".")[0]
-        return {"what": what} if what == "wearer" else {"what": what, "from": last[name], "to": load[name]}
+
+def difference(before: Values, load: Values) -> dict[str, Any] | None:
+    """Return how `load` differs from the load before, None if it does not; of the wearer's data, only that they do."""
+    acting = LOAD if load["mode"] == "zero_g" else ("mode", "payload.mass")
+    name = next((name for name in acting if load[name] != before[name]), "")
+    what = name.partition(".")[0]
+    if what in ("", "wearer"):
+        return {"what": what} if what else None
+    return {"what": what, "from": before[name], "to": load[name]}
 
 
 def _arm_setup(bridge: Values, compensator: Values) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import shutil
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
@@ -107,6 +107,7 @@ def test_messages_of_changing_length_and_order_in_one_topic_are_all_decoded(tmp_
     np.testing.assert_allclose(got, np.array(expected)[:, :, columns], rtol=1e-6)
 
 
+@settings(deadline=None)
 @given(
     st.lists(st.text("abcü_1", min_size=1, max_size=9), max_size=6, unique=True),
     st.text("abcü/", max_size=9),

@@ -39,7 +39,7 @@ def wait_until(condition: Callable[[], object], action: Callable[[], object]) ->
 
 def test_a_node_that_has_gone_and_returned_is_read_anew(node, executor):
     seen: list[float] = []
-    parameters = NodeParameters(node, "/right/other", lambda values: seen.append(values["gain"]))
+    parameters = NodeParameters(node, "/right/other", lambda _name, values: seen.append(values["gain"]))
 
     def spin() -> None:
         executor.spin_once(timeout_sec=0.05)
@@ -53,7 +53,6 @@ def test_a_node_that_has_gone_and_returned_is_read_anew(node, executor):
         other.destroy_node()
         wait_until(lambda: not parameters.is_present, spin)
     assert seen == [1.0, 2.0]
-    parameters.destroy()
 
 
 def test_a_name_without_services_is_not_present(node):
@@ -64,17 +63,13 @@ def test_a_name_without_services_is_not_present(node):
     ghost.destroy_node()
 
 
-def test_answers_after_the_first_are_ignored_once_it_is_destroyed(node, executor, monkeypatch):
+def test_what_is_read_once_ignores_the_answers_after_the_first(node, executor, monkeypatch):
     other = other_node(node)
     clock = itertools.count(0.0, ANSWER_TIMEOUT).__next__  # every update asks again
     monkeypatch.setattr(parameters_module, "time", SimpleNamespace(monotonic=clock))
     answers: list[object] = []
 
-    def destroy(values: dict[str, object]) -> None:
-        answers.append(values)
-        parameters.destroy()
-
-    parameters = NodeParameters(node, "/right/other", destroy)
+    parameters = NodeParameters(node, "/right/other", lambda _name, values: answers.append(values), once=True)
     wait_until(lambda: parameters.is_present, parameters.update)
     for _ in range(5):
         parameters.update()

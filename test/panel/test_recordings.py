@@ -8,7 +8,10 @@ import pytest
 import yaml
 
 from exo_gravity.panel import recordings
+from exo_gravity.panel.control import Control
 from exo_gravity.panel.recordings import Recordings
+
+from ..support.panel_stage import PlayedArms
 
 SCRIPT = {"name": "short", "steps": [{"hold": 4.0}]}
 # Stands for `trial --attach`: prints what it prints, and writes a report.
@@ -62,6 +65,14 @@ def made(tmp_path):
     return device, Recordings(str(tmp_path / "out"), tmp_path, device, print, lambda: 0.0)
 
 
+def answer(files, **body):
+    """Return what a page that asks for this is told, and what is noted."""
+    notes = []
+    control = Control(PlayedArms(), files, notes.append, lambda: 0.0)
+    page = control.open("", "10.0.0.1")
+    return asyncio.run(control.perform(body, page.secret, page.address))[1], "\n".join(notes)
+
+
 def test_parameters_saved_twice_within_a_second_are_two_files(made):
     paths = []
     for _ in range(3):
@@ -75,8 +86,21 @@ def test_parameters_saved_twice_within_a_second_are_two_files(made):
 
 def test_a_folder_that_cannot_be_made_is_named(made, tmp_path):
     (tmp_path / "out").write_text("")
-    assert asyncio.run(made[1].save()) == f"{tmp_path}/out: Not a directory"
-    assert str(tmp_path / "out") in asyncio.run(made[1].record())
+    for kind in ("save", "record"):
+        problem, _ = answer(made[1], do=kind)
+        assert problem.startswith(f"{tmp_path}/out/") and problem.endswith(": Not a directory")
+
+
+def test_a_recorder_that_has_ended_by_itself_is_stopped_with_its_exit_code(made, monkeypatch):
+    monkeypatch.setattr(recordings, "command", lambda *words: [sys.executable, "-c", "raise SystemExit(1)"])
+
+    async def stopped():
+        assert await made[1].record() == ""
+        while made[1].state()["recording"]["on"]:
+            await asyncio.sleep(0.01)
+        return await made[1].stop_recording()
+
+    assert "ended with exit code 1" in asyncio.run(stopped())
 
 
 async def followed(files):
@@ -127,8 +151,8 @@ def test_the_virtual_wearer_ends_with_a_trial_that_an_arm_ended(made, monkeypatc
 # Sessions
 
 
-def begin(files, subject, protocol="", note=""):
-    return asyncio.run(files.session(subject=subject, protocol=protocol, note=note))
+def begin(files, subject, note=""):
+    return answer(files, do="session", subject=subject, protocol="", note=note)[0]
 
 
 def test_a_trial_of_a_subject_is_in_the_list_with_its_report_after_a_restart(made, monkeypatch, tmp_path):
@@ -152,8 +176,8 @@ def test_no_other_file_is_served_as_a_report(made, tmp_path):
 
 
 def test_a_name_is_refused_as_a_code_and_does_not_reach_the_log(made):
-    problem = begin(made[1], "Anna Meier")
-    assert "must be a code" in problem and "Anna" not in problem
+    problem, log = answer(made[1], do="session", subject="Anna Meier", protocol="", note="")
+    assert "must be a code" in problem and problem in log and "Anna" not in log
     assert made[1].state()["session"]["subject"] == ""
     assert "must be a text" in begin(made[1], "P01", note="x" * 1001)
 
@@ -179,4 +203,4 @@ def test_a_wrong_wearers_file_is_refused(made, tmp_path, text):
 
 def test_a_marker_without_a_text_is_called_marker(made):
     assert asyncio.run(made[1].marker("")) == "" and made[0].marked == "marker"
-    assert "must be a text" in asyncio.run(made[1].marker(["a"]))
+    assert answer(made[1], do="marker", text=["a"])[0] == "text must be a text of at most 1000 characters"

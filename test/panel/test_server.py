@@ -96,9 +96,16 @@ def test_on_loopback_the_page_and_its_files_need_no_token_and_nothing_from_elsew
         assert get(stage, path).status_code == 404
 
 
-@pytest.mark.parametrize("host", ["panel.example.org", "evil.example.org:80", "[bad", "10.0.0.1"])
+@pytest.mark.parametrize(
+    "host", ["panel.example.org", "evil.example.org:80", "[bad", "10.0.0.1", "127.0.0.1.example.org"]
+)
 def test_a_foreign_name_for_this_machine_is_refused(stage, host):
     assert get(stage, headers={"host": host}).status_code == 403
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:8080", "localhost:8080", "[::1]:8080"])
+def test_the_names_of_this_machine_are_answered(stage, host):
+    assert get(stage, headers={"host": host}).status_code == 200
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example.org", "null", "", "http://127.0.0.1:1"])
@@ -115,6 +122,7 @@ def test_without_the_token_nothing_is_served_and_with_it_everything(stages):
         answer = get(stage, path)
         assert answer.status_code == 401
         assert "main.js" not in answer.text
+    assert get(stage, headers={"host": "panel.example.org"}).status_code == 401  # as from a proxy
     assert act(stage).status_code == 401
     with pytest.raises(InvalidStatus), live(stage):
         pass
@@ -127,7 +135,11 @@ def test_without_the_token_nothing_is_served_and_with_it_everything(stages):
         assert {"httponly", "samesite=strict"} <= set(opened.headers["set-cookie"].lower().replace(" ", "").split(";"))
         assert TOKEN not in opened.headers["set-cookie"]
         assert client.get(stage.url).status_code == 200
-        cookie = {"cookie": "; ".join(f"{name}={value}" for name, value in client.cookies.items())}
+        ((name, session),) = client.cookies.items()
+    assert len(session) >= 32
+    for wrong in ("", TOKEN, session[:-1], session + "x"):
+        assert get(stage, headers={"cookie": f"{name}={wrong}"}).status_code == 401
+    cookie = {"cookie": f"{name}={session}"}
     assert act(stage, **cookie).status_code == 200
     with live(stage, **cookie) as connection:
         assert first(connection, "page")["number"] == 1

@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from exo_gravity.core.compensation.settings import COMPENSATOR
@@ -102,7 +103,7 @@ class PlayedArms:
         carried["support adapts"] = self.adapts
         carried["share of the wearer (%)"] = self.share
         velocity = [-self.sinking * math.copysign(1.0, tau) for tau in effort]
-        joints = joint_rows(names, position, velocity, effort)
+        joints = joint_rows(SimpleNamespace(name=names, position=position, velocity=velocity, effort=effort))
         return {"bridge": bridge, "compensator": carried, "simulator": self.simulator, "joints": joints}
 
 

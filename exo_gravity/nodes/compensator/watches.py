@@ -165,7 +165,7 @@ class BudgetWatch:
         self._logger = node.get_logger()
         self._names = tuple(joint_names)
         # Without its clients the executor then waits for two entities less.
-        self._bridge = NodeParameters(node, "can_bridge", lambda values: self._bridge.destroy())
+        self._bridge = NodeParameters(node, "can_bridge", once=True)
         self._request: Request | None = None
         self._job: Future[tuple[str, str]] | None = None
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="budget")

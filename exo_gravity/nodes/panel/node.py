@@ -3,7 +3,7 @@
 It is a ROS client like any other: it uses the topics, services and parameters that `ros2` can use, and nothing depends
 on it. The web server (exo_gravity/panel/server.py) runs on a separate thread, which calls the services; this node's
 executor receives the answers, collects the state of the arms and sends it to the pages ten times a second. Joint states
-arrive hundreds of times a second: their subscription keeps the newest message outside the executor (`HotPath`).
+arrive hundreds of times a second: their subscription keeps the newest message outside the executor (`Latest`).
 """
 
 import asyncio
@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, KeyValue
+from diagnostic_msgs.msg import KeyValue
 from geometry_msgs.msg import Vector3Stamped
 from rcl_interfaces.msg import ParameterEvent
 from rcl_interfaces.srv import SetParametersAtomically
@@ -29,10 +29,10 @@ from std_srvs.srv import SetBool, Trigger
 from exo_gravity import packaged
 from exo_gravity.bag.content import MARKERS
 from exo_gravity.core.errors import ExoGravityError, ParameterError
-from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics, Newest, status_values
-from exo_gravity.nodes.ros.parameters import NodeParameters, declare
+from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics, Statuses
+from exo_gravity.nodes.ros.parameters import OtherNodes, declare
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import HotPath
+from exo_gravity.nodes.ros.subscriptions import PITCH_YAW, Latest
 from exo_gravity.panel.control import Control
 from exo_gravity.panel.recordings import Recordings
 from exo_gravity.panel.view import PANEL, LoadChanges, Values, joint_rows, setup_of
@@ -43,41 +43,28 @@ SILENT = 1.5  # s without diagnostics or joint states after which the last ones 
 CALL_TIMEOUT = 3.0  # s, longer than can_bridge itself waits
 ABSENT_TIMEOUT = 0.5  # s, where the service seems to be absent
 LOOK_PERIOD = 0.005  # s between two looks for an answer
-TILT = "/imu/pitch_yaw"
 BRIDGE, COMPENSATOR = "can_bridge", "compensator"
 SIMULATOR = "simulator"
 SHOWN = {BRIDGE: "bridge", COMPENSATOR: "compensator", SIMULATOR: "simulator"}  # what the page calls the status of each
-ASKED = {  # service and request for each request of a page but `set`
+SET = "set_parameters_atomically"
+ASKED = {  # service and request for each request of a page; None for the parameters that it names
     "let_down": (SetBool, f"{BRIDGE}/enable", SetBool.Request(data=False)),
     "enable": (SetBool, f"{BRIDGE}/enable", SetBool.Request(data=True)),
     "clear_fault": (Trigger, f"{BRIDGE}/clear_fault", Trigger.Request()),
     "resume": (Trigger, f"{BRIDGE}/resume", Trigger.Request()),
     "weigh": (Trigger, f"{COMPENSATOR}/weigh", Trigger.Request()),
+    "set": (SetParametersAtomically, f"{COMPENSATOR}/{SET}", None),
+    "perform": (SetParametersAtomically, f"{SIMULATOR}/{SET}", None),  # of no page
 }
 
 
 class ArmClient:
-    """One arm, in the namespace `/name`."""
+    """The services of one arm, in the namespace `/name`, its joint states, and who controls it."""
 
     def __init__(self, node: Node, name: str) -> None:
-        self.newest = dict.fromkeys(("joints", *SHOWN.values()), Newest())  #: what the page shows of it
         self.services = {kind: node.create_client(srv, f"/{name}/{leaf}") for kind, (srv, leaf, _) in ASKED.items()}
-        self.services["set"] = parameter_client(node, f"/{name}/{COMPENSATOR}")
         self.control = node.create_publisher(KeyValue, f"/{name}/{BRIDGE}/control", 10)
-        self._states = HotPath(node, JointState, f"/{name}/joint_states", self._on_states)
-
-    def state(self) -> dict[str, Any]:
-        """Take the newest joint states, and return what the page shows; None in the place of what is old."""
-        self._states.poll()
-        return {kind: newest.within(SILENT) for kind, newest in self.newest.items()}
-
-    def report(self) -> dict[str, str]:
-        """Return what the bridge reports; {} if it is silent."""
-        return self.newest["bridge"].within(SILENT) or {}
-
-    def _on_states(self, message: JointState, _info: dict[str, Any]) -> None:
-        rows = joint_rows(message.name, message.position, message.velocity, message.effort)
-        self.newest["joints"] = Newest(rows, time.monotonic())
+        self.joints = Latest(node, JointState, f"/{name}/joint_states", joint_rows)
 
 
 class Arms:
@@ -91,10 +78,9 @@ class Arms:
         self.clients: dict[str, ArmClient] = {}
         self._node = node
         self._lessee = f"panel {os.getpid()}, " if has_lease else ""
-        self._parameters: dict[str, NodeParameters] = {}  # by full name, also of nodes that ended
-        self._wearers: dict[str, Client] = {}  # the virtual ones, by their simulator's name
+        self._others = OtherNodes(node)
+        self._statuses = Statuses(node)
         self._markers = node.create_publisher(String, MARKERS, 10)
-        node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
         node.create_subscription(ParameterEvent, "/parameter_events", self._on_parameter_event, 50)
 
     @property
@@ -104,46 +90,41 @@ class Arms:
 
     def discover(self) -> None:
         """Add the arms and parameters of new nodes, and read parameters that have changed."""
-        found = self._node.get_node_names_and_namespaces()
-        nodes = {f"{space.rstrip('/')}/{name}" for name, space in found if not name.startswith("_")}
-        nodes.discard(self._node.get_fully_qualified_name())
-        for name in nodes - set(self._parameters):
-            self._parameters[name] = NodeParameters(self._node, name)
+        self._others.update()
+        for name in self._others.found:
             arm, _, leaf = name.strip("/").rpartition("/")
             if leaf == BRIDGE and arm and arm not in self.clients:
                 self.clients[arm] = ArmClient(self._node, arm)
-            if leaf == SIMULATOR and name not in self._wearers:
-                self._wearers[name] = parameter_client(self._node, name)
-        for parameters in self._parameters.values():
-            parameters.update()
 
     def state(self) -> dict[str, Any]:
-        """Return what the page shows of each arm."""
-        return {name: client.state() for name, client in sorted(self.clients.items(), reverse=True)}
+        """Return what the page shows of each arm; None in the place of what is old."""
+        shown = {}
+        for name, client in sorted(self.clients.items(), reverse=True):
+            statuses = {kind: self._statuses.within(SILENT, f"{name}/{leaf}") or None for leaf, kind in SHOWN.items()}
+            shown[name] = {"joints": client.joints.within(SILENT), **statuses}
+        return shown
 
     def nodes(self) -> dict[str, tuple[Values, Values]]:
         """Return the newest parameters of bridge and compensator by arm, {} while they are not known."""
-        known = {name: parameters.values for name, parameters in self._parameters.items()}
-        return {arm: (known[f"/{arm}/{BRIDGE}"], known.get(f"/{arm}/{COMPENSATOR}", {})) for arm in self.names}
+        values = self._others.values
+        return {arm: (values(f"/{arm}/{BRIDGE}"), values(f"/{arm}/{COMPENSATOR}")) for arm in self.names}
 
     # For a trial (`Device` of exo_gravity.panel.recordings); called on the web server's thread
 
     def parameters(self) -> dict[str, dict[str, Any]]:
         """Return the parameters of every node that runs, by full name."""
-        of_nodes = sorted(self._parameters.copy().items())
-        return {name: dict(parameters.values) for name, parameters in of_nodes if parameters.is_present}
+        found = sorted(self._others.found.copy().items())
+        return {name: dict(parameters.values) for name, parameters in found if parameters.is_present}
 
     def states(self) -> dict[str, str | None]:
         """Return the state that each bridge reports; None if it is silent."""
-        return {name: client.report().get("state") for name, client in self.clients.items()}
+        return {name: self._report(name).get("state") for name in self.names}
 
     async def perform(self, script: str) -> str:
         """Let the virtual wearers perform the script at this path, '' for none; return '' or why not."""
-        problems = []
-        for name, client in sorted(self._wearers.items()):
-            problem = await call(client, parameter_request({"trial": script}))
-            problems += [f"{name}: {problem}"] if problem else []
-        return "; ".join(problems)
+        simulated = [arm for arm in sorted(self.names) if f"/{arm}/{SIMULATOR}" in self._others.found]
+        problems = [(arm, await self.ask("perform", arm, {"trial": script})) for arm in simulated]
+        return "; ".join(f"/{arm}/{SIMULATOR}: {problem}" for arm, problem in problems if problem)
 
     def mark(self, text: str) -> str:
         """Publish a marker; return '' or why not."""
@@ -162,38 +143,26 @@ class Arms:
 
     def other_holder(self, arm: str, page: str) -> str:
         """Return the name of another operator who holds control of the arm, as its bridge reports; '' for none."""
-        holder = self.clients[arm].report().get(HELD_BY, NOBODY)
+        holder: str = self._report(arm).get(HELD_BY, NOBODY)
         return "" if holder in (NOBODY, self._lessee + page) else holder
 
     async def ask(self, kind: str, arm: str, values: Mapping[str, Any]) -> str:
         """Do what a page asks of one arm. The request is sent even where the service seems to be absent."""
         if kind == "bring_home":
-            simulator = self._wearers.get(f"/{arm}/{SIMULATOR}")
-            script = {"trial": str(packaged("home.yaml"))}
-            return await call(simulator, parameter_request(script)) if simulator else "the arm is not simulated"
-        request = parameter_request(values) if kind == "set" else ASKED[kind][-1]
+            if f"/{arm}/{SIMULATOR}" not in self._others.found:
+                return "the arm is not simulated"
+            kind, values = "perform", {"trial": str(packaged("home.yaml"))}
+        given = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        request = ASKED[kind][-1] or SetParametersAtomically.Request(parameters=given)
         return await call(self.clients[arm].services[kind], request)
 
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            arm, _, leaf = status.name.strip("/").rpartition("/")
-            if arm in self.clients and leaf in SHOWN:
-                self.clients[arm].newest[SHOWN[leaf]] = Newest(status_values(status), time.monotonic())
+    def _report(self, arm: str) -> dict[str, Any]:
+        """Return what the arm's bridge reports; {} if it is silent."""
+        return self._statuses.within(SILENT, f"{arm}/{BRIDGE}")
 
     def _on_parameter_event(self, event: ParameterEvent) -> None:
-        if event.node in self._parameters:
-            self._parameters[event.node].refresh()
-
-
-def parameter_client(node: Node, name: str) -> Client:
-    """Return a client that sets parameters of the node `name` together."""
-    return node.create_client(SetParametersAtomically, f"{name}/set_parameters_atomically")
-
-
-def parameter_request(values: Mapping[str, Any]) -> SetParametersAtomically.Request:
-    """Return the request that sets `values` together."""
-    messages = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
-    return SetParametersAtomically.Request(parameters=messages)
+        if event.node in self._others.found:
+            self._others.found[event.node].refresh()
 
 
 async def call(client: Client, request: Any) -> str:
@@ -206,10 +175,11 @@ async def call(client: Client, request: Any) -> str:
             return f"{client.srv_name} does not answer"
         await asyncio.sleep(LOOK_PERIOD)
     response: Any = sent.result()
-    result = getattr(response, "result", response)
-    if getattr(result, "successful", getattr(result, "success", False)):
-        return ""
-    return getattr(result, "reason", getattr(result, "message", "")) or "refused without a reason"
+    if isinstance(response, SetParametersAtomically.Response):
+        is_done, reason = response.result.successful, response.result.reason
+    else:
+        is_done, reason = response.success, response.message
+    return "" if is_done else reason or "refused without a reason"
 
 
 class Panel(Node):
@@ -224,10 +194,9 @@ class Panel(Node):
         self._diagnostics = Diagnostics(self)
         self._noted = 0
         self._arms = Arms(self, values["dead_man"])
-        self._tilt = Newest()
-        self._tilts = HotPath(self, Vector3Stamped, TILT, self._on_tilt)
+        self._tilt = Latest(self, Vector3Stamped, PITCH_YAW, tilt_shown)
         scripts = Path(values["trials"]) if values["trials"] else packaged("trials")
-        if values["trials"] and not os.path.isdir(values["trials"]):
+        if scripts is None or not scripts.is_dir():
             raise ParameterError("trials", values["trials"], "a folder")
         self._recordings = Recordings(values["output"], scripts, self._arms, self._note, time.monotonic)
         own = {name: values[name] for name in ("language", "dead_man")}
@@ -269,18 +238,18 @@ class Panel(Node):
     def _send_state(self) -> None:
         if not self._server.is_running:
             self.failure = RuntimeError("the web server has ended")
-        self._tilts.poll()
         nodes = self._arms.nodes()
         if nodes != self._shown:
             self._shown = nodes
             self._server.setup = {**self._own_setup, **setup_of(nodes)}
-        tilt = self._tilt.within(SILENT)
         arms = self._changes.with_causes(self._arms.state(), nodes, time.monotonic())
-        self._server.state = {"arms": arms, "tilt": tilt, **self._recordings.state()}
+        self._server.state = {"arms": arms, "tilt": self._tilt.within(SILENT), **self._recordings.state()}
 
-    def _on_tilt(self, message: Vector3Stamped, _info: dict[str, Any]) -> None:
-        pitch, roll = message.vector.y, message.vector.x
-        self._tilt = Newest({"pitch": pitch, "roll": roll} if math.isfinite(pitch + roll) else None, time.monotonic())
+
+def tilt_shown(message: Vector3Stamped) -> dict[str, float] | None:
+    """Return the tilt in rad as the page shows it, None for one that is not finite."""
+    pitch, roll = message.vector.y, message.vector.x
+    return {"pitch": pitch, "roll": roll} if math.isfinite(pitch + roll) else None
 
 
 def main() -> None:

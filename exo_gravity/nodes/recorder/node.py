@@ -33,20 +33,21 @@ from exo_gravity.bag.writer import BagWriter, offered_qos
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.core.trial.session import Session
 from exo_gravity.nodes.ros.messages import status_values
-from exo_gravity.nodes.ros.parameters import NodeParameters, declare
+from exo_gravity.nodes.ros.parameters import OtherNodes, declare
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import HotPath, Publishers
+from exo_gravity.nodes.ros.subscriptions import PITCH_YAW, HotPath, Publishers
 
-SHARED_TOPICS = {"/imu/pitch_yaw": Vector3Stamped, content.IMU: Imu, "/imu/data_raw": Imu}
-SHARED_TOPICS |= {content.DIAGNOSTICS: DiagnosticArray, content.PARAMETER_EVENTS: ParameterEvent}
-SHARED_TOPICS |= {content.MARKERS: String}
-ARM_TOPICS = {STATES: JointState, content.COMMANDS: JointState, content.STEPS: String}  # in the live line
-OF_ARMS = {**ARM_TOPICS, **dict.fromkeys((content.ASSIST, *content.WEARER), JointState)}
+TYPES = {  # of each topic that is recorded, or of its last part in an arm's namespace
+    STATES: JointState, content.COMMANDS: JointState, content.ASSIST: JointState, content.STEPS: String,
+    **dict.fromkeys(content.WEARER, JointState),
+    content.IMU: Imu, "/imu/data_raw": Imu, PITCH_YAW: Vector3Stamped, content.DIAGNOSTICS: DiagnosticArray,
+    content.PARAMETER_EVENTS: ParameterEvent, content.MARKERS: String,
+}  # fmt: skip
 REPEATER = "robot_model"  # its joint states are those of the arms once more
 UNNAMED = "_NODE_NAME_UNKNOWN_"  # what the RMW calls a publisher whose node it has not discovered yet
 DRAIN_PERIOD = 0.05  # s between two writes of what has arrived
-DISCOVERY_PERIOD = 0.5  # s between two searches for new topics and nodes
-LIVE_PERIOD = 0.1  # s between two lines of live state, and two looks for the answers of new nodes
+DISCOVERY_PERIOD = 0.5  # s between two searches for new topics
+LIVE_PERIOD = 0.1  # s between two lines of live state, and two searches for new nodes
 DEPTH = 1000  # queued messages per topic: two seconds at 500 Hz
 LOSS_REPORT_PERIOD = 5.0  # s between two warnings of lost messages
 # After the launcher's death a bridge lets its arm down: this is recorded while joint states arrive.
@@ -68,11 +69,11 @@ class Recorder(Node):
         self._write_text(content.SESSION, json.dumps(session))
         self._failed: set[str] = set()  # topics and nodes whose failure was reported
         self._last_states, self._orphaned = -math.inf, math.inf  # monotonic s
-        self._reported = (0, 0)  # lost messages
+        self._losses = ""  # what was reported of them
         self._topics: dict[str, HotPath] = {}
         self._counted: list[Publishers] = []  # of joints and IMU; other topics have several
         self._taken: list[tuple[str, int, bytes]] = []  # topic, time of arrival in ns since 1970, serialised
-        self._nodes: dict[str, NodeParameters] = {}  # destroyed once their parameters are in the recording
+        self._nodes = OtherNodes(self, on_read=partial(self._guarded, "parameters", self._write_parameters), once=True)
         self._live = LiveLine() if values["live"] else None
         self.create_timer(DRAIN_PERIOD, self._drain)
         self.create_timer(DISCOVERY_PERIOD, self._discover)
@@ -93,10 +94,9 @@ class Recorder(Node):
         try:
             self._drain()
             self._report_losses()
-            if any(self._reported):
-                missed, unwritten = self._reported
+            if self._losses:
                 self._writer.add_topic(content.LOSSES, content.STRING, offered_qos(True, True, 1))
-                self._write_text(content.LOSSES, f"{missed} did not arrive, {unwritten} were not written")
+                self._write_text(content.LOSSES, self._losses)
         finally:
             self._writer.close()
         if self._writer.error:
@@ -112,26 +112,17 @@ class Recorder(Node):
         self.failure = self._writer.error
 
     def _discover(self) -> None:
-        """Subscribe to new topics, and note new nodes."""
+        """Subscribe to new topics."""
         for topic, _types in self.get_topic_names_and_types():
-            msgtype = SHARED_TOPICS.get(topic) or OF_ARMS.get(leaf(topic))
+            msgtype = TYPES.get(topic) or TYPES.get(leaf(topic))
             if msgtype and topic not in self._topics:
                 self._guarded(topic, self._subscribe, topic, msgtype)
-        for name, namespace in self.get_node_names_and_namespaces():
-            node = f"{namespace.rstrip('/')}/{name}"
-            if node not in self._nodes and node != self.get_fully_qualified_name() and not name.startswith("_"):
-                self._guarded(node, self._add_node, node)
-
-    def _add_node(self, node: str) -> None:
-        write = partial(self._guarded, node, self._write_parameters, node)
-        self._nodes[node] = NodeParameters(self, node, write)
 
     def _look(self) -> None:
-        """Ask the nodes whose parameters are not known, and print the live line."""
-        for node, parameters in self._nodes.items():
-            self._guarded(node, parameters.update)
+        """Ask new nodes for their parameters, and print the live line."""
+        self._guarded("parameters", self._nodes.update)
         if self._live:
-            counts = {"messages": self._writer.count, "lost": sum(self._losses())}
+            counts = {"messages": self._writer.count, "lost": self._missed + self._writer.lost}
             self._guarded("live state", self._live.write, counts)
 
     def _guarded(self, name: str, function: Callable[..., object], *args: Any) -> None:
@@ -143,22 +134,24 @@ class Recorder(Node):
                 self._failed.add(name)
                 self.get_logger().error(f"{name}: {type(error).__name__}: {error}; the rest is recorded")
 
-    def _losses(self) -> tuple[int, int]:
-        """Return how many messages of joints and IMU did not arrive, and how many were not written."""
-        return sum(publishers.missed for publishers in self._counted), self._writer.lost
+    @property
+    def _missed(self) -> int:
+        """How many messages of joints and IMU did not arrive."""
+        return sum(publishers.missed for publishers in self._counted)
 
     def _report_losses(self) -> None:
-        if (lost := self._losses()) != self._reported:
-            self._reported = lost
-            self.get_logger().warning(f"messages lost so far: {lost[0]} did not arrive, {lost[1]} were not written")
+        losses = f"{self._missed} did not arrive, {self._writer.lost} were not written"
+        if self._missed + self._writer.lost and losses != self._losses:
+            self._losses = losses
+            self.get_logger().warning(f"messages lost so far: {losses}")
 
     def _subscribe(self, topic: str, msgtype: type) -> None:
         found = self.get_publishers_info_by_topic(topic)
-        others = [publisher for publisher in found if publisher.node_name not in (REPEATER, UNNAMED)]
-        named = [publisher for publisher in others if leaf(publisher.topic_type) == msgtype.__name__]
-        offered = [publisher.qos_profile for publisher in named]
-        if not offered:
+        named = [publisher for publisher in found if publisher.node_name not in (REPEATER, UNNAMED)]
+        typed = [publisher for publisher in named if leaf(publisher.topic_type) == msgtype.__name__]
+        if not typed:
             return  # a subscriber without a publisher, or a topic of another type; try again later
+        offered = [publisher.qos_profile for publisher in typed]
         reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
         latched = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
         # A recorder must not make the control loops' publishers wait for acknowledgements.
@@ -168,7 +161,7 @@ class Recorder(Node):
             reliability=ReliabilityPolicy.RELIABLE if acknowledged else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
-        self._writer.add_topic(topic, named[0].topic_type, offered_qos(reliable, latched, offered[0].depth or 1))
+        self._writer.add_topic(topic, typed[0].topic_type, offered_qos(reliable, latched, offered[0].depth or 1))
         publishers = Publishers()
         self._counted += [publishers] if msgtype in (JointState, Imu, Vector3Stamped) else []
         self._topics[topic] = HotPath(self, msgtype, topic, partial(self._on_message, topic, publishers), qos, raw=True)
@@ -186,7 +179,6 @@ class Recorder(Node):
         given = {name: value for name, value in values.items() if value != []}
         text = yaml.safe_dump({node: {"ros__parameters": given}}, default_flow_style=None, width=120)
         self._write_text(PARAMETERS, text)
-        self._nodes[node].destroy()
 
     def _write_text(self, topic: str, text: str) -> None:
         now = self.get_clock().now().nanoseconds
@@ -209,19 +201,18 @@ class LiveLine:
 
     def note(self, topic: str, data: bytes) -> None:
         """Keep the newest message of a topic, and the newest status of each node."""
-        if topic != content.DIAGNOSTICS:
+        if leaf(topic) in (STATES, content.COMMANDS, content.STEPS):
             self._latest[topic] = data
-            return
-        for status in deserialize_message(data, DiagnosticArray).status:
-            self._status[status.name] = status_values(status)
+        elif topic == content.DIAGNOSTICS:
+            for status in deserialize_message(data, DiagnosticArray).status:
+                self._status[status.name] = status_values(status)
 
     def write(self, recorder: dict[str, int]) -> None:
         """Write the line to standard output."""
         line: dict[str, Any] = {}
         for topic, data in self._latest.items():
-            if (name := leaf(topic)) not in ARM_TOPICS:
-                continue
-            arm, message = line.setdefault(arm_of(topic), {}), deserialize_message(data, ARM_TOPICS[name])
+            name, arm = leaf(topic), line.setdefault(arm_of(topic), {})
+            message = deserialize_message(data, TYPES[name])
             if name == content.STEPS:
                 with contextlib.suppress(ValueError):  # the report states it
                     arm["step"] = json.loads(message.data)

@@ -9,12 +9,11 @@ It looks for compensators, requests the parameters of each and of its bridge, an
 It only reads: nothing depends on it, and the arms run on if it ends.
 """
 
-import time
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
 
-from builtin_interfaces.msg import Duration
-from diagnostic_msgs.msg import DiagnosticArray
+from builtin_interfaces.msg import Duration, Time
 from geometry_msgs.msg import Point, Vector3Stamped
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -25,11 +24,12 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.tilt import gravity_in_trunk
 from exo_gravity.core.view.scene import ARROW, LINE, SPHERE, TEXT, ArmView, Shape, arm_shapes, gravity_shapes
 from exo_gravity.core.view.urdf import ROBOT_MODEL, ROOT, ArmDescription, described, joint_names, urdf
-from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics, Newest, by_name, status_values, to_nanoseconds
-from exo_gravity.nodes.ros.parameters import NodeParameters, declare
+from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics, Statuses, by_name, to_nanoseconds
+from exo_gravity.nodes.ros.parameters import OtherNodes, declare
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import LATCHED, NEWEST, HotPath
+from exo_gravity.nodes.ros.subscriptions import LATCHED, PITCH_YAW, Latest
 
+COMPENSATOR, BRIDGE = "compensator", "can_bridge"  # the nodes of an arm
 DISCOVERY_PERIOD = 0.5  # s between two searches for arms
 MARKER_PERIOD = 0.1  # s
 STALE = 0.5  # s after which a reading or a state is no longer shown
@@ -45,29 +45,29 @@ class RobotModel(Node):
         super().__init__("robot_model", automatically_declare_parameters_from_overrides=True)
         values = declare(self, ROBOT_MODEL)
         self._meshes = values["meshes"]
-        self._arms: dict[str, ViewedArm] = {}
+        self._others = OtherNodes(self, (COMPENSATOR, BRIDGE))
+        self._statuses = Statuses(self)
+        self._arms: dict[str, ViewedArm] = {}  # by namespace
         self._views: list[tuple[ViewedArm, ArmView]] = []
         self._described: dict[ViewedArm, ArmDescription] = {}
         self._problem = ""  # of the description
-        self._tilt = Newest()  # gravity in the trunk's axes
-        self._status: dict[str, Newest] = {}  # of each node
+        self._tilt = Latest(self, Vector3Stamped, PITCH_YAW, lambda m: gravity_in_trunk(m.vector.y, m.vector.x))
         self._diagnostics = Diagnostics(self)
         self._description = self.create_publisher(String, "robot_description", LATCHED)
         self._joint_states = self.create_publisher(JointState, "joint_states", 1)
         self._markers = self.create_publisher(MarkerArray, "~/markers", 1)
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
-        self._tilts = HotPath(self, Vector3Stamped, "/imu/pitch_yaw", self._on_tilt, NEWEST)
         self.create_timer(DISCOVERY_PERIOD, self._discover)
         self.create_timer(1.0 / values["rate"], self._publish_states)
         self.create_timer(MARKER_PERIOD, self._publish_markers)
 
     def _discover(self) -> None:
-        for name, namespace in self.get_node_names_and_namespaces():
-            if name == "compensator" and namespace not in self._arms:
-                self._arms[namespace] = ViewedArm(self, namespace.rstrip("/"))
-        for arm in self._arms.values():
-            for parameters in arm.parameters:
-                parameters.update()
+        self._others.update()
+        for name in self._others.found:
+            namespace, _, leaf = name.rpartition("/")
+            if leaf == COMPENSATOR and namespace not in self._arms:
+                self._arms[namespace] = ViewedArm(self, namespace)
+        for namespace, arm in self._arms.items():
+            arm.describe(*(self._others.values(f"{namespace}/{leaf}") for leaf in (COMPENSATOR, BRIDGE)))
         known = {arm: arm.description for _, arm in sorted(self._arms.items()) if arm.description}
         if known != self._described:
             self._described, self._problem = known, ""
@@ -82,7 +82,7 @@ class RobotModel(Node):
 
     def _publish_states(self) -> None:
         names = dict(zip(self._described, joint_names(list(self._described.values())), strict=True))
-        found = ((arm, arm.view(self._status.get(arm.bridge, Newest()))) for arm in self._described)
+        found = ((arm, arm.view(self._statuses.within(STALE_STATE, arm.bridge))) for arm in self._described)
         self._views = views = [(arm, view) for arm, view in found if view]
         own_topic = self._joint_states.topic_name
         if not views or self._problem or own_topic in {arm.states_topic for arm in self._arms.values()}:
@@ -93,78 +93,67 @@ class RobotModel(Node):
             velocity=[velocity for _, view in views for velocity in view.velocity],
             effort=[effort for _, view in views for effort in view.effort],
         )
-        states.header.stamp = max((arm.states.header.stamp for arm, _ in views), key=to_nanoseconds)
+        states.header.stamp = max((arm.stamp for arm, _ in views), key=to_nanoseconds)
         self._joint_states.publish(states)
 
     def _publish_markers(self) -> None:
-        self._tilts.poll()
+        gravity = self._tilt.within(STALE)
         if not self._markers.get_subscription_count():
             return
-        groups = [("", gravity_shapes(self._tilt.within(STALE)))]
+        groups = [("", gravity_shapes(gravity))]
         groups += [(f"{view.arm.side}/", arm_shapes(view)) for _, view in self._views]
-        markers = [marker(owner, n, shape) for owner, shapes in groups for n, shape in enumerate(shapes)]
         stamp = self.get_clock().now().to_msg()
-        for each in markers:
-            each.header.stamp = stamp
+        markers = [marker(stamp, owner, n, shape) for owner, shapes in groups for n, shape in enumerate(shapes)]
         self._markers.publish(MarkerArray(markers=markers))
-
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        now = time.monotonic()
-        self._status.update({status.name: Newest(status_values(status), now) for status in message.status})
-
-    def _on_tilt(self, message: Vector3Stamped, _info: dict[str, Any]) -> None:
-        self._tilt = Newest(gravity_in_trunk(message.vector.y, message.vector.x), time.monotonic())
 
 
 class ViewedArm:
-    """The arm in `namespace` ('/right', '' for the root): its parameters and its newest joint states."""
+    """The arm in `namespace` ('/right', '' for the root): its description and its newest joint states."""
 
     def __init__(self, node: Node, namespace: str) -> None:
         self.description: ArmDescription | None = None  #: None until both nodes have answered
         #: Why there is no description or no reading, '' if nothing is wrong
-        self.problem = f"waiting for the parameters of {namespace}/compensator and {namespace}/can_bridge"
+        self.problem = f"waiting for the parameters of {namespace}/{COMPENSATOR} and {namespace}/{BRIDGE}"
         self.states_topic = f"{namespace}/joint_states"
-        self.states = JointState()
-        self.bridge = f"{namespace}/can_bridge".lstrip("/")
-        self._arrived = Newest()
-        self.parameters = [
-            NodeParameters(node, f"{namespace}/{leaf}", self._on_values) for leaf in ("compensator", "can_bridge")
-        ]
-        self._subscription = HotPath(node, JointState, self.states_topic, self._on_states, NEWEST)
+        self.stamp = Time()  #: of the newest joint states
+        self.bridge = f"{namespace}/{BRIDGE}".lstrip("/")
+        self._states = Latest(node, JointState, self.states_topic)
+        self._parameters: tuple[object, ...] = ()  # that were described
 
-    def view(self, status: Newest) -> ArmView | None:
-        """Return what is known of the arm now; None without a description or a fresh reading. status: its bridge's."""
-        self._subscription.poll()
-        if self.description is None:
-            return None
-        self.problem = "" if self._arrived.within(STALE) else f"no messages on {self.states_topic}"
+    def describe(self, *parameters: dict[str, Any]) -> None:
+        """Take the parameters of compensator and bridge, {} while they are not known."""
+        if parameters == self._parameters or not all(parameters):
+            return
+        self._parameters = parameters
         try:
-            names = self.description.limits.joint_names
-            fields = ("position", "velocity", "effort")
-            theta, velocity, effort = (by_name(self.states, field, names) for field in fields)
-        except ParameterError as error:
-            self.problem = self.problem or f"{self.states_topic}: {error.name} must be {error.expected}"
-        if self.problem:
-            return None
-        values = status.within(STALE_STATE) or {}
-        return ArmView(self.description, theta, velocity, effort, values.get("state", ""), values.get("message", ""))
-
-    def _on_states(self, message: JointState, _info: dict[str, Any]) -> None:
-        self.states, self._arrived = message, Newest(True, time.monotonic())
-
-    def _on_values(self, _values: object) -> None:
-        try:
-            with suppress(KeyError):  # one of them has not answered yet, or is of another kind of arm
-                self.description = described(*(parameters.values for parameters in self.parameters))
+            with suppress(KeyError):  # one of them is of another kind of arm
+                self.description = described(*parameters)
         except ParameterError as error:
             self.problem = f"{self.bridge.rpartition('/')[0] or 'arm'}: {error}"
 
+    def view(self, status: Mapping[str, Any]) -> ArmView | None:
+        """Return what is known of the arm now; None without a description or a fresh reading. status: its bridge's."""
+        states = self._states.within(STALE)
+        if self.description is None:
+            return None
+        if states is None:
+            self.problem = f"no messages on {self.states_topic}"
+            return None
+        names = self.description.limits.joint_names
+        try:
+            theta, velocity, effort = (by_name(states, field, names) for field in ("position", "velocity", "effort"))
+        except ParameterError as error:
+            self.problem = f"{self.states_topic}: {error.name} must be {error.expected}"
+            return None
+        self.problem, self.stamp = "", states.header.stamp
+        return ArmView(self.description, theta, velocity, effort, status.get("state", ""), status.get("message", ""))
 
-def marker(owner: str, number: int, shape: Shape) -> Marker:
+
+def marker(stamp: Time, owner: str, number: int, shape: Shape) -> Marker:
     """Return the marker of a shape; owner: 'left/' or 'right/', or '' for what both arms share."""
     kind = KINDS[shape.kind]
     marker = Marker(ns=f"{owner}{shape.group}", id=number, type=kind, lifetime=LIFETIME, text=shape.text)
-    marker.header.frame_id = ROOT
+    marker.header.frame_id, marker.header.stamp = ROOT, stamp
     marker.color = ColorRGBA(**dict(zip("rgba", shape.colour, strict=True)))
     marker.pose.orientation.w = 1.0
     points = [Point(x=x, y=y, z=z) for x, y, z in shape.points.tolist()]

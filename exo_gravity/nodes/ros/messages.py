@@ -7,7 +7,6 @@ arrives.
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -56,18 +55,6 @@ def velocity_of(message: JointState, names: Sequence[str], exact: bool = True) -
         return None
 
 
-@dataclass(frozen=True)
-class Newest:
-    """The newest message of one kind, or what is used of it."""
-
-    content: Any = None
-    time: float = -math.inf  #: monotonic s of its arrival
-
-    def within(self, timeout: float) -> Any:
-        """Return the content; None if it is older than `timeout` s."""
-        return self.content if time.monotonic() - self.time < timeout else None
-
-
 class Diagnostics:
     """Publishes a DiagnosticStatus: a change at once, otherwise twice a second. Logs level and message on a change."""
 
@@ -104,6 +91,23 @@ class Diagnostics:
                 logger.warning(message)
             else:
                 logger.error(message)
+
+
+class Statuses:
+    """The newest status of each node on /diagnostics."""
+
+    def __init__(self, node: Node) -> None:
+        self._newest: dict[str, tuple[float, dict[str, Any]]] = {}  # monotonic s of its arrival, and its values
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._on_message, 50)
+
+    def within(self, timeout: float, name: str) -> dict[str, Any]:
+        """Return the `status_values` of the node, as 'right/can_bridge'; {} if they are older than `timeout` s."""
+        arrived, values = self._newest.get(name, (-math.inf, {}))
+        return values if time.monotonic() - arrived < timeout else {}
+
+    def _on_message(self, message: DiagnosticArray) -> None:
+        now = time.monotonic()
+        self._newest.update({status.name: (now, status_values(status)) for status in message.status})
 
 
 def status_values(status: DiagnosticStatus) -> dict[str, Any]:

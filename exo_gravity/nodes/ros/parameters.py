@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -103,21 +103,25 @@ def plain(value: Any) -> Any:
 class NodeParameters:
     """The parameters of another node, in `values` once they are known.
 
-    name: its full name, or its name in `node`'s namespace. on_change: called with `values` on the executor's thread
-    each time that they were read.
+    name: its full name, or its name in `node`'s namespace. on_read: called with name and `values` on the executor's
+    thread each time that they were read. once: they are read once, and the executor then has no clients to wait for.
     """
 
     def __init__(
-        self, node: Node, name: str, on_change: Callable[[dict[str, Any]], object] = lambda values: None
+        self,
+        node: Node,
+        name: str,
+        on_read: Callable[[str, dict[str, Any]], object] = lambda name, values: None,
+        once: bool = False,
     ) -> None:
         self.values: dict[str, Any] = {}
         self.is_present = False  #: whether it has its services; a node that has died can stay in ROS's list of names
-        self._node = node
-        self._on_change = on_change
+        self._node, self._name = node, name
+        self._on_read, self._once = on_read, once
         self._get = node.create_client(GetParameters, f"{name}/get_parameters")
         self._list = node.create_client(ListParameters, f"{name}/list_parameters")
         self._due = -math.inf  # s, when to ask; infinite while the values are known
-        self._is_destroyed = False
+        self._is_done = False
 
     def refresh(self) -> None:
         """Read the parameters again, at the next `update`."""
@@ -125,7 +129,7 @@ class NodeParameters:
 
     def update(self) -> None:
         """Read the parameters if they may have changed and the node answers. Call it on the executor's thread."""
-        if self._is_destroyed:
+        if self._is_done:
             return
         self.is_present = self._get.service_is_ready() and self._list.service_is_ready()
         now = time.monotonic()
@@ -135,23 +139,46 @@ class NodeParameters:
             self._due = now + ANSWER_TIMEOUT
             self._list.call_async(ListParameters.Request()).add_done_callback(self._on_names)
 
-    def destroy(self) -> None:
-        """Remove the clients; answers that are still on their way are ignored."""
-        self._is_destroyed = True
-        self._node.destroy_client(self._get)
-        self._node.destroy_client(self._list)
-
     def _on_names(self, listed: Future) -> None:
-        if not self._is_destroyed:
+        if not self._is_done:
             names = listed.result().result.names
             asked = self._get.call_async(GetParameters.Request(names=names))
             asked.add_done_callback(lambda done: self._on_values(names, done))
 
     def _on_values(self, names: Sequence[str], asked: Future) -> None:
-        if self._is_destroyed:
+        if self._is_done:
             return
         if math.isfinite(self._due):  # else they have changed since
             self._due = math.inf
         values = map(parameter_value_to_python, asked.result().values)
         self.values = {name: plain(value) for name, value in zip(names, values, strict=False) if value is not None}
-        self._on_change(self.values)
+        if self._once:
+            self._is_done = True
+            self._node.destroy_client(self._get)
+            self._node.destroy_client(self._list)
+        self._on_read(self._name, self.values)
+
+
+class OtherNodes:
+    """The other nodes that were found, in `found` by full name, with their parameters.
+
+    leaves: last parts of the names that are looked for; () for all. A node that has ended stays in `found`.
+    """
+
+    def __init__(self, node: Node, leaves: Collection[str] = (), **options: Any) -> None:
+        self.found: dict[str, NodeParameters] = {}
+        self._node, self._leaves, self._options = node, leaves, options
+
+    def update(self) -> None:
+        """Find new nodes, and read parameters that may have changed. Call it on the executor's thread."""
+        for leaf, namespace in self._node.get_node_names_and_namespaces():
+            name = f"{namespace.rstrip('/')}/{leaf}"
+            is_wanted = leaf in self._leaves if self._leaves else not leaf.startswith("_")
+            if is_wanted and name not in self.found and name != self._node.get_fully_qualified_name():
+                self.found[name] = NodeParameters(self._node, name, **self._options)
+        for parameters in self.found.values():
+            parameters.update()
+
+    def values(self, name: str) -> dict[str, Any]:
+        """Return the newest parameters of a node; {} while they are not known."""
+        return self.found[name].values if name in self.found else {}
