@@ -11,13 +11,14 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 from exo_gravity.core.errors import DeviceError, ParameterError
-from exo_gravity.hardware.imu_sources.source import Axes, Clock, ImuSource, Measurement
+from exo_gravity.hardware.imu_sources.source import Axes, Clock, ImuSource
 
 MAX_BLOCK = 32  # bytes
 TEMPERATURE_PERIOD = 1.0  # s
 BANK_SELECT = 0x7F  # of a chip whose registers lie in banks
 
 Bus = Any  # a `smbus2.SMBus`
+Values = Mapping[int, int]  # of registers, in the order in which they are written
 Limits = tuple[float, float]
 Wait = Callable[[float], Any]  # s, e.g. time.sleep
 
@@ -41,8 +42,7 @@ class Registers:
     _bank: int | None = None  # None: not known, as after a program that was killed
 
     def __init__(self, bus: Bus, address: int, device: str, bus_name: str) -> None:
-        self._bus = bus
-        self._address = address
+        self._bus, self._address = bus, address
         self._where = f"at 0x{address:02X} on {bus_name}"
         self.name = f"{device} {self._where}"
 
@@ -61,14 +61,14 @@ class Registers:
         """Write one register."""
         self._transfer(self._bus.write_byte_data, register, value)
 
-    def set(self, values: Mapping[int, int]) -> None:
-        """Write registers in order, each of which is read back."""
+    def set(self, values: Values) -> None:
+        """Write registers, each of which is read back."""
         for register, value in values.items():
             self.write(register, value)
             if (found := self.read(register)) != value:
                 raise DeviceError(self.name, f"holds 0x{found:02X} after 0x{value:02X} was written", register)
 
-    def identify(self, register: int, known: dict[int, str]) -> str:
+    def identify(self, register: int, known: Mapping[int, str]) -> str:
         """Return the name of the device by its WHO_AM_I `register`; raise DeviceError for one that is not known."""
         if (found := self.read(register)) not in known:
             expected = " or ".join(f"0x{value:02X} ({name})" for value, name in known.items())
@@ -96,24 +96,26 @@ class Registers:
 class FifoSource(ImuSource):
     """Base of the chips on I2C.
 
-    A chip's class states WHO_AM_I and how to set up the chip, and how to read its FIFO. A FIFO that overflows is
-    emptied: its oldest bytes are gone, and with them where a sample begins.
+    A FIFO that overflows is emptied: its oldest bytes are gone, and with them where a sample begins. So it is after a
+    disturbed transfer.
     """
 
     IDENTITY: ClassVar[int]  # the register WHO_AM_I
     KNOWN: ClassVar[dict[int, str]]  # its values
+    IS_BANKED = False
     TEMPERATURE: ClassVar[int]  # the first of its registers
     ORDER: ClassVar[str]  # of the two bytes of a number: '>' for high byte first, '<' for low byte first
     SETTLING: ClassVar[float]  # s after the self-test's actuators were switched
+    PACKET: ClassVar[int]  # bytes of a packet in the FIFO
     thermometer: tuple[float, float]  # LSB/degC; degC at 0
 
-    def __init__(self, registers: Registers, rate: float, clock: Clock, wait: Wait, self_test: bool = True) -> None:
+    def __init__(self, registers: Registers, rate: float, clock: Clock, wait: Wait, self_test: bool) -> None:
         """Set up the chip for about `rate` samples a second; with `self_test` it must be still for a second.
 
         Raises DeviceError if the chip does not answer, is another one, or fails its self-test.
         """
-        self._registers = registers
-        self._wait = wait
+        self._registers, self._wait = registers, wait
+        registers.is_banked = self.IS_BANKED
         self.chip = registers.identify(self.IDENTITY, self.KNOWN)
         super().__init__(registers.name, self._set_up(rate, self_test), clock)
         self._temperature_due = -math.inf
@@ -122,30 +124,29 @@ class FifoSource(ImuSource):
         """Close the bus; never raises."""
         self._registers.close()
 
-    def _measure(self, now: float) -> list[Measurement]:
+    def _packets(self, now: float) -> list[bytes]:
         try:
             if not now < self._temperature_due <= now + TEMPERATURE_PERIOD:
                 self._temperature_due = now + TEMPERATURE_PERIOD
                 (raw,) = struct.unpack(f"{self.ORDER}h", self._registers.read_block(self.TEMPERATURE, 2))
                 self.temperature = raw / self.thermometer[0] + self.thermometer[1]
-            return self._drain()
-        except DeviceError as error:
-            # A disturbed transfer: where a sample begins in the FIFO is no longer known.
-            try:
-                return self._lose("a read failed")
-            except DeviceError:
-                raise error from None
-
-    def _lose(self, why: str) -> list[Measurement]:
-        """Give up what is in the FIFO."""
-        self._why_lost = why
+            register, count = self._queue()
+            if count is not None:
+                data = self._registers.read_block(register, self.PACKET * count, self.PACKET)
+                return [data[start : start + self.PACKET] for start in range(0, len(data), self.PACKET)]
+            self._why_lost = "FIFO overflowed"
+        except DeviceError:
+            self._why_lost = "a read failed"
         self._sample_clock.interrupt()
         self._empty_fifo()
         return []
 
-    def _responses(
-        self, off: Mapping[int, int], on: Mapping[int, int], data: Sequence[int], count: int, period: float
-    ) -> list[float]:
+    def _axes(self, data: bytes, scale: float) -> Axes:
+        """Return three 16-bit numbers times `scale`."""
+        x, y, z = struct.unpack(f"{self.ORDER}3h", data)
+        return x * scale, y * scale, z * scale
+
+    def _responses(self, off: Values, on: Values, data: Sequence[int], count: int, period: float) -> list[float]:
         """Return how the self-test's actuators change the mean of `count` readings, `period` s apart, in LSB.
 
         off, on: registers that switch the actuators. data: registers of three axes each, whose means follow.
@@ -172,17 +173,12 @@ class FifoSource(ImuSource):
                 "keep it still and try again, or replace it",
             )
 
-    def _axes(self, data: bytes, scale: float) -> Axes:
-        """Return three 16-bit numbers times `scale`."""
-        x, y, z = struct.unpack(f"{self.ORDER}3h", data)
-        return x * scale, y * scale, z * scale
-
     def _set_up(self, rate: float, self_test: bool) -> float:
         """Reset the chip, test it, set ranges, filters, rate and FIFO; return the rate that it has."""
         raise NotImplementedError
 
-    def _drain(self) -> list[Measurement]:
-        """Return the FIFO's samples."""
+    def _queue(self) -> tuple[int, int | None]:
+        """Return the FIFO's data register, and how many packets it holds; None if it has overflowed."""
         raise NotImplementedError
 
     def _empty_fifo(self) -> None:

@@ -10,20 +10,17 @@ against PX4, InvenSense_ICM20948_registers.hpp.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.hardware.imu_sources.i2c import FifoSource, Limits, Registers
+from exo_gravity.hardware.imu_sources.i2c import FifoSource, Limits, Registers, Values
 from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Measurement
 
-SAMPLE = 12  # bytes in the FIFO
 RADIANS_PER_LSB = RADIANS_PER_DEGREE / 16.4  # at 2000 deg/s
 ACCELERATION_PER_LSB = STANDARD_GRAVITY / 2048.0  # at 16 g
 READINGS = 200  # of each mean of the self-test
 START_UP = 0.1  # s after a reset, and after waking
 RESET, BEST_CLOCK = 0x80, 0x01  # PWR_MGMT_1
-
-Values = dict[int, int]  # of registers, in the order in which they are written
 
 
 def _factory_6500(registers: Registers, firsts: tuple[int, int]) -> list[float]:
@@ -122,7 +119,7 @@ ICM_20948 = Map(
 class InvenSense(FifoSource):
     """Base of the InvenSense chips."""
 
-    ORDER, SETTLING = ">", 0.02
+    ORDER, SETTLING, PACKET = ">", 0.02, 12
     map: Map
     capacity = 512  # bytes of the FIFO
     thermometer = 333.87, 21.0
@@ -153,17 +150,14 @@ class InvenSense(FifoSource):
         for register, value in self.map.emptied:
             self._registers.write(register, value)
 
-    def _drain(self) -> list[Measurement]:
-        count = int.from_bytes(self._registers.read_block(self.map.fifo[0], 2), "big") & 0x1FFF
+    def _queue(self) -> tuple[int, int | None]:
+        count, data = self.map.fifo
+        used = int.from_bytes(self._registers.read_block(count, 2), "big") & 0x1FFF
         # Not the overflow flag: on some of these chips it is always set (Linux: inv_mpu_ring.c).
-        if count > self.capacity - SAMPLE:
-            return self._lose("FIFO overflowed")
-        data = self._registers.read_block(self.map.fifo[1], count // SAMPLE * SAMPLE, SAMPLE)
-        samples = (data[start : start + SAMPLE] for start in range(0, len(data), SAMPLE))
-        return [
-            Measurement(self._axes(sample[6:], RADIANS_PER_LSB), self._axes(sample[:6], ACCELERATION_PER_LSB))
-            for sample in samples
-        ]
+        return data, None if used > self.capacity - self.PACKET else used // self.PACKET
+
+    def _decode(self, packet: bytes) -> Measurement:
+        return Measurement(self._axes(packet[6:], RADIANS_PER_LSB), self._axes(packet[:6], ACCELERATION_PER_LSB))
 
 
 class Mpu6050(InvenSense):
@@ -181,10 +175,5 @@ class Mpu6050(InvenSense):
 class Icm20948(InvenSense):
     """An ICM-20948, whose registers lie in four banks. Its magnetometer is not used."""
 
-    IDENTITY, TEMPERATURE, map = 0x000, 0x039, ICM_20948
+    IDENTITY, TEMPERATURE, IS_BANKED, map = 0x000, 0x039, True, ICM_20948
     KNOWN: ClassVar = {0xEA: "ICM-20948"}
-
-    def __init__(self, registers: Registers, *arguments: Any, **options: Any) -> None:
-        """Set up the chip; see `FifoSource`."""
-        registers.is_banked = True
-        super().__init__(registers, *arguments, **options)

@@ -48,7 +48,7 @@ class ImuSource:
     def read(self) -> list[ImuSample]:
         """Return every sample since the last call, the oldest first, without waiting for one. Raises DeviceError."""
         arrival = self._clock()
-        measurements = self._measure(arrival)
+        measurements = [measured for packet in self._packets(arrival) if (measured := self._decode(packet))]
         stamps = self._sample_clock.stamps(arrival, [measurement.skipped for measurement in measurements])
         if self._sample_clock.lost > self.lost:
             self.lost, self.loss = self._sample_clock.lost, self._why_lost or "not read in time"
@@ -59,8 +59,12 @@ class ImuSource:
         """Release the device; never raises."""
         raise NotImplementedError
 
-    def _measure(self, now: float) -> list[Measurement]:
-        """Return what the device has measured since the last call, the oldest first."""
+    def _packets(self, now: float) -> list[bytes]:
+        """Return the packets that the device has sent since the last call, the oldest first."""
+        raise NotImplementedError
+
+    def _decode(self, packet: bytes) -> Measurement | None:
+        """Return the measurement that a packet completes."""
         raise NotImplementedError
 
 
