@@ -48,12 +48,8 @@ class ImuNode(Node):
         self._topic = self.resolve_topic_name(values["input_topic"])
         if self._topic in (PITCH_YAW, DATA):
             raise ParameterError("input_topic", values["input_topic"], "a topic that this node does not publish")
-        self._estimator = TrunkEstimator(
-            values["rotation_trunk_from_imu"],
-            values["rate"],
-            values["gyroscope_range"],
-            values["accelerometer_range"],
-        )
+        settings = ("rotation_trunk_from_imu", "rate", "gyroscope_range", "accelerometer_range")
+        self._estimator = TrunkEstimator(*(values[name] for name in settings))
         self._timeout = values["timeout"]
         self._arrived = time.monotonic()
         self._driver = Publishers()
@@ -218,19 +214,15 @@ def message_of(sample: ImuSample) -> Imu:
     """Return the sample's message, in the IMU's axes; what was not measured has the covariance -1 (REP-145)."""
     message = Imu()
     message.header.stamp, message.header.frame_id = Time(nanoseconds=round(sample.time * 1e9)).to_msg(), "imu"
-    q, w, a = message.orientation, message.angular_velocity, message.linear_acceleration
-    if sample.orientation is None:
-        message.orientation_covariance[0] = NOT_REPORTED
-    else:
-        q.x, q.y, q.z, q.w = sample.orientation
-    if sample.angular_velocity is None:
-        message.angular_velocity_covariance[0] = NOT_REPORTED
-    else:
-        w.x, w.y, w.z = sample.angular_velocity
-    if sample.acceleration is None:
-        message.linear_acceleration_covariance[0] = NOT_REPORTED
-    else:
-        a.x, a.y, a.z = sample.acceleration
+    for vector, covariance, values in (
+        (message.orientation, message.orientation_covariance, sample.orientation),
+        (message.angular_velocity, message.angular_velocity_covariance, sample.angular_velocity),
+        (message.linear_acceleration, message.linear_acceleration_covariance, sample.acceleration),
+    ):
+        if values is None:
+            covariance[0] = NOT_REPORTED
+        for axis, value in zip("xyzw", values or (), strict=False):
+            setattr(vector, axis, value)
     return message
 
 

@@ -31,47 +31,47 @@ RESPONSES = (0.070, (150.0, 700.0), "deg/s"), (0.122, (50.0, 1700.0), "mg")  # g
 class Lsm6dsox(FifoSource):
     """An LSM6DSOX or LSM6DSO. Its low-pass filters follow its rate without further registers."""
 
-    IDENTITY, TEMPERATURE, ORDER, SETTLING, PACKET = WHO_AM_I, OUT_TEMP_L, "<", 0.1, 7
+    WHO_AM_I, TEMPERATURE, ORDER, SETTLING, PACKET = WHO_AM_I, OUT_TEMP_L, "<", 0.1, 7
     KNOWN: ClassVar = {0x6C: "LSM6DSOX"}
     thermometer = 256.0, 25.0
     _half: tuple[int, int, Axes] | None = None  # tag, time slot and axes that wait for the other sensor's
 
     def _set_up(self, rate: float, self_test: bool) -> float:
-        self._registers.write(CTRL3_C, SOFTWARE_RESET)
+        self._write(CTRL3_C, SOFTWARE_RESET)
         for _ in range(10):
             self._wait(0.01)
-            if not self._registers.read(CTRL3_C) & SOFTWARE_RESET:
+            if not self._read(CTRL3_C) & SOFTWARE_RESET:
                 break
         else:
-            raise DeviceError(self._registers.name, "does not finish its reset", CTRL3_C)
-        self._registers.set({CTRL9_XL: NO_I3C, CTRL3_C: WHOLE_SAMPLES})
+            raise DeviceError(self.name, "does not finish its reset", CTRL3_C)
+        self._set({CTRL9_XL: NO_I3C, CTRL3_C: WHOLE_SAMPLES})
         if self_test:
             self._test(1, CTRL1_XL, SELECT_4_G, 52.0, OUTX_L_A, 0x01)
             self._test(0, CTRL2_G, SELECT_2000_DPS, 208.0, OUTX_L_G, 0x04)
         rate = min(RATES, key=lambda candidate: abs(candidate - rate))
         code = RATES[rate]
         rates = {FIFO_CTRL3: code << 4 | code, CTRL1_XL: code << 4 | SELECT_16_G, CTRL2_G: code << 4 | SELECT_2000_DPS}
-        self._registers.set(rates)
+        self._set(rates)
         self._empty_fifo()
         return rate
 
     def _test(self, sensor: int, control: int, scale: int, rate: float, data: int, actuators: int) -> None:
         """Compare means of 5 samples with the actuators off and on, as the manufacturer's example does."""
-        self._registers.set({control: RATES[rate] << 4 | scale})
+        self._set({control: RATES[rate] << 4 | scale})
         # The chip's clock may be slow.
         response = self._responses({CTRL5_C: 0}, {CTRL5_C: actuators}, [data], 5, 1.1 / rate)
-        self._registers.set({CTRL5_C: 0, control: OFF})
+        self._set({CTRL5_C: 0, control: OFF})
         lsb, limits, unit = RESPONSES[sensor]
         for axis, value in enumerate(response):
             self._judge(3 * sensor + axis, abs(lsb * value), limits, unit)
 
     def _empty_fifo(self) -> None:
         self._half = None
-        self._registers.write(FIFO_CTRL4, OFF)
-        self._registers.write(FIFO_CTRL4, CONTINUOUS)
+        self._write(FIFO_CTRL4, OFF)
+        self._write(FIFO_CTRL4, CONTINUOUS)
 
     def _queue(self) -> tuple[int, int | None]:
-        low, high = self._registers.read_block(FIFO_STATUS1, 2)
+        low, high = self._read_block(FIFO_STATUS1, 2)
         return FIFO_DATA_OUT_TAG, None if high & LOST_WORDS else (high & 0x03) << 8 | low
 
     def _decode(self, packet: bytes) -> Measurement | None:

@@ -1,5 +1,6 @@
 """What every source of IMU samples shares: their stamps, and an IMU that is unplugged and plugged in again."""
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -92,15 +93,11 @@ class SampleClock:
         """
         if not skipped:
             return []
-        steps = len(skipped) + sum(skipped)
         self.lost += sum(skipped)
-        start, newest = self._span(arrival, steps)
-        self._last = newest
-        step, stamps, position = (newest - start) / steps, [], 0
-        for missing in skipped:
-            position += missing + 1
-            stamps.append(start + position * step)
-        return stamps
+        positions = list(itertools.accumulate(missing + 1 for missing in skipped))
+        start, self._last = self._span(arrival, positions[-1])
+        step = (self._last - start) / positions[-1]
+        return [start + position * step for position in positions]
 
     def _span(self, arrival: float, steps: int) -> tuple[float, float]:
         """Return the stamp before the first and that of the last of `steps` periods."""
