@@ -187,8 +187,7 @@ class TrunkEstimator:
         spin_up, speed = (math.dist(first, middle) + math.dist(middle, rate)) / dt, math.hypot(*rate)
         if self._count:
             share, length = 1.0 / (self._count * STANDARD_GRAVITY), math.hypot(*force) / STANDARD_GRAVITY
-            x, y, z = self._total
-            agreement.check(dt, quaternion, (share * x, share * y, share * z), length, spin_up + speed * speed)
+            agreement.check(dt, quaternion, plus(ZERO, self._total, share), length, spin_up + speed * speed)
         self._speed = max(sum(map(abs, rate)), self._speed * (1.0 - dt))
         contradiction = agreement.contradiction + self._speed * self._clock.offset
         self._uncertainty.advance(dt, len(rates) - 1, spin_up, bias_sigma, agreement.square, contradiction)
