@@ -21,7 +21,7 @@ ROOT = Path(__file__).parent
 UNDER_COLCON = "COLCON" in os.environ
 # What a file starts as a process or by its path needs its packages too.
 STARTS = {
-    "test/support/launched_nodes.py": ("exo_gravity.nodes.simulator", "exo_gravity.nodes.imu.node"),
+    "test/support/launched_nodes.py": ("exo_gravity.nodes.simulator", "exo_gravity.nodes.imu"),
     "test/test_docs.py": ("docs.tables",),
     "test/test_examples.py": ("examples.simulated_loop", "examples.emg_assistance", "examples.teach_and_repeat"),
 }

@@ -75,17 +75,6 @@ class TrunkOrientation(NamedTuple):
 class TrunkEstimator:
     """Follows one IMU; where VQF is installed, it need not report its orientation."""
 
-    _agreement, _clock = imu_checks.Agreement(), imu_checks.ClockCheck()
-    _is_fused: bool | None = None  # None before the first sample
-    _time = -math.inf
-    _quaternion: Quaternion | None  # of the IMU by the last sample, world from IMU
-    _force: Floats3 | None  # m/s^2, of the last sample
-    _rates: list[Floats3]  # rad/s, since the last judgement and at it
-    _total: Floats3  # m/s^2, of the forces since then, and
-    _count: int  # how many they are
-    _judged: float  # s, of the sample of the last judgement
-    _speed: float  # rad/s, the highest in the last second
-
     def __init__(
         self,
         rotation_trunk_from_imu: Sequence[float],
@@ -107,8 +96,25 @@ class TrunkEstimator:
         ranges = imu_checks.ACCELEROMETER_RANGES
         self._strongest = one_float("accelerometer_range", accelerometer_range, *ranges, "m/s^2")
         self._fusion = VqfFusion(self._period) if VQF else None
-        self._equal = imu_checks.EqualValues()
+        self._equal, self._clock = imu_checks.EqualValues(), imu_checks.ClockCheck()
+        self._agreement = imu_checks.Agreement()
+        self._is_fused: bool | None = None  # None before the first sample
+        self._time = -math.inf
         self._restart("no sample yet")
+
+    def _restart(self, why: str, is_suspect: bool = False) -> None:
+        """Begin anew with the next sample, or the present one."""
+        if self._fusion:
+            self._fusion.restart()
+        self._why = why  # there is no orientation yet
+        self._uncertainty = TiltUncertainty(self._period)
+        self._agreement = imu_checks.Agreement(is_suspect or self._agreement.is_suspect)
+        self._quaternion: Quaternion | None = None  # of the IMU by the last sample, world from IMU
+        self._force: Floats3 | None = None  # m/s^2, of the last sample
+        self._speed = 0.0  # rad/s, the highest in the last second
+        self._judged = self._time  # s, of the sample of the last judgement
+        self._rates: list[Floats3] = []  # rad/s, at it and since then
+        self._total, self._count = ZERO, 0  # m/s^2, sum of the forces since then, and how many they are
 
     @property
     def gyroscope_bias(self) -> np.ndarray:
@@ -181,8 +187,7 @@ class TrunkEstimator:
         spin_up, speed = (math.dist(first, middle) + math.dist(middle, rate)) / dt, math.hypot(*rate)
         if self._count:
             share, length = 1.0 / (self._count * STANDARD_GRAVITY), math.hypot(*force) / STANDARD_GRAVITY
-            x, y, z = self._total
-            agreement.check(dt, quaternion, (share * x, share * y, share * z), length, spin_up + speed * speed)
+            agreement.check(dt, quaternion, plus(ZERO, self._total, share), length, spin_up + speed * speed)
         self._speed = max(sum(map(abs, rate)), self._speed * (1.0 - dt))
         contradiction = agreement.contradiction + self._speed * self._clock.offset
         self._uncertainty.advance(dt, len(rates) - 1, spin_up, bias_sigma, agreement.square, contradiction)
@@ -201,17 +206,6 @@ class TrunkEstimator:
         self._restart(f"gap of {dt:.2f} s" if is_fused is self._is_fused else "started")
         self._is_fused, self._clock = is_fused, imu_checks.ClockCheck()
         return 0.0
-
-    def _restart(self, why: str, is_suspect: bool = False) -> None:
-        """Begin anew with the next sample, or the present one."""
-        if self._fusion:
-            self._fusion.restart()
-        self._uncertainty = TiltUncertainty(self._period)
-        self._agreement = imu_checks.Agreement(is_suspect or self._agreement.is_suspect)
-        self._why = why  # there is no orientation yet
-        self._quaternion = self._force = None
-        self._judged, self._speed = self._time, 0.0
-        self._rates, self._total, self._count = [], ZERO, 0
 
 
 class VqfFusion:

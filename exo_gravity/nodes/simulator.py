@@ -22,7 +22,7 @@ from exo_gravity.core.motors.joint_motor import OPTIONS, buses_of, channels_of
 from exo_gravity.core.trial.script import IDLE, Step, TrialScript
 from exo_gravity.core.trunk.imu_checks import ImuSample
 from exo_gravity.hardware.can.can_port import open_bus
-from exo_gravity.nodes.imu.device import message_of
+from exo_gravity.nodes.imu import message_of
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
 from exo_gravity.nodes.ros.parameters import accept_changes, bus_of, declare
 from exo_gravity.nodes.ros.run import run

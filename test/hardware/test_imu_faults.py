@@ -143,6 +143,15 @@ def test_a_saturated_sample_is_carried_as_uncertainty_and_a_longer_saturation_wi
     assert np.nanmax(outcome.errors) < WRONG
 
 
+@pytest.mark.parametrize("size", [10.0, 30.0])
+def test_a_single_wrong_rate_is_withheld_as_the_turn_that_it_may_hide(size):
+    for wrong in (400, 700, 1000):
+        gyroscope = MOTION.gyroscope.copy()
+        gyroscope[wrong, 1] += size
+        outcome = follow(Motion(**{**vars(MOTION), "gyroscope": gyroscope}))
+        assert np.isnan(outcome.errors[wrong]) and np.nanmax(outcome.errors) < 1.5
+
+
 def test_an_uncertain_estimate_comes_back_without_a_jump():
     outcome = follow(saturated(0.05))
     back = np.flatnonzero(np.isfinite(outcome.errors) & (MOTION.times > 5.05))

@@ -19,7 +19,7 @@ from sensor_msgs.msg import Imu
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
-from exo_gravity.nodes.imu.node import ImuNode as ImuShell
+from exo_gravity.nodes.imu import ImuNode as ImuShell
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 
 from ..support.handheld_imu import read_recording
@@ -28,7 +28,7 @@ G = 9.80665
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 MOUNTING = Rotation.from_euler("xyz", (math.pi / 2, 0.0, math.pi / 2))  # trunk from IMU: its x points left, its y up
 AHEAD = 25  # samples in flight: fewer than the node queues, so that none is lost
-NODE = [sys.executable, "-c", "from exo_gravity.nodes.imu.node import main; main()", "--ros-args"]
+NODE = [sys.executable, "-c", "from exo_gravity.nodes.imu import main; main()", "--ros-args"]
 
 
 class ImuNode:

@@ -11,8 +11,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.time import Time
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.nodes.imu.device import ImuDevice
-from exo_gravity.nodes.imu.node import ImuNode
+from exo_gravity.nodes.imu import ImuDevice, ImuNode
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.run import keep_to_this_machine
 
@@ -89,20 +88,20 @@ def test_a_message_is_stamped_when_it_was_taken_and_states_what_is_not_measured(
 def test_a_sensor_that_is_unplugged_is_named_and_comes_back_by_itself(rig):
     rig.open()
     rig.poll(1)
-    assert rig.device.problem == "" and rig.device.values["device"] == f"BNO085 on {rig.sensor.port}"
+    assert rig.device.reopening.problem == "" and rig.device.values["device"] == f"BNO085 on {rig.sensor.port}"
     rig.sensor.unplug()
     rig.poll(1, sends=False)
-    assert f"BNO085 on {rig.sensor.port}: cannot be" in rig.device.problem
+    assert f"BNO085 on {rig.sensor.port}: cannot be" in rig.device.reopening.problem
     rig.sensor.plug()
     rig.poll(52, sends=False)
     rig.poll(1)
-    assert len(rig.received) == 2 and rig.device.problem == "" and rig.device.values["opened"] == 2
+    assert len(rig.received) == 2 and rig.device.reopening.problem == "" and rig.device.values["opened"] == 2
 
 
 def test_a_sensor_that_is_missing_at_the_start_is_waited_for(rig):
     rig.sensor.unplug()
     rig.open()
-    assert "cannot be opened" in rig.device.problem
+    assert "cannot be opened" in rig.device.reopening.problem
     rig.sensor.plug()
     rig.poll(52, sends=False)
     rig.poll(1)

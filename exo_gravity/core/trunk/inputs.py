@@ -159,7 +159,7 @@ class FeltMotion:
     """Follows the samples of one IMU."""
 
     def __init__(self) -> None:
-        self._samples: deque[tuple[float, list[float]]] = deque()
+        self._samples: deque[tuple[float, tuple[float, ...]]] = deque()
         self._time = -math.inf  # of the newest sample
         self._parabola: np.ndarray | None = None  # (3, 6), coefficients of (t^2, t, 1) for force and angular velocity
 
@@ -170,9 +170,8 @@ class FeltMotion:
 
         An older sample than the newest is ignored. Raises ParameterError unless all numbers are finite.
         """
-        values = [*map(float, specific_force), *map(float, angular_velocity)]
-        if len(values) != 6 or not all(map(math.isfinite, values)):
-            raise ParameterError("linear_acceleration, angular_velocity", values, "3 finite numbers each")
+        force = three_floats("linear_acceleration", specific_force)
+        values = force + three_floats("angular_velocity", angular_velocity)
         time = now - max(0.0, age)
         if not time > self._time:
             return

@@ -4,8 +4,8 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from exo_gravity.core.errors import DeviceError, ParameterError
-from exo_gravity.hardware.imu_sources.i2c import Bus, FifoSource, Registers, open_bus
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.hardware.imu_sources.i2c import Bus, FifoSource, open_bus
 from exo_gravity.hardware.imu_sources.invensense import Icm20948, Mpu6050
 from exo_gravity.hardware.imu_sources.lsm6dsox import Lsm6dsox
 from exo_gravity.hardware.imu_sources.serial_sensors import Bno085, WitMotion
@@ -35,18 +35,11 @@ def open_source(
     ParameterError if a parameter does not suit the device or a library is missing.
     """
     kind = values["source"]
-    if kind == "topic":
-        raise ParameterError("source", kind, "a device")
     if kind in CHIPS:
         chip, usual_address = CHIPS[kind]
         number = values["i2c.bus"]
-        bus = open_i2c(number)
-        registers = Registers(bus, values["i2c.address"] or usual_address, kind, f"/dev/i2c-{number}")
-        try:
-            return chip(registers, values["rate"], clock, wait, self_test)
-        except DeviceError:
-            registers.close()
-            raise
+        where = f"/dev/i2c-{number}", values["i2c.address"] or usual_address
+        return chip(kind, open_i2c(number), where, values["rate"], clock, wait, self_test)
     port, baud = values["serial.port"], values["serial.baud"]
     if not port:
         raise ParameterError("serial.port", port, "the sensor's port, e.g. /dev/ttyUSB0")

@@ -10,31 +10,27 @@ against PX4, InvenSense_ICM20948_registers.hpp.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.hardware.imu_sources.i2c import FifoSource, Limits, Registers
+from exo_gravity.hardware.imu_sources.i2c import FifoSource, Limits, Values
 from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Measurement
 
-SAMPLE = 12  # bytes in the FIFO
 RADIANS_PER_LSB = RADIANS_PER_DEGREE / 16.4  # at 2000 deg/s
 ACCELERATION_PER_LSB = STANDARD_GRAVITY / 2048.0  # at 16 g
 READINGS = 200  # of each mean of the self-test
 START_UP = 0.1  # s after a reset, and after waking
 RESET, BEST_CLOCK = 0x80, 0x01  # PWR_MGMT_1
 
-Values = dict[int, int]  # of registers, in the order in which they are written
 
-
-def _factory_6500(registers: Registers, firsts: tuple[int, int]) -> list[float]:
+def _factory_6500(stored: bytes) -> list[float]:
     """Return the factory's responses, angular velocity first, in LSB at 250 deg/s and 2 g; 0: it stored none."""
-    codes = [code for first in firsts for code in registers.read_block(first, 3)]
-    return [2620.0 * 1.01 ** (code - 1) if code else 0.0 for code in codes]
+    return [2620.0 * 1.01 ** (code - 1) if code else 0.0 for code in stored]
 
 
-def _factory_6050(registers: Registers, firsts: tuple[int, int]) -> list[float]:
+def _factory_6050(stored: bytes) -> list[float]:
     """Return the same of an MPU-6050, at 250 deg/s and 8 g (RM-MPU-6000A 4.1)."""
-    *codes, low_bits = registers.read_block(firsts[0], 4)
+    *codes, low_bits = stored
     rates = [25.0 * 131.0 * 1.046 ** ((code & 0x1F) - 1) if code & 0x1F else 0.0 for code in codes]
     codes = [code >> 5 << 2 | low_bits >> (4 - 2 * axis) & 3 for axis, code in enumerate(codes)]
     forces = [4096.0 * 0.34 * (0.92 / 0.34) ** ((code - 1) / 30.0) if code else 0.0 for code in codes]
@@ -54,9 +50,9 @@ class Map(NamedTuple):
     tested: Values  #: of the self-test, for 250 deg/s, 1 kHz
     off: Values  #: without the self-test's actuators
     on: Values  #: with them
-    firsts: tuple[int, int]  #: registers of the factory's response, of angular velocity and of acceleration
+    stored: Values  #: registers from which on the factory stored its response, and how many they are
     #: The response that these say, and its limits: shares of it, or in LSB of either sign without one.
-    factory: Callable[[Registers, tuple[int, int]], list[float]] = _factory_6500
+    factory: Callable[[bytes], list[float]] = _factory_6500
     shares: tuple[Limits, Limits] = (0.5, math.inf), (0.5, 1.5)
     without: tuple[Limits, Limits] = (60.0 * 131.0, math.inf), (225.0 * 16.384, 675.0 * 16.384)  # 60 deg/s, 225 mg
 
@@ -79,7 +75,7 @@ MPU_6500 = Map(
     tested={0x1A: 2, 0x1D: 2, 0x19: 0},
     off={0x1B: 0, 0x1C: 0},
     on={0x1B: 0xE0, 0x1C: 0xE0},
-    firsts=(0x00, 0x0D),
+    stored={0x00: 3, 0x0D: 3},
 )
 # Its CONFIG filters both sensors, and its test is at 8 g. Limits: 14 % (PS-MPU-6000A 6.1), or none.
 MPU_6050 = MPU_6500._replace(
@@ -87,7 +83,7 @@ MPU_6050 = MPU_6500._replace(
     tested={0x1A: 2, 0x19: 0},
     off={0x1B: 0, 0x1C: 0x10},
     on={0x1B: 0xE0, 0x1C: 0xF0},
-    firsts=(0x0D, 0x0D),
+    stored={0x0D: 4},
     factory=_factory_6050,
     shares=((0.86, 1.14), (0.86, 1.14)),
     without=((0.0, math.inf), (0.0, math.inf)),
@@ -115,35 +111,35 @@ ICM_20948 = Map(
     tested={0x200: 0, 0x211: 0, 0x201: 0x11, 0x214: 0x11},  # filter 2, 250 deg/s, 2 g
     off={0x202: 0, 0x215: 0},
     on={0x202: 0x38, 0x215: 0x1C},
-    firsts=(0x102, 0x10E),
+    stored={0x102: 3, 0x10E: 3},
 )
 
 
 class InvenSense(FifoSource):
     """Base of the InvenSense chips."""
 
-    ORDER, SETTLING = ">", 0.02
+    ORDER, SETTLING, PACKET = ">", 0.02, 12
     map: Map
     capacity = 512  # bytes of the FIFO
     thermometer = 333.87, 21.0
 
     def _set_up(self, rate: float, self_test: bool) -> float:
         for value in (RESET, BEST_CLOCK):
-            self._registers.write(self.map.power[0], value)
+            self._write(self.map.power[0], value)
             self._wait(START_UP)
-        self._registers.set({self.map.power[1]: 0})
+        self._set({self.map.power[1]: 0})
         if self_test:
-            self._registers.set(self.map.tested)
+            self._set(self.map.tested)
             self._test(self._responses(self.map.off, self.map.on, self.map.data, READINGS, 1e-3))
         divider = min(max(round(self.map.base_rate / rate) - 1, 0), 255)
         rate = self.map.base_rate / (1 + divider)
         widest = next((code for code, width in self.map.bandwidths.items() if width <= rate / 2), 6)
-        self._registers.set(self.map.set_up(divider, widest))
+        self._set(self.map.set_up(divider, widest))
         self._empty_fifo()
         return rate
 
     def _test(self, response: Sequence[float]) -> None:
-        factory = self.map.factory(self._registers, self.map.firsts)
+        factory = self.map.factory(b"".join(self._read_block(*block) for block in self.map.stored.items()))
         for axis, (value, expected) in enumerate(zip(response, factory, strict=True)):
             low, high = self.map.shares[axis // 3]
             limits = sorted((low * expected, high * expected)) if expected else self.map.without[axis // 3]
@@ -151,25 +147,22 @@ class InvenSense(FifoSource):
 
     def _empty_fifo(self) -> None:
         for register, value in self.map.emptied:
-            self._registers.write(register, value)
+            self._write(register, value)
 
-    def _drain(self) -> list[Measurement]:
-        count = int.from_bytes(self._registers.read_block(self.map.fifo[0], 2), "big") & 0x1FFF
+    def _queue(self) -> tuple[int, int | None]:
+        count, data = self.map.fifo
+        used = int.from_bytes(self._read_block(count, 2), "big") & 0x1FFF
         # Not the overflow flag: on some of these chips it is always set (Linux: inv_mpu_ring.c).
-        if count > self.capacity - SAMPLE:
-            return self._lose("FIFO overflowed")
-        data = self._registers.read_block(self.map.fifo[1], count // SAMPLE * SAMPLE, SAMPLE)
-        samples = (data[start : start + SAMPLE] for start in range(0, len(data), SAMPLE))
-        return [
-            Measurement(self._axes(sample[6:], RADIANS_PER_LSB), self._axes(sample[:6], ACCELERATION_PER_LSB))
-            for sample in samples
-        ]
+        return data, None if used > self.capacity - self.PACKET else used // self.PACKET
+
+    def _decode(self, packet: bytes) -> Measurement:
+        return Measurement(self._axes(packet[6:], RADIANS_PER_LSB), self._axes(packet[:6], ACCELERATION_PER_LSB))
 
 
 class Mpu6050(InvenSense):
     """An MPU-6050 or one of its successors."""
 
-    IDENTITY, TEMPERATURE, map = 0x75, 0x41, MPU_6500
+    WHO_AM_I, TEMPERATURE, map = 0x75, 0x41, MPU_6500
     KNOWN: ClassVar = {0x68: "MPU-6050", 0x70: "MPU-6500", 0x71: "MPU-9250", 0x73: "MPU-9255"}
 
     def _set_up(self, rate: float, self_test: bool) -> float:
@@ -181,10 +174,5 @@ class Mpu6050(InvenSense):
 class Icm20948(InvenSense):
     """An ICM-20948, whose registers lie in four banks. Its magnetometer is not used."""
 
-    IDENTITY, TEMPERATURE, map = 0x000, 0x039, ICM_20948
+    WHO_AM_I, TEMPERATURE, IS_BANKED, map = 0x000, 0x039, True, ICM_20948
     KNOWN: ClassVar = {0xEA: "ICM-20948"}
-
-    def __init__(self, registers: Registers, *arguments: Any, **options: Any) -> None:
-        """Set up the chip; see `FifoSource`."""
-        registers.is_banked = True
-        super().__init__(registers, *arguments, **options)

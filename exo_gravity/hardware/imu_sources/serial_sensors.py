@@ -6,10 +6,8 @@ is east, north, up. Rate and content are set at each opening, and not saved.
 
 BNO085 (BNO080, BNO086) in its UART-RVC mode: 100 packets of 19 bytes a second, already fused. 0xAA 0xAA, a counter,
 yaw, pitch, roll in 0.01 degrees, acceleration x y z in mg with gravity, three reserved bytes, the sum of all but the
-header (data sheet 1000-3927, 1.3.5.2). There is no gyroscope in it. The data sheet turns by yaw, then pitch, then roll,
-and calls y the pitch's axis and x the roll's. Its own example contradicts it: pitch -1.10 and roll 20.85 degrees with
-an acceleration of (-371, -20, 977) mg, which is what gravity gives for a pitch about x and a roll about y. So it is
-done here: yaw about z, pitch about x', roll about y''.
+header (data sheet 1000-3927, 1.3.5.2). There is no gyroscope in it. It yaws about z, pitches about x' and rolls about
+y'', by the data sheet's example, which its text contradicts (docs/imu.md).
 """
 
 import contextlib
@@ -39,11 +37,7 @@ RVC_ANGLE, RVC_ACCELERATION = 0.01 * RADIANS_PER_DEGREE, 1e-3 * STANDARD_GRAVITY
 
 
 class SerialSource(ImuSource):
-    """Base of the sensors on serial ports, which are read without waiting.
-
-    Their packets have one length. They are cut out of the stream of bytes; after lost or extra bytes their start is
-    found again.
-    """
+    """Base of the sensors on serial ports. After lost or extra bytes the start of a packet is found again."""
 
     HEADER: ClassVar[bytes]
     LENGTH: ClassVar[int]  # bytes of a packet
@@ -70,18 +64,11 @@ class SerialSource(ImuSource):
         with contextlib.suppress(OSError):
             self._port.close()
 
-    def _measure(self, now: float) -> list[Measurement]:
+    def _packets(self, now: float) -> list[bytes]:
         try:
-            data = bytes(self._port.read(self._port.in_waiting))
+            data = self._port.read(self._port.in_waiting)
         except OSError as error:
             raise DeviceError(self.name, f"cannot be read: {error}") from None
-        packets = self._packets(data)
-        if data:
-            self.silence = "not one byte" if packets else "bytes, but no whole packet: is serial.baud the sensor's?"
-        return [measurement for packet in packets if (measurement := self._decode(packet))]
-
-    def _packets(self, data: bytes) -> list[bytes]:
-        """Return the whole packets that `data` completes."""
         self._pending += data
         packets, at = [], 0
         while len(self._pending) - at >= self.LENGTH:
@@ -94,15 +81,13 @@ class SerialSource(ImuSource):
             self._in_step = is_whole
             at += self.LENGTH if is_whole else 1
         del self._pending[:at]
+        if data:
+            self.silence = "not one byte" if packets else "bytes, but no whole packet: is serial.baud the sensor's?"
         return packets
 
     def _is_whole(self, packet: bytes) -> bool:
         """Return whether the sum of the packet's content is right."""
         return sum(packet[self.SUMMED : -1]) & 0xFF == packet[-1]
-
-    def _decode(self, packet: bytes) -> Measurement | None:
-        """Return the measurement that a packet completes."""
-        raise NotImplementedError
 
 
 class WitMotion(SerialSource):

@@ -1,5 +1,6 @@
 """What every source of IMU samples shares: their stamps, and an IMU that is unplugged and plugged in again."""
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -48,7 +49,7 @@ class ImuSource:
     def read(self) -> list[ImuSample]:
         """Return every sample since the last call, the oldest first, without waiting for one. Raises DeviceError."""
         arrival = self._clock()
-        measurements = self._measure(arrival)
+        measurements = [measured for packet in self._packets(arrival) if (measured := self._decode(packet))]
         stamps = self._sample_clock.stamps(arrival, [measurement.skipped for measurement in measurements])
         if self._sample_clock.lost > self.lost:
             self.lost, self.loss = self._sample_clock.lost, self._why_lost or "not read in time"
@@ -59,8 +60,12 @@ class ImuSource:
         """Release the device; never raises."""
         raise NotImplementedError
 
-    def _measure(self, now: float) -> list[Measurement]:
-        """Return what the device has measured since the last call, the oldest first."""
+    def _packets(self, now: float) -> list[bytes]:
+        """Return the packets that the device has sent since the last call, the oldest first."""
+        raise NotImplementedError
+
+    def _decode(self, packet: bytes) -> Measurement | None:
+        """Return the measurement that a packet completes."""
         raise NotImplementedError
 
 
@@ -88,15 +93,11 @@ class SampleClock:
         """
         if not skipped:
             return []
-        steps = len(skipped) + sum(skipped)
         self.lost += sum(skipped)
-        start, newest = self._span(arrival, steps)
-        self._last = newest
-        step, stamps, position = (newest - start) / steps, [], 0
-        for missing in skipped:
-            position += missing + 1
-            stamps.append(start + position * step)
-        return stamps
+        positions = list(itertools.accumulate(missing + 1 for missing in skipped))
+        start, self._last = self._span(arrival, positions[-1])
+        step = (self._last - start) / positions[-1]
+        return [start + position * step for position in positions]
 
     def _span(self, arrival: float, steps: int) -> tuple[float, float]:
         """Return the stamp before the first and that of the last of `steps` periods."""

@@ -2,32 +2,39 @@
 
 While samples are missing, impossible, frozen, not yet settled or from two publishers, it publishes nothing: the tilt
 grows old, the compensator withdraws, and `can_bridge` latches the fault. The reason is logged once, and stays on
-/diagnostics while it lasts.
+/diagnostics while it lasts. Samples of a device also go out on the topic that a driver would use, so that recordings
+and `calibrate imu` have them.
 """
 
 import math
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Vector3, Vector3Stamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.time import Time
 from sensor_msgs.msg import Imu
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Rate
+from exo_gravity.core.trunk.inputs import NOT_REPORTED
 from exo_gravity.core.trunk.params import IMU
+from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
+from exo_gravity.hardware.imu_sources import Reopening, open_source
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator, TrunkOrientation
-from exo_gravity.nodes.imu.device import ImuDevice
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import DATA, PITCH_YAW, HotPath, Publishers
+from exo_gravity.nodes.ros.subscriptions import DATA, PITCH_YAW, Callback, HotPath, Publishers, Repeated
 
 # The fusion integrates every sample. A queue of depth 1 would lose samples whenever the node is delayed.
 DEPTH = 50
 WATCH_PERIOD = 0.1  # s
+POLLS_A_SAMPLE = 2.0  # of a device
+MIN_POLL_PERIOD = 0.002  # s
 SAME_CLOCK = 5.0  # s between stamp and arrival
 UNKNOWN_HEADING = math.pi**2  # rad^2, its variance
 
@@ -41,12 +48,8 @@ class ImuNode(Node):
         self._topic = self.resolve_topic_name(values["input_topic"])
         if self._topic in (PITCH_YAW, DATA):
             raise ParameterError("input_topic", values["input_topic"], "a topic that this node does not publish")
-        self._estimator = TrunkEstimator(
-            values["rotation_trunk_from_imu"],
-            values["rate"],
-            values["gyroscope_range"],
-            values["accelerometer_range"],
-        )
+        settings = ("rotation_trunk_from_imu", "rate", "gyroscope_range", "accelerometer_range")
+        self._estimator = TrunkEstimator(*(values[name] for name in settings))
         self._timeout = values["timeout"]
         self._arrived = time.monotonic()
         self._driver = Publishers()
@@ -125,8 +128,8 @@ class ImuNode(Node):
         }
         if self._device:
             values |= self._device.values
-        if self._device and self._device.problem:
-            self._diagnostics.report(ERROR, self._device.problem, values)
+        if self._device and self._device.reopening.problem:
+            self._diagnostics.report(ERROR, self._device.reopening.problem, values)
         elif not self._received:
             self._diagnostics.report(WARN, f"waiting for {self._topic}", values)
         elif age > self._timeout:
@@ -141,15 +144,86 @@ class ImuNode(Node):
             self._diagnostics.report(OK, "publishing", values)
 
 
+class ImuDevice(Repeated):
+    """Calls `callback(message, info)` for each sample of a device: on a thread after `start`, or in each `poll`."""
+
+    def __init__(
+        self, node: Node, values: Mapping[str, Any], topic: str, callback: Callback, clock: Clock = COMPUTER_CLOCK
+    ) -> None:
+        """Open the device that the parameter values name; if it is missing, it is looked for again and again.
+
+        topic: gets the messages too. clock: of the pauses between attempts; the stamps are by the node's. Raises
+        ParameterError if a parameter does not suit the device.
+        """
+        period = max(MIN_POLL_PERIOD, 1.0 / (POLLS_A_SAMPLE * values["rate"]))
+        super().__init__(values["source"], self.poll, period)
+        self._node, self._callback, self._clock = node, callback, clock
+        self._publisher = node.create_publisher(Imu, topic, DEPTH)
+        stamps = node.get_clock()
+        self.reopening = Reopening(
+            lambda self_test: open_source(values, lambda: stamps.now().nanoseconds * 1e-9, self_test, wait=clock.sleep)
+        )
+        self._number = 0  # of the last message
+        self._lost = 0  # samples, as last logged
+        self.poll()
+
+    @property
+    def values(self) -> dict[str, object]:
+        """What is known of the device, for /diagnostics."""
+        source, opened = self.reopening.source, self.reopening.openings
+        if source is None:
+            return {"device": "closed", "opened": opened}
+        return {
+            "device": source.name,
+            "opened": opened,
+            "lost samples": f"{source.lost} {source.loss}".rstrip(),
+            "temperature (degC)": "unknown" if source.temperature is None else f"{source.temperature:.1f}",
+        }
+
+    def stop(self) -> None:
+        """End the thread and close the device."""
+        super().stop()
+        self.reopening.close()
+
+    def poll(self) -> None:
+        """Pass on the samples since the last call; raises ParameterError as the constructor does."""
+        for sample in self.reopening.read(self._clock.monotonic()):
+            message = message_of(sample)
+            self._publisher.publish(message)
+            self._number += 1
+            self._callback(message, {"publication_sequence_number": self._number})
+        source = self.reopening.source
+        lost = source.lost if source else 0
+        if source and lost > self._lost:
+            self._node.get_logger().warning(f"{source.name}: {lost - self._lost} samples lost: {source.loss}")
+        self._lost = lost
+
+
 def sample_of(message: Imu) -> ImuSample:
     """Return the message's sample; a quantity whose covariance says 'not reported' (-1, REP-145) becomes None."""
     q = message.orientation
     return ImuSample(
         to_nanoseconds(message.header.stamp) * 1e-9,
-        None if message.angular_velocity_covariance[0] == -1.0 else _vector(message.angular_velocity),
-        None if message.linear_acceleration_covariance[0] == -1.0 else _vector(message.linear_acceleration),
-        None if message.orientation_covariance[0] == -1.0 else (q.x, q.y, q.z, q.w),
+        None if message.angular_velocity_covariance[0] == NOT_REPORTED else _vector(message.angular_velocity),
+        None if message.linear_acceleration_covariance[0] == NOT_REPORTED else _vector(message.linear_acceleration),
+        None if message.orientation_covariance[0] == NOT_REPORTED else (q.x, q.y, q.z, q.w),
     )
+
+
+def message_of(sample: ImuSample) -> Imu:
+    """Return the sample's message, in the IMU's axes; what was not measured has the covariance -1 (REP-145)."""
+    message = Imu()
+    message.header.stamp, message.header.frame_id = Time(nanoseconds=round(sample.time * 1e9)).to_msg(), "imu"
+    for vector, covariance, values in (
+        (message.orientation, message.orientation_covariance, sample.orientation),
+        (message.angular_velocity, message.angular_velocity_covariance, sample.angular_velocity),
+        (message.linear_acceleration, message.linear_acceleration_covariance, sample.acceleration),
+    ):
+        if values is None:
+            covariance[0] = NOT_REPORTED
+        for axis, value in zip("xyzw", values or (), strict=False):
+            setattr(vector, axis, value)
+    return message
 
 
 def _vector(message: Vector3) -> tuple[float, float, float]:
