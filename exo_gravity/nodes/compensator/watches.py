@@ -164,7 +164,6 @@ class BudgetWatch:
         self.largest_support = "unknown"
         self._logger = node.get_logger()
         self._names = tuple(joint_names)
-        # Without its clients the executor then waits for two entities less.
         self._bridge = NodeParameters(node, "can_bridge", once=True)
         self._request: Request | None = None
         self._job: Future[tuple[str, str]] | None = None
