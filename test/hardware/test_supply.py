@@ -65,6 +65,21 @@ def test_motors_whose_supply_returns_stay_off_until_they_are_enabled(
 
 
 @FORMATS
+@pytest.mark.parametrize(("first", "others"), [(3.0, 9.0), (7.4, 7.6)])
+def test_motors_that_return_one_after_the_other_stay_off(wire_format: WireFormat, first: float, others: float) -> None:
+    """The way down is over before the last motor returns: that must not settle what the first one applies."""
+    arm = Carried(wire_format=wire_format)
+    arm.rig.switch_supply(False)
+    arm.run(0.5)
+    watch = OnWatch(arm.rig)
+    arm.clock.later(first - 0.5, lambda: setattr(arm.rig.device.motors[1], "unplugged", False))
+    arm.clock.later(others - 0.5, lambda: arm.rig.switch_supply(True))
+    arm.run(others + 3.0)
+    assert not watch.was_on
+    assert arm.loop.is_off and arm.safety.state is State.FAULT
+
+
+@FORMATS
 def test_an_arm_whose_bus_was_cut_is_let_down_by_its_motors_that_kept_their_power(wire_format: WireFormat) -> None:
     arm = Carried(wire_format=wire_format)
     arm.rig.device.bus_silent = True

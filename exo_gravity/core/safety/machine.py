@@ -255,7 +255,7 @@ class SafetyMachine:
             self._enter(State.LETTING_DOWN)
         if (all(supply.unsure) and supply.are_off) or descent.is_down(self._now, self._rest.since):
             self.is_unreached = any(silent)
-            supply.settle(silent)
+            supply.settle(may_differ)
             self._enter(State.FAULT if self.fault else State.DISABLED)
             return self._stand()
         columns = zip(self._delivery.missing, silent, supply.unsure, strict=True)
