@@ -169,6 +169,19 @@ def test_a_bridge_that_hands_its_arm_over_is_killed_at_once(bridge: Bridge) -> N
     bridge.rig.assert_let_down()
 
 
+@pytest.mark.parametrize("hands_over", [False, True])
+def test_a_bridge_that_dies_before_it_is_killed_has_its_arm_let_down(bridge: Bridge, hands_over: bool) -> None:
+    def find_none() -> None:
+        bridge.die()
+        raise ProcessLookupError
+
+    bridge.kill = find_none
+    bridge.at(1.0, lambda: bridge.pipe.messages.append("a test") if hands_over else bridge.freeze())
+    assert bridge.guard() == 0
+    assert bridge.log == [f"can_bridge has died: {LET_DOWN[0]}", LET_DOWN[1]]
+    bridge.rig.assert_let_down()
+
+
 @pytest.mark.parametrize("is_frozen", [False, True])
 def test_nothing_is_sent_for_a_bridge_whose_motors_are_off(bridge: Bridge, is_frozen: bool) -> None:
     bridge.drive = OFF

@@ -56,7 +56,7 @@ def guard(
     arm: ArmOnBus | None = None
     clock = notes.clock
     why, silence = "has died", Silence(clock.monotonic(), 2 * POLL)
-    with contextlib.suppress(EOFError, ConnectionError):
+    with contextlib.suppress(EOFError, ConnectionError, ProcessLookupError):  # of `kill`: it has died meanwhile
         while True:
             if receiver.poll(POLL):
                 message = receiver.recv()
