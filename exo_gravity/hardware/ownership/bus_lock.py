@@ -12,7 +12,6 @@ killed, it tells the next owner what the motors still apply.
 import contextlib
 import ctypes
 import errno
-import math
 import mmap
 import os
 import re
@@ -26,7 +25,7 @@ from typing import Any
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import NOTHING, Drive
-from exo_gravity.core.safety.limits import DAMPING
+from exo_gravity.core.safety.limits import DAMPING, MAX_COMMAND
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
 ATTEMPT_TIME = 1.0  # s; a watchdog with nothing to do may take that long to end after its bridge
@@ -106,7 +105,7 @@ class BusLock:
             os.ftruncate(self.descriptor, mmap.PAGESIZE)
         self.notes = DriveNotes.from_buffer(mmap.mmap(self.descriptor, mmap.PAGESIZE))  #: the shared page
         self.notes.clock = clock
-        if not math.isfinite(sum(self.notes.drive.effort + self.notes.drive.damping)):
+        if not all(abs(value) <= MAX_COMMAND for value in self.notes.drive.effort + self.notes.drive.damping):
             self.problem = f"{path}: damaged"
         if self.problem:
             self.notes.note(UNKNOWN_DRIVE)
