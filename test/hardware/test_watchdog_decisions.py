@@ -12,8 +12,7 @@ import pytest
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.drive import OFF
 from exo_gravity.core.safety.limits import FROZEN
-from exo_gravity.hardware.ownership.arm_on_bus import ArmNotes
-from exo_gravity.hardware.ownership.bus_lock import BusLock, DriveNotes
+from exo_gravity.hardware.ownership.bus_lock import ArmNotes, BusLock, DriveNotes
 from exo_gravity.hardware.ownership.owned_bus import HEARTBEAT_TIMEOUT, LONGEST_LOOK, OwnedBus, Silence
 from exo_gravity.hardware.ownership.watchdog import SleepInhibitor, guard
 
