@@ -198,7 +198,8 @@ class CanBridge(LifecycleNode):
         self._report.send(self.loop, self._exchange.command, self._exchange.refusal)
 
     def _look_at(self, watchdog: Watchdog, loop: ControlLoop) -> None:
-        """Let no motor be switched on before the watchdog watches, and none stay on without it."""
+        """Let no motor be switched on before the watchdog watches, and none stay on without it or this node."""
+        loop.attended = time.monotonic()
         loop.safety.hindrance = "the watchdog to start" if watchdog.is_starting else ""
         if not watchdog.alive and loop.safety.state is not State.LETTING_DOWN:
             loop.trip(FaultCode.WATCHDOG_DEAD, "the watchdog process has died, is frozen, or did not start")
