@@ -10,6 +10,7 @@ last noted drive; without a watchdog, the loop lowers the arm without the state 
 
 import contextlib
 import math
+import operator
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
@@ -250,7 +251,8 @@ def lower(bus: MotorBus, drive: Drive, period: float) -> None:
         else:
             faded += period
         supply.step(period, joints, silent)
-        lowered = Drive(effort, (DAMPING,) * len(effort), True, unsure=supply.unsure)
+        unsure = tuple(map(operator.or_, silent, supply.unsure))
+        lowered = Drive(effort, (DAMPING,) * len(effort), True, unsure=unsure)
         with contextlib.suppress(Exception):
             bus.exchange(OFF if is_down else lowered, time + period)
         clock.sleep(max(0.0, time + period - clock.monotonic()))

@@ -13,7 +13,7 @@ from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop
 
-from .simulated_rig import LIMITS
+from .simulated_rig import LIMITS, SAFE_SPEED
 from .virtual_rig import CYCLE, QUICK, Carried, VirtualRig
 
 FORMATS = pytest.mark.parametrize("wire_format", [MIT, MIT_V3], ids=["mit", "mit_v3"])
@@ -103,6 +103,27 @@ def test_a_single_motor_that_restarts_is_switched_on_again_and_let_down_with_the
     assert arm.rig.motors_on == [True] * 4
     arm.run_until(lambda: arm.loop.is_off)
     assert arm.rig.motors_on == [False] * 4
+
+
+@FORMATS
+@pytest.mark.parametrize("away", [0.5, 6.0, 15.0])
+def test_a_single_motor_whose_power_returns_late_does_not_get_its_old_torque(
+    wire_format: WireFormat, away: float
+) -> None:
+    """A command switches a V3 board on: while it does not reply, none is sent that would carry its joint."""
+    arm = Carried(wire_format=wire_format)
+    motor, device_arm = arm.rig.device.motors[1], arm.rig.device.arm
+    motor.unplugged = True
+    arm.run(away)
+    arm.rig.top_speed, motor.unplugged = 0.0, False
+    torques: list[float] = []
+    for _ in range(10):
+        arm.loop.cycle()
+        torques.append(motor.torque(device_arm.positions[1], 0.0))
+    assert max(map(abs, torques)) < 1.0 < arm.rig.carrying[1]
+    arm.run_until(lambda: arm.loop.is_off)
+    assert arm.rig.motors_on == [False] * 4
+    assert arm.rig.top_speed < SAFE_SPEED
 
 
 @pytest.mark.parametrize(("wire_format", "duration"), [(MIT, 10.0), (MIT_V3, 2.0)])
