@@ -9,9 +9,9 @@ from pathlib import Path
 
 from exo_gravity.core.model.gravity import LAWS, Torque
 from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
-from exo_gravity.hardware.ownership.arm_on_bus import ArmOnBus
 from exo_gravity.tools.inputs.arms import read_arm
 from exo_gravity.tools.inputs.parameter_file import can_options, load
 

@@ -9,6 +9,8 @@ last noted drive; without a watchdog, the loop lowers the arm without the state 
 """
 
 import contextlib
+import math
+import operator
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
@@ -17,7 +19,7 @@ from typing import Any
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE
-from exo_gravity.core.safety.drive import NO_COMMAND, OFF, Drive, EffortCommand, FaultCode, State
+from exo_gravity.core.safety.drive import CARRYING, NO_COMMAND, OFF, Drive, EffortCommand, FaultCode, State
 from exo_gravity.core.safety.limits import DAMPING, JointSample
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.monitors import RestTracker, SupplyMonitor
@@ -27,6 +29,7 @@ EFFORT_WAIT = 0.5  # share of a cycle's idle time for which the loop may wait fo
 SMOOTHING = 0.02  # per cycle, of the measured work time
 MAX_ERRORS = 3  # unexpected exceptions in a row after which the state machine is no longer trusted
 SUSPENDED = 1.0  # s; less may be a thread that waited between two looks at a clock
+LONGEST_ABSENCE = 5.0  # s without a sign of the owner, while the arm is carried; its longest request takes 2 s
 HAND_OVER_TIME = 0.5  # s in which a watchdog that takes over has ended this process
 
 # Lowering an arm without the state machine.
@@ -67,6 +70,8 @@ class ControlLoop:
         self.cycle_errors, self.cycle_error = 0, ""
         #: The exception that ended the control, if any.
         self.failure: BaseException | None = None
+        #: s, of the owner's last sign of life; inf if it gives none. One that stands still could not let the arm down.
+        self.attended = math.inf
         #: Its counts may be read, and it may be used within a `call`.
         self.bus = bus
         self._clock = bus.clock
@@ -182,6 +187,9 @@ class ControlLoop:
         if (suspended := self._clock.suspended() - self._suspended) > SUSPENDED:
             self._suspended += suspended
             self.safety.trip(FaultCode.MOTOR_SILENT, f"the computer was suspended for {suspended:.0f} s", now)
+        if now - self.attended > LONGEST_ABSENCE and self.safety.state in CARRYING:
+            reason = f"no service and no timer of the node has run for {LONGEST_ABSENCE:g} s"
+            self.safety.trip(FaultCode.INTERNAL_ERROR, reason, now)
         if self._is_stopping:
             self.safety.disable(now)
         drive = self._drive = self.safety.step(now, tuple(self.bus.samples), efforts)
@@ -243,7 +251,8 @@ def lower(bus: MotorBus, drive: Drive, period: float) -> None:
         else:
             faded += period
         supply.step(period, joints, silent)
-        lowered = Drive(effort, (DAMPING,) * len(effort), True, unsure=supply.unsure)
+        unsure = tuple(map(operator.or_, silent, supply.unsure))
+        lowered = Drive(effort, (DAMPING,) * len(effort), True, unsure=unsure)
         with contextlib.suppress(Exception):
             bus.exchange(OFF if is_down else lowered, time + period)
         clock.sleep(max(0.0, time + period - clock.monotonic()))

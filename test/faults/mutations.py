@@ -88,7 +88,7 @@ MUTATIONS = (
     Mutation(
         "a motor that was switched off is not switched on again",
         ("foreign EXIT to motor 2 while let down", "motor 2 restarts in 30 ms"),
-        (Edit(SAFETY, "missing and not is_silent and not is_unsure for missing", "False for missing"),),
+        (Edit(SAFETY, "missing and not is_unsure for missing", "False for missing"),),
     ),
     Mutation(
         "a second bridge takes the bus",

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.drive import NOTHING, Drive
+from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.ownership.arm_on_bus import ArmOnBus
 from exo_gravity.hardware.ownership.owned_bus import OwnedBus
 
 

@@ -11,9 +11,8 @@ from typing import Any
 from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.motors.wire_formats import MIT, WireFormat
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.hardware.can.can_port import open_bus
+from exo_gravity.hardware.can.can_port import ArmOnBus, open_bus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
-from exo_gravity.hardware.ownership.arm_on_bus import ArmOnBus
 from exo_gravity.sim import ArmConfig
 
 from ..support.ports import own_ports

@@ -10,7 +10,7 @@ from exo_gravity.core.motors.specs import EXIT
 from exo_gravity.core.safety.drive import NOTHING, State
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.control_loop import HAND_OVER_TIME, ControlLoop
+from exo_gravity.hardware.control_loop import HAND_OVER_TIME, LONGEST_ABSENCE, ControlLoop
 
 from ..support.simulated_device import frame
 from .simulated_rig import LIMITS, MOTORS_OF_ARM
@@ -94,6 +94,28 @@ def test_failing_efforts_let_the_arm_down():
     assert "no middleware" in arm.safety.fault.reason
     arm.assert_let_down()
     assert arm.loop.failure is None
+
+
+def test_an_arm_whose_owner_stands_still_is_let_down():
+    """Services, the lease and the look at the watchdog are the owner's: without it no one could let the arm down."""
+    arm = Carried()
+    arm.loop.attended = arm.clock.monotonic()
+    arm.run(0.9 * LONGEST_ABSENCE)
+    arm.loop.attended = arm.clock.monotonic()
+    arm.run(0.9 * LONGEST_ABSENCE)
+    assert arm.safety.state is State.ACTIVE
+    arm.run(0.2 * LONGEST_ABSENCE)
+    assert arm.safety.fault == ("internal_error", "no service and no timer of the node has run for 5 s")
+    arm.assert_let_down()
+
+
+def test_an_owner_that_waits_until_its_arm_is_down_causes_no_fault():
+    arm = Carried()
+    arm.loop.attended = arm.clock.monotonic()
+    arm.safety.disable(arm.clock.monotonic())
+    arm.assert_let_down()
+    arm.run(2.0 * LONGEST_ABSENCE)
+    assert arm.safety.fault is None
 
 
 class Killed(BaseException):

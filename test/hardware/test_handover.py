@@ -9,7 +9,7 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, MotorCommand, unpack_command
 from exo_gravity.core.safety.drive import NOTHING, Drive
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
-from exo_gravity.hardware.ownership.arm_on_bus import ArmOnBus
+from exo_gravity.hardware.can.can_port import ArmOnBus
 
 from .simulated_rig import LIMITS, MOTORS_OF_ARM, PERIOD
 from .virtual_rig import VirtualRig

@@ -13,7 +13,7 @@ from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop
 
-from .simulated_rig import LIMITS
+from .simulated_rig import LIMITS, SAFE_SPEED
 from .virtual_rig import CYCLE, QUICK, Carried, VirtualRig
 
 FORMATS = pytest.mark.parametrize("wire_format", [MIT, MIT_V3], ids=["mit", "mit_v3"])
@@ -65,6 +65,21 @@ def test_motors_whose_supply_returns_stay_off_until_they_are_enabled(
 
 
 @FORMATS
+@pytest.mark.parametrize(("first", "others"), [(3.0, 9.0), (7.4, 7.6)])
+def test_motors_that_return_one_after_the_other_stay_off(wire_format: WireFormat, first: float, others: float) -> None:
+    """The way down is over before the last motor returns: that must not settle what the first one applies."""
+    arm = Carried(wire_format=wire_format)
+    arm.rig.switch_supply(False)
+    arm.run(0.5)
+    watch = OnWatch(arm.rig)
+    arm.clock.later(first - 0.5, lambda: setattr(arm.rig.device.motors[1], "unplugged", False))
+    arm.clock.later(others - 0.5, lambda: arm.rig.switch_supply(True))
+    arm.run(others + 3.0)
+    assert not watch.was_on
+    assert arm.loop.is_off and arm.safety.state is State.FAULT
+
+
+@FORMATS
 def test_an_arm_whose_bus_was_cut_is_let_down_by_its_motors_that_kept_their_power(wire_format: WireFormat) -> None:
     arm = Carried(wire_format=wire_format)
     arm.rig.device.bus_silent = True
@@ -88,6 +103,27 @@ def test_a_single_motor_that_restarts_is_switched_on_again_and_let_down_with_the
     assert arm.rig.motors_on == [True] * 4
     arm.run_until(lambda: arm.loop.is_off)
     assert arm.rig.motors_on == [False] * 4
+
+
+@FORMATS
+@pytest.mark.parametrize("away", [0.5, 6.0, 15.0])
+def test_a_single_motor_whose_power_returns_late_does_not_get_its_old_torque(
+    wire_format: WireFormat, away: float
+) -> None:
+    """A command switches a V3 board on: while it does not reply, none is sent that would carry its joint."""
+    arm = Carried(wire_format=wire_format)
+    motor, device_arm = arm.rig.device.motors[1], arm.rig.device.arm
+    motor.unplugged = True
+    arm.run(away)
+    arm.rig.top_speed, motor.unplugged = 0.0, False
+    torques: list[float] = []
+    for _ in range(10):
+        arm.loop.cycle()
+        torques.append(motor.torque(device_arm.positions[1], 0.0))
+    assert max(map(abs, torques)) < 1.0 < arm.rig.carrying[1]
+    arm.run_until(lambda: arm.loop.is_off)
+    assert arm.rig.motors_on == [False] * 4
+    assert arm.rig.top_speed < SAFE_SPEED
 
 
 @pytest.mark.parametrize(("wire_format", "duration"), [(MIT, 10.0), (MIT_V3, 2.0)])

@@ -18,10 +18,10 @@ from exo_gravity.core.motors.joint_motor import channels_of
 from exo_gravity.core.motors.wire_formats import ID_BITS, MIT, MIT_V3, WireFormat
 from exo_gravity.core.safety.drive import NOTHING, OFF, Drive, FaultCode, State
 from exo_gravity.core.safety.limits import DAMPING
+from exo_gravity.hardware.can.can_port import Address, ArmOnBus
 from exo_gravity.hardware.can.motor_bus import FOREIGN_COMMAND, MotorBus
-from exo_gravity.hardware.ownership import arm_on_bus, owned_bus
-from exo_gravity.hardware.ownership.arm_on_bus import ArmLock, ArmNotes, ArmOnBus
-from exo_gravity.hardware.ownership.bus_lock import Address, BusLock, DriveNotes, notes_file
+from exo_gravity.hardware.ownership import bus_lock, owned_bus
+from exo_gravity.hardware.ownership.bus_lock import ArmLock, ArmNotes, BusLock, DriveNotes, notes_file
 from exo_gravity.hardware.ownership.owned_bus import OwnedBus, let_down
 
 from .simulated_rig import LIMITS, SAFE_SPEED
@@ -287,7 +287,7 @@ def test_the_locks_are_taken_in_one_order_however_the_motors_are_wired(
             taken.append(address[1])
             super().__init__(address, *others, **options)
 
-    monkeypatch.setattr(arm_on_bus, "BusLock", Noted)
+    monkeypatch.setattr(bus_lock, "BusLock", Noted)
     rig, (first, second) = TwoBusRig(carried=False), order
     arm = TwoBusArm(("wire", f"{first},{second},{second},{first}", {}), rig.motors, LIMITS, CYCLE, rig.wires)
     ArmLock(arm, "a test", 0.1, rig.clock).release()

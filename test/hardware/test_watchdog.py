@@ -19,8 +19,7 @@ import pytest
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
-from exo_gravity.hardware.ownership.arm_on_bus import ArmLock
-from exo_gravity.hardware.ownership.bus_lock import BusLock
+from exo_gravity.hardware.ownership.bus_lock import ArmLock, BusLock
 from exo_gravity.hardware.ownership.owned_bus import Watchdog
 
 from .simulated_rig import SimulatedRig, wait_until

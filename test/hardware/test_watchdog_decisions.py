@@ -12,8 +12,7 @@ import pytest
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.drive import OFF
 from exo_gravity.core.safety.limits import FROZEN
-from exo_gravity.hardware.ownership.arm_on_bus import ArmNotes
-from exo_gravity.hardware.ownership.bus_lock import BusLock, DriveNotes
+from exo_gravity.hardware.ownership.bus_lock import ArmNotes, BusLock, DriveNotes
 from exo_gravity.hardware.ownership.owned_bus import HEARTBEAT_TIMEOUT, LONGEST_LOOK, OwnedBus, Silence
 from exo_gravity.hardware.ownership.watchdog import SleepInhibitor, guard
 
@@ -166,6 +165,19 @@ def test_a_bridge_that_hands_its_arm_over_is_killed_at_once(bridge: Bridge) -> N
     assert bridge.guard() == 0
     assert bridge.killed == [pytest.approx(when)]
     assert bridge.log[0] == f"can_bridge handed the arm over and has been killed (a test): {LET_DOWN[0]}"
+    bridge.rig.assert_let_down()
+
+
+@pytest.mark.parametrize("hands_over", [False, True])
+def test_a_bridge_that_dies_before_it_is_killed_has_its_arm_let_down(bridge: Bridge, hands_over: bool) -> None:
+    def find_none() -> None:
+        bridge.die()
+        raise ProcessLookupError
+
+    bridge.kill = find_none
+    bridge.at(1.0, lambda: bridge.pipe.messages.append("a test") if hands_over else bridge.freeze())
+    assert bridge.guard() == 0
+    assert bridge.log == [f"can_bridge has died: {LET_DOWN[0]}", LET_DOWN[1]]
     bridge.rig.assert_let_down()
 
 

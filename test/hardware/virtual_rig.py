@@ -14,10 +14,10 @@ from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.motors.wire_formats import MIT, WireFormat
 from exo_gravity.core.safety.drive import NOTHING, Drive, EffortCommand, State
 from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.hardware.can.can_port import Address, ArmOnBus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.hardware.ownership.arm_on_bus import ArmNotes, ArmOnBus
-from exo_gravity.hardware.ownership.bus_lock import Address, DriveNotes
+from exo_gravity.hardware.ownership.bus_lock import ArmNotes, DriveNotes
 from exo_gravity.hardware.ownership.owned_bus import let_down
 
 from .simulated_rig import LIMITS, POSE, Rig

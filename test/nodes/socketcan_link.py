@@ -14,10 +14,9 @@ from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, pack_reply
 from exo_gravity.core.safety.drive import NOTHING, OFF, Drive
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.hardware.can.can_port import open_bus
+from exo_gravity.hardware.can.can_port import ArmOnBus, open_bus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
-from exo_gravity.hardware.ownership.arm_on_bus import ArmOnBus
 
 VCAN = ("socketcan", "vcan0")
 AK60 = MOTORS["AK60-6"]

@@ -76,10 +76,15 @@ def carry(bridge: CanBridge, rig: SimulatedRig) -> None:
     assert bridge.trigger_configure() is SUCCESS
     assert bridge.trigger_activate() is SUCCESS
     safety = bridge.loop.safety
-    wait_until(lambda: safety.state in (State.ACTIVE, State.FAULT))
+
+    def has_ended() -> bool:
+        rclpy.spin_once(bridge, timeout_sec=0.0)  # a node that stands still carries no arm
+        return safety.state in (State.ACTIVE, State.FAULT)
+
+    wait_until(has_ended)
     while safety.state is State.FAULT:  # as a busy machine causes
         bridge.loop.call(lambda: safety.clear(time.monotonic()) and safety.enable(time.monotonic())).result(5.0)
-        wait_until(lambda: safety.state in (State.ACTIVE, State.FAULT))
+        wait_until(has_ended)
     assert rig.motors_on == [True] * 4
 
 

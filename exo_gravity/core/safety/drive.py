@@ -108,7 +108,7 @@ class FaultCode(str, Enum):
     FOREIGN_COMMAND = "foreign_command", "another sender commands a motor of this arm", RECHECK
     BUS_ERROR = "bus_error", "the CAN bus cannot be opened, or sending or receiving failed", RESUME
     WATCHDOG_DEAD = "watchdog_dead", "the watchdog process has died"
-    INTERNAL_ERROR = "internal_error", "the control loop raised an unexpected exception"
+    INTERNAL_ERROR = "internal_error", "an unexpected exception in the control loop, or a node that stood still"
 
 
 class Fault(NamedTuple):

@@ -255,15 +255,20 @@ class SafetyMachine:
             self._enter(State.LETTING_DOWN)
         if (all(supply.unsure) and supply.are_off) or descent.is_down(self._now, self._rest.since):
             self.is_unreached = any(silent)
-            supply.settle(silent)
+            supply.settle(may_differ)
             self._enter(State.FAULT if self.fault else State.DISABLED)
             return self._stand()
-        columns = zip(self._delivery.missing, silent, supply.unsure, strict=True)
-        enter = tuple(missing and not is_silent and not is_unsure for missing, is_silent, is_unsure in columns)
+        columns = zip(self._delivery.missing, self._unsure, strict=True)
+        enter = tuple(missing and not is_unsure for missing, is_unsure in columns)
         if any(enter):
             self._is_trusted = False
             self._delivery.reset()
-        return Drive(*descent.applied, True, enter, supply.unsure)
+        return Drive(*descent.applied, True, enter, self._unsure)
+
+    @property
+    def _unsure(self) -> tuple[bool, ...]:
+        """Which motors (4,) may be off: those in doubt, and those that do not reply, whose power may return."""
+        return tuple(map(operator.or_, self._readings.silent, self._supply.unsure))
 
     def _stand(self) -> Drive:
         """Return what the motors receive while the arm is off: nothing, unless one of them may be on."""
@@ -277,7 +282,7 @@ class SafetyMachine:
         if not (self.is_unreached or is_doubtful or self._is_found_on):
             return OFF
         if not self._is_found_on and (is_doubtful or any(self._readings.silent)):
-            return Drive(*self._descent.applied, True, unsure=supply.unsure)
+            return Drive(*self._descent.applied, True, unsure=self._unsure)
         if self.state is State.CHECKING:
             self._refuse("a motor was still on: it is let down")
         self.is_unreached = False

@@ -138,9 +138,9 @@ class SupplyMonitor:
         self._heard = list(NOTHING)  # s for which it has replied again
         self._were_silent = [False] * len(held)
 
-    def settle(self, silent: Sequence[bool] = (False,) * JOINT_COUNT) -> None:
-        """End all doubt, apart from that of motors that are `silent` (4,)."""
-        self.unsure = tuple(map(operator.and_, self.unsure, silent))
+    def settle(self, may_differ: Sequence[bool] = (False,) * JOINT_COUNT) -> None:
+        """End all doubt, apart from that of motors that are silent or `returning`, `may_differ` (4,)."""
+        self.unsure = tuple(map(operator.and_, self.unsure, may_differ))
 
     def step(self, dt: float, joints: Sequence[JointSample], silent: Sequence[bool]) -> bool:
         """Take the newest readings; return whether one shows that its motor is on. silent: (4,) who does not reply."""

@@ -19,10 +19,10 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID
 from exo_gravity.core.motors.specs import MOTORS, pack_command
 from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, MIT, MIT_V3, REPLY
-from exo_gravity.hardware.can.can_port import CanPort, open_bus
+from exo_gravity.hardware.can.can_port import Address, CanPort, open_bus
 from exo_gravity.hardware.can.motor_bus import LISTEN_TIME
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
-from exo_gravity.hardware.ownership.bus_lock import Address, BusLock
+from exo_gravity.hardware.ownership.bus_lock import BusLock
 
 SPEC = next(iter(MOTORS.values()))  # the position range is the same for all
 NOTHING = pack_command(SPEC, 0.0, 0.0, 0.0, 0.0, 0.0)

@@ -12,6 +12,7 @@ import contextlib
 import select
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import methodcaller
 from typing import Any, TypeVar
@@ -21,7 +22,10 @@ from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.udp_multicast import UdpMulticastBus
 
 from exo_gravity.core.errors import BusError
+from exo_gravity.core.motors.joint_motor import JointMotor, buses_of
 from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, Frame
+from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.clock import Clock
 
 REOPEN_AFTER = 0.02  # s of failures in a row after which the bus is opened again
@@ -29,6 +33,7 @@ REOPEN_PERIOD = 0.1  # s between two attempts
 MOST_AWAITED = 512  # echoes; twice the frames that a udp_multicast socket keeps unread
 TURN = 0.0005  # s for which one of several buses is awaited that cannot be awaited together
 MAX_STALE_FRAMES = 256  # the capacity of udp_multicast, more than any cycle produces
+Address = tuple[str, str, Mapping[str, Any]]  # interface, channel and options of a python-can bus
 Result = TypeVar("Result")
 
 
@@ -139,6 +144,50 @@ class CanPort:
         self._failing_since, self._bus = None, bus
         if self._is_closing:
             _close(bus)
+
+
+@dataclass(frozen=True)
+class ArmOnBus:
+    """An arm that may have to be let down, and how to reach it."""
+
+    address: Address  #: Of its bus; of several, as the parameters `can` state them.
+    motors: Sequence[JointMotor]  #: From shoulder to elbow.
+    limits: Limits  #: That it must never exceed.
+    period: float  #: s of a control cycle.
+    joints: Sequence[int] = field(default=range(JOINT_COUNT), kw_only=True)  #: (0..3) That are to be reached.
+
+    @property
+    def parts(self) -> "list[ArmOnBus]":
+        """The arm's part on each of its buses."""
+        interface, channel, options = self.address
+        buses = buses_of(channel, options).items()
+        parts = ((name, own, [joint for joint in on if joint in self.joints]) for name, (on, own) in buses)
+        return [replace(self, address=(interface, name, own), joints=joints) for name, own, joints in parts if joints]
+
+    def open(self, address: Address) -> can.BusABC:
+        """Open one of its buses. Raises BusError."""
+        return open_bus(*address)
+
+    def ports(self, clock: Clock, failures: list[BusError] | None = None) -> list[CanPort | None]:
+        """Open its buses; return the port of each joint's motor (4,), None for one that is not to be reached.
+
+        failures: receives the error of each bus that cannot be opened, instead of its ports. Without it, raises
+        BusError.
+        """
+        ports: list[CanPort | None] = [None] * JOINT_COUNT
+        for part in self.parts:
+            try:
+                port = CanPort(self.open(part.address), clock, partial(self.open, part.address))
+            except BusError as error:
+                if failures is None:
+                    for opened in filter(None, ports):
+                        opened.close()
+                    raise
+                failures.append(error)
+                continue
+            for joint in part.joints:
+                ports[joint] = port
+        return ports
 
 
 def awaited(ports: Sequence[CanPort], timeout: float) -> tuple[Sequence[CanPort], float]:

@@ -12,21 +12,20 @@ killed, it tells the next owner what the motors still apply.
 import contextlib
 import ctypes
 import errno
-import math
 import mmap
 import os
 import re
 import socket
 import stat
 import struct
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import NOTHING, Drive
-from exo_gravity.core.safety.limits import DAMPING
+from exo_gravity.core.safety.limits import DAMPING, MAX_COMMAND
+from exo_gravity.hardware.can.can_port import Address, ArmOnBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
 ATTEMPT_TIME = 1.0  # s; a watchdog with nothing to do may take that long to end after its bridge
@@ -39,8 +38,6 @@ FLAGS = os.O_NOFOLLOW | os.O_NONBLOCK  # another user may have put a link or a p
 SHARED = stat.S_ISVTX | stat.S_IWOTH | stat.S_IXOTH
 NOTE = struct.Struct("=10d")  # the first fields of `DriveNotes`, written at once
 UNKNOWN_DRIVE = Drive(NOTHING, (DAMPING,) * JOINT_COUNT, True)  # of motors that may be on: the first frames hold
-
-Address = tuple[str, str, Mapping[str, Any]]  # interface, channel and options of a python-can bus
 
 
 class DriveNotes(ctypes.Structure):
@@ -106,7 +103,7 @@ class BusLock:
             os.ftruncate(self.descriptor, mmap.PAGESIZE)
         self.notes = DriveNotes.from_buffer(mmap.mmap(self.descriptor, mmap.PAGESIZE))  #: the shared page
         self.notes.clock = clock
-        if not math.isfinite(sum(self.notes.drive.effort + self.notes.drive.damping)):
+        if not all(abs(value) <= MAX_COMMAND for value in self.notes.drive.effort + self.notes.drive.damping):
             self.problem = f"{path}: damaged"
         if self.problem:
             self.notes.note(UNKNOWN_DRIVE)
@@ -119,6 +116,70 @@ class BusLock:
             remove_notes(self.descriptor)
         os.close(self.descriptor)
         self.socket.close()
+
+
+class ArmNotes:
+    """The notes of all buses of an arm as one. pages: of the bus of each joint's motor (4,).
+
+    joints: (0..3) on whose buses to note. Every bus has the notes of the whole arm. clock: of their times.
+    """
+
+    def __init__(self, pages: Sequence[DriveNotes], joints: Sequence[int] = range(JOINT_COUNT)) -> None:
+        self.clock = pages[0].clock
+        self._pages = pages
+        self.noted = list({id(pages[joint]): pages[joint] for joint in joints}.values())  #: those of these joints
+
+    def of(self, joints: Sequence[int]) -> "ArmNotes":
+        """Return the notes of the buses of these joints alone."""
+        return ArmNotes(self._pages, joints)
+
+    def note(self, drive: Drive) -> None:
+        """Note what the motors are about to receive."""
+        for page in self.noted:
+            page.note(drive)
+
+    @property
+    def drive(self) -> Drive:
+        """What the motors received last; powered if they may be on on one bus."""
+        drives = [page.drive for page in self._pages]
+        effort, damping = zip(*((drive.effort[i], drive.damping[i]) for i, drive in enumerate(drives)), strict=True)
+        return Drive(effort, damping, any(drive.powered for drive in drives))
+
+    @property
+    def time(self) -> float:
+        """S, of the last note."""
+        return max(page.time for page in self.noted)
+
+    @property
+    def heartbeat(self) -> float:
+        """S, at which the watchdog last ran; 0 before it runs."""
+        return self._pages[0].heartbeat
+
+
+class ArmLock:
+    """Exclusive ownership of every bus of `arm` until `release`. `BusLock` explains the arguments.
+
+    The buses are locked in the order of their names: two owners never wait for each other. Raises BusError, and owns
+    none, if one is held.
+    """
+
+    def __init__(self, arm: ArmOnBus, owner: str, patience: float, clock: Clock) -> None:
+        self.locks: list[BusLock] = []  #: of the buses
+        own: dict[int, BusLock] = {}
+        try:
+            for part in sorted(arm.parts, key=lambda part: bus_name(part.address)):
+                self.locks.append(BusLock(part.address, owner, patience, clock, asks=True))
+                own |= dict.fromkeys(part.joints, self.locks[-1])
+        except BaseException:
+            self.release()
+            raise
+        self.of_joints = [own[joint] for joint in range(JOINT_COUNT)]  #: (4,) of the bus of each joint's motor
+        self.notes = ArmNotes([lock.notes for lock in self.of_joints])
+
+    def release(self) -> None:
+        """Give up all buses: they are free once the watchdog has ended, too."""
+        for lock in self.locks:
+            lock.release()
 
 
 def is_asked_for(lock: socket.socket) -> bool:

@@ -18,12 +18,11 @@ from multiprocessing import Pipe
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.delivery import ABSOLUTE, RELATIVE
 from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.hardware.can.can_port import CanPort
+from exo_gravity.hardware.can.can_port import ArmOnBus, CanPort
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.hardware.ownership.arm_on_bus import ArmLock, ArmNotes, ArmOnBus
-from exo_gravity.hardware.ownership.bus_lock import ATTEMPT_TIME
+from exo_gravity.hardware.ownership.bus_lock import ATTEMPT_TIME, ArmLock, ArmNotes
 
 OPEN_PERIOD = 0.05  # s between two attempts to open the bus
 FIRST_REPLIES = 0.05  # s in which the motors must reply to the first commands

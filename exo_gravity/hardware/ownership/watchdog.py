@@ -28,9 +28,9 @@ import can
 
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.limits import FROZEN
+from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.clock import favour
-from exo_gravity.hardware.ownership.arm_on_bus import ArmNotes, ArmOnBus
-from exo_gravity.hardware.ownership.bus_lock import DriveNotes, is_asked_for, remove_notes
+from exo_gravity.hardware.ownership.bus_lock import ArmNotes, DriveNotes, is_asked_for, remove_notes
 from exo_gravity.hardware.ownership.owned_bus import Silence, let_down
 
 POLL = 0.01  # s
@@ -56,7 +56,7 @@ def guard(
     arm: ArmOnBus | None = None
     clock = notes.clock
     why, silence = "has died", Silence(clock.monotonic(), 2 * POLL)
-    with contextlib.suppress(EOFError, ConnectionError):
+    with contextlib.suppress(EOFError, ConnectionError, ProcessLookupError):  # of `kill`: it has died meanwhile
         while True:
             if receiver.poll(POLL):
                 message = receiver.recv()
@@ -69,7 +69,8 @@ def guard(
                     importlib.import_module(can.interfaces.BACKENDS[message.address[0]][0])
             is_powered, noted, now = notes.drive.powered, notes.time, clock.monotonic()
             if arm:
-                notes.heartbeat = now
+                for page in notes.noted:
+                    page.heartbeat = now
             inhibit(is_powered)
             if silence.look(now, noted, is_powered) > FROZEN:
                 kill()  # it sends nothing from here on, even if it takes long to die
@@ -80,7 +81,8 @@ def guard(
     if arm is None:
         log(f"can_bridge {why}: its motors may still be powered")
         return 1
-    notes.owner = f"the watchdog (PID {os.getpid()}) of {notes.owner}; it is letting the arm down, wait until it ends"
+    for page in notes.noted:
+        page.owner = f"the watchdog (PID {os.getpid()}) of {page.owner}; it is letting the arm down, wait until it ends"
     log(f"can_bridge {why}: letting the arm down")
     if let_down(arm, notes, log, is_wanted):
         log("the arm is down, its motors are off")

@@ -27,10 +27,10 @@ from exo_gravity.core.safety.drive import NO_COMMAND, FaultCode, State
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trunk.inputs import TiltInput
+from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import request_real_time
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.hardware.ownership.arm_on_bus import ArmOnBus
 from exo_gravity.hardware.ownership.owned_bus import OwnedBus, Watchdog, take_over
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import Answer, EffortExchange
@@ -198,7 +198,8 @@ class CanBridge(LifecycleNode):
         self._report.send(self.loop, self._exchange.command, self._exchange.refusal)
 
     def _look_at(self, watchdog: Watchdog, loop: ControlLoop) -> None:
-        """Let no motor be switched on before the watchdog watches, and none stay on without it."""
+        """Let no motor be switched on before the watchdog watches, and none stay on without it or this node."""
+        loop.attended = time.monotonic()
         loop.safety.hindrance = "the watchdog to start" if watchdog.is_starting else ""
         if not watchdog.alive and loop.safety.state is not State.LETTING_DOWN:
             loop.trip(FaultCode.WATCHDOG_DEAD, "the watchdog process has died, is frozen, or did not start")
