@@ -177,7 +177,7 @@ def test_a_missing_bus_is_named():
 
 def test_the_address_can_be_set(chip):
     rig = Rig(chip)
-    rig.bus._address = 0x6B
+    rig.bus.address = 0x6B
     with pytest.raises(DeviceError, match="does not answer: Remote I/O error"):
         rig.open()
     rig.bus.closed = False

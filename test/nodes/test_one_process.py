@@ -109,7 +109,7 @@ def test_an_arm_whose_compensator_has_failed_is_let_down_as_one_whose_compensato
     arm = Carried(on_cycle=exchange.publish)
     torque.append(arm.rig.carrying)
     arm.run(0.1)
-    arm.loop._get_efforts = exchange.get_efforts
+    arm.get_efforts = exchange.get_efforts
     arm.run(1.0)
     assert arm.safety.state is State.ACTIVE
     torque.append(None)

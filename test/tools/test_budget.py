@@ -7,7 +7,6 @@ from pathlib import Path
 import matplotlib.image
 import pytest
 import yaml
-from matplotlib.figure import Figure
 
 from exo_gravity.tools.budget import main
 
@@ -34,9 +33,8 @@ def run(tmp_path, capsys):
 
 @pytest.fixture
 def plain(monkeypatch):
-    """Figures take longest: draw blank ones in tests that do not look at them."""
-    blank = Figure(figsize=(1, 1))
-    monkeypatch.setattr("exo_gravity.tools.budget._joint_figure", lambda *_: blank)
+    """Figures take longest: tests that do not look at them run as without matplotlib."""
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
 
 
 @pytest.mark.usefixtures("plain")
@@ -101,14 +99,6 @@ def test_a_wearer_whose_forearm_does_not_fit_the_robot_ends_with_one_sentence(ru
 def test_an_arm_without_a_bridge_is_refused(run):
     code, text = run("--body-mass", 75, without=(BRIDGE,))
     assert code == 2 and BRIDGE in text
-
-
-@pytest.mark.parametrize(
-    "arguments", [("--body-mass", 75_000), ("--body-mass", 75, "--support", 2), ("--body-mass", "nan")]
-)
-def test_an_impossible_wearer_ends_with_exit_code_2(run, arguments):
-    code, text = run(*arguments)
-    assert code == 2 and "must be a number from" in text
 
 
 def test_without_matplotlib_the_table_is_printed_and_the_missing_package_is_named(run, monkeypatch, tmp_path):

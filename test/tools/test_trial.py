@@ -170,20 +170,6 @@ def test_a_wrong_parameter_ends_with_exit_code_2_one_sentence_and_no_folder(run,
     assert thing in error and error.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    ("arguments", "thing"),
-    [
-        (["no_such_trial"], "no_such_trial"),
-        (["demo", "--params", "nowhere.yaml"], "nowhere.yaml"),
-        (["demo", "--offline", "--params", str(CONFIG / "exo.yaml")], "a file with a simulator"),
-    ],
-)
-def test_a_wrong_file_ends_with_exit_code_2_and_one_sentence(tmp_path, capsys, arguments, thing):
-    assert main([*arguments, "--output", str(tmp_path)]) == 2
-    error = capsys.readouterr().err
-    assert thing in error and error.count("\n") == 1
-
-
 @pytest.mark.usefixtures("without_pictures")
 def test_ctrl_c_lets_the_arm_down_and_reports_what_was_recorded(run, capsys, monkeypatch):
     def stop_on_signals() -> threading.Event:

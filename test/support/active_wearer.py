@@ -23,7 +23,7 @@ ANY = TrialScript("active wearer", (Step("hold", 3600.0),))
 
 
 class ActiveWearer(VirtualWearer):
-    """Behaves as `behaviour` says, without end."""
+    """Behaves as `behaviour` says, for as long as the device runs."""
 
     def __init__(self, behaviour: Behaviour) -> None:
         super().__init__(ANY)
